@@ -1,0 +1,133 @@
+"""Pinhole cameras in the OpenCV convention: x right, y down, z forward; pixel centres at +0.5.
+
+A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres in, pixels out. No lens distortion.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.array_types import Array, Float, Matrix3, Matrix4, Vector3
+from humangs_jax.geometry import transform
+from humangs_jax.numerics import safe_normalize
+from humangs_jax.pytree import pytree_dataclass, replace, static_field
+
+RIGID_TOLERANCE = 1e-3
+"""Calibrations are stored with few digits: R R^T may be this far from the identity before a camera is refused."""
+
+
+@pytree_dataclass
+class Camera:
+    """A pinhole camera, or a batch of cameras of one image size (leading axes on K and cam_from_world).
+
+    K: (3, 3) intrinsics in pixels. cam_from_world: (4, 4) rigid. width, height: pixels, static.
+    """
+
+    K: Matrix3
+    cam_from_world: Matrix4
+    width: int = static_field()
+    height: int = static_field()
+
+    @classmethod
+    def from_opencv(cls, K: object, cam_from_world: object, width: int, height: int) -> "Camera":
+        """A camera from array-likes (3, 3) and (4, 4), checked.
+
+        Raises: ValueError if a shape is wrong, a number not finite, a focal length not positive, the rotation not
+        orthonormal and right-handed (to 1e-3), or the image empty.
+        """
+        K, cam_from_world = np.asarray(K, np.float32), np.asarray(cam_from_world, np.float32)
+        if K.shape != (3, 3):
+            raise ValueError(f"K: expected shape (3, 3), got {K.shape}")
+        if cam_from_world.shape != (4, 4):
+            raise ValueError(f"cam_from_world: expected shape (4, 4), got {cam_from_world.shape}")
+        if not (np.isfinite(K).all() and np.isfinite(cam_from_world).all()):
+            raise ValueError("K and cam_from_world must be finite numbers")
+        if not (K[0, 0] > 0 and K[1, 1] > 0):
+            raise ValueError(f"K: focal lengths must be positive, got fx = {K[0, 0]}, fy = {K[1, 1]}")
+        if abs(K[0, 1]) > RIGID_TOLERANCE * K[0, 0] or not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):
+            raise ValueError(f"K: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}")
+        rotation = cam_from_world[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+            raise ValueError("cam_from_world: the rotation is singular, mirrored or scaled (R R^T must be 1 and det R = 1)")
+        if not np.allclose(cam_from_world[3], [0, 0, 0, 1]):
+            raise ValueError(f"cam_from_world: the last row must be 0 0 0 1, got {cam_from_world[3].tolist()}")
+        if width < 1 or height < 1:
+            raise ValueError(f"width and height must be at least 1, got {width} x {height}")
+        return cls(jnp.asarray(K), jnp.asarray(cam_from_world), int(width), int(height))
+
+    @property
+    def world_from_cam(self) -> Float[Array, "*b 4 4"]:
+        """Inverse of `cam_from_world`."""
+        return transform.invert_rigid(self.cam_from_world)
+
+    @property
+    def center(self) -> Float[Array, "*b 3"]:
+        """Camera centre in the world, metres."""
+        return self.world_from_cam[..., :3, 3]
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """The same camera for the image resampled to another size."""
+        scale = jnp.asarray([width / self.width, height / self.height, 1.0], self.K.dtype)
+        return Camera(self.K * scale[:, None], self.cam_from_world, int(width), int(height))
+
+    def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
+        """The same camera for a world whose lengths are divided by `unit`."""
+        translation = self.cam_from_world[..., :3, 3] / unit
+        return replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
+
+    def __getitem__(self, index: int | slice) -> "Camera":
+        """One camera (or some) of a batch."""
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+
+def stack_cameras(cameras: list[Camera]) -> Camera:
+    """A batch from cameras of one image size. Raises ValueError if sizes differ or the list is empty."""
+    if not cameras:
+        raise ValueError("no cameras to stack")
+    if len({(c.width, c.height) for c in cameras}) > 1:
+        raise ValueError(f"image sizes differ: {sorted({(c.width, c.height) for c in cameras})}")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
+
+
+def project(camera: Camera, points: Float[Array, "*b 3"]) -> tuple[Float[Array, "*b 2"], Float[Array, "*b"]]:
+    """World points of one camera -> pixel positions and depths z (metres). No guard at z = 0: see `rendering.projection`."""
+    p = transform.apply(camera.cam_from_world, points)
+    depth = p[..., 2]
+    uv = p[..., :2] / depth[..., None] * jnp.stack([camera.K[0, 0], camera.K[1, 1]]) + camera.K[:2, 2]
+    return uv, depth
+
+
+def intrinsics_from_fov(vertical_fov: float, width: int, height: int) -> Matrix3:
+    """K of a camera with square pixels and a centred axis; field of view in radians."""
+    focal = 0.5 * height / np.tan(0.5 * vertical_fov)
+    return jnp.asarray([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]], jnp.float32)
+
+
+def look_at(eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, height: int) -> Camera:
+    """A camera at `eye` whose axis passes through `target`, image up along `up` (which may not be parallel to the axis)."""
+    forward = safe_normalize(target - eye, jnp.asarray([0.0, 0.0, 1.0]))
+    right = safe_normalize(jnp.cross(forward, up), jnp.asarray([1.0, 0.0, 0.0]))
+    down = jnp.cross(forward, right)
+    rotation = jnp.stack([right, down, forward])
+    return Camera(K, transform.make(rotation, -rotation @ eye), width, height)
+
+
+def orbit(
+    target: Vector3,
+    distance: Float[Array, " v"] | float,
+    azimuths: Float[Array, " v"],
+    elevations: Float[Array, " v"] | float,
+    K: Matrix3,
+    width: int,
+    height: int,
+) -> Camera:
+    """A batch of cameras on circles around `target`, y up; azimuth 0 stands at +z, angles in radians."""
+    azimuths = jnp.asarray(azimuths)
+    distance, elevations = (jnp.broadcast_to(jnp.asarray(x, azimuths.dtype), azimuths.shape) for x in (distance, elevations))
+
+    def one(r, azimuth, elevation):
+        horizontal = jnp.cos(elevation)
+        direction = jnp.stack([horizontal * jnp.sin(azimuth), jnp.sin(elevation), horizontal * jnp.cos(azimuth)])
+        return look_at(target + r * direction, target, jnp.asarray([0.0, 1.0, 0.0]), K, width, height)
+
+    return jax.vmap(one)(distance, azimuths, elevations)

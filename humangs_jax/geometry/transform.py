@@ -1,0 +1,26 @@
+"""Rigid and affine 4x4 transforms of column vectors, named by their frames: p_a = a_from_b p_b."""
+
+import jax.numpy as jnp
+
+from humangs_jax.array_types import Array, Float
+
+
+def make(rotation: Float[Array, "*#b 3 3"], translation: Float[Array, "*#b 3"]) -> Float[Array, "*b 4 4"]:
+    """[[rotation, translation], [0, 0, 0, 1]]."""
+    batch = jnp.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    rotation = jnp.broadcast_to(rotation, (*batch, 3, 3))
+    translation = jnp.broadcast_to(translation, (*batch, 3))
+    top = jnp.concatenate([rotation, translation[..., None]], axis=-1)
+    bottom = jnp.broadcast_to(jnp.asarray([0.0, 0.0, 0.0, 1.0], top.dtype), (*batch, 1, 4))
+    return jnp.concatenate([top, bottom], axis=-2)
+
+
+def apply(transform: Float[Array, "*#b 4 4"], points: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
+    """Move points by the transform; batch axes broadcast. The last row is taken as (0, 0, 0, 1)."""
+    return jnp.einsum("...ij,...j->...i", transform[..., :3, :3], points) + transform[..., :3, 3]
+
+
+def invert_rigid(transform: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
+    """Inverse of a rotation with translation (the linear part is not checked to be orthogonal)."""
+    rotation = jnp.swapaxes(transform[..., :3, :3], -1, -2)
+    return make(rotation, -jnp.einsum("...ij,...j->...i", rotation, transform[..., :3, 3]))

@@ -1,0 +1,43 @@
+"""3D Gaussians: the scene that every splatter here draws.
+
+Covariance of a Gaussian: A R diag(s)^2 R^T A^T with R the rotation of its quaternion, s its scales (standard deviations, metres)
+and A an optional linear deformation (blend skinning leaves it; identity if absent).
+"""
+
+import jax.numpy as jnp
+
+from humangs_jax.array_types import Array, Float
+from humangs_jax.geometry import quaternion
+from humangs_jax.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class Gaussians:
+    """A set of 3D Gaussians.
+
+    means: (g, 3) metres. quats: (g, 4) wxyz, normalised where used. scales: (g, 3) standard deviations, metres.
+    opacities: (g,) in [0, 1]. colors: (g, 3) linear RGB in [0, 1].
+    deformations: (g, 3, 3) or None; applied to the covariance after the rotation, never to the mean.
+    """
+
+    means: Float[Array, "g 3"]
+    quats: Float[Array, "g 4"]
+    scales: Float[Array, "g 3"]
+    opacities: Float[Array, " g"]
+    colors: Float[Array, "g 3"]
+    deformations: Float[Array, "g 3 3"] | None = None
+
+
+def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:
+    """F = A R diag(s), so that the covariance is F F^T."""
+    quats = quaternion.normalize(gaussians.quats) if normalize_quats else gaussians.quats
+    factors = quaternion.to_matrix(quats) * gaussians.scales[:, None, :]
+    if gaussians.deformations is not None:
+        factors = gaussians.deformations @ factors
+    return factors
+
+
+def covariances(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:
+    """World-space covariance matrices, metres^2."""
+    factors = covariance_factors(gaussians, normalize_quats)
+    return jnp.einsum("gik,gjk->gij", factors, factors)
