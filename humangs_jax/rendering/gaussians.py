@@ -8,7 +8,8 @@ import jax.numpy as jnp
 
 from humangs_jax.array_types import Array, Float
 from humangs_jax.geometry import quaternion
-from humangs_jax.pytree import pytree_dataclass
+from humangs_jax.geometry.svd3 import left_singular_vectors
+from humangs_jax.pytree import pytree_dataclass, replace
 
 
 @pytree_dataclass
@@ -41,3 +42,14 @@ def covariances(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Arr
     """World-space covariance matrices, metres^2."""
     factors = covariance_factors(gaussians, normalize_quats)
     return jnp.einsum("gik,gjk->gij", factors, factors)
+
+
+def factored(gaussians: Gaussians) -> Gaussians:
+    """The same covariances without `deformations`: quats and scales from the singular vectors of A R diag(s).
+
+    Not meant to be differentiated: the factors are not unique where two scales coincide.
+    """
+    if gaussians.deformations is None:
+        return gaussians
+    rotations, scales = left_singular_vectors(covariance_factors(gaussians))
+    return replace(gaussians, quats=quaternion.from_matrix(rotations), scales=scales, deformations=None)

@@ -1,0 +1,55 @@
+"""Gaussians in the files that other people's viewers open.
+
+3DGS `.ply` (Kerbl et al. 2023): per vertex x y z, nx ny nz (zeros), f_dc_* = (rgb - 1/2) / Y00, optionally 45 zero f_rest_*,
+logit opacity, log scales, quaternion wxyz. Lengths in metres, y up, as everywhere here (many viewers assume y down: flip there).
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+
+from humangs_jax.rendering.gaussians import Gaussians, factored
+
+SH_C0 = 0.28209479177387814
+"""The constant spherical harmonic Y00 = 1 / (2 sqrt(pi))."""
+OPACITY_MARGIN = 1e-6
+"""Keeps the logit finite for opacities of 0 and 1."""
+SMALLEST_SCALE = 1e-9
+"""Metres; keeps the logarithm finite for flat Gaussians."""
+
+
+def write_ply(path: str | os.PathLike, gaussians: Gaussians, spherical_harmonics_rest: bool = False) -> None:
+    """Write a 3DGS `.ply`, under a temporary name first.
+
+    spherical_harmonics_rest: add the 45 zero `f_rest_*` fields that some importers (Unity) insist on.
+    """
+    import plyfile
+
+    if gaussians.deformations is not None:
+        gaussians = factored(gaussians)
+    means, quats, scales, opacities, colors = (
+        np.asarray(x, np.float64)
+        for x in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.colors)
+    )
+    p = np.clip(opacities, OPACITY_MARGIN, 1 - OPACITY_MARGIN)
+    norms = np.linalg.norm(quats, axis=-1, keepdims=True)
+    columns = dict(zip("xyz", means.T, strict=True))
+    columns |= {f"n{axis}": np.zeros(len(means)) for axis in "xyz"}
+    columns |= {f"f_dc_{i}": (colors[:, i] - 0.5) / SH_C0 for i in range(3)}
+    if spherical_harmonics_rest:
+        columns |= {f"f_rest_{i}": np.zeros(len(means)) for i in range(45)}
+    columns["opacity"] = np.log(p) - np.log1p(-p)
+    columns |= {f"scale_{i}": np.log(np.maximum(scales[:, i], SMALLEST_SCALE)) for i in range(3)}
+    unit = np.where(norms > 0, quats / np.where(norms > 0, norms, 1), [1.0, 0, 0, 0])
+    columns |= {f"rot_{i}": unit[:, i] for i in range(4)}
+    vertices = np.empty(len(means), dtype=[(name, "<f4") for name in columns])
+    for name, values in columns.items():
+        vertices[name] = values
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

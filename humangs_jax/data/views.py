@@ -1,0 +1,122 @@
+"""Photographs of one subject with the body parameters of each, and what the network needs to know of them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.array_types import Array, Float
+from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.data.capture import Capture
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.models.humangs import HumanGSConfig, HumanGSInputs, subject_unit
+from humangs_jax.pytree import pytree_dataclass, replace
+from humangs_jax.rendering.mesh_rasterizer import RasterConfig
+from humangs_jax.rendering.position_map import gouraud_position_map, plain_position_map
+
+MASK_THRESHOLD = 0.5
+"""A pixel belongs to the person when its mask is above this."""
+
+
+@pytree_dataclass
+class SubjectViews:
+    """Views of one subject; each has a pose of its own, so that inputs of varying poses are nothing special.
+
+    images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) coverage in [0, 1]. cameras: a batch of v, metric.
+    rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients.
+    """
+
+    images: Float[Array, "v h w 3"]
+    masks: Float[Array, "v h w"]
+    cameras: Camera
+    rotations: Float[Array, "v j 3"]
+    translations: Float[Array, "v 3"]
+    betas: Float[Array, " s"]
+
+
+def resize_views(views: SubjectViews, size: int) -> SubjectViews:
+    """Views box-averaged to size x size. Raises ValueError unless both sides are one multiple of `size`."""
+    height, width = views.images.shape[1:3]
+    factor = height // size
+    if height != factor * size or width != factor * size or factor < 1:
+        raise ValueError(f"images of {width} x {height} cannot be box-averaged to {size} x {size}")
+    if factor == 1:
+        return views
+
+    def shrink(x):
+        blocks = x.reshape(x.shape[0], size, factor, size, factor, *x.shape[3:])
+        return blocks.mean(axis=(2, 4))
+
+    return replace(
+        views, images=shrink(views.images), masks=shrink(views.masks), cameras=views.cameras.resized(size, size)
+    )
+
+
+def prepare_inputs(
+    body: BodyModel, views: SubjectViews, config: HumanGSConfig, raster: RasterConfig | None = None
+) -> HumanGSInputs:
+    """Pose the body for every view and rasterize it: position maps, depth maps and the foreground of the photos.
+
+    Pure and jittable; nothing here is differentiated with respect to the body. Triangles that exceed the raster capacity
+    are counted by the rasterizer; the eager path (`raster` None) sizes it to the scene.
+    """
+    rest = shape_body(body, views.betas)
+
+    def pose_view(rotations, translation):
+        return pose_body(body, rest, BodyPose(rotations, translation)).vertices
+
+    posed = jax.vmap(pose_view)(views.rotations, views.translations)
+    unit = subject_unit(rest.vertices)
+    canonical, cameras = rest.vertices / unit, views.cameras.in_units(unit)
+    draw = {"plain": plain_position_map, "gouraud": gouraud_position_map}[config.position_map]
+
+    def rasterize_view(arguments):
+        vertices, camera = arguments
+        return draw(vertices / unit, canonical, body.faces, camera, raster or RasterConfig())
+
+    # one view after the other: a vmapped rasterizer would make every view pay for the fullest one
+    position_maps, depth_maps = jax.lax.map(rasterize_view, (posed, cameras))
+    return HumanGSInputs(
+        images=views.images,
+        cameras=views.cameras,
+        posed_vertices=posed,
+        canonical_vertices=rest.vertices,
+        position_maps=position_maps,
+        depth_maps=depth_maps,
+        foreground=(views.masks > MASK_THRESHOLD) | (depth_maps >= 0),
+    )
+
+
+def standardize(capture: Capture, size: int) -> SubjectViews:
+    """A capture's photos as the network wants them: white behind the mask, padded to a centred square, resized to `size`.
+
+    Intrinsics follow the pixels. Without masks the photos stay as they are and everything that the posed body covers counts
+    as foreground.
+    """
+    images, masks = np.asarray(capture.images, np.float32), capture.masks
+    if masks is not None:
+        masks = np.asarray(masks, np.float32)
+        images = images * masks[..., None] + (1 - masks[..., None])
+    else:
+        masks = np.zeros(images.shape[:3], np.float32)
+    height, width = images.shape[1:3]
+    side = max(height, width)
+    top, left = (side - height) // 2, (side - width) // 2
+    pad = ((0, 0), (top, side - height - top), (left, side - width - left))
+    images = np.pad(images, (*pad, (0, 0)), constant_values=1.0)
+    masks = np.pad(masks, pad)
+    if side != size:
+        from skimage.transform import resize
+
+        images = np.stack([resize(x, (size, size, 3), anti_aliasing=size < side) for x in images])
+        masks = np.stack([resize(x, (size, size), anti_aliasing=size < side) for x in masks])
+    shift = jnp.asarray([[0, 0, left], [0, 0, top], [0, 0, 0]], jnp.float32)
+    square = Camera(capture.cameras.K + shift, capture.cameras.cam_from_world, side, side)
+    frames = np.asarray(capture.frames)
+    return SubjectViews(
+        images=jnp.asarray(images, jnp.float32),
+        masks=jnp.asarray(masks, jnp.float32),
+        cameras=square.resized(size, size),
+        rotations=jnp.asarray(capture.poses.rotations)[frames],
+        translations=jnp.asarray(capture.poses.translation)[frames],
+        betas=jnp.asarray(capture.betas),
+    )
