@@ -1,0 +1,118 @@
+"""A body model: shape -> pose -> vertices, for any number of vertices n and joints j.
+
+    rest(beta)  = template + shape_directions beta                      (T-pose, theta = 0)
+    joints      = joint_regressor rest(beta)
+    posed       = blend skinning of rest(beta) + pose_directions (R - I), then the translation.
+
+Metres, y up, the person faces +z with the left side at +x. SMPL-X is one such model, the CC0 body shipped with the
+package another (`humangs_jax.body.library.load_body`).
+"""
+
+import jax.numpy as jnp
+
+from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.body import skinning
+from humangs_jax.geometry import quaternion
+from humangs_jax.pytree import pytree_dataclass, static_field
+
+
+@pytree_dataclass
+class BodyModel:
+    """An articulated, shapeable triangle mesh.
+
+    template: (n, 3) mean T-pose, metres.
+    shape_directions: (n, 3, s) metres per unit of a shape coefficient; names in `shape_names`.
+    pose_directions: (n, 3, q) or None; q = 9 (j - 1) entries of R_j - I, row-major, joints 1 and up.
+    joint_regressor: (j, n) joints from rest vertices; rows sum to 1.
+    skinning_weights: (n, j) non-negative, rows sum to 1.
+    faces: (f, 3) vertex indices, counter-clockwise seen from outside.
+    uvs, uv_faces: (u, 2) texture coordinates (v up) and (f, 3) indices into them, or None.
+    collapse_order, collapse_into: (n,) or None: progressive decimation, see `humangs_jax.body.decimation`.
+    parents: static, parent of each joint, -1 for the root. joint_names, shape_names, name: static.
+    """
+
+    template: Float[Array, "n 3"]
+    shape_directions: Float[Array, "n 3 s"]
+    pose_directions: Float[Array, "n 3 q"] | None
+    joint_regressor: Float[Array, "j n"]
+    skinning_weights: Float[Array, "n j"]
+    faces: Int[Array, "f 3"]
+    uvs: Float[Array, "u 2"] | None = None
+    uv_faces: Int[Array, "f 3"] | None = None
+    collapse_order: Int[Array, " n"] | None = None
+    collapse_into: Int[Array, " n"] | None = None
+    parents: tuple[int, ...] = static_field(default=())
+    joint_names: tuple[str, ...] = static_field(default=())
+    shape_names: tuple[str, ...] = static_field(default=())
+    name: str = static_field(default="body")
+
+
+@pytree_dataclass
+class BodyPose:
+    """A pose.
+
+    rotations: (j, 3) axis-angle of each joint relative to its parent, radians. translation: (3,) metres, applied last.
+    """
+
+    rotations: Float[Array, "j 3"]
+    translation: Float[Array, "3"]
+
+
+@pytree_dataclass
+class RestBody:
+    """A shaped body in T-pose (theta = 0). vertices: (n, 3) metres. joints: (j, 3) metres."""
+
+    vertices: Float[Array, "n 3"]
+    joints: Float[Array, "j 3"]
+
+
+@pytree_dataclass
+class PosedBody:
+    """A posed body.
+
+    vertices: (n, 3) metres. joint_transforms: (j, 4, 4) from rest to posed space, translation included.
+    joints: (j, 3) metres.
+    """
+
+    vertices: Float[Array, "n 3"]
+    joint_transforms: Float[Array, "j 4 4"]
+    joints: Float[Array, "j 3"]
+
+
+def rest_pose(body: BodyModel) -> BodyPose:
+    """The T-pose: no rotation, no translation."""
+    dtype = body.template.dtype
+    return BodyPose(jnp.zeros((len(body.parents), 3), dtype), jnp.zeros(3, dtype))
+
+
+def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
+    """The T-pose of a person.
+
+    Arguments: betas, coefficients of the first directions; those not given are 0.
+    Raises: ValueError if there are more coefficients than directions.
+    """
+    used, available = betas.shape[0], body.shape_directions.shape[-1]
+    if used > available:
+        raise ValueError(f"{used} shape coefficients, but body '{body.name}' has {available} shape directions")
+    directions = body.shape_directions[..., :used]
+    vertices = body.template + jnp.einsum("nas,s->na", directions, betas, precision=skinning.EXACT)
+    return RestBody(vertices, jnp.matmul(body.joint_regressor, vertices, precision=skinning.EXACT))
+
+
+def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
+    """R_j - I of joints 1 and up, row-major: what the pose correctives are linear in."""
+    matrices = quaternion.matrix_from_axis_angle(rotations[1:])
+    return (matrices - jnp.eye(3, dtype=matrices.dtype)).reshape(-1)
+
+
+def pose_body(body: BodyModel, rest: RestBody, pose: BodyPose) -> PosedBody:
+    """Pose a shaped body: correctives, blend skinning, translation."""
+    vertices = rest.vertices
+    if body.pose_directions is not None:
+        features = pose_features(pose.rotations)
+        vertices = vertices + jnp.einsum("naq,q->na", body.pose_directions, features, precision=skinning.EXACT)
+    transforms = skinning.joint_transforms(rest.joints, body.parents, pose.rotations, pose.translation)
+    blended = skinning.blend_transforms(body.skinning_weights, transforms)
+    return PosedBody(
+        skinning.apply_transforms(blended, vertices), transforms, skinning.apply_transforms(transforms, rest.joints)
+    )
