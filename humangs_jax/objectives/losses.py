@@ -1,0 +1,23 @@
+"""Losses, unreduced: each says where the error lies, and the caller weighs and averages."""
+
+import jax.numpy as jnp
+
+from humangs_jax.array_types import Array, Float
+
+
+def squared_error(predicted: Float[Array, "*b"], target: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Squared difference, elementwise; of images in [0, 1], or of coverages and masks."""
+    return jnp.square(predicted - target)
+
+
+def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:
+    """How far the tight Gaussians stray from their vertex: squared norm of the offset, averaged over the k of a vertex.
+
+    Offsets are in normalised units (body height 1.8), so the weight of this term does not depend on the subject's size.
+    """
+    return jnp.mean(jnp.sum(jnp.square(tight_offsets), axis=-1), axis=-1)
+
+
+def excess(values: Float[Array, "*b"], limit: float) -> Float[Array, "*b"]:
+    """Squared excess over a limit, 0 below it; such as Gaussians that grow larger than anything a body needs."""
+    return jnp.square(jnp.maximum(values - limit, 0.0))

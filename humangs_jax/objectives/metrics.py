@@ -1,0 +1,46 @@
+"""Metrics of a predicted image against a photograph, both (h, w, 3) in [0, 1]."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.array_types import Array, Float, Scalar
+from humangs_jax.numerics import safe_divide
+from humangs_jax.objectives.ssim import SIGMA, WINDOW
+
+WHITE = 0.90
+"""A pixel is background when every channel is above this (the published patch metrics)."""
+LARGEST_PSNR = 100.0
+"""dB reported for equal images, whose PSNR is infinite and would spoil any mean."""
+
+
+def decibels(mean_squared_error: Scalar) -> Scalar:
+    """PSNR of a mean squared error of values in [0, 1], at most 100 dB."""
+    return -10 * jnp.log10(jnp.maximum(mean_squared_error, 10 ** (-LARGEST_PSNR / 10)))
+
+
+def psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Scalar:
+    """Peak signal-to-noise ratio over the whole frame in dB, of the prediction clipped to [0, 1]."""
+    return decibels(jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target)))
+
+
+def masked_psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"], mask: Float[Array, "h w"]) -> Scalar:
+    """PSNR in dB over the pixels of a mask, each counted by its coverage; 100 where the mask is empty."""
+    errors = jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target), axis=-1)
+    return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
+
+
+def foreground_share(image: Float[Array, "h w 3"]) -> Scalar:
+    """Share of the pixels that are not background: some channel is at most 0.90."""
+    return jnp.mean(jnp.any(image <= WHITE, axis=-1).astype(image.dtype))
+
+
+def ssim(predicted: np.ndarray, target: np.ndarray) -> float:
+    """Structural similarity of two (h, w, 3) images by scikit-image, on the host: window 11, Gaussian weights."""
+    from skimage.metrics import structural_similarity
+
+    predicted, target = np.clip(np.asarray(predicted), 0, 1), np.asarray(target)
+    return float(
+        structural_similarity(
+            predicted, target, win_size=WINDOW, sigma=SIGMA, gaussian_weights=True, data_range=1, channel_axis=-1
+        )
+    )

@@ -1,0 +1,93 @@
+"""SSIM against scikit-image, and what a loss made of it must do."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from humangs_jax.objectives.metrics import ssim
+from humangs_jax.objectives.ssim import (
+    WINDOW,
+    halve,
+    multiscale_structural_dissimilarity,
+    similarity_map,
+    structural_dissimilarity,
+    window_weights,
+)
+
+FLOAT32_SSIM = 1e-5  # cancellation in the float32 variances of bright flat regions against C2 = 9e-4
+FLOAT64_SSIM = 1e-12  # the same sums in another order
+
+
+def pair(seed, height=40, width=33, noise=0.1):
+    generator = np.random.default_rng(seed)
+    target = np.clip(np.kron(generator.random((height // 8 + 1, width // 8 + 1, 3)), np.ones((8, 8, 1))), 0, 1)
+    target = target[:height, :width]
+    target[: height // 3] = 1.0  # white background, where float32 variances are hardest
+    predicted = np.clip(target + noise * generator.standard_normal(target.shape), 0, 1)
+    return predicted, target
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-3, 0.1, 0.5]))
+@settings(deadline=None, max_examples=10)
+def test_agrees_with_skimage(seed, noise):
+    predicted, target = (x.astype(np.float32) for x in pair(seed, noise=noise))
+    ours = jnp.mean(similarity_map(jnp.asarray(predicted), jnp.asarray(target)))
+    assert abs(float(ours) - ssim(predicted.astype(np.float64), target.astype(np.float64))) < FLOAT32_SSIM
+
+
+def test_agrees_with_skimage_in_float64():
+    predicted, target = pair(3)
+    with jax.enable_x64(True):
+        ours = float(jnp.mean(similarity_map(jnp.asarray(predicted), jnp.asarray(target))))
+    assert abs(ours - ssim(predicted, target)) < FLOAT64_SSIM
+
+
+def test_one_window_against_its_definition():
+    generator = np.random.default_rng(0)
+    x, y = generator.random((2, WINDOW, WINDOW, 1))
+    weights = np.outer(window_weights(), window_weights())[..., None]
+    mean_x, mean_y = (weights * x).sum(), (weights * y).sum()
+    unbiased = WINDOW**2 / (WINDOW**2 - 1)
+    variance_x, variance_y = (unbiased * (weights * (z - m) ** 2).sum() for z, m in ((x, mean_x), (y, mean_y)))
+    covariance = unbiased * (weights * (x - mean_x) * (y - mean_y)).sum()
+    expected = (2 * mean_x * mean_y + 1e-4) * (2 * covariance + 9e-4)
+    expected /= (mean_x**2 + mean_y**2 + 1e-4) * (variance_x + variance_y + 9e-4)
+    with jax.enable_x64(True):
+        ours = similarity_map(jnp.asarray(x), jnp.asarray(y))
+    assert ours.shape == (1, 1, 1)
+    assert abs(float(ours[0, 0, 0]) - expected) < FLOAT64_SSIM
+
+
+def test_equal_images_have_no_dissimilarity_and_no_gradient():
+    _, target = pair(1)
+    target = jnp.asarray(target, jnp.float32)
+    loss = lambda image: jnp.mean(structural_dissimilarity(image, target))
+    value, gradient = jax.value_and_grad(loss)(target)
+    assert abs(float(value)) < FLOAT32_SSIM
+    assert float(jnp.max(jnp.abs(gradient))) < FLOAT32_SSIM
+
+
+def test_descending_the_gradient_restores_the_image():
+    predicted, target = (jnp.asarray(x, jnp.float32) for x in pair(2))
+    loss = jax.jit(jax.value_and_grad(lambda image: multiscale_structural_dissimilarity(image, target, 2)))
+    first, gradient = loss(predicted)
+    for _ in range(20):
+        value, gradient = loss(predicted)
+        predicted = predicted - 0.5 * gradient / jnp.linalg.norm(gradient)
+    assert float(value) < 0.5 * float(first)
+
+
+def test_scales_are_averaged_and_halved_by_boxes():
+    predicted, target = (jnp.asarray(x, jnp.float32) for x in pair(4))
+    np.testing.assert_allclose(halve(predicted)[2, 3], predicted[4:6, 6:8].mean(axis=(0, 1)), rtol=1e-6)
+    scales = [structural_dissimilarity(predicted, target), structural_dissimilarity(halve(predicted), halve(target))]
+    expected = np.mean([float(jnp.mean(x)) for x in scales])
+    assert abs(float(multiscale_structural_dissimilarity(predicted, target, 2)) - expected) < FLOAT32_SSIM
+
+
+def test_an_image_below_the_window_is_refused():
+    with pytest.raises(ValueError, match="no 11 x 11 window"):
+        similarity_map(jnp.zeros((10, 40, 3)), jnp.zeros((10, 40, 3)))
