@@ -1,0 +1,194 @@
+"""Tiles: which items (splats, triangles) touch which square of pixels, one list per tile in one buffer of fixed size.
+
+A rasterizer uses it in five steps, all with static shapes:
+
+1. count, for every item, how many tiles it touches, and `expand` the counts: slot -> item (in one step, or item -> rows
+   of tiles -> tiles). From the slot's place among the item's slots follows its tile; slots that are not needed get tile
+   `grid.tiles`.
+2. `sort_into_tiles`: the (tile, item) pairs by tile, and by item number inside a tile. Number the items by depth first
+   and every list runs front to back.
+3. `blocks_by_length`: tiles by falling list length, so that a block of consecutive ones has lists of about the same
+   length, and empty tiles come last and are never visited.
+4. the rasterizer's own loop over blocks, and over chunks of the lists of a block; pixels of a tile are one axis of
+   `tile_size`^2 values, row by row, at `grid.offsets` from the tile's centre in `grid.centers`.
+5. `tiles_to_image`, and `image_to_tiles` for gradients.
+
+What does not fit in a buffer is counted: `Expansion.needed` is exact whatever the capacity. Image sizes need not be
+multiples of the tile size: the last row and column of tiles reach beyond the image, and those pixels are cut off.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from humangs_jax.array_types import Array, Float, Int
+
+SUM_LIMIT = 1 << 30
+"""Running sums stop here instead of wrapping past 2^31: far above any buffer, so a sum there only says "too many"."""
+
+_ROW = 64
+"""Width of the triangular products in `cumsum`: 64 numbers below 2^18 add up exactly in float32."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TileGrid:
+    """An image cut into squares of `tile_size` pixels, numbered row by row. Static (hashable)."""
+
+    width: int
+    height: int
+    tile_size: int
+
+    @property
+    def columns(self) -> int:
+        """Tiles per row of tiles."""
+        return -(-self.width // self.tile_size)
+
+    @property
+    def rows(self) -> int:
+        """Rows of tiles."""
+        return -(-self.height // self.tile_size)
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles; also the tile number of "no tile"."""
+        return self.columns * self.rows
+
+    @property
+    def pixels(self) -> int:
+        """Pixels per tile."""
+        return self.tile_size**2
+
+    def offsets(self, dtype: object = np.float32) -> np.ndarray:
+        """(2, pixels): x and y of a tile's pixel centres, from the tile's centre. Small: moments stay accurate."""
+        pixel = np.arange(self.pixels)
+        offsets = np.stack([pixel % self.tile_size, pixel // self.tile_size]) + 0.5 - self.tile_size / 2
+        return offsets.astype(dtype)
+
+    def centers(self, dtype: object = np.float32) -> np.ndarray:
+        """(t, 2): x and y of the tiles' centres, pixels."""
+        tile = np.arange(self.tiles)
+        corners = np.stack([tile % self.columns, tile // self.columns], axis=-1) * self.tile_size
+        return (corners + self.tile_size / 2).astype(dtype)
+
+
+class Expansion(NamedTuple):
+    """Slots shared out among items, item by item.
+
+    source: (capacity,) item of each slot; of slots >= needed, the last item that has any.
+    first: (n,) first slot of each item, so that slot - first[source] counts the slots of one item.
+    needed: slots asked for, whatever the capacity (saturates at `SUM_LIMIT`). Slot s is used if s < needed.
+    """
+
+    source: Int[Array, " capacity"]
+    first: Int[Array, " n"]
+    needed: Int[Array, ""]
+
+
+class TileLists(NamedTuple):
+    """For each tile a list of items: items[starts[t] : starts[t] + counts[t]], ascending.
+
+    items: (capacity,). starts, counts: (t,).
+    """
+
+    items: Int[Array, " capacity"]
+    starts: Int[Array, " t"]
+    counts: Int[Array, " t"]
+
+
+class TileBlocks(NamedTuple):
+    """Tiles by falling list length, padded to whole blocks.
+
+    tiles: (blocks * block,) tile numbers; the padding has the number "no tile" (t), which is out of bounds on purpose:
+    gather with a fill value, scatter with mode="drop". used: how many blocks hold a tile whose list is not empty.
+    """
+
+    tiles: Int[Array, " t_padded"]
+    used: Int[Array, ""]
+
+
+def cumsum(x: Int[Array, " n"]) -> Int[Array, " n"]:
+    """Inclusive running sum of int32 numbers in [0, 2^18), saturating at `SUM_LIMIT`.
+
+    Rows of 64 by a triangular matrix product, then the rows' totals: on XLA's CPU backend several times faster than
+    `jnp.cumsum`. Exact: the products are of numbers below 2^24 at full float32 precision.
+    """
+    n = x.shape[0]
+    rows = jnp.pad(x, (0, -n % _ROW)).reshape(-1, _ROW).astype(jnp.float32)
+    triangle = jnp.triu(jnp.ones((_ROW, _ROW), jnp.float32))
+    within = jnp.matmul(rows, triangle, precision=lax.Precision.HIGHEST)
+    totals = within[:, -1]
+    fits = jnp.cumsum(totals) < SUM_LIMIT  # rounded sums of positive numbers: good enough to tell
+    ends = jnp.where(fits, jnp.cumsum(totals.astype(jnp.int32), dtype=jnp.int32), SUM_LIMIT)
+    before = jnp.pad(ends, (1, 0))[:-1]
+    return jnp.minimum(within.astype(jnp.int32) + before[:, None], SUM_LIMIT).reshape(-1)[:n]
+
+
+def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
+    """Shares out `capacity` slots: item i takes the next counts[i] of them (0 <= counts < 2^18)."""
+    n = counts.shape[0]
+    if n == 0:
+        zeros = jnp.zeros(capacity, jnp.int32)
+        return Expansion(zeros, counts, jnp.zeros((), jnp.int32))
+    end = cumsum(counts)
+    first = end - counts
+    some = counts > 0
+    # items with slots, numbered without gaps: a mark at each one's first slot, summed up, is that number
+    marks = jnp.zeros(capacity, jnp.int32).at[jnp.where(some, first, capacity)].add(1, mode="drop")
+    number = cumsum(some.astype(jnp.int32)) - 1
+    item = jnp.zeros(n, jnp.int32).at[jnp.where(some, number, n)].set(jnp.arange(n, dtype=jnp.int32), mode="drop")
+    source = item[jnp.maximum(cumsum(marks) - 1, 0)]
+    return Expansion(source, first, end[-1])
+
+
+def bits_for(count: int) -> int:
+    """Bits that hold the numbers 0 .. count - 1 (at least one)."""
+    return max(1, (count - 1).bit_length())
+
+
+def sort_into_tiles(
+    tiles: Int[Array, " capacity"], items: Int[Array, " capacity"], tile_count: int, item_count: int
+) -> TileLists:
+    """Pairs (tile, item) -> lists by tile, ascending by item. Pairs of tile `tile_count` ("no tile") are left out.
+
+    One sort of one uint32 where the tile number and the item number fit it together (sorting a key with a payload costs
+    several times as much); otherwise a sort by two keys.
+    """
+    bits = bits_for(item_count)
+    if (tile_count + 1) << bits <= 1 << 32:
+        key = tiles.astype(jnp.uint32) << bits | items.astype(jnp.uint32)
+        sorted_items = (jnp.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
+    else:
+        sorted_items = lax.sort((tiles, items), num_keys=2, is_stable=False)[1]
+    counts = jnp.zeros(tile_count, jnp.int32).at[tiles].add(1, mode="drop")
+    starts = jnp.cumsum(counts, dtype=jnp.int32) - counts
+    return TileLists(sorted_items, starts, counts)
+
+
+def blocks_by_length(counts: Int[Array, " t"], block: int) -> TileBlocks:
+    """Tiles in blocks of `block`, by falling list length; equal ones, and ones too long for the key, by number."""
+    t = counts.shape[0]
+    bits = bits_for(t)
+    longest = (1 << (32 - bits)) - 1
+    key = (longest - jnp.minimum(counts.astype(jnp.uint32), longest)) << bits | jnp.arange(t, dtype=jnp.uint32)
+    tiles = (jnp.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
+    tiles = jnp.pad(tiles, (0, -t % block), constant_values=t)
+    used = jnp.sum(counts > 0, dtype=jnp.int32)
+    return TileBlocks(tiles, (used + block - 1) // block)
+
+
+def image_to_tiles(image: Float[Array, "h w c"], grid: TileGrid) -> Float[Array, "t c p"]:
+    """The pixels of each tile, channel by channel; 0 beyond the image."""
+    size, c = grid.tile_size, image.shape[-1]
+    image = jnp.pad(image, ((0, grid.rows * size - grid.height), (0, grid.columns * size - grid.width), (0, 0)))
+    tiles = image.reshape(grid.rows, size, grid.columns, size, c).transpose(0, 2, 4, 1, 3)
+    return tiles.reshape(grid.tiles, c, grid.pixels)
+
+
+def tiles_to_image(tiles: Float[Array, "t c p"], grid: TileGrid) -> Float[Array, "h w c"]:
+    """Inverse of `image_to_tiles`; pixels beyond the image are cut off."""
+    size, c = grid.tile_size, tiles.shape[1]
+    image = tiles.reshape(grid.rows, grid.columns, c, size, size).transpose(0, 3, 1, 4, 2)
+    return image.reshape(grid.rows * size, grid.columns * size, c)[: grid.height, : grid.width]
