@@ -68,7 +68,7 @@ class Camera:
     def resized(self, width: int, height: int) -> "Camera":
         """The same camera for the image resampled to another size."""
         scale = jnp.asarray([width / self.width, height / self.height, 1.0], self.K.dtype)
-        return Camera(self.K * scale[:, None], self.cam_from_world, int(width), int(height))
+        return replace(self, K=self.K * scale[:, None], width=int(width), height=int(height))
 
     def in_units(self, unit: Float[Array, ""] | float) -> "Camera":
         """The same camera for a world whose lengths are divided by `unit`."""
