@@ -1,0 +1,221 @@
+"""The `humangs` command line. Each command is a function below; tyro makes its options from the signature.
+
+What the user got wrong (a capture, a file, an option) ends in one line on stderr and exit code 2; nothing is written then.
+"""
+
+import os
+import sys
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+Positional = tyro.conf.Positional
+
+
+def demo(out: Path = Path("demo_out"), weights: Path | None = None, size: int = 256) -> None:
+    """Reconstruct the person that ships with the package from four photos, look at them anew, animate them.
+
+    Args:
+        out: folder for the pictures, the video, the avatar and report.json.
+        weights: network weights (.safetensors); the shipped ones if not given.
+        size: side of the animation's frames in pixels.
+    """
+    from humangs_jax.avatar.demo import run_demo
+
+    run_demo(out, weights=weights, frame_size=size)
+
+
+def reconstruct(capture: Positional[Path], out: Path = Path("avatar.npz"), weights: Path | None = None) -> None:
+    """Reconstruct an avatar from a capture folder (photos, cameras, body poses: docs/capture_format.md).
+
+    Args:
+        capture: folder with capture.json.
+        out: the avatar file to write.
+        weights: network weights (.safetensors); the shipped ones if not given.
+    """
+    from humangs_jax.avatar.reconstruct import reconstruct as run
+    from humangs_jax.data.capture import load_capture
+    from humangs_jax.models.weights import load_weights
+
+    photos = load_capture(capture)
+    _require_parent(out)
+    variables, config = load_weights(weights)
+    avatar = run(variables, config, photos)
+    avatar.save(out)
+    print(f"{out}: {len(avatar.gaussians.means):,} Gaussians from {len(photos.images)} photos")
+
+
+def animate(
+    avatar: Positional[Path],
+    motion: Path | None = None,
+    out: Path = Path("animation.mp4"),
+    size: int = 512,
+    azimuth: float = 20.0,
+    turn: float = 0.0,
+) -> None:
+    """Animate an avatar with a motion of SMPL-X poses and write a video (.mp4 or .gif).
+
+    Args:
+        avatar: file written by `humangs reconstruct`.
+        motion: .npz (ours, AMASS, AIST++, THuman4.0, AvatarReX) or LHM's .json; the shipped walk if not given.
+        out: the video to write.
+        size: side of the frames in pixels.
+        azimuth: degrees; 0 looks at the avatar's front.
+        turn: degrees the camera travels around the avatar during the motion.
+    """
+    from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.avatar.frames import motion_frames
+    from humangs_jax.avatar.video import write_video
+    from humangs_jax.data.motion import load_motion
+
+    _require_parent(out)
+    _require_suffix(out, (".mp4", ".gif"))
+    person, poses = Avatar.load(avatar), load_motion(motion)
+    frames = motion_frames(person, poses, size, azimuth=azimuth, turn=turn)
+    write_video(out, frames, poses.fps)
+    print(f"{out}: {len(frames)} frames at {poses.fps:g} frames per second")
+
+
+def render(
+    avatar: Positional[Path],
+    out: Path = Path("views"),
+    views: int = 8,
+    size: int = 512,
+    capture: Path | None = None,
+    exr: bool = False,
+) -> None:
+    """Draw an avatar in its T-pose from a circle of cameras, or in the poses and from the cameras of a capture.
+
+    Args:
+        avatar: file written by `humangs reconstruct`.
+        out: folder for view_000.png and so on.
+        views: number of cameras on the circle.
+        size: side of the images in pixels (circle only).
+        capture: take cameras and poses from this capture folder instead.
+        exr: also write views.exr: float32 RGBA, depth Z and camera matrices, one part per view.
+    """
+    from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.avatar.frames import capture_renderings, turntable_renderings, write_renderings
+    from humangs_jax.data.capture import load_capture
+
+    person = Avatar.load(avatar)
+    if capture is not None:
+        cameras, renderings = capture_renderings(person, load_capture(capture))
+    else:
+        cameras, renderings = turntable_renderings(person, views, size)
+    written = write_renderings(out, cameras, renderings, exr=exr)
+    print(f"{out}: {written} views")
+
+
+def export(
+    avatar: Positional[Path], out: Path = Path("avatar.ply"), motion: Path | None = None, frame: int = 0, rest: bool = False
+) -> None:
+    """Export an avatar as a 3DGS .ply that Gaussian viewers open, in the T-pose or in one frame of a motion.
+
+    Args:
+        avatar: file written by `humangs reconstruct`.
+        out: the .ply to write.
+        motion: pose it by this motion.
+        frame: which frame of the motion.
+        rest: add the 45 zero f_rest fields that some importers (Unity) want.
+    """
+    from humangs_jax.avatar.animate import animate as pose_avatar
+    from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.avatar.export import write_ply
+    from humangs_jax.data.motion import load_motion
+
+    _require_parent(out)
+    _require_suffix(out, (".ply",))
+    person = Avatar.load(avatar)
+    gaussians = person.gaussians
+    if motion is not None:
+        poses = load_motion(motion)
+        if not 0 <= frame < len(poses.translations):
+            raise ValueError(f"{motion}: frame {frame} asked for, but it has {len(poses.translations)} frames")
+        gaussians = pose_avatar(person, poses.pose(frame))
+    write_ply(out, gaussians, spherical_harmonics_rest=rest)
+    print(f"{out}: {len(gaussians.means):,} Gaussians")
+
+
+def synth(
+    out: Path = Path("synthetic_people"),
+    subjects: int = 8,
+    split: Literal["train", "validation", "test"] = "train",
+    size: int = 256,
+    first: int = 0,
+) -> None:
+    """Make synthetic clothed people and write them as capture folders with held-out views. Can be interrupted and resumed.
+
+    Args:
+        out: folder for one capture folder per subject and manifest.json.
+        subjects: how many.
+        split: seeds of the three splits never overlap.
+        size: side of the images in pixels.
+        first: index of the first subject within the split.
+    """
+    from humangs_jax.data.synthetic.writer import synthesize
+
+    synthesize(out, subjects=subjects, split=split, image_size=size, first=first)
+
+
+def check(capture: Positional[Path], out: Path = Path("check.png")) -> None:
+    """Draw the posed body over each photo of a capture: wrong pose or camera conventions show at a glance.
+
+    Args:
+        capture: folder with capture.json.
+        out: the contact sheet to write.
+    """
+    from humangs_jax.avatar.check import check_capture
+    from humangs_jax.data.capture import load_capture
+
+    photos = load_capture(capture)
+    _require_parent(out)
+    report = check_capture(photos, out)
+    print(report)
+
+
+def train(data: Positional[Path], out: Path = Path("runs/train"), steps: int | None = None) -> None:
+    """Train the small network on capture folders (for example those of `humangs synth`). Resumes from --out.
+
+    Args:
+        data: folder of capture folders.
+        out: checkpoints, log, validation pictures and weights.safetensors.
+        steps: number of steps; the preset's if not given. All settings: experiments/train_small.py --help.
+    """
+    from humangs_jax.training.loop import train as run
+    from humangs_jax.training.presets import small
+
+    run(small(steps=steps), data, out)
+
+
+COMMANDS = {f.__name__: f for f in (demo, reconstruct, animate, render, export, synth, check, train)}
+
+
+def _require_parent(path: Path) -> None:
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"--out {path}: the folder {path.parent} does not exist")
+
+
+def _require_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"--out {path}: expected a name ending in {' or '.join(suffixes)}")
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # no notes of XLA's between our lines
+    try:
+        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="humangs", description=__doc_summary__)
+    except (ValueError, OSError) as error:
+        print(f"humangs: error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("humangs: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+__doc_summary__ = "Animatable 3D Gaussian humans from a few photos with body poses."
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,91 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.geometry import camera as cameras
+from humangs_jax.geometry import transform
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.rays import pixel_rays, plucker_rays
+
+ATOL = 1e-5
+K = np.array([[100.0, 0, 16], [0, 110, 12], [0, 0, 1]])
+
+
+def ring(n=5, size=32):
+    intrinsics = cameras.intrinsics_from_fov(np.pi / 3, size, size)
+    azimuths = jnp.linspace(0, 2 * np.pi, n, endpoint=False)
+    return cameras.orbit(jnp.asarray([0.1, 0.9, 0.0]), 2.0, azimuths, 0.2, intrinsics, size, size)
+
+
+def test_orbit_looks_at_its_target_right_side_up():
+    for i in range(5):
+        c = ring()[i]
+        uv, depth = cameras.project(c, jnp.asarray([[0.1, 0.9, 0.0], [0.1, 1.1, 0.0]]))
+        assert np.allclose(uv[0], 16, atol=1e-3) and np.isclose(depth[0], 2, atol=ATOL)
+        assert uv[1, 1] < uv[0, 1]  # y up in the world is up in the image, whose y points down
+    front = ring()[0]
+    uv, _ = cameras.project(front, jnp.asarray([[0.3, 0.9, 0.0]]))
+    assert uv[0, 0] > 16  # seen from +z, the world's +x is on the right
+
+
+def test_transforms_compose_and_invert():
+    c = ring()[2]
+    identity = c.world_from_cam @ c.cam_from_world
+    assert np.allclose(identity, np.eye(4), atol=ATOL)
+    assert np.allclose(transform.apply(c.world_from_cam, jnp.zeros(3)), c.center, atol=ATOL)
+
+
+def test_rays_pass_through_the_pixel_centres_they_belong_to():
+    c = ring()[3]
+    origin, directions = pixel_rays(c)
+    assert np.allclose(np.linalg.norm(directions, axis=-1), 1, atol=ATOL)
+    uv, _ = cameras.project(c, origin + 1.7 * directions[5, 9])
+    assert np.allclose(uv, [9.5, 5.5], atol=1e-3)
+    moment, direction = jnp.split(plucker_rays(c), 2, axis=-1)
+    assert np.allclose(jnp.sum(moment * direction, -1), 0, atol=ATOL)
+    assert np.allclose(moment[5, 9], np.cross(origin, direction[5, 9]), atol=ATOL)
+
+
+def test_resizing_and_units_keep_the_picture():
+    c, point = ring()[1], jnp.asarray([0.2, 1.0, 0.1])
+    uv, depth = cameras.project(c, point)
+    doubled, _ = cameras.project(c.resized(64, 64), point)
+    scaled, scaled_depth = cameras.project(c.in_units(0.5), point / 0.5)
+    assert np.allclose(doubled, 2 * uv, atol=1e-3)
+    assert np.allclose(scaled, uv, atol=1e-3) and np.isclose(scaled_depth, depth / 0.5, atol=ATOL)
+
+
+def test_gradients_reach_the_pose_and_the_intrinsics():
+    c = ring()[0]
+    gradient = jax.grad(lambda c: cameras.project(c, jnp.asarray([0.2, 1.0, 0.1]))[0].sum())(c)
+    assert np.abs(gradient.K).max() > 0 and np.abs(gradient.cam_from_world).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(K=np.eye(4)), r"K: expected shape \(3, 3\)"),
+        (dict(cam_from_world=np.eye(3)), r"cam_from_world: expected shape"),
+        (dict(K=K * np.nan), "finite"),
+        (dict(K=-K), "focal"),
+        (dict(K=K.T), "expected"),
+        (dict(cam_from_world=np.diag([0, 1, 1, 1.0])), "singular"),
+        (dict(cam_from_world=np.diag([-1, 1, 1, 1.0])), "mirrored"),
+        (dict(cam_from_world=2 * np.eye(4)), "scaled"),
+        (dict(width=0), "at least 1"),
+    ],
+)
+def test_bad_cameras_are_refused_by_name(change, message):
+    arguments = dict(K=K, cam_from_world=np.eye(4), width=32, height=24) | change
+    with pytest.raises(ValueError, match=message):
+        Camera.from_opencv(**arguments)
+
+
+def test_stacking_needs_cameras_of_one_size():
+    c = ring()[0]
+    assert cameras.stack_cameras([c, c]).K.shape == (2, 3, 3)
+    with pytest.raises(ValueError, match="sizes differ"):
+        cameras.stack_cameras([c, c.resized(8, 8)])
+    with pytest.raises(ValueError, match="no cameras"):
+        cameras.stack_cameras([])
