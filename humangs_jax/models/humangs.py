@@ -1,0 +1,317 @@
+"""The network: photographs with poses in, canonical 3D Gaussians out, in one forward pass.
+
+    encode          photos -> tokens -> transformer -> feature maps and a global token
+    sample_vertices feature maps -> features of every posed body vertex, pooled over views
+    decode          features -> K Gaussians per vertex of the canonical body
+
+Everything is written for ONE subject; batch with `jax.vmap` over `inputs` (variables unbatched). Callers jit, with `config`
+static. Lengths inside are normalised units: metres divided by s = (height of the canonical body) / 1.8, so that every
+body is 1.8 high; means and scales are multiplied by s at the end, and what goes in is metric except where said otherwise.
+"""
+
+import dataclasses
+import functools
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.array_types import Array, Bool, Float, Int, Key, Scalar
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.rays import plucker_rays
+from humangs_jax.models.tokenizer import Packing, Tokenizer, TokenSelection, pack_patches, patchify, unpack_tokens
+from humangs_jax.models.transformer import INIT_STD, Transformer, TransformerConfig
+from humangs_jax.models.upsampler import Upsampler, UpsamplerConfig
+from humangs_jax.models.vertex_decoder import (
+    VertexDecoder,
+    VertexDecoderConfig,
+    VertexFeatures,
+    activate,
+    decoder_input,
+)
+from humangs_jax.pytree import pytree_dataclass, replace
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.sampling.pixel_aligned import (
+    PixelAlignedConfig,
+    photo_colors,
+    pool_views,
+    project_vertices,
+    sample_views,
+    visible_vertices,
+)
+from humangs_jax.sampling.triplane import TriplaneConfig
+
+TARGET_HEIGHT = 1.8
+"""Height of every canonical body in normalised units."""
+ENCODED_POSITION = 39
+"""Width of the positional encoding of a vertex."""
+
+Variables = dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True)
+class HumanGSConfig:
+    """Everything that a set of weights depends on; see `models.presets`.
+
+    image_size: side of the photographs, pixels (recorded: the network takes any multiple of the patch size).
+    patch_size: side of a token's patch, pixels. tokens: "all" patches, or those that the "foreground" touches, packed into
+    `token_capacity` slots over all views. position_map, skinning: how the position map that comes in was shaded, and how the
+    Gaussians are to be skinned (recorded). body_vertices: vertex count to decimate bodies to, None for all (recorded).
+    dtype: of the products; parameters, norms and softmax statistics stay float32 at least.
+    """
+
+    image_size: int = 512
+    patch_size: int = 8
+    tokens: TokenSelection = "all"
+    token_capacity: int = 0
+    position_map: Literal["plain", "gouraud"] = "plain"
+    skinning: Literal["affine", "rotation"] = "affine"
+    body_vertices: int | None = None
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    texture: TriplaneConfig = TriplaneConfig()
+    transformer: TransformerConfig = TransformerConfig()
+    upsampler: UpsamplerConfig = UpsamplerConfig()
+    sampling: PixelAlignedConfig = PixelAlignedConfig()
+    decoder: VertexDecoderConfig = VertexDecoderConfig()
+
+    def __post_init__(self):
+        """Raises ValueError for sizes that do not fit together."""
+        transformer, decoder = self.transformer, self.decoder
+        if self.image_size % self.patch_size:
+            raise ValueError(f"image_size {self.image_size} is no multiple of patch_size {self.patch_size}")
+        if transformer.width % transformer.attention.head_width:
+            raise ValueError(
+                f"width {transformer.width} is no multiple of head_width {transformer.attention.head_width}"
+            )
+        if transformer.layers < 4 or transformer.layers % 2:
+            raise ValueError(f"layers must be even and at least 4, to have quarters; got {transformer.layers}")
+        if self.tokens == "foreground" and self.token_capacity < 1:
+            raise ValueError("tokens = 'foreground' needs a token_capacity of at least 1")
+        if decoder.residual_color and not self.sampling.sample_rgb:
+            raise ValueError("decoder.residual_color needs sampling.sample_rgb: there is no photo colour to correct")
+        if decoder.gaussians_per_vertex < 1:
+            raise ValueError("decoder: tight + free must be at least 1")
+
+    @property
+    def compute_dtype(self) -> Any:
+        """dtype for Linen modules; None promotes inputs and parameters, so that float64 stays float64."""
+        return jnp.bfloat16 if self.dtype == "bfloat16" else None
+
+    @property
+    def decoder_width(self) -> int:
+        """Numbers that enter the decoder per vertex."""
+        width = self.transformer.width
+        local = self.upsampler.out if self.upsampler.enabled else width
+        return local + width * self.transformer.class_token + ENCODED_POSITION + 4 * self.sampling.sample_rgb
+
+
+@pytree_dataclass
+class HumanGSInputs:
+    """What the network is told of one subject.
+
+    images: (v, h, w, 3) in [0, 1], white background. cameras: a batch of v, metric. posed_vertices: (v, n, 3) metric, the
+    body in the pose of each photo. canonical_vertices: (n, 3) metric, T-pose. position_maps: (v, h, w, 3) canonical position
+    of each pixel, normalised units, 1 on background. depth_maps: (v, h, w) rasterized z, normalised units, -1 on background.
+    foreground: (v, h, w) pixels of the person (used by `tokens = "foreground"`).
+    """
+
+    images: Float[Array, "v h w 3"]
+    cameras: Camera
+    posed_vertices: Float[Array, "v n 3"]
+    canonical_vertices: Float[Array, "n 3"]
+    position_maps: Float[Array, "v h w 3"]
+    depth_maps: Float[Array, "v h w"]
+    foreground: Bool[Array, "v h w"]
+
+
+@pytree_dataclass
+class Encoding:
+    """What the encoder makes of the photographs.
+
+    maps: (v, h', w', d) feature maps. global_token: (d',) or None without a class token. dropped_tokens: foreground patches
+    that the token capacity had no room for.
+    """
+
+    maps: Float[Array, "v h w d"]
+    global_token: Float[Array, " e"] | None
+    dropped_tokens: Int[Array, ""]
+
+
+@pytree_dataclass
+class HumanGSOutputs:
+    """Canonical Gaussians of one subject.
+
+    gaussians: g = n * k of them, metric, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from the vertex, normalised
+    units (for the tightness loss). skinning_offsets: (n * k, j) logits of the skinning head, or None (see
+    `vertex_decoder.corrected_skinning_weights`). dropped_tokens: see `Encoding`.
+    """
+
+    gaussians: Gaussians
+    tight_offsets: Float[Array, "n t 3"]
+    skinning_offsets: Float[Array, "g j"] | None
+    dropped_tokens: Int[Array, ""]
+
+
+class Encoder(nn.Module):
+    """Pixels of all views (v, h, w, 12: rgb, rays, canonical position) -> maps (v, h', w', d), global token."""
+
+    config: HumanGSConfig
+    axis_name: str | None = None
+
+    @nn.compact
+    def __call__(
+        self, pixels: Float[Array, "v h w 12"], packing: Packing | None = None, train: bool = False
+    ) -> tuple[Float[Array, "v i j d"], Float[Array, " e"] | None]:
+        config, dtype = self.config, self.config.compute_dtype
+        width = config.transformer.width
+        patches = patchify(pixels, config.patch_size)
+        patch_count = len(patches)
+        grid = (pixels.shape[0], pixels.shape[1] // config.patch_size, pixels.shape[2] // config.patch_size)
+        if packing is not None:
+            patches = patches.at[packing.indices].get(mode="fill", fill_value=0)
+        tokens = Tokenizer(width, config.texture, dtype, name="tokenizer")(patches)
+        count = None if packing is None else packing.count
+        if config.transformer.class_token:
+            class_token = self.param("class_token", nn.initializers.truncated_normal(INIT_STD), (1, width))
+            tokens = jnp.concatenate([class_token.astype(tokens.dtype), tokens])
+            count = None if count is None else count + 1
+
+        depths = Transformer(config.transformer, dtype, name="transformer")(tokens, count)
+        global_token = depths[-1][0] if config.transformer.class_token else None
+        if config.transformer.class_token:
+            depths = [x[1:] for x in depths]
+        if not config.upsampler.enabled or config.upsampler.features == "final":
+            depths = depths[-1:]
+        if packing is not None:
+            depths = [unpack_tokens(x, packing, patch_count) for x in depths]
+        maps = [x.reshape(*grid, width) for x in depths]
+        if not config.upsampler.enabled:
+            return maps[0], global_token
+        return Upsampler(config.upsampler, dtype, self.axis_name, name="upsampler")(maps, train), global_token
+
+
+def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
+    """s, metres per normalised unit: the canonical body's height over 1.8."""
+    y = canonical_vertices[:, 1]
+    return (jnp.max(y) - jnp.min(y)) / TARGET_HEIGHT
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
+    """Fresh variables {"params": {"encoder", "decoder"}, "batch_stats": {"encoder"} or {}}, float32."""
+    encoder_key, decoder_key = jax.random.split(key)
+    pixels = jnp.zeros((1, 2 * config.patch_size, 2 * config.patch_size, 12))
+    encoder = Encoder(config).init(encoder_key, pixels)
+    decoder = VertexDecoder(config.decoder).init(decoder_key, jnp.zeros((1, config.decoder_width)))
+    batch_stats = {"encoder": encoder["batch_stats"]} if "batch_stats" in encoder else {}
+    return {"params": {"encoder": encoder["params"], "decoder": decoder["params"]}, "batch_stats": batch_stats}
+
+
+def select_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Packing | None:
+    """Which patches become tokens; None for all of them."""
+    if config.tokens == "all":
+        return None
+    touched = jnp.any(patchify(inputs.foreground[..., None].astype(jnp.float32), config.patch_size) > 0, axis=(1, 2))
+    return pack_patches(touched, min(config.token_capacity, len(touched)))
+
+
+def encode_with_statistics(
+    variables: Variables,
+    inputs: HumanGSInputs,
+    config: HumanGSConfig,
+    train: bool = False,
+    axis_name: str | None = None,
+) -> tuple[Encoding, Variables]:
+    """`encode`, and the running batch statistics: updated ones if `train`, the given ones otherwise."""
+    height, width = inputs.images.shape[1:3]
+    if (inputs.cameras.width, inputs.cameras.height) != (width, height):
+        raise ValueError(
+            f"images are {width} x {height} but their cameras say {inputs.cameras.width} x {inputs.cameras.height}"
+        )
+    cameras = inputs.cameras.in_units(subject_unit(inputs.canonical_vertices))
+    rays = jax.vmap(plucker_rays)(cameras).astype(inputs.images.dtype)
+    pixels = jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
+    packing = select_tokens(inputs, config)
+
+    batch_stats = variables["batch_stats"]
+    own = {"params": variables["params"]["encoder"]}
+    if batch_stats:
+        own["batch_stats"] = batch_stats["encoder"]
+    update = train and bool(batch_stats)
+    result = Encoder(config, axis_name).apply(own, pixels, packing, train, mutable=["batch_stats"] if update else False)
+    if update:
+        result, updated = result
+        batch_stats = {"encoder": updated["batch_stats"]}
+    maps, global_token = result
+    dropped = jnp.zeros((), jnp.int32) if packing is None else packing.dropped
+    return Encoding(maps, global_token, dropped), batch_stats
+
+
+def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -> Encoding:
+    """Photographs -> feature maps and global token, with the running batch statistics.
+
+    Raises ValueError if images and cameras differ in size, or the patch size does not divide it.
+    """
+    return encode_with_statistics(variables, inputs, config)[0]
+
+
+def sample_vertices(encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig) -> VertexFeatures:
+    """Feature maps (and photographs, if configured) at the projections of the posed vertices, pooled over views."""
+    sampling = config.sampling
+    unit = subject_unit(inputs.canonical_vertices)
+    cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
+    size = (cameras.width, cameras.height)
+    pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
+    see = lambda p, z, surface: visible_vertices(p, z, surface, size, sampling.convention)
+    visible = jax.vmap(see)(pixels, depths, inputs.depth_maps)
+    weights = visible.astype(pixels.dtype) if sampling.pool == "visible" else jnp.ones_like(depths)
+    local = pool_views(sample_views(encoding.maps, pixels, size, sampling.convention), weights)
+    if not sampling.sample_rgb:
+        return VertexFeatures(local, encoding.global_token)
+    colors = photo_colors(sample_views(inputs.images, pixels, size, sampling.convention), visible)
+    return VertexFeatures(local, encoding.global_token, colors, jnp.mean(visible.astype(pixels.dtype), axis=0))
+
+
+def decode(
+    variables: Variables, features: VertexFeatures, canonical_vertices: Float[Array, "n 3"], config: HumanGSConfig
+) -> HumanGSOutputs:
+    """Features of vertices -> canonical Gaussians, metric; `dropped_tokens` is 0 (the encoder's business)."""
+    unit = subject_unit(canonical_vertices)
+    canonical = canonical_vertices / unit
+    decoder = VertexDecoder(config.decoder, config.compute_dtype)
+    raw = decoder.apply({"params": variables["params"]["decoder"]}, decoder_input(features, canonical))
+    at_vertices = activate(raw, config.decoder, features.photo_colors)
+    flat = lambda x: x.reshape(-1, *x.shape[2:])
+    gaussians = Gaussians(
+        means=flat(canonical[:, None] + at_vertices.offsets) * unit,
+        quats=flat(at_vertices.quats),
+        scales=flat(at_vertices.scales) * unit,
+        opacities=flat(at_vertices.opacities),
+        colors=flat(at_vertices.colors),
+    )
+    return HumanGSOutputs(
+        gaussians=gaussians,
+        tight_offsets=at_vertices.offsets[:, : config.decoder.tight],
+        skinning_offsets=None if raw.skinning is None else flat(raw.skinning),
+        dropped_tokens=jnp.zeros((), jnp.int32),
+    )
+
+
+def apply_humangs(
+    variables: Variables,
+    inputs: HumanGSInputs,
+    config: HumanGSConfig,
+    train: bool = False,
+    axis_name: str | None = None,
+) -> tuple[HumanGSOutputs, Variables]:
+    """The whole network for one subject: outputs and batch statistics.
+
+    train: normalise by this subject's statistics and return updated running ones. Under a vmap over subjects give the
+    vmap's `axis_name` to share the statistics over the batch; without it each subject has its own, to be averaged.
+    Raises: see `encode`.
+    """
+    encoding, batch_stats = encode_with_statistics(variables, inputs, config, train, axis_name)
+    features = sample_vertices(encoding, inputs, config)
+    outputs = decode(variables, features, inputs.canonical_vertices, config)
+    return replace(outputs, dropped_tokens=encoding.dropped_tokens), batch_stats

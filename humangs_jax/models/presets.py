@@ -1,0 +1,61 @@
+"""Named configurations. `published` runs the released weights, `paper` is what the paper describes, `small` is what we ship."""
+
+import dataclasses
+
+from humangs_jax.models.attention import AttentionConfig
+from humangs_jax.models.humangs import HumanGSConfig
+from humangs_jax.models.transformer import TransformerConfig
+from humangs_jax.models.upsampler import UpsamplerConfig
+from humangs_jax.models.vertex_decoder import VertexDecoderConfig
+from humangs_jax.sampling.pixel_aligned import PixelAlignedConfig
+from humangs_jax.sampling.triplane import TriplaneConfig
+
+
+def published() -> HumanGSConfig:
+    """The authors' release, 99 M parameters, with its quirks."""
+    return HumanGSConfig(
+        position_map="gouraud",
+        skinning="rotation",
+        dtype="bfloat16",
+        sampling=PixelAlignedConfig(pool="all", convention="mixed"),
+    )
+
+
+def paper() -> HumanGSConfig:
+    """The paper: visible views pooled, a plain position map; conventions otherwise ours."""
+    return HumanGSConfig(dtype="bfloat16")
+
+
+def small() -> HumanGSConfig:
+    """Trained on a CPU and shipped: tokens of the foreground only, colour read off the photographs."""
+    return HumanGSConfig(
+        image_size=256,
+        tokens="foreground",
+        token_capacity=1536,
+        body_vertices=3000,
+        texture=TriplaneConfig(resolution=64, channels=8),
+        transformer=TransformerConfig(width=256, layers=6),
+        upsampler=UpsamplerConfig(hidden=64, out=64),
+        sampling=PixelAlignedConfig(pool="visible", convention="half_pixel", sample_rgb=True),
+        decoder=VertexDecoderConfig(
+            hidden=256, tight=1, free=2, offset_scale=0.1, initial_log_scale=-4.6, residual_color=True
+        ),
+    )
+
+
+def tiny() -> HumanGSConfig:
+    """`small` in everything but size, for tests."""
+    config = small()
+    return dataclasses.replace(
+        config,
+        image_size=32,
+        token_capacity=16,
+        body_vertices=None,
+        texture=TriplaneConfig(resolution=8, channels=2),
+        transformer=TransformerConfig(width=16, layers=4, attention=AttentionConfig(head_width=8)),
+        upsampler=UpsamplerConfig(hidden=8, out=8),
+        decoder=dataclasses.replace(config.decoder, hidden=16),
+    )
+
+
+PRESETS = {"published": published, "paper": paper, "small": small, "tiny": tiny}

@@ -1,0 +1,77 @@
+"""Pre-norm transformer over all tokens of all views; position is in the tokens themselves (rays and pose features).
+
+    x += attention(norm1(x));  x += mlp(norm2(x))
+
+LayerNorms of the blocks have a weight and no bias, the final one has both (eps 1e-5). Norms and softmax run in float32 at
+least, and so does the residual stream; products run in `dtype`.
+"""
+
+import dataclasses
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.models.attention import NORM_EPSILON, Attention, AttentionConfig
+
+INIT_STD = 0.02
+
+
+@dataclasses.dataclass(frozen=True)
+class TransformerConfig:
+    """width: features per token. layers: blocks, a multiple of 4. mlp_ratio: hidden width of the MLP over the width.
+
+    class_token: a learned global token in front of all others. remat: recompute blocks in the backward pass.
+    """
+
+    width: int = 768
+    layers: int = 12
+    mlp_ratio: int = 4
+    class_token: bool = True
+    remat: bool = False
+    attention: AttentionConfig = AttentionConfig()
+
+
+def layer_norm(dtype: Any, name: str, use_bias: bool = False) -> nn.LayerNorm:
+    """The LayerNorm of the published network; the two-pass variance does not cancel."""
+    return nn.LayerNorm(epsilon=NORM_EPSILON, use_bias=use_bias, use_fast_variance=False, dtype=dtype, name=name)
+
+
+class Block(nn.Module):
+    """One pre-norm block; tokens (l, d) -> (l, d)."""
+
+    config: TransformerConfig
+    index: int
+    dtype: Any = None
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> Float[Array, "l d"]:
+        config = self.config
+        init = nn.initializers.normal(INIT_STD / (2 * (self.index + 1)) ** 0.5)
+        dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=self.dtype, kernel_init=init, name=name)
+        normed = layer_norm(self.dtype, "norm1")(x)
+        x = x + Attention(config.attention, init, self.dtype, name="attention")(normed, count)
+        hidden = dense(config.mlp_ratio * config.width, "mlp_in")(layer_norm(self.dtype, "norm2")(x))
+        return x + dense(config.width, "mlp_out")(jax.nn.gelu(hidden, approximate=False))
+
+
+class Transformer(nn.Module):
+    """All blocks; tokens (l, d) -> outputs after layers L/4, L/2, 3L/4 (raw) and L (after the final norm), each (l, d)."""
+
+    config: TransformerConfig
+    dtype: Any = None
+
+    @nn.compact
+    def __call__(self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> list[Float[Array, "l d"]]:
+        config = self.config
+        x = layer_norm(self.dtype, "input_norm")(tokens)
+        x = x.astype(jnp.promote_types(x.dtype, jnp.float32))
+        block_class = nn.remat(Block) if config.remat else Block
+        collected = []
+        for index in range(config.layers):
+            x = block_class(config, index, self.dtype, name=f"block_{index}")(x, count)
+            if index + 1 in (config.layers // 4, config.layers // 2, 3 * config.layers // 4):
+                collected.append(x)
+        return [*collected, layer_norm(self.dtype, "norm", use_bias=True)(x)]

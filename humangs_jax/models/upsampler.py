@@ -1,0 +1,98 @@
+"""Feature aggregation: token maps of several depths fused and upsampled four times.
+
+With hidden width H: each map 1x1 -> H, concatenated, 3x3 -> 2H, norm, LeakyReLU; then twice a 4x4 transposed convolution of
+stride 2 (2H -> H, H -> H/2), norm, LeakyReLU, and a 3x3 convolution (-> H, norm, LeakyReLU; -> out, bare). Maps are (v, h, w, c).
+"""
+
+import dataclasses
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.array_types import Array, Float
+
+SLOPE = 0.2
+MOMENTUM = 0.9
+"""Of the running statistics; torch calls it 0.1."""
+KAIMING = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
+KAIMING_TRANSPOSED = nn.initializers.variance_scaling(2.0, "fan_in", "normal")
+"""torch counts the fan-out of a transposed convolution over its input channels."""
+
+
+@dataclasses.dataclass(frozen=True)
+class UpsamplerConfig:
+    """enabled: off, the map is the final token map itself (ablation). hidden, out: widths, see the module.
+
+    features: "intermediate" aggregates four depths, "final" upsamples the last one only (ablation).
+    """
+
+    enabled: bool = True
+    hidden: int = 256
+    out: int = 768
+    features: Literal["intermediate", "final"] = "intermediate"
+
+
+class UpConvolution(nn.Module):
+    """4x4 transposed convolution, stride 2, padding 1: (v, h, w, c) -> (v, 2h, 2w, features).
+
+    An output row 2i needs input rows i - 1, i under kernel rows 3, 1, and row 2i + 1 needs rows i, i + 1 under 2, 0; columns
+    likewise. So one 2x2 convolution to 4 * features channels, interleaved, does it without dilation, which is slow on CPU.
+    The kernel (4, 4, c, features) is stored unflipped: input pixel (i, j) adds kernel[a, b] to output pixel (2i + a - 1, 2j + b - 1).
+    """
+
+    features: int
+    dtype: Any = None
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v 2*h 2*w features"]:
+        views, height, width, channels = x.shape
+        kernel = self.param("kernel", KAIMING_TRANSPOSED, (4, 4, channels, self.features))
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        x, kernel, bias = nn.dtypes.promote_dtype(x, kernel, bias, dtype=self.dtype)
+        order = jnp.asarray([3, 1, 2, 0])  # phase, then tap
+        kernel = kernel[order][:, order].reshape(2, 2, 2, 2, channels, self.features)
+        kernel = jnp.transpose(kernel, (1, 3, 4, 0, 2, 5)).reshape(2, 2, channels, 4 * self.features)
+        y = jax.lax.conv_general_dilated(
+            x, kernel, (1, 1), ((1, 1), (1, 1)), dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+        y = y.reshape(views, height + 1, width + 1, 2, 2, self.features)
+        y = jnp.stack([y[:, :-1, :, 0], y[:, 1:, :, 1]], axis=2)
+        y = jnp.stack([y[:, :, :, :-1, 0], y[:, :, :, 1:, 1]], axis=4)
+        return y.reshape(views, 2 * height, 2 * width, self.features) + bias
+
+
+class Upsampler(nn.Module):
+    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, out). `axis_name`: vmap axis to share batch statistics over."""
+
+    config: UpsamplerConfig
+    dtype: Any = None
+    axis_name: str | None = None
+
+    @nn.compact
+    def __call__(self, maps: list[Float[Array, "v h w d"]], train: bool = False) -> Float[Array, "v 4*h 4*w out"]:
+        hidden = self.config.hidden
+
+        def norm_relu(x, name):
+            norm = nn.BatchNorm(
+                use_running_average=not train,
+                momentum=MOMENTUM,
+                use_fast_variance=False,
+                dtype=self.dtype,
+                axis_name=self.axis_name if train else None,
+                name=name,
+            )
+            return jax.nn.leaky_relu(norm(x), SLOPE)
+
+        def convolution(features, name):
+            return nn.Conv(features, (3, 3), dtype=self.dtype, kernel_init=KAIMING, name=name)
+
+        projected = [
+            nn.Dense(hidden, dtype=self.dtype, kernel_init=KAIMING, name=f"project_{i}")(x) for i, x in enumerate(maps)
+        ]
+        x = norm_relu(convolution(2 * hidden, "fuse")(jnp.concatenate(projected, axis=-1)), "fuse_norm")
+        x = norm_relu(UpConvolution(hidden, self.dtype, name="up1")(x), "up1_norm")
+        x = norm_relu(convolution(hidden, "conv1")(x), "conv1_norm")
+        x = norm_relu(UpConvolution(hidden // 2, self.dtype, name="up2")(x), "up2_norm")
+        return convolution(self.config.out, "conv2")(x)
