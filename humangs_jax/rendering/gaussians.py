@@ -53,3 +53,26 @@ def factored(gaussians: Gaussians) -> Gaussians:
         return gaussians
     rotations, scales = left_singular_vectors(covariance_factors(gaussians))
     return replace(gaussians, quats=quaternion.from_matrix(rotations), scales=scales, deformations=None)
+
+
+def skin_gaussians(
+    gaussians: Gaussians, transforms: Float[Array, "g 4 4"], mode: Literal["affine", "rotation"] = "affine"
+) -> Gaussians:
+    """Move each Gaussian by its (blended) transform; scales, opacities and colours stay.
+
+    affine: the covariance is transformed by the full linear part, which is appended to `deformations`.
+    rotation: as published, the linear part times the Gaussian's rotation matrix is read as a quaternion. Where blending left
+    no rotation the quaternion's norm is below 1; draw with `normalize_quats=False` to reproduce that.
+
+    Raises: ValueError for another mode, or for `rotation` of Gaussians that carry deformations already.
+    """
+    linear, means = transforms[:, :3, :3], transform.apply(transforms, gaussians.means)
+    if mode == "affine":
+        deformations = linear if gaussians.deformations is None else linear @ gaussians.deformations
+        return replace(gaussians, means=means, deformations=deformations)
+    if mode != "rotation":
+        raise ValueError(f"skinning mode must be 'affine' or 'rotation', got {mode!r}")
+    if gaussians.deformations is not None:
+        raise ValueError("'rotation' skinning keeps quaternions only: these Gaussians are deformed already")
+    rotations = quaternion.to_matrix(quaternion.normalize(gaussians.quats))
+    return replace(gaussians, means=means, quats=quaternion.from_matrix(linear @ rotations))
