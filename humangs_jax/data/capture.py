@@ -25,6 +25,7 @@ import numpy as np
 from humangs_jax.array_types import Float, Int
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.data.images import read_grey, read_image, write_png
+from humangs_jax.data.npz import read_npz
 from humangs_jax.geometry.camera import Camera, stack_cameras
 
 FORMAT = "humangs-capture"
@@ -89,7 +90,7 @@ class Capture:
             self,
             images=self.images[views],
             masks=None if self.masks is None else self.masks[views],
-            cameras=self.cameras[jnp.asarray(views)],
+            cameras=jax.tree.map(lambda leaf: leaf[views], self.cameras),
             frames=self.frames[views],
             names=tuple(self.names[i] for i in views),
         )
@@ -315,22 +316,14 @@ def _check_keys(mapping, known, required, file, prefix):
 def _read_parameters(file):
     """Model name, betas, rotations and translations of body.npz, unchecked but for their presence."""
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise CaptureError(file, "", "expected an npz archive, got a single array")
-            _check_keys(archive.files, BODY_KEYS, BODY_KEYS, file, "")
-            values = {}
-            for key in BODY_KEYS:
-                try:
-                    values[key] = archive[key]
-                except ValueError as error:
-                    raise CaptureError(file, key, "expected numbers, got a pickled object") from error
+        values, pickled = read_npz(file)
     except FileNotFoundError:
         raise CaptureError(file, "", "no such file (capture.json: body names it)") from None
-    except CaptureError:
-        raise
-    except Exception as error:  # zipfile, zlib and numpy raise seven different types for a damaged archive
-        raise CaptureError(file, "", f"not a readable npz archive: {error}") from error
+    except OSError as error:
+        raise CaptureError(file, "", error.strerror or error) from error
+    if pickled:
+        raise CaptureError(file, pickled[0], "expected numbers, got a pickled object")
+    _check_keys(values, BODY_KEYS, BODY_KEYS, file, "")
     name = values["body"]
     if name.shape != () or name.dtype.kind not in "US" or not str(name.item()):
         raise CaptureError(
@@ -340,13 +333,13 @@ def _read_parameters(file):
 
 
 def _load_model(file, name, folder=None):
+    model_file = Path(name) if folder is None else folder / name
+    if name != DEFAULT_BODY and not model_file.is_file():
+        raise CaptureError(file, "body", f"no model file at {model_file}: expected {DEFAULT_BODY!r} or the path of one")
     from humangs_jax.body.library import load_body
 
     if name == DEFAULT_BODY:
         return load_body()
-    model_file = Path(name) if folder is None else folder / name
-    if not model_file.is_file():
-        raise CaptureError(file, "body", f"no model file at {model_file}: expected {DEFAULT_BODY!r} or the path of one")
     try:
         return load_body(model_file)
     except Exception as error:

@@ -1,0 +1,440 @@
+import json
+import shutil
+import struct
+import zlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.data.capture import CaptureError, capture_from_arrays, load_capture, save_capture
+from humangs_jax.data.images import read_image, write_png
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+
+HEIGHT, WIDTH, VIEWS, FRAMES, JOINTS = 12, 10, 3, 2, 5
+HALF_LEVEL = 0.5 / 255 + 1e-6
+"""8-bit images are rounded to the nearest level."""
+
+
+def tiny_body():
+    """A tetrahedron with five joints and three shape directions."""
+    template = jnp.asarray([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
+    return BodyModel(
+        template=template,
+        shape_directions=jnp.ones((4, 3, 3)),
+        pose_directions=None,
+        joint_regressor=jnp.full((JOINTS, 4), 0.25),
+        skinning_weights=jnp.full((4, JOINTS), 1 / JOINTS),
+        faces=jnp.asarray([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+        parents=(-1, 0, 1, 2, 3),
+        joint_names=tuple("abcde"),
+        name="tiny",
+    )
+
+
+def arrays(seed=0):
+    random = np.random.default_rng(seed)
+    K = intrinsics_from_fov(0.8, WIDTH, HEIGHT)
+    cameras = orbit(jnp.zeros(3), 3.0, jnp.arange(VIEWS) * 1.0, 0.1, K, WIDTH, HEIGHT)
+    return dict(
+        images=random.random((VIEWS, HEIGHT, WIDTH, 3)),
+        K=cameras.K,
+        cam_from_world=cameras.cam_from_world,
+        rotations=random.normal(size=(FRAMES, JOINTS, 3)),
+        translations=random.normal(size=(FRAMES, 3)),
+        betas=random.normal(size=2),
+        masks=random.random((VIEWS, HEIGHT, WIDTH)),
+        frames=[0, 1, 1],
+        body=tiny_body(),
+    )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A valid capture on disk, of the tiny body."""
+    save_capture(tmp_path / "me", capture_from_arrays(**arrays()))
+    return tmp_path / "me"
+
+
+def load(path):
+    return load_capture(path, body=tiny_body())
+
+
+def assert_same(a, b, atol):
+    np.testing.assert_allclose(a.images, b.images, atol=atol, rtol=0)
+    np.testing.assert_allclose(a.masks, b.masks, atol=atol, rtol=0)
+    for field in ("frames", "betas"):
+        np.testing.assert_array_equal(getattr(a, field), getattr(b, field))
+    jax.tree.map(np.testing.assert_array_equal, (a.cameras, a.poses), (b.cameras, b.poses))
+    assert a.names == b.names
+
+
+def test_round_trip(tmp_path):
+    capture = capture_from_arrays(**arrays(), names=("front", "left-1", "back.2"))
+    save_capture(tmp_path / "a" / "me", capture)
+    once = load(tmp_path / "a" / "me")
+    assert_same(capture, once, HALF_LEVEL)
+    save_capture(tmp_path / "b", once)
+    assert_same(once, load(tmp_path / "b"), 0)  # a loaded capture is written back exactly
+    assert once.images.dtype == once.masks.dtype == once.betas.dtype == np.float32
+    assert once.poses.rotations.dtype == jnp.float32
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]  # nothing temporary stays
+
+
+def test_round_trip_without_masks(tmp_path):
+    capture = capture_from_arrays(**{**arrays(), "masks": None})
+    save_capture(tmp_path / "me", capture)
+    assert load(tmp_path / "me").masks is None
+    np.testing.assert_allclose(capture.images, arrays()["images"], atol=1e-7)
+
+
+def test_masks_put_photos_on_white_once(tmp_path):
+    a = arrays()
+    on_white = a["images"] * a["masks"][..., None] + 1 - a["masks"][..., None]
+    np.testing.assert_allclose(capture_from_arrays(**a).images, on_white, atol=1e-6)
+    np.testing.assert_allclose(capture_from_arrays(**a, background="white").images, a["images"], atol=1e-7)
+    save_capture(tmp_path / "me", capture_from_arrays(**{**a, "masks": None}))
+    mask = a["masks"][0]
+    write_png(tmp_path / "me" / "mask.png", mask)
+    description = json.loads((tmp_path / "me" / "capture.json").read_text())
+    for view in description["views"]:
+        view["mask"] = "mask.png"
+    (tmp_path / "me" / "capture.json").write_text(json.dumps(description))
+    expected = a["images"] * mask[..., None] + 1 - mask[..., None]
+    np.testing.assert_allclose(load(tmp_path / "me").images, expected, atol=2 * HALF_LEVEL)
+
+
+def test_select_and_pose():
+    capture = capture_from_arrays(**arrays())
+    some = capture.select([2, 0])
+    np.testing.assert_array_equal(some.images, capture.images[[2, 0]])
+    np.testing.assert_array_equal(some.cameras.cam_from_world[1], capture.cameras.cam_from_world[0])
+    assert some.names == (capture.names[2], capture.names[0]) and list(some.frames) == [1, 0]
+    assert some.view_count == 2 and some.frame_count == capture.frame_count == FRAMES
+    np.testing.assert_array_equal(capture.pose(1).rotations, capture.poses.rotations[1])
+    assert capture.pose(1).translation.shape == (3,)
+
+
+def test_alpha_is_the_mask_and_goes_onto_white(folder):
+    from PIL import Image
+
+    random = np.random.default_rng(3)
+    pixels = random.integers(0, 256, (HEIGHT, WIDTH, 4), np.uint8)
+    description = json.loads((folder / "capture.json").read_text())
+    for view in description["views"]:
+        Image.fromarray(pixels).save(folder / view["image"])
+        del view["mask"]
+    (folder / "capture.json").write_text(json.dumps(description))
+    capture = load(folder)
+    alpha = pixels[..., 3:] / 255
+    np.testing.assert_allclose(capture.masks[0], alpha[..., 0], atol=1e-6)
+    np.testing.assert_allclose(capture.images[0], pixels[..., :3] / 255 * alpha + 1 - alpha, atol=1e-6)
+
+
+def deep_png(pixels, colour_type):
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
+    header = struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], 16, colour_type, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+@pytest.mark.parametrize(("channels", "colour_type"), [(1, 0), (3, 2), (4, 6), (2, 4)])
+def test_sixteen_bit_png_keeps_every_bit(tmp_path, channels, colour_type):
+    pixels = np.random.default_rng(1).integers(0, 65536, (7, 9, channels), np.uint16)
+    (tmp_path / "deep.png").write_bytes(deep_png(pixels, colour_type))
+    colours, alpha = read_image(tmp_path / "deep.png")
+    expected = pixels.astype(np.float32) / np.float32(65535)
+    np.testing.assert_array_equal(colours, np.broadcast_to(expected[..., : 3 if channels > 2 else 1], (7, 9, 3)))
+    if channels in (2, 4):
+        np.testing.assert_array_equal(alpha, expected[..., -1])
+    else:
+        assert alpha is None
+
+
+@pytest.mark.parametrize("mode", ["L", "1", "P", "RGB", "CMYK", "LA", "RGBA"])
+def test_every_common_image_mode_is_read(tmp_path, mode):
+    from PIL import Image
+
+    image = Image.fromarray(np.random.default_rng(2).integers(0, 256, (8, 9, 3), np.uint8)).convert(mode)
+    suffix = "jpg" if mode == "CMYK" else "png"
+    image.save(tmp_path / f"x.{suffix}")
+    colours, alpha = read_image(tmp_path / f"x.{suffix}")
+    assert colours.shape == (8, 9, 3) and (alpha is not None) == mode.endswith("A")
+    if mode != "CMYK":  # JPEG is lossy
+        np.testing.assert_allclose(colours, np.asarray(image.convert("RGB")) / 255, atol=1e-6)
+
+
+def test_frame_may_be_left_out_for_a_single_pose(folder):
+    edit_parameters(folder, rotations=np.zeros((1, JOINTS, 3)), translations=np.zeros((1, 3)))
+    edit_json(folder, lambda d: [view.pop("frame") for view in d["views"]])
+    assert list(load(folder).frames) == [0, 0, 0]
+
+
+def test_views_of_one_name_stay_apart(folder):
+    (folder / "cam1").mkdir()
+    (folder / "cam2").mkdir()
+    for i in range(2):
+        shutil.copy(folder / "images" / f"00{i}.png", folder / f"cam{i + 1}" / "0000.png")
+        edit_json(folder, lambda d, i=i: d["views"][i].update(image=f"cam{i + 1}/0000.png"))
+    names = load(folder).names
+    assert names == ("cam1_0000", "cam2_0000", "images_002")
+
+
+def test_a_body_file_is_referred_to_by_a_relative_path(folder, tmp_path, monkeypatch):
+    from humangs_jax.data import capture as module
+
+    (tmp_path / "models").mkdir()
+    (tmp_path / "models" / "BODY.npz").write_bytes(b"")
+    asked = []
+    monkeypatch.setattr(module, "_load_model", lambda file, name, folder=None: asked.append(name) or tiny_body())
+    a = {**arrays(), "body_file": tmp_path / "models" / "BODY.npz"}
+    save_capture(tmp_path / "deep" / "er", capture_from_arrays(**a))
+    assert np.load(tmp_path / "deep" / "er" / "body.npz")["body"].item() == "../../models/BODY.npz"
+    capture = load_capture(tmp_path / "deep" / "er")
+    assert asked == ["../../models/BODY.npz"]
+    save_capture(tmp_path / "flat", capture)
+    assert np.load(tmp_path / "flat" / "body.npz")["body"].item() == "../models/BODY.npz"
+
+
+# What is wrong on disk: one line, file and field ---------------------------------------------------------------------
+
+
+def edit_json(folder, change):
+    description = json.loads((folder / "capture.json").read_text())
+    change(description)
+    (folder / "capture.json").write_text(json.dumps(description))
+
+
+def edit_parameters(folder, **changes):
+    with np.load(folder / "body.npz") as archive:
+        values = {**archive, **changes}
+    np.savez(folder / "body.npz", **{k: v for k, v in values.items() if v is not None})
+
+
+def view(i, **changes):
+    return lambda f: edit_json(f, lambda d: d["views"][i].update(changes))
+
+
+def drop(i, key):
+    return lambda f: edit_json(f, lambda d: d["views"][i].pop(key))
+
+
+def top(**changes):
+    return lambda f: edit_json(f, lambda d: d.update(changes))
+
+
+def parameters(**changes):
+    return lambda f: edit_parameters(f, **changes)
+
+
+def with_nan(shape, index):
+    array = np.zeros(shape)
+    array[index] = np.nan
+    return array
+
+
+def png(name, shape, level=0.5):
+    return lambda f: write_png(f / name, np.full(shape, level, np.float32))
+
+
+MIRRORED = np.diag([-1.0, 1, 1, 1]).tolist()
+SINGULAR = np.zeros((4, 4)).tolist()
+NOT_FINITE = [[float("nan"), 0, 5], [0, 9, 5], [0, 0, 1]]
+
+BAD = {
+    "no capture.json": (lambda f: (f / "capture.json").unlink(), "capture.json", "no such file"),
+    "invalid JSON": (lambda f: (f / "capture.json").write_text('{"a": 1,\n}'), "capture.json", "line 2"),
+    "binary JSON": (lambda f: (f / "capture.json").write_bytes(b"\xff\xfe\0"), "capture.json", "cannot be read"),
+    "a JSON list": (lambda f: (f / "capture.json").write_text("[]"), "capture.json", "expected a JSON object"),
+    "format": (top(format="colmap"), "capture.json: format", "colmap"),
+    "version": (top(version=2), "capture.json: version", "expected 1"),
+    "body key": (top(body=3), "capture.json: body", "3"),
+    "background": (top(background="black"), "capture.json: background", "black"),
+    "no views": (top(views=[]), "capture.json: views", "at least one"),
+    "views no list": (top(views={}), "capture.json: views", "list"),
+    "view no object": (top(views=["a.png"]), "capture.json: views[0]", "object"),
+    "unknown top key": (top(unit="mm"), "capture.json: unit", "unknown"),
+    "unknown view key": (view(1, masks="a.png"), "capture.json: views[1].masks", "unknown"),
+    "image not named": (drop(2, "image"), "capture.json: views[2].image", "missing"),
+    "image no string": (view(2, image=7), "capture.json: views[2].image", "path"),
+    "image missing": (lambda f: (f / "images/001.png").unlink(), "images/001.png", "no such image file"),
+    "image unreadable": (lambda f: (f / "images/001.png").write_bytes(b"?"), "images/001.png", "not a readable image"),
+    "image cut off": (
+        lambda f: (f / "images/001.png").write_bytes((f / "images/001.png").read_bytes()[:200]),
+        "images/001.png",
+        "not a readable image",
+    ),
+    "image a folder": (view(0, image="images"), "images", "not a readable image"),
+    "image sizes differ": (
+        lambda f: (png("images/001.png", (9, 9, 3))(f), png("masks/001.png", (9, 9))(f)),
+        "images/001.png: size",
+        "9 x 9",
+    ),
+    "mask missing": (lambda f: (f / "masks/002.png").unlink(), "masks/002.png", "no such image file"),
+    "mask size": (png("masks/001.png", (9, 9)), "masks/001.png: size", "9 x 9"),
+    "mask of 0 and 1": (png("masks/001.png", (HEIGHT, WIDTH), 1 / 255), "masks/001.png: values", "255"),
+    "mask for some": (drop(1, "mask"), "capture.json: views[1].mask", "all or none"),
+    "K shape": (view(1, K=[[1, 0], [0, 1]]), "capture.json: views[1].K", "(3, 3)"),
+    "K ragged": (view(1, K=[[1, 0, 0], [0, 1]]), "capture.json: views[1].K", "3 x 3 numbers"),
+    "K words": (view(1, K="wide"), "capture.json: views[1].K", "3 x 3 numbers"),
+    "K null": (view(1, K=None), "capture.json: views[1].K", "3 x 3 numbers"),
+    "K not finite": (view(1, K=NOT_FINITE), "capture.json: views[1].K", "finite"),
+    "K transposed": (view(1, K=[[9, 0, 0], [0, 9, 0], [5, 5, 1]]), "capture.json: views[1]: K", "fx"),
+    "K negative": (view(1, K=[[-9, 0, 5], [0, 9, 5], [0, 0, 1]]), "capture.json: views[1]: K", "positive"),
+    "camera 3 x 4": (view(1, cam_from_world=MIRRORED[:3]), "capture.json: views[1].cam_from_world", "(4, 4)"),
+    "camera singular": (view(1, cam_from_world=SINGULAR), "capture.json: views[1]: cam_from_world", "singular"),
+    "camera mirrored": (view(1, cam_from_world=MIRRORED), "capture.json: views[1]: cam_from_world", "mirrored"),
+    "frame too high": (view(1, frame=FRAMES), "capture.json: views[1].frame", "0 to 1"),
+    "frame negative": (view(1, frame=-1), "capture.json: views[1].frame", "0 to 1"),
+    "frame a float": (view(1, frame=0.5), "capture.json: views[1].frame", "integer"),
+    "frame true": (view(1, frame=True), "capture.json: views[1].frame", "integer"),
+    "frame left out": (drop(1, "frame"), "capture.json: views[1].frame", "2 poses"),
+    "no body.npz": (lambda f: (f / "body.npz").unlink(), "body.npz", "no such file"),
+    "broken body.npz": (lambda f: (f / "body.npz").write_bytes(b"PK\3\4 no"), "body.npz", "npz"),
+    "text body.npz": (lambda f: (f / "body.npz").write_bytes(b"hello"), "body.npz", "npz"),
+    "body.npz an npy": (
+        lambda f: (np.save(f / "a.npy", np.zeros(3)), shutil.move(f / "a.npy", f / "body.npz")),
+        "body.npz",
+        "npz",
+    ),
+    "unknown parameter": (parameters(scale=1.0), "body.npz: scale", "unknown"),
+    "no rotations": (parameters(rotations=None), "body.npz: rotations", "missing"),
+    "pickled": (parameters(betas=np.array([None])), "body.npz: betas", "pickled"),
+    "body a number": (parameters(body=np.asarray(3)), "body.npz: body", "makehuman"),
+    "rotations shape": (parameters(rotations=np.zeros((FRAMES, JOINTS * 3))), "body.npz: rotations", "(frames, 5, 3)"),
+    "joints": (parameters(rotations=np.zeros((FRAMES, 24, 3))), "body.npz: rotations", "(frames, 5, 3)"),
+    "no poses": (parameters(rotations=np.zeros((0, JOINTS, 3))), "body.npz: rotations", "(frames, 5, 3)"),
+    "pose NaN": (parameters(rotations=with_nan((FRAMES, JOINTS, 3), (1, 2, 0))), "body.npz: rotations", "[1, 2, 0]"),
+    "translation NaN": (parameters(translations=with_nan((FRAMES, 3), (0, 1))), "body.npz: translations", "finite"),
+    "translation count": (parameters(translations=np.zeros((5, 3))), "body.npz: translations", "(2, 3)"),
+    "betas too long": (parameters(betas=np.zeros(4)), "body.npz: betas", "at most 3"),
+    "betas 2D": (parameters(betas=np.zeros((1, 3))), "body.npz: betas", "at most 3"),
+    "betas words": (parameters(betas=np.array(["a"])), "body.npz: betas", "numbers"),
+    "betas complex": (parameters(betas=np.zeros(2, complex)), "body.npz: betas", "numbers"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_folder_is_one_line_with_file_and_field(folder, case):
+    load(folder)  # valid before
+    spoil, place, told = BAD[case]
+    spoil(folder)
+    with pytest.raises(CaptureError) as caught:
+        load(folder)
+    message = str(caught.value)
+    assert "\n" not in message and message.startswith(f"{folder}/{place}") and told in message, message
+
+
+def test_no_folder_and_no_model_file(folder, tmp_path):
+    with pytest.raises(CaptureError, match=r"nowhere/capture.json: no such file"):
+        load(tmp_path / "nowhere")
+    edit_parameters(folder, body=np.asarray("../SMPLX.npz"))
+    with pytest.raises(CaptureError, match=r"body.npz: body: no model file at .*SMPLX.npz"):
+        load_capture(folder)
+    pytest.importorskip("humangs_jax.body.library")
+    (folder.parent / "SMPLX.npz").write_bytes(b"not a model")
+    with pytest.raises(CaptureError, match=r"body.npz: body: .*SMPLX.npz cannot be used as a body"):
+        load_capture(folder)
+
+
+BAD_ARRAYS = {
+    "uint8 range": (dict(images=np.full((VIEWS, HEIGHT, WIDTH, 3), 200)), "images: expected values in [0, 1]"),
+    "channels": (dict(images=np.zeros((VIEWS, HEIGHT, WIDTH))), "images: expected shape"),
+    "none": (dict(images=np.zeros((0, HEIGHT, WIDTH, 3))), "images: expected shape"),
+    "mask shape": (dict(masks=np.zeros((VIEWS, WIDTH, HEIGHT))), "masks: expected shape"),
+    "mask range": (dict(masks=np.full((VIEWS, HEIGHT, WIDTH), 255)), "masks: expected values"),
+    "K": (dict(K=np.zeros((VIEWS, 3, 3))), "view 0: K"),
+    "K count": (dict(K=np.zeros((VIEWS + 1, 3, 3))), "K: expected shape"),
+    "K ragged": (dict(K=[[1, 2], [3]]), "K: expected numbers"),
+    "cameras": (dict(cam_from_world=np.zeros((VIEWS, 3, 4))), "cam_from_world: expected shape"),
+    "frames count": (dict(frames=[0]), "frames: expected shape"),
+    "frames range": (dict(frames=[0, 1, 2]), "frames[2]: expected 0 to 1"),
+    "frames kind": (dict(frames=[0.0, 1.0, 0.0]), "frames[0]: expected an integer"),
+    "frames missing": (dict(frames=None), "frames: expected a frame for each view"),
+    "names": (dict(names=["a", "a", "b"]), "names: expected 3 different names"),
+    "name with slash": (dict(names=["a", "../b", "c"]), "names: expected letters"),
+    "background": (dict(background="black"), "background: expected one of"),
+    "betas": (dict(betas=np.zeros(9)), "betas: expected at most 3"),
+    "rotations": (dict(rotations=np.full((FRAMES, JOINTS, 3), np.inf)), "rotations: expected finite"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_ARRAYS)
+def test_bad_arrays_are_one_line(case):
+    changes, told = BAD_ARRAYS[case]
+    with pytest.raises(CaptureError) as caught:
+        capture_from_arrays(**{**arrays(), **changes})
+    assert str(caught.value).startswith(f"arrays: {told}") and "\n" not in str(caught.value)
+
+
+# Nothing is written when something is wrong --------------------------------------------------------------------------
+
+
+def spoiled(**changes):
+    import dataclasses
+
+    return dataclasses.replace(capture_from_arrays(**arrays()), **changes)
+
+
+def bad_captures():
+    capture = capture_from_arrays(**arrays())
+    half = capture.cameras.resized(5, 6)
+    poses = jax.tree.map(lambda x: x * jnp.nan, capture.poses)
+    return {
+        "images": spoiled(images=capture.images * np.float32(255)),
+        "masks": spoiled(masks=capture.masks * np.float32(np.nan)),
+        "cameras: expected the image size": spoiled(cameras=half),
+        "cameras: expected 3": spoiled(cameras=capture.select([0, 1]).cameras),
+        "rotations": spoiled(poses=poses),
+        "frames[0]": spoiled(frames=np.full(VIEWS, 7)),
+        "names": spoiled(names=("a", "b", "c/d")),
+        "betas": spoiled(betas=np.zeros(7, np.float32)),
+    }
+
+
+@pytest.mark.parametrize("field", list(bad_captures()))
+def test_bad_capture_writes_nothing(tmp_path, field):
+    with pytest.raises(CaptureError) as caught:
+        save_capture(tmp_path / "sub" / "me", bad_captures()[field])
+    assert str(caught.value).startswith(f"capture: {field}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_existing_folders(folder, tmp_path):
+    capture = capture_from_arrays(**arrays(1))
+    before = (folder / "capture.json").read_bytes()
+    with pytest.raises(CaptureError, match="not empty"):
+        save_capture(folder, capture)
+    assert (folder / "capture.json").read_bytes() == before
+    (folder / "old.txt").write_text("gone")
+    save_capture(folder, capture, overwrite=True)
+    assert_same(load(folder), capture, HALF_LEVEL)
+    assert not (folder / "old.txt").exists()
+
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    save_capture(photos, capture)  # an empty folder is as good as none
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "thesis.tex").write_text("dear")
+    with pytest.raises(CaptureError, match="refusing to overwrite"):
+        save_capture(other, capture, overwrite=True)
+    with pytest.raises(CaptureError, match="is a file"):
+        save_capture(other / "thesis.tex", capture, overwrite=True)
+    assert (other / "thesis.tex").read_text() == "dear"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["me", "other", "photos"]
+
+
+def test_a_failed_write_leaves_what_was_there(folder, monkeypatch):
+    from humangs_jax.data import capture as module
+
+    before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+    monkeypatch.setattr(module.json, "dumps", lambda *a, **k: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        save_capture(folder, capture_from_arrays(**arrays(1)), overwrite=True)
+    assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before
+    assert [p.name for p in folder.parent.iterdir()] == ["me"]
