@@ -2,12 +2,13 @@
 
 Tokens that are padding stand at the end; the first `count` ones are attended to. Three exact implementations:
 
-- "chunked": einsums over blocks of queries, recomputed in the backward pass, so that memory grows with L and not with L^2;
+- "chunked": einsums over blocks of queries, recomputed in the backward pass, so that memory grows with L and not with
+  L^2;
 - "xla": `jax.nn.dot_product_attention`, which materialises L x L logits;
 - "cudnn": its fused flash attention (NVIDIA, half precision only).
 
-"auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens, and "chunked" otherwise:
-on a CPU `jax.nn.dot_product_attention` is several times slower (measured: see `experiments`).
+"auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens, and "chunked"
+otherwise: on a CPU `jax.nn.dot_product_attention` is several times slower (measured: see `experiments`).
 """
 
 import dataclasses

@@ -4,9 +4,10 @@
     sample_vertices feature maps -> features of every posed body vertex, pooled over views
     decode          features -> K Gaussians per vertex of the canonical body
 
-Everything is written for ONE subject; batch with `jax.vmap` over `inputs` (variables unbatched). Callers jit, with `config`
-static. Lengths inside are normalised units: metres divided by s = (height of the canonical body) / 1.8, so that every
-body is 1.8 high; means and scales are multiplied by s at the end, and what goes in is metric except where said otherwise.
+Everything is written for ONE subject; batch with `jax.vmap` over `inputs` (variables unbatched). Callers jit, with
+`config` static. Lengths inside are normalised units: metres divided by s = (height of the canonical body) / 1.8, so
+that every body is 1.8 high; means and scales are multiplied by s at the end, and what goes in is metric except where
+said otherwise.
 """
 
 import dataclasses
@@ -55,10 +56,10 @@ class HumanGSConfig:
     """Everything that a set of weights depends on; see `models.presets`.
 
     image_size: side of the photographs, pixels (recorded: the network takes any multiple of the patch size).
-    patch_size: side of a token's patch, pixels. tokens: "all" patches, or those that the "foreground" touches, packed into
-    `token_capacity` slots over all views. position_map, skinning: how the position map that comes in was shaded, and how the
-    Gaussians are to be skinned (recorded). body_vertices: vertex count to decimate bodies to, None for all (recorded).
-    dtype: of the products; parameters, norms and softmax statistics stay float32 at least.
+    patch_size: side of a token's patch, pixels. tokens: "all" patches, or those that the "foreground" touches, packed
+    into `token_capacity` slots over all views. position_map, skinning: how the position map that comes in was shaded,
+    and how the Gaussians are to be skinned (recorded). body_vertices: vertex count to decimate bodies to, None for all
+    (recorded). dtype: of the products; parameters, norms and softmax statistics stay float32 at least.
     """
 
     image_size: int = 512
@@ -69,11 +70,11 @@ class HumanGSConfig:
     skinning: Literal["affine", "rotation"] = "affine"
     body_vertices: int | None = None
     dtype: Literal["float32", "bfloat16"] = "float32"
-    texture: TriplaneConfig = TriplaneConfig()
-    transformer: TransformerConfig = TransformerConfig()
-    upsampler: UpsamplerConfig = UpsamplerConfig()
-    sampling: PixelAlignedConfig = PixelAlignedConfig()
-    decoder: VertexDecoderConfig = VertexDecoderConfig()
+    texture: TriplaneConfig = dataclasses.field(default_factory=TriplaneConfig)
+    transformer: TransformerConfig = dataclasses.field(default_factory=TransformerConfig)
+    upsampler: UpsamplerConfig = dataclasses.field(default_factory=UpsamplerConfig)
+    sampling: PixelAlignedConfig = dataclasses.field(default_factory=PixelAlignedConfig)
+    decoder: VertexDecoderConfig = dataclasses.field(default_factory=VertexDecoderConfig)
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
@@ -95,7 +96,7 @@ class HumanGSConfig:
 
     @property
     def compute_dtype(self) -> Any:
-        """dtype for Linen modules; None promotes inputs and parameters, so that float64 stays float64."""
+        """For Linen modules; None promotes inputs and parameters, so that float64 stays float64."""
         return jnp.bfloat16 if self.dtype == "bfloat16" else None
 
     @property
@@ -110,10 +111,10 @@ class HumanGSConfig:
 class HumanGSInputs:
     """What the network is told of one subject.
 
-    images: (v, h, w, 3) in [0, 1], white background. cameras: a batch of v, metric. posed_vertices: (v, n, 3) metric, the
-    body in the pose of each photo. canonical_vertices: (n, 3) metric, T-pose. position_maps: (v, h, w, 3) canonical position
-    of each pixel, normalised units, 1 on background. depth_maps: (v, h, w) rasterized z, normalised units, -1 on background.
-    foreground: (v, h, w) pixels of the person (used by `tokens = "foreground"`).
+    images: (v, h, w, 3) in [0, 1], white background. cameras: a batch of v, metric. posed_vertices: (v, n, 3) metric,
+    the body in the pose of each photo. canonical_vertices: (n, 3) metric, T-pose. position_maps: (v, h, w, 3) canonical
+    position of each pixel, normalised units, 1 on background. depth_maps: (v, h, w) rasterized z, normalised units, -1
+    on background. foreground: (v, h, w) pixels of the person (used by `tokens = "foreground"`).
     """
 
     images: Float[Array, "v h w 3"]
@@ -129,8 +130,8 @@ class HumanGSInputs:
 class Encoding:
     """What the encoder makes of the photographs.
 
-    maps: (v, h', w', d) feature maps. global_token: (d',) or None without a class token. dropped_tokens: foreground patches
-    that the token capacity had no room for.
+    maps: (v, h', w', d) feature maps. global_token: (d',) or None without a class token. dropped_tokens: foreground
+    patches that the token capacity had no room for.
     """
 
     maps: Float[Array, "v h w d"]
@@ -142,8 +143,8 @@ class Encoding:
 class HumanGSOutputs:
     """Canonical Gaussians of one subject.
 
-    gaussians: g = n * k of them, metric, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from the vertex, normalised
-    units (for the tightness loss). skinning_offsets: (n * k, j) logits of the skinning head, or None (see
+    gaussians: g = n * k of them, metric, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from the vertex,
+    normalised units (for the tightness loss). skinning_offsets: (n * k, j) logits of the skinning head, or None (see
     `vertex_decoder.corrected_skinning_weights`). dropped_tokens: see `Encoding`.
     """
 

@@ -1,4 +1,4 @@
-"""Named configurations. `published` runs the released weights, `paper` is what the paper describes, `small` is what we ship."""
+"""Named configurations: `published` runs the released weights, `paper` is as described, `small` is what we ship."""
 
 import dataclasses
 

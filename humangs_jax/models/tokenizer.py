@@ -1,7 +1,7 @@
 """From photographs to tokens: patches of rgb, Plücker rays and neural texture, one bias-free linear map.
 
-Channel order of a pixel: 2 rgb - 1 (3), moment (3), direction (3), texture planes xy, xz, yz. Channels run fastest inside
-a pixel, pixels row-major inside a patch, patches row-major inside a view, views in their order.
+Channel order of a pixel: 2 rgb - 1 (3), moment (3), direction (3), texture planes xy, xz, yz. Channels run fastest
+inside a pixel, pixels row-major inside a patch, patches row-major inside a view, views in their order.
 """
 
 from typing import Any, Literal
@@ -24,7 +24,8 @@ class Packing:
     """Which patches became tokens.
 
     indices: (l,) of the kept patches, in their order; the number of patches itself where a token is padding.
-    count: tokens that are no padding (they come first). dropped: patches that the static number of tokens had no room for.
+    count: tokens that are no padding (they come first). dropped: patches that the static number of tokens had no room
+    for.
     """
 
     indices: Int[Array, " l"]

@@ -2,8 +2,8 @@
 
     x += attention(norm1(x));  x += mlp(norm2(x))
 
-LayerNorms of the blocks have a weight and no bias, the final one has both (eps 1e-5). Norms and softmax run in float32 at
-least, and so does the residual stream; products run in `dtype`.
+LayerNorms of the blocks have a weight and no bias, the final one has both (eps 1e-5). Norms and softmax run in float32
+at least, and so does the residual stream; products run in `dtype`.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ class TransformerConfig:
     mlp_ratio: int = 4
     class_token: bool = True
     remat: bool = False
-    attention: AttentionConfig = AttentionConfig()
+    attention: AttentionConfig = dataclasses.field(default_factory=AttentionConfig)
 
 
 def layer_norm(dtype: Any, name: str, use_bias: bool = False) -> nn.LayerNorm:
@@ -58,7 +58,7 @@ class Block(nn.Module):
 
 
 class Transformer(nn.Module):
-    """All blocks; tokens (l, d) -> outputs after layers L/4, L/2, 3L/4 (raw) and L (after the final norm), each (l, d)."""
+    """Tokens (l, d) -> outputs after layers L/4, L/2, 3L/4 (raw) and L (after the final norm), each (l, d)."""
 
     config: TransformerConfig
     dtype: Any = None

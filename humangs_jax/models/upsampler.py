@@ -1,7 +1,8 @@
 """Feature aggregation: token maps of several depths fused and upsampled four times.
 
-With hidden width H: each map 1x1 -> H, concatenated, 3x3 -> 2H, norm, LeakyReLU; then twice a 4x4 transposed convolution of
-stride 2 (2H -> H, H -> H/2), norm, LeakyReLU, and a 3x3 convolution (-> H, norm, LeakyReLU; -> out, bare). Maps are (v, h, w, c).
+With hidden width H: each map 1x1 -> H, concatenated, 3x3 -> 2H, norm, LeakyReLU; then twice a 4x4 transposed
+convolution of stride 2 (2H -> H, H -> H/2), norm, LeakyReLU, and a 3x3 convolution (-> H, norm, LeakyReLU; -> out,
+bare). Maps are (v, h, w, c).
 """
 
 import dataclasses
@@ -37,9 +38,10 @@ class UpsamplerConfig:
 class UpConvolution(nn.Module):
     """4x4 transposed convolution, stride 2, padding 1: (v, h, w, c) -> (v, 2h, 2w, features).
 
-    An output row 2i needs input rows i - 1, i under kernel rows 3, 1, and row 2i + 1 needs rows i, i + 1 under 2, 0; columns
-    likewise. So one 2x2 convolution to 4 * features channels, interleaved, does it without dilation, which is slow on CPU.
-    The kernel (4, 4, c, features) is stored unflipped: input pixel (i, j) adds kernel[a, b] to output pixel (2i + a - 1, 2j + b - 1).
+    An output row 2i needs input rows i - 1, i under kernel rows 3, 1, and row 2i + 1 needs rows i, i + 1 under 2, 0;
+    columns likewise. So one 2x2 convolution to 4 * features channels, interleaved, does it without dilation, which is
+    slow on CPU. The kernel (4, 4, c, features) is stored unflipped: input pixel (i, j) adds kernel[a, b] to output
+    pixel (2i + a - 1, 2j + b - 1).
     """
 
     features: int

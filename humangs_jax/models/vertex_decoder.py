@@ -1,7 +1,8 @@
 """From features of a body vertex to its K Gaussians.
 
-Input of a vertex: pooled local feature, global token, positional encoding of the canonical position, and optionally its photo
-colour and the fraction of views that see it. The first `tight` Gaussians of a vertex are those whose offsets a loss keeps small.
+Input of a vertex: pooled local feature, global token, positional encoding of the canonical position, and optionally its
+photo colour and the fraction of views that see it. The first `tight` Gaussians of a vertex are those whose offsets a
+loss keeps small.
 """
 
 import dataclasses
@@ -32,9 +33,9 @@ WEIGHT_EPSILON = 1e-9
 class VertexDecoderConfig:
     """hidden: width. tight, free: Gaussians per vertex of the two kinds, K = tight + free.
 
-    skinning_joints: joints of the head that corrects skinning weights, None without it. offset_scale: offsets are bounded to
-    it by tanh (normalised units), None leaves them unbounded as published. initial_log_scale: initial bias of the scales,
-    before the softplus. residual_color: colours are predicted relative to the photo colour.
+    skinning_joints: joints of the head that corrects skinning weights, None without it. offset_scale: offsets are
+    bounded to it by tanh (normalised units), None leaves them unbounded as published. initial_log_scale: initial bias
+    of the scales, before the softplus. residual_color: colours are predicted relative to the photo colour.
     """
 
     hidden: int = 256
@@ -68,7 +69,8 @@ class VertexFeatures:
 class RawGaussians:
     """Heads before their activations.
 
-    geometry: (n, k, 10) offset, quaternion, scale. appearance: (n, k, 4) colour, opacity. skinning: (n, k, j) logits or None.
+    geometry: (n, k, 10) offset, quaternion, scale. appearance: (n, k, 4) colour, opacity. skinning: (n, k, j) logits or
+    None.
     """
 
     geometry: Float[Array, "n k 10"]
@@ -80,7 +82,8 @@ class RawGaussians:
 class VertexGaussians:
     """K Gaussians of every vertex, lengths in normalised units.
 
-    offsets: (n, k, 3) from the vertex. quats: (n, k, 4) wxyz, unit. scales: (n, k, 3). opacities: (n, k). colors: (n, k, 3).
+    offsets: (n, k, 3) from the vertex. quats: (n, k, 4) wxyz, unit. scales: (n, k, 3). opacities: (n, k). colors: (n,
+    k, 3).
     """
 
     offsets: Float[Array, "n k 3"]
@@ -97,7 +100,7 @@ def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
 
 
 def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> Float[Array, "n c"]:
-    """Local feature, global token, positional encoding, photo colour as 2 rgb - 1, visible fraction; absent ones left out."""
+    """Local feature, global token, positional encoding, photo colour as 2 rgb - 1, visible fraction, as configured."""
     vertices = canonical.shape[0]
     parts = [features.local]
     if features.global_token is not None:
@@ -111,7 +114,7 @@ def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> F
 def activate(
     raw: RawGaussians, config: VertexDecoderConfig, photo_colors: Float[Array, "n 3"] | None = None
 ) -> VertexGaussians:
-    """Quaternion normalised, scale softplus, colour and opacity sigmoid, offset bounded if the configuration says so."""
+    """Quaternion normalised, scale softplus, colour and opacity sigmoid, offset bounded if so configured."""
     offsets, quats, scales = jnp.split(raw.geometry, (3, 7), axis=-1)
     if config.offset_scale is not None:
         offsets = config.offset_scale * jnp.tanh(offsets / config.offset_scale)
@@ -134,7 +137,7 @@ def corrected_skinning_weights(
 
 
 class VertexDecoder(nn.Module):
-    """Decoder inputs (n, c) -> raw heads. Last layers run in float32 at least: their outputs are positions and colours."""
+    """Decoder inputs (n, c) -> raw heads. Last layers run in float32 at least: they give positions and colours."""
 
     config: VertexDecoderConfig
     dtype: Any = None

@@ -4,10 +4,12 @@ Covariance of a Gaussian: A R diag(s)^2 R^T A^T with R the rotation of its quate
 and A an optional linear deformation (blend skinning leaves it; identity if absent).
 """
 
+from typing import Literal
+
 import jax.numpy as jnp
 
 from humangs_jax.array_types import Array, Float
-from humangs_jax.geometry import quaternion
+from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.svd3 import left_singular_vectors
 from humangs_jax.pytree import pytree_dataclass, replace
 
@@ -61,8 +63,8 @@ def skin_gaussians(
     """Move each Gaussian by its (blended) transform; scales, opacities and colours stay.
 
     affine: the covariance is transformed by the full linear part, which is appended to `deformations`.
-    rotation: as published, the linear part times the Gaussian's rotation matrix is read as a quaternion. Where blending left
-    no rotation the quaternion's norm is below 1; draw with `normalize_quats=False` to reproduce that.
+    rotation: as published, the linear part times the Gaussian's rotation matrix is read as a quaternion. Where blending
+    left no rotation the quaternion's norm is below 1; draw with `normalize_quats=False` to reproduce that.
 
     Raises: ValueError for another mode, or for `rotation` of Gaussians that carry deformations already.
     """

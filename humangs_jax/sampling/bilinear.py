@@ -1,7 +1,7 @@
 """Sampling of grids at fractional positions, zeros outside.
 
-Positions are texel indices (x, y): (0, 0) is the CENTRE of the first texel, x runs along the width. Two conventions lead
-there from pixels u in [0, W] (pixel centres at +0.5) of an image that a w-texel grid covers:
+Positions are texel indices (x, y): (0, 0) is the CENTRE of the first texel, x runs along the width. Two conventions
+lead there from pixels u in [0, W] (pixel centres at +0.5) of an image that a w-texel grid covers:
 
 - half-pixel (correct): texels are areas, index = u * w / W - 0.5;
 - mixed (published): u / W * 2 - 1 treats pixels as areas, then `align_corners=True` treats texels as points,

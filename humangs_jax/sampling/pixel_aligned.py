@@ -39,7 +39,7 @@ class PixelAlignedConfig:
 
 
 def project_vertices(camera: Camera, vertices: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
-    """Pixel positions and depths z of one camera; finite, with finite gradients, for vertices in its plane or behind it."""
+    """Pixel positions and depths z of one camera; finite, also in gradients, for vertices in its plane or behind."""
     p = transform.apply(camera.cam_from_world, vertices)
     depth = p[:, 2]
     divisor = depth + DEPTH_EPSILON

@@ -1,7 +1,7 @@
 """Neural texture: three feature planes over the canonical body, read at canonical positions.
 
-Planes are xy, xz, yz; the first named axis is the horizontal texture coordinate. Positions in [-1, 1] span a plane from the
-centre of its first texel to the centre of its last one (`align_corners=True`); outside are zeros.
+Planes are xy, xz, yz; the first named axis is the horizontal texture coordinate. Positions in [-1, 1] span a plane from
+the centre of its first texel to the centre of its last one (`align_corners=True`); outside are zeros.
 """
 
 import dataclasses
