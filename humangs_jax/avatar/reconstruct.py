@@ -1,9 +1,6 @@
 """Photos with body poses -> one forward pass -> an avatar."""
 
-import functools
-
 import jax
-import jax.numpy as jnp
 
 from humangs_jax.array_types import PyTree
 from humangs_jax.avatar.avatar import Avatar
@@ -12,10 +9,7 @@ from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, prepare_inputs, standardize
 from humangs_jax.models.humangs import HumanGSConfig, apply_humangs
-
-SKINNING_FLOOR = 1e-9
-"""Added to skinning weights before their logarithm, so that predicted logit offsets apply to absent joints too (reference)."""
-
+from humangs_jax.models.vertex_decoder import corrected_skinning_weights
 
 def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar:
     """Reconstruct the person of a capture.
@@ -50,13 +44,11 @@ def reconstruct_views(
     inputs = prepare_inputs(body, views, config)
     outputs, _ = apply_humangs(variables, inputs, config)
     rest = shape_body(body, views.betas)
-    per_vertex = outputs.gaussians.means.shape[0] // body.template.shape[0]
-    weights = jnp.repeat(body.skinning_weights, per_vertex, axis=0)
-    if outputs.skinning_offsets is not None:
-        weights = jax.nn.softmax(jnp.log(weights + SKINNING_FLOOR) + outputs.skinning_offsets, axis=-1)
     avatar = Avatar(
         gaussians=outputs.gaussians,
-        skinning_weights=weights,
+        skinning_weights=corrected_skinning_weights(
+            body.skinning_weights, outputs.skinning_offsets, config.decoder.gaussians_per_vertex
+        ),
         rest_vertices=rest.vertices,
         rest_joints=rest.joints,
         faces=body.faces,
@@ -67,4 +59,4 @@ def reconstruct_views(
     return avatar, outputs.dropped_tokens
 
 
-_reconstruct_compiled = functools.partial(jax.jit, static_argnames="config")(reconstruct_views)
+_reconstruct_compiled = jax.jit(reconstruct_views, static_argnames="config")

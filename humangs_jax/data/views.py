@@ -87,17 +87,12 @@ def prepare_inputs(
 
 
 def standardize(capture: Capture, size: int) -> SubjectViews:
-    """A capture's photos as the network wants them: white behind the mask, padded to a centred square, resized to `size`.
+    """A capture's photos as the network wants them: padded with white to a centred square and resized to `size`.
 
-    Intrinsics follow the pixels. Without masks the photos stay as they are and everything that the posed body covers counts
-    as foreground.
+    Intrinsics follow the pixels. Without masks only what the posed body covers will count as foreground.
     """
-    images, masks = np.asarray(capture.images, np.float32), capture.masks
-    if masks is not None:
-        masks = np.asarray(masks, np.float32)
-        images = images * masks[..., None] + (1 - masks[..., None])
-    else:
-        masks = np.zeros(images.shape[:3], np.float32)
+    images = capture.images
+    masks = np.zeros(images.shape[:3], np.float32) if capture.masks is None else capture.masks
     height, width = images.shape[1:3]
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2

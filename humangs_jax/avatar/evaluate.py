@@ -1,0 +1,83 @@
+"""How well an avatar matches photographs that it has not seen, and the simplest baseline that it must beat."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.array_types import Array, Float
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.data.capture import Capture
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.objectives import metrics
+from humangs_jax.rendering.mesh_rasterizer import interpolate, rasterize_mesh
+from humangs_jax.sampling.pixel_aligned import (
+    photo_colors,
+    project_vertices,
+    sample_views,
+    visible_vertices,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scores:
+    """Means over views. psnr and psnr_foreground in dB, ssim by scikit-image, foreground: share of the true mask."""
+
+    psnr: float
+    ssim: float
+    psnr_foreground: float
+    foreground: float
+
+
+def score(predicted: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
+    """Compare pictures with a capture's photos, view by view. Raises ValueError if the capture has no masks."""
+    if truth.masks is None:
+        raise ValueError("the foreground PSNR needs a mask for every view")
+    views = range(truth.view_count)
+    images, masks = jnp.asarray(truth.images), jnp.asarray(truth.masks)
+    predicted = jnp.clip(jnp.asarray(predicted), 0, 1)
+    return Scores(
+        psnr=float(np.mean([metrics.psnr(predicted[i], images[i]) for i in views])),
+        ssim=float(np.mean([metrics.ssim(np.asarray(predicted[i]), truth.images[i]) for i in views])),
+        psnr_foreground=float(np.mean([metrics.masked_psnr(predicted[i], images[i], masks[i]) for i in views])),
+        foreground=float(np.mean(truth.masks)),
+    )
+
+
+def painted_body(inputs: Capture) -> Float[Array, "n 3"]:
+    """A colour for each vertex of the body: the mean photo colour over the views that see it, grey where none does."""
+    body = inputs.body
+    rest = shape_body(body, jnp.asarray(inputs.betas))
+    size = (inputs.cameras.width, inputs.cameras.height)
+
+    def view(frame, camera):
+        vertices = _posed_vertices(inputs, rest, frame)
+        pixels, depths = project_vertices(camera, vertices)
+        depth_map = rasterize_mesh(vertices, body.faces, camera).depth
+        return pixels, visible_vertices(pixels, depths, depth_map, size, "half_pixel")
+
+    seen = [view(int(frame), inputs.cameras[i]) for i, frame in enumerate(inputs.frames)]
+    pixels, visible = (jnp.stack(x) for x in zip(*seen, strict=True))
+    return photo_colors(sample_views(jnp.asarray(inputs.images), pixels, size, "half_pixel"), visible)
+
+
+def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.ndarray, "v h w 3"]:
+    """The painted body mesh on white, in the poses and from the cameras of a capture."""
+    body = views.body
+    rest = shape_body(body, jnp.asarray(views.betas))
+
+    def draw(frame: int, camera: Camera):
+        fragments = rasterize_mesh(_posed_vertices(views, rest, frame), body.faces, camera)
+        return np.asarray(interpolate(fragments, body.faces, colors, jnp.ones(3)))
+
+    return np.stack([draw(int(frame), views.cameras[i]) for i, frame in enumerate(views.frames)])
+
+
+def _posed_vertices(capture, rest, frame):
+    return _pose(capture.body, rest, capture.pose(frame))
+
+
+@jax.jit
+def _pose(body, rest, pose: BodyPose):
+    return pose_body(body, rest, pose).vertices

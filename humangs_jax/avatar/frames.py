@@ -1,0 +1,129 @@
+"""Pictures of an avatar: along a motion, from a circle of cameras, or as a capture's cameras saw the person."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.array_types import Array, Float
+from humangs_jax.avatar.animate import skin
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.body.model import BodyPose
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.motion import Motion
+from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
+from humangs_jax.rendering.splatting import Rendering, render
+
+VERTICAL_FOV = np.pi / 6
+"""Narrow enough that a person keeps natural proportions."""
+MARGIN = 1.12
+"""Room around a person in the frame."""
+
+posed = jax.jit(skin)
+
+
+def draw(
+    avatar: Avatar, poses: Iterator[BodyPose], cameras: Iterator[Camera], background: Float[Array, "3"] | None = None
+) -> Iterator[Rendering]:
+    """One rendering per pose and camera. Compiles once per image size, and again only if a frame needs more room."""
+    for pose, camera in zip(poses, cameras, strict=True):
+        yield render(posed(avatar, pose), camera, background=background)
+
+
+def motion_frames(
+    avatar: Avatar, motion: Motion, size: int, azimuth: float = 0.0, turn: float = 0.0, progress: bool = True
+) -> Float[np.ndarray, "m size size 3"]:
+    """Frames of a moving avatar, (m, size, size, 3) in [0, 1]. azimuth and turn in degrees."""
+    from tqdm import tqdm
+
+    count = len(motion.translations)
+    azimuths = np.radians(azimuth + turn * np.arange(count) / max(count, 1))
+    # the camera stands still: it frames everywhere that the root goes
+    path = np.asarray(motion.translations)
+    center = 0.5 * (path.min(0) + path.max(0)) + np.asarray(avatar.rest_vertices).mean(0)
+    height = np.ptp(np.asarray(avatar.rest_vertices)[:, 1])
+    half = 0.5 * max(height + np.ptp(path[:, 1]), height * 0.6 + np.ptp(path[:, [0, 2]], axis=0).max())
+    distance = MARGIN * half / np.tan(0.5 * VERTICAL_FOV) + 0.5 * height * 0.3
+    center[1] = np.asarray(avatar.rest_vertices)[:, 1].min() + 0.5 * height + path[:, 1].mean()
+    cameras = orbit(
+        jnp.asarray(center, jnp.float32),
+        distance,
+        jnp.asarray(azimuths, jnp.float32),
+        0.08,
+        intrinsics_from_fov(VERTICAL_FOV, size, size),
+        size,
+        size,
+    )
+    renderings = draw(avatar, (motion.pose(i) for i in range(count)), (cameras[i] for i in range(count)))
+    bar = tqdm(renderings, total=count, desc="animate", unit="frame", disable=not progress)
+    return np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in bar])
+
+
+def turntable_renderings(avatar: Avatar, views: int, size: int) -> tuple[Camera, list[Rendering]]:
+    """The T-pose from `views` cameras on a circle, starting in front."""
+    if views < 1 or size < 1:
+        raise ValueError(f"--views and --size must be at least 1, got {views} and {size}")
+    vertices = np.asarray(avatar.rest_vertices)
+    center = 0.5 * (vertices.min(0) + vertices.max(0))
+    radius = np.linalg.norm(vertices - center, axis=-1).max()
+    cameras = orbit(
+        jnp.asarray(center),
+        MARGIN * radius / np.sin(0.5 * VERTICAL_FOV),
+        jnp.linspace(0, 2 * np.pi, views, endpoint=False),
+        0.1,
+        intrinsics_from_fov(VERTICAL_FOV, size, size),
+        size,
+        size,
+    )
+    pose = BodyPose(jnp.zeros((len(avatar.parents), 3)), jnp.zeros(3))
+    return cameras, list(draw(avatar, iter([pose] * views), (cameras[i] for i in range(views))))
+
+
+def capture_renderings(
+    avatar: Avatar, capture: Capture, background: Float[Array, "3"] | None = None
+) -> tuple[Camera, list[Rendering]]:
+    """The avatar in the poses and from the cameras of a capture.
+
+    Raises: ValueError if the capture's body has another number of joints than the avatar.
+    """
+    joints = capture.poses.rotations.shape[1]
+    if joints != len(avatar.parents):
+        raise ValueError(f"the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}")
+    poses = (capture.pose(int(frame)) for frame in capture.frames)
+    cameras = (capture.cameras[i] for i in range(capture.view_count))
+    return capture.cameras, list(draw(avatar, poses, cameras, background))
+
+
+def write_renderings(out: str | os.PathLike, cameras: Camera, renderings: list[Rendering], exr: bool = False) -> int:
+    """Write view_000.png ... into a folder, and views.exr if asked. Returns the number of views."""
+    from humangs_jax.data.images import write_png
+
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    for i, rendering in enumerate(renderings):
+        write_png(out / f"view_{i:03d}.png", np.asarray(rendering.rgb))
+    if exr:
+        write_renderings_exr(out / "views.exr", cameras, renderings)
+    return len(renderings)
+
+
+def write_renderings_exr(path: str | os.PathLike, cameras: Camera, renderings: list[Rendering]) -> None:
+    """Float32 RGBA as rendered, Z in metres and the camera's matrices, one part per view."""
+    from humangs_jax.data.exr import ExrView, write_exr
+
+    write_exr(
+        path,
+        [
+            ExrView(
+                name=f"view_{i:03d}",
+                rgba=np.concatenate([np.asarray(r.rgb), np.asarray(r.alpha)[..., None]], axis=-1),
+                depth=np.asarray(r.depth),
+                K=np.asarray(cameras.K[i]),
+                cam_from_world=np.asarray(cameras.cam_from_world[i]),
+            )
+            for i, r in enumerate(renderings)
+        ],
+    )
