@@ -6,7 +6,7 @@ With R_j the local rotation, J_j the rest joint and p its parent:
     W_j = W_p R_j,    t_j = t_p + W_p (J_j - J_p),    G_j = [W_j | t_j - W_j J_j + translation].
 
 Rotations turn about the joints in the rest pose, whose frames are all aligned with the world (SMPL's convention).
-Products here ask for full precision: accelerators otherwise round float32 factors to 8 or 10 bits, which is millimetres.
+Products here ask for full precision: accelerators otherwise round float32 factors to 8 or 10 bits, millimetres here.
 """
 
 import jax

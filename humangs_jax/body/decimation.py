@@ -1,0 +1,314 @@
+"""Progressive decimation of a body by half-edge collapses.
+
+A half-edge collapse u -> v moves vertex u onto its neighbour v: the two triangles between them vanish, and what remains is a mesh on
+a subset of the vertices, whose positions, shape directions and skinning weights are the original ones. `collapse_sequence` orders all
+collapses once: `order[u]` is the rank of u (0 stays longest), `into[u]` the vertex it moves onto. Any size is then a table look-up.
+
+Cost of u -> v: |uv|^2 + FLATNESS q_u(v), with q_u the mean squared distance to the planes that u has gathered (Garland and Heckbert,
+Surface Simplification Using Quadric Error Metrics): the length spreads the vertices evenly over the skin, so that the crowded face
+and ears go before the torso, and the quadric keeps fingers round. What cannot be seen from outside goes first.
+"""
+
+import heapq
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.pytree import replace
+
+FLATNESS = 100.0
+"""1 mm off the surface costs as much as 1 cm of edge."""
+HIDDEN = 0.01
+"""Factor on the cost of what cannot be seen from outside: edges there count as ten times shorter."""
+VIEWS = 60
+CELL = 0.004
+"""Metres: size of a depth-buffer cell, and with it how narrow a gap lets light through."""
+SMALLEST_TURN = 0.3
+"""A face may turn by at most acos(0.3) = 73 degrees in one collapse."""
+SMALLEST_QUALITY = 0.08
+"""Lower bound of 4 sqrt(3) area / (sum of squared edges), 1 for an equilateral triangle, unless the face was worse before."""
+LOCAL = 200
+"""Vertices near a joint that share the correction of its regressor."""
+
+
+def exposure(vertices: np.ndarray, faces: np.ndarray, views: int = VIEWS) -> np.ndarray:
+    """In how many of `views` parallel projections each vertex (n, 3) is the nearest thing, as a share in [0, 1]."""
+    size = np.linalg.norm(np.ptp(vertices, axis=0))
+    cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
+    # Faces become points no further apart than a cell, so that the depth buffer has no holes.
+    corners = vertices[faces]
+    longest = max(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(), cell)
+    steps = int(min(np.ceil(longest / cell), 12))
+    grid = np.array([(a, b, steps - a - b) for a in range(steps + 1) for b in range(steps + 1 - a)]) / steps
+    spread = np.einsum("gk,fka->fga", grid, corners).reshape(-1, 3)
+    golden = np.pi * (3 - np.sqrt(5))
+    seen = np.zeros(len(vertices))
+    for i in range(views):
+        y = 1 - 2 * (i + 0.5) / views
+        forward = np.array([np.sqrt(1 - y * y) * np.cos(golden * i), y, np.sqrt(1 - y * y) * np.sin(golden * i)])
+        right = np.linalg.svd(forward[None])[2][1]
+        frame = np.stack([right, np.cross(forward, right)], axis=1)
+        low = (spread @ frame).min(0)
+        columns = int(size / cell) + 3
+        cells = lambda p, frame=frame, low=low, columns=columns: (
+            ((p @ frame - low) / cell).astype(int) @ np.array([columns, 1])
+        )
+        buffer = np.full(columns * columns, np.inf)
+        np.minimum.at(buffer, cells(spread), spread @ forward)
+        seen += vertices @ forward < buffer[cells(vertices)] + 2 * cell
+    return seen / views
+
+
+class _Mesh:
+    """Triangles under collapse: who is beside whom, and the planes each vertex has gathered."""
+
+    def __init__(self, vertices, faces, uv_faces, importance):
+        self.positions = vertices.tolist()
+        self.faces = faces.tolist()
+        self.uv_faces = faces.tolist() if uv_faces is None else uv_faces.tolist()
+        self.importance = importance.tolist()
+        self.around = [set() for _ in self.positions]
+        self.beside = [set() for _ in self.positions]
+        for index, face in enumerate(self.faces):
+            for corner in face:
+                self.around[corner].add(index)
+                self.beside[corner].update(face)
+        for vertex, ring in enumerate(self.beside):
+            ring.discard(vertex)
+        self.quadrics = _vertex_quadrics(vertices, faces).tolist()
+        self.blocked = {}
+        self.stamp = [0] * len(self.positions)
+
+    def cost(self, u, v):
+        (x, y, z), (a, b, c) = self.positions[v], self.positions[u]
+        xx, xy, xz, xd, yy, yz, yd, zz, zd, dd, area = self.quadrics[u]
+        squared = x * x * xx + y * y * yy + z * z * zz + dd
+        squared += 2 * (x * y * xy + x * z * xz + y * z * yz + x * xd + y * yd + z * zd)
+        length = (x - a) ** 2 + (y - b) ** 2 + (z - c) ** 2
+        return self.importance[u] * (length + FLATNESS * max(squared, 0.0) / max(area, 1e-12))
+
+    def between(self, u, v):
+        return [f for f in self.around[u] if v in self.faces[f]]
+
+    def uv_moves(self, u, shared, v):
+        """Texture vertex of u -> that of v in the same chart, or None if some chart at u does not reach v."""
+        moves = {self.uv_at(f, u): self.uv_at(f, v) for f in shared}
+        return moves if all(self.uv_at(f, u) in moves for f in self.around[u]) else None
+
+    def uv_at(self, face, vertex):
+        return self.uv_faces[face][self.faces[face].index(vertex)]
+
+    def allowed(self, u, v):
+        """Whether u -> v keeps a manifold of the same topology, unbroken texture charts and no folded or needle faces."""
+        shared = self.between(u, v)
+        common = self.beside[u] & self.beside[v]
+        if len(common) != len(shared) or not 1 <= len(shared) <= 2:
+            return False
+        if len(self.around[u]) != len(self.beside[u]) and len(shared) != 1:  # u on a rim moves along it only
+            return False
+        if self.uv_moves(u, shared, v) is None:
+            return False
+        around_v = {frozenset(self.faces[f]) for f in self.around[v]}
+        for f in self.around[u]:
+            if f in shared:
+                continue
+            a, b, c = (self.positions[i] for i in self.faces[f])
+            after = [v if i == u else i for i in self.faces[f]]
+            if frozenset(after) in around_v:
+                return False
+            p, q, r = (self.positions[i] for i in after)
+            old, new = _normal(a, b, c), _normal(p, q, r)
+            lengths = (_squared(old) * _squared(new)) ** 0.5
+            if old[0] * new[0] + old[1] * new[1] + old[2] * new[2] <= SMALLEST_TURN * lengths:
+                return False
+            if _quality(new, p, q, r) < min(SMALLEST_QUALITY, _quality(old, a, b, c)):
+                return False
+        return True
+
+    def collapse(self, u, v):
+        shared = self.between(u, v)
+        moves = self.uv_moves(u, shared, v)
+        for f in shared:
+            for corner in self.faces[f]:
+                if corner != u:
+                    self.around[corner].discard(f)
+        for f in self.around[u].difference(shared):
+            slot = self.faces[f].index(u)
+            self.uv_faces[f][slot] = moves[self.uv_faces[f][slot]]
+            self.faces[f][slot] = v
+            self.around[v].add(f)
+        for n in self.beside[u]:
+            self.beside[n].discard(u)
+            if n != v:
+                self.beside[n].add(v)
+                self.beside[v].add(n)
+        self.around[u], self.beside[u] = set(), set()
+        self.quadrics[v] = [a + b for a, b in zip(self.quadrics[u], self.quadrics[v], strict=True)]
+        self.stamp[v] += 1
+
+
+def _normal(a, b, c):
+    ux, uy, uz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    vx, vy, vz = c[0] - a[0], c[1] - a[1], c[2] - a[2]
+    return (uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx)
+
+
+def _squared(x):
+    return x[0] * x[0] + x[1] * x[1] + x[2] * x[2]
+
+
+def _quality(normal, a, b, c):
+    edges = sum((p[i] - q[i]) ** 2 for p, q in ((a, b), (b, c), (c, a)) for i in range(3))
+    return 2 * 3**0.5 * _squared(normal) ** 0.5 / max(edges, 1e-30)
+
+
+def _vertex_quadrics(vertices, faces):
+    """Area-weighted sums over the faces of a vertex of the outer product of (n, d), upper triangle, and of the area: (n, 11)."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    normal = np.cross(b - a, c - a)
+    area = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = normal / np.maximum(area, 1e-30)
+    plane = np.concatenate([normal, -np.sum(normal * a, axis=1, keepdims=True)], axis=1)
+    rows, columns = np.triu_indices(4)
+    terms = np.concatenate([plane[:, rows] * plane[:, columns], np.ones_like(area)], axis=1) * area
+    quadrics = np.zeros((len(vertices), 11))
+    for i in range(3):
+        np.add.at(quadrics, faces[:, i], terms)
+    return quadrics
+
+
+def collapse_sequence(
+    vertices: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """All half-edge collapses of a triangle mesh, best first.
+
+    Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3), whose seams are then kept closed.
+    Returns: order (n,), 0 for the vertex that stays longest; into (n,), the vertex each one moves onto, itself if it never can.
+    """
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
+    hidden = exposure(vertices, faces) == 0
+    mesh = _Mesh(vertices, faces, None if uv_faces is None else np.asarray(uv_faces), np.where(hidden, HIDDEN, 1.0))
+    heap = [(mesh.cost(u, v), u, v, 0) for u, ring in enumerate(mesh.beside) for v in ring]
+    heapq.heapify(heap)
+    removed, into = [], np.arange(len(vertices))
+    while heap:
+        _, u, v, stamp = heapq.heappop(heap)
+        if stamp != mesh.stamp[u] or v not in mesh.beside[u]:
+            continue
+        if not mesh.allowed(u, v):
+            mesh.blocked.setdefault(u, set()).add(v)
+            continue
+        ring = mesh.beside[u] - mesh.beside[v] - {v}
+        mesh.collapse(u, v)
+        removed.append(u)
+        into[u] = v
+        again = {(v, n) for n in mesh.beside[v]} | {(n, v) for n in ring}
+        for n in mesh.beside[v]:  # what was forbidden here may be allowed now
+            again.update((n, t) for t in mesh.blocked.pop(n, ()) if t in mesh.beside[n])
+        for a, b in again:
+            heapq.heappush(heap, (mesh.cost(a, b), a, b, mesh.stamp[a]))
+    order = np.zeros(len(vertices), np.int64)
+    order[removed] = len(vertices) - 1 - np.arange(len(removed))
+    kept = np.setdiff1d(np.arange(len(vertices)), removed)
+    order[kept] = np.arange(len(kept))
+    return order, into
+
+
+def _follow(into: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """For each vertex the kept one that it ends on."""
+    target = np.where(kept, np.arange(len(into)), into)
+    while not kept[target].all():
+        target = target[target]
+    return target
+
+
+def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """A joint regressor on the kept vertices with the joints of the full body, for the template and every shape direction.
+
+    The weights of lost vertices move to where those went; the smallest change of the nearby weights then removes the error.
+    """
+    regressor = np.asarray(body.joint_regressor, np.float64)
+    moved = np.zeros_like(regressor)
+    np.add.at(moved.T, target, regressor.T)
+    moved = moved[:, kept]
+    count = len(kept)
+    columns = lambda keep: np.concatenate(
+        [
+            np.asarray(body.template, np.float64)[keep],
+            np.asarray(body.shape_directions, np.float64)[keep].reshape(len(regressor[0, keep]), -1),
+            np.ones((len(regressor[0, keep]), 1)),
+        ],
+        axis=1,
+    )
+    every = np.zeros(count, bool)
+    full, reduced = columns(np.arange(count)), columns(kept)
+    error = regressor @ full - moved @ reduced
+    joints, places = regressor @ full[:, :3], reduced[:, :3]
+    del every
+    for j in range(len(moved)):
+        near = np.argsort(np.linalg.norm(places - joints[j], axis=1))[:LOCAL]
+        moved[j, near] += np.linalg.lstsq(reduced[near].T, error[j], rcond=1e-10)[0]
+    return moved
+
+
+def _carry_uvs(body, faces, target, kept_faces):
+    """Texture vertices of the remaining corners: of the vertex a corner moved onto, the one nearest in the texture."""
+    uvs, uv_faces = np.asarray(body.uvs), np.asarray(body.uv_faces)
+    pairs = np.unique(np.stack([faces.ravel(), uv_faces.ravel()], axis=1), axis=0)
+    start = np.searchsorted(pairs[:, 0], np.arange(len(target) + 1))
+    corners, corner_uvs = faces[kept_faces].ravel(), uv_faces[kept_faces].ravel()
+    ends = target[corners]
+    best, best_distance = corner_uvs.copy(), np.where(ends == corners, 0.0, np.inf)
+    for i in range(int(np.diff(start).max())):
+        valid = start[ends] + i < start[ends + 1]
+        candidate = pairs[np.minimum(start[ends] + i, len(pairs) - 1), 1]
+        distance = np.where(valid, np.linalg.norm(uvs[candidate] - uvs[corner_uvs], axis=1), np.inf)
+        nearer = distance < best_distance
+        best, best_distance = np.where(nearer, candidate, best), np.minimum(distance, best_distance)
+    used, renumbered = np.unique(best, return_inverse=True)
+    return jnp.asarray(uvs[used]), jnp.asarray(renumbered.reshape(-1, 3), jnp.int32)
+
+
+def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
+    """A body on `vertex_count` of the body's own vertices, with the same joints for every shape.
+
+    Host-side numpy: milliseconds if the body carries its collapses (the shipped one does), seconds to find them otherwise; the
+    result carries its own. Raises: ValueError if vertex_count is larger than the body or too small for its topology.
+    """
+    total = body.template.shape[0]
+    if not 0 < vertex_count <= total:
+        raise ValueError(f"vertex_count {vertex_count}: body '{body.name}' has {total} vertices")
+    if body.collapse_order is None or body.collapse_into is None:
+        order, into = collapse_sequence(
+            np.asarray(body.template), np.asarray(body.faces), None if body.uvs is None else np.asarray(body.uv_faces)
+        )
+    else:
+        order, into = np.asarray(body.collapse_order), np.asarray(body.collapse_into)
+    smallest = int(np.sum(into == np.arange(total)))
+    if vertex_count < smallest:
+        raise ValueError(
+            f"vertex_count {vertex_count}: body '{body.name}' can be reduced to {smallest} vertices at most"
+        )
+    kept = np.flatnonzero(order < vertex_count)
+    target = _follow(into, order < vertex_count)
+    renumber = np.full(total, -1)
+    renumber[kept] = np.arange(vertex_count)
+    faces = np.asarray(body.faces)
+    ends = target[faces]
+    solid = (ends != np.roll(ends, 1, axis=1)).all(axis=1)
+    uvs, uv_faces = (None, None) if body.uvs is None else _carry_uvs(body, faces, target, solid)
+    dtype = body.template.dtype
+    return replace(
+        body,
+        template=body.template[kept],
+        shape_directions=body.shape_directions[kept],
+        pose_directions=None if body.pose_directions is None else body.pose_directions[kept],
+        joint_regressor=jnp.asarray(_refit_regressor(body, target, kept), dtype),
+        skinning_weights=body.skinning_weights[kept],
+        faces=jnp.asarray(renumber[ends[solid]], jnp.int32),
+        uvs=uvs,
+        uv_faces=uv_faces,
+        collapse_order=jnp.asarray(order[kept], jnp.int32),
+        collapse_into=jnp.asarray(renumber[into[kept]], jnp.int32),
+    )
