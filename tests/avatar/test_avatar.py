@@ -1,0 +1,135 @@
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.avatar.animate import animate, skin
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.export import SH_C0, write_ply
+from humangs_jax.body.model import BodyPose
+from humangs_jax.rendering.gaussians import Gaussians, covariances
+
+COVARIANCE_TOLERANCE = 2e-5  # relative to the largest entry: a float32 SVD and its squares
+
+
+def make_avatar(seed=0, g=12, skinning="affine"):
+    rng = np.random.default_rng(seed)
+    f32 = lambda x: jnp.asarray(x, jnp.float32)
+    weights = rng.random((g, 3))
+    gaussians = Gaussians(
+        f32(rng.normal(size=(g, 3))),
+        f32(rng.normal(size=(g, 4))),
+        f32(np.exp(rng.normal(size=(g, 3)) - 3)),
+        f32(rng.random(g)),
+        f32(rng.random((g, 3))),
+    )
+    return Avatar(
+        gaussians,
+        f32(weights / weights.sum(1, keepdims=True)),
+        f32(rng.normal(size=(6, 3))),
+        f32(rng.normal(size=(3, 3))),
+        jnp.asarray(rng.integers(0, 6, (4, 3)), jnp.int32),
+        parents=(-1, 0, 1),
+        joint_names=("a", "b", "c"),
+        skinning=skinning,
+    )
+
+
+def make_pose(seed=1):
+    rng = np.random.default_rng(seed)
+    return BodyPose(jnp.asarray(rng.normal(size=(3, 3)), jnp.float32), jnp.asarray(rng.normal(size=3), jnp.float32))
+
+
+def test_save_and_load_are_exact(tmp_path):
+    avatar = make_avatar()
+    avatar.save(tmp_path / "a.npz")
+    loaded = Avatar.load(tmp_path / "a.npz")
+    assert jax.tree.structure(loaded) == jax.tree.structure(avatar)
+    jax.tree.map(np.testing.assert_array_equal, loaded, avatar)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_broken_files_are_refused_by_name(tmp_path):
+    path = tmp_path / "a.npz"
+    with pytest.raises(FileNotFoundError, match="no such file"):
+        Avatar.load(path)
+    path.write_bytes(b"not an archive")
+    with pytest.raises(ValueError, match=r"a\.npz: not an avatar"):
+        Avatar.load(path)
+    make_avatar().save(path)
+    archive = dict(np.load(path))
+    for change, message in (
+        ({"means": archive["means"][:, :2]}, "means: expected shape"),
+        ({"header": np.asarray(json.dumps(json.loads(str(archive["header"])) | {"version": 9}))}, "version 9"),
+        ({"faces": None}, "missing keys"),
+    ):
+        np.savez(path, **{k: v for k, v in (archive | change).items() if v is not None})
+        with pytest.raises(ValueError, match=message):
+            Avatar.load(path)
+
+
+def test_the_zero_pose_leaves_the_gaussians_where_they_are():
+    avatar = make_avatar()
+    still = animate(avatar, BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)))
+    np.testing.assert_allclose(still.means, avatar.gaussians.means, atol=1e-6)
+    np.testing.assert_allclose(covariances(still), covariances(avatar.gaussians), atol=1e-7, rtol=1e-4)
+
+
+@pytest.mark.parametrize("skinning", ["affine", "rotation"])
+def test_a_rigid_motion_moves_everything_rigidly(skinning):
+    avatar = make_avatar(skinning=skinning)
+    turn = jnp.zeros((3, 3)).at[0].set(jnp.asarray([0.3, -0.7, 0.2]))
+    moved = animate(avatar, BodyPose(turn, jnp.asarray([0.1, 0.2, -0.3])))
+    from humangs_jax.geometry.quaternion import matrix_from_axis_angle
+
+    R, root = np.asarray(matrix_from_axis_angle(turn[0])), np.asarray(avatar.rest_joints[0])
+    expected = (np.asarray(avatar.gaussians.means) - root) @ R.T + root + np.asarray([0.1, 0.2, -0.3])
+    np.testing.assert_allclose(moved.means, expected, atol=1e-5)
+    exact = R @ np.asarray(covariances(avatar.gaussians)) @ R.T
+    assert np.abs(np.asarray(covariances(moved)) - exact).max() < COVARIANCE_TOLERANCE * np.abs(exact).max()
+
+
+def test_five_arrays_say_what_the_deformation_says():
+    avatar, pose = make_avatar(), make_pose()
+    deformed, plain = skin(avatar, pose), animate(avatar, pose)
+    assert deformed.deformations is not None and plain.deformations is None
+    exact = np.asarray(covariances(deformed))
+    scale = np.abs(exact).max(axis=(1, 2), keepdims=True)
+    assert (np.abs(np.asarray(covariances(plain)) - exact) < COVARIANCE_TOLERANCE * scale).all()
+    np.testing.assert_allclose(np.linalg.norm(plain.quats, axis=-1), 1, atol=1e-5)
+
+
+def test_skinning_is_differentiable_in_avatar_and_pose():
+    avatar, pose = make_avatar(), make_pose()
+    loss = lambda pose, scales: jnp.sum(covariances(skin(avatar, pose))[:, 0, 1] * 100) + jnp.sum(scales)
+    gradient = jax.grad(loss)(pose, avatar.gaussians.scales)
+    assert np.isfinite(gradient.rotations).all() and np.abs(gradient.rotations).max() > 0
+
+
+def test_ply_holds_what_viewers_expect(tmp_path):
+    import plyfile
+
+    gaussians = make_avatar().gaussians
+    write_ply(tmp_path / "a.ply", gaussians, spherical_harmonics_rest=True)
+    vertex = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"]
+    assert len(vertex.data) == 12 and sum(name.startswith("f_rest_") for name in vertex.data.dtype.names) == 45
+    read = lambda *names: np.stack([vertex[name] for name in names], axis=-1)
+    np.testing.assert_allclose(read("x", "y", "z"), gaussians.means)
+    np.testing.assert_allclose(0.5 + SH_C0 * read("f_dc_0", "f_dc_1", "f_dc_2"), gaussians.colors, atol=1e-6)
+    np.testing.assert_allclose(1 / (1 + np.exp(-vertex["opacity"])), gaussians.opacities, atol=2e-6)
+    np.testing.assert_allclose(np.exp(read("scale_0", "scale_1", "scale_2")), gaussians.scales, rtol=1e-5)
+    quats = read("rot_0", "rot_1", "rot_2", "rot_3")
+    expected = np.asarray(gaussians.quats) / np.linalg.norm(gaussians.quats, axis=-1, keepdims=True)
+    np.testing.assert_allclose(quats, expected, atol=1e-6)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_ply_survives_extremes(tmp_path):
+    import plyfile
+
+    g = Gaussians(jnp.zeros((2, 3)), jnp.zeros((2, 4)), jnp.zeros((2, 3)), jnp.asarray([0.0, 1.0]), jnp.ones((2, 3)))
+    write_ply(tmp_path / "a.ply", g)
+    data = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    assert all(np.isfinite(data[name]).all() for name in data.dtype.names)
