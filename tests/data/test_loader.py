@@ -1,0 +1,223 @@
+"""The loader: deterministic, resumable, and never silent about what it leaves out."""
+
+import logging
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.data.capture import capture_from_arrays, save_capture
+from humangs_jax.data.loader import (
+    CaptureCache,
+    ExampleSource,
+    StoredSubject,
+    ViewSampling,
+    draw_views,
+    find_captures,
+    nearest_view,
+    shrink,
+    store_capture,
+    subject_order,
+)
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+
+FLOAT32 = 1e-6
+SIZE, VIEWS, POSES = 16, 6, 2
+LEVELS = 20  # view i of subject s is one flat grey, byte 20 s + i
+SAMPLING = ViewSampling(input_counts=(2,), target_count=2)
+
+
+def small_body():
+    template = np.random.default_rng(0).normal(size=(8, 3)).astype(np.float32)
+    weights = np.eye(2, dtype=np.float32)[np.arange(8) % 2]
+    return BodyModel(
+        template=jnp.asarray(template),
+        shape_directions=jnp.zeros((8, 3, 4)),
+        pose_directions=None,
+        joint_regressor=jnp.full((2, 8), 1 / 8),
+        skinning_weights=jnp.asarray(weights),
+        faces=jnp.asarray([[0, 1, 2], [3, 4, 5]]),
+        parents=(-1, 0),
+        joint_names=("root", "child"),
+        shape_names=("a", "b", "c", "d"),
+        name="small",
+    )
+
+
+def write_subject(path, seed, views=VIEWS, masks=True):
+    generator = np.random.default_rng(seed)
+    azimuths = jnp.asarray(np.linspace(0, 2 * np.pi, views, endpoint=False), jnp.float32)
+    K = intrinsics_from_fov(0.8, SIZE, SIZE)
+    cameras = orbit(jnp.zeros(3), 3.0, azimuths, 0.1, K, SIZE, SIZE)
+    capture = capture_from_arrays(
+        np.broadcast_to((LEVELS * seed + np.arange(views))[:, None, None, None] / 255, (views, SIZE, SIZE, 3)),
+        np.asarray(K),
+        np.asarray(cameras.cam_from_world),
+        generator.normal(size=(POSES, 2, 3)) * 0.1,
+        generator.normal(size=(POSES, 3)) * 0.1,
+        betas=[0.5, -0.5],
+        masks=np.ones((views, SIZE, SIZE)) if masks else None,
+        frames=np.arange(views) % POSES,
+        background="white",
+        body=small_body(),
+    )
+    save_capture(path, capture)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    root = tmp_path_factory.mktemp("subjects")
+    for i in range(4):
+        write_subject(root / f"s{i}", i)
+    return root
+
+
+@pytest.fixture
+def source(folder):
+    return ExampleSource(CaptureCache(find_captures(folder), small_body()), SAMPLING, SIZE, SIZE // 2, batch_size=2)
+
+
+def greys(views):
+    """(subject, view) of every image, read off its grey."""
+    return [divmod(round(255 * float(image.mean())), LEVELS) for image in views.images]
+
+
+def same(a, b):
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def fake_subject(views, poses, seed=0):
+    azimuths = np.random.default_rng(seed).uniform(-np.pi, np.pi, views)
+    empty = np.zeros((0,))
+    return StoredSubject(empty, empty, empty, empty, np.arange(views) % poses, azimuths, empty, empty, empty)
+
+
+def test_batches_are_a_function_of_seed_and_step(folder, source):
+    again = ExampleSource(CaptureCache(find_captures(folder), small_body()), SAMPLING, SIZE, SIZE // 2, batch_size=2)
+    again.batch_at(9)  # whatever was asked for before must not matter
+    assert same(source.batch_at(5), again.batch_at(5))
+    assert not same(source.batch_at(5), source.batch_at(6))
+
+
+def test_iterating_resumes_to_the_very_batch(source):
+    whole = dict(source.batches(0, 6))
+    rest = dict(source.batches(3, 6))
+    assert sorted(whole) == list(range(6)) and sorted(rest) == [3, 4, 5]
+    assert all(same(whole[step], rest[step]) for step in rest)
+
+
+def test_a_pass_shows_every_subject_once(source):
+    shown = [greys(source.example_at(i, 2).inputs)[0][0] for i in range(8)]
+    assert sorted(shown[:4]) == sorted(shown[4:]) == [0, 1, 2, 3]
+    assert len({tuple(subject_order(0, epoch, 20)) for epoch in range(5)}) == 5
+
+
+def test_views_carry_their_own_pose_camera_and_size(folder, source):
+    stored = store_capture(folder / "s3", small_body())
+    for index in range(4):
+        example = source.example_at(index, 2)
+        assert example.inputs.images.shape == (2, SIZE, SIZE, 3)
+        assert example.targets.images.shape == (2, SIZE // 2, SIZE // 2, 3)
+        assert example.targets.cameras.width == SIZE // 2
+        for views, scale in ((example.inputs, 1.0), (example.targets, 0.5)):
+            for i, (subject, view) in enumerate(greys(views)):
+                if subject == 3:
+                    np.testing.assert_array_equal(views.rotations[i], stored.rotations[view % POSES])
+                    np.testing.assert_array_equal(views.cameras.cam_from_world[i], stored.cam_from_world[view])
+                    np.testing.assert_allclose(views.cameras.K[i, :2], scale * stored.K[view, :2], rtol=FLOAT32)
+        np.testing.assert_allclose(example.inputs.betas, [0.5, -0.5, 0, 0])
+
+
+@given(st.integers(0, 1000), st.integers(1, 6), st.integers(1, 3))
+@settings(deadline=None, max_examples=50)
+def test_inputs_and_targets_are_disjoint_and_of_the_subject(seed, input_count, poses):
+    sampling = ViewSampling(input_counts=(input_count,), target_count=3)
+    subject = fake_subject(12, poses, seed)
+    inputs, targets = draw_views(np.random.default_rng(seed), subject, input_count, sampling)
+    assert len(set(inputs)) == input_count and len(set(targets)) == 3
+    assert not set(inputs) & set(targets)
+    assert set(inputs) | set(targets) <= set(range(12))
+
+
+def test_inputs_of_one_pose_stand_around_the_subject():
+    azimuths = np.linspace(-np.pi, np.pi, 24, endpoint=False)
+    subject = fake_subject(24, 2)._replace(azimuths=azimuths)
+    sampling = ViewSampling(jitter=0.0, scattered_share=0.0, mixed_pose_share=0.0)
+    for seed in range(20):
+        inputs, _ = draw_views(np.random.default_rng(seed), subject, 4, sampling)
+        assert len(set(subject.frames[inputs])) == 1
+        gaps = np.diff(np.sort(azimuths[inputs]))
+        np.testing.assert_allclose(gaps, np.pi / 2, atol=0.3)  # cameras of a pose stand pi / 6 apart
+
+
+def test_mixed_poses_are_mixed():
+    sampling = ViewSampling(mixed_pose_share=1.0)
+    frames = [
+        len(set(s.frames[draw_views(np.random.default_rng(i), s, 4, sampling)[0]]))
+        for i, s in enumerate([fake_subject(24, 2)] * 20)
+    ]
+    assert max(frames) == 2
+
+
+def test_nearest_view_wraps_around():
+    subject = fake_subject(3, 1)._replace(azimuths=np.asarray([-3.1, 0.0, 2.0]))
+    assert nearest_view(subject, 3.1, np.ones(3, bool)) == 0
+    assert nearest_view(subject, 3.1, np.asarray([False, True, True])) == 2
+
+
+def test_shrinking_averages_boxes():
+    images = np.random.default_rng(0).integers(0, 256, (2, 8, 8, 3)).astype(np.uint8)
+    np.testing.assert_allclose(shrink(images, 2)[1, 0, 1], images[1, :4, 4:].mean(axis=(0, 1)) / 255, rtol=1e-5)
+    with pytest.raises(ValueError, match="8 x 8 cannot be box-averaged to 3 x 3"):
+        shrink(images, 3)
+
+
+def test_a_broken_folder_is_skipped_counted_and_named(folder, tmp_path, caplog):
+    write_subject(tmp_path / "few", 5, views=3)
+    write_subject(tmp_path / "nomask", 6, masks=False)
+    write_subject(tmp_path / "torn", 7)
+    next((tmp_path / "torn").glob("images/*")).write_bytes(b"no image")
+    folders = (*find_captures(tmp_path), folder / "s1")
+    source = ExampleSource(CaptureCache(folders, small_body()), SAMPLING, SIZE, SIZE)
+    with caplog.at_level(logging.WARNING):
+        for index in range(8):
+            assert greys(source.example_at(index, 2).inputs)[0][0] == 1
+    assert {path.name for path in source.cache.broken} == {"few", "nomask", "torn"}
+    assert "3 views, but inputs and targets need 4" in source.cache.broken[tmp_path / "few"]
+    assert "no masks" in source.cache.broken[tmp_path / "nomask"]
+    assert len(caplog.records) == 3
+    assert all(any(name in r.getMessage() for r in caplog.records) for name in ("few", "nomask", "torn"))
+
+
+def test_nothing_but_broken_folders_is_an_error_of_the_loop(tmp_path):
+    write_subject(tmp_path / "few", 5, views=3)
+    source = ExampleSource(CaptureCache(find_captures(tmp_path), small_body()), SAMPLING, SIZE, SIZE)
+    with pytest.raises(ValueError, match=r"none of the 1 capture folders can be used.*need 4"):
+        next(source.batches(0, 1))
+
+
+def test_leaving_the_loop_ends_the_thread(source):
+    batches = source.batches(0, 100)
+    next(batches)
+    batches.close()
+    assert not [t for t in threading.enumerate() if t.name == "humangs-loader"]
+
+
+def test_the_memory_limit_only_costs_time(folder):
+    bounded = CaptureCache(find_captures(folder), small_body(), limit_bytes=store_bytes(folder))
+    assert [bounded.load(i) is bounded.load(i) for i in range(3)] == [True, False, False]
+    assert same(bounded.load(2), CaptureCache(find_captures(folder), small_body()).load(2))
+
+
+def store_bytes(folder):
+    return store_capture(folder / "s0", small_body()).size_bytes
+
+
+def test_a_folder_without_captures_is_named(tmp_path):
+    with pytest.raises(ValueError, match="no capture folder here"):
+        find_captures(tmp_path)
