@@ -27,16 +27,25 @@ STANDARD_ATTRIBUTES = {"name", "type", "compression", "owner", "view", "comments
 class ExrView:
     """One rendered view.
 
-    rgba: (h, w, 4) linear colours and coverage. depth: (h, w) metres, or None. camera: of the image's size, or None.
+    rgba: (h, w, 4) linear colours and coverage. depth: (h, w) metres, or None.
+    K, cam_from_world: (3, 3) pixels and (4, 4) metres of its camera, both or neither.
     name: of the part; unique in a file. channels: further (h, w) images by name. attributes: strings for the header.
     """
 
     rgba: Float[np.ndarray, "h w 4"]
     depth: Float[np.ndarray, "h w"] | None = None
-    camera: Camera | None = None
+    K: Float[np.ndarray, "3 3"] | None = None
+    cam_from_world: Float[np.ndarray, "4 4"] | None = None
     name: str = ""
     channels: Mapping[str, Float[np.ndarray, "h w"]] = dataclasses.field(default_factory=dict)
     attributes: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the header tells. Raises: ValueError if it tells none, or what is no camera."""
+        if self.K is None or self.cam_from_world is None:
+            raise ValueError(f"view {self.name!r}: no camera: expected K and cam_from_world")
+        return Camera.from_opencv(self.K, self.cam_from_world, self.rgba.shape[1], self.rgba.shape[0])
 
 
 def write_exr(path: str | Path, views: ExrView | Sequence[ExrView]) -> None:
@@ -75,7 +84,7 @@ def read_exr(path: str | Path) -> list[ExrView]:
     """The views of a file, one per part; half floats become float32. A part without alpha is opaque, grey is repeated.
 
     Raises: FileNotFoundError; OSError if it is no OpenEXR file or a damaged one; ValueError naming the part that has no
-    colours or whose camera matrices are no camera.
+    colours or whose K or cam_from_world is no matrix.
     """
     import OpenEXR
 
@@ -116,15 +125,11 @@ def _to_part(view, name):
         if key in STANDARD_ATTRIBUTES:
             raise ValueError(f"view {name!r}: attributes: {key} has a meaning of its own in OpenEXR")
         header[key] = str(value)
-    if view.camera is not None:
-        if (view.camera.height, view.camera.width) != (height, width):
-            size = (view.camera.height, view.camera.width)
-            raise ValueError(f"view {name!r}: camera: expected size {(height, width)}, got {size}")
-        for key, shape in (("K", (3, 3)), ("cam_from_world", (4, 4))):
-            matrix = np.ascontiguousarray(getattr(view.camera, key), np.float32)
-            if matrix.shape != shape:
-                raise ValueError(f"view {name!r}: camera: expected {key} of shape {shape}, got {matrix.shape}")
-            header[key] = matrix
+    if (view.K is None) != (view.cam_from_world is None):
+        raise ValueError(f"view {name!r}: expected both K and cam_from_world, or neither")
+    if view.K is not None:
+        header["K"] = np.ascontiguousarray(view.K, np.float32)
+        header["cam_from_world"] = np.ascontiguousarray(view.cam_from_world, np.float32)
     return OpenEXR.Part(header, channels, name)
 
 
@@ -136,12 +141,15 @@ def _from_part(part, path):
         raise ValueError(f"{path}: part {part.name()!r}: expected channels R, G, B, got {sorted(part.channels)}")
     alpha = images.pop("A", np.ones_like(colours[0]))
     depth = images.pop(DEPTH, None)
-    height, width = colours[0].shape
-    camera = None
-    if "K" in part.header and "cam_from_world" in part.header:
-        try:
-            camera = Camera.from_opencv(part.header["K"], part.header["cam_from_world"], width, height)
-        except ValueError as error:
-            raise ValueError(f"{path}: part {part.name()!r}: {error}") from error
+    matrices = [_matrix(part, key, size, path) for key, size in (("K", 3), ("cam_from_world", 4))]
     attributes = {k: v for k, v in part.header.items() if isinstance(v, str) and k not in STANDARD_ATTRIBUTES}
-    return ExrView(np.stack([*colours, alpha], axis=-1), depth, camera, part.name(), images, attributes)
+    return ExrView(np.stack([*colours, alpha], axis=-1), depth, *matrices, part.name(), images, attributes)
+
+
+def _matrix(part, key, size, path):
+    if key not in part.header:
+        return None
+    matrix = np.asarray(part.header[key])
+    if matrix.shape != (size, size):
+        raise ValueError(f"{path}: part {part.name()!r}: {key}: expected a {size} x {size} matrix, got {matrix.shape}")
+    return matrix.astype(np.float32)

@@ -10,9 +10,10 @@ from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 HEIGHT, WIDTH = 13, 9  # odd and unequal: a transposed or strided write cannot pass
 
 
-def cameras(count):
+def matrices(i):
     K = intrinsics_from_fov(0.7, WIDTH, HEIGHT)
-    return orbit(jnp.zeros(3), 3.0, jnp.arange(count) * 0.7, 0.1, K, WIDTH, HEIGHT)
+    camera = orbit(jnp.zeros(3), 3.0, jnp.arange(3) * 0.7, 0.1, K, WIDTH, HEIGHT)[i]
+    return dict(K=np.asarray(camera.K), cam_from_world=np.asarray(camera.cam_from_world))
 
 
 def make_view(i, **changes):
@@ -20,7 +21,7 @@ def make_view(i, **changes):
     values = dict(
         rgba=random.random((HEIGHT, WIDTH, 4), np.float32),
         depth=random.random((HEIGHT, WIDTH), np.float32) * 1e4,
-        camera=cameras(3)[i],
+        **matrices(i),
         name=f"cam{i}",
         channels={f"position.{axis}": random.normal(size=(HEIGHT, WIDTH)).astype(np.float32) for axis in "XYZ"},
         attributes={"humangs": json.dumps({"frame": i})},
@@ -71,7 +72,7 @@ def test_strided_arrays_are_written_right(tmp_path, how):
     np.testing.assert_array_equal(back.rgba, view.rgba)
     np.testing.assert_array_equal(back.depth, view.depth)
     np.testing.assert_array_equal(back.channels["n.X"], view.rgba[..., 1])
-    assert back.name == "view000" and back.camera is None and back.attributes == {}
+    assert back.name == "view000" and back.K is None and back.attributes == {}
 
 
 def test_other_types_become_float32(tmp_path):
@@ -97,10 +98,12 @@ def test_files_of_others(tmp_path):
         file.write(str(tmp_path / "depth.exr"))
     with pytest.raises(ValueError, match=r"depth.exr: part .*expected channels R, G, B"):
         read_exr(tmp_path / "depth.exr")
-    with OpenEXR.File({"K": np.zeros((3, 3), "f"), "cam_from_world": np.eye(4, dtype="f")}, {"Y": image}) as file:
+    with OpenEXR.File({"K": np.eye(4, dtype="f")}, {"Y": image}) as file:
         file.write(str(tmp_path / "camera.exr"))
-    with pytest.raises(ValueError, match=r"camera.exr: part .*focal"):
+    with pytest.raises(ValueError, match=r"camera.exr: part .*K: expected a 3 x 3 matrix"):
         read_exr(tmp_path / "camera.exr")
+    with pytest.raises(ValueError, match="no camera"):
+        _ = ExrView(np.zeros((4, 4, 4), np.float32)).camera
 
 
 BAD = {
@@ -110,8 +113,8 @@ BAD = {
         lambda: [make_view(0), ExrView(np.zeros((4, 4, 4), np.float32))],
         "views: expected one image size",
     ),
-    "camera size": (lambda: make_view(0, camera=cameras(3)[0].resized(4, 4)), "'cam0': camera: expected size"),
-    "batched camera": (lambda: make_view(0, camera=cameras(3)), "'cam0': camera: expected K of shape"),
+    "half a camera": (lambda: make_view(0, K=None), "'cam0': expected both K and cam_from_world"),
+    "channel size": (lambda: make_view(0, channels={"n": np.zeros((2, 2), np.float32)}), "'cam0': channel n: expected"),
     "channel twice": (
         lambda: make_view(0, channels={"Z": np.zeros((HEIGHT, WIDTH), np.float32)}),
         "Z is there already",
