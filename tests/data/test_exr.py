@@ -106,6 +106,12 @@ def test_files_of_others(tmp_path):
         _ = ExrView(np.zeros((4, 4, 4), np.float32)).camera
 
 
+def with_small_channel():
+    view = make_view(0)
+    view.channels["n"] = np.zeros((2, 2), np.float32)  # past the shape check of the constructor
+    return view
+
+
 BAD = {
     "none": (lambda: [], "views: expected at least one"),
     "names": (lambda: [make_view(0), make_view(1, name="cam0")], "different names"),
@@ -114,7 +120,7 @@ BAD = {
         "views: expected one image size",
     ),
     "half a camera": (lambda: make_view(0, K=None), "'cam0': expected both K and cam_from_world"),
-    "channel size": (lambda: make_view(0, channels={"n": np.zeros((2, 2), np.float32)}), "'cam0': channel n: expected"),
+    "channel size": (lambda: with_small_channel(), "'cam0': channel n: expected"),
     "channel twice": (
         lambda: make_view(0, channels={"Z": np.zeros((HEIGHT, WIDTH), np.float32)}),
         "Z is there already",
