@@ -3,7 +3,9 @@
 The orientation flag that phones write into JPEG files (EXIF) is ignored: a calibration speaks of the stored pixels.
 """
 
+import os
 import subprocess
+import uuid
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ PNG_COLOUR_TYPES = {2: "rgb", 4: "grey and alpha", 6: "rgba"}
 """Colour types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
 
 
-def read_image(path: Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
+def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
     """Colours and, where the file has an alpha channel, alpha. Grey images become three equal channels.
 
     Raises: OSError if the file cannot be read as an image; FileNotFoundError (an OSError) if it is not there.
@@ -27,7 +29,7 @@ def read_image(path: Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray
     return np.ascontiguousarray(colours), np.ascontiguousarray(pixels[..., -1])
 
 
-def read_grey(path: Path) -> Float[np.ndarray, "h w"]:
+def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     """A one-channel image such as a mask; colour files are averaged.
 
     Raises: OSError if the file cannot be read; ValueError if it has alpha besides the colours (which is meant?).
@@ -38,11 +40,20 @@ def read_grey(path: Path) -> Float[np.ndarray, "h w"]:
     return colours[..., 0] if (colours == colours[..., :1]).all() else colours.mean(axis=-1)
 
 
-def write_png(path: Path, image: Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w"]) -> None:
-    """Write colours or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside are clipped."""
+def write_png(path: str | Path, image: Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w"]) -> None:
+    """Write colours or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside are clipped.
+
+    The file appears whole or not at all. Raises: OSError if it cannot be written.
+    """
     from PIL import Image
 
-    Image.fromarray(to_uint8(image)).save(path, format="PNG")
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        Image.fromarray(to_uint8(image)).save(temporary, format="PNG")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def to_uint8(image: Float[np.ndarray, "*shape"]) -> np.ndarray:
