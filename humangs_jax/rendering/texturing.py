@@ -44,9 +44,9 @@ def render_textured_mesh(
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
     """A picture of the mesh as seen by one camera: rgb over the background, alpha, and depth.
 
-    A pixel is the mean of supersample x supersample samples of visibility and texture. alpha is its covered share; depth
-    the mean z of its covered samples, 0 where nothing is covered (as in splatted pictures). Differentiable with respect
-    to texture, uvs and background. A texture much finer than the samples aliases: raise `supersample`.
+    A pixel is the mean of supersample x supersample samples of visibility and texture. alpha is its covered share,
+    depth the mean z of its covered samples and 0 where there are none (as in splatted pictures). Differentiable with
+    respect to texture, uvs and background. A texture much finer than the samples aliases: raise `supersample`.
     """
     fine = camera.resized(camera.width * supersample, camera.height * supersample)
     fragments = rasterize_mesh(vertices, faces, fine, config)
