@@ -1,0 +1,155 @@
+"""Which splats touch which tiles: depth order, then exactly the pairs (tile, splat) whose footprint meets the tile.
+
+A splat's footprint is the ellipse d^T cov2d^-1 d <= reach around its centre, outside of which alpha < alpha_min. It
+meets a tile if it meets the rectangle spanned by the tile's pixel centres. With D the determinant of cov2d, the ellipse
+at height dy above its centre spans
+
+    dx = (xy / yy) dy -+ sqrt(D / yy (reach - dy^2 / yy)),     |dy| <= sqrt(reach yy),
+
+so inside one row of tiles it reaches farthest right at dy = xy sqrt(reach / xx), clamped to the row, and farthest left
+at the opposite point. Pairs are emitted by two expansions: splat -> rows of tiles -> tiles.
+
+Nothing here is differentiated.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.rendering.projection import ProjectedGaussians
+from humangs_jax.rendering.tiling import SUM_LIMIT, TileGrid, bits_for, expand
+
+SLACK = 2e-3
+"""Pixels by which footprints are widened, against rounding of positions (a float32 at 1000 pixels has 6e-5)."""
+
+REACH_SLACK = (1.0001, 1e-5)
+"""The squared reach is multiplied by the first and raised by the second, against rounding of alpha at its threshold."""
+
+
+class Footprints(NamedTuple):
+    """Ellipses on the image, planes of (g,), named as in `ProjectedGaussians`; reach is 0 where nothing is drawn."""
+
+    x: Float[Array, " g"]
+    y: Float[Array, " g"]
+    xx: Float[Array, " g"]
+    xy: Float[Array, " g"]
+    yy: Float[Array, " g"]
+    determinant: Float[Array, " g"]
+    reach: Float[Array, " g"]
+
+
+class Pairs(NamedTuple):
+    """(tile, splat) pairs; unused ones have the tile number "no tile".
+
+    tiles, splats: (capacity,). needed: how many there are in all. overflow: how many of them are missing here.
+    """
+
+    tiles: Int[Array, " capacity"]
+    splats: Int[Array, " capacity"]
+    needed: Int[Array, ""]
+    overflow: Int[Array, ""]
+
+
+def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
+    """Stable order of positive depths, nearest first.
+
+    float32: radix passes, each a sort of ONE uint32 (digit of the depth, then position), which XLA's CPU backend does
+    four times as fast as an argsort. The bits of positive floats are ordered like the floats.
+    """
+    g = depths.shape[0]
+    if depths.dtype != jnp.float32:
+        return jnp.argsort(depths, stable=True).astype(jnp.int32)
+    bits = bits_for(g)
+    digit = 32 - bits
+    value, position = lax.bitcast_convert_type(depths, jnp.uint32), jnp.arange(g, dtype=jnp.uint32)
+    order = position.astype(jnp.int32)
+    for shift in range(0, 31, digit):  # the sign bit is 0
+        key = ((value[order] >> shift) & ((1 << digit) - 1)) << bits | position
+        order = order[(jnp.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)]
+    return order
+
+
+def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Footprints:
+    """Ellipses of the visible splats, a little widened against rounding; the others get reach 0."""
+    factor, more = REACH_SLACK
+    reach = jnp.where(projected.visible & (reach > 0), reach * factor + more, 0.0)
+    p = lax.stop_gradient(projected)
+    return Footprints(p.x, p.y, p.xx, p.xy, p.yy, p.determinant, reach)
+
+
+def count_pairs(ellipses: Footprints, grid: TileGrid) -> tuple[Int[Array, ""], Int[Array, ""]]:
+    """(rows, pairs) that `emit_pairs` needs, without any buffer; both saturate at `SUM_LIMIT`."""
+    _, counts = _row_range(ellipses, grid)
+    return _saturating_sum(counts), _count_row_by_row(ellipses, grid, jnp.max(counts, initial=0))
+
+
+def emit_pairs(ellipses: Footprints, grid: TileGrid, max_rows: int, max_pairs: int) -> Pairs:
+    """All pairs, splat by splat, in buffers of fixed size; if they overflow, the last splats lose theirs."""
+    row0, counts = _row_range(ellipses, grid)
+    rows = expand(counts, max_rows)
+    slot = jnp.arange(max_rows, dtype=jnp.int32)
+    row = (row0 - rows.first)[rows.source] + slot
+    column0, column1 = _column_range(Footprints(*(plane[rows.source] for plane in ellipses)), row, grid)
+    pairs = expand(jnp.where(slot < rows.needed, jnp.maximum(column1 - column0 + 1, 0), 0), max_pairs)
+
+    slot = jnp.arange(max_pairs, dtype=jnp.int32)
+    tile = (row * grid.columns + column0 - pairs.first)[pairs.source] + slot
+    tiles = jnp.where(slot < pairs.needed, tile, grid.tiles)
+    # If rows are missing, so are their pairs, and they must be counted some other way; else this loop runs zero times.
+    missing = rows.needed > max_rows
+    recount = _count_row_by_row(ellipses, grid, jnp.where(missing, jnp.max(counts, initial=0), 0))
+    needed = jnp.where(missing, recount, pairs.needed)
+    return Pairs(tiles, rows.source[pairs.source], needed, needed - jnp.minimum(pairs.needed, max_pairs))
+
+
+def _first(v, tile_size, tiles):
+    """First of `tiles` whose last pixel centre is not left of v."""
+    return jnp.clip(jnp.ceil((v - (tile_size - 0.5) - SLACK) / tile_size), 0, tiles).astype(jnp.int32)
+
+
+def _last(v, tile_size, tiles):
+    """Last of `tiles` whose first pixel centre is not right of v."""
+    return jnp.clip(jnp.floor((v - 0.5 + SLACK) / tile_size), -1, tiles - 1).astype(jnp.int32)
+
+
+def _row_range(e: Footprints, grid: TileGrid):
+    """First row of tiles of each splat, and how many."""
+    half = jnp.sqrt(e.reach * e.yy)
+    row0 = _first(e.y - half, grid.tile_size, grid.rows)
+    row1 = _last(e.y + half, grid.tile_size, grid.rows)
+    return row0, jnp.where(e.reach > 0, jnp.maximum(row1 - row0 + 1, 0), 0)
+
+
+def _column_range(e: Footprints, row, grid: TileGrid):
+    """First and last tile of each splat within one row of tiles."""
+    size = grid.tile_size
+    height = jnp.sqrt(e.reach * e.yy)
+    top = jnp.maximum(row * size + 0.5 - SLACK - e.y, -height)
+    bottom = jnp.minimum((row + 1) * size - 0.5 + SLACK - e.y, height)
+    tip = e.xy * jnp.sqrt(e.reach / e.xx)
+    slope, ratio = e.xy / e.yy, e.determinant / e.yy
+    right, left = jnp.clip(tip, top, bottom), jnp.clip(-tip, top, bottom)
+    half = lambda dy: jnp.sqrt(jnp.maximum(ratio * (e.reach - dy * dy / e.yy), 0))
+    column0 = _first(e.x + slope * left - half(left), size, grid.columns)
+    column1 = _last(e.x + slope * right + half(right), size, grid.columns)
+    return column0, column1
+
+
+def _count_row_by_row(ellipses: Footprints, grid: TileGrid, most_rows):
+    """Pairs of all splats: their first rows of tiles, then their second ones, and so on."""
+    row0, counts = _row_range(ellipses, grid)
+
+    def count(i, total):
+        column0, column1 = _column_range(ellipses, row0 + i, grid)
+        return jnp.minimum(
+            total + _saturating_sum(jnp.where(i < counts, jnp.maximum(column1 - column0 + 1, 0), 0)), SUM_LIMIT
+        )
+
+    return lax.fori_loop(0, most_rows, count, jnp.zeros((), jnp.int32))
+
+
+def _saturating_sum(x):
+    fits = jnp.sum(x.astype(jnp.float32)) < SUM_LIMIT
+    return jnp.where(fits, jnp.sum(x, dtype=jnp.int32), SUM_LIMIT)

@@ -1,0 +1,126 @@
+"""EWA projection: 3D Gaussians to 2D Gaussians on the image (Zwicker et al. 2001; Kerbl et al. 2023).
+
+With p = (X, Y, Z) the mean in the camera's frame, fx, fy, cx, cy of K and W the camera's rotation,
+
+    mean2d = (fx X/Z + cx, fy Y/Z + cy)
+    J      = [[fx/Z, 0, -fx X/Z^2], [0, fy/Z, -fy Y/Z^2]]             the projection's derivative at p
+    cov2d  = M M^T + dilation I,   M = J W A R diag(s)                (2, 3), A R diag(s) the factor of the covariance
+
+Everything is kept as planes of g numbers rather than as (g, 2, 2) arrays: XLA then fuses the projection, and its
+gradient, into a few loops. Its determinant is not taken from the entries of cov2d, where float32 cancels for needles,
+but as a sum of squares: |m0 x m1|^2 + dilation (|m0|^2 + |m1|^2) + dilation^2 for the rows m0, m1 of M.
+
+Gaussians that are not drawn (centre nearer than `near` or behind, footprint beyond `LARGEST_FOOTPRINT`) have finite
+values and pass zero gradients. K's skew is taken as 0.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+
+from humangs_jax.array_types import Array, Bool, Float
+from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering import constants
+from humangs_jax.rendering.gaussians import Gaussians
+
+
+class ProjectedGaussians(NamedTuple):
+    """2D Gaussians on the image, planes of (g,).
+
+    x, y: centre, pixels. depth: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2, dilated.
+    determinant: of the covariance, pixels^4. visible: whether it is drawn.
+    """
+
+    x: Float[Array, " g"]
+    y: Float[Array, " g"]
+    depth: Float[Array, " g"]
+    xx: Float[Array, " g"]
+    xy: Float[Array, " g"]
+    yy: Float[Array, " g"]
+    determinant: Float[Array, " g"]
+    visible: Bool[Array, " g"]
+
+
+def project(
+    gaussians: Gaussians,
+    camera: Camera,
+    near: float = constants.NEAR,
+    dilation: float = constants.DILATION,
+    jacobian_margin: float | None = None,
+) -> ProjectedGaussians:
+    """Projects every Gaussian.
+
+    near: metres. dilation: pixels^2. jacobian_margin: None for the exact Jacobian; a number clamps where it is
+    evaluated to that fraction of the half field of view beyond the border (`INRIA_JACOBIAN_MARGIN`).
+    """
+    K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    X, Y, Z = (_dot(rotation[i], gaussians.means.T) + translation[i] for i in range(3))
+    in_front = near < Z
+    X, Y = jnp.where(in_front, X, 0.0), jnp.where(in_front, Y, 0.0)
+    inverse_depth = 1 / jnp.where(in_front, Z, 1.0)
+    u, v = X * inverse_depth, Y * inverse_depth
+
+    ju, jv = u, v
+    if jacobian_margin is not None:
+        ju = _clamp_to_view(u, fx, cx, camera.width, jacobian_margin)
+        jv = _clamp_to_view(v, fy, cy, camera.height, jacobian_margin)
+    zx, zy = fx * inverse_depth, fy * inverse_depth
+    jw = [
+        [zx * (rotation[0, j] - ju * rotation[2, j]) for j in range(3)],
+        [zy * (rotation[1, j] - jv * rotation[2, j]) for j in range(3)],
+    ]
+    m = _times_factors(jw, gaussians)
+
+    small = _all([jnp.abs(entry) < constants.LARGEST_FOOTPRINT for row in m for entry in row])
+    m0, m1 = ([jnp.where(small, entry, 0.0) for entry in row] for row in m)
+    xx, xy, yy = _dot(m0, m0), _dot(m0, m1), _dot(m1, m1)
+    normal = [m0[1] * m1[2] - m0[2] * m1[1], m0[2] * m1[0] - m0[0] * m1[2], m0[0] * m1[1] - m0[1] * m1[0]]
+    determinant = _dot(normal, normal) + dilation * (xx + yy) + dilation * dilation
+    return ProjectedGaussians(
+        x=fx * u + cx,
+        y=fy * v + cy,
+        depth=Z,
+        xx=xx + dilation,
+        xy=xy,
+        yy=yy + dilation,
+        determinant=determinant,
+        visible=in_front & small & (determinant > 0),
+    )
+
+
+def squared_reach(opacities: Float[Array, " g"], alpha_min: float = constants.ALPHA_MIN) -> Float[Array, " g"]:
+    """The d^T cov2d^-1 d at which a splat's alpha falls to `alpha_min`; 0 if it starts below. No gradient."""
+    opacities = lax.stop_gradient(opacities)
+    seen = opacities > alpha_min
+    return jnp.where(seen, 2 * jnp.log(jnp.where(seen, opacities, 1.0) / alpha_min), 0.0)
+
+
+def _times_factors(rows, gaussians: Gaussians):
+    """Rows @ A R diag(s) for 2 x 3 rows of planes."""
+    if gaussians.deformations is not None:
+        rows = _times_matrices(rows, gaussians.deformations)
+    rows = _times_matrices(rows, quaternion.to_matrix(quaternion.normalize(gaussians.quats)))
+    return [[row[j] * gaussians.scales[:, j] for j in range(3)] for row in rows]
+
+
+def _times_matrices(rows, matrices):
+    return [[_dot(row, matrices[:, :, j].T) for j in range(3)] for row in rows]
+
+
+def _clamp_to_view(slope, focal, center, size, margin):
+    extra = margin * 0.5 * size / focal
+    return jnp.clip(slope, -center / focal - extra, (size - center) / focal + extra)
+
+
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _all(conditions):
+    result = conditions[0]
+    for condition in conditions[1:]:
+        result &= condition
+    return result
