@@ -1,7 +1,10 @@
 """Frames -> a video file: .mp4 (H.264, plays everywhere) or .gif (256 colours for all frames, endless loop)."""
 
+import contextlib
 import os
+import subprocess
 import uuid
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -49,37 +52,29 @@ def write_video(path: str | Path, frames: Float[np.ndarray, "m h w 3"], fps: flo
 
 
 def _write_mp4(path, frames, fps):
+    """Through ffmpeg itself: imageio's writer does not tell when ffmpeg fails."""
     import imageio_ffmpeg
 
     height, width = frames.shape[1:3]
     odd = ((0, height % 2), (0, width % 2), (0, 0))
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error"]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width + width % 2}x{height + height % 2}"]
+    command += ["-r", str(Fraction(fps).limit_denominator(100_000)), "-i", "-", "-an"]
+    command += ["-c:v", "libx264", "-crf", str(CONSTANT_RATE_FACTOR), "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
     # said and done in BT.709: players guess the matrix of an untagged file by its size
-    tags = [f"-{key}" for key in ("colorspace", "color_primaries", "color_trc")]
-    output = [
-        "-crf",
-        str(CONSTANT_RATE_FACTOR),
-        "-movflags",
-        "+faststart",
-        "-vf",
-        "scale=out_color_matrix=bt709:out_range=tv",
-    ]
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        (width + width % 2, height + height % 2),
-        fps=fps,
-        codec="libx264",
-        pix_fmt_out="yuv420p",
-        quality=None,
-        macro_block_size=1,
-        output_params=output + [word for tag in tags for word in (tag, "bt709")],
-        ffmpeg_log_level="error",
-    )
-    writer.send(None)
-    try:
-        for frame in frames:
-            writer.send(np.ascontiguousarray(np.pad(to_uint8(frame), odd, mode="edge")))
-    finally:
-        writer.close()
+    command += ["-vf", "scale=out_color_matrix=bt709:out_range=tv"]
+    command += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+        try:
+            for frame in frames:
+                ffmpeg.stdin.write(np.pad(to_uint8(frame), odd, mode="edge").tobytes())
+            ffmpeg.stdin.close()
+        except BrokenPipeError:  # ffmpeg has given up: it says why
+            with contextlib.suppress(BrokenPipeError):
+                ffmpeg.stdin.close()
+        problem = ffmpeg.stderr.read().decode(errors="replace")
+    if ffmpeg.returncode:
+        raise OSError(f"{path}: ffmpeg failed: {' '.join(problem.split())}")
 
 
 def _write_gif(path, frames, fps):

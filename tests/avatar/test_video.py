@@ -1,3 +1,5 @@
+import subprocess
+
 import numpy as np
 import pytest
 
@@ -18,10 +20,19 @@ def moving_square(count, height=48, width=64):
     return frames
 
 
-def read_back(path):
-    import imageio.v3 as iio
+def ffmpeg(*arguments):
+    import imageio_ffmpeg
 
-    return iio.imread(path) / 255.0
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=False)
+
+
+def read_back(path, height=48, width=64):
+    """By ffmpeg itself (imageio's reader leaves file handles open)."""
+    data = ffmpeg(
+        "-v", "error", "-i", path, "-fps_mode", "passthrough", "-f", "rawvideo", "-pix_fmt", "rgb24", "-"
+    ).stdout
+    return np.frombuffer(data, np.uint8).reshape(-1, height, width, 3) / 255.0
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.MP4", "a.gif"])
@@ -37,15 +48,10 @@ def test_frames_come_back(tmp_path, name):
 
 
 def test_mp4_says_its_speed_and_pixel_format(tmp_path):
-    import imageio_ffmpeg
-
     write_video(tmp_path / "a.mp4", moving_square(30, 47, 63), 30)  # odd sides
-    reader = imageio_ffmpeg.read_frames(str(tmp_path / "a.mp4"))
-    meta = next(reader)
-    reader.close()
-    assert meta["fps"] == 30 and meta["size"] == (64, 48) and "yuv420p" in meta["pix_fmt"] and meta["codec"] == "h264"
-    assert abs(meta["duration"] - 1) < 0.05
-    assert "bt709" in meta["pix_fmt"]
+    told = ffmpeg("-i", tmp_path / "a.mp4").stderr.decode()
+    assert "Video: h264" in told and "yuv420p(tv, bt709" in told and "64x48" in told and " 30 fps" in told
+    assert "Duration: 00:00:01.0" in told
     back = read_back(tmp_path / "a.mp4")
     assert back.shape[0] == 30
     assert np.abs(back[:, :47, :63] - moving_square(30, 47, 63)).mean() < H264_ERROR  # padded, not resized
@@ -104,3 +110,12 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     assert (tmp_path / "a.mp4").read_text() == "old" and len(list(tmp_path.iterdir())) == 1
     with pytest.raises(FileNotFoundError, match="no such folder"):
         write_video(tmp_path / "nowhere" / "a.mp4", moving_square(2), 24)
+
+
+def test_ffmpeg_failing_is_an_error(tmp_path, monkeypatch):
+    import humangs_jax.avatar.video as module
+
+    monkeypatch.setattr(module, "CONSTANT_RATE_FACTOR", "no number")
+    with pytest.raises(OSError, match=r"ffmpeg failed: .*no number"):
+        write_video(tmp_path / "a.mp4", moving_square(200), 24)
+    assert list(tmp_path.iterdir()) == []
