@@ -1,0 +1,86 @@
+"""The optimizer as published: AdamW, warm-up and cosine, clipped gradients, and a guard against bad steps.
+
+A gradient is made finite entry by entry first (NaN becomes 0, infinities +-1e-6). A step whose gradient norm exceeds
+`skip_norm`, or whose loss is not finite, changes nothing, neither parameters nor moments nor the schedule, and is
+counted.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from humangs_jax.array_types import Array, Float, Int, PyTree, Scalar
+
+INFINITY_STAND_IN = 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class OptimizerConfig:
+    """learning_rate: the peak, reached after `warmup_steps` from 0, then a cosine to 0 at the end of the run.
+
+    betas, weight_decay: of AdamW; decay acts on parameters with two or more axes (products, textures, the class token).
+    clip_norm: gradients longer than this are scaled down to it. skip_norm: above it the step is skipped.
+    """
+
+    learning_rate: float = 4e-4
+    warmup_steps: int = 3000
+    betas: tuple[float, float] = (0.9, 0.95)
+    weight_decay: float = 0.05
+    clip_norm: float = 1.0
+    skip_norm: float = 100.0
+
+
+class GuardState(NamedTuple):
+    """skipped: steps skipped so far. norm: gradient norm of the last step, before clipping. inner: what is guarded."""
+
+    skipped: Int[Array, ""]
+    norm: Float[Array, ""]
+    inner: PyTree
+
+
+def learning_rate(config: OptimizerConfig, steps: int) -> optax.Schedule:
+    """Step number -> learning rate of a run of `steps` steps."""
+    warmup = min(config.warmup_steps, steps)
+    return optax.warmup_cosine_decay_schedule(0.0, config.learning_rate, warmup, max(steps, warmup + 1))
+
+
+def decayed(params: PyTree) -> PyTree:
+    """True for the parameters that weight decay acts on."""
+    return jax.tree.map(lambda x: x.ndim >= 2, params)
+
+
+def finite_gradients(gradients: PyTree) -> PyTree:
+    """NaN entries become 0 and infinite ones +-1e-6."""
+    stand_in = INFINITY_STAND_IN
+    return jax.tree.map(lambda x: jnp.nan_to_num(x, nan=0.0, posinf=stand_in, neginf=-stand_in), gradients)
+
+
+def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.GradientTransformationExtraArgs:
+    """`inner` on finite gradients, skipped where their norm exceeds `skip_norm` or the loss is not finite.
+
+    The loss is the extra argument `value` of `update`.
+    """
+
+    def init(params):
+        return GuardState(jnp.zeros((), jnp.int32), jnp.zeros(()), inner.init(params))
+
+    def update(gradients: PyTree, state: GuardState, params: PyTree, *, value: Scalar, **_):
+        gradients = finite_gradients(gradients)
+        norm = optax.global_norm(gradients)
+        good = jnp.isfinite(value) & (norm <= skip_norm)
+        updates, advanced = inner.update(gradients, state.inner, params)
+        keep = lambda new, old: jnp.where(good, new, old)
+        updates = jax.tree.map(lambda x: keep(x, jnp.zeros_like(x)), updates)
+        advanced = jax.tree.map(keep, advanced, state.inner)
+        return updates, GuardState(state.skipped + ~good, norm, advanced)
+
+    return optax.GradientTransformationExtraArgs(init, update)
+
+
+def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformationExtraArgs:
+    """The optimizer of a run of `steps` steps; its state is a `GuardState`."""
+    adamw = optax.adamw(learning_rate(config, steps), *config.betas, weight_decay=config.weight_decay, mask=decayed)
+    return guard(optax.chain(optax.clip_by_global_norm(config.clip_norm), adamw), config.skip_norm)
