@@ -26,7 +26,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="index of the first subject within the test split")
     parser.add_argument("--weights", type=Path, help="weights file; the shipped ones if not given")
     parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--pictures", type=Path, help="write truth, ours and baseline of two views of every subject here")
+    parser.add_argument(
+        "--pictures", type=Path, help="write truth, ours and baseline of two views of every subject here"
+    )
     arguments = parser.parse_args()
     if arguments.subjects < 1 or arguments.views < 1 or arguments.held_out < 1:
         parser.error("--subjects, --views and --held-out must be at least 1")
@@ -89,7 +91,12 @@ def evaluate(arguments: argparse.Namespace) -> dict:
         f"{means['baseline_psnr_foreground']:9.2f}{means['foreground']:8.3f}"
     )
     if arguments.pictures:
-        contact_sheet(np.stack(pictures), arguments.pictures, labels=["truth", "ours", "painted body"] * (len(pictures) // 3), columns=6)
+        contact_sheet(
+            np.stack(pictures),
+            arguments.pictures,
+            labels=["truth", "ours", "painted body"] * (len(pictures) // 3),
+            columns=6,
+        )
     return {**means, "views": arguments.views, "image_size": arguments.size, "subjects": rows}
 
 

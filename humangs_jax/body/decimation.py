@@ -1,12 +1,14 @@
 """Progressive decimation of a body by half-edge collapses.
 
-A half-edge collapse u -> v moves vertex u onto its neighbour v: the two triangles between them vanish, and what remains is a mesh on
-a subset of the vertices, whose positions, shape directions and skinning weights are the original ones. `collapse_sequence` orders all
-collapses once: `order[u]` is the rank of u (0 stays longest), `into[u]` the vertex it moves onto. Any size is then a table look-up.
+A half-edge collapse u -> v moves vertex u onto its neighbour v: the two triangles between them vanish, and what remains
+is a mesh on a subset of the vertices, whose positions, shape directions and skinning weights are the original ones.
+`collapse_sequence` orders all collapses once: `order[u]` is the rank of u (0 stays longest), `into[u]` the vertex it
+moves onto. Any size is then a table look-up.
 
-Cost of u -> v: |uv|^2 + FLATNESS q_u(v), with q_u the mean squared distance to the planes that u has gathered (Garland and Heckbert,
-Surface Simplification Using Quadric Error Metrics): the length spreads the vertices evenly over the skin, so that the crowded face
-and ears go before the torso, and the quadric keeps fingers round. What cannot be seen from outside goes first.
+Cost of u -> v: |uv|^2 + FLATNESS q_u(v), with q_u the mean squared distance to the planes that u has gathered (Garland
+and Heckbert, Surface Simplification Using Quadric Error Metrics): the length spreads the vertices evenly over the skin,
+so that the crowded face and ears go before the torso, and the quadric keeps fingers round. What cannot be seen from
+outside goes first.
 """
 
 import heapq
@@ -27,9 +29,11 @@ CELL = 0.004
 SMALLEST_TURN = 0.3
 """A face may turn by at most acos(0.3) = 73 degrees in one collapse."""
 SMALLEST_QUALITY = 0.08
-"""Lower bound of 4 sqrt(3) area / (sum of squared edges), 1 for an equilateral triangle, unless the face was worse before."""
+"""Lower bound of 4 sqrt(3) area / (sum of squared edges), 1 for an equilateral triangle, unless it was worse."""
 LOCAL = 200
 """Vertices near a joint that share the correction of its regressor."""
+RIDGE = 1e-13
+"""Relative to the trace of the normal equations, which are singular where a shape direction moves nothing."""
 
 
 def exposure(vertices: np.ndarray, faces: np.ndarray, views: int = VIEWS) -> np.ndarray:
@@ -100,7 +104,7 @@ class _Mesh:
         return self.uv_faces[face][self.faces[face].index(vertex)]
 
     def allowed(self, u, v):
-        """Whether u -> v keeps a manifold of the same topology, unbroken texture charts and no folded or needle faces."""
+        """Whether u -> v keeps the topology, the texture charts whole, and folds no face nor makes it a needle."""
         shared = self.between(u, v)
         common = self.beside[u] & self.beside[v]
         if len(common) != len(shared) or not 1 <= len(shared) <= 2:
@@ -164,7 +168,7 @@ def _quality(normal, a, b, c):
 
 
 def _vertex_quadrics(vertices, faces):
-    """Area-weighted sums over the faces of a vertex of the outer product of (n, d), upper triangle, and of the area: (n, 11)."""
+    """Per vertex: area-weighted sums over its faces of the outer product of (normal, d), and of the area: (n, 11)."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -184,7 +188,8 @@ def collapse_sequence(
     """All half-edge collapses of a triangle mesh, best first.
 
     Arguments: vertices (n, 3) in metres; faces (f, 3); uv_faces (f, 3), whose seams are then kept closed.
-    Returns: order (n,), 0 for the vertex that stays longest; into (n,), the vertex each one moves onto, itself if it never can.
+    Returns: order (n,), 0 for the vertex that stays longest; into (n,), the vertex each one moves onto, itself if it
+    never can.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     hidden = exposure(vertices, faces) == 0
@@ -224,45 +229,41 @@ def _follow(into: np.ndarray, kept: np.ndarray) -> np.ndarray:
 
 
 def _refit_regressor(body: BodyModel, target: np.ndarray, kept: np.ndarray) -> np.ndarray:
-    """A joint regressor on the kept vertices with the joints of the full body, for the template and every shape direction.
+    """A joint regressor on the kept vertices that gives the joints of the full body, whatever its shape.
 
-    The weights of lost vertices move to where those went; the smallest change of the nearby weights then removes the error.
+    The weights of lost vertices move to where those went; the smallest change of the nearby weights then removes the
+    error.
     """
     regressor = np.asarray(body.joint_regressor, np.float64)
     moved = np.zeros_like(regressor)
     np.add.at(moved.T, target, regressor.T)
     moved = moved[:, kept]
-    count = len(kept)
-    columns = lambda keep: np.concatenate(
-        [
-            np.asarray(body.template, np.float64)[keep],
-            np.asarray(body.shape_directions, np.float64)[keep].reshape(len(regressor[0, keep]), -1),
-            np.ones((len(regressor[0, keep]), 1)),
-        ],
-        axis=1,
-    )
-    every = np.zeros(count, bool)
-    full, reduced = columns(np.arange(count)), columns(kept)
-    error = regressor @ full - moved @ reduced
-    joints, places = regressor @ full[:, :3], reduced[:, :3]
-    del every
-    for j in range(len(moved)):
-        near = np.argsort(np.linalg.norm(places - joints[j], axis=1))[:LOCAL]
-        moved[j, near] += np.linalg.lstsq(reduced[near].T, error[j], rcond=1e-10)[0]
+    template, directions = np.asarray(body.template, np.float64), np.asarray(body.shape_directions, np.float64)
+    # What a row of the regressor must reproduce: the template, every direction, and 1.
+    full = np.concatenate([template, directions.reshape(len(template), -1), np.ones((len(template), 1))], axis=1)
+    error = regressor @ full - moved @ full[kept]
+    joints = regressor @ template
+    distances = np.linalg.norm(template[kept] - joints[:, None], axis=2)
+    near = np.argpartition(distances, min(LOCAL, len(kept)) - 1, axis=1)[:, :LOCAL]
+    rows = full[kept[near]]
+    gram = np.einsum("jnp,jnq->jpq", rows, rows, optimize=True)
+    ridge = RIDGE * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(full.shape[1])
+    multipliers = np.linalg.solve(gram + ridge, error[..., None])
+    np.add.at(moved, (np.arange(len(moved))[:, None], near), (rows @ multipliers)[..., 0])
     return moved
 
 
 def _carry_uvs(body, faces, target, kept_faces):
     """Texture vertices of the remaining corners: of the vertex a corner moved onto, the one nearest in the texture."""
     uvs, uv_faces = np.asarray(body.uvs), np.asarray(body.uv_faces)
-    pairs = np.unique(np.stack([faces.ravel(), uv_faces.ravel()], axis=1), axis=0)
-    start = np.searchsorted(pairs[:, 0], np.arange(len(target) + 1))
+    pairs = np.unique(faces.ravel().astype(np.int64) * len(uvs) + uv_faces.ravel())  # (vertex, texture vertex)
+    start = np.searchsorted(pairs, np.arange(len(target) + 1) * len(uvs))
     corners, corner_uvs = faces[kept_faces].ravel(), uv_faces[kept_faces].ravel()
     ends = target[corners]
     best, best_distance = corner_uvs.copy(), np.where(ends == corners, 0.0, np.inf)
     for i in range(int(np.diff(start).max())):
         valid = start[ends] + i < start[ends + 1]
-        candidate = pairs[np.minimum(start[ends] + i, len(pairs) - 1), 1]
+        candidate = pairs[np.minimum(start[ends] + i, len(pairs) - 1)] % len(uvs)
         distance = np.where(valid, np.linalg.norm(uvs[candidate] - uvs[corner_uvs], axis=1), np.inf)
         nearer = distance < best_distance
         best, best_distance = np.where(nearer, candidate, best), np.minimum(distance, best_distance)
@@ -273,8 +274,9 @@ def _carry_uvs(body, faces, target, kept_faces):
 def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
     """A body on `vertex_count` of the body's own vertices, with the same joints for every shape.
 
-    Host-side numpy: milliseconds if the body carries its collapses (the shipped one does), seconds to find them otherwise; the
-    result carries its own. Raises: ValueError if vertex_count is larger than the body or too small for its topology.
+    Host-side numpy: milliseconds if the body carries its collapses (the shipped one does), seconds to find them
+    otherwise; the result carries its own. Raises: ValueError if vertex_count is larger than the body or too small for
+    its topology.
     """
     total = body.template.shape[0]
     if not 0 < vertex_count <= total:
@@ -299,13 +301,14 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
     solid = (ends != np.roll(ends, 1, axis=1)).all(axis=1)
     uvs, uv_faces = (None, None) if body.uvs is None else _carry_uvs(body, faces, target, solid)
     dtype = body.template.dtype
+    rows = lambda array: jnp.asarray(np.asarray(array)[kept])  # by numpy: no compilation for each size
     return replace(
         body,
-        template=body.template[kept],
-        shape_directions=body.shape_directions[kept],
-        pose_directions=None if body.pose_directions is None else body.pose_directions[kept],
+        template=rows(body.template),
+        shape_directions=rows(body.shape_directions),
+        pose_directions=None if body.pose_directions is None else rows(body.pose_directions),
         joint_regressor=jnp.asarray(_refit_regressor(body, target, kept), dtype),
-        skinning_weights=body.skinning_weights[kept],
+        skinning_weights=rows(body.skinning_weights),
         faces=jnp.asarray(renumber[ends[solid]], jnp.int32),
         uvs=uvs,
         uv_faces=uv_faces,

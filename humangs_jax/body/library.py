@@ -11,11 +11,12 @@ from humangs_jax.body.model import BodyModel
 def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel:
     """A body model.
 
-    Arguments: path: None for the CC0 body shipped with the package (13,380 vertices, 55 joints in SMPL-X order, the person faces
-    +z, pelvis at (0, -0.35, 0)); a file of `humangs_jax.body.storage`; or an SMPL-X model file (.npz or .pkl).
+    Arguments: path: None for the CC0 body shipped with the package (13,380 vertices, 55 joints in SMPL-X order, the
+    person faces +z, pelvis at (0, -0.35, 0)); a file of `humangs_jax.body.storage`; or an SMPL-X model file (.npz or
+    .pkl).
     smplx_options: for SMPL-X files only, see `humangs_jax.body.smplx.load_smplx`.
-    Raises: FileNotFoundError; ValueError, naming file and key, for what cannot be read; TypeError for options of SMPL-X files
-    given with another body.
+    Raises: FileNotFoundError; ValueError, naming file and key, for what cannot be read; TypeError for options of SMPL-X
+    files given with another body.
     """
     if path is None:
         if smplx_options:

@@ -1,7 +1,8 @@
 """The package's own body file: one small npz without pickles.
 
-Small numbers make it small: positions of shape directions are multiples of 10 micrometres in int16, weights are the largest few
-of each vertex in uint16, indices are uint16 where they fit. `read_body` returns float32 weights whose rows sum to 1.
+Small numbers make it small: positions of shape directions are multiples of 10 micrometres in int16, weights are the
+largest few of each vertex in uint16, indices are uint16 where they fit. `read_body` returns float32 weights whose rows
+sum to 1.
 """
 
 import zipfile
