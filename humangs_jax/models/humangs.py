@@ -59,7 +59,9 @@ class HumanGSConfig:
     patch_size: side of a token's patch, pixels. tokens: "all" patches, or those that the "foreground" touches, packed
     into `token_capacity` slots over all views. position_map, skinning: how the position map that comes in was shaded,
     and how the Gaussians are to be skinned (recorded). body_vertices: vertex count to decimate bodies to, None for all
-    (recorded). dtype: of the products; parameters, norms and softmax statistics stay float32 at least.
+    (recorded). ray_origins: the release divides camera centres by s and the ray origins taken from them once more, so
+    that the moments of its rays ("twice_normalized") fit no camera; needed to run its weights. dtype: of the products;
+    parameters, norms and softmax statistics stay float32 at least.
     """
 
     image_size: int = 512
@@ -69,6 +71,7 @@ class HumanGSConfig:
     position_map: Literal["plain", "gouraud"] = "plain"
     skinning: Literal["affine", "rotation"] = "affine"
     body_vertices: int | None = None
+    ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
     dtype: Literal["float32", "bfloat16"] = "float32"
     texture: TriplaneConfig = dataclasses.field(default_factory=TriplaneConfig)
     transformer: TransformerConfig = dataclasses.field(default_factory=TransformerConfig)
@@ -209,12 +212,21 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     return {"params": {"encoder": encoder["params"], "decoder": decoder["params"]}, "batch_stats": batch_stats}
 
 
+def touched_patches(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]:
+    """How many patches the foreground touches, over all views: the token capacity that these photographs need."""
+    return jnp.sum(_touched(inputs, config), dtype=jnp.int32)
+
+
 def select_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Packing | None:
     """Which patches become tokens; None for all of them."""
     if config.tokens == "all":
         return None
-    touched = jnp.any(patchify(inputs.foreground[..., None].astype(jnp.float32), config.patch_size) > 0, axis=(1, 2))
+    touched = _touched(inputs, config)
     return pack_patches(touched, min(config.token_capacity, len(touched)))
+
+
+def _touched(inputs, config):
+    return jnp.any(patchify(inputs.foreground[..., None].astype(jnp.float32), config.patch_size) > 0, axis=(1, 2))
 
 
 def encode_with_statistics(
@@ -230,8 +242,10 @@ def encode_with_statistics(
         raise ValueError(
             f"images are {width} x {height} but their cameras say {inputs.cameras.width} x {inputs.cameras.height}"
         )
-    cameras = inputs.cameras.in_units(subject_unit(inputs.canonical_vertices))
-    rays = jax.vmap(plucker_rays)(cameras).astype(inputs.images.dtype)
+    unit = subject_unit(inputs.canonical_vertices)
+    cameras = inputs.cameras.in_units(unit)
+    ray_cameras = cameras.in_units(unit) if config.ray_origins == "twice_normalized" else cameras
+    rays = jax.vmap(plucker_rays)(ray_cameras).astype(inputs.images.dtype)
     pixels = jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
     packing = select_tokens(inputs, config)
 

@@ -16,6 +16,7 @@ def published() -> HumanGSConfig:
     return HumanGSConfig(
         position_map="gouraud",
         skinning="rotation",
+        ray_origins="twice_normalized",
         dtype="bfloat16",
         sampling=PixelAlignedConfig(pool="all", convention="mixed"),
     )
@@ -31,11 +32,11 @@ def small() -> HumanGSConfig:
     return HumanGSConfig(
         image_size=256,
         tokens="foreground",
-        token_capacity=1536,
-        body_vertices=3000,
+        token_capacity=960,
+        body_vertices=6000,
         texture=TriplaneConfig(resolution=64, channels=8),
         transformer=TransformerConfig(width=256, layers=6),
-        upsampler=UpsamplerConfig(hidden=64, out=64),
+        upsampler=UpsamplerConfig(enabled=False),  # its backward pass alone costs a CPU more than the whole encoder
         sampling=PixelAlignedConfig(pool="visible", convention="half_pixel", sample_rgb=True),
         decoder=VertexDecoderConfig(
             hidden=256, tight=1, free=2, offset_scale=0.1, initial_log_scale=-4.6, residual_color=True

@@ -33,7 +33,7 @@ class Packing:
     dropped: Int[Array, ""]
 
 
-def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p patch*patch c"]:
+def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p pixels c"]:
     """Cut maps into square patches. Raises ValueError unless the patch size divides both sides."""
     views, height, width, channels = maps.shape
     if height % patch or width % patch:

@@ -1,0 +1,167 @@
+"""Weights on disk: one safetensors file, tensors under their path in the variables, the configuration in its header.
+
+Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format": "humangs-weights",
+"version": "1", "config": JSON of the configuration}. float16 halves the file (and rounds to 11 bits); loading gives
+float32.
+"""
+
+import dataclasses
+import json
+import os
+import types
+import typing
+from importlib import resources
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.models.humangs import HumanGSConfig, Variables, init_humangs
+
+FORMAT = "humangs-weights"
+VERSION = "1"
+SHIPPED = "assets/weights.safetensors"
+
+
+def config_to_json(config: HumanGSConfig) -> str:
+    """Configuration as JSON, sub-configurations nested."""
+    return json.dumps(dataclasses.asdict(config))
+
+
+def config_from_json(text: str) -> HumanGSConfig:
+    """Inverse of `config_to_json`; fields that are absent take their defaults.
+
+    Raises: ValueError for a field that the configuration does not have or a value of another type, naming it.
+    """
+    try:
+        values = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"configuration is no JSON: {error}") from error
+    return _build(HumanGSConfig, values, "config")
+
+
+def _build(cls: type, values: Any, path: str) -> Any:
+    """A (nested) configuration dataclass from plain JSON values, checked against its annotations."""
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: expected an object, got {values!r}")
+    annotations = typing.get_type_hints(cls)
+    if unknown := sorted(set(values) - set(annotations)):
+        raise ValueError(f"{path}.{unknown[0]}: {cls.__name__} has no such field")
+    arguments = {}
+    for name, value in values.items():
+        annotation = annotations[name]
+        if dataclasses.is_dataclass(annotation):
+            value = _build(annotation, value, f"{path}.{name}")
+        elif not _matches(value, annotation):
+            raise ValueError(f"{path}.{name}: {value!r} is no {annotation}")
+        arguments[name] = value
+    return cls(**arguments)
+
+
+def _matches(value: Any, annotation: Any) -> bool:
+    """Whether a JSON value fits one of the annotations that configurations use."""
+    origin = typing.get_origin(annotation)
+    if origin is Literal:
+        return value in typing.get_args(annotation)
+    if origin in (typing.Union, types.UnionType):
+        return any(_matches(value, option) for option in typing.get_args(annotation))
+    if annotation is float:
+        return isinstance(value, int | float) and not isinstance(value, bool)
+    return type(value) is annotation
+
+
+def expected_variables(config: HumanGSConfig) -> Variables:
+    """Shapes and dtypes of the variables of a configuration, without computing anything."""
+    return jax.eval_shape(lambda key: init_humangs(key, config), jax.random.key(0))
+
+
+def _flatten(variables: Variables) -> dict[str, Any]:
+    """{"params/encoder/...": leaf}."""
+    leaves = jax.tree_util.tree_leaves_with_path(variables)
+    return {"/".join(str(entry.key) for entry in path): leaf for path, leaf in leaves}
+
+
+def save_weights(
+    path: str | os.PathLike,
+    variables: Variables,
+    config: HumanGSConfig,
+    dtype: Literal["float32", "float16"] = "float32",
+) -> None:
+    """Write the variables; the file appears whole or not at all.
+
+    Raises: ValueError if a tensor does not fit the configuration, is not finite, or overflows float16, naming its key.
+    """
+    from safetensors.numpy import save
+
+    tensors = _check(_flatten(variables), expected_variables(config), str(path))
+    if dtype == "float16":
+        for key, tensor in tensors.items():
+            if np.abs(tensor).max(initial=0) > np.finfo(np.float16).max:
+                raise ValueError(f"{key}: overflows float16; store it as float32")
+    metadata = {"format": FORMAT, "version": VERSION, "config": config_to_json(config)}
+    data = save({key: np.ascontiguousarray(x, np.dtype(dtype)) for key, x in tensors.items()}, metadata)
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_bytes(data)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, HumanGSConfig]:
+    """Variables (float32) and configuration of a file; None loads the weights that come with the package.
+
+    Raises: FileNotFoundError; ValueError if the file is no weights file of ours, or a tensor is missing, unknown, of
+    the wrong shape or not finite, naming file and key.
+    """
+    if path is None:
+        with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:
+            if not shipped.exists():
+                raise FileNotFoundError("this installation ships no weights: give the path of a weights file")
+            return load_weights(shipped)
+    from safetensors import SafetensorError, safe_open
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no weights file {path}")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no mapping)
+    except (SafetensorError, TypeError) as error:
+        raise ValueError(f"{path} is no readable safetensors file: {error}") from error
+    if metadata.get("format") != FORMAT or metadata.get("version") != VERSION:
+        found = f"format {metadata.get('format')!r}, version {metadata.get('version')!r}"
+        raise ValueError(f"{path}: expected header format {FORMAT!r}, version {VERSION!r}; found {found}")
+    try:
+        config = config_from_json(metadata.get("config", ""))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    return variables_from_tensors(tensors, config, str(path)), config
+
+
+def variables_from_tensors(tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str) -> Variables:
+    """Float32 variables from flat tensors keyed by path; ValueError naming the key unless they are exactly those."""
+    expected = expected_variables(config)
+    arrays = _check(tensors, expected, where)
+    return jax.tree.unflatten(jax.tree.structure(expected), [jnp.asarray(x, jnp.float32) for x in arrays.values()])
+
+
+def _check(tensors: dict[str, Any], variables: Variables, where: str) -> dict[str, np.ndarray]:
+    """The tensors as numpy arrays, in the order of the variables' leaves, if they are exactly those."""
+    expected = _flatten(variables)
+    if missing := sorted(set(expected) - set(tensors)):
+        raise ValueError(f"{where}: tensor {missing[0]!r} is missing ({len(missing)} in all)")
+    if unknown := sorted(set(tensors) - set(expected)):
+        raise ValueError(f"{where}: tensor {unknown[0]!r} is unknown to this configuration ({len(unknown)} in all)")
+    arrays = {}
+    for key, leaf in expected.items():
+        array = np.asarray(tensors[key])
+        if array.shape != leaf.shape:
+            raise ValueError(f"{where}: tensor {key!r} has shape {array.shape}, the configuration wants {leaf.shape}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"{where}: tensor {key!r} holds numbers that are not finite")
+        arrays[key] = array
+    return arrays
