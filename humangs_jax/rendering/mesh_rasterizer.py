@@ -63,7 +63,8 @@ class Fragments:
     face_ids: (h, w) index of the face, -1 where there is none.
     barycentrics: (h, w, 3) perspective-correct weights of the face's corners, >= 0, of sum 1; 0 where there is no face.
     depth: (h, w) z in the camera, in the units of the vertices; -1 where there is no face.
-    overflow: faces that may be missing from the picture: they cross the near plane (or come after 2^30 rows of pixels).
+    overflow: faces that may be missing from the picture: they cross the near plane, are not finite numbers of pixels, or
+        come after the first 2^30 rows of pixels.
     """
 
     face_ids: Int[Array, "h w"]
@@ -138,13 +139,14 @@ def _pixel_centers(pixel, width, dtype):
 
 
 def _drawn(corners, near):
-    """Faces before the near plane that have an area in the image; and how many faces cross the near plane."""
-    before = corners[:, 2::3] > near
+    """Faces before the near plane that have an area in the image; and how many faces are left out that may be seen."""
+    z = corners[:, 2::3]
     ab, ac = corners[:, 3:5] - corners[:, 0:2], corners[:, 6:8] - corners[:, 0:2]
     area = jnp.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
     rounding = AREA_ROUNDING * jnp.finfo(corners.dtype).eps * jnp.abs(ab).sum(-1) * jnp.abs(ac).sum(-1)
-    drawn = before.all(-1) & jnp.isfinite(corners).all(-1) & (area > rounding)
-    return drawn, jnp.sum(before.any(-1) & ~before.all(-1), dtype=jnp.int32)
+    whole = (z > near).all(-1) & jnp.isfinite(area)
+    lost = ~whole & ~(z <= near).all(-1)  # also where z is NaN
+    return whole & (area > rounding), jnp.sum(lost, dtype=jnp.int32)
 
 
 def _rows(corners, drawn, width, height):

@@ -1,0 +1,378 @@
+"""The rasterizer against rays: every face meets every pixel's ray in float64 numpy, without edge functions."""
+
+import itertools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
+from humangs_jax.rendering.mesh_rasterizer import Fragments, RasterConfig, interpolate, rasterize_mesh
+
+PIXEL_ERROR = 1e-4
+"""Float32 positions of pixels: coordinates of tens of pixels are rounded to 4e-6, after a few operations each."""
+DEPTH_TIE = 1e-5
+"""Relative depth difference below which float32 may order two faces either way."""
+SMALL_STEPS = RasterConfig(rows_per_step=64, fragments_per_step=128)
+"""Many steps of both loops even on small meshes."""
+WIDTH, HEIGHT = 33, 21
+
+
+class Oracle(NamedTuple):
+    """What rays hit: (h, w) maps; `unsure` where an edge is within PIXEL_ERROR or two depths are within DEPTH_TIE."""
+
+    face_ids: np.ndarray
+    depth: np.ndarray
+    barycentrics: np.ndarray
+    steepness: np.ndarray  # |change of depth per pixel| of the face that is hit
+    unsure: np.ndarray
+
+
+def ray_oracle(vertices, faces, camera, near=0.01):
+    """A ray z d hits the plane of a face where z d = [v0 v1 v2] b with the weights b adding up to 1."""
+    transform, K = np.asarray(camera.cam_from_world, np.float64), np.asarray(camera.K, np.float64)
+    points = np.asarray(vertices, np.float64) @ transform[:3, :3].T + transform[:3, 3]
+    v = points[np.asarray(faces)]  # (f, corner, xyz)
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    d = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
+    normals = np.stack([np.cross(v[:, 1], v[:, 2]), np.cross(v[:, 2], v[:, 0]), np.cross(v[:, 0], v[:, 1])], axis=1)
+    determinant = np.einsum("fi,fi->f", v[:, 0], normals[:, 0])
+    drawn = (v[..., 2] > near).all(-1) & (np.abs(determinant) > 1e-14 * np.abs(v).max((1, 2)) ** 3)
+    scaled = normals[drawn] / determinant[drawn, None, None]
+    ids = np.flatnonzero(drawn)
+    weights = np.einsum("hwi,fci->fhwc", d, scaled)  # b / z
+    with np.errstate(divide="ignore"):
+        z = 1 / weights.sum(-1)
+    distance = (weights / np.linalg.norm(scaled[..., :2] / [K[0, 0], K[1, 1]], axis=-1)[:, None, None]).min(-1)
+    hits = np.where(distance >= 0, z, np.inf)
+    nearest = hits.argmin(0)  # of equal ones the first
+    row, column = np.indices(nearest.shape)
+    depth = hits[nearest, row, column]
+    hit = np.isfinite(depth)
+    unsure = ((np.abs(distance) < PIXEL_ERROR) & (z < np.where(hit, depth * (1 + DEPTH_TIE), np.inf))).any(0)
+    unsure |= ((hits > depth) & (hits < depth * (1 + DEPTH_TIE))).any(0)
+    slope = np.linalg.norm(scaled.sum(1)[:, :2] / [K[0, 0], K[1, 1]], axis=-1)[nearest]
+    finite = np.where(hit, depth, 0)
+    return Oracle(
+        face_ids=np.where(hit, ids[nearest], -1),
+        depth=np.where(hit, depth, -1),
+        barycentrics=np.where(hit[..., None], weights[nearest, row, column] * finite[..., None], 0),
+        steepness=finite**2 * slope,
+        unsure=unsure,
+    )
+
+
+def check_against_rays(fragments, vertices, faces, camera, pixel_error=PIXEL_ERROR, most_unsure=0.1):
+    oracle = ray_oracle(vertices, faces, camera)
+    assert oracle.unsure.mean() <= most_unsure  # or the test would be empty
+    ids = np.asarray(fragments.face_ids)
+    np.testing.assert_array_equal(ids[~oracle.unsure], oracle.face_ids[~oracle.unsure])
+    np.testing.assert_array_equal(np.asarray(fragments.depth)[ids < 0], -1)
+    np.testing.assert_array_equal(np.asarray(fragments.barycentrics)[ids < 0], 0)
+    same = (ids == oracle.face_ids) & (ids >= 0)
+    depth, weights = np.asarray(fragments.depth, np.float64)[same], np.asarray(fragments.barycentrics, np.float64)[same]
+    assert weights.min(initial=0) >= 0
+    np.testing.assert_allclose(weights.sum(-1), 1, atol=1e-6)
+    allowed = pixel_error * (oracle.steepness[same] + oracle.depth[same])
+    assert (np.abs(depth - oracle.depth[same]) <= allowed).all()
+    # the weights say where on the face: the same point, seen from the camera, as the ray's
+    corners = np.asarray(vertices, np.float64)[np.asarray(faces)[ids[same]]]
+    error = np.linalg.norm(np.einsum("pc,pci->pi", weights - oracle.barycentrics[same], corners), axis=-1)
+    assert (error <= allowed).all()
+    return oracle
+
+
+def sphere(rows=12, columns=18, radius=1.0):
+    """A closed sphere: shared vertices at the seam and at the poles."""
+    polar = np.pi * np.arange(1, rows) / rows
+    around = 2 * np.pi * np.arange(columns) / columns
+    ring = np.stack([np.cos(around), 0 * around, np.sin(around)], -1)
+    body = np.sin(polar)[:, None, None] * ring + np.cos(polar)[:, None, None] * np.array([0, 1, 0])
+    vertices = radius * np.concatenate([body.reshape(-1, 3), [[0, 1, 0], [0, -1, 0]]])
+    i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(rows - 2), np.arange(columns), indexing="ij"))
+    a, b = i * columns + j, i * columns + (j + 1) % columns
+    faces = [np.stack([a, b, a + columns], -1), np.stack([b, b + columns, a + columns], -1)]
+    j = np.arange(columns)
+    top, bottom, last = len(vertices) - 2, len(vertices) - 1, (rows - 2) * columns
+    faces.append(np.stack([0 * j + top, (j + 1) % columns, j], -1))
+    faces.append(np.stack([0 * j + bottom, last + j, last + (j + 1) % columns], -1))
+    return vertices.astype(np.float32), np.concatenate(faces).astype(np.int32)
+
+
+def some_camera(seed=0, distance=3.0, width=WIDTH, height=HEIGHT):
+    eye = np.random.default_rng(seed).normal(size=3)
+    eye = jnp.asarray(distance * eye / np.linalg.norm(eye), jnp.float32)
+    K = intrinsics_from_fov(0.8, width, height)
+    return look_at(eye, jnp.zeros(3), jnp.asarray([0.1, 1.0, 0.2]), K, width, height)
+
+
+def flat_camera(width=WIDTH, height=HEIGHT):
+    """Points (x, y, 1) are seen at the pixel position (x, y), exactly."""
+    return Camera.from_opencv(np.eye(3), np.eye(4), width, height)
+
+
+def draw(vertices, faces, camera, config=SMALL_STEPS):
+    return rasterize_mesh(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera, config)
+
+
+# --------------------------------------------------------------------------------------------- against rays
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([0.02, 0.2, 1.0, 4.0]))
+def test_random_triangles_equal_rays(seed, size):
+    rng = np.random.default_rng(seed)
+    centers = rng.uniform(-1, 1, (40, 1, 3))
+    vertices = (centers + size * rng.normal(size=(40, 3, 3))).reshape(-1, 3).astype(np.float32)
+    faces = np.arange(120).reshape(40, 3)
+    camera = some_camera(seed)
+    check_against_rays(draw(vertices, faces, camera), vertices, faces, camera)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_sphere_equals_rays(seed):
+    vertices, faces = sphere()
+    camera = some_camera(seed)
+    oracle = check_against_rays(draw(vertices, faces, camera), vertices, faces, camera)
+    assert 0.2 < (oracle.face_ids >= 0).mean() < 0.9
+
+
+def test_faces_smaller_than_pixels_equal_rays():
+    vertices, faces = sphere(30, 45)
+    camera = some_camera(5)
+    check_against_rays(draw(vertices, faces, camera, RasterConfig()), vertices, faces, camera)
+
+
+def test_strong_perspective_equals_rays():
+    """A floor from under the camera to far away: weights linear in the image would be wrong by more than half."""
+    vertices = np.array([[-40, 1, 0.3], [40, 1, 0.3], [-40, 1, 60], [40, 1, 60]], np.float32)
+    faces = np.array([[0, 1, 2], [1, 3, 2]])
+    camera = Camera.from_opencv([[20, 0, 16.2], [0, 20, 4.3], [0, 0, 1]], np.eye(4), WIDTH, HEIGHT)
+    check_against_rays(draw(vertices, faces, camera), vertices, faces, camera)
+
+
+def test_float64():
+    with jax.enable_x64(True):
+        vertices, faces = sphere()
+        camera = some_camera(3)
+        camera = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), camera)
+        fragments = draw(vertices.astype(np.float64), faces, camera)
+        assert fragments.depth.dtype == fragments.barycentrics.dtype == jnp.float64
+        assert fragments.face_ids.dtype == jnp.int32
+        check_against_rays(fragments, vertices, faces, camera, pixel_error=1e-11)
+
+
+# --------------------------------------------------------------------------------------------- watertight
+
+
+def grid(x, y):
+    """A sheet at z = 1 through the points x[i, j], y[i, j], cells cut along alternating diagonals."""
+    rows, columns = x.shape
+    vertices = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3).astype(np.float32)
+    faces = []
+    for i, j in itertools.product(range(rows - 1), range(columns - 1)):
+        a, b, c, d = i * columns + j, i * columns + j + 1, (i + 1) * columns + j, (i + 1) * columns + j + 1
+        faces += [[a, b, c], [b, d, c]] if (i + j) % 2 else [[a, b, d], [a, d, c]]
+    return vertices, np.array(faces)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 1e-7, 1e-6, 1e-3, 0.2]), st.sampled_from([1.0, 1.4]))
+def test_sheet_has_no_holes(seed, jitter, spacing):
+    """Vertices on pixel centres, edges through pixel centres, or both missed by roundings."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[-1:23, -1:35].astype(np.float64)
+    x, y = (spacing * a + 0.5 - (spacing - 1) + jitter * rng.normal(size=a.shape) for a in (x, y))
+    vertices, faces = grid(x, y)
+    faces = np.stack([np.roll(face, turn) for face, turn in zip(faces, rng.integers(0, 3, len(faces)), strict=True)])
+    faces[::2] = faces[::2, ::-1]  # neither winding nor the first corner may matter
+    fragments = draw(vertices, faces, flat_camera(), RasterConfig())
+    assert (np.asarray(fragments.face_ids) >= 0).all()
+
+
+def test_fans_of_slivers_have_no_holes():
+    """Two hundred thin faces around a vertex at, or next to, a pixel centre."""
+    around = np.linspace(0, 2 * np.pi, 200, endpoint=False)
+    i = np.arange(200)
+    faces = np.stack([np.full(200, 200), i, (i + 1) % 200], -1)
+    for center in ([16.5, 10.5], [16.5 + 1e-6, 10.5 - 2e-6], [16.4999, 10.50003], [16.0, 10.0]):
+        rim = np.array([16.5, 10.5]) + 60 * np.stack([np.cos(around), np.sin(around)], -1)
+        points = np.concatenate([rim, [center]])
+        vertices = np.concatenate([points, np.ones((201, 1))], -1).astype(np.float32)
+        fragments = draw(vertices, faces, flat_camera(), RasterConfig())
+        assert (np.asarray(fragments.face_ids) >= 0).all()
+
+
+def test_sphere_never_shows_its_inside():
+    """A hole in the front of a closed surface shows the back, which is further away than the centre."""
+    vertices, faces = sphere(20, 30)
+    for seed in range(10):
+        camera = some_camera(seed, width=128, height=128)
+        depth = np.asarray(draw(vertices, faces, camera, RasterConfig()).depth)
+        assert 0 < depth.max() < 3.0
+        # convex: seen from outside, the rows of the silhouette are whole
+        covered = depth > 0
+        assert (np.diff(covered.astype(int), axis=1) == 1).sum(1).max() == 1
+
+
+# --------------------------------------------------------------------------------------------- rules
+
+SQUARE = np.array([[2, 2, 1], [12, 2, 1], [2, 12, 1], [12, 12, 1]], np.float32)
+SQUARE_FACES = np.array([[0, 1, 2], [1, 3, 2]])
+
+
+def test_of_equal_depths_the_lowest_face_wins_whatever_the_step():
+    faces = np.concatenate([SQUARE_FACES + 4] + [SQUARE_FACES] * 20)  # many steps apart
+    vertices = np.concatenate([SQUARE, SQUARE + np.float32([0, 0, 1]) * 0.5])
+    vertices[4:, :2] *= 1.5  # the first two faces lie behind, in the same place of the image
+    ids = np.asarray(draw(vertices, faces, flat_camera()).face_ids)
+    assert set(np.unique(ids)) == {-1, 2, 3}
+
+
+def test_both_windings_are_drawn_alike():
+    camera = flat_camera()
+    front, back = draw(SQUARE, SQUARE_FACES, camera), draw(SQUARE, SQUARE_FACES[:, ::-1], camera)
+    np.testing.assert_array_equal(front.face_ids, back.face_ids)
+    np.testing.assert_allclose(front.barycentrics, back.barycentrics[..., ::-1], atol=1e-7)
+
+
+def test_edges_belong_to_the_face():
+    vertices = np.array([[0.5, 0.5, 1], [4.5, 0.5, 1], [0.5, 4.5, 1]], np.float32)
+    ids = np.asarray(draw(vertices, np.array([[0, 1, 2]]), flat_camera(6, 6)).face_ids)
+    expected = np.add.outer(np.arange(6), np.arange(6)) <= 4  # rows and columns 0 .. 4 and the diagonal between them
+    np.testing.assert_array_equal(ids == 0, expected)
+
+
+def test_near_plane_drops_and_counts():
+    """A face behind the camera, one that crosses the near plane, one beyond it."""
+    vertices = np.concatenate([SQUARE[:3] * [1, 1, -1], SQUARE[:3], SQUARE[:3]]).astype(np.float32)
+    vertices[3, 2] = 0.0
+    fragments = draw(vertices, np.arange(9).reshape(3, 3), flat_camera())
+    assert set(np.unique(fragments.face_ids)) == {-1, 2}
+    assert fragments.overflow == 1
+    behind = draw(-SQUARE, SQUARE_FACES, flat_camera())
+    assert (np.asarray(behind.face_ids) == -1).all() and behind.overflow == 0
+    assert (draw(SQUARE, SQUARE_FACES, flat_camera(), RasterConfig(near=1.5)).face_ids == -1).all()
+
+
+def test_bad_faces_are_harmless():
+    """Points, segments, NaN, infinity and coordinates near the largest float leave the other faces as they are."""
+    bad = np.array([[7, 7, 1], [np.nan, 7, 1], [7, np.inf, 1], [3e38, 3e38, 1], [4.5, 4.5, 0.5], [8.5, 8.5, 0.5]])
+    vertices = np.concatenate([SQUARE, bad]).astype(np.float32)
+    faces = [[4, 4, 4], [0, 3, 0], [0, 3, 3], [0, 1, 5], [6, 1, 2], [7, 0, 1], [8, 8, 9], [8, 9, 9], [8, 9, 8]]
+    faces = np.concatenate([faces, SQUARE_FACES])
+    with_bad, without = draw(vertices, faces, flat_camera()), draw(SQUARE, SQUARE_FACES, flat_camera())
+    ids = np.asarray(with_bad.face_ids)
+    np.testing.assert_array_equal(np.where(ids >= 0, ids - len(faces) + 2, -1), without.face_ids)
+    np.testing.assert_array_equal(with_bad.depth, without.depth)
+    np.testing.assert_array_equal(with_bad.barycentrics, without.barycentrics)
+    assert with_bad.overflow == 3  # NaN, infinity, and the one whose area overflows
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
+def test_units_do_not_matter(scale):
+    vertices, faces = sphere()
+    camera = some_camera(1)
+    one = draw(vertices, faces, camera)
+    config = RasterConfig(near=0.01 * scale, rows_per_step=64, fragments_per_step=128)
+    other = draw(vertices * np.float32(scale), faces, camera.in_units(1 / scale), config)
+    assert (np.asarray(one.face_ids) == other.face_ids).mean() > 0.99  # a pixel on an edge may go to the neighbour
+    same = (np.asarray(one.face_ids) == other.face_ids) & (np.asarray(one.face_ids) >= 0)
+    np.testing.assert_allclose(np.asarray(other.depth)[same] / scale, np.asarray(one.depth)[same], rtol=1e-4)
+
+
+def test_huge_faces_cover_everything():
+    vertices = np.float32([[-1e5, -1e5, 1], [3e5, -1e5, 1], [-1e5, 3e5, 1]])
+    fragments = draw(vertices, np.array([[0, 1, 2]]), flat_camera())
+    assert (np.asarray(fragments.face_ids) == 0).all()
+    np.testing.assert_allclose(fragments.depth, 1, rtol=1e-6)
+
+
+def test_tiny_faces_between_pixel_centers_are_not_seen():
+    vertices = np.float32([[7.6, 7.6, 1], [8.4, 7.7, 1], [7.7, 8.4, 1]])
+    assert (np.asarray(draw(vertices, np.array([[0, 1, 2]]), flat_camera()).face_ids) == -1).all()
+    vertices = np.float32([[7.4999, 7.4999, 1], [7.5003, 7.4999, 1], [7.4999, 7.5003, 1]])
+    ids = np.asarray(draw(vertices, np.array([[0, 1, 2]]), flat_camera()).face_ids)
+    assert np.argwhere(ids == 0).tolist() == [[7, 7]]
+
+
+def test_images_of_one_pixel_and_meshes_of_nothing():
+    vertices = jnp.asarray(SQUARE)
+    assert draw(vertices, SQUARE_FACES, Camera.from_opencv(np.eye(3), np.eye(4), 1, 1)).face_ids == -1
+    K = np.array([[1, 0, -6.0], [0, 1, -5.0], [0, 0, 1]])
+    assert draw(vertices, SQUARE_FACES, Camera.from_opencv(K, np.eye(4), 1, 1)).face_ids == 0
+    empty = draw(vertices, np.zeros((0, 3)), flat_camera())
+    assert (np.asarray(empty.face_ids) == -1).all() and (np.asarray(empty.depth) == -1).all()
+    image = interpolate(empty, jnp.zeros((0, 3), jnp.int32), vertices, jnp.asarray([1.0, 2.0, 3.0]))
+    np.testing.assert_array_equal(image, np.broadcast_to([1.0, 2.0, 3.0], (HEIGHT, WIDTH, 3)))
+
+
+# --------------------------------------------------------------------------------------------- transformations
+
+
+def test_vmap_equals_loop_and_steps_do_not_matter():
+    vertices, faces = sphere()
+    cameras = orbit(
+        jnp.zeros(3), 3.0, jnp.asarray([0.0, 1.0, 4.0]), 0.3, intrinsics_from_fov(0.8, WIDTH, HEIGHT), WIDTH, HEIGHT
+    )
+    moved = jnp.asarray(vertices) * jnp.asarray([1.0, 0.3, 1.2])[:, None, None]  # different numbers of steps
+    batch = jax.vmap(lambda v, camera: draw(v, faces, camera))(moved, cameras)
+    for i in range(3):
+        one = draw(moved[i], faces, cameras[i], RasterConfig())
+        np.testing.assert_array_equal(batch.face_ids[i], one.face_ids)
+        np.testing.assert_allclose(batch.depth[i], one.depth, rtol=1e-6)
+        np.testing.assert_allclose(batch.barycentrics[i], one.barycentrics, atol=1e-5)
+
+
+def test_interpolation_of_positions_is_the_seen_point():
+    vertices, faces = sphere()
+    camera = some_camera(2)
+    fragments = draw(vertices, faces, camera)
+    background = jnp.asarray([5.0, 6.0, 7.0])
+    points = np.asarray(interpolate(fragments, jnp.asarray(faces), jnp.asarray(vertices), background), np.float64)
+    covered = np.asarray(fragments.face_ids) >= 0
+    np.testing.assert_array_equal(points[~covered], np.broadcast_to(background, points[~covered].shape))
+    transform, K = np.asarray(camera.cam_from_world, np.float64), np.asarray(camera.K, np.float64)
+    seen = (points[covered] @ transform[:3, :3].T + transform[:3, 3]) @ K.T
+    rows, columns = np.nonzero(covered)
+    np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], np.stack([columns, rows], -1) + 0.5, atol=PIXEL_ERROR)
+    np.testing.assert_allclose(seen[:, 2], np.asarray(fragments.depth)[covered], rtol=1e-5)
+
+
+def test_corner_attributes_have_their_own_numbering():
+    fragments = draw(SQUARE, SQUARE_FACES, flat_camera())
+    attributes = jnp.asarray([[1.0], [2.0]])
+    image = np.asarray(interpolate(fragments, jnp.asarray([[0, 0, 0], [1, 1, 1]]), attributes, jnp.zeros(1)))[..., 0]
+    np.testing.assert_allclose(image, np.asarray(fragments.face_ids) + 1, atol=1e-6)
+
+
+def test_gradients_reach_attributes_and_nothing_else():
+    vertices, faces = jnp.asarray(SQUARE), jnp.asarray(SQUARE_FACES)
+    camera = flat_camera()
+
+    def total(vertices, attributes):
+        fragments = rasterize_mesh(vertices, faces, camera, SMALL_STEPS)
+        image = interpolate(fragments, faces, attributes, jnp.zeros(1))
+        return jnp.sum(image) + jnp.sum(jnp.where(fragments.depth > 0, fragments.depth, 0))
+
+    to_vertices, to_attributes = jax.grad(total, (0, 1))(vertices, jnp.ones((4, 1)))
+    np.testing.assert_array_equal(to_vertices, 0)
+    fragments = draw(vertices, faces, camera)
+    expected = np.zeros(4)
+    ids = np.asarray(fragments.face_ids)
+    np.add.at(expected, SQUARE_FACES[ids[ids >= 0]], np.asarray(fragments.barycentrics)[ids >= 0])
+    np.testing.assert_allclose(to_attributes[:, 0], expected, rtol=1e-5)
+    np.testing.assert_allclose(to_attributes.sum(), 100, rtol=1e-5)  # the square holds 10 x 10 pixel centres
+
+
+@pytest.mark.parametrize("platform", ["cpu", "cuda", "tpu"])
+def test_lowers_for_every_platform(platform):
+    camera = flat_camera()
+    function = jax.jit(lambda v, f: jax.vmap(lambda v: rasterize_mesh(v, f, camera))(v))
+    shapes = jax.ShapeDtypeStruct((2, 4, 3), jnp.float32), jax.ShapeDtypeStruct((2, 3), jnp.int32)
+    exported = jax.export.export(function, platforms=[platform])(*shapes)
+    assert isinstance(jax.tree.unflatten(exported.out_tree, exported.out_avals), Fragments)
