@@ -6,6 +6,7 @@ window lies in the image count, as there. The window is separable, and a sum of 
 faster on a CPU than the depthwise convolution that says the same.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -26,14 +27,32 @@ def window_weights() -> np.ndarray:
     return weights / weights.sum()
 
 
-def blur(x: Float[Array, "*b h w c"]) -> Float[Array, "*b y x c"]:
-    """The windowed mean around every pixel whose window lies inside the image: (h - 10, w - 10)."""
+def _windowed(x):
     weights = window_weights()
     height, width = x.shape[-3] - WINDOW + 1, x.shape[-2] - WINDOW + 1
-    if height < 1 or width < 1:
-        raise ValueError(f"an image of {x.shape[-2]} x {x.shape[-3]} has no {WINDOW} x {WINDOW} window")
     rows = sum(float(weight) * x[..., i : i + height, :, :] for i, weight in enumerate(weights))
     return sum(float(weight) * rows[..., i : i + width, :] for i, weight in enumerate(weights))
+
+
+@jax.custom_vjp
+def blur(x: Float[Array, "*b h w c"]) -> Float[Array, "*b y x c"]:
+    """The windowed mean around every pixel whose window lies inside the image: (h - 10, w - 10).
+
+    Raises: ValueError for an image smaller than the window.
+    """
+    if min(x.shape[-3:-1]) < WINDOW:
+        raise ValueError(f"an image of {x.shape[-2]} x {x.shape[-3]} has no {WINDOW} x {WINDOW} window")
+    return _windowed(x)
+
+
+def _blur_transposed(_, gradient):
+    # the window is symmetric, so the transpose is the same sum over the zero-padded gradient; left to itself, JAX would
+    # pad and add once per slice, which takes four times as long
+    margin = (WINDOW - 1, WINDOW - 1)
+    return (_windowed(jnp.pad(gradient, [(0, 0)] * (gradient.ndim - 3) + [margin, margin, (0, 0)])),)
+
+
+blur.defvjp(lambda x: (blur(x), None), _blur_transposed)
 
 
 def similarity_map(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"]) -> Float[Array, "y x c"]:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from humangs_jax.objectives.metrics import ssim
 from humangs_jax.objectives.ssim import (
     WINDOW,
+    blur,
     halve,
     multiscale_structural_dissimilarity,
     similarity_map,
@@ -59,6 +60,15 @@ def test_one_window_against_its_definition():
         ours = similarity_map(jnp.asarray(x), jnp.asarray(y))
     assert ours.shape == (1, 1, 1)
     assert abs(float(ours[0, 0, 0]) - expected) < FLOAT64_SSIM
+
+
+def test_blur_has_the_gradient_of_its_definition():
+    generator = np.random.default_rng(0)
+    x, y = generator.random((2, 14, 17, 2)), generator.random((2, 4, 7, 2))
+    with jax.enable_x64(True):
+        blurred, transpose = jax.vjp(blur, jnp.asarray(x))
+        (back,) = transpose(jnp.asarray(y))
+    assert abs(np.vdot(blurred, y) - np.vdot(x, back)) < 1e-10  # <Ax, y> = <x, A^T y> of some hundred numbers
 
 
 def test_equal_images_have_no_dissimilarity_and_no_gradient():
