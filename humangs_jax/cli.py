@@ -109,7 +109,11 @@ def render(
 
 
 def export(
-    avatar: Positional[Path], out: Path = Path("avatar.ply"), motion: Path | None = None, frame: int = 0, rest: bool = False
+    avatar: Positional[Path],
+    out: Path = Path("avatar.ply"),
+    motion: Path | None = None,
+    frame: int = 0,
+    rest: bool = False,
 ) -> None:
     """Export an avatar as a 3DGS .ply that Gaussian viewers open, in the T-pose or in one frame of a motion.
 

@@ -14,7 +14,17 @@ from humangs_jax.rendering.gaussians import Gaussians
 
 FORMAT = "humangs-avatar"
 VERSION = 1
-_ARRAYS = ("means", "quats", "scales", "opacities", "colors", "skinning_weights", "rest_vertices", "rest_joints", "faces")
+_ARRAYS = (
+    "means",
+    "quats",
+    "scales",
+    "opacities",
+    "colors",
+    "skinning_weights",
+    "rest_vertices",
+    "rest_joints",
+    "faces",
+)
 
 
 @pytree_dataclass

@@ -1,47 +1,54 @@
 """Photos with body poses -> one forward pass -> an avatar."""
 
+import dataclasses
+
 import jax
 
-from humangs_jax.array_types import PyTree
+from humangs_jax.array_types import Array, Int, PyTree
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel, shape_body
+from humangs_jax.capacity import round_up
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, prepare_inputs, standardize
-from humangs_jax.models.humangs import HumanGSConfig, apply_humangs
+from humangs_jax.models.humangs import HumanGSConfig, apply_humangs, touched_patches
 from humangs_jax.models.vertex_decoder import corrected_skinning_weights
+
 
 def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar:
     """Reconstruct the person of a capture.
 
-    The photos are brought to the network's image size (white background, centred square) and the body to the vertex count
-    that the weights were trained for (`config.body_vertices`). Compiled once per number of views and body.
+    The photos are brought to the network's image size (white, centred square), the body to the vertex count that the weights
+    were trained for (`config.body_vertices`), and the token capacity to what these photos need. Compiles once per number of
+    views, body and capacity, which is rounded up to few sizes.
 
-    Raises: ValueError if the capture has no view, or if foreground patches exceeded the network's token capacity.
+    Raises: ValueError if the capture has no view.
     """
-    if len(capture.images) == 0:
+    if capture.view_count == 0:
         raise ValueError("capture: 0 views; at least one photo is needed")
     body = capture.body
     if config.body_vertices is not None and config.body_vertices < len(body.template):
         body = decimate(body, config.body_vertices)
     views = standardize(capture, config.image_size)
-    avatar, dropped = _reconstruct_compiled(variables, config, body, views)
-    if int(dropped) > 0:
-        raise ValueError(
-            f"{int(dropped)} foreground patches do not fit into token_capacity = {config.token_capacity}: "
-            "use fewer views, or a configuration with a larger token_capacity"
-        )
-    return avatar
+    inputs = _prepare(body, views, config)
+    if config.tokens == "foreground":
+        capacity = round_up(int(_touched_patches(inputs, config)))
+        config = dataclasses.replace(config, token_capacity=capacity)
+    return _assemble_compiled(variables, config, body, views, inputs)[0]
 
 
 def reconstruct_views(
     variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews
-) -> tuple[Avatar, jax.Array]:
-    """The pure function behind `reconstruct`: one subject's views -> avatar and the count of patches dropped.
+) -> tuple[Avatar, Int[Array, ""]]:
+    """The pure function behind `reconstruct`: one subject's views -> avatar, and the count of foreground patches that did
+    not fit into `config.token_capacity`.
 
-    Batch over subjects with `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`.
+    Batch over subjects with `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`, the body being decimated already.
     """
-    inputs = prepare_inputs(body, views, config)
+    return _assemble(variables, config, body, views, prepare_inputs(body, views, config))
+
+
+def _assemble(variables, config, body, views, inputs):
     outputs, _ = apply_humangs(variables, inputs, config)
     rest = shape_body(body, views.betas)
     avatar = Avatar(
@@ -59,4 +66,6 @@ def reconstruct_views(
     return avatar, outputs.dropped_tokens
 
 
-_reconstruct_compiled = jax.jit(reconstruct_views, static_argnames="config")
+_assemble_compiled = jax.jit(_assemble, static_argnames="config")
+_prepare = jax.jit(prepare_inputs, static_argnames="config")
+_touched_patches = jax.jit(touched_patches, static_argnames="config")

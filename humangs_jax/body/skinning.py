@@ -55,13 +55,19 @@ def joint_transforms(
         slot = np.searchsorted(order[-1], parent)  # levels are sorted by joint index
         parent_world, parent_position = worlds[-1][slot], positions[-1][slot]
         bone = rest_joints[level] - rest_joints[parent]
-        worlds.append(jnp.matmul(parent_world, local[level], precision=EXACT))
+        worlds.append(_product(parent_world, local[level]))
         positions.append(parent_position + jnp.einsum("jab,jb->ja", parent_world, bone, precision=EXACT))
         order.append(level)
     from_order = np.argsort(np.concatenate(order))
     world, position = jnp.concatenate(worlds)[from_order], jnp.concatenate(positions)[from_order]
     offset = position - jnp.einsum("jab,jb->ja", world, rest_joints, precision=EXACT) + translation
     return transform.make(world, offset)
+
+
+def _product(a, b):
+    """a b of small matrices by multiplying and adding: exact on every backend, and XLA's CPU compiler (jax 0.10 to 0.12)
+    rejects the batched `dot` that two nested vmaps make of this product."""
+    return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
 def blend_transforms(weights: Float[Array, "n j"], transforms: Float[Array, "j 4 4"]) -> Float[Array, "n 4 4"]:

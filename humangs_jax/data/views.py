@@ -105,7 +105,7 @@ def standardize(capture: Capture, size: int) -> SubjectViews:
         images = np.stack([resize(x, (size, size, 3), anti_aliasing=size < side) for x in images])
         masks = np.stack([resize(x, (size, size), anti_aliasing=size < side) for x in masks])
     shift = jnp.asarray([[0, 0, left], [0, 0, top], [0, 0, 0]], jnp.float32)
-    square = Camera(capture.cameras.K + shift, capture.cameras.cam_from_world, side, side)
+    square = replace(capture.cameras, K=capture.cameras.K + shift, width=side, height=side)
     frames = np.asarray(capture.frames)
     return SubjectViews(
         images=jnp.asarray(images, jnp.float32),

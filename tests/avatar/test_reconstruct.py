@@ -1,0 +1,144 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.avatar.animate import skin
+from humangs_jax.avatar.reconstruct import reconstruct, reconstruct_views
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.library import load_body
+from humangs_jax.data.capture import capture_from_arrays
+from humangs_jax.data.views import SubjectViews, standardize
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.models.humangs import init_humangs
+from humangs_jax.models.presets import tiny
+from humangs_jax.rendering.splatting import SplatConfig, render
+
+SIZE = 32
+VMAP_TOLERANCE = 2e-5  # batched matrix products round differently
+
+
+@pytest.fixture(scope="module")
+def body():
+    return decimate(load_body(), 500)
+
+
+@pytest.fixture(scope="module")
+def network():
+    config = dataclasses.replace(tiny(), token_capacity=48)
+    return init_humangs(jax.random.key(0), config), config
+
+
+def subject_views(seed, views=2):
+    rng = np.random.default_rng(seed)
+    cameras = orbit(
+        jnp.asarray([0.0, 0.9, 0.0]),
+        2.0,
+        jnp.arange(float(views)),
+        0.1,
+        intrinsics_from_fov(np.pi / 3, SIZE, SIZE),
+        SIZE,
+        SIZE,
+    )
+    return SubjectViews(
+        jnp.asarray(rng.random((views, SIZE, SIZE, 3)), jnp.float32),
+        jnp.asarray(rng.random((views, SIZE, SIZE)) > 0.7, jnp.float32),
+        cameras,
+        jnp.asarray(0.2 * rng.normal(size=(views, 55, 3)), jnp.float32),
+        jnp.asarray(0.1 * rng.normal(size=(views, 3)), jnp.float32),
+        jnp.asarray(rng.normal(size=4), jnp.float32),
+    )
+
+
+def test_vmap_over_subjects_is_a_loop(body, network):
+    variables, config = network
+    subjects = [subject_views(seed) for seed in range(2)]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *subjects)
+    run = jax.jit(reconstruct_views, static_argnames="config")
+    batched = jax.jit(jax.vmap(lambda v: reconstruct_views(variables, config, body, v)))(batch)
+    for i, subject in enumerate(subjects):
+        alone = run(variables, config, body, subject)
+        one = jax.tree.map(lambda leaf, i=i: leaf[i], batched)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4), one, alone)
+
+
+def test_reconstruct_and_render_lower_for_every_platform(body, network):
+    variables, config = network
+
+    def picture(variables, views):
+        avatar, dropped = reconstruct_views(variables, config, body, views)
+        from humangs_jax.body.model import BodyPose
+
+        gaussians = skin(avatar, BodyPose(views.rotations[0], views.translations[0]))
+        return render(gaussians, views.cameras[0], SplatConfig()).rgb, dropped
+
+    exported = jax.export.export(jax.jit(picture), platforms=("cpu", "cuda", "tpu"))(variables, subject_views(0))
+    assert set(exported.platforms) == {"cpu", "cuda", "tpu"}
+    image, _ = exported.call(variables, subject_views(0))
+    expected, _ = jax.jit(picture)(variables, subject_views(0))
+    np.testing.assert_allclose(image, expected, atol=1e-5)
+
+
+def capture(body, height, width, views=2):
+    cameras = orbit(
+        jnp.asarray([0.0, 0.9, 0.0]),
+        2.2,
+        jnp.arange(float(views)),
+        0.1,
+        intrinsics_from_fov(np.pi / 3, width, height),
+        width,
+        height,
+    )
+    rng = np.random.default_rng(0)
+    return capture_from_arrays(
+        rng.random((views, height, width, 3)),
+        np.asarray(cameras.K),
+        np.asarray(cameras.cam_from_world),
+        np.zeros((1, 55, 3)),
+        np.zeros((1, 3)),
+        masks=np.ones((views, height, width)),
+        body=body,
+    )
+
+
+def test_photos_of_any_size_become_squares_with_cameras_that_follow(body):
+    photos = capture(body, 48, 36)
+    views = standardize(photos, SIZE)
+    assert views.images.shape == (2, SIZE, SIZE, 3) and views.cameras.width == SIZE
+    assert np.allclose(views.images[:, :, :3], 1, atol=1e-3)  # padded columns are white
+    from humangs_jax.geometry.camera import project
+
+    point = jnp.asarray([0.2, 1.1, 0.1])
+    before, _ = project(photos.cameras[1], point)
+    after, _ = project(views.cameras[1], point)
+    np.testing.assert_allclose(after, (np.asarray(before) + np.asarray([6, 0])) * SIZE / 48, atol=1e-3)
+
+
+def test_the_token_capacity_follows_the_photos(body, network):
+    variables, config = network
+    photos = capture(body, SIZE, SIZE, views=4)  # full masks: 4 x 16 patches, more than the configuration's 48
+    views = standardize(photos, SIZE)
+    _, dropped = jax.jit(reconstruct_views, static_argnames="config")(variables, config, body, views)
+    assert int(dropped) == 4 * 16 - 48
+    roomy = dataclasses.replace(config, token_capacity=64)
+    expected, none_dropped = jax.jit(reconstruct_views, static_argnames="config")(variables, roomy, body, views)
+    assert int(none_dropped) == 0
+    avatar = reconstruct(variables, config, photos)
+    np.testing.assert_allclose(avatar.gaussians.colors, expected.gaussians.colors, atol=VMAP_TOLERANCE)
+
+
+def test_no_photos_are_an_error(body, network):
+    with pytest.raises(ValueError, match="0 views"):
+        reconstruct(*network, capture(body, SIZE, SIZE).select([]))
+
+
+def test_the_body_is_decimated_to_what_the_weights_want(body, network):
+    variables, config = network
+    avatar = reconstruct(
+        variables, dataclasses.replace(config, body_vertices=300, token_capacity=64), capture(body, SIZE, SIZE)
+    )
+    per_vertex = config.decoder.gaussians_per_vertex
+    assert len(avatar.rest_vertices) == 300 and len(avatar.gaussians.means) == 300 * per_vertex
+    np.testing.assert_allclose(np.asarray(avatar.skinning_weights).sum(-1), 1, atol=1e-5)
