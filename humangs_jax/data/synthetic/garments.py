@@ -1,0 +1,202 @@
+"""Garments: shells cut out of the body and draped around it, and tubes (skirts) swept around hips and legs.
+
+A cut is a field over template coordinates, positive where there is cloth. A shell starts on the skin, is smoothed (cloth does
+not follow navels), moved outwards to the convex outlines of trunk and limbs, and never comes nearer to the skin than its ease.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from humangs_jax.data.synthetic import anatomy as anatomy_module
+from humangs_jax.data.synthetic import slices
+from humangs_jax.data.synthetic.anatomy import ANKLE, Anatomy, smoothstep
+from humangs_jax.data.synthetic.noise import ripples
+from humangs_jax.data.synthetic.surfaces import Surface, cut, grid_faces, smooth, turn_in_hems, unit, vertex_normals
+
+HEM_MARGIN = 0.012
+"""Skin is removed below cloth from this far inside the hem (metres of template coordinates)."""
+TUBE_COLUMNS, TUBE_STEP = 72, 0.035
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """How a shell hangs. Metres.
+
+    ease: distance from skin (at least) and from the outlines. hang: slope by which hanging cloth may narrow downwards (metres
+    per metre; large clings). sleeve, leg: width added at the end of the limb. fold: height of the folds. hem: depth of the hem.
+    """
+
+    ease: float
+    hang: float = 3.0
+    sleeve: float = 0.0
+    leg: float = 0.0
+    leg_hang: float = 3.0
+    fold: float = 0.004
+    hem: float = 0.008
+
+
+def shell(rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], fit: Fit) -> Surface:
+    """A garment that covers the skin where all fields (n,) over the body's vertices are positive."""
+    skin = anatomy.skin
+    surface = skin.with_attributes(
+        skin_point=skin.vertices, arm=anatomy.arm, leg=anatomy.leg, **{f"field{i}": f for i, f in enumerate(fields)}
+    )
+    for i in range(len(fields)):
+        surface = cut(surface, surface.attributes[f"field{i}"])
+    draped = _drape(rng, anatomy, surface, fit)
+    weights = smooth_weights(draped.weights, draped.faces, 4)
+    kept = {name: draped.attributes[name] for name in ("template", "cloth")}
+    return turn_in_hems(Surface(draped.vertices, draped.faces, weights, kept), fit.hem)
+
+
+def covered(fields: list[np.ndarray], margin: float = HEM_MARGIN) -> np.ndarray:
+    """(n,) whether a body vertex lies under the cloth of `fields`, hems excluded."""
+    return np.min(fields, axis=0) > margin
+
+
+def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> np.ndarray:
+    """Skinning weights (n, j) smoothed over a surface; rows sum to 1."""
+    used = weights.max(0) > 0
+    smoothed = np.zeros_like(weights)
+    smoothed[:, used] = smooth(weights[:, used], faces, iterations)
+    return smoothed / smoothed.sum(1, keepdims=True)
+
+
+def _drape(rng, anatomy, surface, fit):
+    below, arm, leg = (surface.attributes[name] for name in ("skin_point", "arm", "leg"))
+    normals = unit(smooth(surface.attributes["normals"], surface.faces, 2))
+    points = smooth(below, surface.faces, 4, keep_hems=True) + fit.ease * normals
+    points = _push_trunk(anatomy, points, arm, leg, fit)
+    for side in (0, 1):
+        points = _push_arm(anatomy, points, arm, side, fit)
+        points = _push_leg(anatomy, points, leg, side, fit)
+    points = smooth(points, surface.faces, 3, keep_hems=True)
+    outer = vertex_normals(points, surface.faces)
+    cloth = surface.attributes["cloth"]
+    points = points + (fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11))[:, None] * outer
+    distance = np.sum((points - below) * surface.attributes["normals"], -1)
+    points = points + np.maximum(fit.ease - distance, 0)[:, None] * surface.attributes["normals"]
+    side = np.sign(surface.attributes["template"][:, 0])
+    thighs = leg > 0.6  # trouser legs do not cross the middle
+    points[:, 0] = np.where(thighs, side * np.maximum(side * points[:, 0], 0.004), points[:, 0])
+    return surface.moved(points)
+
+
+def _push_trunk(anatomy, points, arm, leg, fit):
+    outline = slices.hanging(anatomy.trunk, fit.hang)
+    angle, radius = slices.polar(points[:, [0, 2]], np.zeros((1, 2)))
+    wanted = outline.radius(points[:, 1], angle) + fit.ease
+    below_armpit = 1 - smoothstep(-0.03, 0.06, anatomy_height(anatomy, points))
+    amount = (1 - arm) * (1 - leg) * below_armpit
+    grown = radius + amount * np.maximum(wanted - radius, 0)
+    scale = grown / np.maximum(radius, 1e-4)
+    return np.stack([points[:, 0] * scale, points[:, 1], points[:, 2] * scale], -1)
+
+
+def anatomy_height(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
+    """(n,) heights of points above the shoulders' height less that of the template: about template y for the trunk."""
+    shoulders = anatomy.joints[anatomy_module.LEFT_SHOULDER, 1]
+    return points[:, 1] - shoulders + anatomy_module.ARM_HEIGHT
+
+
+def _push_arm(anatomy, points, arm, side, fit):
+    outline = anatomy.arms[side]
+    along = np.abs(points[:, 0])
+    start, end = outline.levels[0] + 0.12, outline.levels[-1] - 0.1
+    extra = fit.sleeve * np.clip((along - start) / (end - start), 0, 1)
+    center = outline.center(along)
+    angle, radius = slices.polar(points[:, [1, 2]], center)
+    wanted = outline.radius(along, angle) + fit.ease + extra
+    own = (points[:, 0] > 0) if side == 0 else (points[:, 0] < 0)
+    scale = 1 + own * arm * np.maximum(wanted - radius, 0) / np.maximum(radius, 1e-4)
+    across = center + (points[:, [1, 2]] - center) * scale[:, None]
+    return np.stack([points[:, 0], across[:, 0], across[:, 1]], -1)
+
+
+def _push_leg(anatomy, points, leg, side, fit):
+    shape = anatomy.legs[side]
+    inner = shape.with_radii(np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii))
+    outline = slices.hanging(inner, fit.leg_hang)
+    center = outline.center(points[:, 1])
+    angle, radius = slices.polar(points[:, [0, 2]], center)
+    down = np.clip((-0.45 - points[:, 1]) / 0.65, 0, 1)
+    wanted = outline.radius(points[:, 1], angle) + fit.ease + fit.leg * down
+    own = (points[:, 0] > 0) if side == 0 else (points[:, 0] < 0)
+    scale = 1 + own * leg * np.maximum(wanted - radius, 0) / np.maximum(radius, 1e-4)
+    across = center + (points[:, [0, 2]] - center) * scale[:, None]
+    return np.stack([across[:, 0], points[:, 1], across[:, 1]], -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Skirt:
+    """top, bottom: template heights. ease, flare: metres added at the top, and per metre further down. pleats: count, depth."""
+
+    top: float
+    bottom: float
+    ease: float
+    flare: float
+    pleats: int = 0
+    pleat_depth: float = 0.0
+
+
+def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
+    """A tube around the hips and both legs."""
+    rows = max(3, int(np.ceil((cut_of.top - cut_of.bottom) / TUBE_STEP)) + 1)
+    template_y = np.linspace(cut_of.top, cut_of.bottom, rows)
+    y = rest_height(anatomy, template_y)
+    angle = np.arange(TUBE_COLUMNS) * (2 * np.pi / TUBE_COLUMNS)
+    outline = slices.blurred(slices.hanging(anatomy.hips_and_legs, 0.15))
+    height, around = (x.reshape(-1) for x in np.meshgrid(y, angle, indexing="ij"))
+    down = np.repeat((cut_of.top - template_y) / max(cut_of.top - cut_of.bottom, 1e-6), TUBE_COLUMNS)
+    drop = np.repeat(cut_of.top - template_y, TUBE_COLUMNS)
+    radius = outline.radius(height, around) + cut_of.ease + cut_of.flare * drop
+    pleats = np.cos(cut_of.pleats * around) if cut_of.pleats else 0
+    wave = ripples(rng, np.stack([np.sin(around), 0.3 * height, np.cos(around)], -1), wavelength=0.9)
+    radius = radius + down * (cut_of.pleat_depth * pleats + 0.012 * (1 + 4 * cut_of.flare) * wave)
+    vertices = np.stack([radius * np.sin(around), height, radius * np.cos(around)], -1).astype(np.float32)
+    template = np.stack([0.16 * np.sin(around), np.repeat(template_y, TUBE_COLUMNS), 0.02 + 0.16 * np.cos(around)], -1)
+    cloth = np.stack([template[:, 0], template[:, 1], template[:, 2] - 0.02, np.full(len(template), 0.16)], -1)
+    faces = grid_faces(rows, TUBE_COLUMNS, closed=True)
+    weights = _skirt_weights(anatomy, vertices, template[:, 1])
+    surface = Surface(
+        vertices, faces, weights, {"template": template.astype(np.float32), "cloth": cloth.astype(np.float32)}
+    )
+    return turn_in_hems(surface, 0.008)
+
+
+def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
+    """Rest heights of the person for heights on the trunk and the legs of the template."""
+    names = (anatomy_module.LEFT_ANKLE, anatomy_module.LEFT_KNEE, anatomy_module.LEFT_HIP, anatomy_module.LEFT_SHOULDER)
+    marks = [ANKLE, -0.764, -0.358, anatomy_module.ARM_HEIGHT]
+    person = [anatomy.joints[i, 1] for i in names]
+    slope_low, slope_high = template_y - marks[0], template_y - marks[-1]
+    inside = np.interp(template_y, marks, person)
+    return inside + np.minimum(slope_low, 0) + np.maximum(slope_high, 0)
+
+
+def _skirt_weights(anatomy, vertices, template_y):
+    """The trunk's weights at the waist, then more and more of the thighs (and shins), shared by the side a vertex is on."""
+    template = anatomy.skin.attributes["template"]
+    near = np.flatnonzero((np.abs(template[:, 0]) < 0.2) & (template[:, 1] < 0.0) & (template[:, 1] > -0.4))[::2]
+    trunk = nearest_weights(anatomy, vertices, near)
+    left = smoothstep(-0.09, 0.09, vertices[:, 0])
+    thigh = 0.92 * smoothstep(0.30, 0.58, -template_y)
+    shin = 0.75 * smoothstep(0.70, 0.98, -template_y)
+    legs = np.zeros_like(trunk)
+    for joint, share in (
+        (anatomy_module.LEFT_HIP, left * (1 - shin)),
+        (anatomy_module.LEFT_HIP + 1, (1 - left) * (1 - shin)),
+        (anatomy_module.LEFT_KNEE, left * shin),
+        (anatomy_module.LEFT_KNEE + 1, (1 - left) * shin),
+    ):
+        legs[:, joint] = share
+    return (trunk * (1 - thigh)[:, None] + legs * thigh[:, None]).astype(np.float32)
+
+
+def nearest_weights(anatomy: Anatomy, points: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """(n, j) mean skinning weights of the body vertices nearest to each point, among candidate vertex indices."""
+    body = anatomy.skin.vertices[candidates]
+    squared = np.sum(points**2, -1)[:, None] - 2 * points @ body.T + np.sum(body**2, -1)[None]
+    nearest = np.argpartition(squared, 6, axis=1)[:, :6]
+    return anatomy.skin.weights[candidates][nearest].mean(1)

@@ -1,0 +1,53 @@
+"""Smooth random functions of position: sums of plane waves (cheap, band-limited) and lattice noise (irregular)."""
+
+import numpy as np
+
+
+def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float, waves: int = 6) -> np.ndarray:
+    """(n,) a random band-limited function of points (n, 3), of unit amplitude or so, with features of a wavelength."""
+    return Ripples(rng, wavelength, waves)(points)
+
+
+class Ripples:
+    """A random sum of plane waves; the same object is the same function for every view."""
+
+    def __init__(self, rng: np.random.Generator, wavelength: float, waves: int = 6, stretch=(1.0, 1.0, 1.0)):
+        direction = rng.normal(size=(3, waves))
+        direction /= np.linalg.norm(direction, axis=0)
+        scale = 2 * np.pi / wavelength * rng.uniform(0.6, 1.5, waves)
+        self.k = (direction * scale * np.asarray(stretch)[:, None]).astype(np.float32)
+        self.phase = rng.uniform(0, 2 * np.pi, waves).astype(np.float32)
+        self.amplitude = np.float32(np.sqrt(2 / waves) * 0.7)
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """(n,) values at (n, 3) points."""
+        return self.amplitude * np.sin(points.astype(np.float32) @ self.k + self.phase).sum(-1)
+
+    def gradient(self, points: np.ndarray) -> np.ndarray:
+        """(n, 3) derivatives at (n, 3) points."""
+        return self.amplitude * np.cos(points.astype(np.float32) @ self.k + self.phase) @ self.k.T
+
+
+def lattice(points: np.ndarray, seed: int) -> np.ndarray:
+    """(n,) value noise in [0, 1] of (n, d) points: random values on the integer lattice, blended smoothly; d = 1, 2 or 3."""
+    base = np.floor(points)
+    t = (points - base).astype(np.float32)
+    t = t * t * (3 - 2 * t)
+    cell = base.astype(np.int64)
+    total = np.zeros(len(points), np.float32)
+    for corner in range(1 << points.shape[1]):
+        bits = [(corner >> axis) & 1 for axis in range(points.shape[1])]
+        weight = np.ones(len(points), np.float32)
+        for axis, bit in enumerate(bits):
+            weight = weight * (t[:, axis] if bit else 1 - t[:, axis])
+        total += weight * hashed(cell + np.asarray(bits), seed)
+    return total
+
+
+def hashed(cells: np.ndarray, seed: int) -> np.ndarray:
+    """(n,) uniform [0, 1) numbers of integer cells (n, d), the same for the same cell and seed."""
+    primes = np.asarray([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint64)[: cells.shape[1]]
+    mixed = (cells.astype(np.uint64) * primes).sum(-1, dtype=np.uint64) + np.uint64(seed * 0x27D4EB2F & 0xFFFFFFFF)
+    mixed = (mixed ^ (mixed >> np.uint64(15))) * np.uint64(0x2C1B3C6D) & np.uint64(0xFFFFFFFF)
+    mixed = (mixed ^ (mixed >> np.uint64(12))) * np.uint64(0x297A2D39) & np.uint64(0xFFFFFFFF)
+    return ((mixed ^ (mixed >> np.uint64(15))) & np.uint64(0xFFFFFF)).astype(np.float32) / np.float32(1 << 24)

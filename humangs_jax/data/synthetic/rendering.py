@@ -1,0 +1,97 @@
+"""Views of a synthetic person: rasterized at twice the size, shaded per pixel, box-averaged."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.data.synthetic.fabrics import Spots
+from humangs_jax.data.synthetic.noise import Ripples
+from humangs_jax.data.synthetic.shading import bend_normals, occlusion, shade
+from humangs_jax.data.synthetic.subject import SyntheticSubject
+from humangs_jax.data.synthetic.surfaces import vertex_normals
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
+
+SUPERSAMPLING = 2
+VERTEX_STEP, FACE_STEP = 4096, 8192
+"""Meshes are padded to multiples of these, so that few shapes are compiled."""
+INSIDE_SHADE = 0.45
+"""Brightness of the inner side of cloth."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PosedSubject:
+    """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n, 3), openness (n,)."""
+
+    subject: SyntheticSubject
+    rotations: np.ndarray
+    translation: np.ndarray
+    vertices: np.ndarray
+    normals: np.ndarray
+    openness: np.ndarray
+
+
+def pose_subject(subject: SyntheticSubject, rotations: np.ndarray, translation: np.ndarray) -> PosedSubject:
+    """Skin the mesh and gather what its shading needs."""
+    vertices = subject.posed_vertices(rotations, translation).astype(np.float32)
+    normals = vertex_normals(vertices, subject.surface.faces)
+    return PosedSubject(subject, rotations, translation, vertices, normals, occlusion(vertices, normals))
+
+
+def render_view(posed: PosedSubject, camera: Camera, background: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """(h, w, 3) picture on the background and (h, w) coverage of one camera, both in [0, 1]."""
+    s = SUPERSAMPLING
+    large = camera.resized(camera.width * s, camera.height * s)
+    faces = posed.subject.surface.faces
+    fragments = rasterize_mesh(*_padded(posed.vertices, faces), large)
+    ids = np.asarray(fragments.face_ids).reshape(-1)
+    seen = np.flatnonzero(ids >= 0)
+    barycentrics = np.asarray(fragments.barycentrics).reshape(-1, 3)[seen]
+    eye = np.asarray(camera.center, np.float32)
+    picture = np.full((len(ids), 3), background, np.float32)
+    picture[seen] = _shade_pixels(posed, ids[seen], barycentrics, eye)
+    shape = (camera.height, s, camera.width, s)
+    image = picture.reshape(*shape, 3).mean(axis=(1, 3))
+    mask = (ids >= 0).astype(np.float32).reshape(shape).mean(axis=(1, 3))
+    return np.clip(image, 0, 1), mask
+
+
+def _padded(vertices, faces):
+    """Repeats a vertex and appends faces without area up to the next step: the rasterizer then compiles few times."""
+    extra_vertices, extra_faces = -len(vertices) % VERTEX_STEP, -len(faces) % FACE_STEP
+    vertices = np.concatenate([vertices, np.repeat(vertices[:1], extra_vertices, 0)])
+    return jnp.asarray(vertices), jnp.asarray(np.concatenate([faces, np.zeros((extra_faces, 3), faces.dtype)]))
+
+
+def _shade_pixels(posed, ids, barycentrics, eye):
+    subject = posed.subject
+    faces, attributes = subject.surface.faces, subject.surface.attributes
+    values = np.concatenate(
+        [posed.vertices, posed.normals, posed.openness[:, None], attributes["cloth"], attributes["template"]], axis=1
+    )
+    corners = faces[ids]
+    blended = sum(barycentrics[:, i : i + 1] * values[corners[:, i]] for i in range(3))
+    points, normals, openness = blended[:, :3], blended[:, 3:6], blended[:, 6]
+    spots = Spots(blended[:, 7:11], blended[:, 11:14])
+    a, b, c = (posed.vertices[corners[:, i]] for i in range(3))
+    flat = np.cross(b - a, c - a)
+    inside = np.sum(flat * (eye - points), -1) < 0
+    normals = normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-9)
+    normals = np.where(inside[:, None], -normals, normals)
+    material_ids = subject.face_materials[ids]
+    albedo, sheen = np.empty_like(points), np.zeros(len(ids), np.float32)
+    order = np.argsort(material_ids, kind="stable")
+    bounds = np.searchsorted(material_ids[order], np.arange(len(subject.materials) + 1))
+    for k, material in enumerate(subject.materials):
+        chosen = order[bounds[k] : bounds[k + 1]]
+        if len(chosen) == 0:
+            continue
+        own = Spots(spots.cloth[chosen], spots.template[chosen])
+        albedo[chosen], sheen[chosen] = material.albedo(own), material.sheen
+        if material.wrinkles > 0:
+            folds = Ripples(np.random.default_rng([subject.seed, 100 + k]), 0.09, 8, stretch=(1.0, 0.7, 1.0))
+            slope = 0.012 * material.wrinkles * folds.gradient(own.cloth[:, :3])
+            normals[chosen] = bend_normals(normals[chosen], slope)
+    openness = np.where(inside, INSIDE_SHADE * openness, openness)
+    return shade(subject.lights, np.clip(albedo, 0.01, None), normals, openness, sheen)
