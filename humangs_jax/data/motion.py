@@ -15,6 +15,7 @@ folder of them)    jaw_pose, leye_pose, reye_pose (3,), lhand_pose, rhand_pose (
 In memory: SMPL-X's 55 joints, axis-angle in radians, metres, y up. What a file does not tell (fingers, eyes) is 0.
 """
 
+import functools
 import json
 import re
 from collections.abc import Mapping
@@ -33,7 +34,7 @@ from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.restricted_pickle import as_array, read_pickle
 from humangs_jax.body.smplx import HandBasis
 from humangs_jax.data.npz import read_npz
-from humangs_jax.geometry import quaternion
+from humangs_jax.geometry import quaternion, transform
 from humangs_jax.pytree import pytree_dataclass, replace, static_field
 
 WALK = "walk.npz"
@@ -142,12 +143,18 @@ def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion
     Arguments:
         rest, parents: of the body that will move. Its lowest joint is asked, and as far below it as in T-pose is the sole.
     """
-    transforms = jax.vmap(skinning.joint_transforms, in_axes=(None, None, 0, 0))
-    joint_transforms = transforms(rest.joints, parents, motion.rotations, motion.translations)
-    joints = jnp.einsum("mjik,jk->mji", joint_transforms[..., :3, :3], rest.joints) + joint_transforms[..., :3, 3]
+    joints = _joint_paths(rest.joints, parents, motion.rotations, motion.translations)
     sole = rest.joints[:, 1].min() - rest.vertices[:, 1].min()
     shift = jnp.stack([joints[0, 0, 0], joints[..., 1].min() - sole, joints[0, 0, 2]])
     return replace(motion, translations=motion.translations - shift)
+
+
+@functools.partial(jax.jit, static_argnames="parents")
+def _joint_paths(rest_joints, parents, rotations, translations):
+    """(m, j, 3) joints in space."""
+    transforms = jax.vmap(skinning.joint_transforms, in_axes=(None, None, 0, 0))
+    transforms = transforms(rest_joints, parents, rotations, translations)
+    return transform.apply(transforms, rest_joints)
 
 
 # Formats: each returns rotations (m, 55, 3), translations (m, 3), frames per second, the format's up axis or None (y) ----

@@ -1,0 +1,360 @@
+import json
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.body.model import BodyPose, RestBody
+from humangs_jax.body.skinning import joint_transforms
+from humangs_jax.body.smplx import HandBasis
+from humangs_jax.data.motion import PELVIS, UPRIGHT, Motion, MotionError, grounded, load_motion, save_motion
+from humangs_jax.geometry import quaternion
+
+FLOAT32 = 1e-5
+"""Angles up to 3 rad and metres in float32, a few operations."""
+FRAMES = 6
+
+
+def random(shape, seed=0, scale=0.2):
+    return np.random.default_rng(seed).normal(size=shape) * scale
+
+
+def write(path, **arrays):
+    np.savez(path, **arrays)
+    return path
+
+
+def upright_poses(columns):
+    """Poses whose pelvis stands on +y."""
+    return random((FRAMES, columns), scale=0.1)
+
+
+# Formats -------------------------------------------------------------------------------------------------------------
+
+
+def test_our_own_format_round_trips(tmp_path):
+    motion = Motion(
+        jnp.asarray(random((FRAMES, 55, 3)), jnp.float32), jnp.asarray(random((FRAMES, 3)), jnp.float32), 24.0
+    )
+    save_motion(tmp_path / "a.npz", motion)
+    back = load_motion(tmp_path / "a.npz")
+    jax.tree.map(np.testing.assert_array_equal, motion, back)  # fps is part of the structure
+    assert load_motion(tmp_path / "a.npz", fps=30).fps == 30.0
+    np.testing.assert_array_equal(back.pose(3).rotations, motion.rotations[3])
+    assert back.pose(3).translation.shape == (3,)
+
+
+def test_amass_with_all_joints(tmp_path):
+    poses, trans = upright_poses(165), random((FRAMES, 3))
+    motion = load_motion(write(tmp_path / "a.npz", poses=poses, trans=trans, mocap_framerate=120.0, betas=np.zeros(16)))
+    np.testing.assert_allclose(motion.rotations, poses.reshape(FRAMES, 55, 3), atol=FLOAT32)
+    np.testing.assert_allclose(motion.translations, trans, atol=FLOAT32)
+    assert motion.fps == 120.0
+
+
+def test_amass_without_face_puts_the_hands_where_they_belong(tmp_path):
+    poses = upright_poses(156)
+    arrays = dict(poses=poses, trans=np.zeros((FRAMES, 3)), mocap_frame_rate=np.array(60), gender=np.array("male"))
+    motion = load_motion(write(tmp_path / "a.npz", **arrays, labels=np.array([{"pickled": 1}], object)))
+    flat = np.asarray(motion.rotations).reshape(FRAMES, -1)
+    np.testing.assert_allclose(flat[:, :66], poses[:, :66], atol=FLOAT32)
+    assert (flat[:, 66:75] == 0).all()
+    np.testing.assert_allclose(flat[:, 75:], poses[:, 66:], atol=FLOAT32)
+    left_index = np.asarray(motion.rotations)[:, JOINT_NAMES.index("left_index1")]
+    np.testing.assert_allclose(left_index, poses[:, 66:69], atol=FLOAT32)
+
+
+@pytest.mark.parametrize("suffix", [".pkl", ".npz"])
+@pytest.mark.parametrize("scaling", [None, 93.77])
+def test_aist(tmp_path, suffix, scaling):
+    poses, metres = random((FRAMES, 72)), random((FRAMES, 3), 1)
+    data = {"smpl_poses": poses, "smpl_trans": metres * (scaling or 1000), "smpl_loss": 0.1}
+    if scaling:
+        data["smpl_scaling"] = np.array([scaling])
+    path = tmp_path / f"gBR{suffix}"
+    if suffix == ".pkl":
+        path.write_bytes(pickle.dumps(data))
+    else:
+        write(path, **data)
+    motion = load_motion(path)
+    np.testing.assert_allclose(motion.rotations.reshape(FRAMES, -1)[:, :66], poses[:, :66], atol=FLOAT32)
+    assert (np.asarray(motion.rotations)[:, 22:] == 0).all()  # SMPL's hand joints are not ours
+    np.testing.assert_allclose(motion.translations, metres, atol=FLOAT32)
+    assert motion.fps == 60.0
+
+
+def smpl_params(**changes):
+    parts = dict(
+        global_orient=upright_poses(3),
+        transl=random((FRAMES, 3)),
+        body_pose=random((FRAMES, 63), 1),
+        jaw_pose=random((FRAMES, 3), 2),
+        left_hand_pose=random((FRAMES, 45), 3),
+        right_hand_pose=random((FRAMES, 45), 4),
+        betas=np.zeros((1, 10)),
+        expression=np.zeros((FRAMES, 10)),
+    )
+    return {k: v for k, v in {**parts, **changes}.items() if v is not None}
+
+
+def test_smpl_params(tmp_path):
+    parts = smpl_params()
+    motion = load_motion(write(tmp_path / "smpl_params.npz", **parts))
+    rotations = np.asarray(motion.rotations)
+    expected = [parts[k] for k in ("global_orient", "body_pose", "jaw_pose")] + [np.zeros((FRAMES, 6))]
+    expected += [parts["left_hand_pose"], parts["right_hand_pose"]]
+    np.testing.assert_allclose(rotations.reshape(FRAMES, -1), np.concatenate(expected, 1), atol=FLOAT32)
+    np.testing.assert_allclose(motion.translations, parts["transl"], atol=FLOAT32)
+    assert motion.fps == 30.0
+    few = smpl_params(jaw_pose=None, left_hand_pose=None, right_hand_pose=None)
+    assert (np.asarray(load_motion(write(tmp_path / "b.npz", **few)).rotations)[:, 22:] == 0).all()
+
+
+def test_hand_conventions(tmp_path):
+    """Principal coefficients and mean hands need the model's basis, and are used as it says."""
+    basis = HandBasis(jnp.asarray(random((2, 45), 5), jnp.float32), jnp.asarray(random((2, 45, 45), 6), jnp.float32))
+    parts = smpl_params(left_hand_pose=random((FRAMES, 12), 7), right_hand_pose=None)
+    path = write(tmp_path / "a.npz", **parts)
+    with pytest.raises(MotionError, match="left_hand_pose: 12 numbers are principal coefficients"):
+        load_motion(path)
+    flat = np.asarray(load_motion(path, hands=basis).rotations)[:, 25:40].reshape(FRAMES, 45)
+    np.testing.assert_allclose(flat, parts["left_hand_pose"] @ np.asarray(basis.components)[0, :12], atol=FLOAT32)
+    mean = np.asarray(load_motion(path, hands=basis, flat_hand_mean=False).rotations)
+    np.testing.assert_allclose(mean[:, 25:40].reshape(FRAMES, 45), flat + np.asarray(basis.means)[0], atol=FLOAT32)
+    assert (mean[:, 40:] == 0).all()  # a hand that the file does not have stays flat
+    with pytest.raises(ValueError, match="needs the mean hand"):
+        load_motion(path, flat_hand_mean=False)
+
+
+def lhm_frame(i, **changes):
+    parts = dict(
+        betas=[0.0] * 10,
+        root_pose=[0.1, 0.01 * i, 0.0],
+        body_pose=random((21, 3), i).tolist(),
+        jaw_pose=[0.1, 0, 0],
+        leye_pose=[0, 0.1, 0],
+        reye_pose=[0, 0, 0.1],
+        lhand_pose=random((15, 3), 10 + i).tolist(),
+        rhand_pose=random((15, 3), 20 + i).tolist(),
+        trans=[0.1 * i, 0, 2],
+        focal=[1000, 1000],
+        princpt=[256, 256],
+        img_size_wh=[512, 512],
+    )
+    return {**parts, **changes}
+
+
+def write_lhm(folder, frames):
+    folder.mkdir()
+    for i, frame in enumerate(frames):
+        (folder / f"{i + 8}.json").write_text(json.dumps(frame))  # 8, 9, 10, 11: numbers, not words
+    return folder
+
+
+def test_lhm(tmp_path):
+    frames = [lhm_frame(i) for i in range(4)]
+    motion = load_motion(write_lhm(tmp_path / "seq", frames))
+    np.testing.assert_allclose(motion.translations[:, 0], [0, 0.1, 0.2, 0.3], atol=FLOAT32)
+    for i, frame in enumerate(frames):
+        names = ("body_pose", "jaw_pose", "leye_pose", "reye_pose", "lhand_pose", "rhand_pose")
+        parts = [np.reshape(frame[k], (-1, 3)) for k in ("root_pose", *names)]
+        np.testing.assert_allclose(motion.rotations[i], np.concatenate(parts), atol=FLOAT32)
+    one = load_motion(tmp_path / "seq" / "10.json")
+    np.testing.assert_array_equal(one.rotations, motion.rotations[2:3])
+
+
+# The world's up ------------------------------------------------------------------------------------------------------
+
+
+def rotation_vector(matrix):
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(matrix).as_rotvec()
+
+
+@pytest.mark.parametrize("axis", list(UPRIGHT))
+def test_any_world_is_turned_upright(tmp_path, axis):
+    """The same motion told in another world comes back, as joints in space."""
+    poses, trans = upright_poses(165), random((FRAMES, 3))
+    turn = np.asarray(quaternion.to_matrix(jnp.asarray(UPRIGHT[axis])), float).round()  # to our world
+    told = poses.copy()
+    for i in range(FRAMES):
+        root = np.asarray(quaternion.matrix_from_axis_angle(jnp.asarray(poses[i, :3], jnp.float32)), float)
+        told[i, :3] = rotation_vector(turn.T @ root)
+    told_trans = (trans + PELVIS) @ turn - PELVIS  # the pelvis moves with the world
+    path = write(tmp_path / "a.npz", poses=told, trans=told_trans, mocap_framerate=30)
+    asked = load_motion(path) if axis != "y" else load_motion(path, up="y")
+    for motion in (asked, load_motion(path, up=axis)):
+        back = quaternion.matrix_from_axis_angle(motion.rotations)
+        expected = quaternion.matrix_from_axis_angle(jnp.asarray(poses.reshape(FRAMES, 55, 3), jnp.float32))
+        np.testing.assert_allclose(back, expected, atol=FLOAT32)
+        np.testing.assert_allclose(motion.translations, trans, atol=FLOAT32)
+    untouched = load_motion(path, up="y")
+    np.testing.assert_allclose(untouched.translations, told_trans, atol=FLOAT32)
+
+
+def test_where_no_axis_is_clear_the_format_decides(tmp_path):
+    poses = np.zeros((2, 165))
+    poses[1, 0] = np.pi  # once upright, once upside down
+    trans = np.array([[0.0, 0, 1], [0, 0, 1]]) - PELVIS
+    amass = load_motion(write(tmp_path / "a.npz", poses=poses, trans=trans, mocap_framerate=30))
+    np.testing.assert_allclose(amass.translations, np.array([[0.0, 1, 0]] * 2) - PELVIS, atol=FLOAT32)
+    parts = dict(global_orient=poses[:, :3], body_pose=poses[:, 3:66], transl=trans)
+    other = load_motion(write(tmp_path / "b.npz", **parts))
+    np.testing.assert_allclose(other.translations, trans, atol=FLOAT32)
+
+
+# Wrong files ---------------------------------------------------------------------------------------------------------
+
+NAN = np.zeros((FRAMES, 165))
+NAN[2, 7] = np.nan
+AMASS = dict(poses=np.zeros((FRAMES, 165)), trans=np.zeros((FRAMES, 3)), mocap_framerate=30)
+OURS = dict(rotations=np.zeros((FRAMES, 55, 3)), translations=np.zeros((FRAMES, 3)), fps=24)
+AIST = dict(smpl_poses=np.zeros((FRAMES, 72)), smpl_trans=np.zeros((FRAMES, 3)))
+
+
+def without(arrays, key):
+    return {k: v for k, v in arrays.items() if k != key}
+
+
+BAD = {
+    "no motion": (dict(vertices=np.zeros(3)), ": no motion: expected one of the keys rotations"),
+    "columns": ({**AMASS, "poses": np.zeros((FRAMES, 100))}, ": poses: expected 165, 156, 72 or 66 columns"),
+    "no frames": ({**AMASS, "poses": np.zeros((0, 165))}, ": poses: expected at least one frame"),
+    "NaN": ({**AMASS, "poses": NAN}, ": poses: expected finite numbers, got nan at index [2, 7]"),
+    "infinite": ({**AMASS, "trans": np.full((FRAMES, 3), np.inf)}, ": trans: expected finite"),
+    "counts": ({**AMASS, "trans": np.zeros((FRAMES + 1, 3))}, ": trans: expected shape (6, 3), got (7, 3)"),
+    "no trans": (without(AMASS, "trans"), ": trans: missing"),
+    "no rate": (without(AMASS, "mocap_framerate"), ": mocap_framerate: missing"),
+    "rate 0": ({**AMASS, "mocap_framerate": 0}, ": mocap_framerate: expected a positive"),
+    "words": ({**AMASS, "poses": np.array([["a"]])}, ": poses: expected numbers"),
+    "pickled": ({**AMASS, "trans": np.array([None])}, ": trans: a pickled object"),
+    "ours": ({**OURS, "rotations": np.zeros((FRAMES, 165))}, ": rotations: expected shape (any, any, 3)"),
+    "ours, counts": ({**OURS, "translations": np.zeros((1, 3))}, ": translations: expected shape (6, 3)"),
+    "ours, no fps": (without(OURS, "fps"), ": fps: missing"),
+    "aist": ({**AIST, "smpl_poses": np.zeros((FRAMES, 66))}, ": smpl_poses: expected shape (frames, 72)"),
+    "aist, scaling": ({**AIST, "smpl_scaling": 0.0}, ": smpl_scaling: expected a positive"),
+    "params, body": (smpl_params(body_pose=np.zeros((FRAMES, 69))), ": body_pose: expected shape (6, 63)"),
+    "params, orient": (without(smpl_params(), "global_orient"), ": global_orient: missing"),
+    "params, hand": (smpl_params(left_hand_pose=np.zeros((2, 45))), ": left_hand_pose: expected shape (6, 45)"),
+    "params, jaw": (smpl_params(jaw_pose=np.zeros((FRAMES, 4))), ": jaw_pose: expected shape (6, 3)"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_npz_is_one_line_with_file_and_key(tmp_path, case):
+    arrays, told = BAD[case]
+    path = write(tmp_path / "a.npz", **arrays)
+    with pytest.raises(MotionError) as caught:
+        load_motion(path)
+    assert str(caught.value).startswith(f"{path}{told}") and "\n" not in str(caught.value)
+
+
+class Evil:
+    def __reduce__(self):
+        return (print, ("run!",))
+
+
+def test_other_bad_files(tmp_path, capsys):
+    def message(path, **options):
+        with pytest.raises(MotionError) as caught:
+            load_motion(path, **options)
+        assert "\n" not in str(caught.value) and str(tmp_path) in str(caught.value)
+        return str(caught.value)
+
+    assert "no such file" in message(tmp_path / "none.npz")
+    (tmp_path / "text.npz").write_text("hello")
+    assert "text.npz" in message(tmp_path / "text.npz")
+    (tmp_path / "evil.pkl").write_bytes(pickle.dumps({"smpl_poses": Evil()}))
+    assert "refused" in message(tmp_path / "evil.pkl") and capsys.readouterr().out == ""
+    (tmp_path / "empty").mkdir()
+    assert "no .json file" in message(tmp_path / "empty")
+    (tmp_path / "broken.json").write_text("{")
+    assert "not readable as JSON" in message(tmp_path / "broken.json")
+    (tmp_path / "list.json").write_text("[1]")
+    assert "expected a JSON object" in message(tmp_path / "list.json")
+    frames = [lhm_frame(0), {k: v for k, v in lhm_frame(1).items() if k != "trans"}]
+    assert "9.json: trans: missing" in message(write_lhm(tmp_path / "some", frames))
+    ragged = write_lhm(tmp_path / "ragged", [lhm_frame(0), lhm_frame(1, body_pose=[[0, 0, 0]])])
+    assert "body_pose: expected numbers" in message(ragged)
+    assert "fps: expected a positive" in message(write(tmp_path / "ok.npz", **AMASS), fps=-1)
+    with pytest.raises(ValueError, match="up: expected auto, y"):
+        load_motion(tmp_path / "ok.npz", up="w")
+
+
+# Using motions -------------------------------------------------------------------------------------------------------
+
+
+def rest_body():
+    """A body of joints alone, the shipped one's roughly: enough for the ground."""
+    joints = np.array(random((55, 3), 1, 0.3), np.float32)
+    joints[0] = PELVIS
+    joints[7] = [0.1, -1.16, 0]
+    vertices = np.concatenate([joints, [[0.1, -1.23, 0]]]).astype(np.float32)
+    return RestBody(jnp.asarray(vertices), jnp.asarray(joints))
+
+
+def test_grounded_stands_on_the_floor_at_the_origin():
+    rest = rest_body()
+    motion = Motion(
+        jnp.asarray(random((FRAMES, 55, 3)), jnp.float32), jnp.asarray(random((FRAMES, 3), 3, 2.0), jnp.float32)
+    )
+    placed = grounded(motion, rest, PARENTS)
+    shift = np.asarray(motion.translations - placed.translations)
+    np.testing.assert_allclose(shift, np.broadcast_to(shift[0], shift.shape), atol=FLOAT32)  # by a constant
+    joints = []
+    move = jax.jit(joint_transforms, static_argnums=1)
+    for i in range(FRAMES):
+        pose = placed.pose(i)
+        transforms = np.asarray(move(rest.joints, PARENTS, pose.rotations, pose.translation))
+        joints.append(np.einsum("jab,jb->ja", transforms[:, :3, :3], rest.joints) + transforms[:, :3, 3])
+    joints = np.stack(joints)
+    np.testing.assert_allclose(joints[0, 0, [0, 2]], 0, atol=FLOAT32)
+    sole = float(rest.joints[:, 1].min() - rest.vertices[:, 1].min())
+    np.testing.assert_allclose(joints[..., 1].min(), sole, atol=FLOAT32)
+
+
+def test_at_rate_takes_the_nearest_frames():
+    motion = Motion(jnp.zeros((120, 2, 3)), jnp.arange(120.0)[:, None] * jnp.ones(3), 120.0)
+    slow = motion.at_rate(30)
+    assert slow.fps == 30.0 and list(np.asarray(slow.translations)[:, 0]) == list(range(0, 120, 4))
+    fast = motion.at_rate(240.0)
+    assert len(fast.translations) == 240 and float(fast.translations[-1, 0]) == 119
+    assert len(motion.at_rate(0.5).translations) == 1
+
+
+def test_motions_are_pytrees():
+    motion = Motion(jnp.zeros((4, 2, 3)), jnp.ones((4, 3)), 24.0)
+    poses = jax.vmap(lambda rotations, translation: BodyPose(rotations, translation))(
+        motion.rotations, motion.translations
+    )
+    assert poses.translation.shape == (4, 3)
+    doubled = jax.jit(lambda m: jax.tree.map(lambda x: 2 * x, m))(motion)
+    assert doubled.fps == 24.0 and float(doubled.translations.max()) == 2
+
+
+def test_the_shipped_walk(tmp_path):
+    """On the ground in every frame, a smooth loop, arms down, legs in turn."""
+    from humangs_jax.body.library import load_body
+    from humangs_jax.body.model import pose_body, shape_body
+
+    motion, body = load_motion(), load_body()
+    assert motion.rotations.shape == (48, 55, 3) and motion.fps == 24.0
+    save_motion(tmp_path / "walk.npz", motion)
+    assert (tmp_path / "walk.npz").stat().st_size < 100_000
+    rest = shape_body(body, jnp.zeros(0))
+    pose = jax.jit(lambda p: pose_body(body, rest, p))
+    bodies = [pose(motion.pose(i)) for i in range(0, 48, 4)]
+    lowest = np.array([b.vertices[:, 1].min() for b in bodies])
+    np.testing.assert_allclose(lowest, 0, atol=1e-4)
+    joints = {name: np.stack([b.joints[i] for b in bodies]) for i, name in enumerate(JOINT_NAMES)}
+    assert (joints["left_wrist"][:, 1] < joints["left_elbow"][:, 1]).all()
+    assert (joints["left_ankle"][:, 2] - joints["right_ankle"][:, 2]).max() > 0.3
+    assert (joints["left_ankle"][:, 2] - joints["right_ankle"][:, 2]).min() < -0.3
+    assert (joints["right_wrist"][:, 1] > joints["right_shoulder"][:, 1]).any()  # the wave
+    step = np.diff(np.concatenate([motion.rotations, motion.rotations[:1]]), axis=0)
+    steps = np.linalg.norm(step, axis=-1).max(axis=1)
+    assert steps[-1] <= steps[:-1].max() and steps.max() < 0.5  # the way back to the start is a step like the others
