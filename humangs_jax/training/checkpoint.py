@@ -1,0 +1,133 @@
+"""Checkpoints of a run: the newest few and the best, each complete or not there, bit for bit what was saved.
+
+out/config.json          the configuration of the run
+out/checkpoints/STEP     Orbax checkpoints of the TrainState, with the score of their validation
+"""
+
+import contextlib
+import dataclasses
+import json
+import logging
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import jax
+
+from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.state import TrainState
+
+logger = logging.getLogger(__name__)
+
+UNSCORED = -1e9
+"""Score of a checkpoint that was saved before any validation: worse than every other."""
+ADJUSTABLE = ("log_every", "validate_every", "checkpoint_every", "keep_checkpoints")
+"""What may change in the middle of a run without changing its numbers."""
+
+
+class Checkpoints:
+    """The checkpoints in a folder. `keep`: how many of the newest stay, besides the one of the highest score."""
+
+    def __init__(self, folder: str | Path, keep: int = 2):
+        import orbax.checkpoint as ocp
+        from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
+
+        def score(metrics):
+            return metrics["score"]
+
+        self._ocp = ocp
+        kept = AnyPreservationPolicy([LatestN(keep), BestN(get_metric_fn=score, n=1)])
+        options = ocp.CheckpointManagerOptions(
+            best_fn=score, preservation_policy=kept, enable_async_checkpointing=False, create=True
+        )
+        with _quiet():
+            self._manager = ocp.CheckpointManager(Path(folder).resolve(), options=options)
+
+    @property
+    def steps(self) -> list[int]:
+        """Steps of which there is a checkpoint, ascending."""
+        return sorted(self._manager.all_steps())
+
+    @property
+    def best_step(self) -> int | None:
+        """The step of the highest score, None without checkpoints."""
+        return self._manager.best_step()
+
+    def score(self, step: int) -> float | None:
+        """The score that a checkpoint was saved with."""
+        metrics = self._manager.metrics(step)
+        return None if metrics is None or metrics["score"] == UNSCORED else metrics["score"]
+
+    def save(self, state: TrainState, score: float | None = None) -> None:
+        """Write the state under its step; returns when it is on disk. A step that is there already is left as it is."""
+        step = int(state.step)
+        if step in self._manager.all_steps():
+            return
+        metrics = {"score": UNSCORED if score is None else float(score)}
+        with _quiet():
+            self._manager.save(step, args=self._ocp.args.StandardSave(_as_dict(state)), metrics=metrics)
+
+    def restore(self, like: TrainState, step: int | None = None) -> TrainState:
+        """The state of a step (None: the newest). `like`: a state of the same run, for structure, shapes and devices.
+
+        Raises: FileNotFoundError if there is no such checkpoint; ValueError if it is of another model.
+        """
+        step = self._manager.latest_step() if step is None else step
+        if step is None or step not in self._manager.all_steps():
+            raise FileNotFoundError(
+                f"{self._manager.directory}: no checkpoint{'' if step is None else f' of step {step}'}"
+            )
+        abstract = jax.tree.map(self._ocp.utils.to_shape_dtype_struct, _as_dict(like))
+        with _quiet():
+            restored = self._manager.restore(step, args=self._ocp.args.StandardRestore(abstract))
+        # through numpy: the buffers are XLA's own then, and may be donated
+        return TrainState(
+            **jax.tree.map(lambda x, old: jax.device_put(jax.device_get(x), old.sharding), restored, _as_dict(like))
+        )
+
+    def close(self) -> None:
+        """Release what Orbax holds."""
+        self._manager.close()
+
+
+def save_config(out: str | Path, config: TrainConfig) -> None:
+    """Write out/config.json, or check the one that is there.
+
+    Raises: ValueError, naming a field, if the folder belongs to a run of another configuration.
+    """
+    path = Path(out) / "config.json"
+    fields = json.loads(json.dumps(dataclasses.asdict(config)))
+    if path.is_file():
+        earlier = _flat(json.loads(path.read_text()))
+        for name, value in _flat(fields).items():
+            if name not in ADJUSTABLE and earlier.get(name, value) != value:
+                raise ValueError(
+                    f"{path}: this run was started with {name} = {earlier[name]}, not {value}: use another --out"
+                )
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(json.dumps(fields, indent=1))
+    temporary.replace(path)
+
+
+def _as_dict(state):
+    return {field.name: getattr(state, field.name) for field in dataclasses.fields(state)}
+
+
+def _flat(tree, prefix=""):
+    """{"loss.squared": 1.0, ...} from nested dicts."""
+    items = {}
+    for name, value in tree.items():
+        items |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return items
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Orbax's chatter, which goes through absl's logger."""
+    absl = logging.getLogger("absl")
+    level = absl.level
+    absl.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        absl.setLevel(level)
