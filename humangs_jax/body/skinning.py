@@ -65,8 +65,10 @@ def joint_transforms(
 
 
 def _product(a, b):
-    """a b of small matrices by multiplying and adding: exact on every backend, and XLA's CPU compiler (jax 0.10 to 0.12)
-    rejects the batched `dot` that two nested vmaps make of this product."""
+    """Matrix product by multiplying and adding: exact on every backend.
+
+    XLA's CPU compiler (jax 0.10 to 0.12) rejects the batched `dot` that two nested vmaps make of this product.
+    """
     return jnp.sum(a[..., :, :, None] * b[..., None, :, :], axis=-2)
 
 
