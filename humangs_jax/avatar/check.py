@@ -25,7 +25,8 @@ LONGEST_SIDE = 512
 """Larger photos are shrunk to this for the check, pixels."""
 LEAST_IOU = 0.5
 """Clothes and hair cover about a fifth of a silhouette that the body does not; half means another pose or camera."""
-LEAST_INSIDE = 0.5
+LEAST_INSIDE, SURELY_INSIDE = 0.5, 0.9
+"""Share of the vertices in the frame: below the first it is a warning, the second is asked of an explanation."""
 LEAST_HEIGHT = 0.05
 """Share of the image's height: a body smaller than this has its lengths in another unit."""
 LEFT, RIGHT, MIDDLE = (0.15, 0.45, 1.0), (1.0, 0.35, 0.15), (0.85, 0.85, 0.85)
@@ -220,13 +221,17 @@ def _judge(name, picture, mask) -> ViewCheck:
 
 
 def _likely_mistake(vertices, faces, tints, camera, mask):
-    """The first of the usual mistakes that, undone, puts the body where the mask is (or into the frame, without masks)."""
+    """The usual mistake that, undone, puts the body where the mask is; without a mask the only one that puts it into frame."""
+    fitting = {}
     for mistake, undo in MISTAKES.items():
-        matrix = undo(np.asarray(camera.cam_from_world))
-        picture = _picture(vertices, faces, tints, replace(camera, cam_from_world=jnp.asarray(matrix, jnp.float32)))
-        if not _judge("", picture, mask).warnings and float(picture.inside) > 0.9:
-            return mistake
-    return None
+        matrix = jnp.asarray(undo(np.asarray(camera.cam_from_world)), jnp.float32)
+        picture = _picture(vertices, faces, tints, replace(camera, cam_from_world=matrix))
+        view = _judge("", picture, mask)
+        if not view.warnings and view.inside > SURELY_INSIDE:
+            fitting[mistake] = view.iou
+    if mask is None:
+        return next(iter(fitting)) if len(fitting) == 1 else None
+    return max(fitting, key=fitting.get) if fitting else None
 
 
 def _outline(covered):
