@@ -7,7 +7,7 @@ also reach before it may be missing from the picture and are counted in `Fragmen
 
 Method: scanlines. Faces of a body cover a few pixels or none, so that tiles of pixels times lists of faces would
 mostly test pixels that a face does not touch. Instead each face is expanded to its rows of pixel centres and each row
-to the pixels of its span (`tiling.expand`, twice); these fragments meet in a z-buffer by two scatters, first the least
+to the pixels of its span (see `_window`); these fragments meet in a z-buffer by two scatters, first the least
 depth of a pixel, then the least face number at that depth. Both levels run in steps of a fixed number of slots, and as
 many steps as the mesh needs: shapes are static, yet there is no capacity that a mesh could exceed.
 
@@ -28,7 +28,7 @@ from jax import lax
 from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.pytree import pytree_dataclass
-from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, expand
+from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum
 
 SPAN_SLACK = 16
 """Spans of pixels are widened by this many roundings of the coordinates; the edge functions decide."""
@@ -209,11 +209,15 @@ def _weights_by_pixel(corners, face_ids, width, pixels_per_step):
 
 
 def _window(first, end, start, size):
-    """`expand`, only slots start .. start + size: item of each slot, the slot's place in it, and whether it is used."""
-    counts = jnp.clip(end - start, 0, size) - jnp.clip(first - start, 0, size)
-    source, _, used = expand(counts, size)
-    slot = jnp.arange(size, dtype=jnp.int32)
-    return source, slot + start - first[source], slot < used
+    """Slots start .. start + size of items that own the slots first .. end: item of each, its place in the item, used or not.
+
+    As many items begin at or before a slot as the running sum of marks says, and the last of them owns the slot: items
+    without slots begin together with the next one that has any.
+    """
+    marks = jnp.zeros(size, jnp.int32).at[jnp.maximum(first - start, 0)].add(1, mode="drop")
+    item = cumsum(marks) - 1
+    slot = start + jnp.arange(size, dtype=jnp.int32)
+    return item, slot - first[item], slot < end[-1]
 
 
 def _z_buffer(corners, first_row, row_begin, row_end, width, height, config):

@@ -9,8 +9,6 @@ network was trained on, and needed to run its weights: positions as colours, thr
 light.
 """
 
-import functools
-
 import jax
 import jax.numpy as jnp
 
@@ -25,7 +23,6 @@ LIGHT = (0.0, 1.0, 0.0)
 AMBIENT, DIFFUSE, SPECULAR, SHININESS = 0.5, 0.3, 0.2, 64
 
 
-@functools.partial(jax.jit, static_argnames="config")
 def plain_position_map(
     posed_vertices: Float[Array, "n 3"],
     canonical_vertices: Float[Array, "n 3"],
@@ -37,7 +34,6 @@ def plain_position_map(
     return _map(posed_vertices, canonical_vertices, faces, camera, config)
 
 
-@functools.partial(jax.jit, static_argnames="config")
 def gouraud_position_map(
     posed_vertices: Float[Array, "n 3"],
     canonical_vertices: Float[Array, "n 3"],
@@ -51,6 +47,7 @@ def gouraud_position_map(
     return _map(posed_vertices, 2 * colors - 1, faces, camera, config)
 
 
+@jax.jit
 def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> Float[Array, "n 3"]:
     """Unit normals: the sum of (v1 - v0) x (v2 - v0) over the faces at a vertex, as wound; 0 where that vanishes."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -59,6 +56,7 @@ def vertex_normals(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"]) -> F
     return safe_normalize(total, jnp.zeros(3))
 
 
+@jax.jit
 def _light(albedo, points, normals, eye):
     """Phong's light at the vertices: ambient and diffuse times the albedo, and a white highlight."""
     dot = lambda a, b: jnp.sum(a * b, axis=-1, keepdims=True)

@@ -116,7 +116,11 @@ def flat_camera(width=WIDTH, height=HEIGHT):
 
 
 def draw(vertices, faces, camera, config=SMALL_STEPS):
-    return rasterize_mesh(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera, config)
+    """Padded by faces without area (harmless: see `test_bad_faces_are_harmless`), so that many tests share one compilation."""
+    vertices, faces = jnp.asarray(vertices), jnp.asarray(faces, jnp.int32)
+    vertices = jnp.pad(vertices, ((0, -len(vertices) % 128), (0, 0)))
+    faces = jnp.pad(faces, ((0, -len(faces) % 128), (0, 0)))
+    return rasterize_mesh(vertices, faces, camera, config)
 
 
 # --------------------------------------------------------------------------------------------- against rays
@@ -242,8 +246,10 @@ def test_both_windings_are_drawn_alike():
 
 def test_edges_belong_to_the_face():
     vertices = np.array([[0.5, 0.5, 1], [4.5, 0.5, 1], [0.5, 4.5, 1]], np.float32)
-    ids = np.asarray(draw(vertices, np.array([[0, 1, 2]]), flat_camera(6, 6)).face_ids)
-    expected = np.add.outer(np.arange(6), np.arange(6)) <= 4  # rows and columns 0 .. 4 and the diagonal between them
+    ids = np.asarray(draw(vertices, np.array([[0, 1, 2]]), flat_camera()).face_ids)
+    expected = (
+        np.add.outer(np.arange(HEIGHT), np.arange(WIDTH)) <= 4
+    )  # the centres on both axes and on the diagonal too
     np.testing.assert_array_equal(ids == 0, expected)
 
 
@@ -256,7 +262,7 @@ def test_near_plane_drops_and_counts():
     assert fragments.overflow == 1
     behind = draw(-SQUARE, SQUARE_FACES, flat_camera())
     assert (np.asarray(behind.face_ids) == -1).all() and behind.overflow == 0
-    assert (draw(SQUARE, SQUARE_FACES, flat_camera(), RasterConfig(near=1.5)).face_ids == -1).all()
+    assert (draw(SQUARE * np.float32(1e-3), SQUARE_FACES, flat_camera()).face_ids == -1).all()
 
 
 def test_bad_faces_are_harmless():
@@ -265,7 +271,8 @@ def test_bad_faces_are_harmless():
     vertices = np.concatenate([SQUARE, bad]).astype(np.float32)
     faces = [[4, 4, 4], [0, 3, 0], [0, 3, 3], [0, 1, 5], [6, 1, 2], [7, 0, 1], [8, 8, 9], [8, 9, 9], [8, 9, 8]]
     faces = np.concatenate([faces, SQUARE_FACES])
-    with_bad, without = draw(vertices, faces, flat_camera()), draw(SQUARE, SQUARE_FACES, flat_camera())
+    with_bad = rasterize_mesh(jnp.asarray(vertices), jnp.asarray(faces), flat_camera(), SMALL_STEPS)
+    without = rasterize_mesh(jnp.asarray(SQUARE), jnp.asarray(SQUARE_FACES), flat_camera(), SMALL_STEPS)
     ids = np.asarray(with_bad.face_ids)
     np.testing.assert_array_equal(np.where(ids >= 0, ids - len(faces) + 2, -1), without.face_ids)
     np.testing.assert_array_equal(with_bad.depth, without.depth)
@@ -273,7 +280,7 @@ def test_bad_faces_are_harmless():
     assert with_bad.overflow == 3  # NaN, infinity, and the one whose area overflows
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1e-3, 1e3, 1e6])
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_units_do_not_matter(scale):
     vertices, faces = sphere()
     camera = some_camera(1)
@@ -303,9 +310,9 @@ def test_tiny_faces_between_pixel_centers_are_not_seen():
 def test_images_of_one_pixel_and_meshes_of_nothing():
     vertices = jnp.asarray(SQUARE)
     assert draw(vertices, SQUARE_FACES, Camera.from_opencv(np.eye(3), np.eye(4), 1, 1)).face_ids == -1
-    K = np.array([[1, 0, -6.0], [0, 1, -5.0], [0, 0, 1]])
-    assert draw(vertices, SQUARE_FACES, Camera.from_opencv(K, np.eye(4), 1, 1)).face_ids == 0
-    empty = draw(vertices, np.zeros((0, 3)), flat_camera())
+    shifted = Camera.from_opencv([[1, 0, -6.0], [0, 1, -5.0], [0, 0, 1]], np.eye(4), 1, 1)
+    assert draw(vertices, SQUARE_FACES, shifted).face_ids == 0
+    empty = rasterize_mesh(vertices, jnp.zeros((0, 3), jnp.int32), flat_camera())
     assert (np.asarray(empty.face_ids) == -1).all() and (np.asarray(empty.depth) == -1).all()
     image = interpolate(empty, jnp.zeros((0, 3), jnp.int32), vertices, jnp.asarray([1.0, 2.0, 3.0]))
     np.testing.assert_array_equal(image, np.broadcast_to([1.0, 2.0, 3.0], (HEIGHT, WIDTH, 3)))

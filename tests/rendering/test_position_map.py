@@ -1,0 +1,98 @@
+"""Position maps against the release's own rasterizer (see `provenance` in data/mesh_crops.npz) and against geometry."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.geometry.camera import Camera, orbit, project
+from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
+from humangs_jax.rendering.position_map import gouraud_position_map, plain_position_map, vertex_normals
+
+STORED_AS_FLOAT16 = 5e-4
+"""Half of float16's spacing below 1."""
+DEPTH_ERROR = 1e-5
+"""Two float32 rasterizers; depths are about 2.5."""
+GOURAUD_ERROR = 5e-5
+"""The highlight's 64th power magnifies roundings of the normals (1e-7) by 64, the interpolation adds a little."""
+
+
+@pytest.fixture(scope="module")
+def golden():
+    with np.load(Path(__file__).parent / "data" / "mesh_crops.npz") as file:
+        return dict(file)
+
+
+def mesh(golden):
+    posed, canonical = jnp.asarray(golden["posed_vertices"]), jnp.asarray(golden["canonical_vertices"])
+    return posed, canonical, jnp.asarray(golden["faces"].astype(np.int32))
+
+
+def camera_of(golden, view):
+    fx, fy, cx, cy = golden["fxfycxcy"][view]
+    height, width = golden["depth"].shape[1:]
+    cam_from_world = np.linalg.inv(golden["c2w"][view].astype(np.float64))
+    return Camera.from_opencv([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], cam_from_world, width, height)
+
+
+@pytest.mark.parametrize("view", [0, 1])
+def test_maps_equal_the_release(golden, view):
+    posed, canonical, faces = mesh(golden)
+    camera = camera_of(golden, view)
+    np.testing.assert_array_equal(rasterize_mesh(posed, faces, camera).face_ids, golden["face_ids"][view])
+    plain, depth = plain_position_map(posed, canonical, faces, camera)
+    gouraud, gouraud_depth = gouraud_position_map(posed, canonical, faces, camera)
+    np.testing.assert_allclose(plain, golden["position_map_plain"][view], atol=STORED_AS_FLOAT16)
+    np.testing.assert_allclose(gouraud, golden["position_map_gouraud"][view], atol=GOURAUD_ERROR)
+    np.testing.assert_allclose(depth, golden["depth"][view], atol=DEPTH_ERROR)
+    np.testing.assert_array_equal(depth, gouraud_depth)
+    background = golden["face_ids"][view] < 0
+    assert background.any()
+    for image in (plain, gouraud):
+        np.testing.assert_array_equal(np.asarray(image)[background], 1)
+    np.testing.assert_array_equal(np.asarray(depth)[background], -1)
+
+
+def test_golden_crops_can_tell_the_shader_apart(golden):
+    """The highlight and the direction of the normals matter in the crops, or the comparison above would prove little."""
+    posed, canonical, faces = mesh(golden)
+    flipped, _ = gouraud_position_map(posed, canonical, faces[:, ::-1], camera_of(golden, 0))
+    plain, _ = plain_position_map(posed, canonical, faces, camera_of(golden, 0))
+    for other in (flipped, plain):
+        assert np.abs(np.asarray(other) - golden["position_map_gouraud"][0]).max() > 1000 * GOURAUD_ERROR
+
+
+def test_map_of_the_posed_mesh_itself_is_where_the_rays_hit():
+    """With the posed vertices as the canonical ones; two views in one `vmap`."""
+    rng = np.random.default_rng(0)
+    vertices = jnp.asarray(rng.uniform(-0.8, 0.8, (30, 3)), jnp.float32)
+    faces = jnp.asarray(rng.permutation(30).reshape(10, 3), jnp.int32)
+    K = jnp.asarray([[30, 0, 9.5], [0, 30, 8.0], [0, 0, 1]])
+    cameras = orbit(jnp.zeros(3), 3.0, jnp.asarray([0.3, 2.0]), 0.2, K, 19, 16)
+    points, depth = jax.vmap(lambda camera: plain_position_map(vertices, vertices, faces, camera))(cameras)
+    for view in range(2):
+        rows, columns = np.nonzero(np.asarray(depth[view]) > 0)
+        assert len(rows) > 20
+        uv, z = project(cameras[view], points[view][rows, columns])
+        np.testing.assert_allclose(uv, np.stack([columns, rows], axis=-1) + 0.5, atol=1e-3)
+        np.testing.assert_allclose(z, depth[view][rows, columns], rtol=1e-5)
+
+
+def test_vertex_normals():
+    """An octahedron's normals are its vertices; a vertex without faces, or of faces without area, has none."""
+    corners = np.concatenate([np.eye(3), -np.eye(3), np.full((2, 3), 5.0)])
+    faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5], [6, 6, 6]]
+    normals = vertex_normals(jnp.asarray(corners, jnp.float32), jnp.asarray(faces))
+    np.testing.assert_allclose(normals[:6], corners[:6], atol=1e-6)
+    np.testing.assert_array_equal(normals[6:], 0)
+
+
+def test_float64(golden):
+    with jax.enable_x64(True):
+        posed, canonical, faces = (jnp.asarray(np.asarray(x)) for x in mesh(golden))
+        camera = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), camera_of(golden, 1))
+        image, depth = gouraud_position_map(posed.astype(jnp.float64), canonical.astype(jnp.float64), faces, camera)
+        assert image.dtype == depth.dtype == jnp.float64
+        np.testing.assert_allclose(image, golden["position_map_gouraud"][1], atol=GOURAUD_ERROR)
