@@ -11,16 +11,20 @@ import numpy as np
 from humangs_jax.array_types import Array, Float
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.body.model import BodyPose
+from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.motion import Motion
+from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.rendering.splatting import Rendering, render
 
 VERTICAL_FOV = np.pi / 6
 """Narrow enough that a person keeps natural proportions."""
-MARGIN = 1.12
+MARGIN = 1.08
 """Room around a person in the frame."""
+ARM_REACH = 0.3
+"""Share of the height that swinging arms and striding legs reach from the root, sideways."""
+ELEVATION = 0.1
+"""Radians above the horizon."""
 
 posed = jax.jit(skin)
 
@@ -39,20 +43,21 @@ def motion_frames(
     """Frames of a moving avatar, (m, size, size, 3) in [0, 1]. azimuth and turn in degrees."""
     from tqdm import tqdm
 
+    rest = RestBody(avatar.rest_vertices, avatar.rest_joints)
+    motion = grounded(motion, rest, avatar.parents)
     count = len(motion.translations)
     azimuths = np.radians(azimuth + turn * np.arange(count) / max(count, 1))
-    # the camera stands still: it frames everywhere that the root goes
-    path = np.asarray(motion.translations)
-    center = 0.5 * (path.min(0) + path.max(0)) + np.asarray(avatar.rest_vertices).mean(0)
-    height = np.ptp(np.asarray(avatar.rest_vertices)[:, 1])
-    half = 0.5 * max(height + np.ptp(path[:, 1]), height * 0.6 + np.ptp(path[:, [0, 2]], axis=0).max())
-    distance = MARGIN * half / np.tan(0.5 * VERTICAL_FOV) + 0.5 * height * 0.3
-    center[1] = np.asarray(avatar.rest_vertices)[:, 1].min() + 0.5 * height + path[:, 1].mean()
+    # the target stands still: the frame holds everywhere that the root goes
+    path = np.asarray(motion.translations + avatar.rest_joints[0])[:, [0, 2]]
+    height = float(np.ptp(np.asarray(avatar.rest_vertices)[:, 1]))
+    middle = 0.5 * (path.min(0) + path.max(0))
+    half_width = 0.5 * float(np.linalg.norm(np.ptp(path, axis=0))) + ARM_REACH * height
+    half = MARGIN * max(0.5 * height, half_width)
     cameras = orbit(
-        jnp.asarray(center, jnp.float32),
-        distance,
+        jnp.asarray([middle[0], 0.5 * height, middle[1]], jnp.float32),
+        half / np.tan(0.5 * VERTICAL_FOV) + half_width,
         jnp.asarray(azimuths, jnp.float32),
-        0.08,
+        ELEVATION,
         intrinsics_from_fov(VERTICAL_FOV, size, size),
         size,
         size,
@@ -73,7 +78,7 @@ def turntable_renderings(avatar: Avatar, views: int, size: int) -> tuple[Camera,
         jnp.asarray(center),
         MARGIN * radius / np.sin(0.5 * VERTICAL_FOV),
         jnp.linspace(0, 2 * np.pi, views, endpoint=False),
-        0.1,
+        ELEVATION,
         intrinsics_from_fov(VERTICAL_FOV, size, size),
         size,
         size,

@@ -15,6 +15,7 @@ import re
 import shutil
 import uuid
 from collections.abc import Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,8 @@ FORMAT = "humangs-capture"
 VERSION = 1
 DEFAULT_BODY = "makehuman"
 """Name of the body that comes with the package; any other `body` in body.npz is the path of a model file."""
+DEMO_CAPTURE = "demo_capture"
+"""Name of the capture of a synthetic person that comes with the package."""
 TOP_KEYS = {"format", "version", "body", "background", "views"}
 VIEW_KEYS = {"image", "mask", "K", "cam_from_world", "frame"}
 BODY_KEYS = {"body", "betas", "rotations", "translations"}
@@ -160,12 +163,15 @@ def load_capture(path: str | Path, *, body: BodyModel | None = None) -> Capture:
     """Read and check a capture folder.
 
     Arguments:
-        path: the folder that holds capture.json.
+        path: the folder that holds capture.json. "demo_capture", where no such folder is, stands for the one that comes
+            with the package (and "demo_capture/held_out" for its held-out views).
         body: a model to use in place of the one that body.npz names.
 
     Raises: CaptureError, one line naming file and field.
     """
     folder = Path(path)
+    if not folder.exists() and folder.parts[:1] == (DEMO_CAPTURE,):
+        folder = Path(str(resources.files("humangs_jax"))) / "assets" / folder
     file = folder / "capture.json"
     description = _read_description(file)
     parameter_file = folder / description["body"]
