@@ -10,6 +10,10 @@ VERTICAL_FOV = np.deg2rad(60.0)
 DISTANCE_FACTOR = (1.8, 2.2)
 """Distance in bounding radii: nearer than 1.7 the frame cuts heads and feet."""
 ELEVATION = np.deg2rad(np.asarray([-5.0, 15.0]))
+FRAME = 0.98
+"""Share of the half frame that the person may reach; a camera that is too near for it steps back."""
+
+_orbit = jax.jit(orbit, static_argnums=(5, 6))
 
 
 def bounding_sphere(vertices: np.ndarray) -> tuple[np.ndarray, float]:
@@ -27,22 +31,24 @@ def spread_azimuths(rng: np.random.Generator, count: int, jitter: float = 0.3) -
 def cameras_around(rng: np.random.Generator, vertices: np.ndarray, azimuths: np.ndarray, image_size: int) -> Camera:
     """A batch of cameras at the azimuths, distances and elevations drawn from the protocol's ranges."""
     center, radius = bounding_sphere(vertices)
-    count = len(azimuths)
-    distances = radius * rng.uniform(*DISTANCE_FACTOR, count)
-    elevations = rng.uniform(*ELEVATION, count)
-    K = intrinsics_from_fov(VERTICAL_FOV, image_size, image_size)
-    return _orbit(
-        jnp.asarray(center, jnp.float32),
-        jnp.asarray(distances, jnp.float32),
-        jnp.asarray(azimuths, jnp.float32),
-        jnp.asarray(elevations, jnp.float32),
-        K,
-        image_size,
+    distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
+    elevations = rng.uniform(*ELEVATION, len(azimuths))
+    near = [nearest_distance(vertices - center, a, e) for a, e in zip(azimuths, elevations, strict=True)]
+    distances, azimuths, elevations = (
+        jnp.asarray(x, jnp.float32) for x in (np.maximum(distances, near), azimuths, elevations)
     )
+    K = intrinsics_from_fov(VERTICAL_FOV, image_size, image_size)
+    target = jnp.asarray(center, jnp.float32)
+    return _orbit(target, distances, azimuths, elevations, K, image_size, image_size)
 
 
-def _orbit(center, distances, azimuths, elevations, K, size):
-    return _jitted(center, distances, azimuths, elevations, K, size, size)
-
-
-_jitted = jax.jit(orbit, static_argnums=(5, 6))
+def nearest_distance(points: np.ndarray, azimuth: float, elevation: float) -> float:
+    """Least distance from the origin at which a camera that looks at it has all points (n, 3) in its square frame."""
+    sa, ca, se, ce = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
+    towards, up, right = (
+        np.asarray([ce * sa, se, ce * ca]),
+        np.asarray([-se * sa, ce, -se * ca]),
+        np.asarray([ca, 0, -sa]),
+    )
+    reach = np.maximum(np.abs(points @ up), np.abs(points @ right))
+    return float(np.max(reach / (FRAME * np.tan(VERTICAL_FOV / 2)) + points @ towards))

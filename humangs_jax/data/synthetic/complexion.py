@@ -48,7 +48,7 @@ def sample_complexion(rng: np.random.Generator, male: bool) -> Complexion:
 
 
 def _hair_odds(darkness):
-    dark = np.clip((darkness - 0.35) / 0.3, 0, 1)
+    dark = np.clip((darkness - 0.22) / 0.2, 0, 1)
     fair_odds, dark_odds = (
         np.asarray([0.2, 0.35, 0.22, 0.08, 0.1, 0.05]),
         np.asarray([0.78, 0.12, 0.01, 0.0, 0.06, 0.03]),

@@ -50,13 +50,13 @@ def colour(hue: float, saturation: float, value: float) -> np.ndarray:
 
 def random_colour(rng: np.random.Generator) -> np.ndarray:
     """A dye: neutrals, denim blues, earth colours or something loud."""
-    kind = rng.choice(["neutral", "muted", "vivid", "earth", "navy"], p=[0.26, 0.26, 0.28, 0.1, 0.1])
+    kind = rng.choice(["neutral", "muted", "vivid", "earth", "navy"], p=[0.28, 0.28, 0.22, 0.11, 0.11])
     if kind == "neutral":
         return colour(rng.random(), rng.uniform(0, 0.06), rng.choice([0.1, 0.18, 0.32, 0.5, 0.7, 0.85]))
     if kind == "muted":
         return colour(rng.random(), rng.uniform(0.2, 0.5), rng.uniform(0.3, 0.8))
     if kind == "vivid":
-        return colour(rng.random(), rng.uniform(0.55, 0.95), rng.uniform(0.4, 0.9))
+        return colour(rng.random(), rng.uniform(0.5, 0.85), rng.uniform(0.35, 0.8))
     if kind == "earth":
         return colour(rng.uniform(0.05, 0.12), rng.uniform(0.3, 0.7), rng.uniform(0.2, 0.7))
     return colour(rng.uniform(0.56, 0.66), rng.uniform(0.4, 0.8), rng.uniform(0.12, 0.45))
@@ -84,7 +84,7 @@ def band(x: np.ndarray, low: float, high: float, soft: float = 0.0015) -> np.nda
 def plain(rng, base):
     """One dye, slightly uneven."""
     cloud = Ripples(rng, 0.12)
-    return lambda s: base * (1 + 0.05 * cloud(s.cloth[:, :3]))[:, None]
+    return lambda s: base * (1 + 0.03 * cloud(s.cloth[:, :3]))[:, None]
 
 
 def stripes(rng, base, other, upright=False):

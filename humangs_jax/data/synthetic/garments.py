@@ -12,7 +12,16 @@ from humangs_jax.data.synthetic import anatomy as anatomy_module
 from humangs_jax.data.synthetic import slices
 from humangs_jax.data.synthetic.anatomy import ANKLE, Anatomy, smoothstep
 from humangs_jax.data.synthetic.noise import ripples
-from humangs_jax.data.synthetic.surfaces import Surface, cut, grid_faces, smooth, turn_in_hems, unit, vertex_normals
+from humangs_jax.data.synthetic.surfaces import (
+    Surface,
+    boundary_edges,
+    cut,
+    grid_faces,
+    smooth,
+    turn_in_hems,
+    unit,
+    vertex_normals,
+)
 
 HEM_MARGIN = 0.012
 """Skin is removed below cloth from this far inside the hem (metres of template coordinates)."""
@@ -66,21 +75,23 @@ def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> n
 def _drape(rng, anatomy, surface, fit):
     below, arm, leg = (surface.attributes[name] for name in ("skin_point", "arm", "leg"))
     normals = unit(smooth(surface.attributes["normals"], surface.faces, 2))
-    points = smooth(below, surface.faces, 4, keep_hems=True) + fit.ease * normals
+    points = smooth(below, surface.faces, 8, keep_hems=True) + fit.ease * normals
     points = _push_trunk(anatomy, points, arm, leg, fit)
     for side in (0, 1):
         points = _push_arm(anatomy, points, arm, side, fit)
         points = _push_leg(anatomy, points, leg, side, fit)
     points = smooth(points, surface.faces, 3, keep_hems=True)
     outer = vertex_normals(points, surface.faces)
-    cloth = surface.attributes["cloth"]
+    cloth = smooth(surface.attributes["cloth"], surface.faces, 10, keep_hems=True)  # as the points were
     points = points + (fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11))[:, None] * outer
     distance = np.sum((points - below) * surface.attributes["normals"], -1)
-    points = points + np.maximum(fit.ease - distance, 0)[:, None] * surface.attributes["normals"]
+    points = points + np.maximum(0.55 * fit.ease - distance, 0)[:, None] * surface.attributes["normals"]
+    hems = np.unique(boundary_edges(surface.faces))
+    points[hems] = smooth(points, surface.faces, 4, keep_hems=True)[hems]
     side = np.sign(surface.attributes["template"][:, 0])
     thighs = leg > 0.6  # trouser legs do not cross the middle
     points[:, 0] = np.where(thighs, side * np.maximum(side * points[:, 0], 0.004), points[:, 0])
-    return surface.moved(points)
+    return surface.moved(points).with_attributes(cloth=cloth)
 
 
 def _push_trunk(anatomy, points, arm, leg, fit):

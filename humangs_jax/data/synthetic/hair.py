@@ -13,7 +13,6 @@ from humangs_jax.data.synthetic.poses import HEAD, NECK, SPINE3
 from humangs_jax.data.synthetic.surfaces import (
     Surface,
     cut,
-    edges_of,
     grid_faces,
     join,
     smooth,
@@ -26,8 +25,8 @@ SKULL = np.asarray([0.0, 0.345, 0.02])
 CROWN, NECK_HEIGHT = 0.4356, 0.189
 
 SHORT_LINE = (
-    [0.0, 0.55, 0.95, 1.2, 1.42, 1.55, 2.0, 2.35, 3.15],
-    [0.392, 0.388, 0.368, 0.325, 0.315, 0.354, 0.35, 0.245, 0.215],
+    [0.0, 0.55, 0.95, 1.2, 1.36, 1.42, 1.86, 1.95, 2.3, 3.15],
+    [0.392, 0.388, 0.368, 0.325, 0.312, 0.353, 0.353, 0.275, 0.234, 0.226],
 )
 """Azimuths and heights: forehead, temple, sideburn before the ear, above and behind the ear, nape."""
 LONG_LINE = ([0.0, 0.5, 0.9, 1.12, 1.2, 3.15], [0.394, 0.388, 0.362, 0.30, -9.0, -9.0])
@@ -55,7 +54,7 @@ def scalp_shell(
     surface = cut(anatomy.skin.with_attributes(above=above), above)
     normals = unit(smooth(surface.attributes["normals"], surface.faces, 8))
     full = smoothstep(-0.002, 0.022, surface.attributes["above"])
-    grown = thickness * full * (1 + bumps * ripples(rng, surface.attributes["template"], 0.03)) + 0.0025
+    grown = thickness * full * (1 + bumps * ripples(rng, surface.attributes["template"], 0.05)) + 0.0025
     base = smooth(surface.vertices, surface.faces, 3, keep_hems=True)
     return _finish(surface.moved(base + grown[:, None] * normals), 0.006)
 
@@ -68,7 +67,7 @@ def falling_tube(
     At the sides it ends on the shoulders.
     """
     skin, template = anatomy.skin, anatomy.skin.attributes["template"]
-    to_rest, to_template = _height_maps(anatomy)
+    to_rest = _rest_heights(anatomy)
     center = np.asarray([0.0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01])
     scale = 1 + thickness / 0.09
     ears = (np.abs(template[:, 0]) > 0.0735) & (template[:, 1] > 0.26) & (template[:, 1] < 0.36)
@@ -89,11 +88,13 @@ def falling_tube(
     row_height, around = (x.reshape(-1) for x in np.meshgrid(rows, angle, indexing="ij"))
     height = to_rest(row_height)
     inner = center[1] + (height - center[1]) / scale
-    radius = scale * falling.radius(np.minimum(inner, to_rest(CROWN - 0.002)), around)
-    at_top = row_height >= top - 1e-6
-    radius = np.where(at_top, 0.0, radius)
+    brim, summit = to_rest(0.385), center[1] + (to_rest(top) - center[1]) / scale
+    vault = np.sqrt(np.clip(1 - np.clip((inner - brim) / (summit - brim), 0, 1) ** 2, 0, 1))  # the dome above the brim
+    radius = scale * vault * falling.radius(np.minimum(inner, brim), around)
     below = smoothstep(0.0, 0.12, SKULL[1] - row_height)
-    radius = np.maximum(radius, (back.radius(height, around) + 0.012) * (row_height < 0.24))
+    radius = np.maximum(
+        radius, (back.radius(height, around) + 0.034 * smoothstep(-0.23, -0.17, -row_height)) * (row_height < 0.24)
+    )
     radius = radius + below * wave * ripples(
         rng, np.stack([3 * np.sin(around), height * 4, 3 * np.cos(around)], -1), 1.2
     )
@@ -117,7 +118,7 @@ def falling_tube(
 
 def bun(rng, anatomy: Anatomy, radius: float, elevation: float) -> Surface:
     """A ball of hair on the back of the head."""
-    to_rest, _ = _height_maps(anatomy)
+    to_rest = _rest_heights(anatomy)
     direction = np.asarray([0, np.sin(elevation), -np.cos(elevation)])
     center = np.asarray([0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01]) + direction * (0.095 + 0.55 * radius)
     return _rigid(anatomy, _ball(center, radius * np.asarray([1.0, 0.9, 0.85])), HEAD)
@@ -125,7 +126,7 @@ def bun(rng, anatomy: Anatomy, radius: float, elevation: float) -> Surface:
 
 def ponytail(rng, anatomy: Anatomy, length: float) -> Surface:
     """A tapering tail from the back of the head down the back."""
-    to_rest, _ = _height_maps(anatomy)
+    to_rest = _rest_heights(anatomy)
     start = np.asarray([0, to_rest(0.36), anatomy.joints[HEAD, 2] - 0.105])
     t = np.linspace(0, 1, 14)
     line = start + np.stack([0 * t, -length * t**1.3, -0.05 * np.sin(np.pi * np.minimum(t * 1.6, 1) / 1.3) - 0.01], -1)
@@ -201,12 +202,11 @@ def eyeballs(anatomy: Anatomy) -> Surface:
     return join(parts)
 
 
-def _height_maps(anatomy):
-    """Template heights of head and neck -> rest heights of the person, and back."""
+def _rest_heights(anatomy):
+    """Template heights of head and neck -> rest heights of the person."""
     neck = anatomy.joints[NECK, 1]
-    crown = anatomy.skin.vertices[:, 1].max()
-    factor = (crown - neck) / (CROWN - NECK_HEIGHT)
-    return lambda y: neck + (y - NECK_HEIGHT) * factor, lambda y: NECK_HEIGHT + (y - neck) / factor
+    factor = (anatomy.skin.vertices[:, 1].max() - neck) / (CROWN - NECK_HEIGHT)
+    return lambda y: neck + (y - NECK_HEIGHT) * factor
 
 
 def _falling_weights(anatomy, vertices, template_y):
@@ -220,17 +220,3 @@ def _falling_weights(anatomy, vertices, template_y):
     trunk = head.copy()
     trunk[lower] = nearest_weights(anatomy, vertices[lower], near)
     return (head * own + trunk * (1 - own)).astype(np.float32)
-
-
-__all__ = [
-    "CAP_LINE",
-    "LONG_LINE",
-    "SHORT_LINE",
-    "beard",
-    "bun",
-    "edges_of",
-    "eyeballs",
-    "falling_tube",
-    "ponytail",
-    "scalp_shell",
-]

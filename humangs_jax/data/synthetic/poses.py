@@ -58,6 +58,10 @@ GOALS = {
 """Arm goals: probability, and where the wrist should be relative to the shoulder in arm lengths (left arm)."""
 
 
+RAISE = {"hang": (-1.5, -1.05), "away": (-1.3, -0.7), "wave": (-1.45, 1.25), "up": (-0.5, 1.25), "side": (-0.4, 0.4)}
+"""Range of the upper arm's elevation for some goals (0: horizontal)."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Build:
     """What the prior must know of a body: rest joints (j, 3), parents, and radii in metres of its clothed parts."""
@@ -125,7 +129,7 @@ def limited(rotations: np.ndarray) -> np.ndarray:
 
 def _bend_legs(rng, rotations):
     gait = rng.choice(["stand", "contrapposto", "walk", "wide", "squat", "lunge"], p=[0.34, 0.2, 0.24, 0.1, 0.06, 0.06])
-    spread = rng.uniform(0.03, 0.12)
+    spread = rng.uniform(-0.035, 0.06)
     flexion, knee = np.zeros(2), np.zeros(2)  # left, right: thigh forward, shin backward
     if gait == "contrapposto":
         relaxed = rng.integers(2)
@@ -178,7 +182,7 @@ def _bend_arm(rng, build, rotations, goal, side):
     raised = {"wave": 0.15, "up": 0.3, "side": 0.05}.get(goal, -0.08)
     rotations[collar] = np.asarray([0, rng.normal(-0.03, 0.03), raised + rng.normal(0, 0.03)]) * mirror
     down = np.zeros((n, 3))
-    down[:, 2] = rng.uniform(-1.45, 1.25, n) if goal in ("wave", "up", "side") else rng.uniform(-1.45, -0.1, n)
+    down[:, 2] = rng.uniform(*RAISE.get(goal, (-1.45, -0.1)), n)
     forward, twist, flex = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 3))
     forward[:, 1] = -rng.uniform(-0.5, 1.4, n) if goal != "hang" else -rng.uniform(-0.25, 0.35, n)
     twist[:, 0] = rng.uniform(-1.0, 0.8, n)

@@ -90,7 +90,7 @@ def _shade_pixels(posed, ids, barycentrics, eye):
         own = Spots(spots.cloth[chosen], spots.template[chosen])
         albedo[chosen], sheen[chosen] = material.albedo(own), material.sheen
         if material.wrinkles > 0:
-            folds = Ripples(np.random.default_rng([subject.seed, 100 + k]), 0.09, 8, stretch=(1.0, 0.7, 1.0))
+            folds = Ripples(np.random.default_rng([subject.seed, 100 + k]), 0.09, 8, stretch=(1.2, 0.45, 1.2))
             slope = 0.012 * material.wrinkles * folds.gradient(own.cloth[:, :3])
             normals[chosen] = bend_normals(normals[chosen], slope)
     openness = np.where(inside, INSIDE_SHADE * openness, openness)

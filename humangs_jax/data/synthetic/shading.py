@@ -57,9 +57,19 @@ def occlusion(vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
             grid = (np.roll(grid, 1, axis) + grid + np.roll(grid, -1, axis)) / 3
     dark = np.zeros(len(vertices), np.float32)
     for reach in REACH:
-        at = ((vertices + reach * normals - low) / CELL).astype(int)
-        dark += grid[tuple(np.clip(at, 0, size - 1).T)] / len(REACH)
+        dark += _trilinear(grid, (vertices + reach * normals - low) / CELL - 0.5) / len(REACH)
     return np.clip(1.08 - 2.6 * dark, 0.35, 1.0)
+
+
+def _trilinear(grid, at):
+    """Grid values at fractional indices (n, 3)."""
+    base = np.clip(np.floor(at).astype(int), 0, np.asarray(grid.shape) - 2)
+    t = np.clip(at - base, 0, 1).astype(np.float32)
+    total = np.zeros(len(at), np.float32)
+    for corner in range(8):
+        bits = np.asarray([corner & 1, corner >> 1 & 1, corner >> 2])
+        total += np.prod(np.where(bits, t, 1 - t), axis=1) * grid[tuple((base + bits).T)]
+    return total
 
 
 def shade(

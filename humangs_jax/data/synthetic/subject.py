@@ -1,14 +1,12 @@
 """A synthetic person from a seed: one skinned triangle mesh, a material per face, lights, and a source of poses."""
 
 import dataclasses
-import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, shape_body
-from humangs_jax.body.skinning import joint_transforms
 from humangs_jax.data.synthetic import anatomy as anatomy_module
 from humangs_jax.data.synthetic import complexion, fabrics, hair, poses, wardrobe
 from humangs_jax.data.synthetic.anatomy import Anatomy
@@ -25,7 +23,7 @@ class SyntheticSubject:
     """A dressed person.
 
     seed. betas: (s,) shape of the body. surface: the mesh at rest with attributes `template`, `cloth`. face_materials: (f,)
-    indices into materials. lights. build: what the pose prior knows.
+    indices into materials. lights. build: what the pose prior knows. under_cloth: (n,) skin vertices kept below a hem.
     """
 
     seed: int
@@ -35,7 +33,7 @@ class SyntheticSubject:
     materials: tuple[Material, ...]
     lights: Lights
     build: poses.Build
-    rest_joints: np.ndarray
+    under_cloth: np.ndarray
 
     def posed_vertices(self, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
         """(n, 3) world positions of the mesh in a pose: rotations (j, 3), translation (3,)."""
@@ -44,11 +42,15 @@ class SyntheticSubject:
         return np.einsum("nij,nj->ni", blended[..., :3], self.surface.vertices) + blended[..., 3]
 
     def _transforms(self, rotations, translation):
-        rotations, translation = jnp.asarray(rotations, jnp.float32), jnp.asarray(translation, jnp.float32)
-        return np.asarray(_joint_transforms(jnp.asarray(self.rest_joints), self.build.parents, rotations, translation))
+        """(j, 4, 4) rest -> posed, by the pose prior's own kinematics: no compilation, the same on every backend."""
+        world, positions = poses.joint_positions(self.build, np.asarray(rotations, np.float64))
+        transforms = np.zeros((len(world), 4, 4))
+        transforms[:, :3, :3] = world
+        transforms[:, :3, 3] = positions - np.einsum("jab,jb->ja", world, self.build.joints) + translation
+        transforms[:, 3, 3] = 1
+        return transforms.astype(np.float32)
 
 
-_joint_transforms = jax.jit(joint_transforms, static_argnums=1)
 _shape = jax.jit(shape_body)
 
 
@@ -70,8 +72,9 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
     tones, styled = _style_hair(rng, anatomy, male)
     for piece in styled:
         outfit.add(piece.surface, piece.material)
+    skin, under = _visible_skin(anatomy, outfit.hidden)
     pieces = [
-        wardrobe.Piece(_visible_skin(anatomy, outfit.hidden), complexion.skin_material(rng, tones)),
+        wardrobe.Piece(skin, complexion.skin_material(rng, tones)),
         wardrobe.Piece(hair.eyeballs(anatomy), complexion.eye_material(tones)),
         *outfit.pieces,
     ]
@@ -84,7 +87,7 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
         materials=tuple(piece.material for piece in pieces),
         lights=sample_lights(rng),
         build=_build(anatomy, surface),
-        rest_joints=np.asarray(rest.joints),
+        under_cloth=np.concatenate([under, np.zeros(len(surface.vertices) - len(under), bool)]),
     )
 
 
@@ -95,13 +98,8 @@ def sample_shape(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[np.n
     at = {name: i for i, name in enumerate(names)}
     betas[at["sex_male"]] = (1 if male else -1) * rng.uniform(0.55, 1.0)
     betas[at["age"]] = rng.uniform(-0.2, 0.8)
-    betas[at["weight"]] = np.clip(rng.normal(0.05, 0.45), -0.8, 1.2)
+    betas[at["weight"]] = np.clip(rng.normal(0.1, 0.6), -0.9, 1.6)
     return betas.astype(np.float32), male
-
-
-@functools.lru_cache(maxsize=1)
-def _cached_host_arrays(key):
-    return key[1]()
 
 
 _HOST: dict[int, tuple] = {}
@@ -116,11 +114,12 @@ def _host_arrays(body):
     return _HOST[id(body)][1:]
 
 
-def _visible_skin(anatomy: Anatomy, hidden: np.ndarray) -> Surface:
-    skin = anatomy.skin
+def _visible_skin(anatomy: Anatomy, hidden: np.ndarray) -> tuple[Surface, np.ndarray]:
+    """Skin without the faces that are wholly under cloth, and which of its vertices (n,) are under cloth."""
+    skin = anatomy.skin.with_attributes(hidden=hidden)
     bare = compact(skin, ~hidden[skin.faces].all(1))
     kept = {name: bare.attributes[name] for name in ("template", "cloth")}
-    return Surface(bare.vertices, bare.faces, bare.weights, kept)
+    return Surface(bare.vertices, bare.faces, bare.weights, kept), bare.attributes["hidden"]
 
 
 def _style_hair(rng, anatomy, male):
@@ -154,7 +153,7 @@ def _style_hair(rng, anatomy, male):
             "short": rng.uniform(0.013, 0.026),
             "curly": rng.uniform(0.03, 0.06),
         }.get(style, 0.009)
-        bumps = {"curly": 0.35, "short": 0.2}.get(style, 0.1)
+        bumps = {"curly": 0.22, "short": 0.16}.get(style, 0.1)
         pieces.append(wardrobe.Piece(hair.scalp_shell(rng, anatomy, thickness, bumps, shift=receding), material))
         tones = dataclasses.replace(tones, scalp_stubble=0.9)
     if style == "ponytail":
@@ -164,7 +163,7 @@ def _style_hair(rng, anatomy, male):
     if style == "cap":
         knit = Material(fabrics.random_fabric(rng, plainness=0.5), wrinkles=0.2)
         pieces.append(
-            wardrobe.Piece(hair.scalp_shell(rng, anatomy, rng.uniform(0.016, 0.024), 0.03, hair.CAP_LINE), knit)
+            wardrobe.Piece(hair.scalp_shell(rng, anatomy, rng.uniform(0.012, 0.018), 0.03, hair.CAP_LINE), knit)
         )
     if male and rng.random() < 0.25:
         pieces.append(wardrobe.Piece(hair.beard(rng, anatomy, rng.uniform(0.004, 0.018)), material))

@@ -59,10 +59,8 @@ def sleeve_field(template: np.ndarray, end: float) -> np.ndarray:
 def dress_up(rng: np.random.Generator, anatomy: Anatomy, male: bool) -> Outfit:
     """A random outfit."""
     outfit = Outfit([], np.zeros(len(anatomy.skin.vertices), bool))
-    if not male and rng.random() < 0.25:
-        legs_end = _dress(rng, anatomy, outfit)
-    else:
-        legs_end = _separates(rng, anatomy, outfit, male)
+    in_a_dress = not male and rng.random() < 0.25
+    legs_end = _dress(rng, anatomy, outfit) if in_a_dress else _separates(rng, anatomy, outfit, male)
     _shoes(rng, anatomy, outfit, legs_end)
     return outfit
 
@@ -70,10 +68,10 @@ def dress_up(rng: np.random.Generator, anatomy: Anatomy, male: bool) -> Outfit:
 def _separates(rng, anatomy, outfit, male):
     template = anatomy.skin.attributes["template"]
     tucked = rng.random() < 0.25
-    top_bottom = rng.uniform(-0.27, -0.24) if tucked else rng.uniform(-0.375, -0.30)
+    waist = rng.uniform(-0.235, -0.21)
+    top_bottom = waist - 0.025 if tucked else rng.uniform(-0.375, -0.30)
     jacket = rng.random() < 0.22
     _top(rng, anatomy, outfit, male, top_bottom, snug=jacket or tucked)
-    waist = rng.uniform(-0.235, -0.21)
     bottom_layer = 0.013 if tucked else 0.007
     if not male and rng.random() < 0.3:
         end = rng.choice([rng.uniform(-0.72, -0.6), rng.uniform(-1.0, -0.8)], p=[0.6, 0.4])
@@ -124,7 +122,7 @@ def _top(rng, anatomy, outfit, male, bottom, snug):
     loose = 0.0 if snug else rng.uniform(0.0, 1.0) if kind not in ("sweater", "hoodie") else rng.uniform(0.5, 1.0)
     fit = Fit(
         ease=0.009 + 0.016 * loose,
-        hang=rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 0.8,
+        hang=rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 2.0,
         sleeve=0.004 + (0.035 if sleeve < 0.45 else 0.018) * loose,
         fold=0.002 + 0.004 * loose,
     )
