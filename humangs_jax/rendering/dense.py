@@ -5,6 +5,8 @@ formula, its gradients are autodiff's. Memory and time grow with Gaussians times
 images.
 """
 
+import functools
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -17,6 +19,7 @@ from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
 from humangs_jax.rendering.splatting import Rendering
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def render_dense(
     gaussians: Gaussians,
     camera: Camera,

@@ -1,0 +1,292 @@
+"""The tiled renderer against the dense one, and as a JAX function: jit, vmap, grad, checkpoint, export, its buffers."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
+
+from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.pytree import replace
+from humangs_jax.rendering.dense import render_dense
+from humangs_jax.rendering.splatting import SplatConfig, default_pairs, fit_config, render, render_views
+
+FLOAT64 = 1e-9
+"""Relative to the largest entry; float64 rounding, grown by the 1 / (1 - alpha) <= 1000 of the gradient."""
+
+FLOAT32, FLOAT32_GRADIENT = 1e-4, 5e-3
+"""float32 against float64; gradients relative to the largest entry, Gaussians at the near plane included."""
+
+CHUNKS = SplatConfig(block=4, chunk=4, chunk_backward=3)
+"""Several blocks, and several chunks of each, in a small image; also quick to compile."""
+
+VIEW = (HEIGHT, WIDTH)
+
+
+def loss_weights():
+    """The loss is a random linear function of everything a rendering holds, so no gradient can hide."""
+    rng = np.random.default_rng(7)
+    return rng.normal(size=(*VIEW, 3)), rng.normal(size=VIEW), rng.normal(size=VIEW)
+
+
+def evaluate(draw, gaussians, view, background):
+    """Rendering, and gradients with respect to everything."""
+    weights = loss_weights()
+
+    def loss(gaussians, K, pose, background):
+        r = draw(gaussians, Camera(K, pose, view.width, view.height), background)
+        value = sum(jnp.sum(w.astype(a.dtype) * a) for w, a in zip(weights, (r.rgb, r.alpha, r.depth), strict=True))
+        return value, r
+
+    arguments = gaussians, view.K, view.cam_from_world, background
+    (_, rendering), gradients = jax.value_and_grad(loss, argnums=(0, 1, 2, 3), has_aux=True)(*arguments)
+    return rendering, gradients
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def tiled(gaussians, view, background, config=CHUNKS):
+    return evaluate(lambda g, c, b: render(g, c, config, b), gaussians, view, background)
+
+
+@jax.jit
+def dense(gaussians, view, background):
+    return evaluate(lambda g, c, b: render_dense(g, c, background=b), gaussians, view, background)
+
+
+def background(dtype=np.float64):
+    return jnp.asarray([0.2, 0.5, 0.9], dtype)
+
+
+def assert_close(ours, expected, tolerance):
+    """Leaf by leaf, relative to the largest entry of the leaf (or to 1)."""
+
+    def check(path, a, b):
+        a, b = np.asarray(a), np.asarray(b)
+        assert np.isfinite(a).all(), path
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * max(1.0, np.abs(b).max(initial=0)), err_msg=str(path))
+
+    jax.tree_util.tree_map_with_path(check, ours, expected)
+
+
+@settings(max_examples=8, deadline=None)
+@given(seed=st.integers(0, 2**20))
+def test_equals_dense_with_all_gradients(seed):
+    with jax.enable_x64(True):
+        gaussians = random_gaussians(seed)
+        ours, expected = (f(gaussians, camera(), background()) for f in (tiled, dense))
+        assert_close(ours, expected, FLOAT64)
+        assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(expected[1]))
+
+
+def test_gradients_are_derivatives():
+    """Central differences, with decisions that do not flip at this seed and no alpha at the clamp."""
+    with jax.enable_x64(True):
+        gaussians, step = random_gaussians(11), 1e-6
+        gaussians = replace(gaussians, opacities=gaussians.opacities.at[:15].multiply(0.9))
+        arguments = gaussians, camera(), background()
+        gradients = tiled(*arguments)[1]
+        rng = np.random.default_rng(3)
+        weights = loss_weights()
+
+        def loss(arguments):
+            r = tiled(*arguments)[0]
+            return sum(
+                float(np.sum(w * np.asarray(a))) for w, a in zip(weights, (r.rgb, r.alpha, r.depth), strict=True)
+            )
+
+        leaves, structure = jax.tree.flatten(arguments)
+        slopes = jax.tree.leaves(gradients)
+        assert [a.shape for a in leaves] == [a.shape for a in slopes]
+        for i, slope in enumerate(slopes):
+            direction = jnp.asarray(rng.normal(size=slope.shape))
+            moved = [
+                jax.tree.unflatten(structure, [*leaves[:i], leaves[i] + s * direction, *leaves[i + 1 :]])
+                for s in (step, -step)
+            ]
+            difference = (loss(moved[0]) - loss(moved[1])) / (2 * step)
+            np.testing.assert_allclose(jnp.vdot(slope, direction), difference, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "config",
+    [SplatConfig(), SplatConfig(tile_size=5, block=3, chunk=1)],
+    ids=["default", "tile 5"],
+)
+def test_the_schedule_does_not_change_the_image(config):
+    with jax.enable_x64(True):
+        gaussians = random_gaussians(5)
+        expected = dense(gaussians, camera(), background())[0]
+        assert_close(render(gaussians, camera(), config, background()), expected, FLOAT64)
+
+
+def test_every_knob_means_the_same_as_in_dense():
+    config = dataclasses.replace(
+        CHUNKS, near=2.5, dilation=0.1, alpha_min=0.05, alpha_max=0.8, transmittance_stop=0.02, jacobian_margin=0.0
+    )
+    with jax.enable_x64(True):
+        gaussians = random_gaussians(6)
+        ours, expected = (f(gaussians, camera(), config, background()) for f in (render, render_dense))
+        assert_close(ours, expected, FLOAT64)
+
+
+def test_float32_differs_only_by_rounding_and_by_decisions():
+    gaussians, view = random_gaussians(8, np.float32), camera(np.float32)
+    ours = tiled(gaussians, view, background(np.float32))
+    with jax.enable_x64(True):
+        exact = jax.tree.map(
+            lambda a: jnp.asarray(np.asarray(a, np.float64)), (gaussians, view, background(np.float32))
+        )
+        expected = dense(*exact)
+    error = np.abs(np.asarray(ours[0].rgb) - np.asarray(expected[0].rgb)).max(axis=-1)
+    assert np.sum(error > FLOAT32) <= 2  # pixels at which alpha = 1/255, the stop or the order fell the other way
+    assert error.max() < 2 / 255
+    assert_close(ours[1], jax.tree.map(np.asarray, expected[1]), FLOAT32_GRADIENT)
+    assert ours[0].rgb.dtype == np.float32
+
+
+def test_the_order_of_the_gaussians_does_not_matter():
+    with jax.enable_x64(True):
+        gaussians = random_gaussians(9)
+        order = np.random.default_rng(0).permutation(COUNT)
+        image, (gradient, *_) = tiled(gaussians, camera(), background())
+        other_image, (other, *_) = tiled(few(gaussians, order), camera(), background())
+        assert_close(other_image, image, FLOAT64)
+        assert_close(other, few(gradient, order), FLOAT64)
+
+
+def test_coincident_depths_are_drawn_by_index():
+    with jax.enable_x64(True):
+        gaussians = random_gaussians(10)
+        level = replace(camera(), cam_from_world=jnp.eye(4))
+        flat = replace(gaussians, means=gaussians.means.at[:, 2].set(3.0))
+        image, reverse = (render(g, level, CHUNKS) for g in (flat, few(flat, np.arange(COUNT)[::-1])))
+        assert_close(image, render_dense(flat, level), FLOAT64)
+        assert np.abs(image.rgb - reverse.rgb).max() > 0.01  # the order is visible, and is that of the index
+
+
+def views(dtype=np.float32):
+    tilts = [camera(dtype).cam_from_world.at[0, 3].add(0.1 * i) for i in range(3)]
+    return stack_cameras([replace(camera(dtype), cam_from_world=tilt) for tilt in tilts])
+
+
+def test_batches_of_subjects_and_views_equal_the_loop():
+    """Gradients of a sum over nested vmaps, through a checkpoint."""
+    with jax.enable_x64(True):
+        subjects, cameras = [random_gaussians(seed) for seed in (1, 2)], views(np.float64)
+        draw = jax.checkpoint(lambda g, c, b: render(g, c, CHUNKS, b))
+
+        @jax.jit
+        def together(batch):
+            def loss(batch):
+                renderings = jax.vmap(jax.vmap(draw, (None, 0, None)), (0, None, None))(batch, cameras, background())
+                outputs = renderings.rgb, renderings.alpha, renderings.depth
+                return sum(jnp.sum(w * a) for w, a in zip(loss_weights(), outputs, strict=True)), renderings
+
+            (_, renderings), gradients = jax.value_and_grad(loss, has_aux=True)(batch)
+            return renderings, gradients
+
+        renderings, gradients = together(jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects))
+        for i, subject in enumerate(subjects):
+            singles = [tiled(subject, cameras[j], background()) for j in range(3)]
+            for j, (rendering, _) in enumerate(singles):
+                assert_close(jax.tree.map(lambda leaf, i=i, j=j: leaf[i, j], renderings), rendering, FLOAT64)
+            total = jax.tree.map(lambda *leaves: sum(leaves), *(gradient[0] for _, gradient in singles))
+            assert_close(jax.tree.map(lambda leaf, i=i: leaf[i], gradients), total, FLOAT64)
+
+
+def test_render_views_equals_the_loop_and_fits_the_largest_view():
+    with jax.enable_x64(True):
+        gaussians, cameras = random_gaussians(1), views(np.float64)
+        renderings = render_views(gaussians, cameras, CHUNKS, background())
+        for i in range(3):
+            single = tiled(gaussians, cameras[i], background())[0]
+            assert_close(jax.tree.map(lambda leaf, i=i: leaf[i], renderings), single, FLOAT64)
+
+
+def needed(gaussians, view):
+    """Pairs by the error message's number."""
+    with pytest.raises(ValueError, match="max_pairs >= ") as error:
+        render(gaussians, view, dataclasses.replace(CHUNKS, max_pairs=1))
+    return int(str(error.value).split("max_pairs >= ")[1].split()[0])
+
+
+def test_overflow_is_counted_under_jit_and_refused_eagerly():
+    gaussians, view = random_gaussians(2, np.float32), camera(np.float32)
+    pairs = needed(gaussians, view)
+    config = dataclasses.replace(CHUNKS, max_pairs=pairs - 20, max_rows=256)
+    assert jax.jit(render, static_argnums=2)(gaussians, view, config).overflow == 20
+    with pytest.raises(ValueError, match=rf"20 .*max_pairs >= {pairs} .*got max_pairs = {pairs - 20}"):
+        render(gaussians, view, config)
+
+
+def test_fitted_buffers_hold_every_view():
+    gaussians, cameras = random_gaussians(2, np.float32), views()
+    config = fit_config(gaussians, cameras, CHUNKS, margin=1.0)
+    most = max(needed(gaussians, cameras[i]) for i in range(3))
+    assert most <= config.max_pairs < 1.5 * most
+    assert default_pairs(COUNT, WIDTH, HEIGHT) == COUNT * 6  # never more than every Gaussian in every tile
+    assert default_pairs(50_000, 512, 512) == 12 * 50_000 + 16 * 4096
+
+
+EXTREMES = {
+    "zero scales": lambda g: {"scales": jnp.zeros_like(g.scales)},
+    "zero quaternions": lambda g: {"quats": jnp.zeros_like(g.quats)},
+    "transparent": lambda g: {"opacities": jnp.zeros_like(g.opacities)},
+    "opaque": lambda g: {"opacities": jnp.ones_like(g.opacities)},
+    "huge": lambda g: {"scales": jnp.full_like(g.scales, 1e6)},
+    "beyond huge": lambda g: {"scales": jnp.full_like(g.scales, 1e30)},
+    "long needles": lambda g: {"scales": g.scales.at[:, 0].set(1e4).at[:, 1:].set(0)},
+    "at the near plane": lambda g: {"means": g.means.at[:, 2].set(-0.1 + 0.01 + 1e-6)},
+    "at the camera": lambda g: {"means": jnp.zeros_like(g.means) - camera(np.float32).cam_from_world[:3, 3]},
+    "far beside": lambda g: {"means": g.means.at[:, 0].set(1e6)},
+    "flat": lambda g: {"deformations": jnp.zeros_like(g.deformations)},
+}
+UNSEEN = ("transparent", "beyond huge", "at the camera")
+
+
+@pytest.mark.parametrize("name", EXTREMES)
+def test_extremes_are_finite(name):
+    gaussians = random_gaussians(12, np.float32)
+    gaussians = replace(gaussians, **EXTREMES[name](gaussians))
+    rendering, gradients = tiled(gaussians, camera(np.float32), background(np.float32))
+    for leaf in jax.tree.leaves((rendering, gradients)):
+        assert np.isfinite(leaf).all()
+    assert rendering.rgb.min() >= 0 and rendering.rgb.max() <= 1 + FLOAT32
+    assert (rendering.alpha.max() == 0) == (name in UNSEEN)
+
+
+def test_empty_scenes_show_the_background():
+    behind = random_gaussians(0, np.float32)
+    behind = replace(behind, means=behind.means.at[:, 2].set(-1.0))
+    for gaussians in (behind, few(behind, np.arange(0))):
+        rendering = render(gaussians, camera(np.float32), background=background(np.float32))
+        np.testing.assert_array_equal(rendering.rgb, np.broadcast_to(background(np.float32), (*VIEW, 3)))
+        assert not rendering.alpha.any() and not rendering.depth.any() and rendering.overflow == 0
+    assert (render(behind, camera(np.float32)).rgb == 1).all()  # white by default
+
+
+def test_one_pixel():
+    with jax.enable_x64(True):
+        gaussians, view = random_gaussians(0), camera(width=1, height=1)
+        assert_close(render(gaussians, view), render_dense(gaussians, view), FLOAT64)
+
+
+@pytest.mark.parametrize("gradient", [False, True])
+def test_lowers_for_every_platform(gradient):
+    gaussians, view = random_gaussians(0, np.float32), camera(np.float32)
+    loss = lambda gaussians, view: jnp.sum(render(gaussians, view, CHUNKS).rgb)
+    function = jax.grad(loss) if gradient else lambda gaussians, view: render(gaussians, view, CHUNKS).rgb
+    exported = jax.export.export(jax.jit(function), platforms=("cpu", "cuda", "tpu"))(gaussians, view)
+    assert "callback" not in exported.mlir_module()
+
+
+def test_settings_are_checked():
+    for wrong in ({"chunk": 0}, {"alpha_min": 0.0}, {"alpha_max": 1.0}, {"near": -1.0}, {"max_pairs": 0}):
+        with pytest.raises(ValueError, match="SplatConfig"):
+            SplatConfig(**wrong)
