@@ -6,6 +6,7 @@ is not where the mask is, is tried again with the usual mistakes undone, and the
 """
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import jax
@@ -25,6 +26,7 @@ LONGEST_SIDE = 512
 """Larger photos are shrunk to this for the check, pixels."""
 LEAST_IOU = 0.5
 """Clothes and hair cover about a fifth of a silhouette that the body does not; half means another pose or camera."""
+SURELY_IOU = 0.6
 LEAST_INSIDE, SURELY_INSIDE = 0.5, 0.9
 """Share of the vertices in the frame: below the first it is a warning, the second is asked of an explanation."""
 LEAST_HEIGHT = 0.05
@@ -34,18 +36,30 @@ OUTLINE = (0.1, 0.85, 0.2)
 AMBIENT = 0.35
 OPACITY = 0.55
 
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0]).astype(np.float32)
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""Points of a y-up world -> points of a z-up world."""
+
+
+def _moved(offset):
+    return np.block([[np.eye(3), np.reshape(offset, (3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
 MISTAKES = {
-    "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m: np.linalg.inv(m),
-    "the camera looks along -z with y up (OpenGL, Blender, NeRF): negate rows 2 and 3 of cam_from_world": lambda m: (
-        _FLIP @ m
+    "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m, t: np.linalg.inv(m),
+    "the camera looks along -z with y up (OpenGL, Blender, NeRF): negate rows 2 and 3 of cam_from_world": (
+        lambda m, t: _FLIP @ m
     ),
     "the matrix is camera to world in OpenGL's convention (NeRF, Blender): invert it, then negate rows 2 and 3": (
-        lambda m: _FLIP @ np.linalg.inv(m)
+        lambda m, t: _FLIP @ np.linalg.inv(m)
     ),
-    "the camera's translation is in millimetres": lambda m: np.block([[m[:3, :3], m[:3, 3:] / 1000], [m[3:]]]),
+    "the camera's translation is in millimetres": lambda m, t: np.block([[m[:3, :3], m[:3, 3:] / 1000], [m[3:]]]),
+    "the body's translation is in millimetres": lambda m, t: m @ _moved(t / 1000 - t),
+    "the cameras stand in a world with z up: multiply cam_from_world by (x, y, z) -> (x, -z, y) from the right": (
+        lambda m, t: m @ _FROM_Y_UP
+    ),
 }
-"""What people give in place of cam_from_world, and how to come back from it."""
+"""What people give, and the cam_from_world that undoes it, from theirs and the body's translation."""
 
 
 @pytree_dataclass
@@ -113,8 +127,12 @@ def check_capture(capture: Capture, out: str | Path) -> CheckReport:
         picture = _picture(posed, capture.body.faces, tints, cameras[i])
         mask = None if masks is None else masks[i] > 0.5
         view = _judge(name, picture, mask)
-        if view.warnings and (cause := _likely_mistake(posed, capture.body.faces, tints, cameras[i], mask)):
-            view = dataclasses.replace(view, warnings=(*view.warnings, f"it would fit if {cause}"))
+        if view.warnings:
+            translation = np.asarray(capture.poses.translation[int(capture.frames[i])], float)
+            draw = functools.partial(_picture, posed, capture.body.faces, tints)
+            cause = _mistake_in_picture(picture, mask) or _mistake_in_space(draw, cameras[i], translation, mask)
+            explained = f"it would fit if {cause}"
+            view = dataclasses.replace(view, warnings=view.warnings + ((explained,) if cause else ()))
         pictures.append(overlay(images[i], picture))
         views.append(view)
     contact_sheet(np.stack(pictures), out, labels=[_label(view) for view in views])
@@ -220,13 +238,23 @@ def _judge(name, picture, mask) -> ViewCheck:
     return ViewCheck(name, iou, inside, tuple(warnings))
 
 
-def _likely_mistake(vertices, faces, tints, camera, mask):
-    """The usual mistake that, undone, puts the body where the mask is; without a mask the only one that puts it into frame."""
+def _mistake_in_picture(picture, mask):
+    """An inverted mask, or a mirrored photo."""
+    if mask is None or not mask.any():
+        return None
+    covered = np.asarray(picture.covered)
+    tried = {"the mask is inverted": (covered, ~mask), "the photo is mirrored": (covered[:, ::-1], mask)}
+    shares = {mistake: (a & b).sum() / max((a | b).sum(), 1) for mistake, (a, b) in tried.items()}
+    best = max(shares, key=shares.get)
+    return best if shares[best] > SURELY_IOU else None
+
+
+def _mistake_in_space(draw, camera, translation, mask):
+    """The usual mistake that, undone, puts the body where the mask is; without a mask the only one that puts it in frame."""
     fitting = {}
     for mistake, undo in MISTAKES.items():
-        matrix = jnp.asarray(undo(np.asarray(camera.cam_from_world)), jnp.float32)
-        picture = _picture(vertices, faces, tints, replace(camera, cam_from_world=matrix))
-        view = _judge("", picture, mask)
+        matrix = jnp.asarray(undo(np.asarray(camera.cam_from_world, float), translation), camera.K.dtype)
+        view = _judge("", draw(replace(camera, cam_from_world=matrix)), mask)
         if not view.warnings and view.inside > SURELY_INSIDE:
             fitting[mistake] = view.iou
     if mask is None:

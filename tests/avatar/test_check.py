@@ -11,6 +11,7 @@ from humangs_jax.body.model import BodyModel, rest_pose
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.images import read_image
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.pytree import replace
 
 SIZE = 64
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -112,11 +113,13 @@ def test_overlay_changes_only_the_body():
     np.testing.assert_array_equal(overlay(photo, parts), picture)
 
 
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # (x, y, z) -> (x, z, -y): z-up to y-up
 MISTAKES = {
     "is the inverse": np.linalg.inv,
+    "a world with z up": lambda m: m @ Z_UP,
     "looks along -z": lambda m: FLIP @ m,
     "camera to world in OpenGL": lambda m: np.linalg.inv(FLIP @ m),
-    "millimetres": lambda m: np.block([[m[:3, :3], m[:3, 3:] * 1000], [m[3:]]]),
+    "camera's translation is in millimetres": lambda m: np.block([[m[:3, :3], m[:3, 3:] * 1000], [m[3:]]]),
 }
 
 
@@ -137,6 +140,27 @@ def test_without_masks_no_wrong_mistake_is_named(tmp_path, mistake):
         assert view.iou is None
         assert all(mistake in warning for warning in view.warnings if "would fit" in warning)
     assert str(report).count("no mask") == 3
+
+
+def test_mistakes_in_pictures_and_poses_are_named(tmp_path):
+    right = capture()
+    aside = replace(right.cameras, K=right.cameras.K.at[:, 0, 2].add(12))  # off the middle, then mirrored
+    flipped = {name: np.roll(getattr(right, name), 12, axis=2)[:, :, ::-1].copy() for name in ("images", "masks")}
+    millimetres = replace(right.poses, translation=jnp.asarray([[400.0, 300.0, 200.0]]))
+    shift = np.eye(4)
+    shift[:3, 3] = [-0.4, -0.3, -0.2]
+    moved = right.cameras.cam_from_world @ jnp.asarray(shift, jnp.float32)
+    wrong = {
+        "the mask is inverted": dict(masks=1 - right.masks),
+        "the photo is mirrored": {**flipped, "cameras": aside},
+        "the body's translation is in millimetres": dict(
+            poses=millimetres, cameras=replace(right.cameras, cam_from_world=moved)
+        ),
+    }
+    for mistake, changes in wrong.items():
+        report = check_capture(dataclasses.replace(right, **changes), tmp_path / "check.png")
+        named = [view.warnings[-1:] for view in report.views]
+        assert sum(mistake in warning for warnings in named for warning in warnings) >= 2, (mistake, named)
 
 
 def test_warnings_tell_what_is_wrong(tmp_path):
