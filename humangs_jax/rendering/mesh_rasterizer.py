@@ -212,7 +212,7 @@ def _window(first, end, start, size):
     """Slots start .. start + size of items that own the slots first .. end: item of each, its place in the item, used or not.
 
     As many items begin at or before a slot as the running sum of marks says, and the last of them owns the slot: items
-    without slots begin together with the next one that has any.
+    without slots begin together with the next one that has any. (Exact below 2^24 items, see `cumsum`.)
     """
     marks = jnp.zeros(size, jnp.int32).at[jnp.maximum(first - start, 0)].add(1, mode="drop")
     item = cumsum(marks) - 1
