@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.array_types import Float
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 
 VERTICAL_FOV = np.deg2rad(60.0)
@@ -16,19 +17,21 @@ FRAME = 0.98
 _orbit = jax.jit(orbit, static_argnums=(5, 6))
 
 
-def bounding_sphere(vertices: np.ndarray) -> tuple[np.ndarray, float]:
+def bounding_sphere(vertices: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
     """Middle of the bounding box (3,) and the largest distance from it."""
     center = 0.5 * (vertices.min(0) + vertices.max(0))
     return center, float(np.linalg.norm(vertices - center, axis=1).max())
 
 
-def spread_azimuths(rng: np.random.Generator, count: int, jitter: float = 0.3) -> np.ndarray:
+def spread_azimuths(rng: np.random.Generator, count: int, jitter: float = 0.3) -> Float[np.ndarray, " count"]:
     """(count,) sorted azimuths, evenly spread from a random start, each moved by up to `jitter` of the spacing."""
     spacing = 2 * np.pi / count
     return rng.uniform(0, spacing) + spacing * (np.arange(count) + rng.uniform(-jitter, jitter, count))
 
 
-def cameras_around(rng: np.random.Generator, vertices: np.ndarray, azimuths: np.ndarray, image_size: int) -> Camera:
+def cameras_around(
+    rng: np.random.Generator, vertices: Float[np.ndarray, "n 3"], azimuths: Float[np.ndarray, " v"], image_size: int
+) -> Camera:
     """A batch of cameras at the azimuths, distances and elevations drawn from the protocol's ranges."""
     center, radius = bounding_sphere(vertices)
     distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
@@ -42,7 +45,7 @@ def cameras_around(rng: np.random.Generator, vertices: np.ndarray, azimuths: np.
     return _orbit(target, distances, azimuths, elevations, K, image_size, image_size)
 
 
-def nearest_distance(points: np.ndarray, azimuth: float, elevation: float) -> float:
+def nearest_distance(points: Float[np.ndarray, "n 3"], azimuth: float, elevation: float) -> float:
     """Least distance from the origin at which a camera that looks at it has all points (n, 3) in its square frame."""
     sa, ca, se, ce = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
     towards, up, right = (

@@ -114,7 +114,7 @@ def eye_material(tones: Complexion) -> Material:
     def albedo(s: Spots):
         d = s.template
         angle = np.arccos(np.clip(d[:, 2] / np.maximum(np.linalg.norm(d, axis=1), 1e-6), -1, 1))
-        white = np.asarray([0.84, 0.82, 0.80], np.float32) + 0 * d
+        white = np.asarray([0.84, 0.82, 0.80], np.float32)
         result = mix(white, tones.iris, band(angle, -1, 0.47, 0.05))
         result = mix(result, tones.iris * 0.4, band(angle, 0.40, 0.48, 0.05))
         result = mix(result, np.asarray([0.02, 0.02, 0.02], np.float32), band(angle, -1, 0.21, 0.05))
@@ -136,6 +136,6 @@ def hair_material(rng: np.random.Generator, base: np.ndarray, streak: float) -> 
         coarse = lattice(np.stack([angle / 0.25, s.template[:, 1] / 0.12], -1), seed + 1)
         bright = 1 + streak * (1.1 * (fine - 0.5) + 0.7 * (coarse - 0.5))
         down = np.clip((0.3 - s.template[:, 1]) / 0.35, 0, 1)
-        return mix(base + 0 * s.cloth[:, :3], tips, down) * bright[:, None]
+        return mix(base, tips, down) * bright[:, None]
 
     return Material(albedo, wrinkles=0.0, sheen=0.4)

@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from humangs_jax.array_types import Float
 from humangs_jax.data.synthetic.noise import Ripples, hashed, lattice
 
 ALBEDO_LIMIT = 0.88
@@ -20,16 +21,16 @@ ALBEDO_LIMIT = 0.88
 class Spots:
     """Points on a surface. cloth: (n, 4), see `anatomy.cloth_coordinates`. template: (n, 3) template coordinates."""
 
-    cloth: np.ndarray
-    template: np.ndarray
+    cloth: Float[np.ndarray, "n 4"]
+    template: Float[np.ndarray, "n 3"]
 
     @property
-    def around(self) -> np.ndarray:
+    def around(self) -> Float[np.ndarray, " n"]:
         """(n,) metres around the trunk or limb, 0 in front."""
         return np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * self.cloth[:, 3]
 
     @property
-    def along(self) -> np.ndarray:
+    def along(self) -> Float[np.ndarray, " n"]:
         """(n,) metres along the trunk or limb (height)."""
         return self.cloth[:, 1]
 
@@ -43,12 +44,12 @@ class Material:
     sheen: float = 0.0
 
 
-def colour(hue: float, saturation: float, value: float) -> np.ndarray:
+def colour(hue: float, saturation: float, value: float) -> Float[np.ndarray, "3"]:
     """(3,) linear-as-given RGB."""
     return np.asarray(colorsys.hsv_to_rgb(hue % 1, np.clip(saturation, 0, 1), np.clip(value, 0, 1)), np.float32)
 
 
-def random_colour(rng: np.random.Generator) -> np.ndarray:
+def random_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
     """A dye: neutrals, denim blues, earth colours or something loud."""
     kind = rng.choice(["neutral", "muted", "vivid", "earth", "navy"], p=[0.28, 0.28, 0.22, 0.11, 0.11])
     if kind == "neutral":
@@ -62,7 +63,7 @@ def random_colour(rng: np.random.Generator) -> np.ndarray:
     return colour(rng.uniform(0.56, 0.66), rng.uniform(0.4, 0.8), rng.uniform(0.12, 0.45))
 
 
-def accent(rng: np.random.Generator, base: np.ndarray) -> np.ndarray:
+def accent(rng: np.random.Generator, base: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """A second dye that stands out from the first."""
     for _ in range(8):
         other = random_colour(rng)
@@ -71,12 +72,19 @@ def accent(rng: np.random.Generator, base: np.ndarray) -> np.ndarray:
     return np.where(base.mean() > 0.45, base * 0.3, 0.3 + 0.55 * base).astype(np.float32)
 
 
-def mix(a: np.ndarray, b: np.ndarray, amount: np.ndarray) -> np.ndarray:
-    """A where amount (n,) is 0, b where it is 1."""
+def mix(
+    a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], amount: Float[np.ndarray, " m"]
+) -> Float[np.ndarray, "m 3"]:
+    """Colours, of points (m, 3) or one for all (3,): `a` where amount is 0, `b` where it is 1."""
     return a + (b - a) * amount[:, None]
 
 
-def band(x: np.ndarray, low: float, high: float, soft: float = 0.0015) -> np.ndarray:
+def band(
+    x: Float[np.ndarray, " n"],
+    low: float | int | Float[np.ndarray, " n"],
+    high: float | int | Float[np.ndarray, " n"],
+    soft: float = 0.0015,
+) -> Float[np.ndarray, " n"]:
     """1 between low and high (metres), with soft edges."""
     return np.clip((x - low) / soft + 0.5, 0, 1) * np.clip((high - x) / soft + 0.5, 0, 1)
 
@@ -95,7 +103,7 @@ def stripes(rng, base, other, upright=False):
     def albedo(s):
         x = s.around if upright else s.along
         phase = (x / period) % 1
-        return mix(base + 0 * s.cloth[:, :3], other, band(phase * period, 0.0, share * period))
+        return mix(base, other, band(phase * period, 0.0, share * period))
 
     return albedo
 
@@ -108,7 +116,7 @@ def checks(rng, base, other):
     def albedo(s):
         across = band((s.around / period) % 1 * period, 0, period / 2)
         along = band((s.along / period) % 1 * period, 0, period / 2)
-        result = mix(base + 0 * s.cloth[:, :3], other, 0.5 * (across + along))
+        result = mix(base, other, 0.5 * (across + along))
         if thin:
             lines = np.maximum(
                 band((s.around / period + 0.25) % 1 * period, 0, 0.004),
@@ -128,7 +136,7 @@ def dots(rng, base, other):
         row = np.floor(s.along / period)
         x = ((s.around / period + 0.5 * (row % 2)) % 1 - 0.5) * period
         y = ((s.along / period) % 1 - 0.5) * period
-        return mix(base + 0 * s.cloth[:, :3], other, band(np.sqrt(x * x + y * y), -1, size * period, 0.002))
+        return mix(base, other, band(np.sqrt(x * x + y * y), -1, size * period, 0.002))
 
     return albedo
 
@@ -144,9 +152,8 @@ def flowers(rng, base, other):
         d = (plane - cell - jitter) * period
         r, a = np.sqrt(np.sum(d * d, -1)), np.arctan2(d[:, 1], d[:, 0]) + 6 * hashed(cell, seed + 2)
         petals = band(r, -1, period * (0.2 + 0.08 * np.cos(5 * a)), 0.002)
-        dye = mix(other + 0 * s.cloth[:, :3], third, (hashed(cell, seed + 3) > 0.5).astype(np.float32))
-        result = mix(base + 0 * s.cloth[:, :3], base * 0.6, 0.0 * r)
-        result = result + (dye - result) * petals[:, None]
+        dye = mix(other, third, (hashed(cell, seed + 3) > 0.5).astype(np.float32))
+        result = mix(base, dye, petals)
         return mix(result, np.asarray([0.85, 0.75, 0.3], np.float32), band(r, -1, period * 0.07, 0.002))
 
     return albedo
@@ -163,7 +170,7 @@ def mottled(rng, base, other):
         width = 0.02 if hard else 0.2
         first = np.clip((n - 0.47) / width + 0.5, 0, 1)
         second = np.clip((lattice(p * 1.2 + 7.7, seed + 2) - 0.62) / width + 0.5, 0, 1)
-        return mix(mix(base + 0 * s.cloth[:, :3], other, first), third, 0.8 * second)
+        return mix(mix(base, other, first), third, 0.8 * second)
 
     return albedo
 
@@ -174,7 +181,7 @@ def melange(rng, base, other):
 
     def albedo(s):
         fine = lattice(np.stack([s.around / 0.006, s.along / 0.009], -1), seed)
-        return mix(base + 0 * s.cloth[:, :3], other, share * fine)
+        return mix(base, other, share * fine)
 
     return albedo
 
@@ -199,7 +206,7 @@ def colour_blocks(rng, base, other):
     level, wide, third = rng.uniform(-0.15, 0.06), rng.uniform(0.01, 0.03), accent(rng, other)
 
     def albedo(s):
-        upper = mix(base + 0 * s.cloth[:, :3], other, band(s.along, level, 9.0))
+        upper = mix(base, other, band(s.along, level, 9.0))
         return mix(upper, third, band(s.along, level - wide, level))
 
     return albedo
@@ -312,7 +319,7 @@ def leather(rng, base, trim, sole_height):
 
     def albedo(s):
         y, x, z = s.cloth[:, 1], s.cloth[:, 0], s.cloth[:, 2]
-        result = mix(base + 0 * s.cloth[:, :3], trim, band(y, -1, sole_height, 0.002))
+        result = mix(base, trim, band(y, -1, sole_height, 0.002))
         laces = (
             band((z / 0.014) % 1 * 0.014, 0, 0.005)
             * band(np.abs(x), -1, 0.018)

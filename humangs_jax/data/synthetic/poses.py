@@ -9,6 +9,8 @@ import dataclasses
 
 import numpy as np
 
+from humangs_jax.array_types import Float
+
 PELVIS, LEFT_HIP, RIGHT_HIP, SPINE1, LEFT_KNEE, RIGHT_KNEE, SPINE2, LEFT_ANKLE, RIGHT_ANKLE, SPINE3 = range(10)
 LEFT_FOOT, RIGHT_FOOT, NECK, LEFT_COLLAR, RIGHT_COLLAR, HEAD = range(10, 16)
 LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST = range(16, 22)
@@ -66,7 +68,7 @@ RAISE = {"hang": (-1.5, -1.05), "away": (-1.3, -0.7), "wave": (-1.45, 1.25), "up
 class Build:
     """What the prior must know of a body: rest joints (j, 3), parents, and radii in metres of its clothed parts."""
 
-    joints: np.ndarray
+    joints: Float[np.ndarray, "j 3"]
     parents: tuple[int, ...]
     torso_radius: float
     thigh_radius: float
@@ -74,7 +76,7 @@ class Build:
     arm_radius: float
 
 
-def rotation_matrix(vectors: np.ndarray) -> np.ndarray:
+def rotation_matrix(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """Rodrigues' formula for rotation vectors (..., 3)."""
     angle = np.sqrt(np.sum(vectors * vectors, axis=-1))[..., None, None]
     x, y, z = np.moveaxis(vectors / np.maximum(angle[..., 0], 1e-9), -1, 0)
@@ -83,7 +85,7 @@ def rotation_matrix(vectors: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
 
 
-def rotation_vector(matrix: np.ndarray) -> np.ndarray:
+def rotation_vector(matrix: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3"]:
     """The rotation vector of (..., 3, 3) rotations by less than pi."""
     angle = np.arccos(np.clip((np.trace(matrix, axis1=-2, axis2=-1) - 1) / 2, -1, 1))[..., None]
     pairs = [(2, 1), (0, 2), (1, 0)]
@@ -91,7 +93,9 @@ def rotation_vector(matrix: np.ndarray) -> np.ndarray:
     return axis * np.where(angle < 1e-4, 0.5, angle / np.maximum(2 * np.sin(angle), 1e-9))
 
 
-def joint_positions(build: Build, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def joint_positions(
+    build: Build, rotations: Float[np.ndarray, "j 3"]
+) -> tuple[Float[np.ndarray, "j 3 3"], Float[np.ndarray, "j 3"]]:
     """World rotations (j, 3, 3) and positions (j, 3) of all joints for rotation vectors (j, 3)."""
     local = rotation_matrix(rotations)
     world, positions = np.empty_like(local), np.empty_like(build.joints, dtype=np.float64)
@@ -104,7 +108,7 @@ def joint_positions(build: Build, rotations: np.ndarray) -> tuple[np.ndarray, np
     return world, positions
 
 
-def sample_rotations(rng: np.random.Generator, build: Build) -> np.ndarray:
+def sample_rotations(rng: np.random.Generator, build: Build) -> Float[np.ndarray, "j 3"]:
     """(j, 3) rotation vectors of a random plausible pose."""
     rotations = np.zeros((JOINTS, 3))
     rotations[PELVIS] = [rng.normal(0, 0.03), rng.uniform(-0.7, 0.7), 0.0]
@@ -118,7 +122,7 @@ def sample_rotations(rng: np.random.Generator, build: Build) -> np.ndarray:
     return limited(rotations)
 
 
-def limited(rotations: np.ndarray) -> np.ndarray:
+def limited(rotations: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3"]:
     """Rotation vectors (j, 3) shortened to the limits of their joints."""
     limit = np.zeros(JOINTS)
     limit[list(LIMITS)] = list(LIMITS.values())

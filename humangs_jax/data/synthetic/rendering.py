@@ -5,6 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.array_types import Float
 from humangs_jax.data.synthetic.fabrics import Spots
 from humangs_jax.data.synthetic.noise import Ripples
 from humangs_jax.data.synthetic.shading import bend_normals, occlusion, shade
@@ -25,21 +26,25 @@ class PosedSubject:
     """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n, 3), openness (n,)."""
 
     subject: SyntheticSubject
-    rotations: np.ndarray
-    translation: np.ndarray
-    vertices: np.ndarray
-    normals: np.ndarray
-    openness: np.ndarray
+    rotations: Float[np.ndarray, "j 3"]
+    translation: Float[np.ndarray, "3"]
+    vertices: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    openness: Float[np.ndarray, " n"]
 
 
-def pose_subject(subject: SyntheticSubject, rotations: np.ndarray, translation: np.ndarray) -> PosedSubject:
+def pose_subject(
+    subject: SyntheticSubject, rotations: Float[np.ndarray, "j 3"], translation: Float[np.ndarray, "3"]
+) -> PosedSubject:
     """Skin the mesh and gather what its shading needs."""
     vertices = subject.posed_vertices(rotations, translation).astype(np.float32)
     normals = vertex_normals(vertices, subject.surface.faces)
     return PosedSubject(subject, rotations, translation, vertices, normals, occlusion(vertices, normals))
 
 
-def render_view(posed: PosedSubject, camera: Camera, background: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def render_view(
+    posed: PosedSubject, camera: Camera, background: float = 1.0
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """(h, w, 3) picture on the background and (h, w) coverage of one camera, both in [0, 1]."""
     s = SUPERSAMPLING
     large = camera.resized(camera.width * s, camera.height * s)

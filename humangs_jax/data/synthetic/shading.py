@@ -7,6 +7,7 @@ import dataclasses
 
 import numpy as np
 
+from humangs_jax.array_types import Float
 from humangs_jax.data.synthetic.fabrics import ALBEDO_LIMIT
 from humangs_jax.data.synthetic.surfaces import unit
 
@@ -20,10 +21,10 @@ REACH = (0.045, 0.11)
 class Lights:
     """directions: (k, 3) towards the lights. strengths: (k, 3). sky, ground: (3,) ambient from above and below."""
 
-    directions: np.ndarray
-    strengths: np.ndarray
-    sky: np.ndarray
-    ground: np.ndarray
+    directions: Float[np.ndarray, "k 3"]
+    strengths: Float[np.ndarray, "k 3"]
+    sky: Float[np.ndarray, "3"]
+    ground: Float[np.ndarray, "3"]
 
 
 def sample_lights(rng: np.random.Generator) -> Lights:
@@ -45,7 +46,7 @@ def sample_lights(rng: np.random.Generator) -> Lights:
     )
 
 
-def occlusion(vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
+def occlusion(vertices: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """(n,) openness of each vertex in [0.35, 1]: how empty the grid is in front of it."""
     low = vertices.min(0) - 6 * CELL
     size = np.ceil((vertices.max(0) + 6 * CELL - low) / CELL).astype(int)
@@ -73,8 +74,12 @@ def _trilinear(grid, at):
 
 
 def shade(
-    lights: Lights, albedo: np.ndarray, normals: np.ndarray, openness: np.ndarray, sheen: np.ndarray
-) -> np.ndarray:
+    lights: Lights,
+    albedo: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    openness: Float[np.ndarray, " n"],
+    sheen: Float[np.ndarray, " n"],
+) -> Float[np.ndarray, "n 3"]:
     """(n, 3) colours in [0, 1] of points with albedo (n, 3), unit normals (n, 3), openness (n,), sheen (n,)."""
     up = 0.5 + 0.5 * normals[:, 1:2]
     light = (lights.ground + (lights.sky - lights.ground) * up) * openness[:, None]
@@ -88,7 +93,7 @@ def shade(
     return np.clip(np.minimum(albedo, ALBEDO_LIMIT) * light, 0, 0.97).astype(np.float32)
 
 
-def bend_normals(normals: np.ndarray, slope: np.ndarray) -> np.ndarray:
+def bend_normals(normals: Float[np.ndarray, "n 3"], slope: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Normals (n, 3) tilted against the gradient (n, 3) of a height field on the surface."""
     along = slope - np.sum(slope * normals, -1, keepdims=True) * normals
     return unit(normals - along)

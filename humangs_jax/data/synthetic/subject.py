@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.array_types import Bool, Float, Int
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.data.synthetic import anatomy as anatomy_module
 from humangs_jax.data.synthetic import complexion, fabrics, hair, poses, wardrobe
@@ -27,15 +28,17 @@ class SyntheticSubject:
     """
 
     seed: int
-    betas: np.ndarray
+    betas: Float[np.ndarray, " s"]
     surface: Surface
-    face_materials: np.ndarray
+    face_materials: Int[np.ndarray, " f"]
     materials: tuple[Material, ...]
     lights: Lights
     build: poses.Build
-    under_cloth: np.ndarray
+    under_cloth: Bool[np.ndarray, " n"]
 
-    def posed_vertices(self, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    def posed_vertices(
+        self, rotations: Float[np.ndarray, "j 3"], translation: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "n 3"]:
         """(n, 3) world positions of the mesh in a pose: rotations (j, 3), translation (3,)."""
         transforms = self._transforms(rotations, translation)
         blended = (self.surface.weights @ transforms[:, :3].reshape(len(transforms), 12)).reshape(-1, 3, 4)
@@ -91,7 +94,7 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
     )
 
 
-def sample_shape(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[np.ndarray, bool]:
+def sample_shape(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[Float[np.ndarray, " s"], bool]:
     """(s,) shape coefficients and whether the person is dressed as a man."""
     betas = np.clip(rng.normal(0, 1, len(names)), -2, 2) * SHAPE_SPREAD
     male = bool(rng.random() < 0.5)

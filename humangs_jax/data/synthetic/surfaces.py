@@ -8,6 +8,8 @@ import dataclasses
 
 import numpy as np
 
+from humangs_jax.array_types import Bool, Float, Int
+
 NORMAL_FLOOR = 1e-12
 """Added to lengths before dividing: vertices without area get the zero normal."""
 
@@ -16,12 +18,12 @@ NORMAL_FLOOR = 1e-12
 class Surface:
     """vertices: (n, 3) metres at rest. faces: (f, 3). weights: (n, j) skinning weights. attributes: name -> (n, ...)."""
 
-    vertices: np.ndarray
-    faces: np.ndarray
-    weights: np.ndarray
+    vertices: Float[np.ndarray, "n 3"]
+    faces: Int[np.ndarray, "f 3"]
+    weights: Float[np.ndarray, "n j"]
     attributes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
-    def moved(self, vertices: np.ndarray) -> "Surface":
+    def moved(self, vertices: Float[np.ndarray, "n 3"]) -> "Surface":
         """The same surface with other vertex positions."""
         return dataclasses.replace(self, vertices=np.asarray(vertices, np.float32))
 
@@ -30,30 +32,32 @@ class Surface:
         return dataclasses.replace(self, attributes={**self.attributes, **attributes})
 
 
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+def vertex_normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
     """(n, 3) area-weighted unit normals."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     face_normals = np.cross(b - a, c - a)
     return unit(scatter_add(faces.T.reshape(-1), np.tile(face_normals, (3, 1)), len(vertices)))
 
 
-def scatter_add(indices: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+def scatter_add(
+    indices: Int[np.ndarray, " m"], values: Float[np.ndarray, "m c"], count: int
+) -> Float[np.ndarray, "count c"]:
     """Sums of the rows of `values` (m, c) that share an index, (count, c) float32."""
     columns = [np.bincount(indices, weights=values[:, c], minlength=count) for c in range(values.shape[1])]
     return np.stack(columns, axis=1).astype(np.float32)
 
 
-def unit(vectors: np.ndarray) -> np.ndarray:
+def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Vectors over their lengths along the last axis."""
     return vectors / (np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)) + NORMAL_FLOOR)
 
 
-def edges_of(faces: np.ndarray) -> np.ndarray:
+def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
     """(e, 2) directed edges of all faces, three per face."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-def boundary_edges(faces: np.ndarray) -> np.ndarray:
+def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
     """(e, 2) directed edges that only one face has: the hems."""
     edges = edges_of(faces).astype(np.int64)
     count = int(faces.max()) + 1
@@ -62,7 +66,13 @@ def boundary_edges(faces: np.ndarray) -> np.ndarray:
     return edges[uses[inverse] == 1].astype(np.int32)
 
 
-def smooth(values: np.ndarray, faces: np.ndarray, iterations: int, strength: float = 0.5, keep_hems: bool = False):
+def smooth(
+    values: Float[np.ndarray, "n c"],
+    faces: Int[np.ndarray, "f 3"],
+    iterations: int,
+    strength: float = 0.5,
+    keep_hems: bool = False,
+) -> Float[np.ndarray, "n c"]:
     """Laplacian smoothing of vertex values (n, c): each step moves a vertex towards the mean of its neighbours.
 
     keep_hems: vertices on the boundary only feel their neighbours on the boundary, so that hems stay crisp and do not shrink.
@@ -86,7 +96,7 @@ def smooth(values: np.ndarray, faces: np.ndarray, iterations: int, strength: flo
     return values.astype(np.float32)
 
 
-def compact(surface: Surface, face_mask: np.ndarray) -> Surface:
+def compact(surface: Surface, face_mask: Bool[np.ndarray, " f"]) -> Surface:
     """The faces chosen by a (f,) mask and only the vertices they use."""
     faces = surface.faces[face_mask]
     used = np.zeros(len(surface.vertices), bool)
@@ -100,7 +110,7 @@ def compact(surface: Surface, face_mask: np.ndarray) -> Surface:
     )
 
 
-def cut(surface: Surface, field: np.ndarray) -> Surface:
+def cut(surface: Surface, field: Float[np.ndarray, " n"]) -> Surface:
     """The part where a per-vertex field (n,) is positive, cut exactly along its zero line."""
     field = np.where(np.abs(field) < 1e-6, 1e-6, field).astype(np.float32)
     inside = field > 0
@@ -171,7 +181,7 @@ def turn_in_hems(surface: Surface, depth: float) -> Surface:
     )
 
 
-def grid_faces(rows: int, columns: int, closed: bool) -> np.ndarray:
+def grid_faces(rows: int, columns: int, closed: bool) -> Int[np.ndarray, "f 3"]:
     """Triangles of a (rows, columns) grid of vertices, row-major; `closed`: the last column joins the first.
 
     Counter-clockwise seen from the side where columns run to the right and rows run down.
