@@ -18,9 +18,9 @@ from pathlib import Path
 
 import jax
 
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, ExampleSource
+from humangs_jax.data.views import gaussian_body
 from humangs_jax.models.humangs import Variables
 from humangs_jax.models.weights import save_weights
 from humangs_jax.training.checkpoint import Checkpoints, save_config
@@ -51,7 +51,7 @@ def train(
     """Train until `config.steps`, from the newest checkpoint in `out` if there is one.
 
     Arguments:
-        body: the model that the captures' parameters belong to; decimated to `config.model.body_vertices` here.
+        body: the model that the captures' parameters belong to; made into the model's `gaussian_body` here.
         training, validation: capture folders; no validation without the latter.
         variables: where to start a new run, for instance shipped weights; None for fresh ones.
         stop_at: end after this step as if interrupted.
@@ -63,9 +63,7 @@ def train(
     out = Path(out)
     (out / "sheets").mkdir(parents=True, exist_ok=True)
     save_config(out, config)
-    wanted = config.model.body_vertices
-    if wanted is not None and wanted < len(body.template):
-        body = decimate(body, wanted)
+    body = gaussian_body(body, config.model)
     size = config.model.image_size
     source = ExampleSource(
         CaptureCache(training, body), config.views, size, config.target_size, config.batch_size, config.seed

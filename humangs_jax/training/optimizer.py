@@ -58,6 +58,11 @@ def finite_gradients(gradients: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.nan_to_num(x, nan=0.0, posinf=stand_in, neginf=-stand_in), gradients)
 
 
+def gradient_norm(gradients: PyTree) -> Scalar:
+    """Euclidean norm over all entries of all leaves."""
+    return jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(gradients)))
+
+
 def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.GradientTransformationExtraArgs:
     """`inner` on finite gradients, skipped where their norm exceeds `skip_norm` or the loss is not finite.
 
@@ -69,7 +74,7 @@ def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.Gradie
 
     def update(gradients: PyTree, state: GuardState, params: PyTree, *, value: Scalar, **_):
         gradients = finite_gradients(gradients)
-        norm = optax.global_norm(gradients)
+        norm = gradient_norm(gradients)
         good = jnp.isfinite(value) & (norm <= skip_norm)
         updates, advanced = inner.update(gradients, state.inner, params)
         keep = lambda new, old: jnp.where(good, new, old)

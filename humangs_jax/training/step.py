@@ -86,9 +86,12 @@ def subject_loss(
 
 
 def batch_gradients(
-    state: TrainState, body: BodyModel, batch: Example, keys: Key, config: TrainConfig
+    state: TrainState, body: BodyModel, batch: Example, keys: Array, config: TrainConfig
 ) -> tuple[Scalar, PyTree, PyTree, Metrics]:
-    """(loss, gradients, batch_stats, metrics) of a batch: means over its subjects, but sums of what was dropped."""
+    """(loss, gradients, batch_stats, metrics) of a batch: means over its subjects, but sums of what was dropped.
+
+    keys: one per subject.
+    """
     if config.batching == "vmap":
 
         def batch_loss(params):

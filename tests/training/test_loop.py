@@ -1,0 +1,103 @@
+"""The loop: resume is bitwise, signals save, people it never saw are looked at, and it learns."""
+
+import dataclasses
+import json
+import logging
+import signal
+
+import jax
+import numpy as np
+import pytest
+
+from humangs_jax.models.weights import load_weights
+from humangs_jax.training import loop
+from humangs_jax.training.checkpoint import Checkpoints
+from humangs_jax.training.config import tiny
+from humangs_jax.training.loop import train
+
+CONFIG = tiny()
+
+
+def lines(out):
+    return [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def whole(body, captures, tmp_path_factory):
+    """A run of four steps in one go, and its folder."""
+    out = tmp_path_factory.mktemp("whole")
+    return train(CONFIG, body, captures[:2], out, validation=captures[2:], progress=False), out
+
+
+def test_resume_after_two_steps_ends_bit_for_bit_where_four_steps_end(body, captures, tmp_path, whole, same):
+    state = train(CONFIG, body, captures[:2], tmp_path, validation=captures[2:], stop_at=2, progress=False)
+    assert int(state.step) == 2
+    resumed = train(CONFIG, body, captures[:2], tmp_path, validation=captures[2:], progress=False)
+    assert int(resumed.step) == 4 and same(resumed, whole[0])
+    losses = lambda out: [line["loss"] for line in lines(out) if "loss" in line]
+    assert losses(tmp_path) == losses(whole[1]) and len(losses(tmp_path)) == 4
+
+
+def test_a_finished_run_stays_as_it_is(body, captures, whole, same):
+    before = len(lines(whole[1]))
+    assert same(train(CONFIG, body, captures[:2], whole[1], progress=False), whole[0])
+    assert len(lines(whole[1])) == before
+
+
+def test_what_a_run_leaves_behind(whole):
+    state, out = whole
+    validations = [line for line in lines(out) if "val_psnr" in line]
+    assert [line["step"] for line in validations] == [2, 4]
+    assert all(np.isfinite(list(line.values())).all() and line["val_overflow"] == 0 for line in validations)
+    from PIL import Image
+
+    side, shown = CONFIG.model.image_size, CONFIG.views.input_counts[0] + 2 * CONFIG.views.target_count
+    with Image.open(out / "sheets" / "0000004.png") as sheet:
+        assert sheet.size == (shown * side, side)
+    variables, model = load_weights(out / "weights.safetensors")
+    assert model == CONFIG.model
+    halved = jax.tree.map(lambda x: np.asarray(x).astype(np.float16).astype(np.float32), state.variables)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool((np.asarray(a) == b).all()), variables, halved))
+    checkpoints = Checkpoints(out / "checkpoints")
+    best = max(validations, key=lambda line: line["val_psnr"])
+    assert checkpoints.best_step == best["step"] and checkpoints.score(best["step"]) == best["val_psnr"]
+    checkpoints.close()
+
+
+def test_a_signal_saves_and_ends_the_run(body, captures, tmp_path, monkeypatch, caplog):
+    def interrupted(*arguments):
+        result = step(*arguments)
+        signal.raise_signal(signal.SIGTERM)
+        return result
+
+    step, handler = loop.train_step, signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(loop, "train_step", interrupted)
+    with caplog.at_level(logging.WARNING):
+        state = train(CONFIG, body, captures[:2], tmp_path, progress=False)
+    assert int(state.step) == 1 and "stopping after this step" in caplog.text
+    assert signal.getsignal(signal.SIGTERM) is handler
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+    assert checkpoints.steps == [1]
+    checkpoints.close()
+
+
+def test_another_configuration_is_refused_before_anything_runs(body, captures, whole):
+    with pytest.raises(ValueError, match="started with seed = 0, not 1"):
+        train(dataclasses.replace(CONFIG, seed=1), body, captures[:2], whole[1], progress=False)
+
+
+def test_a_broken_folder_is_named_and_logged(body, captures, tmp_path, caplog):
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    (broken / "capture.json").write_text("{}")
+    with caplog.at_level(logging.WARNING):
+        train(CONFIG, body, [broken, captures[0]], tmp_path / "out", stop_at=2, progress=False)
+    assert str(broken) in caplog.text
+    assert lines(tmp_path / "out")[-1]["broken_folders"] == 1
+
+
+def test_the_loss_falls_on_one_subject(body, captures, tmp_path):
+    config = dataclasses.replace(CONFIG, steps=60, validate_every=60, checkpoint_every=60)
+    train(config, body, captures[:1], tmp_path, progress=False)
+    losses = [line["loss"] for line in lines(tmp_path)]
+    assert np.mean(losses[-10:]) < 0.7 * np.mean(losses[:5])

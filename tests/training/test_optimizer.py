@@ -1,0 +1,101 @@
+"""The optimizer's groups, schedule and guard."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from humangs_jax.training.optimizer import (
+    INFINITY_STAND_IN,
+    OptimizerConfig,
+    decayed,
+    finite_gradients,
+    gradient_norm,
+    learning_rate,
+    make_optimizer,
+)
+
+FLOAT32 = 1e-6
+CONFIG = OptimizerConfig(learning_rate=0.1, warmup_steps=0)
+PARAMS = {"kernel": jnp.ones((2, 3)), "bias": jnp.ones(3), "texture": jnp.ones((3, 2, 2, 2)), "scale": jnp.ones(2)}
+
+
+def stepped(gradients, config=CONFIG, value=1.0, state=None, params=PARAMS):
+    optimizer = make_optimizer(config, 100)
+    state = optimizer.init(params) if state is None else state
+    updates, state = optimizer.update(gradients, state, params, value=jnp.asarray(value))
+    return optax.apply_updates(params, updates), state
+
+
+def filled(value):
+    return jax.tree.map(lambda x: jnp.full_like(x, value), PARAMS)
+
+
+def test_weight_decay_acts_on_two_axes_and_more():
+    assert decayed(PARAMS) == {"kernel": True, "bias": False, "texture": True, "scale": False}
+    params, _ = stepped(filled(0.0))
+    shrunk = 1 - CONFIG.learning_rate * CONFIG.weight_decay
+    for name, leaf in params.items():
+        np.testing.assert_allclose(leaf, shrunk if decayed(PARAMS)[name] else 1.0, rtol=FLOAT32)
+
+
+def test_first_step_is_adams_whatever_the_clipping():
+    params, state = stepped(filled(3.0))
+    assert float(state.norm) == pytest.approx(3 * np.sqrt(sum(x.size for x in PARAMS.values())), rel=FLOAT32)
+    np.testing.assert_allclose(params["bias"], 1 - CONFIG.learning_rate, rtol=1e-5)  # eps of Adam against the clipped
+
+
+@given(st.floats(1e-3, 16.0))  # beyond, the step is skipped
+def test_moments_see_clipped_gradients(size):
+    _, state = stepped(filled(size))
+    moments = [x for x in jax.tree.leaves(state.inner) if x.ndim]
+    first = moments[: len(PARAMS)]
+    norm = float(gradient_norm(first)) / (1 - CONFIG.betas[0])
+    unclipped = size * np.sqrt(sum(x.size for x in PARAMS.values()))
+    assert norm == pytest.approx(min(unclipped, CONFIG.clip_norm), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("gradient", "value"), [(1e4, 1.0), (0.1, np.nan), (0.1, np.inf)], ids=["large", "nan loss", "infinite loss"]
+)
+def test_a_bad_step_changes_nothing_and_is_counted(gradient, value):
+    _, before = stepped(filled(0.1))
+    params, state = stepped(filled(gradient), value=value, state=before)
+    assert int(before.skipped) == 0 and int(state.skipped) == 1
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), params, PARAMS))
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.all(a == b)), state.inner, before.inner))
+    params, state = stepped(filled(0.1), state=state)
+    assert int(state.skipped) == 1 and not bool(jnp.all(params["bias"] == 1))
+
+
+@given(st.lists(st.floats(width=32), min_size=1, max_size=20))
+def test_gradients_become_finite_and_finite_ones_stay(values):
+    given_ = np.asarray(values, np.float32)
+    cleaned = np.asarray(finite_gradients({"x": jnp.asarray(given_)})["x"])
+    finite = np.isfinite(given_)
+    np.testing.assert_array_equal(cleaned[finite], given_[finite])
+    assert (cleaned[np.isnan(given_)] == 0).all()
+    infinite = np.isinf(given_)
+    np.testing.assert_array_equal(cleaned[infinite], np.float32(INFINITY_STAND_IN) * np.sign(given_[infinite]))
+
+
+def test_bad_entries_alone_skip_no_step():
+    gradients = filled(0.1)
+    gradients["bias"] = jnp.asarray([jnp.nan, jnp.inf, -jnp.inf])
+    params, state = stepped(gradients)
+    assert int(state.skipped) == 0
+    assert float(params["bias"][0]) == 1.0 and float(params["bias"][1]) < 1 < float(params["bias"][2])
+
+
+def test_schedule_warms_up_and_ends_at_zero():
+    rate = learning_rate(OptimizerConfig(learning_rate=0.4, warmup_steps=10), 110)
+    assert [float(rate(i)) for i in (0, 5, 10)] == pytest.approx([0.0, 0.2, 0.4])
+    assert float(rate(60)) == pytest.approx(0.2, rel=1e-5) and float(rate(110)) == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_run_shorter_than_its_warm_up_has_a_schedule():
+    rate = learning_rate(OptimizerConfig(learning_rate=0.4, warmup_steps=3000), 4)
+    assert float(rate(4)) == pytest.approx(0.4)

@@ -1,0 +1,101 @@
+"""The training step: terms, backgrounds, gradients, and what a bad batch may do."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.data.loader import CaptureCache, ExampleSource
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.pytree import replace
+from humangs_jax.training.config import tiny
+from humangs_jax.training.state import init_state
+from humangs_jax.training.step import batch_gradients, change_background, random_backgrounds, train_step
+
+FLOAT32 = 1e-5
+CONFIG = tiny()
+
+
+@pytest.fixture(scope="module")
+def source(body, captures):
+    return ExampleSource(
+        CaptureCache(captures, body), CONFIG.views, CONFIG.model.image_size, CONFIG.target_size, CONFIG.batch_size
+    )
+
+
+def test_a_step_moves_the_parameters_and_tells_of_it(body, source):
+    before = init_state(CONFIG)
+    state, metrics = train_step(init_state(CONFIG), source.batch_at(0), body, CONFIG)
+    assert int(state.step) == 1
+    moved = jax.tree.map(lambda a, b: bool(jnp.any(a != b)), state.params, before.params)
+    assert np.mean(jax.tree.leaves(moved)) > 0.9  # biases that only unused units see may stay
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool(jnp.any(a != b)), state.batch_stats, before.batch_stats))
+    weights = dataclasses.asdict(CONFIG.loss)
+    expected = sum(
+        weights[name] * float(metrics[name]) for name in ("squared", "structural", "silhouette", "tightness")
+    )
+    assert float(metrics["loss"]) == pytest.approx(expected, rel=FLOAT32)
+    assert float(metrics["grad_norm"]) > 0
+    assert int(metrics["skipped"]) == int(metrics["dropped_tokens"]) == int(metrics["overflow"]) == 0
+
+
+def test_a_bad_batch_costs_a_step_and_nothing_else(body, source, same):
+    batch = source.batch_at(0)
+    broken = batch.targets.images.at[0, 0, 0, 0].set(jnp.nan)
+    batch = replace(batch, targets=replace(batch.targets, images=broken))
+    before = init_state(CONFIG)
+    state, metrics = train_step(init_state(CONFIG), batch, body, CONFIG)
+    assert int(state.step) == 1 and int(metrics["skipped"]) == 1
+    for name in ("params", "batch_stats"):
+        assert same(getattr(state, name), getattr(before, name))
+
+
+def test_steps_repeat_bit_for_bit(body, source, same):
+    first, _ = train_step(init_state(CONFIG), source.batch_at(2), body, CONFIG)
+    second, _ = train_step(init_state(CONFIG), source.batch_at(2), body, CONFIG)
+    assert same(first, second)
+
+
+@pytest.mark.slow
+def test_a_batch_gives_the_mean_gradient_of_its_subjects(body, source):
+    state = init_state(CONFIG)
+    keys = jax.random.split(jax.random.key(0), 2)
+    batch = jax.tree.map(lambda *x: jnp.concatenate(x), source.batch_at(0), source.batch_at(1))
+    one = lambda i: batch_gradients(state, body, jax.tree.map(lambda x: x[i : i + 1], batch), keys[i : i + 1], CONFIG)
+    both = batch_gradients(state, body, batch, keys, CONFIG)
+    singles = [one(0), one(1)]
+    for position in (0, 1, 2):  # loss, gradients, batch statistics
+        mean = jax.tree.map(lambda a, b: (a + b) / 2, *(x[position] for x in singles))
+        close = jax.tree.map(
+            lambda a, b: np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b) + 1e-9, both[position], mean
+        )
+        assert jax.tree.all(close)
+    together = dataclasses.replace(CONFIG, batching="vmap")
+    alone = batch_gradients(state, body, jax.tree.map(lambda x: x[:1], batch), keys[:1], together)
+    assert float(alone[0]) == pytest.approx(float(singles[0][0]), rel=FLOAT32)
+    norms = [np.sqrt(sum(float(jnp.vdot(x, x)) for x in jax.tree.leaves(g[1]))) for g in (alone, singles[0])]
+    assert norms[0] == pytest.approx(norms[1], rel=1e-3)
+
+
+def views_on_white(color, masks):
+    images = masks[..., None] * color + (1 - masks[..., None])
+    cameras = jax.vmap(lambda K: Camera(K, jnp.eye(4), 4, 4))(jnp.broadcast_to(jnp.eye(3), (2, 3, 3)))
+    return SubjectViews(images, masks, cameras, jnp.zeros((2, 1, 3)), jnp.zeros((2, 3)), jnp.zeros(1))
+
+
+def test_backgrounds_are_exchanged_as_if_photographed_so():
+    masks = jnp.asarray(np.random.default_rng(0).random((2, 4, 4)), jnp.float32)
+    color, backgrounds = jnp.asarray([0.2, 0.5, 0.9]), jnp.asarray([[0.1, 0.2, 0.3], [1.0, 1.0, 1.0]])
+    views = views_on_white(color, masks)
+    expected = masks[..., None] * color + (1 - masks[..., None]) * backgrounds[:, None, None]
+    np.testing.assert_allclose(change_background(views, backgrounds), expected, atol=FLOAT32)
+
+
+def test_the_share_of_random_backgrounds_is_kept():
+    keys = jax.random.split(jax.random.key(0), 200)
+    white = np.asarray(jax.vmap(lambda key: jnp.all(random_backgrounds(key, 3, 0.25) == 1, axis=-1))(keys))
+    assert 0.68 < white.mean() < 0.82  # 600 draws of probability 0.75: four standard deviations
+    assert bool(jnp.all(random_backgrounds(keys[0], 3, 0.0) == 1))
