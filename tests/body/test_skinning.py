@@ -1,0 +1,73 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from body_cases import PARENTS, random_pose, world_frames
+
+from humangs_jax.body import skinning
+
+EXACT = 1e-12  # float64 against float64
+ATOL = 5e-6  # float32, chains of 4 joints, lengths of about 1
+
+joint_transforms = jax.jit(skinning.joint_transforms, static_argnums=1)
+
+
+def test_levels_hold_every_joint_once_and_parents_first():
+    levels = skinning.joint_levels(PARENTS)
+    assert sorted(int(j) for level in levels for j in level) == list(range(len(PARENTS)))
+    depth = {int(j): i for i, level in enumerate(levels) for j in level}
+    assert all(depth[j] == depth[p] + 1 for j, p in enumerate(PARENTS) if p >= 0)
+
+
+@pytest.mark.parametrize("parents", [(0, 0), (-1, -1), (-1, 2, 1), (-1, 7), (1, 2, 0)])
+def test_what_is_no_tree_is_refused(parents):
+    with pytest.raises(ValueError, match="root"):
+        skinning.joint_levels(parents)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_joint_transforms_are_frame_products(seed):
+    joints = np.random.default_rng(seed + 10).normal(size=(len(PARENTS), 3))
+    rotations, translation = random_pose(seed)
+    expected = []
+    for frame, joint in zip(world_frames(joints, PARENTS, rotations), joints, strict=True):
+        rest = np.eye(4)
+        rest[:3, 3] = joint
+        moved = frame @ np.linalg.inv(rest)
+        moved[:3, 3] += translation
+        expected.append(moved)
+    with jax.enable_x64(True):
+        args = [jnp.asarray(x) for x in (joints, rotations, translation)]
+        found = joint_transforms(args[0], PARENTS, *args[1:])
+        assert found.dtype == jnp.float64
+        assert np.abs(np.asarray(found) - expected).max() < EXACT
+    args = [jnp.asarray(x, jnp.float32) for x in (joints, rotations, translation)]
+    found = joint_transforms(args[0], PARENTS, *args[1:])
+    assert np.abs(np.asarray(found) - expected).max() < ATOL
+
+
+def test_one_joint_is_a_rotation_about_it():
+    joint = jnp.asarray([[0.3, -0.2, 0.5]])
+    transforms = joint_transforms(joint, (-1,), jnp.asarray([[0.0, np.pi / 2, 0.0]]), jnp.asarray([0, 1.0, 0]))
+    moved = skinning.apply_transforms(transforms, joint + jnp.asarray([[0, 0, 1.0]]))
+    assert np.allclose(moved, joint + jnp.asarray([[1.0, 1.0, 0]]), atol=ATOL)  # about +y, z goes to x
+
+
+def test_blending_is_a_weighted_sum():
+    rng = np.random.default_rng(0)
+    weights, transforms = rng.uniform(size=(6, 3)), rng.normal(size=(3, 4, 4))
+    expected = [sum(w * t for w, t in zip(row, transforms, strict=True)) for row in weights]
+    found = skinning.blend_transforms(jnp.asarray(weights, jnp.float32), jnp.asarray(transforms, jnp.float32))
+    assert np.allclose(found, expected, atol=ATOL)
+    points = rng.normal(size=(6, 3))
+    applied = skinning.apply_transforms(found, jnp.asarray(points, jnp.float32))
+    loop = [t[:3, :3] @ p + t[:3, 3] for t, p in zip(expected, points, strict=True)]
+    assert np.allclose(applied, loop, atol=ATOL)
+
+
+def test_nested_vmap_compiles():
+    joints = jnp.asarray(np.random.default_rng(0).normal(size=(2, len(PARENTS), 3)), jnp.float32)
+    rotations = jnp.zeros((2, 3, len(PARENTS), 3))
+    run = lambda joint, r: skinning.joint_transforms(joint, PARENTS, r, jnp.zeros(3))
+    found = jax.jit(jax.vmap(jax.vmap(run, (None, 0))))(joints, rotations)
+    assert np.allclose(found, np.eye(4), atol=ATOL)

@@ -1,0 +1,263 @@
+import importlib.util
+import os
+import pickle
+import sys
+import types
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.sparse
+
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.body.smplx import assemble_pose, load_hands, load_smplx
+
+DATA = Path(__file__).parent / "data"
+MODEL, ARRAYS = DATA / "smplx_reduced_model.npz", DATA / "smplx_reduced_arrays.npz"
+ATOL = 1e-6  # float32 numbers of a metre, read and multiplied once
+
+
+def made_up_file(n=9, columns=20, seed=0):
+    """Arrays of a model file as they are stored: root parent 2^32 - 1, unsigned indices, float64."""
+    rng = np.random.default_rng(seed)
+    weights = rng.uniform(size=(n, 55))
+    regressor = np.where(rng.uniform(size=(55, n)) < 0.5, rng.uniform(size=(55, n)), 0)
+    regressor[:, 0] = 1 - regressor[:, 1:].sum(1)
+    parents = np.asarray(PARENTS, np.int64)
+    parents[0] = 2**32 - 1
+    return {
+        "v_template": rng.normal(size=(n, 3)),
+        "f": rng.integers(0, n, size=(4, 3)).astype(np.uint32),
+        "shapedirs": rng.normal(size=(n, 3, columns)),
+        "posedirs": rng.normal(size=(n, 3, 486)),
+        "J_regressor": regressor,
+        "weights": weights / weights.sum(1, keepdims=True),
+        "kintree_table": np.stack([parents, np.arange(55)]).astype(np.uint32),
+        "hands_meanl": rng.normal(size=45),
+        "hands_meanr": rng.normal(size=45),
+        "hands_componentsl": rng.normal(size=(45, 45)),
+        "hands_componentsr": rng.normal(size=(45, 45)),
+        "vt": rng.uniform(size=(6, 2)),
+        "ft": rng.integers(0, 6, size=(4, 3)).astype(np.uint32),
+    }
+
+
+def check_script():
+    path = Path(__file__).parents[2] / "experiments" / "check_body.py"
+    spec = importlib.util.spec_from_file_location("check_body", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_agrees_with_the_public_package_in_every_hand_convention():
+    script = check_script()
+    rows = script.compare(MODEL, ARRAYS)
+    assert {convention for convention, *_ in rows} == {"axis_flat", "axis_mean", "pca12_mean"}
+    assert len(rows) == 6
+    assert max(max(errors) for _, _, *errors in rows) < script.TOLERANCE
+
+
+def test_check_script_fails_on_other_numbers(tmp_path, monkeypatch, capsys):
+    arrays = dict(np.load(ARRAYS))
+    arrays["axis_mean_joints"] = arrays["axis_mean_joints"] + 2e-5
+    np.savez(tmp_path / "other.npz", **arrays)
+    for path, status in ((tmp_path / "other.npz", 1), (ARRAYS, 0)):
+        monkeypatch.setattr(sys, "argv", ["check_body.py", str(MODEL), str(path), "--float32"])
+        with pytest.raises(SystemExit) as stop:
+            check_script().main()
+        assert stop.value.code == status
+    assert "FAILED" in capsys.readouterr().out
+
+
+def test_an_npz_is_read_as_it_is(tmp_path):
+    arrays = made_up_file()
+    objects = np.asarray({"pelvis": 0}, dtype=object)
+    np.savez(tmp_path / "SMPLX_NEUTRAL.npz", **arrays, joint2num=objects)
+    body = load_smplx(tmp_path / "SMPLX_NEUTRAL.npz", shape_count=3, expression_count=2)
+    assert body.name == "SMPLX_NEUTRAL"
+    assert body.parents == PARENTS and body.joint_names == JOINT_NAMES
+    assert body.shape_names == ("shape_0", "shape_1", "shape_2", "expression_0", "expression_1")
+    assert np.allclose(body.shape_directions, arrays["shapedirs"][..., [0, 1, 2, 10, 11]], atol=ATOL)
+    for field, key in (("template", "v_template"), ("pose_directions", "posedirs"), ("joint_regressor", "J_regressor")):
+        assert np.allclose(getattr(body, field), arrays[key], atol=ATOL)
+    for field, key in (("skinning_weights", "weights"), ("faces", "f"), ("uvs", "vt"), ("uv_faces", "ft")):
+        assert np.allclose(getattr(body, field), arrays[key], atol=ATOL)
+    assert body.template.dtype == jnp.float32
+    with jax.enable_x64(True):
+        assert np.array_equal(load_smplx(tmp_path / "SMPLX_NEUTRAL.npz").template, arrays["v_template"])
+
+
+def test_current_files_hold_expressions_after_300_columns(tmp_path):
+    arrays = made_up_file(n=2, columns=400)
+    np.savez(tmp_path / "model.npz", **{k: v % 2 if k == "f" else v for k, v in arrays.items()})
+    body = load_body(tmp_path / "model.npz", shape_count=1, expression_count=1)
+    assert np.allclose(body.shape_directions, arrays["shapedirs"][..., [0, 300]], atol=ATOL)
+    assert load_smplx(tmp_path / "model.npz", shape_count=300, expression_count=100).shape_directions.shape == (
+        2,
+        3,
+        400,
+    )
+    with pytest.raises(ValueError, match="'shapedirs' has 300 shape directions, asked for 301"):
+        load_smplx(tmp_path / "model.npz", shape_count=301)
+
+
+def chumpy_pickle(path, content, wrap):
+    """Write a pickle that names chumpy's classes, with the attributes that chumpy's own pickles carry."""
+    modules = {name: types.ModuleType(name) for name in ("chumpy", "chumpy.ch", "chumpy.reordering")}
+
+    class Ch:
+        pass
+
+    class Select:
+        pass
+
+    for cls, module in ((Ch, "chumpy.ch"), (Select, "chumpy.reordering")):
+        cls.__module__, cls.__qualname__ = module, cls.__name__
+        setattr(modules[module], cls.__name__, cls)
+    chumpy = Ch()
+    chumpy.x = content[wrap[0]]
+    chumpy._dirty_vars = {}
+    source, select = Ch(), Select()
+    source.x = np.concatenate([[7.0], content[wrap[1]].ravel()])
+    select.a, select.idxs, select.preferred_shape = source, np.arange(1, source.x.size), content[wrap[1]].shape
+    sys.modules.update(modules)
+    try:
+        path.write_bytes(pickle.dumps({**content, wrap[0]: chumpy, wrap[1]: select}, protocol=2))
+    finally:
+        for name in modules:
+            del sys.modules[name]
+
+
+@pytest.mark.parametrize("sparse", [scipy.sparse.csc_matrix, scipy.sparse.csr_matrix, scipy.sparse.coo_matrix])
+def test_a_pickle_with_sparse_and_chumpy_arrays_is_the_same_model(tmp_path, sparse):
+    arrays = made_up_file()
+    np.savez(tmp_path / "model.npz", **arrays)
+    chumpy_pickle(
+        tmp_path / "model.pkl", {**arrays, "J_regressor": sparse(arrays["J_regressor"])}, ("v_template", "posedirs")
+    )
+    one, other = load_smplx(tmp_path / "model.npz"), load_body(tmp_path / "model.pkl")
+    for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert np.array_equal(a, b)
+
+
+class Evil:
+    def __init__(self, marker):
+        self.marker = marker
+
+    def __reduce__(self):
+        return (os.mkdir, (self.marker,))
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+def test_a_pickle_that_would_run_code_is_refused_by_name(tmp_path, protocol):
+    marker = tmp_path / "was_here"
+    (tmp_path / "model.pkl").write_bytes(
+        pickle.dumps({**made_up_file(), "extra": Evil(str(marker))}, protocol=protocol)
+    )
+    with pytest.raises(ValueError, match=r"model\.pkl.*'(posix|nt)\.mkdir'"):
+        load_smplx(tmp_path / "model.pkl")
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 4, 5])
+def test_every_pickle_protocol_is_read(tmp_path, protocol):
+    arrays = made_up_file()
+    (tmp_path / "model.pkl").write_bytes(pickle.dumps(arrays, protocol=protocol))
+    assert np.allclose(load_smplx(tmp_path / "model.pkl").template, arrays["v_template"], atol=ATOL)
+
+
+def broken(**changes):
+    return {key: value for key, value in {**made_up_file(), **changes}.items() if value is not None}
+
+
+def with_bad_number(key):
+    array = made_up_file()[key].copy()
+    array.flat[0] = np.nan
+    return broken(**{key: array})
+
+
+@pytest.mark.parametrize(
+    "content, message",
+    [
+        (broken(weights=None), "key 'weights' is missing"),
+        (broken(weights=np.ones((9, 52))), r"key 'weights': expected shape \(9, 55\), got \(9, 52\)"),
+        (broken(v_template=np.ones((9, 4))), r"key 'v_template': expected shape \(any, 3\)"),
+        (broken(shapedirs=np.ones((9, 3, 12))), "key 'shapedirs': expected 20 or 400 columns"),
+        (broken(f=np.full((4, 3), 9, np.uint32)), r"key 'f': indices must lie in \[0, 9\)"),
+        (broken(kintree_table=np.zeros((2, 55), np.uint32)), "key 'kintree_table' is not SMPL-X's joint tree"),
+        (broken(J_regressor=np.asarray([None] * 3, dtype=object)), "key 'J_regressor'"),
+        (broken(posedirs=np.full((9, 3, 486), "a")), "key 'posedirs': expected numbers"),
+        (with_bad_number("posedirs"), "key 'posedirs' has numbers that are not finite"),
+    ],
+)
+def test_bad_files_are_named_with_the_key(tmp_path, content, message):
+    np.savez(tmp_path / "bad.npz", **content)
+    with pytest.raises(ValueError, match=r"bad\.npz: " + message):
+        load_smplx(tmp_path / "bad.npz")
+
+
+def test_what_is_no_model_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        load_smplx(tmp_path / "nowhere.npz")
+    (tmp_path / "text.npz").write_text("no")
+    (tmp_path / "text.pkl").write_text("no")
+    (tmp_path / "list.pkl").write_bytes(pickle.dumps([1]))
+    for name in ("text.npz", "text.pkl", "list.pkl"):
+        with pytest.raises(ValueError, match=name):
+            load_smplx(tmp_path / name)
+
+
+def test_hands_are_explicit():
+    hands = load_hands(MODEL)
+    flat = assemble_pose(use_pca=False, flat_hand_mean=True)
+    assert np.array_equal(flat.rotations, np.zeros((55, 3)))
+    mean = assemble_pose(use_pca=False, flat_hand_mean=False, hands=hands)
+    assert np.allclose(mean.rotations[25:40].ravel(), hands.means[0], atol=ATOL)
+    assert np.allclose(mean.rotations[40:].ravel(), hands.means[1], atol=ATOL)
+    one = assemble_pose(use_pca=True, flat_hand_mean=True, hands=hands, right_hand_pose=jnp.asarray([0, 2.0]))
+    assert np.allclose(one.rotations[40:].ravel(), 2 * hands.components[1, 1], atol=ATOL)
+    assert np.array_equal(one.rotations[:40], np.zeros((40, 3)))
+    with pytest.raises(TypeError, match="flat_hand_mean"):
+        assemble_pose(use_pca=False)
+    for options in ({"use_pca": False, "flat_hand_mean": False}, {"use_pca": True, "flat_hand_mean": True}):
+        with pytest.raises(ValueError, match=r"left_hand_pose.*hand basis"):
+            assemble_pose(**options, left_hand_pose=jnp.zeros(12))
+    with pytest.raises(ValueError, match="right_hand_pose: expected at most 45"):
+        assemble_pose(use_pca=True, flat_hand_mean=True, hands=hands, right_hand_pose=jnp.zeros(46))
+
+
+def test_parts_go_to_their_joints():
+    parts = {
+        "global_orient": [0.0, 1, 2],
+        "body_pose": np.arange(3, 66.0).reshape(21, 3),
+        "jaw_pose": [66.0, 67, 68],
+        "leye_pose": [69.0, 70, 71],
+        "reye_pose": [72.0, 73, 74],
+        "left_hand_pose": np.arange(75, 120.0),
+        "right_hand_pose": np.arange(120, 165.0).reshape(15, 3),
+    }
+    pose = assemble_pose(use_pca=False, flat_hand_mean=True, translation=[1.0, 2, 3], **parts)
+    assert np.array_equal(pose.rotations, np.arange(165.0).reshape(55, 3))
+    assert np.array_equal(pose.translation, [1, 2, 3])
+    for name, shape in (("body_pose", (66,)), ("jaw_pose", (4,)), ("left_hand_pose", (12,)), ("translation", (4,))):
+        with pytest.raises(ValueError, match=name):
+            assemble_pose(use_pca=False, flat_hand_mean=True, **{name: np.zeros(shape)})
+
+
+def test_poses_assemble_under_vmap_and_jit():
+    hands = load_hands(MODEL)
+    numbers = jnp.asarray(np.random.default_rng(0).normal(size=(4, 12)), jnp.float32)
+    assemble = lambda x: assemble_pose(use_pca=True, flat_hand_mean=False, hands=hands, left_hand_pose=x)
+    batch = jax.jit(jax.vmap(assemble))(numbers)
+    assert np.allclose(batch.rotations[2], assemble(numbers[2]).rotations, atol=ATOL)
+    body = load_smplx(MODEL)
+    rest = shape_body(body, jnp.zeros(1))
+    vertices = jax.jit(jax.vmap(lambda r, t: pose_body(body, rest, BodyPose(r, t)).vertices))(
+        batch.rotations, batch.translation
+    )
+    assert vertices.shape == (4, 75, 3) and np.isfinite(vertices).all()

@@ -1,0 +1,66 @@
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import shape_body
+from humangs_jax.body.subdivision import split_long_edges
+
+LONGEST = 0.05
+JOINT_TOLERANCE = 1e-6  # metres: joints are regressed from the same vertices
+
+
+@pytest.fixture(scope="module")
+def coarse():
+    return decimate(load_body(), 800)
+
+
+def edge_uses(faces):
+    faces = np.asarray(faces)
+    sides = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    return np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
+
+
+def area(vertices, faces):
+    a, b, c = (np.asarray(vertices, np.float64)[np.asarray(faces)[:, i]] for i in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+
+def volume(vertices, faces):
+    a, b, c = (np.asarray(vertices, np.float64)[np.asarray(faces)[:, i]] for i in range(3))
+    return np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6
+
+
+def test_edges_are_short_and_the_surface_is_the_same(coarse):
+    fine = split_long_edges(coarse, LONGEST)
+    edges, uses = edge_uses(fine.faces)
+    x = np.asarray(fine.template)
+    assert np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1).max() <= LONGEST
+    assert len(x) > len(coarse.template)
+    assert (uses == 1).sum() == (edge_uses(coarse.faces)[1] == 1).sum() and uses.max() == 2  # no T-junction, no crack
+    np.testing.assert_allclose(area(fine.template, fine.faces), area(coarse.template, coarse.faces), rtol=1e-5)
+    np.testing.assert_allclose(volume(fine.template, fine.faces), volume(coarse.template, coarse.faces), rtol=1e-5)
+    np.testing.assert_array_equal(x[: len(coarse.template)], coarse.template)
+
+
+def test_midpoints_stay_midpoints_in_every_shape_and_weights_sum_to_one(coarse):
+    fine = split_long_edges(coarse, LONGEST)
+    np.testing.assert_allclose(fine.skinning_weights.sum(-1), 1, atol=1e-5)
+    betas = jnp.asarray([1.0, -2.0, 1.5])
+    before, after = shape_body(coarse, betas), shape_body(fine, betas)
+    np.testing.assert_allclose(after.joints, before.joints, atol=JOINT_TOLERANCE)
+    np.testing.assert_allclose(area(after.vertices, fine.faces), area(before.vertices, coarse.faces), rtol=1e-5)
+
+
+def test_nothing_happens_where_nothing_is_long(coarse):
+    same = split_long_edges(coarse, 10.0)
+    np.testing.assert_array_equal(same.faces, coarse.faces)
+    assert len(same.template) == len(coarse.template)
+
+
+@pytest.mark.parametrize("longest", [0.0, -1.0, float("nan"), 1e-9])
+def test_impossible_lengths_are_refused(coarse, longest):
+    small = decimate(coarse, 60) if longest == 1e-9 else coarse
+    with pytest.raises(ValueError, match="longest edge"):
+        split_long_edges(small, longest)
