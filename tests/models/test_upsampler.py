@@ -1,0 +1,50 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.models.upsampler import MOMENTUM, UpConvolution, Upsampler, UpsamplerConfig
+
+CONFIG = UpsamplerConfig(hidden=4, out=5)
+
+
+def random_maps(depths=4, views=2, side=3, width=6):
+    rng = np.random.default_rng(0)
+    return [jnp.asarray(rng.normal(size=(views, side, side, width)), jnp.float32) for _ in range(depths)]
+
+
+def test_up_convolution_is_the_transposed_convolution():
+    """Every input pixel adds its kernel, stride 2, minus a border of one."""
+    rng = np.random.default_rng(1)
+    x, kernel, bias = rng.normal(size=(2, 3, 4, 5)), rng.normal(size=(4, 4, 5, 6)), rng.normal(size=6)
+    expected = np.zeros((2, 2 * 3 + 2, 2 * 4 + 2, 6))
+    for i in range(3):
+        for j in range(4):
+            expected[:, 2 * i : 2 * i + 4, 2 * j : 2 * j + 4] += np.einsum("vc,abco->vabo", x[:, i, j], kernel)
+    expected = expected[:, 1:-1, 1:-1] + bias
+    with jax.enable_x64(True):
+        params = {"kernel": jnp.asarray(kernel), "bias": jnp.asarray(bias)}
+        ours = UpConvolution(6).apply({"params": params}, jnp.asarray(x))
+        np.testing.assert_allclose(ours, expected, rtol=1e-12, atol=1e-12)
+
+
+def test_statistics_follow_the_batch_only_in_training():
+    maps = random_maps()
+    module = Upsampler(CONFIG)
+    variables = jax.jit(module.init)(jax.random.key(0), maps)
+    evaluate = jax.jit(module.apply)
+    trained, updated = jax.jit(lambda v, m: module.apply(v, m, True, mutable=["batch_stats"]))(variables, maps)
+    still = evaluate(variables, maps)
+    assert still.shape == trained.shape == (2, 12, 12, CONFIG.out) and not np.allclose(still, trained, atol=1e-3)
+    of_the_batch = lambda new, old: (new - MOMENTUM * old) / (1 - MOMENTUM)
+    statistics = jax.tree.map(of_the_batch, updated["batch_stats"], variables["batch_stats"])
+    assert all((norm["var"] > 0).all() for norm in statistics.values())
+    assert np.allclose(evaluate({**variables, "batch_stats": statistics}, maps), trained, atol=1e-4)
+
+
+def test_final_features_only():
+    module = Upsampler(dataclasses.replace(CONFIG, features="final"))
+    shapes = jax.eval_shape(module.init, jax.random.key(0), random_maps(depths=1))
+    assert [name for name in shapes["params"] if name.startswith("project")] == ["project_0"]
+    assert shapes["params"]["fuse"]["kernel"].shape == (3, 3, CONFIG.hidden, 2 * CONFIG.hidden)
