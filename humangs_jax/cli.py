@@ -145,22 +145,38 @@ def export(
 def synth(
     out: Path = Path("synthetic_people"),
     subjects: int = 8,
-    split: Literal["train", "validation", "test"] = "train",
-    size: int = 256,
+    split: Literal["train", "validation", "test", "demo"] = "train",
     first: int = 0,
+    size: int = 256,
+    views: int = 4,
+    held_out: int = 8,
+    for_training: bool = False,
 ) -> None:
     """Make synthetic clothed people and write them as capture folders with held-out views. Can be interrupted and resumed.
 
     Args:
         out: folder for one capture folder per subject and manifest.json.
         subjects: how many.
-        split: seeds of the three splits never overlap.
-        size: side of the images in pixels.
-        first: index of the first subject within the split.
+        split: the seeds of the splits never overlap.
+        first: number of the first subject within the split.
+        size: side of the photos in pixels.
+        views: photos per subject, evenly spread around the person.
+        held_out: further views of the same pose, in the sub-folder held_out/.
+        for_training: instead, one capture of 2 poses x 12 views per subject, for `humangs train`.
     """
-    from humangs_jax.data.synthetic.writer import synthesize
+    from humangs_jax.data.synthetic import synthesize
+    from humangs_jax.data.synthetic.seeds import SPLITS
 
-    synthesize(out, subjects=subjects, split=split, image_size=size, first=first)
+    if subjects < 1 or views < 1 or held_out < 0 or size < 1 or first < 0:
+        raise ValueError("--subjects, --views and --size must be at least 1, --held-out and --first at least 0")
+    first_seed = SPLITS[split].start + first
+    if for_training:
+        folders = synthesize(out, subjects, first_seed, image_size=size)
+    else:
+        folders = synthesize(
+            out, subjects, first_seed, training=False, image_size=size, views=views, poses=1, held_out_views=held_out
+        )
+    print(f"{out}: {len(folders)} people")
 
 
 def check(capture: Positional[Path], out: Path = Path("check.png")) -> None:
@@ -179,18 +195,40 @@ def check(capture: Positional[Path], out: Path = Path("check.png")) -> None:
     print(report)
 
 
-def train(data: Positional[Path], out: Path = Path("runs/train"), steps: int | None = None) -> None:
-    """Train the small network on capture folders (for example those of `humangs synth`). Resumes from --out.
+def train(
+    data: Positional[Path],
+    out: Path = Path("runs/train"),
+    validation: Path | None = None,
+    steps: int | None = None,
+    init_weights: Path | None = None,
+) -> None:
+    """Train the small network on capture folders (`humangs synth --for-training`). Continues a run that is in --out.
 
     Args:
         data: folder of capture folders.
         out: checkpoints, log, validation pictures and weights.safetensors.
-        steps: number of steps; the preset's if not given. All settings: experiments/train_small.py --help.
+        validation: folder of capture folders of other people, looked at now and then.
+        steps: length of the run; the preset's if not given. All settings: experiments/train_small.py --help.
+        init_weights: start from these weights instead of fresh ones.
     """
-    from humangs_jax.training.loop import train as run
-    from humangs_jax.training.presets import small
+    import dataclasses
 
-    run(small(steps=steps), data, out)
+    from humangs_jax.body.library import load_body
+    from humangs_jax.data.loader import find_captures
+    from humangs_jax.models.weights import load_weights
+    from humangs_jax.training.config import small
+    from humangs_jax.training.loop import train as run
+
+    config = small()
+    if steps is not None:
+        config = dataclasses.replace(config, steps=steps)
+    people = find_captures(data)
+    others = find_captures(validation) if validation is not None else ()
+    variables = None
+    if init_weights is not None:
+        variables, model = load_weights(init_weights)
+        config = dataclasses.replace(config, model=model)
+    run(config, load_body(), people, out, validation=others, variables=variables)
 
 
 COMMANDS = {f.__name__: f for f in (demo, reconstruct, animate, render, export, synth, check, train)}

@@ -6,11 +6,10 @@ import jax
 
 from humangs_jax.array_types import Array, Int, PyTree
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.capacity import round_up
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import SubjectViews, prepare_inputs, standardize
+from humangs_jax.data.views import SubjectViews, gaussian_body, prepare_inputs, standardize
 from humangs_jax.models.humangs import HumanGSConfig, apply_humangs, touched_patches
 from humangs_jax.models.vertex_decoder import corrected_skinning_weights
 
@@ -18,17 +17,15 @@ from humangs_jax.models.vertex_decoder import corrected_skinning_weights
 def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar:
     """Reconstruct the person of a capture.
 
-    The photos are brought to the network's image size (white, centred square), the body to the vertex count that the weights
-    were trained for (`config.body_vertices`), and the token capacity to what these photos need. Compiles once per number of
+    The photos are brought to the network's image size (white, centred square), the body to the vertices that the weights want
+    (`gaussian_body`), and the token capacity to what these photos need. Compiles once per number of
     views, body and capacity, which is rounded up to few sizes.
 
     Raises: ValueError if the capture has no view.
     """
     if capture.view_count == 0:
         raise ValueError("capture: 0 views; at least one photo is needed")
-    body = capture.body
-    if config.body_vertices is not None and config.body_vertices < len(body.template):
-        body = decimate(body, config.body_vertices)
+    body = gaussian_body(capture.body, config)
     views = standardize(capture, config.image_size)
     inputs = _prepare(body, views, config)
     if config.tokens == "foreground":
@@ -43,7 +40,7 @@ def reconstruct_views(
     """The pure function behind `reconstruct`: one subject's views -> avatar, and the count of foreground patches that did
     not fit into `config.token_capacity`.
 
-    Batch over subjects with `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`, the body being decimated already.
+    Batch over subjects with `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`, with a body from `gaussian_body`.
     """
     return _assemble(variables, config, body, views, prepare_inputs(body, views, config))
 

@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.array_types import Array, Float
+from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.body.subdivision import split_long_edges
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.models.humangs import HumanGSConfig, HumanGSInputs, subject_unit
@@ -49,6 +51,13 @@ def resize_views(views: SubjectViews, size: int) -> SubjectViews:
     return replace(
         views, images=shrink(views.images), masks=shrink(views.masks), cameras=views.cameras.resized(size, size)
     )
+
+
+def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
+    """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it."""
+    if config.body_vertices is not None and config.body_vertices < len(body.template):
+        body = decimate(body, config.body_vertices)
+    return body if config.longest_edge is None else split_long_edges(body, config.longest_edge)
 
 
 def prepare_inputs(

@@ -58,7 +58,7 @@ class HumanGSConfig:
     image_size: side of the photographs, pixels (recorded: the network takes any multiple of the patch size).
     patch_size: side of a token's patch, pixels. tokens: "all" patches, or those that the "foreground" touches, packed
     into `token_capacity` slots over all views. position_map, skinning: how the position map that comes in was shaded,
-    and how the Gaussians are to be skinned (recorded). body_vertices: vertex count to decimate bodies to, None for all
+    and how the Gaussians are to be skinned (recorded). body_vertices: vertex count to decimate bodies to, None for all; longest_edge: metres, to which edges are split then, None for not
     (recorded). ray_origins: the release divides camera centres by s and the ray origins taken from them once more, so
     that the moments of its rays ("twice_normalized") fit no camera; needed to run its weights. dtype: of the products;
     parameters, norms and softmax statistics stay float32 at least.
@@ -71,6 +71,7 @@ class HumanGSConfig:
     position_map: Literal["plain", "gouraud"] = "plain"
     skinning: Literal["affine", "rotation"] = "affine"
     body_vertices: int | None = None
+    longest_edge: float | None = None
     ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
     dtype: Literal["float32", "bfloat16"] = "float32"
     texture: TriplaneConfig = dataclasses.field(default_factory=TriplaneConfig)

@@ -32,14 +32,15 @@ def small() -> HumanGSConfig:
     return HumanGSConfig(
         image_size=256,
         tokens="foreground",
-        token_capacity=960,
-        body_vertices=6000,
+        token_capacity=896,
+        body_vertices=4000,
+        longest_edge=0.03,
         texture=TriplaneConfig(resolution=64, channels=8),
         transformer=TransformerConfig(width=256, layers=6),
         upsampler=UpsamplerConfig(enabled=False),  # its backward pass alone costs a CPU more than the whole encoder
         sampling=PixelAlignedConfig(pool="visible", convention="half_pixel", sample_rgb=True),
         decoder=VertexDecoderConfig(
-            hidden=256, tight=1, free=2, offset_scale=0.1, initial_log_scale=-4.6, residual_color=True
+            hidden=256, tight=1, free=2, offset_scale=0.25, initial_log_scale=-4.6, residual_color=True
         ),
     )
 
@@ -52,6 +53,7 @@ def tiny() -> HumanGSConfig:
         image_size=32,
         token_capacity=16,
         body_vertices=None,
+        longest_edge=None,
         texture=TriplaneConfig(resolution=8, channels=2),
         transformer=TransformerConfig(width=16, layers=4, attention=AttentionConfig(head_width=8)),
         upsampler=UpsamplerConfig(hidden=8, out=8),

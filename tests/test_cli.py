@@ -1,0 +1,131 @@
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from humangs_jax import cli
+from humangs_jax.data.capture import load_capture, save_capture
+
+COMMANDS = ("demo", "reconstruct", "animate", "render", "export", "synth", "check", "train")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A small copy of the shipped capture."""
+    path = tmp_path_factory.mktemp("captures") / "someone"
+    save_capture(path, load_capture("demo_capture").select([0, 1]))
+    return path
+
+
+def run(monkeypatch, capsys, *arguments):
+    """(exit code, stdout, stderr) of the command line, in this process."""
+    monkeypatch.setattr(sys, "argv", ["humangs", *map(str, arguments)])
+    try:
+        cli.main()
+        code = 0
+    except SystemExit as exit_:
+        code = exit_.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+def test_help_names_every_command_and_imports_nothing_heavy():
+    code = "import sys; from humangs_jax import cli; sys.argv = ['humangs', '--help']\ntry: cli.main()\nexcept SystemExit: pass\n"
+    code += "assert 'jax' not in sys.modules and 'flax' not in sys.modules"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert all(name in result.stdout for name in COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command, monkeypatch, capsys):
+    code, out, _ = run(monkeypatch, capsys, command, "--help")
+    assert code == 0 and "--out" in out and "docstring" not in out
+
+
+def spoil_json(change):
+    def spoil(path):
+        file = path / "capture.json"
+        description = json.loads(file.read_text())
+        change(description)
+        file.write_text(json.dumps(description))
+
+    return spoil
+
+
+def spoil_body(change):
+    def spoil(path):
+        arrays = dict(np.load(path / "body.npz"))
+        change(arrays)
+        np.savez(path / "body.npz", **arrays)
+
+    return spoil
+
+
+BAD_CAPTURES = {
+    "missing image": (lambda path: next((path / "images").iterdir()).unlink(), "images/"),
+    "wrong K shape": (spoil_json(lambda d: d["views"][0].update(K=[[1, 0], [0, 1]])), "views[0].K"),
+    "NaN pose": (spoil_body(lambda a: a["rotations"].__setitem__((0, 0, 0), np.nan)), "rotations"),
+    "mismatched counts": (spoil_body(lambda a: a.update(translations=np.zeros((7, 3)))), "translations"),
+    "frame out of range": (spoil_json(lambda d: d["views"][1].update(frame=5)), "views[1].frame"),
+    "singular camera": (
+        spoil_json(lambda d: d["views"][0].update(cam_from_world=[[0, 0, 0, 0]] * 3 + [[0, 0, 0, 1]])),
+        "cam_from_world",
+    ),
+    "0 views": (spoil_json(lambda d: d.update(views=[])), "views"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CAPTURES)
+@pytest.mark.parametrize("command", ["reconstruct", "check"])
+def test_a_bad_capture_is_one_line_and_nothing_is_written(case, command, folder, tmp_path, monkeypatch, capsys):
+    spoil, field = BAD_CAPTURES[case]
+    bad, out = tmp_path / "bad", tmp_path / "out"
+    shutil.copytree(folder, bad)
+    spoil(bad)
+    out.mkdir()
+    code, printed, error = run(monkeypatch, capsys, command, bad, "--out", out / "result.npz")
+    assert code == 2 and printed == ""
+    assert error.count("\n") == 1 and error.startswith("humangs: error: ")
+    assert field in error and "bad" in error  # names the field and the file
+    assert list(out.iterdir()) == []
+
+
+def test_wrong_options_are_one_line_too(folder, tmp_path, monkeypatch, capsys):
+    for arguments in (
+        ("reconstruct", tmp_path / "nowhere"),
+        ("reconstruct", folder, "--out", tmp_path / "no" / "such" / "folder.npz"),
+        ("animate", tmp_path / "no_avatar.npz", "--out", tmp_path / "a.mp4"),
+        ("animate", tmp_path / "no_avatar.npz", "--out", tmp_path / "a.txt"),
+        ("export", folder / "body.npz", "--out", tmp_path / "a.ply"),
+        ("reconstruct", folder, "--weights", folder / "body.npz", "--out", tmp_path / "a.npz"),
+        ("synth", "--subjects", "0", "--out", tmp_path / "people"),
+    ):
+        code, _, error = run(monkeypatch, capsys, *arguments)
+        assert code == 2 and error.count("\n") == 1, (arguments, error)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_from_photos_to_pictures(folder, tmp_path, monkeypatch, capsys):
+    """reconstruct, render, animate, export and check, one after the other, as a user would."""
+    import imageio.v3 as iio
+    import plyfile
+
+    monkeypatch.chdir(tmp_path)
+    for arguments in (
+        ("reconstruct", folder, "--out", "avatar.npz"),
+        ("render", "avatar.npz", "--out", "views", "--views", "2", "--size", "64", "--exr"),
+        ("export", "avatar.npz", "--out", "avatar.ply"),
+        ("check", folder, "--out", "check.png"),
+    ):
+        code, _, error = run(monkeypatch, capsys, *arguments)
+        assert code == 0, error
+    picture = iio.imread("views/view_000.png")
+    assert picture.shape == (64, 64, 3) and picture.std() > 10 and (picture[0] == 255).all()
+    assert Path("views/views.exr").stat().st_size > 1000
+    assert len(plyfile.PlyData.read("avatar.ply")["vertex"].data) > 10_000
+    assert iio.imread("check.png").std() > 10
