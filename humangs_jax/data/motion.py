@@ -133,8 +133,8 @@ def load_motion(
 
 def save_motion(path: str | Path, motion: Motion) -> None:
     """Write our own format, compressed."""
-    arrays = {"rotations": motion.rotations, "translations": motion.translations, "fps": motion.fps}
-    np.savez_compressed(path, **{key: np.asarray(value) for key, value in arrays.items()})
+    rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
+    np.savez_compressed(path, rotations=rotations, translations=translations, fps=np.asarray(motion.fps))
 
 
 def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion:
@@ -293,7 +293,7 @@ class _MotionFile:
                 )
                 raise MotionError(self.path, key, problem)
             pose = pose @ np.asarray(self.hands.components)[side, : pose.shape[1]]
-        return pose if self.flat_hand_mean else pose + np.asarray(self.hands.means)[side]
+        return pose if self.flat_hand_mean or self.hands is None else pose + np.asarray(self.hands.means)[side]
 
     def assemble(self, body, face=None, hands=None):
         """(m, 55, 3) from (m, 66) and parts that may be None."""
