@@ -280,6 +280,17 @@ def test_bad_faces_are_harmless():
     assert with_bad.overflow == 3  # NaN, infinity, and the one whose area overflows
 
 
+def test_faces_without_area_cover_nothing():
+    """Three points on a line through a pixel centre, exactly, whose edge functions there are nothing but roundings."""
+    rng = np.random.default_rng(0)
+    step = rng.integers(1, 1 << 18, (40, 1, 2)) * rng.choice([-1, 1], (40, 1, 2)) * 2.0**-20
+    points = 0.5 + step * np.array([-3, 1, 5])[:, None]
+    z = np.array([0.25, 0.5, 1.0])[:, None]
+    vertices = np.concatenate([points * z, np.broadcast_to(z, (40, 3, 1))], axis=-1).reshape(-1, 3).astype(np.float32)
+    ids = np.asarray(draw(vertices, np.arange(120).reshape(40, 3), flat_camera()).face_ids)
+    assert (ids == -1).all()
+
+
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_units_do_not_matter(scale):
     vertices, faces = sphere()
