@@ -1,8 +1,15 @@
-"""Rigid and affine 4x4 transforms of column vectors, named by their frames: p_a = a_from_b p_b."""
+"""Rigid and affine 4x4 transforms of column vectors, named by their frames: p_a = a_from_b p_b.
 
+Products ask for full precision: accelerators otherwise round float32 factors to 8 or 10 bits, which is millimetres.
+"""
+
+import jax
 import jax.numpy as jnp
 
 from humangs_jax.array_types import Array, Float
+
+
+EXACT = jax.lax.Precision.HIGHEST
 
 
 def make(rotation: Float[Array, "*#b 3 3"], translation: Float[Array, "*#b 3"]) -> Float[Array, "*b 4 4"]:
@@ -17,10 +24,10 @@ def make(rotation: Float[Array, "*#b 3 3"], translation: Float[Array, "*#b 3"]) 
 
 def apply(transform: Float[Array, "*#b 4 4"], points: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
     """Move points by the transform; batch axes broadcast. The last row is taken as (0, 0, 0, 1)."""
-    return jnp.einsum("...ij,...j->...i", transform[..., :3, :3], points) + transform[..., :3, 3]
+    return jnp.einsum("...ij,...j->...i", transform[..., :3, :3], points, precision=EXACT) + transform[..., :3, 3]
 
 
 def invert_rigid(transform: Float[Array, "*b 4 4"]) -> Float[Array, "*b 4 4"]:
     """Inverse of a rotation with translation (the linear part is not checked to be orthogonal)."""
     rotation = jnp.swapaxes(transform[..., :3, :3], -1, -2)
-    return make(rotation, -jnp.einsum("...ij,...j->...i", rotation, transform[..., :3, 3]))
+    return make(rotation, -jnp.einsum("...ij,...j->...i", rotation, transform[..., :3, 3], precision=EXACT))
