@@ -8,7 +8,6 @@ import jax.numpy as jnp
 
 from humangs_jax.array_types import Array, Float
 
-
 EXACT = jax.lax.Precision.HIGHEST
 
 
