@@ -58,8 +58,8 @@ class HumanGSConfig:
     image_size: side of the photographs, pixels (recorded: the network takes any multiple of the patch size).
     patch_size: side of a token's patch, pixels. tokens: "all" patches, or those that the "foreground" touches, packed
     into `token_capacity` slots over all views. position_map, skinning: how the position map that comes in was shaded,
-    and how the Gaussians are to be skinned (recorded). body_vertices: vertex count to decimate bodies to, None for all; longest_edge: metres, to which edges are split then, None for not
-    (recorded). ray_origins: the release divides camera centres by s and the ray origins taken from them once more, so
+    and how the Gaussians are to be skinned (recorded). body_vertices, longest_edge: vertex count to decimate bodies to,
+    and metres to split their edges to afterwards, None for neither (recorded). ray_origins: the release divides camera centres by s and the ray origins taken from them once more, so
     that the moments of its rays ("twice_normalized") fit no camera; needed to run its weights. dtype: of the products;
     parameters, norms and softmax statistics stay float32 at least.
     """
