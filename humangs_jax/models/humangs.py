@@ -59,8 +59,9 @@ class HumanGSConfig:
     patch_size: side of a token's patch, pixels. tokens: "all" patches, or those that the "foreground" touches, packed
     into `token_capacity` slots over all views. position_map, skinning: how the position map that comes in was shaded,
     and how the Gaussians are to be skinned (recorded). body_vertices, longest_edge: vertex count to decimate bodies to,
-    and metres to split their edges to afterwards, None for neither (recorded). ray_origins: the release divides camera centres by s and the ray origins taken from them once more, so
-    that the moments of its rays ("twice_normalized") fit no camera; needed to run its weights. dtype: of the products;
+    and metres to split their edges to afterwards, None for neither (recorded). ray_origins: the release divides camera
+    centres by s and the ray origins taken from them once more, so that the moments of its rays ("twice_normalized") fit
+    no camera; needed to run its weights. dtype: of the products;
     parameters, norms and softmax statistics stay float32 at least.
     """
 
