@@ -54,11 +54,11 @@ def compare(model: Path, arrays: Path) -> list[tuple[str, int, float, float, flo
             )
             found = run(jnp.concatenate([number("betas", i), number("expression", i)]), pose)
             wanted = [expected[f"{convention}_{name}"][i] for name in ("vertices", "joints", "full_pose")]
-            errors = [
+            vertices, joints, rotations = (
                 float(np.abs(np.asarray(a, np.float64) - b).max())
                 for a, b in zip((*found, pose.rotations.reshape(-1)), wanted, strict=True)
-            ]
-            rows.append((convention, i, *errors))
+            )
+            rows.append((convention, i, vertices, joints, rotations))
     return rows
 
 

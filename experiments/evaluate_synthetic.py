@@ -49,7 +49,7 @@ def evaluate(arguments: argparse.Namespace) -> dict:
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.body.library import load_body
     from humangs_jax.data.capture import load_capture
-    from humangs_jax.data.synthetic.seeds import split_seed
+    from humangs_jax.data.synthetic.seeds import TEST
     from humangs_jax.data.synthetic.writer import write_subject
     from humangs_jax.models.weights import load_weights
 
@@ -58,11 +58,12 @@ def evaluate(arguments: argparse.Namespace) -> dict:
     print(f"{'subject':>8}{'PSNR':>8}{'SSIM':>8}{'fg PSNR':>9}{'base':>8}{'base fg':>9}{'share':>8}")
     with tempfile.TemporaryDirectory() as folder:
         for index in range(arguments.first, arguments.first + arguments.subjects):
-            seed = split_seed("test", index)
+            seed = TEST[index]
             path = Path(folder) / f"subject_{index:05d}"
             write_subject(
                 path,
                 seed,
+                body=body,
                 image_size=arguments.size,
                 input_views=arguments.views,
                 held_out_views=arguments.held_out,

@@ -5,6 +5,7 @@ What the user got wrong (a capture, a file, an option) ends in one line on stder
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
@@ -231,7 +232,9 @@ def train(
     run(config, load_body(), people, out, validation=others, variables=variables)
 
 
-COMMANDS = {f.__name__: f for f in (demo, reconstruct, animate, render, export, synth, check, train)}
+COMMANDS: dict[str, Callable[..., None]] = {
+    f.__name__: f for f in (demo, reconstruct, animate, render, export, synth, check, train)
+}
 
 
 def _require_parent(path: Path) -> None:

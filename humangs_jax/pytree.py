@@ -21,7 +21,7 @@ def static_field(**kwargs: Any) -> Any:
 def pytree_dataclass(cls: type[T]) -> type[T]:
     """Class decorator: a frozen, keyword-friendly dataclass registered as a pytree with named leaves."""
     cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
-    fields = dataclasses.fields(cls)  # ty: ignore[invalid-argument-type]
+    fields = dataclasses.fields(cls)
     static = tuple(f.name for f in fields if f.metadata.get("static"))
     dynamic = tuple(f.name for f in fields if not f.metadata.get("static"))
 

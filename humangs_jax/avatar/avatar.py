@@ -4,6 +4,7 @@ import json
 import os
 import tempfile
 from pathlib import Path
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -42,7 +43,7 @@ class Avatar:
     faces: Int[Array, "f 3"]
     parents: tuple[int, ...] = static_field()
     joint_names: tuple[str, ...] = static_field()
-    skinning: str = static_field(default="affine")
+    skinning: Literal["affine", "rotation"] = static_field(default="affine")
 
     def save(self, path: str | os.PathLike) -> None:
         """Write one compressed `.npz` (no pickle), under a temporary name first."""
@@ -60,7 +61,9 @@ class Avatar:
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".npz")
         try:
             with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, header=np.asarray(json.dumps(header)), **arrays)
+                header_array = np.asarray(json.dumps(header))
+                # no array is called allow_pickle, the stub's only other keyword
+                np.savez_compressed(file, header=header_array, **arrays)  # ty: ignore[invalid-argument-type]
             os.chmod(temporary, 0o644)
             os.replace(temporary, path)
         except BaseException:

@@ -163,7 +163,8 @@ def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
     if not (left.any() and right.any()):
         left, right = (np.asarray(body.template)[:, 0] * sign > 0 for sign in (1, -1))
     left, right = left.astype(np.float32)[:, None], right.astype(np.float32)[:, None]
-    tints = left * np.float32(LEFT) + right * np.float32(RIGHT) + (1 - left - right) * np.float32(MIDDLE)
+    colors = np.asarray([LEFT, RIGHT, MIDDLE], np.float32)
+    tints = left * colors[0] + right * colors[1] + (1 - left - right) * colors[2]
     return tints.astype(np.float32)
 
 
@@ -245,21 +246,21 @@ def _mistake_in_picture(picture, mask):
     covered = np.asarray(picture.covered)
     tried = {"the mask is inverted": (covered, ~mask), "the photo is mirrored": (covered[:, ::-1], mask)}
     shares = {mistake: (a & b).sum() / max((a | b).sum(), 1) for mistake, (a, b) in tried.items()}
-    best = max(shares, key=shares.get)
+    best = max(shares, key=lambda mistake: shares[mistake])
     return best if shares[best] > SURELY_IOU else None
 
 
 def _mistake_in_space(draw, camera, translation, mask):
     """The usual mistake that, undone, puts the body where the mask is; without a mask the only one that puts it in frame."""
-    fitting = {}
+    fitting: dict[str, float] = {}
     for mistake, undo in MISTAKES.items():
         matrix = jnp.asarray(undo(np.asarray(camera.cam_from_world, float), translation), camera.K.dtype)
         view = _judge("", draw(replace(camera, cam_from_world=matrix)), mask)
         if not view.warnings and view.inside > SURELY_INSIDE:
-            fitting[mistake] = view.iou
+            fitting[mistake] = view.iou or 0.0
     if mask is None:
         return next(iter(fitting)) if len(fitting) == 1 else None
-    return max(fitting, key=fitting.get) if fitting else None
+    return max(fitting, key=lambda mistake: fitting[mistake]) if fitting else None
 
 
 def _outline(covered):

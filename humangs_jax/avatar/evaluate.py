@@ -36,11 +36,11 @@ def score(predicted: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
         raise ValueError("the foreground PSNR needs a mask for every view")
     views = range(truth.view_count)
     images, masks = jnp.asarray(truth.images), jnp.asarray(truth.masks)
-    predicted = jnp.clip(jnp.asarray(predicted), 0, 1)
+    clipped = jnp.clip(jnp.asarray(predicted), 0, 1)
     return Scores(
-        psnr=float(np.mean([metrics.psnr(predicted[i], images[i]) for i in views])),
-        ssim=float(np.mean([metrics.ssim(np.asarray(predicted[i]), truth.images[i]) for i in views])),
-        psnr_foreground=float(np.mean([metrics.masked_psnr(predicted[i], images[i], masks[i]) for i in views])),
+        psnr=float(np.mean([metrics.psnr(clipped[i], images[i]) for i in views])),
+        ssim=float(np.mean([metrics.ssim(np.asarray(clipped[i]), truth.images[i]) for i in views])),
+        psnr_foreground=float(np.mean([metrics.masked_psnr(clipped[i], images[i], masks[i]) for i in views])),
         foreground=float(np.mean(truth.masks)),
     )
 

@@ -120,7 +120,7 @@ def write_renderings_exr(path: str | os.PathLike, cameras: Camera, renderings: l
     from humangs_jax.data.exr import ExrView, write_exr
 
     write_exr(
-        path,
+        Path(path),
         [
             ExrView(
                 name=f"view_{i:03d}",

@@ -65,6 +65,7 @@ def _write_mp4(path, frames, fps):
     command += ["-vf", "scale=out_color_matrix=bt709:out_range=tv"]
     command += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", str(path)]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+        assert ffmpeg.stdin is not None and ffmpeg.stderr is not None  # pipes, as asked for
         try:
             for frame in frames:
                 ffmpeg.stdin.write(np.pad(to_uint8(frame), odd, mode="edge").tobytes())

@@ -40,7 +40,7 @@ RIDGE = 1e-13
 """Relative to the trace of the normal equations, which are singular where a shape direction moves nothing."""
 
 
-def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float) -> np.ndarray:
+def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float | np.floating) -> np.ndarray:
     """Points on the faces, corners included, about `spacing` apart."""
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)

@@ -25,6 +25,9 @@ class _StandIn:
 
 
 class _Sparse(_StandIn):
+    def coordinates(self) -> tuple[np.ndarray, np.ndarray]:
+        raise NotImplementedError
+
     def to_array(self) -> np.ndarray:
         shape, data = self.__dict__["_shape"], np.asarray(self.__dict__["data"])
         dense = np.zeros(shape, data.dtype)

@@ -166,13 +166,17 @@ def _hand(side: int, values: Any, hands: HandBasis | None, use_pca: bool, flat_h
     if hands is None and not (flat_hand_mean and (values is None or not use_pca)):
         raise ValueError(f"{name}: use_pca or flat_hand_mean=False need the model's hand basis (`load_hands`)")
     if values is not None and use_pca:
+        assert hands is not None  # or it was refused above
         values = jnp.asarray(values)
         if values.ndim != 1 or values.shape[0] > 45:
             raise ValueError(f"{name}: expected at most 45 principal coefficients, got shape {values.shape}")
         rotations = jnp.matmul(values, hands.components[side, : values.shape[0]], precision="highest")
     else:
         rotations = _part(name, values, 45, dtype)
-    return rotations if flat_hand_mean else rotations + hands.means[side]
+    if flat_hand_mean:
+        return rotations
+    assert hands is not None  # likewise
+    return rotations + hands.means[side]
 
 
 def assemble_pose(

@@ -69,7 +69,8 @@ def save_body(path: str | Path, body: BodyModel) -> None:
     if body.collapse_order is not None:
         arrays["collapse_order"] = _indices(np.asarray(body.collapse_order))
         arrays["collapse_into"] = _indices(np.asarray(body.collapse_into))
-    np.savez_compressed(path, **arrays)
+    # no array is called allow_pickle, the stub's only other keyword
+    np.savez_compressed(path, **arrays)  # ty: ignore[invalid-argument-type]
 
 
 def is_body_file(path: str | Path) -> bool:

@@ -55,7 +55,7 @@ def write_exr(path: str | Path, views: ExrView | Sequence[ExrView]) -> None:
 
     Raises: ValueError naming the view and what does not fit; OSError if the file cannot be written.
     """
-    import OpenEXR
+    import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
 
     views = [views] if isinstance(views, ExrView) else list(views)
     if not views:
@@ -86,7 +86,7 @@ def read_exr(path: str | Path) -> list[ExrView]:
     Raises: FileNotFoundError; OSError if it is no OpenEXR file or a damaged one; ValueError naming the part that has no
     colours or whose K or cam_from_world is no matrix.
     """
-    import OpenEXR
+    import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
 
     path = Path(path)
     if not path.is_file():
@@ -105,7 +105,7 @@ def read_exr(path: str | Path) -> list[ExrView]:
 
 
 def _to_part(view, name):
-    import OpenEXR
+    import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
 
     height, width = view.rgba.shape[:2]
     channels = {channel: view.rgba[..., i] for i, channel in enumerate(RGBA)}
@@ -136,8 +136,8 @@ def _to_part(view, name):
 def _from_part(part, path):
     images = {name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()}
     grey = images.pop("Y", None)
-    colours = [images.pop(channel, grey) for channel in RGBA[:3]]
-    if any(colour is None for colour in colours):
+    colours = [colour for channel in RGBA[:3] if (colour := images.pop(channel, grey)) is not None]
+    if len(colours) < 3:
         raise ValueError(f"{path}: part {part.name()!r}: expected channels R, G, B, got {sorted(part.channels)}")
     alpha = images.pop("A", np.ones_like(colours[0]))
     depth = images.pop(DEPTH, None)

@@ -10,7 +10,7 @@ import dataclasses
 import logging
 import queue
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -212,14 +212,14 @@ def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray
 
 def subject_views(subject: StoredSubject, indices: Sequence[int], size: int) -> SubjectViews:
     """Some views of a stored subject at size x size pixels. Raises: ValueError, see `shrink`."""
-    indices = np.asarray(indices)
+    chosen = np.asarray(indices)
     height, width = subject.images.shape[1:3]
-    matrices = jnp.asarray(subject.K[indices]), jnp.asarray(subject.cam_from_world[indices])
+    matrices = jnp.asarray(subject.K[chosen]), jnp.asarray(subject.cam_from_world[chosen])
     cameras = jax.vmap(lambda K, cam_from_world: Camera(K, cam_from_world, width, height))(*matrices)
-    frames = subject.frames[indices]
+    frames = subject.frames[chosen]
     return SubjectViews(
-        images=jnp.asarray(shrink(subject.images[indices], size)),
-        masks=jnp.asarray(shrink(subject.masks[indices], size)),
+        images=jnp.asarray(shrink(subject.images[chosen], size)),
+        masks=jnp.asarray(shrink(subject.masks[chosen], size)),
         cameras=cameras.resized(size, size),
         rotations=jnp.asarray(subject.rotations[frames]),
         translations=jnp.asarray(subject.translations[frames]),
@@ -263,10 +263,10 @@ class ExampleSource:
                 self.cache.report(subject_index, f"{self.cache.folders[subject_index]}: {error}")
         raise ValueError(f"none of the {len(self.cache)} capture folders can be used")
 
-    def batches(self, start: int, stop: int, ahead: int = 2) -> Iterator[tuple[int, Example]]:
+    def batches(self, start: int, stop: int, ahead: int = 2) -> Generator[tuple[int, Example], None, None]:
         """(step, batch) for start <= step < stop, `ahead` batches prepared by a thread; its errors are raised here.
 
-        Closing the iterator (or leaving the loop over it) ends the thread.
+        Closing the generator (or leaving the loop over it) ends the thread.
         """
         ready: queue.Queue = queue.Queue(maxsize=ahead)
         stopped = threading.Event()

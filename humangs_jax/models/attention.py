@@ -24,7 +24,8 @@ NORM_EPSILON = 1e-5
 XLA_TOKENS = 8192
 """Up to here L x L logits of all heads fit beside a model on any accelerator (12 heads, float32: 3 GB a layer)."""
 
-Implementation = Literal["auto", "xla", "cudnn", "chunked"]
+Resolved = Literal["xla", "cudnn", "chunked"]
+Implementation = Literal["auto", Resolved]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +41,7 @@ class AttentionConfig:
     query_chunk: int = 512
 
 
-def resolve_implementation(implementation: Implementation, tokens: int, dtype: Any) -> Implementation:
+def resolve_implementation(implementation: Implementation, tokens: int, dtype: Any) -> Resolved:
     """What "auto" stands for on the default backend, for that many tokens of that dtype."""
     if implementation != "auto":
         return implementation
@@ -93,12 +94,12 @@ def attention(
     query_chunk: int = 512,
 ) -> Float[Array, "l h e"]:
     """Attention of every token to the first `count` tokens (None: to all)."""
-    implementation = resolve_implementation(implementation, q.shape[0], q.dtype)
-    if implementation == "chunked":
+    resolved = resolve_implementation(implementation, q.shape[0], q.dtype)
+    if resolved == "chunked":
         return chunked_attention(q, k, v, count, query_chunk)
     lengths = None if count is None else count.astype(jnp.int32)[None]
     out = jax.nn.dot_product_attention(
-        q[None], k[None], v[None], key_value_seq_lengths=lengths, implementation=implementation
+        q[None], k[None], v[None], key_value_seq_lengths=lengths, implementation=resolved
     )
     return out[0]
 

@@ -12,7 +12,7 @@ said otherwise.
 
 import dataclasses
 import functools
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import flax.linen as nn
 import jax
@@ -25,6 +25,7 @@ from humangs_jax.models.tokenizer import Packing, Tokenizer, TokenSelection, pac
 from humangs_jax.models.transformer import INIT_STD, Transformer, TransformerConfig
 from humangs_jax.models.upsampler import Upsampler, UpsamplerConfig
 from humangs_jax.models.vertex_decoder import (
+    RawGaussians,
     VertexDecoder,
     VertexDecoderConfig,
     VertexFeatures,
@@ -258,9 +259,9 @@ def encode_with_statistics(
     update = train and bool(batch_stats)
     result = Encoder(config, axis_name).apply(own, pixels, packing, train, mutable=["batch_stats"] if update else False)
     if update:
-        result, updated = result
+        result, updated = cast(tuple[Any, Variables], result)
         batch_stats = {"encoder": updated["batch_stats"]}
-    maps, global_token = result
+    maps, global_token = cast(tuple[Array, Array | None], result)
     dropped = jnp.zeros((), jnp.int32) if packing is None else packing.dropped
     return Encoding(maps, global_token, dropped), batch_stats
 
@@ -298,6 +299,7 @@ def decode(
     canonical = canonical_vertices / unit
     decoder = VertexDecoder(config.decoder, config.compute_dtype)
     raw = decoder.apply({"params": variables["params"]["decoder"]}, decoder_input(features, canonical))
+    raw = cast(RawGaussians, raw)
     at_vertices = activate(raw, config.decoder, features.photo_colors)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     gaussians = Gaussians(

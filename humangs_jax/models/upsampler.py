@@ -11,6 +11,7 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax.linen.dtypes import promote_dtype
 
 from humangs_jax.array_types import Array, Float
 
@@ -52,7 +53,7 @@ class UpConvolution(nn.Module):
         views, height, width, channels = x.shape
         kernel = self.param("kernel", KAIMING_TRANSPOSED, (4, 4, channels, self.features))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        x, kernel, bias = nn.dtypes.promote_dtype(x, kernel, bias, dtype=self.dtype)
+        x, kernel, bias = promote_dtype(x, kernel, bias, dtype=self.dtype)
         order = jnp.asarray([3, 1, 2, 0])  # phase, then tap
         kernel = kernel[order][:, order].reshape(2, 2, 2, 2, channels, self.features)
         kernel = jnp.transpose(kernel, (1, 3, 4, 0, 2, 5)).reshape(4 * channels, 4 * self.features)

@@ -107,6 +107,7 @@ def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> F
         parts.append(jnp.broadcast_to(features.global_token, (vertices, features.global_token.shape[0])))
     parts.append(positional_encoding(canonical))
     if features.photo_colors is not None:
+        assert features.visible_fraction is not None  # it comes with the colours
         parts += [2 * features.photo_colors - 1, features.visible_fraction[:, None]]
     return jnp.concatenate(parts, axis=-1)
 
@@ -120,6 +121,7 @@ def activate(
         offsets = config.offset_scale * jnp.tanh(offsets / config.offset_scale)
     colors, opacities = raw.appearance[..., :3], raw.appearance[..., 3]
     if config.residual_color:
+        assert photo_colors is not None  # such a network samples them
         colors = colors + inverse_sigmoid(photo_colors, COLOR_MARGIN)[:, None]
     return VertexGaussians(
         offsets, quaternion.normalize(quats), jax.nn.softplus(scales), jax.nn.sigmoid(opacities), jax.nn.sigmoid(colors)

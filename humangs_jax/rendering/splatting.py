@@ -15,6 +15,7 @@ import functools
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.core import Tracer
 
 from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.geometry.camera import Camera
@@ -119,6 +120,7 @@ def _render(gaussians: Gaussians, camera: Camera, background, config: SplatConfi
             jnp.zeros((grid.height, grid.width, 5), projected.x.dtype).at[..., 4].set(1), background, jnp.int32(0)
         )
 
+    assert config.max_pairs is not None  # callers have fitted the buffers
     order = binning.depth_order(jnp.where(projected.visible, lax.stop_gradient(projected.depth), jnp.inf))
     ellipses = binning.Footprints(*(plane[order] for plane in _footprints(projected, gaussians, config)))
     pairs = binning.emit_pairs(ellipses, grid, config.max_rows or config.max_pairs, config.max_pairs)
@@ -198,7 +200,7 @@ def _round_up(size):
 
 
 def _is_traced(*trees):
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(trees))
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
 def _white(gaussians):

@@ -61,13 +61,13 @@ class TileGrid:
         """Pixels per tile."""
         return self.tile_size**2
 
-    def offsets(self, dtype: object = np.float32) -> np.ndarray:
+    def offsets(self, dtype: np.dtype | type = np.float32) -> np.ndarray:
         """(2, pixels): x and y of a tile's pixel centres, from the tile's centre. Small: moments stay accurate."""
         pixel = np.arange(self.pixels)
         offsets = np.stack([pixel % self.tile_size, pixel // self.tile_size]) + 0.5 - self.tile_size / 2
         return offsets.astype(dtype)
 
-    def centers(self, dtype: object = np.float32) -> np.ndarray:
+    def centers(self, dtype: np.dtype | type = np.float32) -> np.ndarray:
         """(t, 2): x and y of the tiles' centres, pixels."""
         tile = np.arange(self.tiles)
         corners = np.stack([tile % self.columns, tile // self.columns], axis=-1) * self.tile_size

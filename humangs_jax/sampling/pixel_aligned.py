@@ -59,7 +59,8 @@ def visible_vertices(
 
     depth_map: rasterized z, -1 on background, so that a vertex over background is unseen. image_size: (width, height).
     """
-    indices = texel_indices(pixels, image_size, depth_map.shape[::-1], convention)
+    height, width = depth_map.shape
+    indices = texel_indices(pixels, image_size, (width, height), convention)
     surface = sample_nearest(depth_map, indices)
     inside = jnp.all((pixels > 0) & (pixels < jnp.asarray(image_size, pixels.dtype)), axis=-1)
     return inside & (depths > 0) & (depths < surface + DEPTH_TOLERANCE)

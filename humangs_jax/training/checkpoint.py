@@ -9,7 +9,7 @@ import dataclasses
 import json
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from pathlib import Path
 
 import jax
@@ -122,7 +122,7 @@ def _flat(tree, prefix=""):
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _quiet() -> Generator[None, None, None]:
     """Without Orbax's chatter, which goes through absl's logger."""
     absl = logging.getLogger("absl")
     level = absl.level

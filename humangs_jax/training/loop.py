@@ -13,7 +13,7 @@ import logging
 import signal
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import jax
@@ -74,7 +74,8 @@ def train(
     state = init_state(config, variables)
     best = None
     if checkpoints.steps:
-        state, best = checkpoints.restore(state), checkpoints.score(checkpoints.best_step)
+        state, best_step = checkpoints.restore(state), checkpoints.best_step
+        best = None if best_step is None else checkpoints.score(best_step)
     start, end = int(state.step), config.steps if stop_at is None else min(config.steps, stop_at)
 
     log = _Log(out / "log.jsonl")
@@ -144,7 +145,7 @@ def _bar(total, start, shown):
 
 
 @contextlib.contextmanager
-def _stop_on_signal() -> Iterator[threading.Event]:
+def _stop_on_signal() -> Generator[threading.Event, None, None]:
     """An event that SIGINT and SIGTERM set; the second SIGINT is a KeyboardInterrupt again."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():  # only the main thread may catch signals

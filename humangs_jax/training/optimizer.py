@@ -82,7 +82,8 @@ def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.Gradie
         advanced = jax.tree.map(keep, advanced, state.inner)
         return updates, GuardState(state.skipped + ~good, norm, advanced)
 
-    return optax.GradientTransformationExtraArgs(init, update)
+    # optax types the constructor's second argument as that of its base class, which knows no extra arguments
+    return optax.GradientTransformationExtraArgs(init, update)  # ty: ignore[invalid-argument-type]
 
 
 def make_optimizer(config: OptimizerConfig, steps: int) -> optax.GradientTransformationExtraArgs:

@@ -1,6 +1,7 @@
 """One step of training: a pure function of state, batch and body."""
 
 import functools
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from humangs_jax.pytree import replace
 from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.forward import draw_targets, reconstruct_example
-from humangs_jax.training.optimizer import learning_rate, make_optimizer
+from humangs_jax.training.optimizer import GuardState, learning_rate, make_optimizer
 from humangs_jax.training.state import TrainState
 
 SUBJECTS = "subjects"
@@ -131,17 +132,20 @@ def train_step(state: TrainState, batch: Example, body: BodyModel, config: Train
     loss, gradients, batch_stats, metrics = batch_gradients(state, body, batch, keys, config)
     optimizer = make_optimizer(config.optimizer, config.steps)
     updates, opt_state = optimizer.update(gradients, state.opt_state, state.params, value=loss)
+    opt_state = cast(GuardState, opt_state)
     good = opt_state.skipped == state.opt_state.skipped
     params = optax.apply_updates(state.params, updates)
     ema_params = state.ema_params
     if ema_params is not None:
+        assert config.ema_decay is not None  # or there would be no average
         # the average starts short, so that it forgets the initial parameters
         decay = jnp.minimum(config.ema_decay, (1 + state.step) / (10 + state.step))
         ema_params = optax.incremental_update(params, ema_params, 1 - decay)
+    rate = learning_rate(config.optimizer, config.steps)
     metrics |= {
         "loss": loss,
         "grad_norm": opt_state.norm,
-        "learning_rate": learning_rate(config.optimizer, config.steps)(state.step - state.opt_state.skipped),
+        "learning_rate": jnp.asarray(rate(state.step - state.opt_state.skipped)),
         "skipped": opt_state.skipped,
     }
     return replace(

@@ -37,12 +37,10 @@ def cameras_around(
     distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
     elevations = rng.uniform(*ELEVATION, len(azimuths))
     near = [nearest_distance(vertices - center, a, e) for a, e in zip(azimuths, elevations, strict=True)]
-    distances, azimuths, elevations = (
-        jnp.asarray(x, jnp.float32) for x in (np.maximum(distances, near), azimuths, elevations)
-    )
+    placed = (jnp.asarray(x, jnp.float32) for x in (np.maximum(distances, near), azimuths, elevations))
     K = intrinsics_from_fov(VERTICAL_FOV, image_size, image_size)
     target = jnp.asarray(center, jnp.float32)
-    return _orbit(target, distances, azimuths, elevations, K, image_size, image_size)
+    return _orbit(target, *placed, K, image_size, image_size)
 
 
 def nearest_distance(points: Float[np.ndarray, "n 3"], azimuth: float, elevation: float) -> float:
