@@ -10,6 +10,7 @@ Layouts: linear (out, in) -> (in, out); convolution (out, in, kh, kw) -> (kh, kw
 
 import collections
 import dataclasses
+import math
 import os
 import pickle
 import zipfile
@@ -147,8 +148,8 @@ def _read(archive: zipfile.ZipFile, root: str, key: str, tensor: LazyTensor) -> 
         raise ValueError(f"{key}: storage {tensor.storage} is missing or damaged: {error}") from error
     sizes = (tensor.offset, *tensor.shape, *tensor.strides)
     last = tensor.offset + sum((n - 1) * stride for n, stride in zip(tensor.shape, tensor.strides, strict=True))
-    empty = 0 in tensor.shape
-    if any(not isinstance(x, int) or x < 0 for x in sizes) or (not empty and last >= len(data)):
+    count = math.prod(tensor.shape)  # views of parameters never repeat numbers: a larger one is a bomb
+    if any(not isinstance(x, int) or x < 0 for x in sizes) or count > len(data) or (count and last >= len(data)):
         raise ValueError(f"{key}: shape {tensor.shape} does not fit storage {tensor.storage} of {len(data)} numbers")
     view = np.lib.stride_tricks.as_strided(
         data[tensor.offset :],

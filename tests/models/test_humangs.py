@@ -1,0 +1,256 @@
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from network_cases import ALL_TOKENS, TINY, random_inputs, random_variables
+
+from humangs_jax.models import presets
+from humangs_jax.models.humangs import (
+    Encoding,
+    HumanGSConfig,
+    apply_humangs,
+    encode,
+    init_humangs,
+    sample_vertices,
+    subject_unit,
+)
+from humangs_jax.models.weights import expected_variables
+from humangs_jax.pytree import replace
+
+FLOAT32_TOLERANCE = 1e-5
+"""The same sums in another order: a few layers of float32 roundings on numbers of order one."""
+BFLOAT16_TOLERANCE = 0.05
+"""bfloat16 has 8 bits (0.4 %); some twenty roundings in a row on numbers of order one."""
+
+
+@functools.partial(jax.jit, static_argnames=("config",))
+def run(variables, inputs, config):
+    """Encoding and outputs, compiled once per configuration and shape."""
+    return encode(variables, inputs, config), apply_humangs(variables, inputs, config)[0]
+
+
+def close(a, b, tolerance=FLOAT32_TOLERANCE):
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(np.allclose(x, y, rtol=tolerance, atol=tolerance) for x, y in pairs)
+
+
+@functools.cache
+def variables_of(config):
+    return random_variables(config)
+
+
+# shapes
+
+
+@pytest.mark.parametrize("name", sorted(presets.PRESETS))
+def test_presets_have_the_shapes_they_promise(name):
+    """Traced at full size, nothing is computed."""
+    config = presets.PRESETS[name]()
+    views, vertices, size = 4, 37, config.image_size
+    inputs = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, random_inputs(0, views, vertices, size)))
+    variables = expected_variables(config)
+    encoding, outputs = jax.eval_shape(lambda v, x: run(v, x, config), variables, inputs)
+    side = size // config.patch_size * (4 if config.upsampler.enabled else 1)
+    width = config.upsampler.out if config.upsampler.enabled else config.transformer.width
+    assert encoding.maps.shape == (views, side, side, width)
+    assert encoding.maps.dtype == (jnp.bfloat16 if config.dtype == "bfloat16" else jnp.float32) or side == size // 8
+    assert outputs.gaussians.means.shape == (vertices * config.decoder.gaussians_per_vertex, 3)
+    assert outputs.tight_offsets.shape == (vertices, 1, 3)
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((outputs.gaussians, variables)))
+
+
+def test_the_published_network_has_99_million_parameters():
+    params = expected_variables(presets.published())["params"]
+    assert round(sum(leaf.size for leaf in jax.tree.leaves(params)) / 1e6) == 99
+
+
+@pytest.mark.parametrize(
+    ("views", "vertices", "tight", "free", "joints"), [(1, 5, 1, 0, None), (3, 40, 0, 2, 7), (6, 1, 2, 3, 55)]
+)
+def test_any_number_of_views_vertices_and_gaussians(views, vertices, tight, free, joints):
+    decoder = dataclasses.replace(TINY.decoder, tight=tight, free=free, skinning_joints=joints)
+    config = dataclasses.replace(TINY, decoder=decoder)
+    inputs = jax.eval_shape(lambda: random_inputs(0, views, vertices))
+    _, outputs = jax.eval_shape(lambda v, x: run(v, x, config), expected_variables(config), inputs)
+    count = vertices * (tight + free)
+    assert outputs.gaussians.opacities.shape == (count,) and outputs.tight_offsets.shape == (vertices, tight, 3)
+    assert (outputs.skinning_offsets is None) if joints is None else (outputs.skinning_offsets.shape == (count, joints))
+
+
+@pytest.mark.parametrize("class_token", [True, False])
+@pytest.mark.parametrize("sample_rgb", [True, False])
+def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
+    config = dataclasses.replace(
+        TINY,
+        transformer=dataclasses.replace(TINY.transformer, class_token=class_token),
+        upsampler=dataclasses.replace(TINY.upsampler, enabled=class_token),
+        sampling=dataclasses.replace(TINY.sampling, sample_rgb=sample_rgb),
+        decoder=dataclasses.replace(TINY.decoder, residual_color=sample_rgb),
+    )
+    variables = expected_variables(config)
+    assert bool(variables["batch_stats"]) == class_token
+    encoding, _ = jax.eval_shape(lambda v: run(v, random_inputs(), config), variables)
+    assert (encoding.global_token is not None) == class_token
+    kernel = variables["params"]["decoder"]["trunk_0"]["kernel"]
+    local = TINY.upsampler.out if class_token else TINY.transformer.width
+    assert kernel.shape[0] == local + TINY.transformer.width * class_token + 39 + 4 * sample_rgb
+
+
+# values
+
+
+def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
+    inputs = random_inputs()
+    inputs = replace(inputs, images=jnp.full_like(inputs.images, 0.7))
+    variables = init_humangs(jax.random.key(0), TINY)
+    fresh = run(variables, inputs, TINY)[1].gaussians
+    unit, k = subject_unit(inputs.canonical_vertices), TINY.decoder.gaussians_per_vertex
+    assert np.abs(fresh.means - jnp.repeat(inputs.canonical_vertices, k, axis=0)).max() < 0.02
+    assert np.allclose(fresh.scales, 0.01 * unit, rtol=0.1)  # softplus(-4.6) = 1.0 cm
+    assert np.allclose(fresh.opacities, jax.nn.sigmoid(-1.0), atol=0.01) and np.allclose(fresh.colors, 0.7, atol=0.01)
+    assert np.allclose(jnp.abs(fresh.quats[:, 0]), 1, atol=0.01)
+    shapes = jax.tree.map(lambda x: (x.shape, x.dtype), variables)
+    assert shapes == jax.tree.map(lambda x: (x.shape, x.dtype), expected_variables(TINY))
+    deepest = variables["params"]["encoder"]["transformer"]["block_3"]["mlp_in"]["kernel"]
+    assert np.isclose(deepest.std(), 0.02 / np.sqrt(2 * 4), rtol=0.1)
+
+
+def test_the_order_of_the_views_does_not_matter():
+    """Maps are permuted with the views, everything pooled stays."""
+    inputs, order = random_inputs(views=3), jnp.asarray([2, 0, 1])
+    per_view = {name: getattr(inputs, name) for name in ("images", "posed_vertices", "position_maps", "depth_maps")}
+    permuted = replace(
+        inputs,
+        cameras=jax.tree.map(lambda x: x[order], inputs.cameras),
+        **{name: x[order] for name, x in per_view.items()},
+    )
+    variables = variables_of(ALL_TOKENS)
+    (encoding, outputs), (other_encoding, other_outputs) = (run(variables, x, ALL_TOKENS) for x in (inputs, permuted))
+    assert close(encoding.maps[order], other_encoding.maps) and not close(encoding.maps, other_encoding.maps)
+    assert close(encoding.global_token, other_encoding.global_token) and close(outputs, other_outputs)
+
+
+def test_foreground_tokens_are_all_tokens_when_everything_is_foreground():
+    inputs = random_inputs()
+    patches = 2 * (32 // 8) ** 2
+    config = dataclasses.replace(TINY, token_capacity=patches + 50)
+    variables = variables_of(ALL_TOKENS)
+    assert close(run(variables, inputs, config), run(variables, inputs, ALL_TOKENS))
+
+
+def test_background_patches_are_unseen_and_dropped_ones_are_counted():
+    inputs = random_inputs()
+    foreground = np.zeros((2, 32, 32), bool)
+    foreground[0, 8:24, 16:32] = foreground[1, 3, 9] = True  # four patches, and one
+    inputs = replace(inputs, foreground=jnp.asarray(foreground))
+    variables = variables_of(TINY)
+    roomy, exact, tight = (dataclasses.replace(TINY, token_capacity=n) for n in (16, 5, 3))
+    encoding, outputs = run(variables, inputs, roomy)
+    assert outputs.dropped_tokens == 0 and close(
+        (encoding, outputs), run(variables, inputs, exact)
+    )  # padding is nothing
+    touched = np.kron(foreground.reshape(2, 4, 8, 4, 8).any((2, 4)), np.ones((8, 8), bool))
+    noise = jnp.where(touched[..., None], inputs.images, 0.123)
+    assert close(encoding, run(variables, replace(inputs, images=noise), roomy)[0])
+    assert not close(encoding, run(variables, replace(inputs, images=inputs.images.at[1, 0, 8].add(0.5)), roomy)[0])
+    assert run(variables, inputs, tight)[1].dropped_tokens == 2
+
+
+def test_bfloat16_is_close():
+    variables, inputs = variables_of(ALL_TOKENS), random_inputs()
+    encoding, outputs = run(variables, inputs, dataclasses.replace(ALL_TOKENS, dtype="bfloat16"))
+    exact_encoding, exact = run(variables, inputs, ALL_TOKENS)
+    assert encoding.maps.dtype == jnp.bfloat16
+    scale = jnp.abs(exact_encoding.maps).max()
+    assert jnp.abs(encoding.maps.astype(jnp.float32) - exact_encoding.maps).max() < BFLOAT16_TOLERANCE * scale
+    assert close(outputs.gaussians.means, exact.gaussians.means, BFLOAT16_TOLERANCE)
+    assert close(outputs.gaussians.colors, exact.gaussians.colors, 2 * BFLOAT16_TOLERANCE)
+
+
+def test_unseen_vertices_are_grey_and_pool_nothing():
+    inputs = replace(random_inputs(), depth_maps=jnp.full((2, 32, 32), -1.0))
+    encoding = Encoding(jnp.ones((2, 16, 16, 8)), jnp.ones(16), jnp.zeros((), jnp.int32))
+    features = sample_vertices(encoding, inputs, TINY)
+    assert np.array_equal(features.local, np.zeros((20, 8))) and np.array_equal(
+        features.photo_colors, np.full((20, 3), 0.5)
+    )
+    assert np.array_equal(features.visible_fraction, np.zeros(20))
+    every = dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, pool="all"))
+    assert np.allclose(sample_vertices(encoding, inputs, every).local, 1, atol=1e-6)
+
+
+# gradients and batches
+
+
+def loss(variables, inputs, config):
+    outputs, _ = apply_humangs(variables, inputs, config, train=True)
+    leaves = [*jax.tree.leaves(outputs.gaussians), outputs.tight_offsets]
+    return sum(jnp.sum(jnp.sin(leaf)) for leaf in leaves)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def gradients(variables, continuous, inputs, config):
+    of = lambda params, continuous: loss({**variables, "params": params}, replace(inputs, **continuous), config)
+    return jax.grad(of, (0, 1))(variables["params"], continuous)
+
+
+def test_gradients_are_finite_and_reach_every_parameter():
+    inputs = random_inputs()
+    cameras = inputs.cameras
+    posed = (
+        inputs.posed_vertices.at[:, 0].set(cameras.center).at[:, 1].set(2 * cameras.center)
+    )  # in and behind the camera
+    inputs = replace(inputs, depth_maps=inputs.depth_maps.at[:, :16].set(-1.0))  # some vertices are seen by none
+    continuous = {"posed_vertices": posed, "images": inputs.images, "canonical_vertices": inputs.canonical_vertices}
+    of_params, of_inputs = gradients(variables_of(TINY), continuous, inputs, TINY)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((of_params, of_inputs)))
+    silent = [path for path, leaf in jax.tree_util.tree_leaves_with_path(of_params) if not np.abs(leaf).max() > 0]
+    assert not silent
+    remat = dataclasses.replace(TINY, transformer=dataclasses.replace(TINY.transformer, remat=True))
+    assert close(of_params, gradients(variables_of(TINY), continuous, inputs, remat)[0], 1e-4)
+
+
+def test_a_vmap_over_subjects_is_a_loop():
+    subjects = [random_inputs(seed) for seed in range(2)]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
+    variables = variables_of(TINY)
+    apply = functools.partial(apply_humangs, config=TINY, train=True)
+    one = jax.jit(apply)
+    looped = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one(variables, x) for x in subjects))
+    assert close(jax.jit(jax.vmap(apply, in_axes=(None, 0)))(variables, batch), looped)
+
+    shared = jax.vmap(functools.partial(apply, axis_name="b"), in_axes=(None, 0), axis_name="b")
+    outputs, statistics = jax.jit(shared)(variables, batch)
+    assert close(*(jax.tree.map(lambda x, i=i: x[i], statistics) for i in range(2)))  # one batch, one set of statistics
+    assert not close(outputs.gaussians.means, looped[0].gaussians.means, 1e-3)
+
+
+# what is refused
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"image_size": 100}, "no multiple of patch_size"),
+        ({"tokens": "foreground"}, "token_capacity"),
+        ({"transformer": presets.TransformerConfig(width=100)}, "head_width"),
+        ({"transformer": presets.TransformerConfig(layers=3)}, "layers"),
+        ({"decoder": presets.VertexDecoderConfig(residual_color=True)}, "sample_rgb"),
+        ({"decoder": presets.VertexDecoderConfig(tight=0, free=0)}, "tight"),
+    ],
+)
+def test_configurations_that_do_not_fit_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        HumanGSConfig(**changes)
+
+
+def test_images_must_be_those_of_the_cameras():
+    inputs = random_inputs()
+    with pytest.raises(ValueError, match="32 x 32 but their cameras say 64 x 32"):
+        apply_humangs(variables_of(TINY), replace(inputs, cameras=replace(inputs.cameras, width=64)), TINY)
+    odd = random_inputs(size=36)
+    with pytest.raises(ValueError, match="36 x 36 cannot be cut"):
+        apply_humangs(variables_of(TINY), odd, TINY)
