@@ -18,6 +18,7 @@ from jax import lax
 from jax.core import Tracer
 
 from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.capacity import round_up
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.numerics import safe_divide
 from humangs_jax.pytree import pytree_dataclass
@@ -108,7 +109,7 @@ def fit_config(
     Sizes are rounded up to 2^i or 1.5 * 2^i, so that similar scenes share one compilation. Measures concrete arrays:
     call it outside of transformations.
     """
-    rows, pairs = (_round_up(int(int(most) * margin)) for most in _needed(gaussians, camera, _without_buffers(config)))
+    rows, pairs = (round_up(int(int(most) * margin)) for most in _needed(gaussians, camera, _without_buffers(config)))
     return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
 
 
@@ -191,12 +192,6 @@ def _with_default_buffers(gaussians, camera, config):
 
 def _without_buffers(config):
     return dataclasses.replace(config, max_pairs=None, max_rows=None)
-
-
-def _round_up(size):
-    """The next 2^i or 1.5 * 2^i."""
-    power = 1 << max(6, (size - 1).bit_length())
-    return 3 * power // 4 if size <= 3 * power // 4 else power
 
 
 def _is_traced(*trees):
