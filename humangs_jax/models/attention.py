@@ -8,7 +8,8 @@ Tokens that are padding stand at the end; the first `count` ones are attended to
 - "cudnn": its fused flash attention (NVIDIA, half precision only).
 
 "auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens, and "chunked"
-otherwise: on a CPU `jax.nn.dot_product_attention` is several times slower (measured: see `experiments`).
+otherwise. On a CPU, 1,537 tokens and 4 heads of 64, "xla" needs 118 ms of processor time and 366 ms with its gradient,
+"chunked" 37 and 168.
 """
 
 import dataclasses

@@ -12,7 +12,7 @@ said otherwise.
 
 import dataclasses
 import functools
-from typing import Any, Literal, cast
+from typing import Any, Literal, NamedTuple, cast
 
 import flax.linen as nn
 import jax
@@ -132,17 +132,14 @@ class HumanGSInputs:
     foreground: Bool[Array, "v h w"]
 
 
-@pytree_dataclass
-class Encoding:
-    """What the encoder makes of the photographs.
+class Encoding(NamedTuple):
+    """What the encoder makes of the photographs: maps, global_token = encode(variables, inputs, config).
 
-    maps: (v, h', w', d) feature maps. global_token: (d',) or None without a class token. dropped_tokens: foreground
-    patches that the token capacity had no room for.
+    maps: (v, h', w', d) feature maps. global_token: (d',) or None without a class token.
     """
 
     maps: Float[Array, "v h w d"]
     global_token: Float[Array, " e"] | None
-    dropped_tokens: Int[Array, ""]
 
 
 @pytree_dataclass
@@ -151,7 +148,8 @@ class HumanGSOutputs:
 
     gaussians: g = n * k of them, metric, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from the vertex,
     normalised units (for the tightness loss). skinning_offsets: (n * k, j) logits of the skinning head, or None (see
-    `vertex_decoder.corrected_skinning_weights`). dropped_tokens: see `Encoding`.
+    `vertex_decoder.corrected_skinning_weights`). dropped_tokens: foreground
+    patches that the token capacity had no room for.
     """
 
     gaussians: Gaussians
@@ -220,6 +218,13 @@ def touched_patches(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, 
     return jnp.sum(_touched(inputs, config), dtype=jnp.int32)
 
 
+def dropped_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]:
+    """How many foreground patches the token capacity has no room for."""
+    if config.tokens == "all":
+        return jnp.zeros((), jnp.int32)
+    return jnp.maximum(touched_patches(inputs, config) - config.token_capacity, 0)
+
+
 def select_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Packing | None:
     """Which patches become tokens; None for all of them."""
     if config.tokens == "all":
@@ -262,10 +267,10 @@ def encode_with_statistics(
         result, updated = cast(tuple[Any, Variables], result)
         batch_stats = {"encoder": updated["batch_stats"]}
     maps, global_token = cast(tuple[Array, Array | None], result)
-    dropped = jnp.zeros((), jnp.int32) if packing is None else packing.dropped
-    return Encoding(maps, global_token, dropped), batch_stats
+    return Encoding(maps, global_token), batch_stats
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -> Encoding:
     """Photographs -> feature maps and global token, with the running batch statistics.
 
@@ -274,6 +279,7 @@ def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -
     return encode_with_statistics(variables, inputs, config)[0]
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def sample_vertices(encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig) -> VertexFeatures:
     """Feature maps (and photographs, if configured) at the projections of the posed vertices, pooled over views."""
     sampling = config.sampling
@@ -291,6 +297,7 @@ def sample_vertices(encoding: Encoding, inputs: HumanGSInputs, config: HumanGSCo
     return VertexFeatures(local, encoding.global_token, colors, jnp.mean(visible.astype(pixels.dtype), axis=0))
 
 
+@functools.partial(jax.jit, static_argnames="config")
 def decode(
     variables: Variables, features: VertexFeatures, canonical_vertices: Float[Array, "n 3"], config: HumanGSConfig
 ) -> HumanGSOutputs:
@@ -333,4 +340,4 @@ def apply_humangs(
     encoding, batch_stats = encode_with_statistics(variables, inputs, config, train, axis_name)
     features = sample_vertices(encoding, inputs, config)
     outputs = decode(variables, features, inputs.canonical_vertices, config)
-    return replace(outputs, dropped_tokens=encoding.dropped_tokens), batch_stats
+    return replace(outputs, dropped_tokens=dropped_tokens(inputs, config)), batch_stats

@@ -24,13 +24,11 @@ class Packing:
     """Which patches became tokens.
 
     indices: (l,) of the kept patches, in their order; the number of patches itself where a token is padding.
-    count: tokens that are no padding (they come first). dropped: patches that the static number of tokens had no room
-    for.
+    count: tokens that are no padding (they come first).
     """
 
     indices: Int[Array, " l"]
     count: Int[Array, ""]
-    dropped: Int[Array, ""]
 
 
 def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p pixels c"]:
@@ -43,11 +41,9 @@ def patchify(maps: Float[Array, "v h w c"], patch: int) -> Float[Array, "p pixel
 
 
 def pack_patches(foreground: Bool[Array, " p"], capacity: int) -> Packing:
-    """Indices of the foreground patches in a static number of slots; patches beyond the capacity are counted."""
-    total = jnp.sum(foreground)
+    """Indices of the foreground patches in a static number of slots; those beyond the capacity are left out."""
     indices = jnp.nonzero(foreground, size=capacity, fill_value=foreground.shape[0])[0]
-    count = jnp.minimum(total, capacity)
-    return Packing(indices, count, total - count)
+    return Packing(indices, jnp.minimum(jnp.sum(foreground), capacity))
 
 
 def unpack_tokens(tokens: Float[Array, "l d"], packing: Packing, patches: int) -> Float[Array, "p d"]:

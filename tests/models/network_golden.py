@@ -99,7 +99,7 @@ def stages(variables, inputs, config, skinning_weights, joint_transforms):
     found["mid_encoder_out"] = transformer["__call__"][0][-1]
     found["mid_feature_map_stride4"] = channels_first(maps)[:, :, ::4, ::4]
 
-    features = sample_vertices(Encoding(maps, global_token, jnp.zeros((), jnp.int32)), inputs, config)
+    features = sample_vertices(Encoding(maps, global_token), inputs, config)
     entering = decoder_input(features, inputs.canonical_vertices / unit)
     found["mid_decoder_input"] = entering[:, :-POSITION_ENCODING]
     raw = VertexDecoder(config.decoder).apply({"params": variables["params"]["decoder"]}, entering)

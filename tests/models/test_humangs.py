@@ -12,11 +12,14 @@ from humangs_jax.models.humangs import (
     Encoding,
     HumanGSConfig,
     apply_humangs,
+    dropped_tokens,
     encode,
-    init_humangs,
     sample_vertices,
+    select_tokens,
     subject_unit,
 )
+from humangs_jax.models.transformer import Block
+from humangs_jax.models.vertex_decoder import VertexDecoder
 from humangs_jax.models.weights import expected_variables
 from humangs_jax.pytree import replace
 
@@ -28,7 +31,7 @@ BFLOAT16_TOLERANCE = 0.05
 
 @functools.partial(jax.jit, static_argnames=("config",))
 def run(variables, inputs, config):
-    """Encoding and outputs, compiled once per configuration and shape."""
+    """Encoding and outputs, compiled once per configuration and shape (the compiler merges what both compute)."""
     return encode(variables, inputs, config), apply_humangs(variables, inputs, config)[0]
 
 
@@ -105,22 +108,26 @@ def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
 def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
     inputs = random_inputs()
     inputs = replace(inputs, images=jnp.full_like(inputs.images, 0.7))
-    variables = init_humangs(jax.random.key(0), TINY)
+    decoder = VertexDecoder(TINY.decoder).init(jax.random.key(0), jnp.zeros((1, TINY.decoder_width)))
+    variables = variables_of(TINY)
+    variables = {**variables, "params": {**variables["params"], "decoder": decoder["params"]}}
     fresh = run(variables, inputs, TINY)[1].gaussians
     unit, k = subject_unit(inputs.canonical_vertices), TINY.decoder.gaussians_per_vertex
     assert np.abs(fresh.means - jnp.repeat(inputs.canonical_vertices, k, axis=0)).max() < 0.02
     assert np.allclose(fresh.scales, 0.01 * unit, rtol=0.1)  # softplus(-4.6) = 1.0 cm
     assert np.allclose(fresh.opacities, jax.nn.sigmoid(-1.0), atol=0.01) and np.allclose(fresh.colors, 0.7, atol=0.01)
     assert np.allclose(jnp.abs(fresh.quats[:, 0]), 1, atol=0.01)
-    shapes = jax.tree.map(lambda x: (x.shape, x.dtype), variables)
-    assert shapes == jax.tree.map(lambda x: (x.shape, x.dtype), expected_variables(TINY))
-    deepest = variables["params"]["encoder"]["transformer"]["block_3"]["mlp_in"]["kernel"]
-    assert np.isclose(deepest.std(), 0.02 / np.sqrt(2 * 4), rtol=0.1)
+
+
+def test_deeper_blocks_begin_smaller():
+    config = presets.TransformerConfig(width=64, layers=4, attention=presets.AttentionConfig(head_width=32))
+    kernel = jax.jit(Block(config, 3).init)(jax.random.key(0), jnp.zeros((2, 64)))["params"]["mlp_in"]["kernel"]
+    assert np.isclose(kernel.std(), 0.02 / np.sqrt(2 * 4), rtol=0.05)
 
 
 def test_the_order_of_the_views_does_not_matter():
     """Maps are permuted with the views, everything pooled stays."""
-    inputs, order = random_inputs(views=3), jnp.asarray([2, 0, 1])
+    inputs, order = random_inputs(), jnp.asarray([1, 0])
     per_view = {name: getattr(inputs, name) for name in ("images", "posed_vertices", "position_maps", "depth_maps")}
     permuted = replace(
         inputs,
@@ -147,7 +154,7 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     foreground[0, 8:24, 16:32] = foreground[1, 3, 9] = True  # four patches, and one
     inputs = replace(inputs, foreground=jnp.asarray(foreground))
     variables = variables_of(TINY)
-    roomy, exact, tight = (dataclasses.replace(TINY, token_capacity=n) for n in (16, 5, 3))
+    roomy, exact, tight = TINY, *(dataclasses.replace(TINY, token_capacity=n) for n in (5, 3))
     encoding, outputs = run(variables, inputs, roomy)
     assert outputs.dropped_tokens == 0 and close(
         (encoding, outputs), run(variables, inputs, exact)
@@ -156,7 +163,8 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     noise = jnp.where(touched[..., None], inputs.images, 0.123)
     assert close(encoding, run(variables, replace(inputs, images=noise), roomy)[0])
     assert not close(encoding, run(variables, replace(inputs, images=inputs.images.at[1, 0, 8].add(0.5)), roomy)[0])
-    assert run(variables, inputs, tight)[1].dropped_tokens == 2
+    packing = select_tokens(inputs, tight)
+    assert dropped_tokens(inputs, tight) == 2 and packing.count == 3 and np.array_equal(packing.indices, [6, 7, 10])
 
 
 def test_bfloat16_is_close():
@@ -172,14 +180,15 @@ def test_bfloat16_is_close():
 
 def test_unseen_vertices_are_grey_and_pool_nothing():
     inputs = replace(random_inputs(), depth_maps=jnp.full((2, 32, 32), -1.0))
-    encoding = Encoding(jnp.ones((2, 16, 16, 8)), jnp.ones(16), jnp.zeros((), jnp.int32))
-    features = sample_vertices(encoding, inputs, TINY)
+    encoding = Encoding(jnp.ones((2, 16, 16, 8)), jnp.ones(16))
+    sample = jax.jit(sample_vertices, static_argnames="config")
+    features = sample(encoding, inputs, TINY)
     assert np.array_equal(features.local, np.zeros((20, 8))) and np.array_equal(
         features.photo_colors, np.full((20, 3), 0.5)
     )
     assert np.array_equal(features.visible_fraction, np.zeros(20))
     every = dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, pool="all"))
-    assert np.allclose(sample_vertices(encoding, inputs, every).local, 1, atol=1e-6)
+    assert np.allclose(sample(encoding, inputs, every).local, 1, atol=1e-6)
 
 
 # gradients and batches
@@ -205,12 +214,11 @@ def test_gradients_are_finite_and_reach_every_parameter():
     )  # in and behind the camera
     inputs = replace(inputs, depth_maps=inputs.depth_maps.at[:, :16].set(-1.0))  # some vertices are seen by none
     continuous = {"posed_vertices": posed, "images": inputs.images, "canonical_vertices": inputs.canonical_vertices}
-    of_params, of_inputs = gradients(variables_of(TINY), continuous, inputs, TINY)
+    config = dataclasses.replace(TINY, transformer=dataclasses.replace(TINY.transformer, remat=True))
+    of_params, of_inputs = gradients(variables_of(TINY), continuous, inputs, config)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((of_params, of_inputs)))
     silent = [path for path, leaf in jax.tree_util.tree_leaves_with_path(of_params) if not np.abs(leaf).max() > 0]
     assert not silent
-    remat = dataclasses.replace(TINY, transformer=dataclasses.replace(TINY.transformer, remat=True))
-    assert close(of_params, gradients(variables_of(TINY), continuous, inputs, remat)[0], 1e-4)
 
 
 def test_a_vmap_over_subjects_is_a_loop():
@@ -221,11 +229,6 @@ def test_a_vmap_over_subjects_is_a_loop():
     one = jax.jit(apply)
     looped = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one(variables, x) for x in subjects))
     assert close(jax.jit(jax.vmap(apply, in_axes=(None, 0)))(variables, batch), looped)
-
-    shared = jax.vmap(functools.partial(apply, axis_name="b"), in_axes=(None, 0), axis_name="b")
-    outputs, statistics = jax.jit(shared)(variables, batch)
-    assert close(*(jax.tree.map(lambda x, i=i: x[i], statistics) for i in range(2)))  # one batch, one set of statistics
-    assert not close(outputs.gaussians.means, looped[0].gaussians.means, 1e-3)
 
 
 # what is refused
@@ -248,9 +251,10 @@ def test_configurations_that_do_not_fit_are_refused(changes, message):
 
 
 def test_images_must_be_those_of_the_cameras():
+    apply = lambda inputs: jax.eval_shape(lambda x: apply_humangs(variables_of(TINY), x, TINY), inputs)
     inputs = random_inputs()
     with pytest.raises(ValueError, match="32 x 32 but their cameras say 64 x 32"):
-        apply_humangs(variables_of(TINY), replace(inputs, cameras=replace(inputs.cameras, width=64)), TINY)
+        apply(replace(inputs, cameras=replace(inputs.cameras, width=64)))
     odd = random_inputs(size=36)
     with pytest.raises(ValueError, match="36 x 36 cannot be cut"):
-        apply_humangs(variables_of(TINY), odd, TINY)
+        apply(odd)

@@ -43,6 +43,20 @@ def test_statistics_follow_the_batch_only_in_training():
     assert np.allclose(evaluate({**variables, "batch_stats": statistics}, maps), trained, atol=1e-4)
 
 
+def test_a_batch_may_share_its_statistics():
+    maps = [jnp.stack([x, 2 * x + 1]) for x in random_maps(depths=1)]
+    module = Upsampler(dataclasses.replace(CONFIG, features="final"), axis_name="b")
+    variables = jax.jit(module.init)(jax.random.key(0), [x[0] for x in maps])
+    apply = lambda x: module.apply(variables, x, True, mutable=["batch_stats"])
+    outputs, updated = jax.jit(jax.vmap(apply, axis_name="b"))(maps)
+    for statistics in jax.tree.leaves(updated):
+        assert np.array_equal(statistics[0], statistics[1])
+    together = dataclasses.replace(module, axis_name=None).apply(
+        variables, [x.reshape(-1, *x.shape[2:]) for x in maps], True, mutable=["batch_stats"]
+    )
+    assert np.allclose(outputs.reshape(together[0].shape), together[0], atol=1e-4)
+
+
 def test_final_features_only():
     module = Upsampler(dataclasses.replace(CONFIG, features="final"))
     shapes = jax.eval_shape(module.init, jax.random.key(0), random_maps(depths=1))
