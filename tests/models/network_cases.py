@@ -33,7 +33,7 @@ def random_inputs(seed=0, views=2, vertices=20, size=32):
     )
 
 
-def random_variables(config, seed=0):
+def random_like(shapes, seed=0):
     """Variables in which every number matters: fresh ones begin with zeros and tiny last layers."""
     rng = np.random.default_rng(seed)
 
@@ -44,4 +44,9 @@ def random_variables(config, seed=0):
         width = 1 if leaf.ndim < 2 else np.prod(leaf.shape[:-1])
         return jnp.asarray(rng.normal(size=leaf.shape) * (0.1 if leaf.ndim < 2 else width**-0.5), leaf.dtype)
 
-    return jax.tree_util.tree_map_with_path(draw, expected_variables(config))
+    return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
+def random_variables(config, seed=0):
+    """Those of a configuration (initialising would cost a compilation)."""
+    return random_like(expected_variables(config), seed)

@@ -108,7 +108,7 @@ def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
 def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
     inputs = random_inputs()
     inputs = replace(inputs, images=jnp.full_like(inputs.images, 0.7))
-    decoder = VertexDecoder(TINY.decoder).init(jax.random.key(0), jnp.zeros((1, TINY.decoder_width)))
+    decoder = jax.jit(VertexDecoder(TINY.decoder).init)(jax.random.key(0), jnp.zeros((1, TINY.decoder_width)))
     variables = variables_of(TINY)
     variables = {**variables, "params": {**variables["params"], "decoder": decoder["params"]}}
     fresh = run(variables, inputs, TINY)[1].gaussians

@@ -3,6 +3,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from network_cases import random_like
 
 from humangs_jax.models.upsampler import MOMENTUM, UpConvolution, Upsampler, UpsamplerConfig
 
@@ -32,7 +33,7 @@ def test_up_convolution_is_the_transposed_convolution():
 def test_statistics_follow_the_batch_only_in_training():
     maps = random_maps()
     module = Upsampler(CONFIG)
-    variables = jax.jit(module.init)(jax.random.key(0), maps)
+    variables = random_like(jax.eval_shape(module.init, jax.random.key(0), maps))
     evaluate = jax.jit(module.apply)
     trained, updated = jax.jit(lambda v, m: module.apply(v, m, True, mutable=["batch_stats"]))(variables, maps)
     still = evaluate(variables, maps)
@@ -46,15 +47,15 @@ def test_statistics_follow_the_batch_only_in_training():
 def test_a_batch_may_share_its_statistics():
     maps = [jnp.stack([x, 2 * x + 1]) for x in random_maps(depths=1)]
     module = Upsampler(dataclasses.replace(CONFIG, features="final"), axis_name="b")
-    variables = jax.jit(module.init)(jax.random.key(0), [x[0] for x in maps])
+    variables = random_like(jax.eval_shape(module.init, jax.random.key(0), [x[0] for x in maps]))
     apply = lambda x: module.apply(variables, x, True, mutable=["batch_stats"])
     outputs, updated = jax.jit(jax.vmap(apply, axis_name="b"))(maps)
     for statistics in jax.tree.leaves(updated):
         assert np.array_equal(statistics[0], statistics[1])
-    together = dataclasses.replace(module, axis_name=None).apply(
-        variables, [x.reshape(-1, *x.shape[2:]) for x in maps], True, mutable=["batch_stats"]
-    )
-    assert np.allclose(outputs.reshape(together[0].shape), together[0], atol=1e-4)
+    alone = dataclasses.replace(module, axis_name=None)
+    in_one = lambda x: alone.apply(variables, x, True, mutable=["batch_stats"])[0]
+    together = jax.jit(in_one)([x.reshape(-1, *x.shape[2:]) for x in maps])
+    assert np.allclose(outputs.reshape(together.shape), together, atol=1e-4)
 
 
 def test_final_features_only():

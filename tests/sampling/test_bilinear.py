@@ -26,27 +26,27 @@ def test_agrees_with_a_sum_over_all_texels(height, width):
     indices = rng.uniform(-2, 8, (60, 2))
     indices[:20] = np.round(indices[:20])  # on texel centres, edges and one texel outside
     with jax.enable_x64(True):
-        ours = sample_bilinear(jnp.asarray(grid), jnp.asarray(indices))
+        ours = jax.jit(sample_bilinear)(jnp.asarray(grid), jnp.asarray(indices))
         assert ours.dtype == jnp.float64
         np.testing.assert_allclose(ours, oracle(grid, indices), rtol=RTOL64, atol=RTOL64)
-    ours = sample_bilinear(jnp.asarray(grid, jnp.float32), jnp.asarray(indices, jnp.float32))
+    ours = jax.jit(sample_bilinear)(jnp.asarray(grid, jnp.float32), jnp.asarray(indices, jnp.float32))
     np.testing.assert_allclose(ours, oracle(grid, indices), rtol=RTOL32, atol=RTOL32)
 
 
-@pytest.mark.parametrize("bad", [np.inf, np.nan, -1e30, 3e9])
-def test_far_and_broken_positions_read_zero_with_zero_gradient(bad):
-    grid = jnp.ones((4, 5, 2))
-    for position in ([bad, 1.0], [1.0, bad], [bad, bad]):
-        value, gradient = jax.value_and_grad(lambda p: jnp.sum(sample_bilinear(grid, p)))(jnp.asarray(position))
-        assert value == 0 and np.array_equal(gradient, [0, 0])
-    assert float(sample_nearest(jnp.ones((4, 5)), jnp.asarray([bad, 1.0]))) == 0
+def test_far_and_broken_positions_read_zero_with_zero_gradient():
+    bad = [np.inf, -np.inf, np.nan, 1e30, -1e30, 3e9]
+    positions = jnp.asarray([p for x in bad for p in ([x, 1.0], [1.0, x], [x, x])])
+    read = lambda p: jnp.sum(sample_bilinear(jnp.ones((4, 5, 2)), p))
+    values, gradients = jax.jit(jax.vmap(jax.value_and_grad(read)))(positions)
+    assert np.array_equal(values, np.zeros(18)) and np.array_equal(gradients, np.zeros((18, 2)))
+    assert np.array_equal(sample_nearest(jnp.ones((4, 5)), positions), np.zeros(18))
 
 
 def test_gradients_agree_with_differences():
     rng = np.random.default_rng(1)
     with jax.enable_x64(True):
         grid, indices = jnp.asarray(rng.normal(size=(4, 5, 2))), jnp.asarray(rng.uniform(0.1, 2.9, (6, 2)))
-        check_grads(sample_bilinear, (grid, indices), order=1, modes=("rev",), atol=1e-6, rtol=1e-6)
+        check_grads(jax.jit(sample_bilinear), (grid, indices), order=1, modes=("rev",), atol=1e-6, rtol=1e-6)
 
 
 def test_nearest_rounds_halves_to_even():
@@ -70,7 +70,7 @@ def test_conventions():
 def test_half_pixel_sampling_reproduces_a_ramp_at_any_resolution():
     ramp = lambda n, size: (jnp.arange(n) + 0.5) * size / n  # each texel holds its centre's pixel position
     pixels = jnp.asarray([[3.0, 5.0], [7.25, 2.0]])
-    for n in (4, 8, 16):
+    for n in (4, 16):
         grid = jnp.broadcast_to(ramp(n, 16.0)[None, :, None], (n, n, 1))
-        sampled = sample_bilinear(grid, texel_indices(pixels, (16, 16), (n, n), "half_pixel"))
+        sampled = jax.jit(sample_bilinear)(grid, texel_indices(pixels, (16, 16), (n, n), "half_pixel"))
         assert np.allclose(sampled[:, 0], pixels[:, 0], atol=1e-5)
