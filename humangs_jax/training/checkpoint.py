@@ -13,6 +13,7 @@ from collections.abc import Generator
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.state import TrainState
@@ -80,10 +81,7 @@ class Checkpoints:
         abstract = jax.tree.map(self._ocp.utils.to_shape_dtype_struct, _as_dict(like))
         with _quiet():
             restored = self._manager.restore(step, args=self._ocp.args.StandardRestore(abstract))
-        # through numpy: the buffers are XLA's own then, and may be donated
-        return TrainState(
-            **jax.tree.map(lambda x, old: jax.device_put(jax.device_get(x), old.sharding), restored, _as_dict(like))
-        )
+        return TrainState(**jax.tree.map(_placed_as, restored, _as_dict(like)))
 
     def close(self) -> None:
         """Release what Orbax holds."""
@@ -107,6 +105,12 @@ def save_config(out: str | Path, config: TrainConfig) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     temporary.write_text(json.dumps(fields, indent=1))
     temporary.replace(path)
+
+
+def _placed_as(value, like):
+    """Through numpy: the buffers are XLA's own then, and may be donated. Uncommitted stays uncommitted: no recompiling."""
+    host = jax.device_get(value)
+    return jax.device_put(host, like.sharding) if like.committed else jnp.asarray(host)
 
 
 def _as_dict(state):

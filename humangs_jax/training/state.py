@@ -34,12 +34,14 @@ def init_state(config: TrainConfig, variables: Variables | None = None) -> Train
     """The state before the first step, from fresh variables of `config.seed` or from given ones."""
     if variables is None:
         variables = init_humangs(jax.random.key(config.seed), config.model)
-    params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), variables["params"])
+    # copies: the training step gives its state's buffers away, so neither the caller nor two fields may share one
+    params, batch_stats = (
+        jax.tree.map(lambda x: jnp.array(x, jnp.float32), variables[name]) for name in ("params", "batch_stats")
+    )
     return TrainState(
         step=jnp.zeros((), jnp.int32),
         params=params,
-        batch_stats=variables["batch_stats"],
+        batch_stats=batch_stats,
         opt_state=make_optimizer(config.optimizer, config.steps).init(params),
-        # a copy: the training step gives its state's buffers away, and two fields may not share one
         ema_params=None if config.ema_decay is None else jax.tree.map(jnp.copy, params),
     )

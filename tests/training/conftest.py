@@ -8,6 +8,8 @@ import pytest
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import capture_from_arrays, save_capture
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.models.humangs import init_humangs
+from humangs_jax.training.config import tiny
 
 SIDES, RINGS, SIZE, VIEWS, POSES = 8, 8, 32, 6, 2
 
@@ -96,6 +98,17 @@ def captures(body, tmp_path_factory):
     for i, folder in enumerate(folders):
         write_subject(folder, body, i)
     return folders
+
+
+@pytest.fixture(scope="session")
+def variables():
+    """Fresh variables of `tiny`; without LLVM's optimisations the many small random draws compile four times faster."""
+    draw = jax.jit(
+        init_humangs.__wrapped__,
+        static_argnames="config",
+        compiler_options={"xla_backend_optimization_level": 0},
+    )
+    return draw(jax.random.key(0), tiny().model)
 
 
 @pytest.fixture

@@ -26,9 +26,9 @@ def source(body, captures):
     )
 
 
-def test_a_step_moves_the_parameters_and_tells_of_it(body, source):
-    before = init_state(CONFIG)
-    state, metrics = train_step(init_state(CONFIG), source.batch_at(0), body, CONFIG)
+def test_a_step_moves_the_parameters_and_tells_of_it(body, source, variables):
+    before = init_state(CONFIG, variables)
+    state, metrics = train_step(init_state(CONFIG, variables), source.batch_at(0), body, CONFIG)
     assert int(state.step) == 1
     moved = jax.tree.map(lambda a, b: bool(jnp.any(a != b)), state.params, before.params)
     assert np.mean(jax.tree.leaves(moved)) > 0.9  # biases that only unused units see may stay
@@ -42,26 +42,42 @@ def test_a_step_moves_the_parameters_and_tells_of_it(body, source):
     assert int(metrics["skipped"]) == int(metrics["dropped_tokens"]) == int(metrics["overflow"]) == 0
 
 
-def test_a_bad_batch_costs_a_step_and_nothing_else(body, source, same):
+def test_a_bad_batch_costs_a_step_and_nothing_else(body, source, variables, same):
     batch = source.batch_at(0)
     broken = batch.targets.images.at[0, 0, 0, 0].set(jnp.nan)
     batch = replace(batch, targets=replace(batch.targets, images=broken))
-    before = init_state(CONFIG)
-    state, metrics = train_step(init_state(CONFIG), batch, body, CONFIG)
+    before = init_state(CONFIG, variables)
+    state, metrics = train_step(init_state(CONFIG, variables), batch, body, CONFIG)
     assert int(state.step) == 1 and int(metrics["skipped"]) == 1
     for name in ("params", "batch_stats"):
         assert same(getattr(state, name), getattr(before, name))
 
 
-def test_steps_repeat_bit_for_bit(body, source, same):
-    first, _ = train_step(init_state(CONFIG), source.batch_at(2), body, CONFIG)
-    second, _ = train_step(init_state(CONFIG), source.batch_at(2), body, CONFIG)
+def test_steps_repeat_bit_for_bit(body, source, variables, same):
+    first, _ = train_step(init_state(CONFIG, variables), source.batch_at(2), body, CONFIG)
+    second, _ = train_step(init_state(CONFIG, variables), source.batch_at(2), body, CONFIG)
     assert same(first, second)
 
 
+def test_it_learns_a_batch(body, source, variables):
+    state, batch, history = init_state(CONFIG, variables), source.batch_at(0), []
+    for _ in range(CONFIG.steps):
+        state, metrics = train_step(state, batch, body, CONFIG)
+        history.append(metrics)
+    first, last = ({name: float(value) for name, value in metrics.items()} for metrics in (history[0], history[-1]))
+    assert last["silhouette"] < 0.6 * first["silhouette"] and last["squared"] < 0.8 * first["squared"]
+    assert last["skipped"] == 0
+
+
+def test_a_fresh_state_has_the_shapes_of_a_given_one(variables):
+    shapes = lambda tree: jax.tree.map(lambda x: (x.shape, x.dtype), tree)
+    fresh = jax.eval_shape(lambda: init_state(CONFIG))
+    assert jax.tree.all(jax.tree.map(lambda a, b: a == b, shapes(fresh), shapes(init_state(CONFIG, variables))))
+
+
 @pytest.mark.slow
-def test_a_batch_gives_the_mean_gradient_of_its_subjects(body, source):
-    state = init_state(CONFIG)
+def test_a_batch_gives_the_mean_gradient_of_its_subjects(body, source, variables):
+    state = init_state(CONFIG, variables)
     keys = jax.random.split(jax.random.key(0), 2)
     batch = jax.tree.map(lambda *x: jnp.concatenate(x), source.batch_at(0), source.batch_at(1))
     one = lambda i: batch_gradients(state, body, jax.tree.map(lambda x: x[i : i + 1], batch), keys[i : i + 1], CONFIG)
