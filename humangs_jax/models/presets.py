@@ -37,7 +37,7 @@ def small() -> HumanGSConfig:
         longest_edge=0.03,
         texture=TriplaneConfig(resolution=64, channels=8),
         transformer=TransformerConfig(width=256, layers=6),
-        upsampler=UpsamplerConfig(enabled=False),  # its backward pass alone costs a CPU more than the whole encoder
+        upsampler=UpsamplerConfig(enabled=False),  # left out for its cost on a CPU, see docs/training.md
         sampling=PixelAlignedConfig(pool="visible", convention="half_pixel", sample_rgb=True),
         decoder=VertexDecoderConfig(
             hidden=256, tight=1, free=2, offset_scale=0.25, initial_log_scale=-4.6, residual_color=True
