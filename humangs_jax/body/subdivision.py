@@ -32,7 +32,9 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
         edges, edge_of_side = _edges(faces)
         lengths = np.linalg.norm(linear["template"][edges[:, 0]] - linear["template"][edges[:, 1]], axis=-1)
         if lengths.max() > FINEST * longest:
-            raise ValueError(f"longest edge: {longest} m is less than 1/{FINEST} of this body's longest, {lengths.max():.3g} m")
+            raise ValueError(
+                f"longest edge: {longest} m is less than 1/{FINEST} of this body's longest, {lengths.max():.3g} m"
+            )
         long = np.flatnonzero(lengths > longest)
         if len(long) == 0:
             break
