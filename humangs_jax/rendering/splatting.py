@@ -31,6 +31,10 @@ from humangs_jax.rendering.tiling import TileGrid, sort_into_tiles, tiles_to_ima
 
 __all__ = ["Rendering", "SplatConfig", "default_pairs", "fit_config", "render", "render_views"]
 
+CPU_COMPILER_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
+"""`jax.jit(..., compiler_options=CPU_COMPILER_OPTIONS)` makes the loops over pixels of a program that draws on a CPU with
+AVX-512 up to a third faster. Eager calls use it; options do not reach a jit inside a jit, so your own needs them itself."""
+
 PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
 """Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024
 x 1024, where its 16,384 tiles add another 5 each."""
@@ -68,7 +72,7 @@ def render(
     if _is_traced(gaussians, camera, background):
         return _render(gaussians, camera, background, _with_default_buffers(gaussians, camera, config))
     fitted = fit_config(gaussians, camera, config, margin=1.0) if config.max_pairs is None else config
-    rendering = _render_jit(gaussians, camera, background, fitted)
+    rendering = _jitted(_render, 3)(gaussians, camera, background, fitted)
     _check_overflow(rendering, gaussians, camera, fitted)
     return rendering
 
@@ -82,6 +86,9 @@ def render_views(
 ) -> Rendering:
     """Draws every camera of a batch (leading axis v), `batch_size` views at a time: memory does not grow with v.
 
+    `jax.vmap` of `render` draws all views at once (their tiles become one list of tiles): as fast, a fifth faster with
+    gradients, but it holds the buffers of all views.
+
     Returns a Rendering with a leading axis v. Raises: as `render`.
     """
     background = _white(gaussians) if background is None else background
@@ -90,7 +97,7 @@ def render_views(
             gaussians, cameras, background, _with_default_buffers(gaussians, cameras, config), batch_size
         )
     fitted = fit_config(gaussians, cameras, config, margin=1.0) if config.max_pairs is None else config
-    renderings = _render_views_jit(gaussians, cameras, background, fitted, batch_size)
+    renderings = _jitted(_render_views, 3, 4)(gaussians, cameras, background, fitted, batch_size)
     _check_overflow(renderings, gaussians, cameras, fitted)
     return renderings
 
@@ -148,8 +155,10 @@ def _render_views(gaussians, cameras, background, config, batch_size):
     return lax.map(one, cameras, batch_size=batch_size if batch_size > 1 else None)
 
 
-_render_jit = jax.jit(_render, static_argnums=3)
-_render_views_jit = jax.jit(_render_views, static_argnums=(3, 4))
+@functools.cache
+def _jitted(function, *static):
+    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    return jax.jit(function, static_argnums=static, compiler_options=options)
 
 
 def _project(gaussians, camera, config) -> ProjectedGaussians:

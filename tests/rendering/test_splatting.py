@@ -165,8 +165,8 @@ def test_coincident_depths_are_drawn_by_index():
         gaussians = random_gaussians(10)
         level = replace(camera(), cam_from_world=jnp.eye(4))
         flat = replace(gaussians, means=gaussians.means.at[:, 2].set(3.0))
-        image, reverse = (render(g, level, CHUNKS) for g in (flat, few(flat, np.arange(COUNT)[::-1])))
-        assert_close(image, render_dense(flat, level), FLOAT64)
+        image, reverse = (tiled(g, level, background())[0] for g in (flat, few(flat, np.arange(COUNT)[::-1])))
+        assert_close(image, dense(flat, level, background())[0], FLOAT64)
         assert np.abs(image.rgb - reverse.rgb).max() > 0.01  # the order is visible, and is that of the index
 
 
