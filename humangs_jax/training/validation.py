@@ -11,7 +11,7 @@ import numpy as np
 
 from humangs_jax.array_types import Array, Float
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.images import to_uint8
+from humangs_jax.data.images import write_png
 from humangs_jax.data.loader import CaptureCache, Example, ExampleSource, ViewSampling
 from humangs_jax.models.humangs import Variables
 from humangs_jax.objectives.metrics import masked_psnr, psnr
@@ -66,11 +66,9 @@ def validate(
 
 def write_sheet(path: str | Path, examples: Sequence[Example], pictures: Sequence[np.ndarray]) -> None:
     """A PNG with a row per example: its inputs, then each target beside what the network shows of it."""
-    from PIL import Image
-
     rows = []
     for example, shown in zip(examples, pictures, strict=True):
         targets = np.asarray(example.targets.images)
         pairs = [picture for pair in zip(targets, shown, strict=True) for picture in pair]
         rows.append(np.concatenate([*np.asarray(example.inputs.images), *pairs], axis=1))
-    Image.fromarray(to_uint8(np.concatenate(rows))).save(path)
+    write_png(Path(path), np.concatenate(rows))
