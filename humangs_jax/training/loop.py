@@ -80,9 +80,12 @@ def train(
 
     log = _Log(out / "log.jsonl")
     with _stop_on_signal() as stop, log, _bar(config.steps, start, progress) as bar:
-        batches = source.batches(start, end)
+        batches, pending = source.batches(start, end), None
         for step, batch in batches:
             state, metrics = train_step(state, batch, body, config)
+            # one step may wait behind the one that runs: enough to keep a device busy, and a signal is obeyed soon
+            jax.block_until_ready(pending)
+            pending = metrics
             done = step + 1
             if done % config.log_every == 0 or done == end:
                 numbers = log.write_step(done, metrics, broken=len(source.cache.broken))
