@@ -16,8 +16,3 @@ def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:
     Offsets are in normalised units (body height 1.8), so the weight of this term does not depend on the subject's size.
     """
     return jnp.mean(jnp.sum(jnp.square(tight_offsets), axis=-1), axis=-1)
-
-
-def excess(values: Float[Array, "*b"], limit: float) -> Float[Array, "*b"]:
-    """Squared excess over a limit, 0 below it; such as Gaussians that grow larger than anything a body needs."""
-    return jnp.square(jnp.maximum(values - limit, 0.0))

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.objectives.losses import excess, squared_error, tightness
+from humangs_jax.objectives.losses import squared_error, tightness
 from humangs_jax.objectives.metrics import LARGEST_PSNR, foreground_share, masked_psnr, psnr, ssim
 
 FLOAT32 = 1e-6
@@ -23,10 +23,6 @@ def test_tightness_is_the_squared_norm_per_vertex():
 def test_tightness_averages_the_tight_gaussians_of_a_vertex():
     offsets = jnp.asarray([[[1.0, 0.0, 0.0], [0.0, 0.0, 2.0]]])
     np.testing.assert_allclose(tightness(offsets), [2.5], rtol=FLOAT32)
-
-
-def test_excess_starts_at_the_limit():
-    np.testing.assert_allclose(excess(jnp.asarray([0.1, 0.2, 0.5]), 0.2), [0, 0, 0.09], atol=FLOAT32)
 
 
 def test_psnr_of_a_known_error_and_of_equal_images():
