@@ -1,4 +1,4 @@
-"""Train the small network on synthetic people: the one command behind the weights that come with the package.
+"""Train the network that comes with the package on synthetic people, from nothing or from the shipped weights.
 
     python experiments/train_small.py --out runs/small
 
@@ -6,8 +6,9 @@ Makes the people first (`--subjects` of the training seeds, and a few of the val
 and `--validation` name folders of captures. Continues the run in `--out` if there is one; Ctrl-C saves. Every setting
 of `TrainConfig` is an option: `--steps 4000 --optimizer.learning-rate 2e-4`.
 
-On 2 CPU cores: 3 s per subject to make them, then about 0.8 s per step. Expected of the validation views at 256 x 256:
-22.7 dB after 250 steps, 24.7 after 750, 26.7 after 3,000. The package ships a run's `out/best.safetensors`.
+On 2 CPU cores: 3 s per subject to make them, then 0.9 s per step on an otherwise quiet machine. The shipped weights had two
+runs of 994 and 2,000 steps with the settings in docs/training.md (22.7 dB on the validation views at 256 x 256 after 250
+steps, 24.7 after 750, 26.7 at the end); the preset here is one longer run with the same losses and views.
 """
 
 import dataclasses

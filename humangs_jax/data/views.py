@@ -35,24 +35,6 @@ class SubjectViews:
     betas: Float[Array, " s"]
 
 
-def resize_views(views: SubjectViews, size: int) -> SubjectViews:
-    """Views box-averaged to size x size. Raises ValueError unless both sides are one multiple of `size`."""
-    height, width = views.images.shape[1:3]
-    factor = height // size
-    if height != factor * size or width != factor * size or factor < 1:
-        raise ValueError(f"images of {width} x {height} cannot be box-averaged to {size} x {size}")
-    if factor == 1:
-        return views
-
-    def shrink(x):
-        blocks = x.reshape(x.shape[0], size, factor, size, factor, *x.shape[3:])
-        return blocks.mean(axis=(2, 4))
-
-    return replace(
-        views, images=shrink(views.images), masks=shrink(views.masks), cameras=views.cameras.resized(size, size)
-    )
-
-
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it."""
     if config.body_vertices is not None and config.body_vertices < len(body.template):

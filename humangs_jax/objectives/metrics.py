@@ -7,8 +7,6 @@ from humangs_jax.array_types import Array, Float, Scalar
 from humangs_jax.numerics import safe_divide
 from humangs_jax.objectives.ssim import SIGMA, WINDOW
 
-WHITE = 0.90
-"""A pixel is background when every channel is above this (the published patch metrics)."""
 LARGEST_PSNR = 100.0
 """dB reported for equal images, whose PSNR is infinite and would spoil any mean."""
 
@@ -27,11 +25,6 @@ def masked_psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"],
     """PSNR in dB over the pixels of a mask, each counted by its coverage; 100 where the mask is empty."""
     errors = jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target), axis=-1)
     return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
-
-
-def foreground_share(image: Float[Array, "h w 3"]) -> Scalar:
-    """Share of the pixels that are not background: some channel is at most 0.90."""
-    return jnp.mean(jnp.any(image <= WHITE, axis=-1).astype(image.dtype))
 
 
 def ssim(predicted: np.ndarray, target: np.ndarray) -> float:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.objectives.losses import squared_error, tightness
-from humangs_jax.objectives.metrics import LARGEST_PSNR, foreground_share, masked_psnr, psnr, ssim
+from humangs_jax.objectives.metrics import LARGEST_PSNR, masked_psnr, psnr, ssim
 
 FLOAT32 = 1e-6
 DECIBELS = 1e-3  # logarithm of a float32 mean
@@ -42,11 +42,6 @@ def test_masked_psnr_looks_at_the_mask_alone():
     predicted = target.at[4:].set(0.0).at[:4].add(0.01)
     assert abs(float(masked_psnr(predicted, target, mask)) - 40) < DECIBELS
     assert float(masked_psnr(predicted, target, jnp.zeros((8, 8)))) == LARGEST_PSNR
-
-
-def test_foreground_share_follows_the_darkest_channel():
-    image = jnp.ones((2, 2, 3)).at[0, 0].set(0.0).at[0, 1, 2].set(0.9)
-    assert float(foreground_share(image)) == 0.5
 
 
 def test_ssim_of_the_clipped_prediction():
