@@ -59,7 +59,7 @@ CHUNK = 64
 STEP_BYTES = 64 << 20
 """Largest size of one of the arrays (B, k, p) of a step; the backward pass holds about six of them."""
 
-STEP_CHUNKS = 1024
+STEP_CHUNKS = 2048
 """Largest B: the product over earlier chunks costs 2 B / k flops per pair, as much as the triangular one at B = k^2."""
 
 _LOG_ZERO = -1e3

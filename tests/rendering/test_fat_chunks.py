@@ -1,0 +1,181 @@
+"""The accelerator's schedule of compositing against the CPU's, on the renderer's own lists and on lists made by hand."""
+
+import functools
+from unittest import mock
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from splat_scenes import camera, random_gaussians
+
+from humangs_jax.rendering import binning, compositing, fat_chunks
+from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.rendering.splatting import _footprints, _project
+from humangs_jax.rendering.tiling import TileGrid, TileLists, sort_into_tiles
+
+TOLERANCE = {np.float64: 1e-10, np.float32: 1e-5}
+"""Relative to the largest entry. The schedules add and multiply in another order; in float32 a logarithm of T adds
+|log T| eps <= 1e-6, and gradients divide by 1 - alpha. No decision may fall otherwise: that would show as 1e-4."""
+
+K = fat_chunks.CHUNK
+GRID = TileGrid(21, 13, 8)  # six tiles
+LENGTHS = (0, 3 * K + 5, K, K + 1, 2 * K - 1, 1)
+SPLATS, CAPACITY = 4 * K, 6 * 4 * K
+THIN = compositing._forward, compositing._backward
+FAT = fat_chunks.forward, fat_chunks.backward
+PER_STEP = 3
+"""Chunks per step, so that lists run on from step to step and the last step has padding."""
+
+
+def by_hand(seed, lengths, dtype, grid=GRID, opacities=(0.05, 1.0)):
+    """Splats around the first tiles, and on each tile a list of so many of them, in depth order."""
+    rng, tile = np.random.default_rng(seed), grid.tile_size
+    xy = rng.uniform(-0.6, 3.1, (SPLATS, 2)) * tile
+    shape = rng.uniform([0.16, -0.8, 0.16], 0.8, (SPLATS, 3)) / tile
+    log_opacity = np.log(rng.uniform(*opacities, (SPLATS, 1)))
+    log_opacity[::50] = 0  # alpha is clamped
+    splats = np.concatenate([xy, shape, log_opacity, rng.uniform(size=(SPLATS, 4))], axis=-1)
+    items = np.concatenate([np.sort(rng.choice(SPLATS, n, replace=False)) for n in lengths])
+    items = np.pad(items, (0, CAPACITY - len(items)), constant_values=3)
+    counts = np.asarray(lengths)
+    lists = TileLists(*(jnp.asarray(a, jnp.int32) for a in (items, np.cumsum(counts) - counts, counts)))
+    return jnp.asarray(splats, dtype), lists
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def from_scene(gaussians, grid, config):
+    """Splats and lists as the renderer makes them."""
+    g, dtype = gaussians.means.shape[0], gaussians.means.dtype
+    projected = _project(gaussians, camera(dtype, grid.width, grid.height), config)
+    order = binning.depth_order(jnp.where(projected.visible, projected.depth, jnp.inf))
+    ellipses = binning.Footprints(*(plane[order] for plane in _footprints(projected, gaussians, config)))
+    pairs = binning.emit_pairs(ellipses, grid, g * grid.tiles, g * grid.tiles)
+    features = jnp.concatenate([gaussians.colors, jnp.where(projected.visible, projected.depth, 0.0)[:, None]], axis=-1)
+    splats = compositing.pack_splats(projected, gaussians.opacities, features, config.alpha_min)[order]
+    return splats, sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, g)
+
+
+def schedule(functions, splats, lists, grid=GRID, config=None, per_step=1024):
+    """Everything a schedule computes, for a random cotangent."""
+    config = config or SplatConfig(tile_size=grid.tile_size, block=4, chunk=4, chunk_backward=4)
+    forward, backward = functions
+    with mock.patch.object(fat_chunks, "STEP_CHUNKS", per_step):
+        features, transmittance, lengths = forward(grid, config)(splats, *lists)
+        rng = np.random.default_rng(5)
+        g = jnp.asarray(rng.normal(size=features.shape), splats.dtype)
+        g_transmittance = jnp.asarray(rng.normal(size=transmittance.shape), splats.dtype)
+        total = jnp.sum(g * features, axis=1) + g_transmittance * transmittance
+        sums = backward(grid, config)(splats, lists.items, lists.starts, lengths, g, total)
+    return features, transmittance, sums, lengths
+
+
+run = jax.jit(schedule, static_argnums=(0, 3, 4, 5))
+
+
+def assert_equal(ours, expected, counts, tolerance):
+    """Channel by channel, and column by column of the sums: their sizes differ."""
+    for name, a, b in zip(("features", "transmittance", "sums"), ours, expected, strict=False):
+        assert a.dtype == b.dtype and a.shape == b.shape
+        axes = (0, 2) if name == "features" else 0
+        error = np.abs(np.asarray(a) - b).max(axis=axes) / np.maximum(np.abs(b).max(axis=axes), 1e-30)
+        assert (error <= tolerance).all(), (name, error)
+    # What counts of each list, in whole chunks: those of this schedule are the larger ones.
+    used, needed = np.asarray(ours[3]), np.asarray(expected[3])
+    assert (needed <= used).all() and (used < needed + K).all() and (used <= counts).all()
+
+
+@pytest.mark.parametrize(
+    ("dtype", "tile_size", "per_step"), [(np.float64, 8, 1024), (np.float64, 16, PER_STEP), (np.float32, 16, 1024)]
+)
+def test_equals_the_other_schedule(dtype, tile_size, per_step):
+    with jax.enable_x64(dtype == np.float64):
+        grid = TileGrid(6 * tile_size, tile_size, tile_size)
+        splats, lists = by_hand(1, LENGTHS, dtype, grid, opacities=(0.02, 0.3))
+        ours, expected = run(FAT, splats, lists, grid, None, per_step), run(THIN, splats, lists, grid)
+        assert_equal(ours, expected, lists.counts, TOLERANCE[dtype])
+        ended = np.asarray(expected[3])
+        assert K < ended[1] < 3 * K and ended[1] % K != 0  # the whole tile ends inside a chunk that is not its first
+        assert not ours[0][0].any() and (ours[1][0] == 1).all()  # the empty list
+
+
+@pytest.mark.parametrize(("dtype", "seed"), [(np.float64, 0), (np.float32, 1), (np.float32, 2)])
+def test_equals_the_other_schedule_on_scenes(dtype, seed):
+    with jax.enable_x64(dtype == np.float64):
+        config = SplatConfig(tile_size=8, block=4, chunk=4, chunk_backward=4)
+        splats, lists = from_scene(random_gaussians(seed, dtype, 6 * K), GRID, config)
+        assert lists.counts.max() > 2 * K
+        ours, expected = run(FAT, splats, lists, GRID, None, PER_STEP), run(THIN, splats, lists)
+        assert_equal(ours, expected, lists.counts, TOLERANCE[dtype])
+
+
+@given(
+    seed=st.integers(0, 2**16),
+    lengths=st.lists(st.sampled_from([0, 1, K - 1, K, K + 1, 2 * K, 3 * K + 7, 4 * K]), min_size=6, max_size=6),
+    faint=st.booleans(),
+)
+def test_equals_the_other_schedule_on_any_lists(seed, lengths, faint):
+    with jax.enable_x64(True):
+        splats, lists = by_hand(seed, lengths, np.float64, opacities=(0.004, 0.02) if faint else (0.05, 1.0))
+        ours, expected = run(FAT, splats, lists, GRID, None, PER_STEP), run(THIN, splats, lists)
+        assert_equal(ours, expected, lists.counts, TOLERANCE[np.float64])
+
+
+def test_a_batch_is_one_call():
+    with jax.enable_x64(True):
+        batch = [by_hand(seed, lengths, np.float64) for seed, lengths in ((1, LENGTHS), (2, LENGTHS[::-1]))]
+        splats, lists = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)
+        together = jax.jit(jax.vmap(lambda s, l: schedule(FAT, s, l, per_step=PER_STEP)))(splats, lists)
+        for i, (splats, lists) in enumerate(batch):
+            expected = run(THIN, splats, lists)
+            assert_equal([o[i] for o in together], expected, lists.counts, TOLERANCE[np.float64])
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("stop", [0.0, 1e-4])
+def test_opaque_to_the_last_bit(dtype, stop):
+    """1 - alpha_max is 0 in float32: its logarithm must not make a NaN elsewhere."""
+    with jax.enable_x64(dtype == np.float64):
+        config = SplatConfig(alpha_max=1 - 1e-9, transmittance_stop=stop)
+        splats, lists = by_hand(3, LENGTHS, dtype, opacities=(0.9, 1.0))
+        ours = run(FAT, splats, lists, GRID, config)
+        assert all(np.isfinite(a).all() for a in ours)
+        if stop > 0:
+            assert_equal(ours, run(THIN, splats, lists, GRID, config), lists.counts, TOLERANCE[dtype])
+
+
+@given(st.lists(st.integers(0, 3 * K), min_size=5, max_size=5), st.integers(0, 100))
+def test_chunks_cover_the_lists(counts, gap):
+    starts = np.cumsum([gap, *counts[:-1]])
+    capacity = 15 * K + 100
+    chunks = cut(jnp.asarray(starts, jnp.int32), jnp.asarray(counts, jnp.int32), capacity, 4)
+    expected = [
+        (t, starts[t] + first, min(K, counts[t] - first), min(first + K, counts[t]))
+        for t in range(5)
+        for first in range(0, counts[t], K)
+    ]
+    n = len(expected)
+    assert len(chunks.tiles) % 4 == 0 and chunks.steps == -(-n // 4) <= len(chunks.tiles) // 4
+    np.testing.assert_array_equal(np.stack(chunks[:4], axis=-1)[:n], np.reshape(expected, (n, 4)))
+    assert (chunks.tiles[n:] == 5).all() and not chunks.counts[n:].any()
+
+
+cut = jax.jit(fat_chunks.cut, static_argnums=(2, 3))
+
+
+def test_steps_are_bounded_in_memory():
+    for tile_size, dtype in ((8, np.float32), (16, np.float32), (32, np.float32), (16, np.float64)):
+        b = fat_chunks._chunks_per_step(TileGrid(512, 512, tile_size), dtype, 1 << 20, 1024)
+        assert 1 <= b <= fat_chunks.STEP_CHUNKS
+        assert b * K * tile_size**2 * np.dtype(dtype).itemsize <= fat_chunks.STEP_BYTES
+    assert fat_chunks._chunks_per_step(GRID, np.float32, 2 * K, 6) == 8  # no more than there can be
+
+
+@pytest.mark.parametrize("platform", ["cuda", "tpu"])
+def test_lowers_for(platform):
+    splats, lists = by_hand(1, LENGTHS, np.float32)
+    exported = jax.export.export(jax.jit(lambda s, l: schedule(FAT, s, l)), platforms=[platform])(splats, lists)
+    assert exported.platforms == (platform,)
