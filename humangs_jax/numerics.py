@@ -7,7 +7,13 @@ rejected branch must be evaluated at a harmless argument first. All functions he
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.array_types import Array, Float, PyTree
+
+
+def at_least_float32(tree: PyTree) -> PyTree:
+    """The tree with its bfloat16 and float16 arrays in float32; wider ones as they are. Gradients return narrow."""
+    widen = lambda a: a.astype(dtype) if (dtype := jnp.promote_types(a.dtype, jnp.float32)) != a.dtype else a
+    return jax.tree.map(widen, tree)
 
 
 def safe_divide(numerator: Float[Array, "*#n"], denominator: Float[Array, "*#n"]) -> Float[Array, "*n"]:

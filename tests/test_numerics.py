@@ -51,3 +51,13 @@ def test_zero_has_the_stated_value():
 def test_inverses_invert(x):
     assert np.isclose(numerics.inverse_sigmoid(jax.nn.sigmoid(jnp.float32(x))), x, atol=0.05, rtol=0)
     assert np.isclose(numerics.inverse_softplus(jax.nn.softplus(jnp.float32(x))), x, atol=1e-4, rtol=0)
+
+
+def test_narrow_floats_become_float32_and_their_gradients_narrow_again():
+    narrow = jnp.asarray([1.0, 2.0], jnp.bfloat16)
+    tree = {"a": narrow, "b": jnp.asarray([3.0]), "c": np.asarray([3.0])}
+    wide = numerics.at_least_float32(tree)
+    assert {k: leaf.dtype.name for k, leaf in wide.items()} == {"a": "float32", "b": "float32", "c": "float64"}
+    gradient = jax.grad(lambda x: jnp.sum(numerics.at_least_float32({"x": x})["x"] ** 2))(narrow)
+    assert gradient.dtype == jnp.bfloat16
+    np.testing.assert_array_equal(gradient, [2.0, 4.0])

@@ -14,7 +14,9 @@ from jax import lax
 from humangs_jax.array_types import Array, Float
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.rendering.gaussians import Gaussians, covariances
+from humangs_jax.numerics import at_least_float32
+from humangs_jax.rendering.constants import LARGEST_FOOTPRINT
+from humangs_jax.rendering.gaussians import Gaussians, covariance_factors
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
 from humangs_jax.rendering.splatting import Rendering
 
@@ -29,6 +31,7 @@ def render_dense(
     """Same arguments and meaning as `splatting.render`; buffers and schedule of `config` play no part."""
     if background is None:
         background = jnp.ones(3, gaussians.means.dtype)
+    gaussians, camera, background = at_least_float32((gaussians, camera, background))
     centers, conics, depths, visible = _project(gaussians, camera, config)
     order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
     y, x = jnp.mgrid[: camera.height, : camera.width] + 0.5
@@ -75,6 +78,8 @@ def _project(gaussians, camera, config):
     )
     jacobian = focal[:, None] * jacobian / depths[:, None, None]
     image_from_world = jacobian @ camera.cam_from_world[:3, :3]
-    covariance = image_from_world @ covariances(gaussians) @ jnp.swapaxes(image_from_world, 1, 2)
-    conics = jnp.linalg.inv(covariance + config.dilation * jnp.eye(2, dtype=at.dtype))
-    return slopes * focal + center, conics, depths, visible
+    axes = image_from_world @ covariance_factors(gaussians)
+    small = jnp.all(jnp.abs(axes) < LARGEST_FOOTPRINT, axis=(1, 2))
+    axes = jnp.where(small[:, None, None], axes, 0.0)
+    conics = jnp.linalg.inv(axes @ jnp.swapaxes(axes, 1, 2) + config.dilation * jnp.eye(2, dtype=at.dtype))
+    return slopes * focal + center, conics, depths, visible & small

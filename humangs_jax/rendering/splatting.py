@@ -20,7 +20,7 @@ from jax.core import Tracer
 from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.capacity import round_up
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.numerics import safe_divide
+from humangs_jax.numerics import at_least_float32, safe_divide
 from humangs_jax.pytree import pytree_dataclass
 from humangs_jax.rendering import binning
 from humangs_jax.rendering.compositing import composite, pack_splats
@@ -69,6 +69,7 @@ def render(
     pairs are counted in `Rendering.overflow` instead.
     """
     background = _white(gaussians) if background is None else background
+    gaussians, camera, background = at_least_float32((gaussians, camera, background))
     if _is_traced(gaussians, camera, background):
         return _render(gaussians, camera, background, _with_default_buffers(gaussians, camera, config))
     fitted = fit_config(gaussians, camera, config, margin=1.0) if config.max_pairs is None else config
@@ -92,6 +93,7 @@ def render_views(
     Returns a Rendering with a leading axis v. Raises: as `render`.
     """
     background = _white(gaussians) if background is None else background
+    gaussians, cameras, background = at_least_float32((gaussians, cameras, background))
     if _is_traced(gaussians, cameras, background):
         return _render_views(
             gaussians, cameras, background, _with_default_buffers(gaussians, cameras, config), batch_size
@@ -116,6 +118,7 @@ def fit_config(
     Sizes are rounded up to 2^i or 1.5 * 2^i, so that similar scenes share one compilation. Measures concrete arrays:
     call it outside of transformations.
     """
+    gaussians, camera = at_least_float32((gaussians, camera))
     rows, pairs = (round_up(int(int(most) * margin)) for most in _needed(gaussians, camera, _without_buffers(config)))
     return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
 
@@ -124,30 +127,36 @@ def _render(gaussians: Gaussians, camera: Camera, background, config: SplatConfi
     grid = TileGrid(camera.width, camera.height, config.tile_size)
     projected = _project(gaussians, camera, config)
     if gaussians.means.shape[0] == 0:
-        return _blend(
-            jnp.zeros((grid.height, grid.width, 5), projected.x.dtype).at[..., 4].set(1), background, jnp.int32(0)
-        )
+        blank = jnp.zeros((grid.height, grid.width, 5), projected.x.dtype).at[..., 4].set(1)
+        return _blend(blank, background, 0.0, jnp.int32(0))
 
     assert config.max_pairs is not None  # callers have fitted the buffers
-    order = binning.depth_order(jnp.where(projected.visible, lax.stop_gradient(projected.depth), jnp.inf))
+    depths = jnp.where(projected.visible, lax.stop_gradient(projected.depth), jnp.inf)
+    order = binning.depth_order(depths)
     ellipses = binning.Footprints(*(plane[order] for plane in _footprints(projected, gaussians, config)))
     pairs = binning.emit_pairs(ellipses, grid, config.max_rows or config.max_pairs, config.max_pairs)
     lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, order.shape[0])
 
-    seen = jnp.concatenate([gaussians.colors, jnp.where(projected.visible, projected.depth, 0.0)[:, None]], axis=-1)
+    # Depths are blended relative to the nearest: their gradient is a difference of depths, which must not drown in the
+    # rounding of depths.
+    nearest = jnp.min(depths)
+    nearest = jnp.where(nearest < jnp.inf, nearest, 0.0)
+    behind = jnp.where(projected.visible, projected.depth - nearest, 0.0)
+    seen = jnp.concatenate([gaussians.colors, behind[:, None]], axis=-1)
     splats = pack_splats(projected, gaussians.opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
     features, transmittance = composite(splats, lists, grid, config)
     image = tiles_to_image(jnp.concatenate([features, transmittance[:, None]], axis=1), grid)
-    return _blend(image, background, pairs.overflow)
+    return _blend(image, background, nearest, pairs.overflow)
 
 
-def _blend(image, background, overflow) -> Rendering:
-    """image: (h, w, 5) premultiplied rgb, z and the final transmittance."""
+def _blend(image, background, nearest, overflow) -> Rendering:
+    """image: (h, w, 5) premultiplied rgb, premultiplied z - nearest, and the final transmittance."""
     transmittance = image[..., 4]
     alpha = 1 - transmittance
     rgb = image[..., :3] + transmittance[..., None] * background
-    return Rendering(rgb, alpha, safe_divide(image[..., 3], alpha), overflow)
+    depth = jnp.where(alpha > 0, nearest + safe_divide(image[..., 3], alpha), 0.0)
+    return Rendering(rgb, alpha, depth, overflow)
 
 
 def _render_views(gaussians, cameras, background, config, batch_size):
