@@ -23,7 +23,7 @@ m       frames of a motion
 Functions are written for ONE example and batched with `jax.vmap`; fields of pytrees are annotated unbatched.
 """
 
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt, UInt8
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, Shaped, UInt, UInt8
 
 Key = PRNGKeyArray
 Scalar = Float[Array, ""]
@@ -41,6 +41,7 @@ __all__ = [
     "Matrix4",
     "PyTree",
     "Scalar",
+    "Shaped",
     "UInt",
     "UInt8",
     "Vector3",

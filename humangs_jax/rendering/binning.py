@@ -19,7 +19,7 @@ from jax import lax
 
 from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.rendering.projection import ProjectedGaussians
-from humangs_jax.rendering.tiling import SUM_LIMIT, TileGrid, bits_for, expand
+from humangs_jax.rendering.tiling import SUM_LIMIT, TileGrid, bits_for, expand, take
 
 SLACK = 2e-3
 """Pixels by which footprints are widened, against rounding of positions (a float32 at 1000 pixels has 6e-5)."""
@@ -87,21 +87,23 @@ def count_pairs(ellipses: Footprints, grid: TileGrid) -> tuple[Int[Array, ""], I
 
 def emit_pairs(ellipses: Footprints, grid: TileGrid, max_rows: int, max_pairs: int) -> Pairs:
     """All pairs, splat by splat, in buffers of fixed size; if they overflow, the last splats lose theirs."""
+    bands = _bands(ellipses)
     row0, counts = _row_range(ellipses, grid)
     rows = expand(counts, max_rows)
     slot = jnp.arange(max_rows, dtype=jnp.int32)
-    row = (row0 - rows.first)[rows.source] + slot
-    column0, column1 = _column_range(Footprints(*(plane[rows.source] for plane in ellipses)), row, grid)
+    row = take(row0 - rows.first, rows.source) + slot
+    table = take(jnp.stack(bands, axis=-1), rows.source)
+    column0, column1 = _column_range(_Bands(*(table[:, i] for i in range(len(bands)))), row, grid)
     pairs = expand(jnp.where(slot < rows.needed, jnp.maximum(column1 - column0 + 1, 0), 0), max_pairs)
 
     slot = jnp.arange(max_pairs, dtype=jnp.int32)
-    tile = (row * grid.columns + column0 - pairs.first)[pairs.source] + slot
-    tiles = jnp.where(slot < pairs.needed, tile, grid.tiles)
+    table = take(jnp.stack([row * grid.columns + column0 - pairs.first, rows.source], axis=-1), pairs.source)
+    tiles = jnp.where(slot < pairs.needed, table[:, 0] + slot, grid.tiles)
     # If rows are missing, so are their pairs, and they must be counted some other way; else this loop runs zero times.
     missing = rows.needed > max_rows
     recount = _count_row_by_row(ellipses, grid, jnp.where(missing, jnp.max(counts, initial=0), 0))
     needed = jnp.where(missing, recount, pairs.needed)
-    return Pairs(tiles, rows.source[pairs.source], needed, needed - jnp.minimum(pairs.needed, max_pairs))
+    return Pairs(tiles, table[:, 1], needed, needed - jnp.minimum(pairs.needed, max_pairs))
 
 
 def _first(v, tile_size, tiles):
@@ -122,27 +124,45 @@ def _row_range(e: Footprints, grid: TileGrid):
     return row0, jnp.where(e.reach > 0, jnp.maximum(row1 - row0 + 1, 0), 0)
 
 
-def _column_range(e: Footprints, row, grid: TileGrid):
-    """First and last tile of each splat within one row of tiles."""
+class _Bands(NamedTuple):
+    """What a row of tiles needs of an ellipse, planes of (g,): centre, half its height, how high above the centre its
+    rightmost point is, xy / yy, D / yy, 1 / yy and the squared reach.
+    """
+
+    x: Float[Array, " g"]
+    y: Float[Array, " g"]
+    height: Float[Array, " g"]
+    tip: Float[Array, " g"]
+    slope: Float[Array, " g"]
+    ratio: Float[Array, " g"]
+    inverse: Float[Array, " g"]
+    reach: Float[Array, " g"]
+
+
+def _bands(e: Footprints):
+    height, tip = jnp.sqrt(e.reach * e.yy), e.xy * jnp.sqrt(e.reach / e.xx)
+    return _Bands(e.x, e.y, height, tip, e.xy / e.yy, e.determinant / e.yy, 1 / e.yy, e.reach)
+
+
+def _column_range(e: _Bands, row, grid: TileGrid):
+    """First and last tile of each ellipse within one row of tiles."""
     size = grid.tile_size
-    height = jnp.sqrt(e.reach * e.yy)
-    top = jnp.maximum(row * size + 0.5 - SLACK - e.y, -height)
-    bottom = jnp.minimum((row + 1) * size - 0.5 + SLACK - e.y, height)
-    tip = e.xy * jnp.sqrt(e.reach / e.xx)
-    slope, ratio = e.xy / e.yy, e.determinant / e.yy
-    right, left = jnp.clip(tip, top, bottom), jnp.clip(-tip, top, bottom)
-    half = lambda dy: jnp.sqrt(jnp.maximum(ratio * (e.reach - dy * dy / e.yy), 0))
-    column0 = _first(e.x + slope * left - half(left), size, grid.columns)
-    column1 = _last(e.x + slope * right + half(right), size, grid.columns)
+    top = jnp.maximum(row * size + 0.5 - SLACK - e.y, -e.height)
+    bottom = jnp.minimum((row + 1) * size - 0.5 + SLACK - e.y, e.height)
+    right, left = jnp.clip(e.tip, top, bottom), jnp.clip(-e.tip, top, bottom)
+    half = lambda dy: jnp.sqrt(jnp.maximum(e.ratio * (e.reach - dy * dy * e.inverse), 0))
+    column0 = _first(e.x + e.slope * left - half(left), size, grid.columns)
+    column1 = _last(e.x + e.slope * right + half(right), size, grid.columns)
     return column0, column1
 
 
 def _count_row_by_row(ellipses: Footprints, grid: TileGrid, most_rows):
     """Pairs of all splats: their first rows of tiles, then their second ones, and so on."""
+    bands = _bands(ellipses)
     row0, counts = _row_range(ellipses, grid)
 
     def count(i, total):
-        column0, column1 = _column_range(ellipses, row0 + i, grid)
+        column0, column1 = _column_range(bands, row0 + i, grid)
         return jnp.minimum(
             total + _saturating_sum(jnp.where(i < counts, jnp.maximum(column1 - column0 + 1, 0), 0)), SUM_LIMIT
         )

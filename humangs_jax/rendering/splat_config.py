@@ -35,8 +35,8 @@ class SplatConfig:
     max_pairs: int | None = None
     max_rows: int | None = None
     tile_size: int = 8
-    block: int = 64
-    chunk: int = 16
+    block: int = 32
+    chunk: int = 8
     chunk_backward: int = 8
 
     def __post_init__(self):

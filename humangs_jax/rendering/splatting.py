@@ -31,9 +31,14 @@ from humangs_jax.rendering.tiling import TileGrid, sort_into_tiles, tiles_to_ima
 
 __all__ = ["Rendering", "SplatConfig", "default_pairs", "fit_config", "render", "render_views"]
 
-CPU_COMPILER_OPTIONS = {"xla_cpu_prefer_vector_width": 512}
-"""`jax.jit(..., compiler_options=CPU_COMPILER_OPTIONS)` makes the loops over pixels of a program that draws on a CPU with
-AVX-512 up to a third faster. Eager calls use it; options do not reach a jit inside a jit, so your own needs them itself."""
+CPU_COMPILER_OPTIONS = {
+    "xla_cpu_prefer_vector_width": 512,
+    "xla_disable_hlo_passes": "cpu-parallel-task-assigner,cse_barrier_expander",
+}
+"""`jax.jit(..., compiler_options=CPU_COMPILER_OPTIONS)` of a program that draws on a CPU: wide vectors make the loops over
+pixels up to a third faster where there is AVX-512, and XLA no longer shares out their small kernels, tens of
+microseconds each, over several threads, which took twice the CPU time and gained nothing. Eager calls use it; options do
+not reach a jit inside a jit, so your own needs them itself."""
 
 PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
 """Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024

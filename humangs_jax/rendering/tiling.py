@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.array_types import Array, Float, Int, Shaped
 
 SUM_LIMIT = 1 << 30
 """Running sums stop here instead of wrapping past 2^31: far above any buffer, so a sum there only says "too many"."""
@@ -144,11 +144,25 @@ def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
     """Shares out `capacity` slots: item i takes the next counts[i] >= 0 of them. The counts must suit `cumsum`."""
     if counts.shape[0] == 0:
         return Expansion(jnp.zeros(capacity, jnp.int32), counts, jnp.zeros((), jnp.int32))
-    end = cumsum(counts)
+    end = materialized(cumsum(counts))
     first = end - counts
     # A slot belongs to the last item that starts at or before it, so its number is how many items but the first do.
     marks = jnp.zeros(capacity, jnp.int32).at[first[1:]].add(1, mode="drop")
-    return Expansion(cumsum(marks), first, end[-1])
+    return Expansion(materialized(cumsum(marks)), first, end[-1])
+
+
+def take(table: Shaped[Array, "n *rest"], indices: Int[Array, " slots"]) -> Shaped[Array, "slots *rest"]:
+    """Rows of a table at indices that are known to be in range: no clamping, no wrapping of negative ones."""
+    return materialized(table).at[indices].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def materialized(array: Shaped[Array, "*shape"]) -> Shaped[Array, "*shape"]:
+    """The same numbers, stored before they are used.
+
+    XLA's CPU backend would evaluate the expression behind a table anew for each number that a gather takes from it.
+    It respects the barrier where a program is compiled with `splatting.CPU_COMPILER_OPTIONS`.
+    """
+    return lax.optimization_barrier(array)
 
 
 def bits_for(count: int) -> int:

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from splat_scenes import camera, random_gaussians
 
-from humangs_jax.rendering import binning, compositing, fat_chunks
+from humangs_jax.rendering import binning, compositing, fat_chunks, small_blocks
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import _footprints, _project
 from humangs_jax.rendering.tiling import TileGrid, TileLists, sort_into_tiles
@@ -25,7 +25,7 @@ K = fat_chunks.CHUNK
 GRID = TileGrid(21, 13, 8)  # six tiles
 LENGTHS = (0, 3 * K + 5, K, K + 1, 2 * K - 1, 1)
 SPLATS, CAPACITY = 4 * K, 6 * 4 * K
-THIN = compositing._forward, compositing._backward
+THIN = small_blocks.forward, small_blocks.backward
 FAT = fat_chunks.forward, fat_chunks.backward
 PER_STEP = 3
 """Chunks per step, so that lists run on from step to step and the last step has padding."""
