@@ -45,15 +45,8 @@ def pack_splats(
     """Rows x, y (pixels), r00, r01, r11 (1 / pixels), log opacity, features; finite where not drawn."""
     p = projected
     drawn = p.visible & (opacities >= alpha_min)
-    yy, determinant = jnp.where(drawn, p.yy, 1.0), jnp.where(drawn, p.determinant, 1.0)
-    xy = jnp.where(drawn, p.xy, 0.0)
-    # the Cholesky factor of conic / 2 = [[yy, -xy], [-xy, xx]] / (2 determinant); its Schur complement is 1 / (2 yy).
-    # Divided by yy, not by the determinant: the gradient of a quotient holds the denominator's square, and that of a
-    # determinant overflows float32 from 7e4 pixels on, which made these gradients 0.
-    r00 = lax.rsqrt(2 * (determinant / yy))
-    r11 = lax.rsqrt(2 * yy)
     log_opacity = jnp.log(jnp.where(drawn, opacities, 1.0))
-    return jnp.stack([p.x, p.y, r00, -r00 * xy / yy, r11, log_opacity, *features.T], axis=-1)
+    return jnp.stack([p.x, p.y, p.r00, p.r01, p.r11, log_opacity, *features.T], axis=-1)
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))

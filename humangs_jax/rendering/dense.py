@@ -1,8 +1,12 @@
 """The image by its definition: every Gaussian on every pixel, one after the other. The oracle of `splatting`.
 
 Shares no code with the tiled renderer: its projection multiplies plain matrices, its compositing is the loop of the
-formula, its gradients are autodiff's. Memory and time grow with Gaussians times pixels; use it in float64 on small
-images.
+formula, its gradients are autodiff's. With a_j the columns of M and C = cov2d = M M^T + dilation I, the exponent is
+
+    d^T C^-1 d = (sum_j (a_j x d)^2 + dilation |d|^2) / det C,   det C = sum_i<j (a_i x a_j)^2 + dilation |M|^2 + dilation^2,
+
+sums of squares, accurate for needles of any length (the inverse of C has no correct digit left at 1e8 pixels). Memory and
+time grow with Gaussians times pixels; use it in float64 on small images.
 """
 
 import functools
@@ -32,16 +36,18 @@ def render_dense(
     if background is None:
         background = jnp.ones(3, gaussians.means.dtype)
     gaussians, camera, background = at_least_float32((gaussians, camera, background))
-    centers, conics, depths, visible = _project(gaussians, camera, config)
+    centers, axes, depths, visible = _project(gaussians, camera, config)
+    determinants = _determinant(axes, config.dilation)
     order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
     y, x = jnp.mgrid[: camera.height, : camera.width] + 0.5
     pixels = jnp.stack([x, y], axis=-1).astype(centers.dtype)
 
     def draw(state, splat):
         color, distance, transmittance, ended = state
-        center, conic, depth, is_visible, opacity, rgb = splat
+        center, axis, determinant, depth, is_visible, opacity, rgb = splat
         d = pixels - center
-        raw = opacity * jnp.exp(-0.5 * jnp.einsum("hwi,ij,hwj->hw", d, conic, d))
+        squared = jnp.sum(_cross(axis, d[..., None]) ** 2, axis=-1) + config.dilation * jnp.sum(d**2, axis=-1)
+        raw = opacity * jnp.exp(-0.5 * squared / determinant)
         alpha = jnp.where(raw < config.alpha_max, raw, config.alpha_max)
         alpha = jnp.where(is_visible & (raw >= config.alpha_min), alpha, 0.0)
         ended = ended | (transmittance * (1 - alpha) <= config.transmittance_stop)
@@ -52,7 +58,7 @@ def render_dense(
 
     blank = jnp.zeros((camera.height, camera.width), centers.dtype)
     state = jnp.zeros((*blank.shape, 3), blank.dtype), blank, blank + 1, blank > 0
-    splats = centers, conics, depths, visible, gaussians.opacities, gaussians.colors
+    splats = centers, axes, determinants, depths, visible, gaussians.opacities, gaussians.colors
     (color, distance, transmittance, _), _ = lax.scan(draw, state, jax.tree.map(lambda leaf: leaf[order], splats))
     alpha = 1 - transmittance
     some = alpha > 0
@@ -61,7 +67,10 @@ def render_dense(
 
 
 def _project(gaussians, camera, config):
-    """Centres (g, 2), conics (g, 2, 2), depths (g,) and whether each is drawn; those that are not lie at z = 1."""
+    """Centres (g, 2), axes (g, 2, 3), depths (g,) and whether each is drawn; those that are not lie at z = 1.
+
+    Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + dilation I.
+    """
     p = transform.apply(camera.cam_from_world, gaussians.means)
     visible = p[:, 2] > config.near
     depths = jnp.where(visible, p[:, 2], 1.0)
@@ -80,6 +89,15 @@ def _project(gaussians, camera, config):
     image_from_world = jacobian @ camera.cam_from_world[:3, :3]
     axes = image_from_world @ covariance_factors(gaussians)
     small = jnp.all(jnp.abs(axes) < LARGEST_FOOTPRINT, axis=(1, 2))
-    axes = jnp.where(small[:, None, None], axes, 0.0)
-    conics = jnp.linalg.inv(axes @ jnp.swapaxes(axes, 1, 2) + config.dilation * jnp.eye(2, dtype=at.dtype))
-    return slopes * focal + center, conics, depths, visible & small
+    return slopes * focal + center, jnp.where(small[:, None, None], axes, 0.0), depths, visible & small
+
+
+def _determinant(axes, dilation):
+    """Determinant of axes axes^T + dilation I (Cauchy-Binet): of a needle, the matrix itself cancels in float64 too."""
+    pairs = _cross(axes[..., jnp.asarray([0, 1, 2])], axes[..., jnp.asarray([1, 2, 0])])
+    return jnp.sum(pairs**2, axis=-1) + dilation * jnp.sum(axes**2, axis=(-1, -2)) + dilation**2
+
+
+def _cross(a, b):
+    """Cross products of the columns of two (..., 2, n): (..., n)."""
+    return a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :]

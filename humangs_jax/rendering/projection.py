@@ -8,12 +8,14 @@ With p = (X, Y, Z) the mean in the camera's frame, fx, fy, cx, cy of K and W the
 
 Everything is kept as planes of g numbers rather than as (g, 2, 2) arrays: XLA then fuses the projection, and its
 gradient, into a few loops. Its determinant is not taken from the entries of cov2d, where float32 cancels for needles,
-but as a sum of squares: |m0 x m1|^2 + dilation (|m0|^2 + |m1|^2) + dilation^2 for the rows m0, m1 of M.
+but as a sum of squares: |m0 x m1|^2 + dilation (|m0|^2 + |m1|^2) + dilation^2 for the rows m0, m1 of M. What is drawn is
+the upper triangular r with r^T r = cov2d^-1 / 2, whose gradient is written by hand for the same reason.
 
 Gaussians that are not drawn (centre nearer than `near` or behind, footprint beyond `LARGEST_FOOTPRINT`) have finite
 values and pass zero gradients. K's skew is taken as 0.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -31,7 +33,8 @@ class ProjectedGaussians(NamedTuple):
     """2D Gaussians on the image, planes of (g,).
 
     x, y: centre, pixels. depth: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2, dilated.
-    determinant: of the covariance, pixels^4. visible: whether it is drawn.
+    determinant: of the covariance, pixels^4. r00, r01, r11: the Cholesky factor of half its inverse, 1 / pixels, finite
+    where not drawn. visible: whether it is drawn.
     """
 
     x: Float[Array, " g"]
@@ -41,6 +44,9 @@ class ProjectedGaussians(NamedTuple):
     xy: Float[Array, " g"]
     yy: Float[Array, " g"]
     determinant: Float[Array, " g"]
+    r00: Float[Array, " g"]
+    r01: Float[Array, " g"]
+    r11: Float[Array, " g"]
     visible: Bool[Array, " g"]
 
 
@@ -50,11 +56,13 @@ def project(
     near: float = constants.NEAR,
     dilation: float = constants.DILATION,
     jacobian_margin: float | None = None,
+    normalize_quats: bool = True,
 ) -> ProjectedGaussians:
     """Projects every Gaussian.
 
     near: metres. dilation: pixels^2. jacobian_margin: None for the exact Jacobian; a number clamps where it is
     evaluated to that fraction of the half field of view beyond the border (`INRIA_JACOBIAN_MARGIN`).
+    normalize_quats: False takes the quaternions as they are.
     """
     K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -74,21 +82,23 @@ def project(
         [zx * (rotation[0, j] - ju * rotation[2, j]) for j in range(3)],
         [zy * (rotation[1, j] - jv * rotation[2, j]) for j in range(3)],
     ]
-    m = _times_factors(jw, gaussians)
+    m = _times_factors(jw, gaussians, normalize_quats)
 
     small = _all([jnp.abs(entry) < constants.LARGEST_FOOTPRINT for row in m for entry in row])
     m0, m1 = ([jnp.where(small, entry, 0.0) for entry in row] for row in m)
-    xx, xy, yy = _dot(m0, m0), _dot(m0, m1), _dot(m1, m1)
-    normal = [m0[1] * m1[2] - m0[2] * m1[1], m0[2] * m1[0] - m0[0] * m1[2], m0[0] * m1[1] - m0[1] * m1[0]]
-    determinant = _dot(normal, normal) + dilation * (xx + yy) + dilation * dilation
+    xx, xy, yy, determinant = _covariance(m0, m1, dilation)
+    r00, r01, r11 = _conic_factor(m0, m1, dilation)
     return ProjectedGaussians(
         x=fx * u + cx,
         y=fy * v + cy,
         depth=Z,
-        xx=xx + dilation,
+        xx=xx,
         xy=xy,
-        yy=yy + dilation,
+        yy=yy,
         determinant=determinant,
+        r00=r00,
+        r01=r01,
+        r11=r11,
         visible=in_front & small & (determinant > 0),
     )
 
@@ -100,12 +110,72 @@ def squared_reach(opacities: Float[Array, " g"], alpha_min: float = constants.AL
     return jnp.where(seen, 2 * jnp.log(jnp.where(seen, opacities, 1.0) / alpha_min), 0.0)
 
 
-def _times_factors(rows, gaussians: Gaussians):
+def _covariance(m0, m1, dilation):
+    """xx, xy, yy and determinant of cov2d from the rows of M."""
+    xx, xy, yy = _dot(m0, m0), _dot(m0, m1), _dot(m1, m1)
+    normal = [_cross(m0, m1, 1, 2), _cross(m0, m1, 2, 0), _cross(m0, m1, 0, 1)]
+    determinant = _dot(normal, normal) + dilation * (xx + yy) + dilation * dilation
+    return xx + dilation, xy, yy + dilation, determinant
+
+
+def _cross(m0, m1, j, i):
+    """Cross product of the columns j and i of M."""
+    return m0[j] * m1[i] - m1[j] * m0[i]
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def _conic_factor(m0, m1, dilation):
+    """Upper triangular r with r^T r = cov2d^-1 / 2: r00, r01, r11. Where cov2d is singular, some finite numbers.
+
+    Gradient. With k the symmetric matrix of k00 = r00 g00 + r01 g01, k01 = r11 g01, k11 = r11 g11 (g: the cotangents),
+
+        dL/dM = -2 r^T k r M.
+
+    For a needle of length l and width w, in pixels, the entries of r are of the order of 1 / w, but r's product with
+    its long axis is of the order of 1. Autodiff forms it from cov2d and its determinant and is left with
+    rounding times (l / w)^2. In
+
+        (r M)_0j = r00 / yy (sum_i m1_i (m_j x m_i) + dilation m0_j),     (r M)_1j = r11 m1_j
+
+    what cancels, m_j x m_j, is not there. Nor is a square of the determinant, which overflows from 7e4 pixels on.
+    """
+    _, xy, yy, determinant = _covariance(m0, m1, dilation)
+    regular = determinant > 0
+    yy, determinant = jnp.where(regular, yy, 1.0), jnp.where(regular, determinant, 1.0)
+    r00 = lax.rsqrt(2 * (determinant / yy))
+    return r00, -r00 * (xy / yy), lax.rsqrt(2 * yy)
+
+
+def _conic_factor_fwd(m0, m1, dilation):
+    r = _conic_factor(m0, m1, dilation)
+    return r, (m0, m1, r)
+
+
+def _conic_factor_bwd(dilation, saved, cotangents):
+    m0, m1, (r00, r01, r11) = saved
+    g00, g01, g11 = cotangents
+    k00, k01, k11 = r00 * g00 + r01 * g01, r11 * g01, r11 * g11
+    ratio = 2 * r00 * r11 * r11  # r00 / yy
+    d0, d1 = [], []
+    for j in range(3):
+        across = sum(m1[i] * _cross(m0, m1, j, i) for i in range(3) if i != j)
+        n0, n1 = ratio * (across + dilation * m0[j]), r11 * m1[j]
+        t0, t1 = k00 * n0 + k01 * n1, k01 * n0 + k11 * n1
+        d0.append(-2 * (r00 * t0))
+        d1.append(-2 * (r01 * t0 + r11 * t1))
+    return d0, d1
+
+
+_conic_factor.defvjp(_conic_factor_fwd, _conic_factor_bwd)
+
+
+def _times_factors(rows, gaussians: Gaussians, normalize_quats: bool):
     """Rows @ A R diag(s) for 2 x 3 rows of planes."""
     if gaussians.deformations is not None:
         entries = _planes(gaussians.deformations.reshape(-1, 9))
         rows = _times(rows, [entries[:3], entries[3:6], entries[6:]])
-    rows = _times(rows, _rotation_planes(quaternion.normalize(gaussians.quats)))
+    quats = quaternion.normalize(gaussians.quats) if normalize_quats else gaussians.quats
+    rows = _times(rows, _rotation_planes(quats))
     scales = _planes(gaussians.scales)
     return [[row[j] * scales[j] for j in range(3)] for row in rows]
 
