@@ -1,7 +1,11 @@
 """Sizes of static buffers."""
 
+STEPS = 4
+"""Sizes per power of two."""
+
 
 def round_up(size: int, smallest: int = 64) -> int:
-    """The next 2^i or 1.5 * 2^i, at least `smallest`: similar scenes share one compilation, and at most a third is spare."""
-    power = 1 << (max(size, smallest, 2) - 1).bit_length()
-    return 3 * power // 4 if size <= 3 * power // 4 and smallest <= 3 * power // 4 else power
+    """The next (4, 5, 6 or 7) 2^i, at least `smallest`: similar scenes share one compilation, at most a fifth is spare."""
+    size = max(size, smallest)
+    unit = 1 << max(0, (size - 1).bit_length() - STEPS.bit_length())
+    return -(-size // unit) * unit

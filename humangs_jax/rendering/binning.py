@@ -27,6 +27,9 @@ SLACK = 2e-3
 REACH_SLACK = (1.0001, 1e-5)
 """The squared reach is multiplied by the first and raised by the second, against rounding of alpha at its threshold."""
 
+INRIA_LEAST_SPREAD = 0.1
+"""Pixels^4; INRIA takes no smaller square of half the difference of the variances along a splat's axes."""
+
 
 class Footprints(NamedTuple):
     """Ellipses on the image, planes of (g,), named as in `ProjectedGaussians`; reach is 0 where nothing is drawn."""
@@ -38,6 +41,72 @@ class Footprints(NamedTuple):
     yy: Float[Array, " g"]
     determinant: Float[Array, " g"]
     reach: Float[Array, " g"]
+
+    def rows(self, grid: TileGrid):
+        """First row of tiles of each splat, and how many."""
+        half = jnp.sqrt(self.reach * self.yy)
+        row0 = _first(self.y - half, grid.tile_size, grid.rows)
+        row1 = _last(self.y + half, grid.tile_size, grid.rows)
+        return row0, jnp.where(self.reach > 0, jnp.maximum(row1 - row0 + 1, 0), 0)
+
+    def bands(self) -> "_Bands":
+        height, tip = jnp.sqrt(self.reach * self.yy), self.xy * jnp.sqrt(self.reach / self.xx)
+        inverse = 1 / self.yy
+        return _Bands(self.x, self.y, height, tip, self.xy * inverse, self.determinant * inverse, inverse, self.reach)
+
+
+class _Bands(NamedTuple):
+    """What a row of tiles needs of an ellipse, planes of (g,): centre, half its height, how high above the centre its
+    rightmost point is, xy / yy, D / yy, 1 / yy and the squared reach.
+    """
+
+    x: Float[Array, " g"]
+    y: Float[Array, " g"]
+    height: Float[Array, " g"]
+    tip: Float[Array, " g"]
+    slope: Float[Array, " g"]
+    ratio: Float[Array, " g"]
+    inverse: Float[Array, " g"]
+    reach: Float[Array, " g"]
+
+    def columns(self, row, grid: TileGrid):
+        """First and last tile of each ellipse within one row of tiles."""
+        size = grid.tile_size
+        top = jnp.maximum(row * size + 0.5 - SLACK - self.y, -self.height)
+        bottom = jnp.minimum((row + 1) * size - 0.5 + SLACK - self.y, self.height)
+        right, left = jnp.clip(self.tip, top, bottom), jnp.clip(-self.tip, top, bottom)
+        half = lambda dy: jnp.sqrt(jnp.maximum(self.ratio * (self.reach - dy * dy * self.inverse), 0))
+        column0 = _first(self.x + self.slope * left - half(left), size, grid.columns)
+        column1 = _last(self.x + self.slope * right + half(right), size, grid.columns)
+        return column0, column1
+
+
+class Squares(NamedTuple):
+    """INRIA's footprints, planes of (g,): the tiles that meet a square, as its rasterizer counts them.
+
+    radius: half a side, whole pixels; 0 where nothing is drawn.
+    """
+
+    x: Float[Array, " g"]
+    y: Float[Array, " g"]
+    radius: Float[Array, " g"]
+
+    def rows(self, grid: TileGrid):
+        """First row of tiles of each splat, and how many."""
+        first, last = self._range(self.y, grid.tile_size, grid.rows)
+        return first, jnp.where(self.radius > 0, jnp.maximum(last - first + 1, 0), 0)
+
+    def bands(self) -> "Squares":
+        return self
+
+    def columns(self, row, grid: TileGrid):
+        """First and last tile of each square, the same in all its rows."""
+        return self._range(self.x, grid.tile_size, grid.columns)
+
+    def _range(self, center, size, tiles):
+        low, high = center - 0.5 - self.radius, center - 0.5 + self.radius + size - 1
+        first = jnp.clip(jnp.floor(low / size), 0, tiles)
+        return first.astype(jnp.int32), (jnp.clip(jnp.floor(high / size), 0, tiles) - 1).astype(jnp.int32)
 
 
 class Pairs(NamedTuple):
@@ -79,21 +148,49 @@ def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Foot
     return Footprints(p.x, p.y, p.xx, p.xy, p.yy, p.determinant, reach)
 
 
-def count_pairs(ellipses: Footprints, grid: TileGrid) -> tuple[Int[Array, ""], Int[Array, ""]]:
+def square_footprints(projected: ProjectedGaussians, reach: Float[Array, " g"], extent: float) -> Squares:
+    """Squares of `extent` times the larger standard deviation, rounded up to pixels, where reach is positive."""
+    p = lax.stop_gradient(projected)
+    middle = 0.5 * (p.xx + p.yy)
+    largest = middle + jnp.sqrt(jnp.maximum(middle * middle - p.determinant, INRIA_LEAST_SPREAD))
+    radius = jnp.where(p.visible & (reach > 0), jnp.ceil(extent * jnp.sqrt(largest)), 0.0)
+    return Squares(p.x, p.y, radius)
+
+
+class Share(NamedTuple):
+    """Every `count`-th row of tiles, from row `index` on: what one of `count` devices draws of an image."""
+
+    index: Int[Array, ""] | int = 0
+    count: int = 1
+
+    def of(self, row0, rows):
+        """First and number of the share's rows among `rows` ones from row0 on, in units of `count` rows."""
+        first = (row0 - self.index + self.count - 1) // self.count
+        return first, (row0 + rows - self.index + self.count - 1) // self.count - first
+
+
+WHOLE = Share()
+
+
+def count_pairs(
+    footprints: Footprints | Squares, grid: TileGrid, share: Share = WHOLE
+) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """(rows, pairs) that `emit_pairs` needs, without any buffer; both saturate at `SUM_LIMIT`."""
-    _, counts = _row_range(ellipses, grid)
-    return _saturating_sum(counts), _count_row_by_row(ellipses, grid, jnp.max(counts, initial=0))
+    _, counts = share.of(*footprints.rows(grid))
+    return _saturating_sum(counts), _count_row_by_row(footprints, grid, share, jnp.max(counts, initial=0))
 
 
-def emit_pairs(ellipses: Footprints, grid: TileGrid, max_rows: int, max_pairs: int) -> Pairs:
+def emit_pairs(
+    footprints: Footprints | Squares, grid: TileGrid, max_rows: int, max_pairs: int, share: Share = WHOLE
+) -> Pairs:
     """All pairs, splat by splat, in buffers of fixed size; if they overflow, the last splats lose theirs."""
-    bands = _bands(ellipses)
-    row0, counts = _row_range(ellipses, grid)
+    bands = footprints.bands()
+    first, counts = share.of(*footprints.rows(grid))
     rows = expand(counts, max_rows)
     slot = jnp.arange(max_rows, dtype=jnp.int32)
-    row = take(row0 - rows.first, rows.source) + slot
+    row = (take(first - rows.first, rows.source) + slot) * share.count + share.index
     table = take(jnp.stack(bands, axis=-1), rows.source)
-    column0, column1 = _column_range(_Bands(*(table[:, i] for i in range(len(bands)))), row, grid)
+    column0, column1 = type(bands)(*(table[:, i] for i in range(len(bands)))).columns(row, grid)
     pairs = expand(jnp.where(slot < rows.needed, jnp.maximum(column1 - column0 + 1, 0), 0), max_pairs)
 
     slot = jnp.arange(max_pairs, dtype=jnp.int32)
@@ -101,7 +198,7 @@ def emit_pairs(ellipses: Footprints, grid: TileGrid, max_rows: int, max_pairs: i
     tiles = jnp.where(slot < pairs.needed, table[:, 0] + slot, grid.tiles)
     # If rows are missing, so are their pairs, and they must be counted some other way; else this loop runs zero times.
     missing = rows.needed > max_rows
-    recount = _count_row_by_row(ellipses, grid, jnp.where(missing, jnp.max(counts, initial=0), 0))
+    recount = _count_row_by_row(footprints, grid, share, jnp.where(missing, jnp.max(counts, initial=0), 0))
     needed = jnp.where(missing, recount, pairs.needed)
     return Pairs(tiles, table[:, 1], needed, needed - jnp.minimum(pairs.needed, max_pairs))
 
@@ -116,56 +213,15 @@ def _last(v, tile_size, tiles):
     return jnp.clip(jnp.floor((v - 0.5 + SLACK) / tile_size), -1, tiles - 1).astype(jnp.int32)
 
 
-def _row_range(e: Footprints, grid: TileGrid):
-    """First row of tiles of each splat, and how many."""
-    half = jnp.sqrt(e.reach * e.yy)
-    row0 = _first(e.y - half, grid.tile_size, grid.rows)
-    row1 = _last(e.y + half, grid.tile_size, grid.rows)
-    return row0, jnp.where(e.reach > 0, jnp.maximum(row1 - row0 + 1, 0), 0)
-
-
-class _Bands(NamedTuple):
-    """What a row of tiles needs of an ellipse, planes of (g,): centre, half its height, how high above the centre its
-    rightmost point is, xy / yy, D / yy, 1 / yy and the squared reach.
-    """
-
-    x: Float[Array, " g"]
-    y: Float[Array, " g"]
-    height: Float[Array, " g"]
-    tip: Float[Array, " g"]
-    slope: Float[Array, " g"]
-    ratio: Float[Array, " g"]
-    inverse: Float[Array, " g"]
-    reach: Float[Array, " g"]
-
-
-def _bands(e: Footprints):
-    height, tip = jnp.sqrt(e.reach * e.yy), e.xy * jnp.sqrt(e.reach / e.xx)
-    return _Bands(e.x, e.y, height, tip, e.xy / e.yy, e.determinant / e.yy, 1 / e.yy, e.reach)
-
-
-def _column_range(e: _Bands, row, grid: TileGrid):
-    """First and last tile of each ellipse within one row of tiles."""
-    size = grid.tile_size
-    top = jnp.maximum(row * size + 0.5 - SLACK - e.y, -e.height)
-    bottom = jnp.minimum((row + 1) * size - 0.5 + SLACK - e.y, e.height)
-    right, left = jnp.clip(e.tip, top, bottom), jnp.clip(-e.tip, top, bottom)
-    half = lambda dy: jnp.sqrt(jnp.maximum(e.ratio * (e.reach - dy * dy * e.inverse), 0))
-    column0 = _first(e.x + e.slope * left - half(left), size, grid.columns)
-    column1 = _last(e.x + e.slope * right + half(right), size, grid.columns)
-    return column0, column1
-
-
-def _count_row_by_row(ellipses: Footprints, grid: TileGrid, most_rows):
+def _count_row_by_row(footprints, grid: TileGrid, share: Share, most_rows):
     """Pairs of all splats: their first rows of tiles, then their second ones, and so on."""
-    bands = _bands(ellipses)
-    row0, counts = _row_range(ellipses, grid)
+    bands = footprints.bands()
+    first, counts = share.of(*footprints.rows(grid))
 
     def count(i, total):
-        column0, column1 = _column_range(bands, row0 + i, grid)
-        return jnp.minimum(
-            total + _saturating_sum(jnp.where(i < counts, jnp.maximum(column1 - column0 + 1, 0), 0)), SUM_LIMIT
-        )
+        column0, column1 = bands.columns((first + i) * share.count + share.index, grid)
+        here = jnp.where(i < counts, jnp.maximum(column1 - column0 + 1, 0), 0)
+        return jnp.minimum(total + _saturating_sum(here), SUM_LIMIT)
 
     return lax.fori_loop(0, most_rows, count, jnp.zeros((), jnp.int32))
 

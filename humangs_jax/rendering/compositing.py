@@ -52,23 +52,23 @@ def pack_splats(
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3))
 def composite(
     splats: Float[Array, "g 10"], lists: TileLists, grid: TileGrid, config: SplatConfig
-) -> tuple[Float[Array, "t 4 p"], Float[Array, "t p"]]:
+) -> tuple[Float[Array, "t 4 p"], Float[Array, "t p"], Float[Array, " g"]]:
     """Draws lists of splats, which must be in depth order, into tiles.
 
-    Returns (sum of w f, final T) for every pixel of every tile; tiles with empty lists have (0, 1). Differentiable with
-    respect to `splats`, in reverse mode only.
+    Returns (sum of w f, final T) for every pixel of every tile, (0, 1) where lists are empty; and the largest w of each
+    splat if `config.visibility`, else 0. The first two are differentiable with respect to `splats`, in reverse mode only.
     """
     return _composite_fwd(splats, lists, grid, config)[0]
 
 
 def _composite_fwd(splats, lists, grid, config):
-    features, transmittance, lengths = _scheduled("forward", grid, config, splats, *lists)
-    return (features, transmittance), (splats, lists, features, transmittance, lengths)
+    features, transmittance, lengths, peaks = _scheduled("forward", grid, config, splats, *lists)
+    return (features, transmittance, peaks), (splats, lists, features, transmittance, lengths)
 
 
 def _composite_bwd(grid, config, saved, cotangents):
     splats, lists, features, transmittance, lengths = saved
-    g, g_transmittance = cotangents
+    g, g_transmittance, _ = cotangents
     total = jnp.sum(g * features, axis=1) + g_transmittance * transmittance
     sums = _scheduled("backward", grid, config, splats, lists.items, lists.starts, lengths, g, total)
     return _splat_gradients(splats, sums), None

@@ -36,3 +36,6 @@ INRIA_EXTENT = 3.0
 
 LARGEST_FOOTPRINT = 1e9
 """Pixels; a Gaussian with a longer projected axis is not drawn. Its square's square would overflow float32."""
+
+INRIA_TILE_SIZE = 16
+"""Pixels. It matters where a square cuts splats off: they are drawn on whole tiles."""

@@ -48,6 +48,7 @@ from humangs_jax.rendering.splat_rows import (
     joined_over_batch,
     moments_about_splat,
     monomials,
+    product,
     take_chunk,
     visible_alpha,
 )
@@ -94,7 +95,10 @@ def cut(starts: Int[Array, " t"], counts: Int[Array, " t"], capacity: int, step:
 
 @functools.lru_cache
 def forward(grid: TileGrid, config: SplatConfig):
-    """(splats, items, starts, counts) -> features (t, 4, p), final T (t, p), how much of each list was used (t,)."""
+    """(splats, items, starts, counts) -> features (t, 4, p), final T (t, p), used parts of the lists (t,), peaks (g,).
+
+    peaks: largest w of each splat; 0 unless `config.visibility`.
+    """
     log_stop = _log_stop(config)
 
     @joined_over_batch
@@ -104,9 +108,9 @@ def forward(grid: TileGrid, config: SplatConfig):
         chunks = cut(starts, counts, items.shape[0], step)
 
         def draw(i, carry):
-            sums, lengths, tail = carry
+            sums, lengths, peaks, tail = carry
             c = _slice(chunks, i, step)
-            _, row, _, raw = take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
+            item, row, _, raw = take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
             alpha, fading = _fading(raw, config)
             before, since = _sums_before(fading, c.tiles, tail)
             live = before[:, None] + since + fading > log_stop
@@ -116,12 +120,14 @@ def forward(grid: TileGrid, config: SplatConfig):
             sums = sums.at[c.tiles].add(parts, mode="drop", indices_are_sorted=True)
             reached = jnp.where(jnp.max(before, axis=1) > log_stop, c.ends, 0)
             lengths = lengths.at[c.tiles].max(reached, mode="drop", indices_are_sorted=True)
-            return sums, lengths, _tail(c.tiles, before, since + fading)
+            if config.visibility:
+                peaks = peaks.at[item].max(jnp.max(weights, axis=2), mode="drop")
+            return sums, lengths, peaks, _tail(c.tiles, before, since + fading)
 
         sums, lengths = jnp.zeros((t, FEATURE_COUNT + 1, p), dtype), jnp.zeros(t, jnp.int32)
-        carry = sums, lengths, _no_tail(t, p, dtype)
-        sums, lengths, _ = lax.fori_loop(0, chunks.steps, draw, carry)
-        return sums[:, :FEATURE_COUNT], jnp.exp(sums[:, FEATURE_COUNT]), lengths
+        carry = sums, lengths, jnp.zeros(splats.shape[0], dtype), _no_tail(t, p, dtype)
+        sums, lengths, peaks, _ = lax.fori_loop(0, chunks.steps, draw, carry)
+        return sums[:, :FEATURE_COUNT], jnp.exp(sums[:, FEATURE_COUNT]), lengths, peaks
 
     return forward
 
@@ -158,8 +164,8 @@ def backward(grid: TileGrid, config: SplatConfig):
             slopes = (along * transmittance - behind / (1 - alpha)) * raw
             slopes = jnp.where((weights > 0) & (raw < config.alpha_max), slopes, 0.0)
 
-            moments = jnp.matmul(slopes.reshape(-1, p), powers, precision=EXACT).reshape(step, CHUNK, 6)
-            features = jnp.matmul(weights, jnp.moveaxis(g, 1, 2), precision=EXACT)
+            moments = product(slopes.reshape(-1, p), powers, config).reshape(step, CHUNK, 6)
+            features = product(weights, jnp.moveaxis(g, 1, 2), config)
             rows = jnp.concatenate([moments_about_splat(moments, *offset), features], axis=-1)
             tails = (
                 _tail(c.tiles, b, s + own) for b, s, own in ((before, since, fading), (seen_before, seen_since, gained))

@@ -18,13 +18,13 @@ from jax import lax
 
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splat_rows import (
-    EXACT,
     FEATURE_COUNT,
     FEATURES,
     SPLAT_WIDTH,
     joined_over_batch,
     moments_about_splat,
     monomials,
+    product,
     take_chunk,
     visible_alpha,
 )
@@ -37,7 +37,10 @@ last stored link on; storing T after every splat costs more than that."""
 
 @functools.lru_cache
 def forward(grid: TileGrid, config: SplatConfig):
-    """(splats, items, starts, counts) -> features (t, 4, p), final T (t, p), how much of each list was used (t,)."""
+    """(splats, items, starts, counts) -> features (t, 4, p), final T (t, p), used parts of the lists (t,), peaks (g,).
+
+    peaks: largest w of each splat; 0 unless `config.visibility`.
+    """
     block, k, stop = config.block, config.chunk, config.transmittance_stop
 
     @joined_over_batch
@@ -45,38 +48,45 @@ def forward(grid: TileGrid, config: SplatConfig):
         dtype, t = splats.dtype, counts.shape[0]
         blocks = blocks_by_length(counts, block)
 
-        def draw(b, out):
+        def draw(b, carry):
+            *out, peaks = carry
             tile = lax.dynamic_slice_in_dim(blocks.tiles, b * block, block)
             start, count = _lists_of(tile, starts, counts)
 
             def body(carry):
-                i, transmittance, features, lengths, live = carry
-                _, row, _, raw = take_chunk(splats, items, start + i * k, count - i * k, tile, grid, k)
+                i, transmittance, features, lengths, live, peaks = carry
+                item, row, _, raw = take_chunk(splats, items, start + i * k, count - i * k, tile, grid, k)
                 alpha = lax.optimization_barrier(visible_alpha(raw, config))
-                before = transmittance[:, None]
+                before, weights = transmittance[:, None], []
                 for j in range(k):
                     after = before * (1 - alpha[:, None, j])
                     weight = jnp.where(after > stop, alpha[:, None, j] * before, 0.0)
                     features = features + weight * row[:, j, FEATURES, None]
+                    weights.append(weight)
                     before = after
+                if config.visibility:
+                    highest = jnp.max(jnp.concatenate(weights, axis=1), axis=2)
+                    peaks = peaks.at[item].max(highest, mode="drop")
                 for j in range(k):
                     after = transmittance * (1 - alpha[:, j])
                     transmittance = jnp.where(after > stop, after, jnp.minimum(transmittance, -transmittance))
                 lengths = jnp.where(live, jnp.minimum((i + 1) * k, count), lengths)
                 live = (jnp.max(transmittance, axis=1) > 0) & ((i + 1) * k < count)
-                return i + 1, transmittance, features, lengths, live
+                return i + 1, transmittance, features, lengths, live, peaks
 
             ones = jnp.ones((block, grid.pixels), dtype)
             zeros = jnp.zeros((block, FEATURE_COUNT, grid.pixels), dtype)
-            carry = 0, ones, zeros, jnp.zeros_like(count), count > 0
-            _, transmittance, features, lengths, _ = lax.while_loop(lambda carry: jnp.any(carry[-1]), body, carry)
+            carry = 0, ones, zeros, jnp.zeros_like(count), count > 0, peaks
+            _, transmittance, features, lengths, _, peaks = lax.while_loop(lambda carry: jnp.any(carry[4]), body, carry)
             results = features, jnp.abs(transmittance), lengths
-            return tuple(o.at[tile].set(r, mode="drop", unique_indices=True) for o, r in zip(out, results, strict=True))
+            drawn = (o.at[tile].set(r, mode="drop", unique_indices=True) for o, r in zip(out, results, strict=True))
+            return *drawn, peaks
 
         out = (
             jnp.zeros((t, FEATURE_COUNT, grid.pixels), dtype),
             jnp.ones((t, grid.pixels), dtype),
             jnp.zeros(t, jnp.int32),
+            jnp.zeros(splats.shape[0], dtype),
         )
         return lax.fori_loop(0, blocks.used, draw, out)
 
@@ -121,8 +131,8 @@ def backward(grid: TileGrid, config: SplatConfig):
                     transmittance = after
                 weights, slopes = jnp.stack(weights, axis=1), jnp.stack(slopes, axis=1)
                 # matrix products: XLA's row reductions are slow on CPUs
-                moments = jnp.matmul(slopes.reshape(block * k, -1), powers, precision=EXACT).reshape(block, k, 6)
-                features = jnp.matmul(weights, jnp.moveaxis(g, 1, 2), precision=EXACT)
+                moments = product(slopes.reshape(block * k, -1), powers, config).reshape(block, k, 6)
+                features = product(weights, jnp.moveaxis(g, 1, 2), config)
                 rows = jnp.concatenate([moments_about_splat(moments, *offset), features], axis=-1)
                 return i + 1, transmittance, seen, sums.at[item].add(rows, mode="drop")
 

@@ -1,4 +1,4 @@
-"""Every knob of the splatting renderer, in one frozen (hashable, hence static) dataclass."""
+"""Every knob of the splatting renderer, in one frozen (hashable, hence static) dataclass, and its presets."""
 
 import dataclasses
 
@@ -7,23 +7,36 @@ from humangs_jax.rendering import constants
 
 @dataclasses.dataclass(frozen=True)
 class SplatConfig:
-    """What is drawn, in which buffers, on which schedule.
+    """What is drawn, in which buffers, on which schedule. docs/performance.md has what each knob costs and gains.
 
     What is drawn (see `constants` for reasons and for the numbers of other rasterizers):
         near: metres; nearer Gaussians are not drawn. dilation: pixels^2 added to the projected variances.
         alpha_min: alphas below are skipped. alpha_max: alphas are clamped to it.
         transmittance_stop: a pixel ends before its transmittance would fall to this.
         jacobian_margin: None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat.
+        normalize_quats: False: quaternions are used as they are, as INRIA's rasterizer does.
+        opacity_min: fainter Gaussians are not drawn at all.
+
+    Where footprints end. A splat is drawn on whole tiles, all that its footprint meets.
+        extent: standard deviations; None: only where alpha falls below alpha_min, so that nothing is lost. Less draws
+        faster, and cuts splats off at the borders of tiles: then the image depends on tile_size.
+        square: INRIA's footprint: the square around the splat whose half side is `extent` times the larger standard
+        deviation, rounded up to pixels, at tiles as INRIA counts them.
+
+    What is computed:
+        scale: the image is drawn at this fraction of its resolution, and resized (bilinear).
+        visibility: whether `Rendering.visibility` is computed.
 
     Buffers: capacities for (splat, tile) pairs, `max_pairs`, and for (splat, row of tiles) pairs, `max_rows`.
         None: an eager call measures its need. A traced call (under jit, grad or vmap) cannot, and takes
         `splatting.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and
-        `splatting.fit_config` measures a capacity for such calls. `max_rows` None: as many as pairs, always enough in
+        `splatting.plan` measures a capacity for such calls. `max_rows` None: as many as pairs, always enough in
         practice; smaller is a little faster.
 
-    Schedule: changes the time, not the image.
+    Schedule: changes the time, not the image (but for rounding).
         tile_size: pixels. block: tiles that are composited together. chunk, chunk_backward: splats of a list taken at
-        once.
+        once (block and chunks: on CPUs only).
+        products: "bfloat16" rounds the factors of the gradient's sums over pixels to 8 bits.
     """
 
     near: float = constants.NEAR
@@ -32,15 +45,22 @@ class SplatConfig:
     alpha_max: float = constants.ALPHA_MAX
     transmittance_stop: float = constants.TRANSMITTANCE_STOP
     jacobian_margin: float | None = None
+    normalize_quats: bool = True
+    opacity_min: float = 0.0
+    extent: float | None = None
+    square: bool = False
+    scale: float = 1.0
+    visibility: bool = False
     max_pairs: int | None = None
     max_rows: int | None = None
     tile_size: int = 8
     block: int = 32
     chunk: int = 8
     chunk_backward: int = 8
+    products: str = "float32"
 
     def __post_init__(self):
-        positive = ("alpha_min", "tile_size", "block", "chunk", "chunk_backward")
+        positive = ("alpha_min", "scale", "tile_size", "block", "chunk", "chunk_backward")
         if wrong := [name for name in positive if not getattr(self, name) > 0]:
             raise ValueError(f"SplatConfig: {', '.join(wrong)} must be positive")
         if not self.alpha_min < self.alpha_max < 1:
@@ -49,6 +69,31 @@ class SplatConfig:
             raise ValueError("SplatConfig: near and dilation must not be negative, transmittance_stop in [0, 1)")
         if any(size is not None and size < 1 for size in (self.max_pairs, self.max_rows)):
             raise ValueError("SplatConfig: max_pairs and max_rows must be at least 1")
+        if self.extent is not None and not self.extent > 0:
+            raise ValueError(f"SplatConfig: extent must be positive or None, got {self.extent}")
+        if self.square and self.extent is None:
+            raise ValueError("SplatConfig: a square footprint needs an extent")
+        if self.products not in PRODUCTS:
+            raise ValueError(f"SplatConfig: products must be one of {PRODUCTS}, got {self.products!r}")
 
+
+PRODUCTS = ("float32", "bfloat16")
 
 DEFAULT_CONFIG = SplatConfig()
+
+SPLAT_PRESETS = {
+    "exact": DEFAULT_CONFIG,
+    "near_exact": SplatConfig(alpha_min=1 / 128, transmittance_stop=1e-3),
+    "fast": SplatConfig(extent=2.0, alpha_min=1 / 64, transmittance_stop=1e-2),
+    "inria": SplatConfig(
+        near=constants.INRIA_NEAR,
+        alpha_max=constants.INRIA_ALPHA_MAX,
+        jacobian_margin=constants.INRIA_JACOBIAN_MARGIN,
+        normalize_quats=False,
+        extent=constants.INRIA_EXTENT,
+        square=True,
+        tile_size=constants.INRIA_TILE_SIZE,
+    ),
+}
+"""exact: every alpha of 1/255 and more, in float32. near_exact and fast: see docs/performance.md for their errors and
+gains. inria: the conventions of diff-gaussian-rasterization, which the published weights were trained with."""

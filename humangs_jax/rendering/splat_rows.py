@@ -105,3 +105,11 @@ def moments_about_splat(
         ],
         axis=-1,
     )
+
+
+def product(a: Float[Array, "*b m p"], b: Float[Array, "*b p n"], config: SplatConfig) -> Float[Array, "*b m n"]:
+    """Sums over pixels as a matrix product, with factors of `config.products`."""
+    if config.products == "float32":
+        return jnp.matmul(a, b, precision=EXACT)
+    narrow = a.astype(config.products), b.astype(config.products)
+    return jnp.matmul(*narrow, preferred_element_type=a.dtype)

@@ -1,12 +1,15 @@
 """Differentiable 3D Gaussian splatting in plain JAX, for CPU, GPU and TPU, under `jit`, `vmap` and `grad`.
 
     rendering = render(gaussians, camera)                # eager: the buffers are sized to the scene
-    config = fit_config(gaussians, camera)               # for calls inside jit, vmap, grad: sized once
+    config = plan(gaussians, cameras)                    # for calls inside jit, vmap, grad: sized once
     loss = lambda gaussians: jnp.mean((render(gaussians, camera, config).rgb - photo) ** 2)
 
 Projection, depth order, (tile, splat) pairs, lists by tile, compositing: each has its module. `dense` draws the same
 image by the definition. Gradients (reverse mode only) reach means, quats, scales, opacities, colors, deformations, the
 background, and K and cam_from_world of the camera.
+
+One XLA program runs on one CPU core here. `mesh` shares an image out among devices, which a CPU has as many of as
+`jax.config.update("jax_num_cpu_devices", 2)` says before JAX is first used.
 """
 
 import dataclasses
@@ -16,20 +19,22 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.core import Tracer
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 
-from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.array_types import Array, Bool, Float, Int
 from humangs_jax.capacity import round_up
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.numerics import at_least_float32, safe_divide
 from humangs_jax.pytree import pytree_dataclass
-from humangs_jax.rendering import binning
+from humangs_jax.rendering import binning, constants
 from humangs_jax.rendering.compositing import composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import ProjectedGaussians, project, squared_reach
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
-from humangs_jax.rendering.tiling import TileGrid, sort_into_tiles, tiles_to_image
+from humangs_jax.rendering.tiling import TileGrid, sort_into_tiles, take, tiles_to_image
 
-__all__ = ["Rendering", "SplatConfig", "default_pairs", "fit_config", "render", "render_views"]
+__all__ = ["Rendering", "SplatConfig", "default_pairs", "plan", "render", "render_views", "seen_from"]
 
 CPU_COMPILER_OPTIONS = {
     "xla_cpu_prefer_vector_width": 512,
@@ -51,13 +56,15 @@ class Rendering:
 
     rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is seen, weighted as the
     colours are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that did not fit in the buffers and were not
-    drawn.
+    drawn. visibility: (g,) the largest weight alpha T of each Gaussian on any pixel, 0 if it is hidden; not
+    differentiable; None unless `SplatConfig.visibility`.
     """
 
     rgb: Float[Array, "h w 3"]
     alpha: Float[Array, "h w"]
     depth: Float[Array, "h w"]
     overflow: Int[Array, ""]
+    visibility: Float[Array, " g"] | None = None
 
 
 def render(
@@ -65,10 +72,12 @@ def render(
     camera: Camera,
     config: SplatConfig = DEFAULT_CONFIG,
     background: Float[Array, "3"] | None = None,
+    mesh: Mesh | None = None,
 ) -> Rendering:
     """Draws Gaussians as one camera sees them.
 
-    background: (3,) RGB; None: white.
+    background: (3,) RGB; None: white. mesh: of one axis, whose devices share the image's rows of tiles; None: one
+    device draws it all.
 
     Raises: ValueError if an eager call overflows `config.max_pairs` or `max_rows`. Inside a transformation the missing
     pairs are counted in `Rendering.overflow` instead.
@@ -76,10 +85,10 @@ def render(
     background = _white(gaussians) if background is None else background
     gaussians, camera, background = at_least_float32((gaussians, camera, background))
     if _is_traced(gaussians, camera, background):
-        return _render(gaussians, camera, background, _with_default_buffers(gaussians, camera, config))
-    fitted = fit_config(gaussians, camera, config, margin=1.0) if config.max_pairs is None else config
-    rendering = _jitted(_render, 3)(gaussians, camera, background, fitted)
-    _check_overflow(rendering, gaussians, camera, fitted)
+        return _render(gaussians, camera, background, _with_default_buffers(gaussians, camera, config), mesh)
+    fitted = plan(gaussians, camera, config, margin=1.0, mesh=mesh) if config.max_pairs is None else config
+    rendering = _jitted(_render, 3, 4)(gaussians, camera, background, fitted, mesh)
+    _check_overflow(rendering, gaussians, camera, fitted, mesh)
     return rendering
 
 
@@ -89,24 +98,35 @@ def render_views(
     config: SplatConfig = DEFAULT_CONFIG,
     background: Float[Array, "3"] | None = None,
     batch_size: int = 1,
+    mesh: Mesh | None = None,
 ) -> Rendering:
     """Draws every camera of a batch (leading axis v), `batch_size` views at a time: memory does not grow with v.
 
     `jax.vmap` of `render` draws all views at once (their tiles become one list of tiles): as fast, a fifth faster with
-    gradients, but it holds the buffers of all views.
+    gradients, but it holds the buffers of all views. mesh: of one axis, whose devices share each image.
 
     Returns a Rendering with a leading axis v. Raises: as `render`.
     """
     background = _white(gaussians) if background is None else background
     gaussians, cameras, background = at_least_float32((gaussians, cameras, background))
     if _is_traced(gaussians, cameras, background):
-        return _render_views(
-            gaussians, cameras, background, _with_default_buffers(gaussians, cameras, config), batch_size
-        )
-    fitted = fit_config(gaussians, cameras, config, margin=1.0) if config.max_pairs is None else config
-    renderings = _jitted(_render_views, 3, 4)(gaussians, cameras, background, fitted, batch_size)
-    _check_overflow(renderings, gaussians, cameras, fitted)
+        fitted = _with_default_buffers(gaussians, cameras, config)
+        return _render_views(gaussians, cameras, background, fitted, batch_size, mesh)
+    fitted = plan(gaussians, cameras, config, margin=1.0, mesh=mesh) if config.max_pairs is None else config
+    renderings = _jitted(_render_views, 3, 4, 5)(gaussians, cameras, background, fitted, batch_size, mesh)
+    _check_overflow(renderings, gaussians, cameras, fitted, mesh)
     return renderings
+
+
+def seen_from(
+    gaussians: Gaussians, cameras: Camera, config: SplatConfig = DEFAULT_CONFIG, threshold: float = constants.ALPHA_MIN
+) -> Bool[Array, " g"]:
+    """Which Gaussians weigh at least `threshold` on some pixel of some camera (leading axis v).
+
+    The others can be left out for cameras like these: an avatar's inside is never seen.
+    """
+    renderings = render_views(gaussians, cameras, dataclasses.replace(config, visibility=True))
+    return jnp.max(renderings.visibility, axis=0) >= threshold
 
 
 def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
@@ -115,32 +135,37 @@ def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
     return max(1, min(g * tiles, PAIRS_PER_GAUSSIAN * g + PAIRS_PER_TILE * tiles))
 
 
-def fit_config(
-    gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG, margin: float = 1.25
+def plan(
+    gaussians: Gaussians,
+    cameras: Camera,
+    config: SplatConfig = DEFAULT_CONFIG,
+    margin: float = 1.25,
+    mesh: Mesh | None = None,
 ) -> SplatConfig:
-    """`config` with buffers for this view, or for the largest of a batch of views, times `margin`.
+    """`config` with buffers for one camera, or for the most demanding one of a batch, times `margin`.
 
-    Sizes are rounded up to 2^i or 1.5 * 2^i, so that similar scenes share one compilation. Measures concrete arrays:
-    call it outside of transformations.
+    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. Measures concrete arrays:
+    call it outside of transformations. mesh: the one that `render` will be given, if any.
     """
-    gaussians, camera = at_least_float32((gaussians, camera))
-    rows, pairs = (round_up(int(int(most) * margin)) for most in _needed(gaussians, camera, _without_buffers(config)))
+    gaussians, cameras = at_least_float32((gaussians, cameras))
+    needed = _needed(gaussians, cameras, _without_buffers(config), _shares(mesh))
+    rows, pairs = (round_up(int(int(most) * margin)) for most in needed)
     return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
 
 
-def _render(gaussians: Gaussians, camera: Camera, background, config: SplatConfig) -> Rendering:
-    grid = TileGrid(camera.width, camera.height, config.tile_size)
+def _render(gaussians: Gaussians, camera: Camera, background, config: SplatConfig, mesh: Mesh | None) -> Rendering:
+    if config.scale != 1:
+        return _render_resized(gaussians, camera, background, config, mesh)
+    grid = _grid(camera, config)
     projected = _project(gaussians, camera, config)
     if gaussians.means.shape[0] == 0:
         blank = jnp.zeros((grid.height, grid.width, 5), projected.x.dtype).at[..., 4].set(1)
-        return _blend(blank, background, 0.0, jnp.int32(0))
+        visibility = jnp.zeros(0, blank.dtype) if config.visibility else None
+        return _blend(blank, background, 0.0, jnp.int32(0), visibility)
 
-    assert config.max_pairs is not None  # callers have fitted the buffers
     depths = jnp.where(projected.visible, lax.stop_gradient(projected.depth), jnp.inf)
     order = binning.depth_order(depths)
-    ellipses = binning.Footprints(*(plane[order] for plane in _footprints(projected, gaussians, config)))
-    pairs = binning.emit_pairs(ellipses, grid, config.max_rows or config.max_pairs, config.max_pairs)
-    lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, order.shape[0])
+    footprints = jax.tree.map(lambda plane: take(plane, order), _footprints(projected, gaussians, config))
 
     # Depths are blended relative to the nearest: their gradient is a difference of depths, which must not drown in the
     # rounding of depths.
@@ -150,22 +175,82 @@ def _render(gaussians: Gaussians, camera: Camera, background, config: SplatConfi
     seen = jnp.concatenate([gaussians.colors, behind[:, None]], axis=-1)
     splats = pack_splats(projected, gaussians.opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
-    features, transmittance = composite(splats, lists, grid, config)
-    image = tiles_to_image(jnp.concatenate([features, transmittance[:, None]], axis=1), grid)
-    return _blend(image, background, nearest, pairs.overflow)
+    tiles, peaks, overflow = (_draw if mesh is None else _draw_shared(mesh))(footprints, splats, grid, config)
+    visibility = jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True) if config.visibility else None
+    return _blend(tiles_to_image(tiles, grid), background, nearest, overflow, visibility)
 
 
-def _blend(image, background, nearest, overflow) -> Rendering:
+def _draw(footprints, splats, grid: TileGrid, config: SplatConfig, share: binning.Share = binning.WHOLE):
+    """Tiles (t, 5, p) of premultiplied features and the final T, largest weights (g,), overflow. Splats by depth."""
+    assert config.max_pairs is not None  # callers have fitted the buffers
+    pairs = binning.emit_pairs(footprints, grid, config.max_rows or config.max_pairs, config.max_pairs, share)
+    lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, splats.shape[0])
+    features, transmittance, peaks = composite(splats, lists, grid, config)
+    return jnp.concatenate([features, transmittance[:, None]], axis=1), lax.stop_gradient(peaks), pairs.overflow
+
+
+def _draw_shared(mesh: Mesh):
+    """`_draw`, each device its share of the rows of tiles: interleaved, so that all have like work."""
+    (axis,), n = mesh.axis_names, mesh.size
+
+    def draw(footprints, splats, grid: TileGrid, config: SplatConfig):
+        each = -(-grid.rows // n)
+
+        def one(footprints, splats):
+            share = binning.Share(lax.axis_index(axis), n)
+            tiles, peaks, overflow = _draw(footprints, splats, grid, config, share)
+            tiles = jnp.pad(tiles, ((0, (each * n - grid.rows) * grid.columns), (0, 0), (0, 0)))
+            own = tiles.reshape(each, n, grid.columns, *tiles.shape[1:])[:, share.index]
+            return own, lax.pmax(peaks, axis), lax.psum(overflow, axis)
+
+        shared = jax.shard_map(
+            one, mesh=mesh, in_specs=P(), out_specs=(P(axis), P(), P()), check_vma=False, axis_names={axis}
+        )
+        tiles, peaks, overflow = shared(footprints, splats)
+        tiles = tiles.reshape(n, each, *tiles.shape[1:]).swapaxes(0, 1).reshape(-1, *tiles.shape[2:])
+        return tiles[: grid.tiles], peaks, overflow
+
+    return draw
+
+
+def _render_resized(gaussians, camera, background, config, mesh) -> Rendering:
+    small = dataclasses.replace(config, scale=1.0)
+    r = _render(gaussians, _drawn_camera(camera, config), background, small, mesh)
+    premultiplied = jnp.concatenate([r.rgb, r.alpha[..., None], (r.alpha * r.depth)[..., None]], axis=-1)
+    image = jax.image.resize(premultiplied, (camera.height, camera.width, 5), "linear", antialias=False)
+    alpha = image[..., 3]
+    return Rendering(image[..., :3], alpha, safe_divide(image[..., 4], alpha), r.overflow, r.visibility)
+
+
+def _drawn_camera(camera: Camera, config: SplatConfig) -> Camera:
+    if config.scale == 1:
+        return camera
+    return camera.resized(*(max(1, round(size * config.scale)) for size in (camera.width, camera.height)))
+
+
+def _grid(camera: Camera, config: SplatConfig) -> TileGrid:
+    return TileGrid(camera.width, camera.height, config.tile_size)
+
+
+def _shares(mesh: Mesh | None) -> int:
+    if mesh is None:
+        return 1
+    if len(mesh.axis_names) != 1:
+        raise ValueError(f"the mesh must have one axis, got {mesh.axis_names}")
+    return mesh.size
+
+
+def _blend(image, background, nearest, overflow, visibility) -> Rendering:
     """image: (h, w, 5) premultiplied rgb, premultiplied z - nearest, and the final transmittance."""
     transmittance = image[..., 4]
     alpha = 1 - transmittance
     rgb = image[..., :3] + transmittance[..., None] * background
     depth = jnp.where(alpha > 0, nearest + safe_divide(image[..., 3], alpha), 0.0)
-    return Rendering(rgb, alpha, depth, overflow)
+    return Rendering(rgb, alpha, depth, overflow, visibility)
 
 
-def _render_views(gaussians, cameras, background, config, batch_size):
-    one = lambda camera: _render(gaussians, camera, background, config)
+def _render_views(gaussians, cameras, background, config, batch_size, mesh):
+    one = lambda camera: _render(gaussians, camera, background, config, mesh)
     return lax.map(one, cameras, batch_size=batch_size if batch_size > 1 else None)
 
 
@@ -176,30 +261,39 @@ def _jitted(function, *static):
 
 
 def _project(gaussians, camera, config) -> ProjectedGaussians:
-    return project(gaussians, camera, config.near, config.dilation, config.jacobian_margin)
+    return project(
+        gaussians, camera, config.near, config.dilation, config.jacobian_margin, normalize_quats=config.normalize_quats
+    )
 
 
-def _footprints(projected, gaussians, config) -> binning.Footprints:
-    return binning.footprints(projected, squared_reach(gaussians.opacities, config.alpha_min))
+def _footprints(projected, gaussians, config) -> binning.Footprints | binning.Squares:
+    reach = squared_reach(gaussians.opacities, config.alpha_min)
+    reach = jnp.where(gaussians.opacities >= config.opacity_min, reach, 0.0)
+    if config.square:
+        return binning.square_footprints(projected, reach, config.extent)
+    return binning.footprints(projected, reach if config.extent is None else jnp.minimum(reach, config.extent**2))
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _needed(gaussians, camera, config):
-    """Most rows and most pairs that any of the views needs."""
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def _needed(gaussians, cameras, config, shares):
+    """Most rows and most pairs that any of the views needs, on any of the devices that share them."""
 
     def one(camera):
-        ellipses = _footprints(_project(gaussians, camera, config), gaussians, config)
-        return binning.count_pairs(ellipses, TileGrid(camera.width, camera.height, config.tile_size))
+        camera = _drawn_camera(camera, config)
+        footprints = _footprints(_project(gaussians, camera, config), gaussians, config)
+        counts = (
+            binning.count_pairs(footprints, _grid(camera, config), binning.Share(i, shares)) for i in range(shares)
+        )
+        return [jnp.max(jnp.stack(most)) for most in zip(*counts, strict=True)]
 
-    if camera.K.ndim == 2:
-        return one(camera)
-    rows, pairs = lax.map(one, camera)
-    return jnp.max(rows, initial=0), jnp.max(pairs, initial=0)
+    if cameras.K.ndim == 2:
+        return one(cameras)
+    return [jnp.max(most, initial=0) for most in lax.map(one, cameras)]
 
 
-def _check_overflow(rendering, gaussians, camera, config):
+def _check_overflow(rendering, gaussians, cameras, config, mesh):
     if overflow := int(jnp.max(rendering.overflow, initial=0)):
-        rows, pairs = (int(most) for most in _needed(gaussians, camera, _without_buffers(config)))
+        rows, pairs = (int(most) for most in _needed(gaussians, cameras, _without_buffers(config), _shares(mesh)))
         raise ValueError(
             f"{overflow} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs} "
             f"and max_rows >= {rows}, got max_pairs = {config.max_pairs}, max_rows = {config.max_rows}"
@@ -209,7 +303,8 @@ def _check_overflow(rendering, gaussians, camera, config):
 def _with_default_buffers(gaussians, camera, config):
     if config.max_pairs is not None:
         return config
-    pairs = default_pairs(gaussians.means.shape[0], camera.width, camera.height, config.tile_size)
+    drawn = _drawn_camera(camera, config)
+    pairs = default_pairs(gaussians.means.shape[0], drawn.width, drawn.height, config.tile_size)
     return dataclasses.replace(config, max_pairs=pairs)
 
 

@@ -52,7 +52,7 @@ def from_scene(gaussians, grid, config):
     g, dtype = gaussians.means.shape[0], gaussians.means.dtype
     projected = _project(gaussians, camera(dtype, grid.width, grid.height), config)
     order = binning.depth_order(jnp.where(projected.visible, projected.depth, jnp.inf))
-    ellipses = binning.Footprints(*(plane[order] for plane in _footprints(projected, gaussians, config)))
+    ellipses = jax.tree.map(lambda plane: plane[order], _footprints(projected, gaussians, config))
     pairs = binning.emit_pairs(ellipses, grid, g * grid.tiles, g * grid.tiles)
     features = jnp.concatenate([gaussians.colors, jnp.where(projected.visible, projected.depth, 0.0)[:, None]], axis=-1)
     splats = compositing.pack_splats(projected, gaussians.opacities, features, config.alpha_min)[order]
@@ -61,16 +61,16 @@ def from_scene(gaussians, grid, config):
 
 def schedule(functions, splats, lists, grid=GRID, config=None, per_step=1024):
     """Everything a schedule computes, for a random cotangent."""
-    config = config or SplatConfig(tile_size=grid.tile_size, block=4, chunk=4, chunk_backward=4)
+    config = config or SplatConfig(tile_size=grid.tile_size, block=4, chunk=4, chunk_backward=4, visibility=True)
     forward, backward = functions
     with mock.patch.object(fat_chunks, "STEP_CHUNKS", per_step):
-        features, transmittance, lengths = forward(grid, config)(splats, *lists)
+        features, transmittance, lengths, peaks = forward(grid, config)(splats, *lists)
         rng = np.random.default_rng(5)
         g = jnp.asarray(rng.normal(size=features.shape), splats.dtype)
         g_transmittance = jnp.asarray(rng.normal(size=transmittance.shape), splats.dtype)
         total = jnp.sum(g * features, axis=1) + g_transmittance * transmittance
         sums = backward(grid, config)(splats, lists.items, lists.starts, lengths, g, total)
-    return features, transmittance, sums, lengths
+    return features, transmittance, sums, peaks, lengths
 
 
 run = jax.jit(schedule, static_argnums=(0, 3, 4, 5))
@@ -78,13 +78,13 @@ run = jax.jit(schedule, static_argnums=(0, 3, 4, 5))
 
 def assert_equal(ours, expected, counts, tolerance):
     """Channel by channel, and column by column of the sums: their sizes differ."""
-    for name, a, b in zip(("features", "transmittance", "sums"), ours, expected, strict=False):
+    for name, a, b in zip(("features", "transmittance", "sums", "peaks"), ours, expected, strict=False):
         assert a.dtype == b.dtype and a.shape == b.shape
         axes = (0, 2) if name == "features" else 0
         error = np.abs(np.asarray(a) - b).max(axis=axes) / np.maximum(np.abs(b).max(axis=axes), 1e-30)
         assert (error <= tolerance).all(), (name, error)
     # What counts of each list, in whole chunks: those of this schedule are the larger ones.
-    used, needed = np.asarray(ours[3]), np.asarray(expected[3])
+    used, needed = np.asarray(ours[-1]), np.asarray(expected[-1])
     assert (needed <= used).all() and (used < needed + K).all() and (used <= counts).all()
 
 
@@ -97,7 +97,7 @@ def test_equals_the_other_schedule(dtype, tile_size, per_step):
         splats, lists = by_hand(1, LENGTHS, dtype, grid, opacities=(0.02, 0.3))
         ours, expected = run(FAT, splats, lists, grid, None, per_step), run(THIN, splats, lists, grid)
         assert_equal(ours, expected, lists.counts, TOLERANCE[dtype])
-        ended = np.asarray(expected[3])
+        ended = np.asarray(expected[-1])
         assert K < ended[1] < 3 * K and ended[1] % K != 0  # the whole tile ends inside a chunk that is not its first
         assert not ours[0][0].any() and (ours[1][0] == 1).all()  # the empty list
 
@@ -139,7 +139,7 @@ def test_a_batch_is_one_call():
 def test_opaque_to_the_last_bit(dtype, stop):
     """1 - alpha_max is 0 in float32: its logarithm must not make a NaN elsewhere."""
     with jax.enable_x64(dtype == np.float64):
-        config = SplatConfig(alpha_max=1 - 1e-9, transmittance_stop=stop)
+        config = SplatConfig(alpha_max=1 - 1e-9, transmittance_stop=stop, visibility=True)
         splats, lists = by_hand(3, LENGTHS, dtype, opacities=(0.9, 1.0))
         ours = run(FAT, splats, lists, GRID, config)
         assert all(np.isfinite(a).all() for a in ours)

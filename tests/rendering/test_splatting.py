@@ -15,7 +15,7 @@ from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.pytree import replace
 from humangs_jax.rendering.dense import render_dense
-from humangs_jax.rendering.splatting import SplatConfig, default_pairs, fit_config, render, render_views
+from humangs_jax.rendering.splatting import SplatConfig, default_pairs, plan, render, render_views
 
 FLOAT64 = 1e-9
 """Relative to the largest entry; float64 rounding, grown by the 1 / (1 - alpha) <= 1000 of the gradient."""
@@ -227,7 +227,7 @@ def test_overflow_is_counted_under_jit_and_refused_eagerly():
 
 def test_fitted_buffers_hold_every_view():
     gaussians, cameras = random_gaussians(2, np.float32), views()
-    config = fit_config(gaussians, cameras, CHUNKS, margin=1.0)
+    config = plan(gaussians, cameras, CHUNKS, margin=1.0)
     most = max(needed(gaussians, cameras[i]) for i in range(3))
     assert most <= config.max_pairs < 1.5 * most
     assert default_pairs(COUNT, WIDTH, HEIGHT) == COUNT * 6  # never more than every Gaussian in every tile

@@ -1,0 +1,144 @@
+"""The benchmark script on a small scene whose reference is the dense oracle's, in float64."""
+
+import importlib.util
+import json
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.dense import render_dense
+from humangs_jax.rendering.gaussians import Gaussians
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+SIZE, COUNT = 40, 60
+PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
+TIMES = ("forward_ms", "forward_backward_ms", "forward_cpu_ms", "forward_backward_cpu_ms")
+FLOAT32_PSNR = 80.0  # roundings of 1e-7; a decision at 1/255 that falls the other way on one pixel costs 1e-4
+FLOAT32_GRADIENT = 1e-3
+STORED_AS_FLOAT32 = 1e-6
+
+YARDSTICK = """
+import time
+from typing import NamedTuple, Any
+class Scene(NamedTuple):
+    kind: str; size: int; means: Any; quats: Any; scales: Any; opacities: Any; colors: Any; K: Any; cam_from_world: Any
+class Yardstick:
+    def __init__(self, scene):
+        assert scene.means.shape[1:] == (3,) and scene.K.shape == (3, 3) and scene.cam_from_world.shape == (4, 4)
+        self.shape = (scene.size, scene.size, 3)
+    def forward(self):
+        time.sleep(0.01)
+    def forward_backward(self, target):
+        assert target.shape == self.shape and target.dtype == "float32"
+        time.sleep(0.02)
+"""
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """A folder with scene.npz, reference.npz and a yardstick that only sleeps."""
+    folder = tmp_path_factory.mktemp("benchmark")
+    rng = np.random.default_rng(0)
+    quats = rng.normal(size=(COUNT, 4))
+    arrays = {
+        "means": rng.uniform(-0.4, 0.4, (COUNT, 3)),
+        "quats": quats / np.linalg.norm(quats, axis=1, keepdims=True),
+        "scales": np.exp(rng.uniform(-4, -2, (COUNT, 3))),
+        "opacities": rng.uniform(0.1, 0.95, COUNT),
+        "colors": rng.uniform(size=(COUNT, 3)),
+        "cam_from_world": np.array([[1, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 3], [0, 0, 0, 1.0]]),
+        f"K_{SIZE}": np.array([[120.0, 0, SIZE / 2], [0, 120, SIZE / 2], [0, 0, 1]]),
+    }
+    arrays = {name: array.astype(np.float32) for name, array in arrays.items()}
+    np.savez(folder / "scene.npz", **arrays)
+    target = np.random.default_rng(7).random((SIZE, SIZE, 3)).astype(np.float32)
+    with jax.enable_x64(True):
+        double = {name: jnp.asarray(array, jnp.float64) for name, array in arrays.items()}
+        camera = Camera(double[f"K_{SIZE}"], double["cam_from_world"], SIZE, SIZE)
+        gaussians = Gaussians(*(double[name] for name in PARAMETERS))
+
+        def loss(gaussians):
+            image = render_dense(gaussians, camera, background=jnp.zeros(3)).rgb
+            return jnp.mean((image - target) ** 2), image
+
+        gradients, image = jax.jit(jax.grad(loss, has_aux=True))(gaussians)
+        reference = {f"grad_{name}": np.asarray(getattr(gradients, name), np.float32) for name in PARAMETERS}
+        np.savez(folder / "reference.npz", image=np.asarray(image, np.float32), target_seed=7, **reference)
+    (folder / "yardstick.py").write_text(YARDSTICK)
+    return folder
+
+
+def run(folder, *options):
+    out = folder / "out.json"
+    command = [sys.executable, EXPERIMENTS / "benchmark_splatting.py", "--scene", folder / "scene.npz"]
+    command += ["--size", str(SIZE), "--json", out, *options]
+    environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, env=environment, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(out.read_text()), done.stdout
+
+
+def test_reports_times_beside_the_yardstick_and_errors(files):
+    result, printed = run(files, "--reference", files / "reference.npz", "--yardstick", files, "--repeats", "2")
+    assert all(result[key] > 0 for key in TIMES)
+    assert set(result["yardstick"]) == set(TIMES)
+    assert 10 < result["yardstick"]["forward_ms"] < 20 < result["yardstick"]["forward_backward_ms"]
+    assert result["yardstick"]["forward_cpu_ms"] < 5  # it sleeps
+    for key in TIMES:
+        assert result["ratio"][key] == pytest.approx(result[key] / result["yardstick"][key])
+    assert 0 < result["compile_s"] < 60 and 100 < result["peak_rss_mb"] < 4000
+    assert FLOAT32_PSNR < result["psnr"] < 200
+    assert 0 <= result["fraction_above_2e-4"] < 0.01 and 0 < result["max_abs_error"] < 0.02
+    for measure in ("relative_l2", "cosine", "signed_bias", "gain"):
+        assert set(result[f"gradient_{measure}"]) == set(PARAMETERS)
+    assert all(0 < error < FLOAT32_GRADIENT for error in result["gradient_relative_l2"].values())
+    assert all(0.99999 < cosine <= 1 + 1e-9 for cosine in result["gradient_cosine"].values())
+    assert all(abs(bias) < FLOAT32_GRADIENT for bias in result["gradient_signed_bias"].values())
+    work = result["work"]
+    assert 0 < work["contributing_pairs"] <= work["pixel_pairs_in_lists"]
+    assert work["tile_pairs"] <= work["tile_pairs_capacity"]
+    assert result["config"]["tile_size"] == 8 and result["gaussians"] == COUNT
+    assert f"{result['psnr']:.1f} dB" in printed
+
+
+def test_draws_in_float64_without_a_yardstick(files):
+    result, _ = run(files, "--reference", files / "reference.npz", "--float64", "--repeats", "0")
+    assert result["yardstick"] is None and result["ratio"] is None and result["forward_ms"] is None
+    assert result["dtype"] == "float64"
+    assert result["max_abs_error"] < STORED_AS_FLOAT32
+    assert all(error < STORED_AS_FLOAT32 for error in result["gradient_relative_l2"].values())
+
+
+@pytest.fixture
+def script(monkeypatch):
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    spec = importlib.util.spec_from_file_location("benchmark_splatting", EXPERIMENTS / "benchmark_splatting.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_without_a_reference_errors_are_null(script):
+    class Drawn:
+        rgb = np.zeros((4, 4, 3))
+
+    found = script.errors({"forward": Drawn}, None)
+    assert found["psnr"] is None and found["gradient_cosine"] == dict.fromkeys(PARAMETERS)
+
+
+def test_errors_of_gradients_see_bias_and_gain(script):
+    exact = np.random.default_rng(0).normal(size=1000)
+    found = script.gradient_errors(0.9 * exact + 0.01, exact)
+    mean = np.abs(exact).mean()
+    assert found["signed_bias"] == pytest.approx((0.01 - 0.1 * exact.mean()) / mean)
+    assert found["gain"] == pytest.approx(-0.1, abs=0.01)
+    assert found["relative_l2"] == pytest.approx(math.hypot(0.1, 0.01), rel=0.05)
+    assert script.gradient_errors(-exact, exact)["cosine"] == pytest.approx(-1)
