@@ -17,6 +17,7 @@ from typing import Annotated, Literal
 
 import tyro
 
+from humangs_jax.allocator import keep_freed_memory
 from humangs_jax.training.config import TrainConfig, small
 
 SMALL = small()
@@ -64,4 +65,5 @@ def main(
 
 
 if __name__ == "__main__":
+    keep_freed_memory()
     tyro.cli(main, description=__doc__)

@@ -11,6 +11,8 @@ from typing import Literal
 
 import tyro
 
+from humangs_jax.allocator import keep_freed_memory
+
 Positional = tyro.conf.Positional
 
 
@@ -250,6 +252,7 @@ def _require_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
 def main() -> None:
     """Entry point of the console script."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # no notes of XLA's between our lines
+    keep_freed_memory()
     try:
         tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="humangs", description=__doc_summary__)
     except (ValueError, OSError) as error:
