@@ -132,12 +132,13 @@ def _conic_factor(m0, m1, dilation):
         dL/dM = -2 r^T k r M.
 
     For a needle of length l and width w, in pixels, the entries of r are of the order of 1 / w, but r's product with
-    its long axis is of the order of 1. Autodiff forms it from cov2d and its determinant and is left with
-    rounding times (l / w)^2. In
+    its long axis is of the order of 1. In
 
         (r M)_0j = r00 / yy (sum_i m1_i (m_j x m_i) + dilation m0_j),     (r M)_1j = r11 m1_j
 
-    what cancels, m_j x m_j, is not there. Nor is a square of the determinant, which overflows from 7e4 pixels on.
+    what would cancel, m_j x m_j, is not there. Autodiff sums two terms that cancel, through yy and through the
+    determinant; that is ten times less accurate, and once the determinant passes 2e19 pixels^4 (7e4 pixels square: the
+    square of the determinant overflows) one of them is lost and the gradient along the long axis is as large as across.
     """
     _, xy, yy, determinant = _covariance(m0, m1, dilation)
     regular = determinant > 0

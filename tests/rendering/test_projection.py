@@ -20,9 +20,6 @@ FLOAT64 = 1e-9
 
 FLOAT32 = 1e-5
 
-NEEDLE = 1e-3
-"""Rounding times 20,000: at a needle's end, the rounding of its direction is that many times its width."""
-
 
 @pytest.fixture
 def float64():
@@ -126,19 +123,19 @@ def test_reach_is_where_alpha_meets_its_threshold(float64):
 
 
 def test_gradient_along_the_long_axis_of_a_needle_is_accurate_in_float32():
-    """Of 12,000 pixels : 0.6 pixels. Autodiff through the determinant puts rounding times (l / w)^2 on the long axis."""
+    """12 million pixels by 600. Autodiff through the determinant makes the gradient along as large as that across."""
     n = 6
-    quats = np.stack(
-        [np.cos(angles := np.linspace(0.1, 1.5, n)), 0 * angles, 0.1 + 0 * angles, np.sin(angles)], axis=-1
-    )
-    arrays = [[0.1, 0.2, 2.0]] * n, quats, [[1000.0, 0.05, 0.05]] * n, [1.0] * n, [[1.0] * 3] * n
+    angles = np.linspace(0.1, 1.5, n)
+    quats = np.stack([np.cos(angles), 0 * angles, 0.1 + 0 * angles, np.sin(angles)], axis=-1)
+    arrays = [[0.1, 0.2, 2.0]] * n, quats, [[1e6, 50.0, 50.0]] * n, [1.0] * n, [[1.0] * 3] * n
     d = np.random.default_rng(0).normal(size=(2, n)) * 5
 
     @jax.jit
     def gradients(gaussians, view, d):
         def exponents(gaussians):
             p = project(gaussians, view)
-            return jnp.sum((p.r00 * d[0] + p.r01 * d[1]) ** 2 + (p.r11 * d[1]) ** 2)
+            u, v = p.r00 * d[0] + p.r01 * d[1], p.r11 * d[1]
+            return jnp.sum(0.1 * u * u + 0.2 * u * v + v * v)
 
         gradient = jax.grad(exponents)(gaussians)
         return gradient.scales * gaussians.scales, gradient.quats
@@ -150,7 +147,7 @@ def test_gradient_along_the_long_axis_of_a_needle_is_accurate_in_float32():
             view = jax.tree.map(lambda a, dtype=dtype: jnp.asarray(np.asarray(a), dtype), camera(np.float32))
             values[dtype] = [np.asarray(a) for a in gradients(gaussians, view, jnp.asarray(d, dtype))]
     for found, exact in zip(values[np.float32], values[np.float64], strict=True):
-        assert np.linalg.norm(found - exact) < NEEDLE * np.linalg.norm(exact)
+        assert np.linalg.norm(found - exact) < FLOAT32 * np.linalg.norm(exact)
     long, thin = np.abs(values[np.float64][0][:, 0]).max(), np.abs(values[np.float64][0][:, 1:]).max()
-    assert long < 1e-6 * thin  # what could be drowned
-    assert np.abs(values[np.float32][0][:, 0]).max() < 1e-6 * thin
+    assert long < 1e-3 * thin  # so that it could drown
+    assert np.abs(values[np.float32][0] - values[np.float64][0])[:, 0].max() < 1e-3 * long
