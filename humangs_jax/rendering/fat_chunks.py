@@ -46,6 +46,7 @@ from humangs_jax.rendering.splat_rows import (
     FEATURES,
     SPLAT_WIDTH,
     joined_over_batch,
+    largest_weights,
     moments_about_splat,
     monomials,
     product,
@@ -121,7 +122,7 @@ def forward(grid: TileGrid, config: SplatConfig):
             reached = jnp.where(jnp.max(before, axis=1) > log_stop, c.ends, 0)
             lengths = lengths.at[c.tiles].max(reached, mode="drop", indices_are_sorted=True)
             if config.visibility:
-                peaks = peaks.at[item].max(jnp.max(weights, axis=2), mode="drop")
+                peaks = peaks.at[item].max(largest_weights(weights, c.tiles, grid), mode="drop")
             return sums, lengths, peaks, _tail(c.tiles, before, since + fading)
 
         sums, lengths = jnp.zeros((t, FEATURE_COUNT + 1, p), dtype), jnp.zeros(t, jnp.int32)

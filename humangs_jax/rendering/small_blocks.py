@@ -22,6 +22,7 @@ from humangs_jax.rendering.splat_rows import (
     FEATURES,
     SPLAT_WIDTH,
     joined_over_batch,
+    largest_weights,
     moments_about_splat,
     monomials,
     product,
@@ -65,7 +66,7 @@ def forward(grid: TileGrid, config: SplatConfig):
                     weights.append(weight)
                     before = after
                 if config.visibility:
-                    highest = jnp.max(jnp.concatenate(weights, axis=1), axis=2)
+                    highest = largest_weights(jnp.concatenate(weights, axis=1), tile, grid)
                     peaks = peaks.at[item].max(highest, mode="drop")
                 for j in range(k):
                     after = transmittance * (1 - alpha[:, j])

@@ -78,6 +78,16 @@ def take_chunk(
     return item, row, jnp.stack([x, y]), lax.optimization_barrier(raw)
 
 
+def largest_weights(weights: Float[Array, "b k p"], tiles: Int[Array, " b"], grid: TileGrid) -> Float[Array, "b k"]:
+    """Of each splat on the pixels of its tile that lie inside the image."""
+    place = tiles % grid.tiles
+    x, y = (0.5 * grid.tile_size + offset for offset in grid.offsets())
+    left = jnp.minimum(grid.width - place % grid.columns * grid.tile_size, grid.tile_size)
+    above = jnp.minimum(grid.height - place // grid.columns * grid.tile_size, grid.tile_size)
+    inside = (x < left[:, None]) & (y < above[:, None])
+    return jnp.max(jnp.where(inside[:, None], weights, 0.0), axis=2)
+
+
 def visible_alpha(raw: Float[Array, "*b"], config: SplatConfig) -> Float[Array, "*b"]:
     """Alpha from its raw value: clamped above, 0 if it is skipped."""
     return jnp.where(raw < config.alpha_min, 0.0, jnp.minimum(raw, config.alpha_max))

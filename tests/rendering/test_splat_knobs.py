@@ -1,0 +1,245 @@
+"""What each knob of SplatConfig does to the image, the visibility of Gaussians, and images shared among devices."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
+
+from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.pytree import replace
+from humangs_jax.rendering import binning
+from humangs_jax.rendering.dense import render_dense
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.projection import project, squared_reach
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
+from humangs_jax.rendering.splatting import plan, render, seen_from
+
+FLOAT64 = 1e-9
+"""float64 rounding, relative to the largest entry."""
+
+BFLOAT16 = 2e-2
+"""8 bits of each factor: 2^-9 each, of sums whose terms cancel in part."""
+
+SMALL = SplatConfig(block=4, chunk=4, chunk_backward=4)
+
+
+def knobs(**values):
+    return dataclasses.replace(SMALL, **values)
+
+
+def test_visibility_is_the_largest_weight():
+    """With one colour channel that only Gaussian i has, that channel is the weight of i."""
+    with jax.enable_x64(True):
+        gaussians = random_gaussians(3)
+        weights = jax.vmap(
+            lambda i: render_dense(
+                replace(gaussians, colors=jnp.zeros((COUNT, 3)).at[i, 0].set(1.0)), camera(), background=jnp.zeros(3)
+            ).rgb[..., 0]
+        )(jnp.arange(COUNT))
+        rendering = render(gaussians, camera(), knobs(visibility=True))
+        np.testing.assert_allclose(rendering.visibility, weights.max(axis=(1, 2)), atol=FLOAT64)
+        assert render(gaussians, camera(), SMALL).visibility is None
+        empty = render(few(gaussians, np.arange(0)), camera(), knobs(visibility=True))
+        assert empty.visibility is not None and empty.visibility.shape == (0,)
+
+
+def test_visibility_passes_no_gradient():
+    gaussians, config = random_gaussians(3, np.float32), knobs(visibility=True)
+    gradient = jax.grad(lambda g: jnp.sum(render(g, camera(np.float32), config).visibility))(gaussians)
+    assert all((leaf == 0).all() for leaf in jax.tree.leaves(gradient))
+
+
+def wall_before(gaussians):
+    """An opaque wall, in three layers, between one camera and the Gaussians; another camera looks past it."""
+    n = 3
+    wall = Gaussians(
+        jnp.asarray([[0, 0, 1.0 + 0.01 * i] for i in range(n)]),
+        jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (n, 1)),
+        jnp.tile(jnp.asarray([5.0, 5.0, 1e-3]), (n, 1)),
+        jnp.full(n, 0.999),
+        jnp.ones((n, 3)),
+        jnp.tile(jnp.eye(3), (n, 1, 1)),
+    )
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wall, gaussians)
+
+
+def test_seen_from_keeps_what_any_camera_sees():
+    with jax.enable_x64(True):
+        scene = wall_before(few(random_gaussians(4), np.arange(15, COUNT)))
+        front = camera()
+        beyond = replace(front, cam_from_world=front.cam_from_world.at[2, 3].add(-1.3))
+        hidden = seen_from(scene, stack_cameras([front]), SMALL)
+        assert hidden[0] and not hidden[3:].any()
+        assert seen_from(scene, stack_cameras([front, beyond]), SMALL)[3:].any()
+        kept = few(scene, np.flatnonzero(hidden))
+        limit = np.count_nonzero(~hidden) / 255  # each may have weighed up to 1 / 255
+        difference = np.abs(render(kept, front, SMALL).rgb - render(scene, front, SMALL).rgb).max()
+        assert difference <= limit
+        assert difference < 1e-2
+
+
+def test_opacity_min_drops_the_faint():
+    with jax.enable_x64(True):
+        gaussians = random_gaussians(5)
+        strong = few(gaussians, np.flatnonzero(np.asarray(gaussians.opacities) >= 0.3))
+        assert len(strong.means) < COUNT
+        dropped, expected = render(gaussians, camera(), knobs(opacity_min=0.3)), render(strong, camera(), SMALL)
+        np.testing.assert_allclose(dropped.rgb, expected.rgb, atol=FLOAT64)
+
+
+def test_extent_cuts_whole_tiles_only():
+    with jax.enable_x64(True):
+        gaussians = replace(random_gaussians(6), opacities=jnp.full(COUNT, 0.9))
+        view = camera(width=96, height=64)
+        exact = render(gaussians, view, SMALL)
+        wide = render(gaussians, view, knobs(extent=10.0))
+        np.testing.assert_array_equal(wide.rgb, exact.rgb)
+        narrow = render(gaussians, view, knobs(extent=2.0))
+        assert 1e-3 < np.abs(narrow.rgb - exact.rgb).max() < 0.9 * np.exp(-2) * 8  # what lies beyond two deviations
+        assert plan(gaussians, view, knobs(extent=2.0)).max_pairs < plan(gaussians, view, SMALL).max_pairs
+
+
+def test_scale_draws_the_smaller_image():
+    with jax.enable_x64(True):
+        gaussians, view = random_gaussians(7), camera(width=2 * WIDTH, height=2 * HEIGHT)
+        half = render(gaussians, view.resized(WIDTH, HEIGHT), SMALL)
+        ours = render(gaussians, view, knobs(scale=0.5))
+        assert ours.rgb.shape == (2 * HEIGHT, 2 * WIDTH, 3) and ours.alpha.shape == ours.depth.shape
+        expected = jax.image.resize(half.rgb, ours.rgb.shape, "linear")
+        np.testing.assert_allclose(ours.rgb, expected, atol=FLOAT64)
+        seen = np.asarray(ours.alpha) > 0
+        low, high = half.depth[half.alpha > 0].min(), half.depth.max()
+        assert (ours.depth[seen] >= low - FLOAT64).all() and (ours.depth[seen] <= high + FLOAT64).all()
+        assert plan(gaussians, view, knobs(scale=0.5)).max_pairs <= plan(gaussians, view, SMALL).max_pairs
+
+
+def test_narrow_products_round_only_gradients():
+    gaussians, view = random_gaussians(8, np.float32), camera(np.float32)
+    gaussians = replace(gaussians, means=gaussians.means.at[10].set(gaussians.means[15]))  # none at the near plane
+
+    def run(config):
+        loss = lambda g: jnp.sum(jnp.square(render(g, view, config).rgb - 0.3))
+        return render(gaussians, view, config).rgb, jax.jit(jax.grad(loss))(gaussians)
+
+    (exact, gradient), (image, rounded) = run(SMALL), run(knobs(products="bfloat16"))
+    np.testing.assert_array_equal(image, exact)
+    for a, b in zip(jax.tree.leaves(rounded), jax.tree.leaves(gradient), strict=True):
+        error = np.linalg.norm(a - b) / np.linalg.norm(b)
+        assert 0 < error < BFLOAT16
+
+
+@pytest.mark.parametrize(("name", "most"), [("near_exact", 0.01), ("fast", 0.05), ("inria", 0.02)])
+def test_presets_draw_nearly_the_same(name, most):
+    gaussians, view = few(random_gaussians(9, np.float32), np.arange(15, COUNT)), camera(np.float32)
+    gaussians = replace(gaussians, quats=gaussians.quats / jnp.linalg.norm(gaussians.quats, axis=1, keepdims=True))
+    exact, ours = (render(gaussians, view, SPLAT_PRESETS[preset]) for preset in ("exact", name))
+    assert SPLAT_PRESETS["exact"] == SplatConfig()
+    assert 0 < np.abs(ours.rgb - exact.rgb).mean() < most
+
+
+def test_one_plan_serves_an_animation():
+    gaussians, view = random_gaussians(10, np.float32), camera(np.float32)
+    drawn = jax.jit(render, static_argnums=2)
+    config = plan(gaussians, view, SMALL)
+    for step in range(4):
+        moved = replace(gaussians, means=gaussians.means + 0.02 * step)
+        assert plan(moved, view, SMALL) == config
+        assert drawn(moved, view, config).overflow == 0
+    assert drawn._cache_size() == 1
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_shares_partition_the_pairs(count):
+    gaussians = random_gaussians(2, np.float32)
+    view, grid = camera(np.float32), binning.TileGrid(WIDTH, HEIGHT, 4)
+    footprints = binning.footprints(project(gaussians, view), squared_reach(gaussians.opacities))
+    emit = jax.jit(lambda share: binning.emit_pairs(footprints, grid, 2048, 4096, binning.Share(share, count)))
+    whole = binning.emit_pairs(footprints, grid, 2048, 4096)
+    parts = [emit(jnp.int32(i)) for i in range(count)]
+    listed = lambda p: set(zip(*(np.asarray(a)[np.asarray(p.tiles) < grid.tiles].tolist() for a in p[:2]), strict=True))
+    assert sum(int(p.needed) for p in parts) == int(whole.needed) == len(listed(whole))
+    assert set().union(*map(listed, parts)) == listed(whole)
+    for i, part in enumerate(parts):
+        assert {tile // grid.columns % count for tile, _ in listed(part)} <= {i}
+        rows, pairs = jax.jit(lambda share: binning.count_pairs(footprints, grid, binning.Share(share, count)))(i)
+        assert int(pairs) == int(part.needed) and int(rows) >= 1
+
+
+SHARED = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import jax
+jax.config.update("jax_platforms", "cpu")
+jax.config.update("jax_num_cpu_devices", 3)
+jax.config.update("jax_enable_x64", True)
+import dataclasses
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+from splat_scenes import camera, random_gaussians
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.splatting import SplatConfig, plan, render, render_views
+
+gaussians, view = random_gaussians(1), camera(width=37, height=45)
+config = SplatConfig(block=4, chunk=4, chunk_backward=4, visibility=True)
+
+def loss(arguments, config, mesh):
+    gaussians, K, background = arguments
+    r = render(gaussians, Camera(K, view.cam_from_world, view.width, view.height), config, background, mesh)
+    return jnp.sum(r.rgb**2) + jnp.sum(r.depth * r.alpha)
+
+def close(a, b):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, atol=1e-9 * max(1, np.abs(y).max()))
+
+alone = render(gaussians, view, config)
+arguments = gaussians, view.K, jnp.asarray([0.1, 0.5, 0.9])
+expected = jax.jit(jax.grad(loss), static_argnums=(1, 2))(arguments, plan(gaussians, view, config), None)
+mesh = Mesh(np.asarray(jax.devices()), ("rows",))
+close(render(gaussians, view, config, mesh=mesh), alone)
+planned = plan(gaussians, view, config, mesh=mesh)
+assert planned.max_pairs < plan(gaussians, view, config).max_pairs
+close(jax.jit(jax.grad(loss), static_argnums=(1, 2))(arguments, planned, mesh), expected)
+try:
+    render(gaussians, view, dataclasses.replace(planned, max_pairs=10), mesh=mesh)
+except ValueError as error:
+    assert "max_pairs >=" in str(error)
+else:
+    raise AssertionError("an overflow went by")
+views = Camera(jnp.stack([view.K, view.K]), jnp.stack([view.cam_from_world] * 2), view.width, view.height)
+close(render_views(gaussians, views, config, mesh=mesh).rgb[1], alone.rgb)
+print("shared")
+"""
+
+
+def test_devices_share_an_image():
+    """Devices of a CPU must be asked for before JAX starts: hence a process of its own."""
+    here = str(Path(__file__).parent)
+    done = subprocess.run([sys.executable, "-c", SHARED, here], capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and done.stdout.split() == ["shared"], done.stderr[-3000:]
+
+
+def test_a_mesh_of_two_axes_is_refused():
+    mesh = jax.make_mesh((1, 1), ("a", "b"))
+    with pytest.raises(ValueError, match=r"one axis, got \('a', 'b'\)"):
+        render(random_gaussians(0, np.float32), camera(np.float32), SMALL, mesh=mesh)
+
+
+def test_settings_are_checked():
+    for wrong in ({"extent": 0.0}, {"square": True}, {"scale": 0.0}, {"products": "float8"}):
+        with pytest.raises(ValueError, match="SplatConfig"):
+            SplatConfig(**wrong)
+
+
+def test_cameras_of_a_batch_are_planned_together():
+    gaussians = random_gaussians(2, np.float32)
+    near = camera(np.float32)
+    far = Camera(near.K, near.cam_from_world.at[2, 3].add(3.0), WIDTH, HEIGHT)
+    both = plan(gaussians, stack_cameras([near, far]), SMALL)
+    assert both == max((plan(gaussians, c, SMALL) for c in (near, far)), key=lambda c: c.max_pairs)
