@@ -32,7 +32,7 @@ def render_dense(
     config: SplatConfig = DEFAULT_CONFIG,
     background: Float[Array, "3"] | None = None,
 ) -> Rendering:
-    """Same arguments and meaning as `splatting.render`; buffers and schedule of `config` play no part."""
+    """Same arguments and meaning as `splatting.render`; of `config`, only what decides on what is drawn plays a part."""
     if background is None:
         background = jnp.ones(3, gaussians.means.dtype)
     gaussians, camera, background = at_least_float32((gaussians, camera, background))
@@ -72,7 +72,7 @@ def _project(gaussians, camera, config):
     Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + dilation I.
     """
     p = transform.apply(camera.cam_from_world, gaussians.means)
-    visible = p[:, 2] > config.near
+    visible = (p[:, 2] > config.near) & (gaussians.opacities >= config.opacity_min)
     depths = jnp.where(visible, p[:, 2], 1.0)
     slopes = jnp.where(visible[:, None], p[:, :2], 0.0) / depths[:, None]
     focal, center = jnp.stack([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
@@ -87,7 +87,7 @@ def _project(gaussians, camera, config):
     )
     jacobian = focal[:, None] * jacobian / depths[:, None, None]
     image_from_world = jacobian @ camera.cam_from_world[:3, :3]
-    axes = image_from_world @ covariance_factors(gaussians)
+    axes = image_from_world @ covariance_factors(gaussians, config.normalize_quats)
     small = jnp.all(jnp.abs(axes) < LARGEST_FOOTPRINT, axis=(1, 2))
     return slopes * focal + center, jnp.where(small[:, None, None], axes, 0.0), depths, visible & small
 
