@@ -32,6 +32,7 @@ from humangs_jax.rendering.compositing import composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import ProjectedGaussians, project, squared_reach
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
+from humangs_jax.rendering.splat_rows import FEATURE_COUNT
 from humangs_jax.rendering.tiling import TileGrid, sort_into_tiles, take, tiles_to_image
 
 __all__ = ["Rendering", "SplatConfig", "default_pairs", "plan", "render", "render_views", "seen_from"]
@@ -159,9 +160,9 @@ def _render(gaussians: Gaussians, camera: Camera, background, config: SplatConfi
     grid = _grid(camera, config)
     projected = _project(gaussians, camera, config)
     if gaussians.means.shape[0] == 0:
-        blank = jnp.zeros((grid.height, grid.width, 5), projected.x.dtype).at[..., 4].set(1)
+        blank = jnp.zeros((grid.tiles, FEATURE_COUNT, grid.pixels), projected.x.dtype)
         visibility = jnp.zeros(0, blank.dtype) if config.visibility else None
-        return _blend(blank, background, 0.0, jnp.int32(0), visibility)
+        return _blend(blank, 1 + blank[:, :1], grid, background, 0.0, jnp.int32(0), visibility)
 
     depths = jnp.where(projected.visible, lax.stop_gradient(projected.depth), jnp.inf)
     order = binning.depth_order(depths)
@@ -175,18 +176,22 @@ def _render(gaussians: Gaussians, camera: Camera, background, config: SplatConfi
     seen = jnp.concatenate([gaussians.colors, behind[:, None]], axis=-1)
     splats = pack_splats(projected, gaussians.opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
-    tiles, peaks, overflow = (_draw if mesh is None else _draw_shared(mesh))(footprints, splats, grid, config)
+    draw = _draw if mesh is None else _draw_shared(mesh)
+    features, transmittance, peaks, overflow = draw(footprints, splats, grid, config)
     visibility = jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True) if config.visibility else None
-    return _blend(tiles_to_image(tiles, grid), background, nearest, overflow, visibility)
+    return _blend(features, transmittance, grid, background, nearest, overflow, visibility)
 
 
 def _draw(footprints, splats, grid: TileGrid, config: SplatConfig, share: binning.Share = binning.WHOLE):
-    """Tiles (t, 5, p) of premultiplied features and the final T, largest weights (g,), overflow. Splats by depth."""
+    """Tiles of premultiplied features (t, 4, p) and the final T (t, 1, p), largest weights (g,), overflow.
+
+    Footprints and splats in depth order.
+    """
     assert config.max_pairs is not None  # callers have fitted the buffers
     pairs = binning.emit_pairs(footprints, grid, config.max_rows or config.max_pairs, config.max_pairs, share)
     lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, splats.shape[0])
     features, transmittance, peaks = composite(splats, lists, grid, config)
-    return jnp.concatenate([features, transmittance[:, None]], axis=1), lax.stop_gradient(peaks), pairs.overflow
+    return features, transmittance[:, None], lax.stop_gradient(peaks), pairs.overflow
 
 
 def _draw_shared(mesh: Mesh):
@@ -198,17 +203,22 @@ def _draw_shared(mesh: Mesh):
 
         def one(footprints, splats):
             share = binning.Share(lax.axis_index(axis), n)
-            tiles, peaks, overflow = _draw(footprints, splats, grid, config, share)
+            *tiles, peaks, overflow = _draw(footprints, splats, grid, config, share)
+            return [own_rows(t, share.index) for t in tiles], lax.pmax(peaks, axis), lax.psum(overflow, axis)
+
+        def own_rows(tiles, index):
             tiles = jnp.pad(tiles, ((0, (each * n - grid.rows) * grid.columns), (0, 0), (0, 0)))
-            own = tiles.reshape(each, n, grid.columns, *tiles.shape[1:])[:, share.index]
-            return own, lax.pmax(peaks, axis), lax.psum(overflow, axis)
+            return tiles.reshape(each, n, grid.columns, *tiles.shape[1:])[:, index]
+
+        def joined(rows):
+            tiles = rows.reshape(n, each, *rows.shape[1:]).swapaxes(0, 1).reshape(-1, *rows.shape[2:])
+            return tiles[: grid.tiles]
 
         shared = jax.shard_map(
             one, mesh=mesh, in_specs=P(), out_specs=(P(axis), P(), P()), check_vma=False, axis_names={axis}
         )
         tiles, peaks, overflow = shared(footprints, splats)
-        tiles = tiles.reshape(n, each, *tiles.shape[1:]).swapaxes(0, 1).reshape(-1, *tiles.shape[2:])
-        return tiles[: grid.tiles], peaks, overflow
+        return *map(joined, tiles), peaks, overflow
 
     return draw
 
@@ -240,13 +250,16 @@ def _shares(mesh: Mesh | None) -> int:
     return mesh.size
 
 
-def _blend(image, background, nearest, overflow, visibility) -> Rendering:
-    """image: (h, w, 5) premultiplied rgb, premultiplied z - nearest, and the final transmittance."""
-    transmittance = image[..., 4]
+def _blend(features, transmittance, grid, background, nearest, overflow, visibility) -> Rendering:
+    """features: (t, 4, p) premultiplied rgb and z - nearest. transmittance: (t, 1, p) the final one.
+
+    Tile by tile, and each output on its own: an output that nobody reads then costs nothing, nor does its gradient.
+    """
     alpha = 1 - transmittance
-    rgb = image[..., :3] + transmittance[..., None] * background
-    depth = jnp.where(alpha > 0, nearest + safe_divide(image[..., 3], alpha), 0.0)
-    return Rendering(rgb, alpha, depth, overflow, visibility)
+    rgb = features[:, :3] + transmittance * background[:, None]
+    depth = jnp.where(alpha > 0, nearest + safe_divide(features[:, 3:], alpha), 0.0)
+    rgb, alpha, depth = (tiles_to_image(tiles, grid) for tiles in (rgb, alpha, depth))
+    return Rendering(rgb, alpha[..., 0], depth[..., 0], overflow, visibility)
 
 
 def _render_views(gaussians, cameras, background, config, batch_size, mesh):
