@@ -28,7 +28,7 @@ from jax import lax
 from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.pytree import pytree_dataclass
-from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum
+from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, owners
 
 SPAN_SLACK = 16
 """Spans of pixels are widened by this many roundings of the coordinates; the edge functions decide."""
@@ -209,13 +209,8 @@ def _weights_by_pixel(corners, face_ids, width, pixels_per_step):
 
 
 def _window(first, end, start, size):
-    """Slots start .. start + size of items that own the slots first .. end: item of each, its place in the item, used or not.
-
-    As many items begin at or before a slot as the running sum of marks says, and the last of them owns the slot: items
-    without slots begin together with the next one that has any. (Exact below 2^24 items, see `cumsum`.)
-    """
-    marks = jnp.zeros(size, jnp.int32).at[jnp.maximum(first - start, 0)].add(1, mode="drop")
-    item = cumsum(marks) - 1
+    """Slots start .. start + size of items that own the slots first .. end: item of each, its place in the item, used or not."""
+    item = owners(first, size, start)
     slot = start + jnp.arange(size, dtype=jnp.int32)
     return item, slot - first[item], slot < end[-1]
 

@@ -146,9 +146,17 @@ def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
         return Expansion(jnp.zeros(capacity, jnp.int32), counts, jnp.zeros((), jnp.int32))
     end = materialized(cumsum(counts))
     first = end - counts
-    # A slot belongs to the last item that starts at or before it, so its number is how many items but the first do.
-    marks = jnp.zeros(capacity, jnp.int32).at[first[1:]].add(1, mode="drop")
-    return Expansion(materialized(cumsum(marks)), first, end[-1])
+    return Expansion(owners(first, capacity), first, end[-1])
+
+
+def owners(first: Int[Array, " n"], size: int, start: Int[Array, ""] | int = 0) -> Int[Array, " size"]:
+    """Which item owns each of the slots start .. start + size, if item i owns those from first[i] to first[i + 1].
+
+    As many items begin at or before a slot as the running sum of marks says, and the last of them owns the slot: items
+    without slots begin together with the next one that has any. (Exact below 2^24 items, see `cumsum`.)
+    """
+    marks = jnp.zeros(size, jnp.int32).at[jnp.maximum(first - start, 0)].add(1, mode="drop")
+    return materialized(cumsum(marks) - 1)
 
 
 def take(table: Shaped[Array, "n *rest"], indices: Int[Array, " slots"]) -> Shaped[Array, "slots *rest"]:
