@@ -15,7 +15,8 @@ from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
-from humangs_jax.rendering.splatting import Rendering, render
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splatting import BufferOverflowError, Rendering, plan, render
 
 VERTICAL_FOV = np.pi / 6
 """Narrow enough that a person keeps natural proportions."""
@@ -32,9 +33,27 @@ posed = jax.jit(skin)
 def draw(
     avatar: Avatar, poses: Iterator[BodyPose], cameras: Iterator[Camera], background: Float[Array, "3"] | None = None
 ) -> Iterator[Rendering]:
-    """One rendering per pose and camera. Compiles once per image size, and again only if a frame needs more room."""
-    for pose, camera in zip(poses, cameras, strict=True):
-        yield render(posed(avatar, pose), camera, background=background)
+    """One rendering per pose and camera."""
+    return draw_gaussians((posed(avatar, pose) for pose in poses), cameras, background)
+
+
+def draw_gaussians(
+    gaussians: Iterator[Gaussians], cameras: Iterator[Camera], background: Float[Array, "3"] | None = None
+) -> Iterator[Rendering]:
+    """One rendering per frame of Gaussians and camera.
+
+    Plans for the first frame with room to spare: compiles once per image size, and again only if a frame needs more
+    room than that.
+    """
+    config = None
+    for frame, camera in zip(gaussians, cameras, strict=True):
+        config = config or plan(frame, camera)
+        try:
+            rendering = render(frame, camera, config, background)
+        except BufferOverflowError:
+            config = plan(frame, camera)
+            rendering = render(frame, camera, config, background)
+        yield rendering
 
 
 def motion_frames(

@@ -35,7 +35,16 @@ from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
 from humangs_jax.rendering.splat_rows import FEATURE_COUNT
 from humangs_jax.rendering.tiling import TileGrid, sort_into_tiles, take, tiles_to_image
 
-__all__ = ["Rendering", "SplatConfig", "default_pairs", "plan", "render", "render_views", "seen_from"]
+__all__ = [
+    "BufferOverflowError",
+    "Rendering",
+    "SplatConfig",
+    "default_pairs",
+    "plan",
+    "render",
+    "render_views",
+    "seen_from",
+]
 
 CPU_COMPILER_OPTIONS = {
     "xla_cpu_prefer_vector_width": 512,
@@ -49,6 +58,10 @@ not reach a jit inside a jit, so your own needs them itself."""
 PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
 """Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024
 x 1024, where its 16,384 tiles add another 5 each."""
+
+
+class BufferOverflowError(ValueError):
+    """A view needs larger buffers than its configuration has."""
 
 
 @pytree_dataclass
@@ -80,8 +93,8 @@ def render(
     background: (3,) RGB; None: white. mesh: of one axis, whose devices share the image's rows of tiles; None: one
     device draws it all.
 
-    Raises: ValueError if an eager call overflows `config.max_pairs` or `max_rows`. Inside a transformation the missing
-    pairs are counted in `Rendering.overflow` instead.
+    Raises: BufferOverflowError if an eager call overflows `config.max_pairs` or `max_rows`. Inside a transformation the
+    missing pairs are counted in `Rendering.overflow` instead.
     """
     background = _white(gaussians) if background is None else background
     gaussians, camera, background = at_least_float32((gaussians, camera, background))
@@ -307,7 +320,7 @@ def _needed(gaussians, cameras, config, shares):
 def _check_overflow(rendering, gaussians, cameras, config, mesh):
     if overflow := int(jnp.max(rendering.overflow, initial=0)):
         rows, pairs = (int(most) for most in _needed(gaussians, cameras, _without_buffers(config), _shares(mesh)))
-        raise ValueError(
+        raise BufferOverflowError(
             f"{overflow} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs} "
             f"and max_rows >= {rows}, got max_pairs = {config.max_pairs}, max_rows = {config.max_rows}"
         )

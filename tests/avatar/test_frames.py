@@ -1,0 +1,39 @@
+"""Frames of an animation: one plan of buffers, made anew only for a frame that needs more room."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.avatar import frames
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splatting import render
+
+ROUNDING = 1e-6
+"""float32; other buffers are other programs."""
+
+
+def blobs(count=80):
+    rng = np.random.default_rng(0)
+    means = np.concatenate([rng.uniform(-0.5, 0.5, (count, 2)), rng.uniform(3, 4, (count, 1))], axis=1)
+    quats = np.tile([1.0, 0, 0, 0], (count, 1))
+    arrays = means, quats, np.full((count, 3), 0.02), np.full(count, 0.8), rng.uniform(size=(count, 3))
+    return Gaussians(*(jnp.asarray(a, jnp.float32) for a in arrays))
+
+
+def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
+    plans, gaussians = [], blobs()
+    real = frames.plan
+    monkeypatch.setattr(frames, "plan", lambda *arguments: plans.append(1) or real(*arguments))
+    focal = [20.0, 20.5, 400.0, 21.0]  # the third one comes close
+    cameras = [Camera(jnp.asarray([[f, 0, 32], [0, f, 32], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64) for f in focal]
+    drawn = list(frames.draw_gaussians(iter([gaussians] * 4), iter(cameras)))
+    assert len(plans) == 2
+    for rendering, camera in zip(drawn, cameras, strict=True):
+        np.testing.assert_allclose(rendering.rgb, render(gaussians, camera).rgb, atol=ROUNDING)
+        assert rendering.overflow == 0 and rendering.alpha.max() > 0.5
+
+
+def test_each_frame_needs_a_camera():
+    with pytest.raises(ValueError, match="zip"):
+        list(frames.draw_gaussians(iter([blobs()]), iter([])))
