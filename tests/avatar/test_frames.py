@@ -26,7 +26,7 @@ def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
     real = frames.plan
     monkeypatch.setattr(frames, "plan", lambda *arguments: plans.append(1) or real(*arguments))
     focal = [5.0, 5.2, 150.0, 6.0]  # the third one comes close
-    cameras = [Camera(jnp.asarray([[f, 0, 32], [0, f, 32], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64) for f in focal]
+    cameras = [Camera(jnp.asarray([[f, 0, 36], [0, f, 36], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64) for f in focal]
     drawn = list(frames.draw_gaussians(iter([gaussians] * 4), iter(cameras)))
     assert len(plans) == 2
     for rendering, camera in zip(drawn, cameras, strict=True):
