@@ -53,7 +53,8 @@ from humangs_jax.rendering.splat_rows import (
     moments_about_splat,
     monomials,
     product,
-    take_chunk,
+    raw_alpha,
+    take_rows,
     visible_alpha,
 )
 from humangs_jax.rendering.tiling import TileGrid, expand
@@ -114,7 +115,7 @@ def forward(grid: TileGrid, config: SplatConfig):
         def draw(i, carry):
             sums, lengths, peaks, tail = carry
             c = _slice(chunks, i, step)
-            item, row, _, raw = take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
+            item, row, _, raw = _take(splats, items, c, grid)
             alpha, fading = _fading(raw, config)
             before, since = _sums_before(fading, c.tiles, tail)
             live = before[:, None] + since + fading > log_stop
@@ -154,7 +155,7 @@ def backward(grid: TileGrid, config: SplatConfig):
         def draw(i, carry):
             sums, faded_tail, seen_tail = carry
             c = _slice(chunks, i, step)
-            item, row, offset, raw = take_chunk(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
+            item, row, centre, raw = _take(splats, items, c, grid)
             g, total = (v.at[c.tiles].get(mode="fill", fill_value=0) for v in (cotangents, totals))
             alpha, fading = _fading(raw, config)
             before, since = _sums_before(fading, c.tiles, faded_tail)
@@ -170,7 +171,7 @@ def backward(grid: TileGrid, config: SplatConfig):
 
             moments = product(slopes.reshape(-1, p), powers, config).reshape(step, CHUNK, 6)
             features = product(weights, jnp.moveaxis(g, 1, 2), config)
-            rows = jnp.concatenate([moments_about_splat(moments, *offset), features], axis=-1)
+            rows = jnp.concatenate([moments_about_splat(moments, *centre), features], axis=-1)
             tails = (
                 _tail(c.tiles, b, s + own) for b, s, own in ((before, since, fading), (seen_before, seen_since, gained))
             )
@@ -199,6 +200,13 @@ def _log_stop(config):
 def _slice(chunks, i, step):
     parts = (lax.dynamic_slice_in_dim(v, i * step, step) for v in chunks[:-1])
     return Chunks(*parts, chunks.steps)
+
+
+def _take(splats, items, c, grid):
+    """Of each chunk: the numbers, rows and centres of its splats, and raw alphas, which XLA fuses where it likes."""
+    item, row, centre = take_rows(splats, items, c.starts, c.counts, c.tiles, grid, CHUNK)
+    inside = jnp.arange(CHUNK, dtype=jnp.int32) < c.counts[:, None]
+    return item, row, centre, raw_alpha(row, centre, inside, grid)
 
 
 def _fading(raw, config):

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.array_types import Array, Bool, Float, Int
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import TileGrid
 
@@ -44,7 +44,7 @@ def joined_over_batch(function):
     return function
 
 
-def take_chunk(
+def take_rows(
     splats: Float[Array, "g 10"],
     items: Int[Array, " capacity"],
     starts: Int[Array, " b"],
@@ -52,11 +52,10 @@ def take_chunk(
     tiles: Int[Array, " b"],
     grid: TileGrid,
     k: int,
-) -> tuple[Int[Array, "b k"], Float[Array, "b k 10"], Float[Array, "2 b k"], Float[Array, "b k p"]]:
+) -> tuple[Int[Array, "b k"], Float[Array, "b k 10"], Float[Array, "2 b k"]]:
     """The first k splats of each of b lists, `items[starts : starts + counts]`, which lie on `tiles`.
 
-    Returns their numbers (g past the end of a list), rows, centres from that of the tile, and raw alphas on its pixels
-    (0 past the end).
+    Returns their numbers (g past the end of a list), rows, and centres from that of the tile.
     """
     slot = jnp.arange(k, dtype=jnp.int32)
     item = items.at[starts[:, None] + slot].get(mode="clip")
@@ -67,15 +66,35 @@ def take_chunk(
         (axis * grid.tile_size).astype(row.dtype)[:, None] + 0.5 * grid.tile_size
         for axis in (place % grid.columns, place // grid.columns)
     )
-    x, y, r00, r01, r11 = row[..., X] - cx, row[..., Y] - cy, row[..., R00], row[..., R01], row[..., R11]
+    return item, row, jnp.stack([row[..., X] - cx, row[..., Y] - cy])
+
+
+def raw_alpha(
+    row: Float[Array, "*b 10"], centre: Float[Array, "2 *b"], inside: Bool[Array, "*b"], grid: TileGrid
+) -> Float[Array, "*b p"]:
+    """Raw alphas on the pixels of a tile of splats with a `centre` from the tile's; 0 of those not `inside` a list."""
+    x, y = centre
+    r00, r01, r11 = row[..., R00], row[..., R01], row[..., R11]
     offsets = jnp.asarray(grid.offsets(row.dtype))
     u = (r00 * x + r01 * y)[..., None] - r00[..., None] * offsets[0] - r01[..., None] * offsets[1]
     v = (r11 * y)[..., None] - r11[..., None] * offsets[1]
-    raw = jnp.exp(row[..., LOG_OPACITY, None] - u * u - v * v)
-    raw = jnp.where((slot < counts[:, None])[..., None], raw, 0.0)
-    # One kernel with one exp per pair: without the barrier XLA would fuse exp into each of its consumers, where other
-    # roundings could also let them disagree on what is skipped.
-    return item, row, jnp.stack([x, y]), lax.optimization_barrier(raw)
+    return jnp.where(inside[..., None], jnp.exp(row[..., LOG_OPACITY, None] - u * u - v * v), 0.0)
+
+
+def take_chunk(
+    splats: Float[Array, "g 10"],
+    items: Int[Array, " capacity"],
+    starts: Int[Array, " b"],
+    counts: Int[Array, " b"],
+    tiles: Int[Array, " b"],
+    grid: TileGrid,
+    k: int,
+) -> tuple[Int[Array, "b k"], Float[Array, "b k 10"], Float[Array, "2 b k"], Float[Array, "b k p"]]:
+    """`take_rows` and the raw alphas of these splats, 0 past the end of a list."""
+    item, row, centre = take_rows(splats, items, starts, counts, tiles, grid, k)
+    raw = raw_alpha(row, centre, jnp.arange(k, dtype=jnp.int32) < counts[:, None], grid)
+    # One kernel with one exp per pair: without the barrier XLA would fuse exp into each of its consumers.
+    return item, row, centre, lax.optimization_barrier(raw)
 
 
 def largest_weights(weights: Float[Array, "b k p"], tiles: Int[Array, " b"], grid: TileGrid) -> Float[Array, "b k"]:
