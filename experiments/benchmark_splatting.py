@@ -82,7 +82,7 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
     reference = load_reference(arguments.reference, arguments.size) if arguments.reference else None
     target = make_target(arguments.size, reference.seed if reference else 1)
     config = planned(scene, arguments.preset, arguments.config, arguments.margin, dtype, mesh)
-    programs, compile_s = compiled(scene, target, config, dtype, mesh)
+    programs, facts = compiled(scene, target, config, dtype, mesh)
 
     runs = dict(programs)
     if arguments.yardstick:
@@ -94,7 +94,9 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
     result["ratio"] = result["yardstick"] and {
         key: result[key] / theirs if theirs else None for key, theirs in result["yardstick"].items()
     }
-    result |= {"compile_s": max(compile_s.values()), "compile_s_each": compile_s, "peak_rss_mb": peak_rss_mb()}
+    each = {key: {name: fact[key] for name, fact in facts.items()} for key in ("compile_s", "temporary_mb")}
+    result |= {"compile_s": max(each["compile_s"].values()), "compile_s_each": each["compile_s"]}
+    result |= {"peak_rss_mb": peak_rss_mb(), "temporary_mb": each["temporary_mb"]}
     result |= errors(programs, reference)
     result |= {"work": work(scene, config, dtype), "config": dataclasses.asdict(config)}
     result |= {
@@ -124,8 +126,8 @@ def planned(
 
 def compiled(
     scene: Scene, target: np.ndarray, config: Any, dtype: type = np.float32, mesh: Any = None
-) -> tuple[dict[str, Callable[[], Any]], dict[str, float]]:
-    """Our two programs, bound to the scene, and how long each took to compile, seconds.
+) -> tuple[dict[str, Callable[[], Any]], dict[str, dict[str, float]]]:
+    """Our two programs, bound to the scene, and for each how long it took to compile and how much it holds while it runs.
 
     forward() -> Rendering. forward_backward() -> (loss, gradients as Gaussians). Both wait for their results.
     """
@@ -144,13 +146,17 @@ def compiled(
         return jnp.mean((forward(gaussians).rgb - goal) ** 2)
 
     options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
-    programs, seconds = {}, {}
+    programs, facts = {}, {}
     for name, function in zip(DIRECTIONS, (forward, jax.value_and_grad(loss)), strict=True):
         started = time.perf_counter()
         program = jax.jit(function, compiler_options=options).lower(gaussians).compile()
-        seconds[name] = time.perf_counter() - started
+        memory = program.memory_analysis()
+        facts[name] = {
+            "compile_s": time.perf_counter() - started,
+            "temporary_mb": memory.temp_size_in_bytes / 2**20 if memory else float("nan"),
+        }
         programs[name] = lambda program=program: jax.block_until_ready(program(gaussians))
-    return programs, seconds
+    return programs, facts
 
 
 def yardstick_runs(folder: Path, scene: Scene, target: np.ndarray) -> dict[str, Callable[[], Any]]:

@@ -95,6 +95,19 @@ def load_reference(path: str | Path, size: int) -> Reference:
     return Reference(image, gradients, seed)
 
 
+def around(scene: Scene, views: int) -> "Camera":
+    """Cameras (leading axis v) on a circle around a scene, as far from its middle as its own, from three heights."""
+    import jax.numpy as jnp
+
+    from humangs_jax.geometry.camera import orbit
+
+    own, middle = scene.camera(), np.median(scene.means, axis=0)
+    distance = float(np.linalg.norm(np.asarray(own.center) - middle))
+    azimuths = jnp.linspace(0, 2 * np.pi, views, endpoint=False)
+    elevations = jnp.asarray(np.resize([0.0, 0.4, -0.4], views), azimuths.dtype)
+    return orbit(jnp.asarray(middle), distance, azimuths, elevations, own.K, scene.size, scene.size)
+
+
 def make_target(size: int, seed: int = 1) -> np.ndarray:
     """The image that the loss compares with: noise in [0, 1), float32."""
     return np.random.default_rng(seed).random((size, size, 3)).astype(np.float32)

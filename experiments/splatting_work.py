@@ -231,7 +231,9 @@ def draw_lists(lists: Lists, size: int, tile_size: int, config: Any) -> TileWork
         alpha = np.where(alpha < config.alpha_min, 0, np.minimum(alpha, config.alpha_max)).reshape(length, -1)
         open_ = np.cumprod(1 - alpha, axis=0) > config.transmittance_stop  # of those that went on before
         used = min(length, int(open_.sum(axis=0).max()) + 1)
-        work[:, tile] = ((alpha > 0) & open_).sum(), (alpha > 0).sum(), used
+        inside = pixel + tile % columns * tile_size < size, pixel + tile // columns * tile_size < size
+        seen = (alpha > 0) & (inside[0] & inside[1][:, None]).ravel()
+        work[:, tile] = (seen & open_).sum(), seen.sum(), used
     return TileWork(*work)
 
 

@@ -1,6 +1,6 @@
 """The benchmark script on a small scene whose reference is the dense oracle's, in float64."""
 
-import importlib.util
+import importlib
 import json
 import math
 import os
@@ -16,6 +16,7 @@ import pytest
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.dense import render_dense
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splat_config import SplatConfig
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SIZE, COUNT = 40, 60
@@ -24,6 +25,7 @@ TIMES = ("forward_ms", "forward_backward_ms", "forward_cpu_ms", "forward_backwar
 FLOAT32_PSNR = 80.0  # roundings of 1e-7; a decision at 1/255 that falls the other way on one pixel costs 1e-4
 FLOAT32_GRADIENT = 1e-3
 STORED_AS_FLOAT32 = 1e-6
+ROUNDED_EITHER_WAY = 2  # pairs whose alpha is 1/255 to rounding
 
 YARDSTICK = """
 import time
@@ -118,12 +120,14 @@ def test_draws_in_float64_without_a_yardstick(files):
 
 
 @pytest.fixture
-def script(monkeypatch):
+def load(monkeypatch):
     monkeypatch.syspath_prepend(EXPERIMENTS)
-    spec = importlib.util.spec_from_file_location("benchmark_splatting", EXPERIMENTS / "benchmark_splatting.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return importlib.import_module
+
+
+@pytest.fixture
+def script(load):
+    return load("benchmark_splatting")
 
 
 def test_without_a_reference_errors_are_null(script):
@@ -142,3 +146,60 @@ def test_errors_of_gradients_see_bias_and_gain(script):
     assert found["gain"] == pytest.approx(-0.1, abs=0.01)
     assert found["relative_l2"] == pytest.approx(math.hypot(0.1, 0.01), rel=0.05)
     assert script.gradient_errors(-exact, exact)["cosine"] == pytest.approx(-1)
+
+
+def test_work_needed_agrees_with_brute_force(load, files):
+    """Every pixel against every Gaussian, in float64."""
+    scenes, work = load("gaussian_scenes"), load("splatting_work")
+    scene = scenes.load_scene(files / "scene.npz", SIZE)
+    config = SplatConfig()
+    projected, _ = work.projected_splats(scene, config)
+    order = np.argsort(projected.depth, kind="stable")
+    x, y, xx, xy, yy = (np.asarray(projected[i], np.float64)[order, None, None] for i in (0, 1, 3, 4, 5))
+    dx, dy = np.arange(SIZE) + 0.5 - x, (np.arange(SIZE) + 0.5)[:, None] - y
+    squared = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
+    alpha = np.minimum(scene.opacities[order, None, None] * np.exp(-0.5 * squared), config.alpha_max)
+    alpha = np.where(alpha < config.alpha_min, 0, alpha)
+    weighs = (np.cumprod(1 - alpha, axis=0) > config.transmittance_stop) & (alpha > 0)
+    for tile_size in (8, 16):
+        lists = work.make_lists(scene, config, tile_size)
+        counted = work.draw_lists(lists, SIZE, tile_size, config).contributing.sum()
+        assert abs(counted - weighs.sum()) <= ROUNDED_EITHER_WAY
+    boxes = work.culling_squares(projected, np.where(projected.visible, 1.0, 0.0))["opacity-aware box"]
+    met = 0
+    for left in range(0, SIZE, 8):
+        for top in range(0, SIZE, 8):
+            columns = np.abs(np.clip(projected.x, left + 0.5, left + 7.5) - projected.x) <= boxes[0]
+            rows = np.abs(np.clip(projected.y, top + 0.5, top + 7.5) - projected.y) <= boxes[1]
+            met += (columns & rows).sum()
+    assert work.tiles_met(projected, *boxes, SIZE, 8) == met
+
+
+def test_blocks_work_as_long_as_their_neediest_tile(load):
+    steps = load("splatting_work").block_steps
+    counts, used = np.array([0, 9, 3, 30, 5]), np.array([0, 9, 3, 12, 5])
+    assert steps(counts, counts, 2, 8) == 2 * 32 + 2 * 8  # lists of 30 and 9, then of 5 and 3
+    assert steps(counts, used, 2, 8) == 2 * 16 + 2 * 8
+    assert steps(np.zeros(4, int), np.zeros(4, int), 2, 8) == 0
+
+
+def test_pareto_front_holds_what_nothing_beats(load):
+    tradeoff = load("splatting_tradeoff")
+    rows = [{"time": t, "psnr": p} for t, p in ((1, 100), (0.5, 40), (0.6, 39), (0.8, 60), (0.8, 55), (1.2, 99))]
+    assert [(r["time"], r["psnr"]) for r in tradeoff.pareto(rows, "time")] == [(0.5, 40), (0.8, 60), (1, 100)]
+    assert [tradeoff.short(v) for v in (1 / 64, 0.05, 1e-3, 8, 2.5)] == ["1/64", "0.05", "0.001", "8", "2.5"]
+
+
+def test_slope_of_linear_growth_is_one(load):
+    rows = [{"size": n, "forward_cpu_ms": 3.0 * n} for n in (1, 2, 8)]
+    assert load("splatting_scaling").slope(rows, "forward") == pytest.approx(1)
+
+
+def test_sections_of_a_page_are_replaced(load, tmp_path):
+    reports, page = load("report_tables"), tmp_path / "page.md"
+    page.write_text("before\n<!-- x -->\nold\n<!-- end x -->\nafter\n")
+    for text in ("new", "newer"):
+        reports.write_section(page, "x", text)
+        assert page.read_text() == f"before\n<!-- x -->\n{text}\n<!-- end x -->\nafter\n"
+    with pytest.raises(ValueError, match="markers"):
+        reports.write_section(page, "y", "text")
