@@ -19,7 +19,7 @@ from jax import lax
 
 from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.rendering.projection import ProjectedGaussians
-from humangs_jax.rendering.tiling import SUM_LIMIT, TileGrid, bits_for, expand, take
+from humangs_jax.rendering.tiling import SUM_LIMIT, TileGrid, bits_for, expand, sort_keys, take
 
 SLACK = 2e-3
 """Pixels by which footprints are widened, against rounding of positions (a float32 at 1000 pixels has 6e-5)."""
@@ -136,7 +136,7 @@ def depth_order(depths: Float[Array, " g"]) -> Int[Array, " g"]:
     order = position.astype(jnp.int32)
     for shift in range(0, 31, digit):  # the sign bit is 0
         key = ((value[order] >> shift) & ((1 << digit) - 1)) << bits | position
-        order = order[(jnp.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)]
+        order = order[(sort_keys(key) & ((1 << bits) - 1)).astype(jnp.int32)]
     return order
 
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from humangs_jax.array_types import Array, Float, Int, Shaped
+from humangs_jax.array_types import Array, Float, Int, Shaped, UInt
 
 SUM_LIMIT = 1 << 30
 """Running sums stop here instead of wrapping past 2^31: far above any buffer, so a sum there only says "too many"."""
@@ -178,6 +178,13 @@ def bits_for(count: int) -> int:
     return max(1, (count - 1).bit_length())
 
 
+def sort_keys(keys: UInt[Array, " n"]) -> UInt[Array, " n"]:
+    """Ascending. Equal keys cannot be told apart, so stability is a matter of speed: XLA's stable sort is faster on CPUs
+    by a third, and elsewhere carries the positions along.
+    """
+    return lax.platform_dependent(keys, cpu=jnp.sort, default=lambda keys: lax.sort(keys, is_stable=False))
+
+
 def sort_into_tiles(
     tiles: Int[Array, " capacity"], items: Int[Array, " capacity"], tile_count: int, item_count: int
 ) -> TileLists:
@@ -189,7 +196,7 @@ def sort_into_tiles(
     bits = bits_for(item_count)
     if (tile_count + 1) << bits <= 1 << 32:
         key = tiles.astype(jnp.uint32) << bits | items.astype(jnp.uint32)
-        sorted_items = (jnp.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
+        sorted_items = (sort_keys(key) & ((1 << bits) - 1)).astype(jnp.int32)
     else:
         sorted_items = lax.sort((tiles, items), num_keys=2, is_stable=False)[1]
     counts = jnp.zeros(tile_count, jnp.int32).at[tiles].add(1, mode="drop")
@@ -203,7 +210,7 @@ def blocks_by_length(counts: Int[Array, " t"], block: int) -> TileBlocks:
     bits = bits_for(t)
     longest = (1 << (32 - bits)) - 1
     key = (longest - jnp.minimum(counts.astype(jnp.uint32), longest)) << bits | jnp.arange(t, dtype=jnp.uint32)
-    tiles = (jnp.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
+    tiles = (sort_keys(key) & ((1 << bits) - 1)).astype(jnp.int32)
     tiles = jnp.pad(tiles, (0, -t % block), constant_values=t)
     used = jnp.sum(counts > 0, dtype=jnp.int32)
     return TileBlocks(tiles, (used + block - 1) // block)
