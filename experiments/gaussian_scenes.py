@@ -95,16 +95,15 @@ def load_reference(path: str | Path, size: int) -> Reference:
     return Reference(image, gradients, seed)
 
 
-def around(scene: Scene, views: int) -> "Camera":
-    """Cameras (leading axis v) on a circle around a scene, as far from its middle as its own, from three heights."""
+def orbiting(scene: Scene, azimuths: np.ndarray, elevations: np.ndarray | float = 0.0) -> "Camera":
+    """Cameras (leading axis v) that look at a scene's middle from as far as its own does; radians."""
     import jax.numpy as jnp
 
     from humangs_jax.geometry.camera import orbit
 
     own, middle = scene.camera(), np.median(scene.means, axis=0)
     distance = float(np.linalg.norm(np.asarray(own.center) - middle))
-    azimuths = jnp.linspace(0, 2 * np.pi, views, endpoint=False)
-    elevations = jnp.asarray(np.resize([0.0, 0.4, -0.4], views), azimuths.dtype)
+    azimuths, elevations = (jnp.asarray(angles, jnp.float32) for angles in (azimuths, elevations))
     return orbit(jnp.asarray(middle), distance, azimuths, elevations, own.K, scene.size, scene.size)
 
 

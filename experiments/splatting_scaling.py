@@ -5,8 +5,8 @@
     python experiments/splatting_scaling.py --scene demo --picture docs/images/splatting_scaling.png
 
 Pixels: the same view at 128 to 1024. Gaussians: random subsets of 1/8 to all of them, and all of them twice, the copies
-moved by a quarter of their size. Views: 1 to 8 cameras around the scene at half the size, one after the other
-(`render_views`) and at once (`jax.vmap`). Fits the slope of log CPU time over log size: 1 is linear growth.
+moved by a quarter of their size. Views: 1 to 8 cameras side by side (so that all have the same to draw) at half the
+size, one after the other (`render_views`) and at once (`jax.vmap`). Fits the slope of log CPU time over log size: 1 is linear growth.
 4 minutes. Expected: no slope above 1; about 0.5 over pixels, 0.9 over Gaussians, 1 over views.
 """
 
@@ -19,13 +19,15 @@ from typing import Any
 
 import numpy as np
 from benchmark_splatting import DIRECTIONS, compiled
-from gaussian_scenes import PARAMETERS, Scene, around, load_scene, make_target
+from gaussian_scenes import PARAMETERS, Scene, load_scene, make_target, orbiting
 from interleaved import medians, prepare_process
 from report_tables import markdown_table, write_json, write_section
 
 SIZES = (128, 256, 512, 1024)
 FRACTIONS = (0.125, 0.25, 0.5, 1.0, 2.0)
 VIEWS = (1, 2, 4, 8)
+VIEW_ANGLE = 0.01
+"""Radians from one camera to the next."""
 PANELS = {"pixels": "pixels", "gaussians": "Gaussians", "views, render_views": "views", "views, vmap": "views"}
 
 
@@ -94,7 +96,7 @@ def compiled_views(scene: Scene, views: int, at_once: bool) -> tuple[dict[str, C
 
     from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, plan, render, render_views
 
-    gaussians, cameras = scene.gaussians(), around(scene, views)
+    gaussians, cameras = scene.gaussians(), orbiting(scene, VIEW_ANGLE * np.arange(views))
     config, black = plan(gaussians, cameras, margin=1.0), jnp.zeros(3)
     goal = jnp.asarray(make_target(scene.size))
 

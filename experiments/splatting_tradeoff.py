@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from benchmark_splatting import DIRECTIONS, compiled
-from gaussian_scenes import PARAMETERS, Scene, around, gradient_errors, image_errors, load_scene, make_target
+from gaussian_scenes import PARAMETERS, Scene, gradient_errors, image_errors, load_scene, make_target, orbiting
 from interleaved import prepare_process, timed
 from report_tables import markdown_table, write_json, write_section
 
@@ -135,7 +135,9 @@ def largest_weights(scene: Scene) -> np.ndarray:
 
     gaussians, config = scene.gaussians(), SplatConfig(visibility=True)
     own = render(gaussians, scene.camera(), config).visibility
-    others = render_views(gaussians, around(scene, VIEWS), config).visibility
+    turns = np.linspace(0, 2 * np.pi, VIEWS, endpoint=False)
+    cameras = orbiting(scene, turns, np.resize([0.0, 0.4, -0.4], VIEWS))
+    others = render_views(gaussians, cameras, config).visibility
     return np.maximum(*jax.device_get((own, others.max(axis=0))))
 
 

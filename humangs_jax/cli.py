@@ -234,8 +234,42 @@ def train(
     run(config, load_body(), people, out, validation=others, variables=variables)
 
 
+def convert(
+    checkpoint: Positional[Path],
+    out: Path = Path("weights.safetensors"),
+    head_width: int | None = None,
+    pool: Literal["all", "visible"] = "all",
+    dtype: Literal["float32", "float16"] = "float32",
+) -> None:
+    """Convert a checkpoint of the published network (.pt, read without torch, or .safetensors) into our weights.
+
+    Sizes and parts of the network are read off the shapes; everything else is as in the preset `published`.
+
+    Args:
+        checkpoint: zip-format .pt with a state dict under 'model', or that state dict as .safetensors.
+        out: the weights file to write.
+        head_width: features per attention head, where no shape tells it (networks without q_norm and k_norm).
+        pool: average a vertex's features over all views (as released) or over those that see it.
+        dtype: to store; float16 halves the file.
+    """
+    import dataclasses
+
+    from humangs_jax.models.conversion import LOSS_PREFIX, describe, load_checkpoint
+    from humangs_jax.models.weights import save_weights
+
+    _require_parent(out)
+    _require_suffix(out, (".safetensors",))
+    if out.exists() and checkpoint.exists() and out.samefile(checkpoint):
+        raise ValueError(f"--out {out} is the checkpoint itself")
+    converted = load_checkpoint(checkpoint, head_width)
+    config = dataclasses.replace(converted.config, sampling=dataclasses.replace(converted.config.sampling, pool=pool))
+    save_weights(out, converted.variables, config, dtype)
+    print(f"{out}: {describe(converted)}")
+    print(f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*)")
+
+
 COMMANDS: dict[str, Callable[..., None]] = {
-    f.__name__: f for f in (demo, reconstruct, animate, render, export, synth, check, train)
+    f.__name__: f for f in (demo, reconstruct, animate, render, export, synth, check, train, convert)
 }
 
 

@@ -7,9 +7,9 @@ Tokens that are padding stand at the end; the first `count` ones are attended to
 - "xla": `jax.nn.dot_product_attention`, which materialises L x L logits;
 - "cudnn": its fused flash attention (NVIDIA, half precision only).
 
-"auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens, and "chunked"
-otherwise. On a CPU, 1,537 tokens and 4 heads of 64, "xla" needs 118 ms of processor time and 366 ms with its gradient,
-"chunked" 37 and 168.
+"auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens (not in float64: its
+softmax is always float32), and "chunked" otherwise. On a CPU, 1,537 tokens and 4 heads of 64, "xla" needs 118 ms of
+processor time and 366 ms with its gradient, "chunked" 37 and 168.
 """
 
 import dataclasses
@@ -49,7 +49,8 @@ def resolve_implementation(implementation: Implementation, tokens: int, dtype: A
     backend = jax.default_backend()
     if backend == "gpu" and jnp.dtype(dtype).itemsize == 2:
         return "cudnn"
-    return "xla" if backend in ("gpu", "tpu") and tokens <= XLA_TOKENS else "chunked"
+    fits = tokens <= XLA_TOKENS and jnp.dtype(dtype).itemsize <= 4
+    return "xla" if backend in ("gpu", "tpu") and fits else "chunked"
 
 
 def chunked_attention(

@@ -1,308 +1,308 @@
-"""The authors' released checkpoint (torch, zip-format `.pt`) to our variables, without torch.
+"""The authors' released checkpoint to our variables and back: names, layouts, and the configuration behind the shapes.
 
-A checkpoint is a pickle that describes tensors, and one zip member per storage. The pickle is read by an unpickler that
-knows the calls which rebuild the tensors of a state dict and refuses everything else by name, so no code of a file ever
-runs; only the storages of `model` are read, not those of the optimizer.
-
-Layouts: linear (out, in) -> (in, out); convolution (out, in, kh, kw) -> (kh, kw, in, out); transposed convolution
+Files are read by `models.torch_file` (`.pt`) or safetensors, without torch. Layouts: linear (out, in) -> (in, out); convolution
+(out, in, kh, kw) -> (kh, kw, in, out); 1x1 convolution (out, in, 1, 1) -> (in, out); transposed convolution
 (in, out, kh, kw) -> (kh, kw, in, out), unflipped (see `upsampler.UpConvolution`).
 """
 
-import collections
 import dataclasses
-import math
+import functools
 import os
-import pickle
-import zipfile
+import statistics
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from humangs_jax.models.attention import AttentionConfig
 from humangs_jax.models.humangs import HumanGSConfig, Variables
 from humangs_jax.models.presets import published
+from humangs_jax.models.torch_file import read_torch_file
 from humangs_jax.models.transformer import TransformerConfig
 from humangs_jax.models.upsampler import UpsamplerConfig
 from humangs_jax.models.vertex_decoder import VertexDecoderConfig
-from humangs_jax.models.weights import variables_from_tensors
+from humangs_jax.models.weights import FORMAT, expected_variables, flatten_variables, variables_from_tensors
 from humangs_jax.sampling.triplane import TriplaneConfig
 
-STORAGE_DTYPES = {
-    "DoubleStorage": np.dtype("<f8"),
-    "FloatStorage": np.dtype("<f4"),
-    "HalfStorage": np.dtype("<f2"),
-    "BFloat16Storage": np.dtype("<u2"),  # widened after reading
-    "LongStorage": np.dtype("<i8"),
-    "IntStorage": np.dtype("<i4"),
-    "ShortStorage": np.dtype("<i2"),
-    "CharStorage": np.dtype("i1"),
-    "ByteStorage": np.dtype("u1"),
-    "BoolStorage": np.dtype("?"),
-}
 LOSS_PREFIX = "loss_computer."
 """The release saves its frozen loss networks along; they are no part of the network."""
+SKINNING_WEIGHTS = "tpose_lbs_weights"
+"""(n, j) of the body that the network was trained with; carried along, the network has no use for them."""
 UNSUPPORTED = "target_pose_tokenizer.1.weight"
 """Marks a variant of the network (canonical target maps) that does not exist here."""
+COUNTER = "num_batches_tracked"
+"""Of every batch norm; means nothing here."""
+PIXEL_CHANNELS = 9
+"""rgb and ray, beside the pose features."""
 
-
-@dataclasses.dataclass(frozen=True)
-class LazyTensor:
-    """A tensor of a checkpoint that is not read yet: which storage, and the view of it (in elements)."""
-
-    storage: str
-    kind: str
-    offset: int
-    shape: tuple[int, ...]
-    strides: tuple[int, ...]
-
-
-@dataclasses.dataclass(frozen=True)
-class _StorageType:
-    """Stands for a `torch.*Storage` class."""
-
-    name: str
+StateDict = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
 class Converted:
-    """Variables and their configuration; skinning_weights: (n, j) of the body that the checkpoint carries, or None.
+    """Variables and their configuration; skinning_weights: (n, j) of the body that the checkpoint was made for.
 
     skipped: how many tensors of the frozen loss networks were left out.
     """
 
     variables: Variables
     config: HumanGSConfig
-    skinning_weights: np.ndarray | None
+    skinning_weights: np.ndarray
     skipped: int
 
 
-def _rebuild_tensor(storage, offset, shape, strides, *_):
-    kind, key = storage
-    return LazyTensor(key, kind, offset, tuple(shape), tuple(strides))
+class Layout(NamedTuple):
+    """How a tensor lies in the release and here; the two undo each other."""
+
+    from_release: Callable[[np.ndarray], np.ndarray]
+    to_release: Callable[[np.ndarray], np.ndarray]
 
 
-def _rebuild_parameter(tensor, *_):
-    return tensor
+SAME = Layout(lambda x: x, lambda x: x)
+LINEAR = Layout(lambda x: x.T, lambda x: x.T)
+CONVOLUTION = Layout(lambda x: x.transpose(2, 3, 1, 0), lambda x: x.transpose(3, 2, 0, 1))
+POINTWISE = Layout(lambda x: x[:, :, 0, 0].T, lambda x: x.T[:, :, None, None])
+TRANSPOSED_CONVOLUTION = Layout(lambda x: x.transpose(2, 3, 0, 1), lambda x: x.transpose(2, 3, 0, 1))
+CLASS_TOKEN = Layout(lambda x: x[0], lambda x: x[None])
+
+SINGLE_TENSORS = {
+    "params/encoder/tokenizer/texture": ("neural_texture", SAME),
+    "params/encoder/class_token": ("cls_token", CLASS_TOKEN),
+}
+MODULES = {  # our module: the release's, and the layout of its weight
+    "encoder/tokenizer/linear": ("image_tokenizer.1", LINEAR),
+    "encoder/transformer/input_norm": ("transformer_input_layernorm", SAME),
+    "encoder/transformer/norm": ("norm", SAME),
+    **{f"encoder/upsampler/project_{i}": (f"upsampler.proj.{i}", POINTWISE) for i in range(4)},
+    "encoder/upsampler/fuse": ("upsampler.fuse.0", CONVOLUTION),
+    "encoder/upsampler/fuse_norm": ("upsampler.fuse.1", SAME),
+    "encoder/upsampler/up1": ("upsampler.up1.0", TRANSPOSED_CONVOLUTION),
+    "encoder/upsampler/up1_norm": ("upsampler.up1.1", SAME),
+    "encoder/upsampler/conv1": ("upsampler.up1.3", CONVOLUTION),
+    "encoder/upsampler/conv1_norm": ("upsampler.up1.4", SAME),
+    "encoder/upsampler/up2": ("upsampler.up2.0", TRANSPOSED_CONVOLUTION),
+    "encoder/upsampler/up2_norm": ("upsampler.up2.1", SAME),
+    "encoder/upsampler/conv2": ("upsampler.up2.3", CONVOLUTION),
+    "decoder/trunk_0": ("vertex_decoder.trunk.0", LINEAR),
+    "decoder/trunk_1": ("vertex_decoder.trunk.2", LINEAR),
+    "decoder/geometry_hidden": ("vertex_decoder.geo_head.0", LINEAR),
+    "decoder/geometry_out": ("vertex_decoder.geo_head.2", LINEAR),
+    "decoder/appearance_hidden": ("vertex_decoder.app_head.0", LINEAR),
+    "decoder/appearance_out": ("vertex_decoder.app_head.2", LINEAR),
+    "decoder/skinning_hidden": ("vertex_decoder.lbs_head.0", LINEAR),
+    "decoder/skinning_out": ("vertex_decoder.lbs_head.2", LINEAR),
+}
+BLOCKS = "encoder/transformer/block_"
+BLOCK_MODULES = {
+    "norm1": ("norm1", SAME),
+    "attention/qkv": ("attn.to_qkv", LINEAR),
+    "attention/q_norm": ("attn.q_norm", SAME),
+    "attention/k_norm": ("attn.k_norm", SAME),
+    "attention/out": ("attn.fc", LINEAR),
+    "norm2": ("norm2", SAME),
+    "mlp_in": ("mlp.mlp.0", LINEAR),
+    "mlp_out": ("mlp.mlp.2", LINEAR),
+}
+FIELDS = {"kernel": "weight", "scale": "weight", "bias": "bias", "mean": "running_mean", "var": "running_var"}
 
 
-class _StateDictUnpickler(pickle.Unpickler):
-    """Knows tensors, ordered dicts and storages."""
+def release_name(path: str) -> tuple[str, Layout]:
+    """What the release calls one of our variables ("params/encoder/..."), and how it lies there.
 
-    ALLOWED = {  # noqa: RUF012 (a constant)
-        ("torch._utils", "_rebuild_tensor_v2"): _rebuild_tensor,
-        ("torch._utils", "_rebuild_parameter"): _rebuild_parameter,
-        ("collections", "OrderedDict"): collections.OrderedDict,
-    }
-
-    def find_class(self, module, name):
-        if (module, name) in self.ALLOWED:
-            return self.ALLOWED[module, name]
-        if module == "torch" and name in STORAGE_DTYPES:
-            return _StorageType(name)
-        raise pickle.UnpicklingError(f"refused to load {module}.{name}: no part of a state dict")
-
-    def persistent_load(self, pid):
-        if not (isinstance(pid, tuple) and len(pid) == 5 and pid[0] == "storage" and isinstance(pid[1], _StorageType)):
-            raise pickle.UnpicklingError(f"refused to load the persistent object {pid!r}: no storage")
-        return pid[1].name, str(pid[2])
-
-
-def read_state_dict(path: str | os.PathLike, skip_prefix: str = LOSS_PREFIX) -> tuple[dict[str, np.ndarray], int]:
-    """Tensors under the key `model` of a checkpoint, without those whose name begins with `skip_prefix`; how many those
-    are.
-
-    Raises: ValueError if the file is no zip-format checkpoint, its pickle asks for anything but tensors, or a storage
-    is missing or too short, naming it.
+    Raises: KeyError if the release has no such thing.
     """
+    if path in SINGLE_TENSORS:
+        return SINGLE_TENSORS[path]
+    module, _, field = path.partition("/")[2].rpartition("/")
+    if module.startswith(BLOCKS):
+        index, _, inner = module.removeprefix(BLOCKS).partition("/")
+        name, layout = BLOCK_MODULES[inner]
+        name = f"transformer_blocks.{index}.{name}"
+    else:
+        name, layout = MODULES[module]
+    return f"{name}.{FIELDS[field]}", layout if field == "kernel" else SAME
+
+
+def to_release(variables: Variables) -> StateDict:
+    """Variables as the state dict that the release would have of them (without the body's skinning weights).
+
+    Raises: KeyError for a part of a network that the release does not have.
+    """
+    state = {}
+    for path, value in flatten_variables(variables).items():
+        key, layout = release_name(path)
+        state[key] = layout.to_release(np.asarray(value))
+        if key.endswith("running_var"):
+            state[f"{key.removesuffix('running_var')}{COUNTER}"] = np.zeros((), np.int64)
+    return state
+
+
+def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
+    """Shapes of the state dict that the release has for a configuration, without the body's skinning weights."""
+    shapes = {}
+    for path, leaf in flatten_variables(expected_variables(config)).items():
+        key, layout = release_name(path)
+        shapes[key] = layout.to_release(np.broadcast_to(np.float32(0), leaf.shape)).shape
+        if key.endswith("running_var"):
+            shapes[f"{key.removesuffix('running_var')}{COUNTER}"] = ()
+    return shapes
+
+
+def read_state_dict(path: str | os.PathLike) -> tuple[StateDict, int]:
+    """Tensors of a checkpoint (`.pt`, or `.safetensors` by its suffix), and how many of the loss networks were skipped.
+
+    Raises: OSError; ValueError if the file is damaged, is none, or holds anything but tensors.
+    """
+    if Path(path).suffix.lower() != ".safetensors":
+        return read_torch_file(path, LOSS_PREFIX)
+    from safetensors import SafetensorError, safe_open
+
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no such file: {path}")
     try:
-        archive = zipfile.ZipFile(path)
-    except zipfile.BadZipFile as error:
-        raise ValueError(f"{path} is no zip-format checkpoint (torch.save since 1.6 writes those)") from error
-    with archive:
-        pickles = [name for name in archive.namelist() if name.count("/") == 1 and name.endswith("/data.pkl")]
-        if len(pickles) != 1:
-            raise ValueError(f"{path}: expected one <name>/data.pkl inside, found {pickles}")
-        root = pickles[0].removesuffix("data.pkl")
-        if f"{root}byteorder" in archive.namelist() and archive.read(f"{root}byteorder").strip() != b"little":
-            raise ValueError(f"{path}: only little-endian checkpoints are supported")
-        try:
-            with archive.open(pickles[0]) as file:
-                content = _StateDictUnpickler(file).load()
-        except Exception as error:  # a broken pickle raises nearly anything
-            raise ValueError(f"{path}: {error}") from error
-        if not isinstance(content, dict) or not isinstance(content.get("model"), dict):
-            raise ValueError(f"{path}: expected a dict with a state dict under 'model'")
-        model = content["model"]
-        wanted = {key: value for key, value in model.items() if not str(key).startswith(skip_prefix)}
-        for key, value in wanted.items():
-            if not isinstance(value, LazyTensor):
-                raise ValueError(f"{path}: model[{key!r}] is no tensor but {type(value).__name__}")
-        return {key: _read(archive, root, key, value) for key, value in wanted.items()}, len(model) - len(wanted)
+        with safe_open(path, framework="numpy") as file:
+            if (file.metadata() or {}).get("format") == FORMAT:
+                raise ValueError(f"{path} is a weights file already: nothing to convert")
+            keys = list(file.keys())
+            wanted = [key for key in keys if not key.startswith(LOSS_PREFIX)]
+            return {key: file.get_tensor(key) for key in wanted}, len(keys) - len(wanted)
+    except (SafetensorError, TypeError) as error:
+        raise ValueError(f"{path} is no readable safetensors file: {error}") from error
 
 
-def _read(archive: zipfile.ZipFile, root: str, key: str, tensor: LazyTensor) -> np.ndarray:
-    """The numbers of one tensor, bounds checked."""
-    dtype = STORAGE_DTYPES[tensor.kind]
-    try:
-        data = np.frombuffer(archive.read(f"{root}data/{tensor.storage}"), dtype)
-    except (KeyError, zipfile.BadZipFile, ValueError) as error:
-        raise ValueError(f"{key}: storage {tensor.storage} is missing or damaged: {error}") from error
-    sizes = (tensor.offset, *tensor.shape, *tensor.strides)
-    last = tensor.offset + sum((n - 1) * stride for n, stride in zip(tensor.shape, tensor.strides, strict=True))
-    count = math.prod(tensor.shape)  # views of parameters never repeat numbers: a larger one is a bomb
-    if any(not isinstance(x, int) or x < 0 for x in sizes) or count > len(data) or (count and last >= len(data)):
-        raise ValueError(f"{key}: shape {tensor.shape} does not fit storage {tensor.storage} of {len(data)} numbers")
-    view = np.lib.stride_tricks.as_strided(
-        data[tensor.offset :],
-        tensor.shape,
-        tuple(stride * dtype.itemsize for stride in tensor.strides),
-        writeable=False,
-    )
-    array = np.ascontiguousarray(view).reshape(tensor.shape)
-    return (array.astype(np.uint32) << 16).view(np.float32) if tensor.kind == "BFloat16Storage" else array
+def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConfig:
+    """The configuration whose sizes are those of the tensors; what shapes do not tell is taken from `presets.published`.
 
-
-def infer_config(state: dict[str, np.ndarray]) -> HumanGSConfig:
-    """The configuration whose sizes are those of the tensors; what shapes do not tell is taken from
-    `presets.published`.
-
-    Raises: ValueError for a variant that is not supported, or if a tensor that tells a size is missing.
+    head_width: of a network without normalised queries and keys, where no shape tells it. Of the Gaussians of a vertex
+    one counts as tight. Raises: ValueError for a variant that is not supported, or if a tensor that tells a size is
+    missing or has another number of axes.
     """
     if UNSUPPORTED in state:
-        raise ValueError(f"the checkpoint has {UNSUPPORTED!r}: the variant with canonical target maps is not supported")
+        raise ValueError(f"tensor {UNSUPPORTED!r}: the variant with canonical target maps is not supported")
 
-    def shape(key):
-        if key not in state:
-            raise ValueError(f"the checkpoint has no tensor {key!r}")
-        return state[key].shape
-
+    shape = functools.partial(_shape, state)
+    has = lambda prefix: any(key.startswith(prefix) for key in state)
     base = published()
-    _, resolution, _, channels = shape("neural_texture")
-    width, patch_numbers = shape("image_tokenizer.1.weight")
-    pixels = patch_numbers / (9 + 3 * channels)
-    patch = round(pixels**0.5)
-    if patch * patch != pixels:
-        channels_in = 9 + 3 * channels
+    resolution, channels = shape("neural_texture", 4)[2:]
+    token_width, patch_numbers = shape("image_tokenizer.1.weight", 2)
+    width = statistics.mode([token_width, *shape("transformer_input_layernorm.weight", 1), *shape("norm.weight", 1)])
+    per_pixel = PIXEL_CHANNELS + 3 * channels
+    patch = max(1, round((patch_numbers / per_pixel) ** 0.5))
+    if patch * patch * per_pixel != patch_numbers:
         raise ValueError(
-            f"image_tokenizer.1.weight: {patch_numbers} inputs are no square patch of {channels_in} channels"
+            f"tensor 'image_tokenizer.1.weight' has {patch_numbers} inputs: no square patch of {per_pixel} channels"
         )
-    layers = len({key.split(".")[1] for key in state if key.startswith("transformer_blocks.")})
-    attention = "transformer_blocks.0.attn"
-    qk_norm = f"{attention}.q_norm.weight" in state
-    head_width = shape(f"{attention}.q_norm.weight")[0] if qk_norm else base.transformer.attention.head_width
     upsampler = dataclasses.replace(base.upsampler, enabled=False)
-    if "upsampler.fuse.0.weight" in state:
-        upsampler = UpsamplerConfig(hidden=shape("upsampler.proj.0.weight")[0], out=shape("upsampler.up2.3.weight")[0])
-    gaussians = shape("vertex_decoder.geo_head.2.weight")[0] // 10
+    if has("upsampler."):
+        upsampler = UpsamplerConfig(
+            hidden=shape("upsampler.proj.0.weight", 4)[0], out=shape("upsampler.up2.3.weight", 4)[0]
+        )
+    gaussians = max(1, shape("vertex_decoder.geo_head.2.weight", 2)[0] // 10)
     joints = None
-    if "vertex_decoder.lbs_head.2.weight" in state:
-        joints = shape("vertex_decoder.lbs_head.2.weight")[0] // gaussians
+    if has("vertex_decoder.lbs_head."):
+        joints = shape("vertex_decoder.lbs_head.2.weight", 2)[0] // gaussians
     return dataclasses.replace(
         base,
+        image_size=patch * max(1, base.image_size // patch),
         patch_size=patch,
         texture=TriplaneConfig(resolution, channels),
         transformer=TransformerConfig(
             width=width,
-            layers=layers,
-            mlp_ratio=shape("transformer_blocks.0.mlp.mlp.0.weight")[0] // width,
+            layers=_count_layers(state),
+            mlp_ratio=max(1, shape("transformer_blocks.0.mlp.mlp.0.weight", 2)[0] // width),
             class_token="cls_token" in state,
-            attention=AttentionConfig(head_width=head_width, qk_norm=qk_norm),
+            attention=_infer_attention(state, head_width),
         ),
         upsampler=upsampler,
         decoder=VertexDecoderConfig(
-            hidden=shape("vertex_decoder.trunk.0.weight")[0], tight=1, free=gaussians - 1, skinning_joints=joints
+            hidden=shape("vertex_decoder.trunk.0.weight", 2)[0], tight=1, free=gaussians - 1, skinning_joints=joints
         ),
     )
 
 
-Layout = tuple[int, ...] | None
-LINEAR: Layout = (1, 0)
-CONVOLUTION: Layout = (2, 3, 1, 0)
-TRANSPOSED_CONVOLUTION: Layout = (2, 3, 0, 1)
-NORM: Layout = None
-"""What becomes of a module's weight: a kernel with its axes in this order, or the scale of a norm as it is."""
-
-MODULES: dict[str, tuple[str, Layout]] = {
-    "image_tokenizer.1": ("encoder/tokenizer/linear", LINEAR),
-    "transformer_input_layernorm": ("encoder/transformer/input_norm", NORM),
-    "norm": ("encoder/transformer/norm", NORM),
-    "upsampler.fuse.0": ("encoder/upsampler/fuse", CONVOLUTION),
-    "upsampler.fuse.1": ("encoder/upsampler/fuse_norm", NORM),
-    "upsampler.up1.0": ("encoder/upsampler/up1", TRANSPOSED_CONVOLUTION),
-    "upsampler.up1.1": ("encoder/upsampler/up1_norm", NORM),
-    "upsampler.up1.3": ("encoder/upsampler/conv1", CONVOLUTION),
-    "upsampler.up1.4": ("encoder/upsampler/conv1_norm", NORM),
-    "upsampler.up2.0": ("encoder/upsampler/up2", TRANSPOSED_CONVOLUTION),
-    "upsampler.up2.1": ("encoder/upsampler/up2_norm", NORM),
-    "upsampler.up2.3": ("encoder/upsampler/conv2", CONVOLUTION),
-    "vertex_decoder.trunk.0": ("decoder/trunk_0", LINEAR),
-    "vertex_decoder.trunk.2": ("decoder/trunk_1", LINEAR),
-    "vertex_decoder.geo_head.0": ("decoder/geometry_hidden", LINEAR),
-    "vertex_decoder.geo_head.2": ("decoder/geometry_out", LINEAR),
-    "vertex_decoder.app_head.0": ("decoder/appearance_hidden", LINEAR),
-    "vertex_decoder.app_head.2": ("decoder/appearance_out", LINEAR),
-    "vertex_decoder.lbs_head.0": ("decoder/skinning_hidden", LINEAR),
-    "vertex_decoder.lbs_head.2": ("decoder/skinning_out", LINEAR),
-    **{f"upsampler.proj.{i}": (f"encoder/upsampler/project_{i}", CONVOLUTION) for i in range(4)},
-}
-BLOCK_MODULES: dict[str, tuple[str, Layout]] = {
-    "norm1": ("norm1", NORM),
-    "attn.to_qkv": ("attention/qkv", LINEAR),
-    "attn.q_norm": ("attention/q_norm", NORM),
-    "attn.k_norm": ("attention/k_norm", NORM),
-    "attn.fc": ("attention/out", LINEAR),
-    "norm2": ("norm2", NORM),
-    "mlp.mlp.0": ("mlp_in", LINEAR),
-    "mlp.mlp.2": ("mlp_out", LINEAR),
-}
+def _shape(state: StateDict, key: str, axes: int) -> tuple[int, ...]:
+    if key not in state:
+        raise ValueError(f"tensor {key!r} is missing")
+    if state[key].ndim != axes or 0 in state[key].shape:
+        raise ValueError(f"tensor {key!r} has shape {state[key].shape}, expected {axes} axes")
+    return state[key].shape
 
 
-def _module(name: str) -> tuple[str, Layout]:
-    """Our path and the layout of a module of the release. Raises KeyError if it has none of that name."""
-    if name.startswith("transformer_blocks."):
-        _, index, inner = name.split(".", 2)
-        path, layout = BLOCK_MODULES[inner]
-        return f"encoder/transformer/block_{int(index)}/{path}", layout
-    return MODULES[name]
+def _count_layers(state: StateDict) -> int:
+    indices = {key.split(".")[1] for key in state if key.startswith("transformer_blocks.")}
+    for index in range(len(indices)):
+        if str(index) not in indices:
+            raise ValueError(f"tensor 'transformer_blocks.{index}.norm1.weight' is missing")
+    return len(indices)
 
 
-def map_tensor(key: str, value: np.ndarray) -> tuple[str, np.ndarray] | None:
-    """Our path and layout of one tensor of the network; None for counters that mean nothing here.
-
-    Raises: ValueError for a name that the release does not have, or a tensor with another number of axes.
-    """
-    if key == "neural_texture":
-        return "params/encoder/tokenizer/texture", value
-    if key == "cls_token":
-        return "params/encoder/class_token", value.reshape(-1, value.shape[-1])
-    name, _, field = key.rpartition(".")
-    try:
-        path, layout = _module(name)
-    except (KeyError, ValueError):
-        raise ValueError(f"the checkpoint has a tensor {key!r} that is no part of the published network") from None
-    if field == "num_batches_tracked":
-        return None
-    if field in ("running_mean", "running_var"):
-        return f"batch_stats/{path}/{field.removeprefix('running_')}", value
-    if field == "bias":
-        return f"params/{path}/bias", value
-    if layout is None:
-        return f"params/{path}/scale", value
-    if value.ndim != len(layout):
-        raise ValueError(f"{key}: expected {len(layout)} axes, got shape {value.shape}")
-    value = value.transpose(layout)
-    if ".proj." in key:  # a 1x1 convolution is a linear map
-        value = value.reshape(value.shape[-2:])
-    return f"params/{path}/kernel", value
+def _infer_attention(state: StateDict, head_width: int | None) -> AttentionConfig:
+    """The width of a head is that of its norms, where there are any."""
+    if not any(key.endswith((".attn.q_norm.weight", ".attn.k_norm.weight")) for key in state):
+        if head_width is None:
+            raise ValueError("no tensor 'transformer_blocks.0.attn.q_norm.weight' tells the width of a head: give it")
+        if head_width < 1:
+            raise ValueError(f"the width of a head must be at least 1, got {head_width}")
+        return AttentionConfig(head_width=head_width, qk_norm=False)
+    (found,) = _shape(state, "transformer_blocks.0.attn.q_norm.weight", 1)
+    if head_width not in (None, found):
+        raise ValueError(f"tensor 'transformer_blocks.0.attn.q_norm.weight' says heads of {found}, not {head_width}")
+    return AttentionConfig(head_width=found)
 
 
-def load_checkpoint(path: str | os.PathLike) -> Converted:
-    """A released checkpoint as variables, with the configuration that its shapes tell.
+def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
+    """Raises ValueError, in the release's names, unless the tensors are exactly those expected, and finite."""
+    if missing := sorted(set(expected) - set(state)):
+        raise ValueError(f"tensor {missing[0]!r} is missing ({len(missing)} in all)")
+    if unknown := sorted(set(state) - set(expected)):
+        raise ValueError(f"tensor {unknown[0]!r} is no part of the published network ({len(unknown)} such in all)")
+    if wrong := [key for key, shape in expected.items() if state[key].shape != shape]:
+        found, wanted = state[wrong[0]].shape, expected[wrong[0]]
+        raise ValueError(
+            f"tensor {wrong[0]!r} has shape {found}; to fit the others it should have {wanted} ({len(wrong)} such in all)"
+        )
+    if bad := [key for key, value in state.items() if not np.isfinite(value.astype(np.float64)).all()]:
+        raise ValueError(f"tensor {bad[0]!r} holds numbers that are not finite ({len(bad)} such in all)")
 
-    Raises: ValueError naming file and tensor: see `read_state_dict`, `infer_config`, `map_tensor`; and if a tensor of
-    the network is missing, unknown or of the wrong shape.
+
+def load_checkpoint(path: str | os.PathLike, head_width: int | None = None) -> Converted:
+    """A released checkpoint as float32 variables, with the configuration that its shapes tell.
+
+    head_width: see `infer_config`. Raises: OSError; ValueError naming file and tensor if the file cannot be read or
+    asks for more than tensors, or if a tensor of the network is missing, unknown, of the wrong shape or not finite.
     """
     state, skipped = read_state_dict(path)
-    skinning_weights = state.pop("tpose_lbs_weights", None)
-    config = infer_config(state)
-    tensors = dict(filter(None, (map_tensor(key, value) for key, value in state.items())))
-    return Converted(variables_from_tensors(tensors, config, str(path)), config, skinning_weights, skipped)
+    try:
+        config = infer_config(state, head_width)
+        vertices, joints = _shape(state, SKINNING_WEIGHTS, 2)
+        skinning_shape = (vertices, config.decoder.skinning_joints or joints)
+        _check(state, expected_shapes(config) | {SKINNING_WEIGHTS: skinning_shape})
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    tensors = {}
+    for ours in flatten_variables(expected_variables(config)):
+        key, layout = release_name(ours)
+        tensors[ours] = layout.from_release(state[key])
+    return Converted(variables_from_tensors(tensors, config, str(path)), config, state[SKINNING_WEIGHTS], skipped)
+
+
+def describe(converted: Converted) -> str:
+    """The network in one line."""
+    config, leaves = converted.config, flatten_variables(converted.variables["params"]).values()
+    transformer, decoder = config.transformer, config.decoder
+    parts = [
+        f"{sum(x.size for x in leaves):,} parameters",
+        f"width {transformer.width}",
+        f"{transformer.layers} layers of {transformer.width // transformer.attention.head_width} heads",
+        f"patches of {config.patch_size}",
+        f"texture {config.texture.resolution} x {config.texture.channels}",
+        f"{decoder.gaussians_per_vertex} Gaussians a vertex",
+    ]
+    optional = {
+        "class token": transformer.class_token,
+        "normalised queries and keys": transformer.attention.qk_norm,
+        "upsampler": config.upsampler.enabled,
+        "skinning head": decoder.skinning_joints is not None,
+    }
+    return ", ".join(parts + [name if there else f"no {name}" for name, there in optional.items()])

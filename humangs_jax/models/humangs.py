@@ -91,7 +91,8 @@ class HumanGSConfig:
             raise ValueError(
                 f"width {transformer.width} is no multiple of head_width {transformer.attention.head_width}"
             )
-        if transformer.layers < 4 or transformer.layers % 2:
+        quarters = self.upsampler.enabled and self.upsampler.features == "intermediate"
+        if transformer.layers < 1 or (quarters and (transformer.layers < 4 or transformer.layers % 2)):
             raise ValueError(f"layers must be even and at least 4, to have quarters; got {transformer.layers}")
         if self.tokens == "foreground" and self.token_capacity < 1:
             raise ValueError("tokens = 'foreground' needs a token_capacity of at least 1")
@@ -237,14 +238,11 @@ def _touched(inputs, config):
     return jnp.any(patchify(inputs.foreground[..., None].astype(jnp.float32), config.patch_size) > 0, axis=(1, 2))
 
 
-def encode_with_statistics(
-    variables: Variables,
-    inputs: HumanGSInputs,
-    config: HumanGSConfig,
-    train: bool = False,
-    axis_name: str | None = None,
-) -> tuple[Encoding, Variables]:
-    """`encode`, and the running batch statistics: updated ones if `train`, the given ones otherwise."""
+def encoder_pixels(inputs: HumanGSInputs, config: HumanGSConfig) -> Float[Array, "v h w 12"]:
+    """What the encoder sees of every pixel: rgb, ray (moment, direction), canonical position.
+
+    Raises ValueError if images and cameras differ in size.
+    """
     height, width = inputs.images.shape[1:3]
     if (inputs.cameras.width, inputs.cameras.height) != (width, height):
         raise ValueError(
@@ -254,7 +252,18 @@ def encode_with_statistics(
     cameras = inputs.cameras.in_units(unit)
     ray_cameras = cameras.in_units(unit) if config.ray_origins == "twice_normalized" else cameras
     rays = jax.vmap(plucker_rays)(ray_cameras).astype(inputs.images.dtype)
-    pixels = jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
+    return jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
+
+
+def encode_with_statistics(
+    variables: Variables,
+    inputs: HumanGSInputs,
+    config: HumanGSConfig,
+    train: bool = False,
+    axis_name: str | None = None,
+) -> tuple[Encoding, Variables]:
+    """`encode`, and the running batch statistics: updated ones if `train`, the given ones otherwise."""
+    pixels = encoder_pixels(inputs, config)
     packing = select_tokens(inputs, config)
 
     batch_stats = variables["batch_stats"]
@@ -302,11 +311,25 @@ def decode(
     variables: Variables, features: VertexFeatures, canonical_vertices: Float[Array, "n 3"], config: HumanGSConfig
 ) -> HumanGSOutputs:
     """Features of vertices -> canonical Gaussians, metric; `dropped_tokens` is 0 (the encoder's business)."""
+    raw = decode_heads(variables, features, canonical_vertices, config)
+    return assemble(raw, features, canonical_vertices, config)
+
+
+def decode_heads(
+    variables: Variables, features: VertexFeatures, canonical_vertices: Float[Array, "n 3"], config: HumanGSConfig
+) -> RawGaussians:
+    """The first half of `decode`: heads before their activations."""
+    entering = decoder_input(features, canonical_vertices / subject_unit(canonical_vertices))
+    decoder = VertexDecoder(config.decoder, config.compute_dtype)
+    return cast(RawGaussians, decoder.apply({"params": variables["params"]["decoder"]}, entering))
+
+
+def assemble(
+    raw: RawGaussians, features: VertexFeatures, canonical_vertices: Float[Array, "n 3"], config: HumanGSConfig
+) -> HumanGSOutputs:
+    """The second half of `decode`: activations, and lengths in metres."""
     unit = subject_unit(canonical_vertices)
     canonical = canonical_vertices / unit
-    decoder = VertexDecoder(config.decoder, config.compute_dtype)
-    raw = decoder.apply({"params": variables["params"]["decoder"]}, decoder_input(features, canonical))
-    raw = cast(RawGaussians, raw)
     at_vertices = activate(raw, config.decoder, features.photo_colors)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     gaussians = Gaussians(

@@ -77,7 +77,7 @@ def expected_variables(config: HumanGSConfig) -> Variables:
     return jax.eval_shape(lambda key: init_humangs(key, config), jax.random.key(0))
 
 
-def _flatten(variables: Variables) -> dict[str, Any]:
+def flatten_variables(variables: Variables) -> dict[str, Any]:
     """{"params/encoder/...": leaf}."""
     leaves = jax.tree_util.tree_leaves_with_path(variables)
     return {"/".join(str(entry.key) for entry in path): leaf for path, leaf in leaves}
@@ -95,7 +95,7 @@ def save_weights(
     """
     from safetensors.numpy import save
 
-    tensors = _check(_flatten(variables), expected_variables(config), str(path))
+    tensors = _check(flatten_variables(variables), expected_variables(config), str(path))
     if dtype == "float16":
         for key, tensor in tensors.items():
             if np.abs(tensor).max(initial=0) > np.finfo(np.float16).max:
@@ -151,7 +151,7 @@ def variables_from_tensors(tensors: dict[str, np.ndarray], config: HumanGSConfig
 
 def _check(tensors: dict[str, Any], variables: Variables, where: str) -> dict[str, np.ndarray]:
     """The tensors as numpy arrays, in the order of the variables' leaves, if they are exactly those."""
-    expected = _flatten(variables)
+    expected = flatten_variables(variables)
     if missing := sorted(set(expected) - set(tensors)):
         raise ValueError(f"{where}: tensor {missing[0]!r} is missing ({len(missing)} in all)")
     if unknown := sorted(set(tensors) - set(expected)):

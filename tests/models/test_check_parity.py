@@ -1,0 +1,198 @@
+"""experiments/check_parity.py on made-up triples whose numbers come from an independent network (network_oracle.py)."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import network_golden as golden
+import network_oracle as oracle
+import numpy as np
+import pytest
+from network_golden import check_parity
+from network_oracle import Options
+from torch_writer import tensors, write_checkpoint
+
+GOLDEN = Path(__file__).parents[3] / "shared" / "golden"
+"""The whole golden data, where a checkout has it beside it."""
+VARIANTS = {
+    "no class token, one Gaussian, three views of 96": Options(
+        class_token=False, gaussians=1, views=3, size=(96, 96), patch=12, all_views=False, skinning_head=True
+    ),
+    "no upsampler, skinning head, four views, not square": Options(
+        upsampler=False, skinning_head=True, gaussians=3, views=4, size=(24, 40), layers=2, subjects=2, all_views=False
+    ),
+    "upsampler of six layers, heads without norms, a small patch": Options(
+        layers=6, qk_norm=False, patch=4, size=(16, 16), gaussians=3, width=24, texture=(9, 3), views=1
+    ),
+    "neither class token nor upsampler, one layer": Options(class_token=False, upsampler=False, layers=1, gaussians=4),
+}
+SMALL = VARIANTS["neither class token nor upsampler, one layer"]
+
+
+@pytest.fixture(autouse=True)
+def precision():
+    """main() switches JAX to float64 and back by --dtype."""
+    yield
+    jax.config.update("jax_enable_x64", False)
+
+
+def write_triple(folder, options, change=lambda arrays: None):
+    state, arrays, config = oracle.triple(options)
+    change(arrays)
+    write_checkpoint(folder / "a.pt", {"model": tensors(state)})
+    np.savez(folder / "a.npz", **arrays)
+    (folder / "a.json").write_text(json.dumps(config))
+    return folder / "a.pt", folder / "a.npz", folder / "a.json"
+
+
+def run(monkeypatch, *arguments):
+    """Exit status of the script's main."""
+    monkeypatch.setattr(sys, "argv", ["check_parity.py", *map(str, arguments)])
+    monkeypatch.syspath_prepend(golden.EXPERIMENTS)
+    with pytest.raises(SystemExit) as exit_:
+        check_parity.main()
+    return exit_.value.code
+
+
+def test_the_oracle_is_the_published_network():
+    """Stages of golden_a, with which the authors' own code was run."""
+    state, _ = golden.read_state_dict(golden.CHECKPOINT)
+    arrays = dict(np.load(golden.SUBJECT)) | {"in_lbs_weights": state["tpose_lbs_weights"]}
+    options = Options(width=64, head=16, gaussians=5, texture=(16, 4))
+    inputs = {name: x.astype(np.float64) for name, x in arrays.items() if name.startswith("in_")}
+    found = oracle.Network(state, options).subject(inputs)
+    errors = golden.thinned_errors(found, arrays)
+    assert len(errors) == 17 and max(errors.values()) < 2e-7, errors  # stored as float32
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_every_option_of_the_network(name, tmp_path, monkeypatch, capsys):
+    options = VARIANTS[name]
+    triple = write_triple(tmp_path, options)
+    assert run(monkeypatch, *triple, "--dtype", "float64", "--json", tmp_path / "out.json") == 0, capsys.readouterr()
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["dtype"] == "float64" and result["bound"] == 1e-6 and result["passed"] is True
+    assert len(result["stages"]) == 16 + options.upsampler
+    assert max(result["stages"].values()) < 2e-7, result  # the numbers are stored as float32
+
+
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_other_precisions(dtype, tmp_path, monkeypatch, capsys):
+    triple = write_triple(tmp_path, dataclasses.replace(SMALL, layers=2, class_token=True))
+    assert run(monkeypatch, *triple, "--dtype", dtype, "--json", tmp_path / "out.json") == 0, capsys.readouterr()
+    result = json.loads((tmp_path / "out.json").read_text())
+    assert result["bound"] == {"float32": 2e-5, "bfloat16": 5e-2}[dtype]
+    if dtype == "bfloat16":
+        assert result["stages"]["mid_encoder_out"] > 1e-4  # else it were float32
+        assert result["stages"]["out_ray_d"] < 1e-6
+
+
+def test_one_wrong_number_in_any_stage_fails(tmp_path, monkeypatch, capsys):
+    """The stages are computed once; each is spoilt in turn."""
+    _, arrays, _ = oracle.triple(SMALL)
+    expected = {name: x for name, x in arrays.items() if not name.startswith("in_")}
+    found = {name: x.astype(np.float64) for name, x in expected.items()}
+    assert max(check_parity.relative_errors(found, expected).values()) == 0
+    for name, x in expected.items():
+        spoilt = x.copy()
+        spoilt.flat[x.size // 2] += 1e-3 * np.abs(x).max()
+        assert check_parity.relative_errors(found, expected | {name: spoilt})[name] > 5e-4
+    negative = expected | {"posed_rotations": -expected["posed_rotations"]}
+    assert check_parity.relative_errors(found, negative)["posed_rotations"] == 0
+    negative = expected | {"asset_rotations": -expected["asset_rotations"]}
+    assert check_parity.relative_errors(found, negative)["asset_rotations"] > 0.5
+
+
+def test_what_is_not_compared_fails(tmp_path, monkeypatch, capsys):
+    def change(arrays):
+        arrays["mid_something"] = np.zeros(3, np.float32)
+        arrays["mid_tokens"] = arrays["mid_tokens"][:, :-1]
+        arrays["asset_colors"][0, 0, 0] += 0.1
+        del arrays["posed_means3D"]
+
+    triple = write_triple(tmp_path, SMALL, change)
+    assert run(monkeypatch, *triple, "--json", tmp_path / "out.json") == 1
+    result = json.loads((tmp_path / "out.json").read_text())
+    stages = result["stages"]
+    assert result["passed"] is False and stages["mid_something"] is None and stages["mid_tokens"] is None
+    assert stages["asset_colors"] > 0.05 and stages["mid_block_0"] < 2e-5 and "posed_means3D" not in stages
+    printed = capsys.readouterr().out
+    assert printed.count("NOT COMPARED") == 2 and printed.count("TOO LARGE") == 1 and "FAILED" in printed
+
+
+def test_nothing_not_a_number_passes():
+    reference = {"mid_tokens": np.ones(3)}
+    for ours, theirs in ((np.asarray([1, np.nan, 1]), np.ones(3)), (np.ones(3), np.asarray([1, np.nan, 1]))):
+        assert check_parity.relative_errors({"mid_tokens": ours}, {"mid_tokens": theirs}) == {"mid_tokens": None}
+    assert check_parity.relative_errors({}, reference) == {"mid_tokens": None}
+    assert check_parity.relative_errors({"x": np.full(2, 3.0)}, {"x": np.zeros(2)}) == {"x": 3.0}
+
+
+def spoil(change):
+    return lambda paths: np.savez(paths[1], **change(dict(np.load(paths[1]))))
+
+
+def reconfigure(part, **settings):
+    def change(paths):
+        config = json.loads(paths[2].read_text())
+        section = config["training"] if part == "training" else config["model"][part]
+        section.update(settings)
+        paths[2].write_text(json.dumps(config))
+
+    return change
+
+
+UNUSABLE = {
+    "no checkpoint": (lambda paths: paths[0].unlink(), "a.pt"),
+    "no arrays": (lambda paths: paths[1].write_bytes(b"no zip"), "a.npz"),
+    "no JSON": (lambda paths: paths[2].write_text("{"), "a.json"),
+    "an input missing": (spoil(lambda a: {k: x for k, x in a.items() if k != "in_c2w"}), "'in_c2w' is missing"),
+    "an input of another shape": (spoil(lambda a: a | {"in_c2w": a["in_c2w"][:, :1]}), "in_c2w has shape"),
+    "an input not finite": (spoil(lambda a: a | {"in_image": a["in_image"] * np.nan}), "in_image"),
+    "no stages": (spoil(lambda a: {k: x for k, x in a.items() if k.startswith("in_")}), "no stage"),
+    "other sizes": (reconfigure("transformer", n_layer=3), "model.transformer.n_layer is 3"),
+    "another K": (reconfigure("vertex_decoder", num_free_gaussians=0), "1 tight and 0 free"),
+    "canonical maps": (reconfigure("training", use_canonical_maps=True), "use_canonical_maps"),
+    "another height": (reconfigure("training", target_height=1.0), "target_height"),
+}
+
+
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_unusable_inputs_are_one_line(case, tmp_path, monkeypatch, capsys):
+    change, message = UNUSABLE[case]
+    triple = write_triple(tmp_path, SMALL)
+    change(triple)
+    assert run(monkeypatch, *triple, "--json", tmp_path / "out.json") == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and message in error and not (tmp_path / "out.json").exists()
+
+
+def test_a_checkpoint_may_be_safetensors(tmp_path, monkeypatch, capsys):
+    from safetensors.numpy import save_file
+
+    _, arrays, config = write_triple(tmp_path, SMALL)
+    save_file(
+        {key: np.ascontiguousarray(x) for key, x in oracle.random_state(SMALL).items()}, tmp_path / "a.safetensors"
+    )
+    assert run(monkeypatch, tmp_path / "a.safetensors", arrays, config) == 0, capsys.readouterr()
+
+
+def test_help_imports_nothing_heavy():
+    script = golden.EXPERIMENTS / "check_parity.py"
+    code = "import sys, runpy; sys.argv = ['check_parity.py', '--help']\n"
+    code += f"try: runpy.run_path({str(script)!r}, run_name='__main__')\n"
+    code += "except SystemExit: pass\nassert 'jax' not in sys.modules and 'numpy' not in sys.modules"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert result.returncode == 0 and "CKPT.pt" in result.stdout, result.stderr
+
+
+@pytest.mark.skipif(not GOLDEN.exists(), reason="no golden data beside this checkout")
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", check_parity.BOUNDS)
+@pytest.mark.parametrize("name", ["golden_a", "golden_b"])
+def test_the_golden_data_in_full(name, dtype, monkeypatch, capsys):
+    paths = [GOLDEN / f"{name}.{suffix}" for suffix in ("pt", "npz", "json")]
+    assert run(monkeypatch, *paths, "--dtype", dtype) == 0, capsys.readouterr()
