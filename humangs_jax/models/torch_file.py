@@ -9,6 +9,7 @@ import collections
 import math
 import os
 import pickle
+import struct
 import zipfile
 import zlib
 from typing import Any, NamedTuple
@@ -31,7 +32,7 @@ STATE_DICT = "model"
 """Key of the state dict in the file; what lies under other keys (the optimizer's state) is never read."""
 LARGEST_RATIO = 16
 """Members may unpack to this many times the size of the file: torch does not compress at all."""
-BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, struct.error)
 """What zipfile raises for damaged, truncated, encrypted or exotic archives."""
 
 
@@ -87,6 +88,7 @@ class _StateDictUnpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) not in _ALLOWED:
+            module = "builtins" if module == "__builtin__" else module  # its name in protocol 2, which torch writes
             raise pickle.UnpicklingError(f"refused to load {module}.{name}: no part of a state dict")
         return _ALLOWED[module, name]
 
@@ -104,13 +106,16 @@ def read_torch_file(path: str | os.PathLike, skip_prefix: str | None = None) -> 
     checkpoint or a damaged one, if its pickle asks for anything but tensors, or if a storage is missing or too short,
     naming it.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return _read_archive(archive, os.path.getsize(path), skip_prefix)
-    except BROKEN as error:
-        raise ValueError(f"{path} is no zip-format checkpoint (torch.save since 1.6), or damaged: {error}") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    with open(path, "rb") as file:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                return _read_archive(archive, os.path.getsize(path), skip_prefix)
+        except BROKEN as error:
+            raise ValueError(
+                f"{path} is no zip-format checkpoint (torch.save since 1.6), or damaged: {error}"
+            ) from error
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from error
 
 
 def _read_archive(archive: zipfile.ZipFile, size: int, skip_prefix: str | None) -> tuple[dict[str, np.ndarray], int]:

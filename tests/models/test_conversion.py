@@ -1,172 +1,253 @@
-import collections
 import dataclasses
 import os
-import pickle
 import sys
-import types
-import zipfile
 
+import jax
+import network_oracle as oracle
 import numpy as np
 import pytest
+from network_cases import random_variables
 from network_golden import CHECKPOINT
+from network_oracle import Options
+from safetensors.numpy import save_file
+from torch_writer import FakeTensor, tensors, write_checkpoint
 
-from humangs_jax.models import conversion
-from humangs_jax.models.conversion import infer_config, load_checkpoint, map_tensor, read_state_dict
+from humangs_jax import cli
+from humangs_jax.models.conversion import (
+    describe,
+    expected_shapes,
+    infer_config,
+    load_checkpoint,
+    read_state_dict,
+    to_release,
+)
+from humangs_jax.models.presets import published
+from humangs_jax.models.transformer import TransformerConfig
+from humangs_jax.models.weights import load_weights
 
-
-@dataclasses.dataclass
-class FakeTensor:
-    """What `torch.save` writes for a tensor: a storage by reference, and a view of it."""
-
-    storage: np.ndarray
-    kind: str = "FloatStorage"
-    shape: tuple | None = None
-    strides: tuple | None = None
-    offset: int = 0
-
-
-def write_checkpoint(path, content, monkeypatch, byteorder="little"):
-    """A zip-format checkpoint as torch writes it, without torch."""
-    torch, utils = types.ModuleType("torch"), types.ModuleType("torch._utils")
-    rebuild = lambda *_: None
-    rebuild.__module__, rebuild.__qualname__, rebuild.__name__ = "torch._utils", *["_rebuild_tensor_v2"] * 2
-    utils._rebuild_tensor_v2, torch._utils = rebuild, utils
-    for name in conversion.STORAGE_DTYPES:
-        setattr(torch, name, type(name, (), {"__module__": "torch"}))
-    storages = []
-
-    class Reference:
-        def __init__(self, tensor):
-            self.tensor = tensor
-
-    class Pickler(pickle.Pickler):
-        def persistent_id(self, value):
-            if not isinstance(value, Reference):
-                return None
-            storages.append(value.tensor.storage)
-            size = len(value.tensor.storage)
-            return ("storage", getattr(torch, value.tensor.kind), str(len(storages) - 1), "cpu", size)
-
-        def reducer_override(self, value):
-            if not isinstance(value, FakeTensor):
-                return NotImplemented
-            shape = value.storage.shape if value.shape is None else value.shape
-            strides = (1,) * len(shape) if value.strides is None else value.strides
-            return rebuild, (Reference(value), value.offset, shape, strides, False, collections.OrderedDict())
-
-    with monkeypatch.context() as patch, zipfile.ZipFile(path, "w") as archive:
-        patch.setitem(sys.modules, "torch", torch)
-        patch.setitem(sys.modules, "torch._utils", utils)
-        with archive.open("archive/data.pkl", "w") as file:
-            Pickler(file, protocol=2).dump(content)
-        archive.writestr("archive/byteorder", byteorder)
-        for i, storage in enumerate(storages):
-            archive.writestr(f"archive/data/{i}", storage.tobytes())
-    return path
+VARIANTS = [
+    Options(),
+    Options(class_token=False, gaussians=1, patch=12, texture=(9, 5)),
+    Options(upsampler=False, layers=3, gaussians=3, skinning_head=True, joints=21),
+    Options(class_token=False, upsampler=False, skinning_head=True, layers=1, patch=4),
+    Options(width=48, head=16, layers=8),
+]
 
 
-def test_sizes_are_read_off_the_golden_checkpoint():
-    converted = load_checkpoint(CHECKPOINT)
+def write(folder, state, **others):
+    return write_checkpoint(folder / "a.pt", {"model": tensors(state), **others})
+
+
+@pytest.mark.parametrize("options", VARIANTS)
+def test_the_configuration_is_read_off_the_shapes(options, tmp_path):
+    state = oracle.random_state(options)
+    converted = load_checkpoint(write(tmp_path, state))
     config = converted.config
-    assert (config.transformer.width, config.transformer.layers, config.transformer.attention.head_width) == (64, 4, 16)
-    assert (config.patch_size, config.texture.resolution, config.texture.channels) == (8, 16, 4)
-    assert (config.upsampler.hidden, config.upsampler.out) == (16, 64)
-    assert (config.decoder.hidden, config.decoder.tight, config.decoder.free) == (32, 1, 4)
-    assert config.decoder.skinning_joints is None and converted.skinning_weights.shape == (300, 55)
+    transformer, decoder = config.transformer, config.decoder
+    assert (transformer.width, transformer.layers, transformer.mlp_ratio) == (options.width, options.layers, 4)
+    assert transformer.attention.head_width == options.head and transformer.attention.qk_norm
+    assert transformer.class_token == options.class_token and config.upsampler.enabled == options.upsampler
+    assert config.patch_size == options.patch
+    assert (config.texture.resolution, config.texture.channels) == options.texture
+    assert (decoder.hidden, decoder.tight, decoder.free) == (8, 1, options.gaussians - 1)
+    assert decoder.skinning_joints == (options.joints if options.skinning_head else None)
+    if options.upsampler:
+        assert (config.upsampler.hidden, config.upsampler.out) == (8, options.width)
+    quirks = dataclasses.asdict(published())
+    told = {"image_size", "patch_size", "texture", "transformer", "upsampler", "decoder"}
+    assert all(x == quirks[name] for name, x in dataclasses.asdict(config).items() if name not in told)
+    back = to_release(converted.variables) | {"tpose_lbs_weights": converted.skinning_weights}
+    assert {key: x.shape for key, x in back.items()} == {key: x.shape for key, x in state.items()}
+    for key, value in state.items():
+        assert key.endswith("num_batches_tracked") or np.array_equal(back[key], value), key
+
+
+def test_the_golden_checkpoint():
+    converted = load_checkpoint(CHECKPOINT)
     assert converted.skipped == 4  # frozen loss networks
-    assert config.ray_origins == "twice_normalized" and config.skinning == "rotation"
+    assert converted.skinning_weights.shape == (300, 55)
+    assert (converted.config.transformer.width, converted.config.upsampler.hidden) == (64, 16)
+    line = describe(converted)
+    assert "4 layers of 4 heads" in line and ", upsampler" in line and "no skinning head" in line
 
 
-def test_sizes_of_the_ablations():
-    state, _ = read_state_dict(CHECKPOINT)
-    state = {key: x for key, x in state.items() if not key.startswith("upsampler.") and key != "cls_token"}
-    state["vertex_decoder.lbs_head.2.weight"] = np.zeros((5 * 55, 32), np.float32)
-    config = infer_config(state)
-    assert not config.upsampler.enabled and not config.transformer.class_token and config.decoder.skinning_joints == 55
+def test_shapes_of_the_published_network():
+    shapes = expected_shapes(published())
+    assert shapes["image_tokenizer.1.weight"] == (768, 64 * 57) and shapes["neural_texture"] == (3, 128, 128, 16)
+    assert shapes["transformer_blocks.11.mlp.mlp.2.weight"] == (768, 3072) and shapes["cls_token"] == (1, 1, 768)
+    assert shapes["upsampler.up1.0.weight"] == (512, 256, 4, 4) and shapes["upsampler.up2.3.weight"] == (768, 128, 3, 3)
+    assert shapes["vertex_decoder.trunk.0.weight"] == (256, 768 + 768 + 39)
+    state = {key: np.broadcast_to(np.float32(0), shape) for key, shape in shapes.items()}
+    assert infer_config(state) == published()
+    learned = [n for key, n in shapes.items() if "running" not in key and "num_batches" not in key]
+    assert 95e6 < sum(np.prod(shape) for shape in learned) < 103e6
 
 
-def test_tensors_are_views_of_their_storages(tmp_path, monkeypatch):
-    numbers = np.arange(12, dtype=np.float32)
-    halves = (np.asarray([1.0, -2.5, 0.1], np.float32).view(np.uint32) >> 16).astype(np.uint16)
-    model = {
-        "turned": FakeTensor(numbers, shape=(2, 3), strides=(1, 4), offset=2),
-        "scalar": FakeTensor(np.asarray([7], np.int64), "LongStorage", shape=()),
-        "empty": FakeTensor(numbers[:0], shape=(0, 3), strides=(3, 1)),
-        "half": FakeTensor(halves, "BFloat16Storage"),
-        "loss_computer.vgg": FakeTensor(numbers),
-    }
-    path = write_checkpoint(tmp_path / "a.pt", {"model": collections.OrderedDict(model), "step": 3}, monkeypatch)
-    state, skipped = read_state_dict(path)
-    assert skipped == 1 and set(state) == set(model) - {"loss_computer.vgg"}
-    assert np.array_equal(state["turned"], [[2, 6, 10], [3, 7, 11]])
-    assert state["scalar"].shape == () and state["scalar"] == 7 and state["empty"].shape == (0, 3)
-    assert state["half"].dtype == np.float32 and np.allclose(state["half"], [1, -2.5, 0.1], rtol=2**-7)
+def test_a_made_up_network_goes_there_and_back(tmp_path):
+    config = dataclasses.replace(
+        infer_config(oracle.random_state(Options())), transformer=TransformerConfig(width=128, layers=4)
+    )
+    variables = random_variables(config)
+    state = to_release(variables) | {"tpose_lbs_weights": np.ones((2, 55), np.float32)}
+    back = load_checkpoint(write(tmp_path, state))
+    assert back.config == config
+    assert all(np.array_equal(*pair) for pair in zip(*map(jax.tree.leaves, (variables, back.variables)), strict=True))
 
 
-def test_no_code_of_a_file_runs(tmp_path, monkeypatch):
+def test_heads_without_norms_need_their_width(tmp_path):
+    path = write(tmp_path, oracle.random_state(Options(qk_norm=False)))
+    with pytest.raises(ValueError, match=r"a\.pt: no tensor .*q_norm.weight' tells the width of a head"):
+        load_checkpoint(path)
+    attention = load_checkpoint(path, head_width=4).config.transformer.attention
+    assert attention.head_width == 4 and not attention.qk_norm
+    for wrong, message in ((5, "multiple of head_width 5"), (0, "at least 1")):
+        with pytest.raises(ValueError, match=message):
+            load_checkpoint(path, head_width=wrong)
+    with pytest.raises(ValueError, match="says heads of 8, not 4"):
+        load_checkpoint(write(tmp_path, oracle.random_state(Options())), head_width=4)
+
+
+def test_safetensors_state_dicts(tmp_path):
+    state = oracle.random_state(Options())
+    save_file(state | {"loss_computer.x": np.zeros(2, np.float32)}, tmp_path / "a.safetensors")
+    ours, other = load_checkpoint(tmp_path / "a.safetensors"), load_checkpoint(write(tmp_path, state))
+    assert ours.config == other.config and ours.skipped == 1 and other.skipped == 0
+    leaves = zip(*(jax.tree.leaves(x.variables) for x in (ours, other)), strict=True)
+    assert all(np.array_equal(*pair) for pair in leaves)
+    (tmp_path / "broken.safetensors").write_bytes((tmp_path / "a.safetensors").read_bytes()[:-9])
+    with pytest.raises(ValueError, match="no readable safetensors file"):
+        read_state_dict(tmp_path / "broken.safetensors")
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        read_state_dict(tmp_path / "nowhere.safetensors")
+
+
+def test_half_precision_checkpoints(tmp_path):
+    state = {key: x if x.ndim == 0 else x.astype(np.float16) for key, x in oracle.random_state(Options()).items()}
+    variables = load_checkpoint(write(tmp_path, state)).variables
+    assert all(x.dtype == np.float32 for x in jax.tree.leaves(variables))
+
+
+@pytest.mark.parametrize("options", VARIANTS[:3])
+def test_every_missing_tensor_is_named(options, monkeypatch):
+    from humangs_jax.models import conversion
+
+    state = oracle.random_state(options)
+    for key in state:
+        if key == "cls_token":
+            continue  # a network without one; the decoder's width tells that it is not
+        rest = {name: x for name, x in state.items() if name != key}
+        monkeypatch.setattr(conversion, "read_state_dict", lambda path, rest=rest: (rest, 0))
+        with pytest.raises(ValueError, match=f"x: tensor '{key.replace('.', '[.]')}' is missing"):
+            load_checkpoint("x")
+
+
+def test_every_wrong_shape_is_noticed(monkeypatch):
+    from humangs_jax.models import conversion
+
+    state = oracle.random_state(Options(skinning_head=True))
+    named = 0
+    for key, value in state.items():
+        if key in ("tpose_lbs_weights", "neural_texture"):
+            continue  # the number of vertices, and of texels, is free
+        for wrong in (np.concatenate([value, value]) if value.ndim else np.zeros(1), value[None]):
+            spoilt = state | {key: wrong}
+            monkeypatch.setattr(conversion, "read_state_dict", lambda path, spoilt=spoilt: (spoilt, 0))
+            with pytest.raises(ValueError, match=r"x: .*(shape|inputs|multiple)") as error:
+                load_checkpoint("x")
+            named += f"'{key}'" in str(error.value)
+    assert named > 1.7 * len(state)  # a tensor that tells a size may put the blame on the others
+
+
+def change(key, value):
+    return lambda state: state | {key: value}
+
+
+REFUSED = {
+    "unknown": (change("decoder.weight", np.zeros(3, np.float32)), "tensor 'decoder.weight' is no part"),
+    "unknown in a block": (
+        change("transformer_blocks.0.attn.bias.weight", np.zeros(3, np.float32)),
+        "'transformer_blocks.0.attn.bias.weight' is no part",
+    ),
+    "a block of no number": (
+        change("transformer_blocks.x.norm1.weight", np.zeros(3, np.float32)),
+        "transformer_blocks",
+    ),
+    "a block too far": (
+        change("transformer_blocks.99.norm1.weight", np.zeros(16, np.float32)),
+        "'transformer_blocks.4.norm1.weight' is missing",
+    ),
+    "canonical target maps": (
+        change("target_pose_tokenizer.1.weight", np.zeros(3, np.float32)),
+        "target_pose_tokenizer",
+    ),
+    "not finite": (
+        change("norm.bias", np.full(16, np.nan, np.float32)),
+        "'norm.bias' holds numbers that are not finite",
+    ),
+    "class token removed": (
+        lambda state: {key: x for key, x in state.items() if key != "cls_token"},
+        "'vertex_decoder.trunk.0.weight' has shape",
+    ),
+    "no square patch": (
+        change("image_tokenizer.1.weight", np.zeros((16, 64 * 15 + 1), np.float32)),
+        "image_tokenizer.1.weight' has 961 inputs",
+    ),
+}
+
+
+def convert(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["humangs", "convert", *map(str, arguments)])
+    try:
+        cli.main()
+        code = 0
+    except SystemExit as exit_:
+        code = exit_.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_the_command_refuses_by_name_and_writes_nothing(case, tmp_path, monkeypatch, capsys):
+    spoil, message = REFUSED[case]
+    path = write(tmp_path, spoil(oracle.random_state(Options())))
+    code, out, error = convert(monkeypatch, capsys, path, "--out", tmp_path / "w.safetensors")
+    assert code == 2 and out == "" and error.count("\n") == 1 and message in error and "a.pt" in error
+    assert os.listdir(tmp_path) == ["a.pt"]
+
+
+def test_the_command_refuses_code(tmp_path, monkeypatch, capsys):
     class Evil:
         def __reduce__(self):
             return os.mkdir, (str(tmp_path / "owned"),)
 
-    for i, content in enumerate(({"model": {"w": Evil()}}, {"model": {}, "optimizer": Evil()})):
-        path = write_checkpoint(tmp_path / f"{i}.pt", content, monkeypatch)
-        with pytest.raises(ValueError, match=r"refused to load (posix|nt).mkdir"):
-            read_state_dict(path)
-    assert not (tmp_path / "owned").exists()
+    path = write(tmp_path, oracle.random_state(Options()), lr_scheduler=Evil())
+    code, _, error = convert(monkeypatch, capsys, path, "--out", tmp_path / "w.safetensors")
+    assert code == 2 and error.count("\n") == 1 and "refused to load" in error and ".mkdir" in error
+    assert os.listdir(tmp_path) == ["a.pt"]
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        ({"weights": {}}, "under 'model'"),
-        ([1, 2], "under 'model'"),
-        ({"model": {"w": 3}}, r"model\['w'\] is no tensor but int"),
-        ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(5,))}}, "w: shape .* does not fit"),
-        ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(2,), strides=(-1,), offset=3)}}, "does not fit"),
-        ({"model": {"w": FakeTensor(np.zeros(4, np.float32), offset=-1)}}, "does not fit"),
-        ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(1 << 40, 2), strides=(0, 1))}}, "does not fit"),
-    ],
-)
-def test_damaged_checkpoints_are_clear_errors(tmp_path, monkeypatch, content, message):
-    path = write_checkpoint(tmp_path / "a.pt", content, monkeypatch)
-    with pytest.raises(ValueError, match=message):
-        read_state_dict(path)
-
-
-def test_files_that_are_no_checkpoints(tmp_path, monkeypatch):
-    other = tmp_path / "a.pt"
-    other.write_bytes(b"legacy")
-    with pytest.raises(ValueError, match="no zip-format checkpoint"):
-        read_state_dict(other)
-    with zipfile.ZipFile(other, "w") as archive:
-        archive.writestr("archive/readme", "")
-    with pytest.raises(ValueError, match=r"data\.pkl"):
-        read_state_dict(other)
-    with zipfile.ZipFile(other, "w") as archive:
-        archive.writestr("archive/data.pkl", b"\x80\x02}q")
-    with pytest.raises(ValueError, match=r"a\.pt"):
-        read_state_dict(other)
-    with pytest.raises(ValueError, match="little-endian"):
-        read_state_dict(write_checkpoint(other, {"model": {}}, monkeypatch, byteorder="big"))
-
-
-def test_unknown_and_missing_tensors_are_named(monkeypatch):
-    for key in (
-        "transformer_blocks.0.attn.bias.weight",
-        "transformer_blocks.x.norm1.weight",
-        "decoder.weight",
-        "scale",
-    ):
-        with pytest.raises(ValueError, match=key):
-            map_tensor(key, np.zeros(3))
-    with pytest.raises(ValueError, match=r"expected 4 axes, got shape \(3,\)"):
-        map_tensor("upsampler.fuse.0.weight", np.zeros(3))
-    state, _ = read_state_dict(CHECKPOINT)
-    with pytest.raises(ValueError, match="canonical target maps"):
-        infer_config(state | {"target_pose_tokenizer.1.weight": np.zeros(3)})
-    with pytest.raises(ValueError, match=r"no tensor 'neural_texture'"):
-        infer_config({key: x for key, x in state.items() if key != "neural_texture"})
-    del state["transformer_blocks.2.norm1.weight"]
-    monkeypatch.setattr(conversion, "read_state_dict", lambda path: (state, 0))
-    with pytest.raises(ValueError, match="block_2/norm1/scale' is missing"):
-        load_checkpoint("checkpoint")
+def test_the_command_converts(tmp_path, monkeypatch, capsys):
+    state = oracle.random_state(Options(qk_norm=False))
+    losses = {
+        "loss_computer.a": FakeTensor(np.ones(2, np.float32)),
+        "loss_computer.b": FakeTensor(np.ones(2, np.float32)),
+    }
+    path = write_checkpoint(tmp_path / "a.pt", {"model": tensors(state) | losses, "optimizer": {}})
+    weights = tmp_path / "w.safetensors"
+    code, out, error = convert(monkeypatch, capsys, path, "--out", weights, "--head-width", "4", "--pool", "visible")
+    assert code == 0, error
+    assert "skipped 2 tensors" in out and "loss_computer" in out and "4 layers of 4 heads" in out
+    variables, config = load_weights(weights)
+    converted = load_checkpoint(path, head_width=4)
+    assert config.sampling.pool == "visible" and converted.config.sampling.pool == "all"
+    assert dataclasses.replace(config, sampling=converted.config.sampling) == converted.config
+    leaves = zip(*map(jax.tree.leaves, (variables, converted.variables)), strict=True)
+    assert all(np.array_equal(*pair) for pair in leaves)
+    code, _, error = convert(monkeypatch, capsys, weights, "--out", tmp_path / "again.safetensors")
+    assert code == 2 and "a weights file already" in error
+    for arguments in ((path, "--out", tmp_path / "w.npz"), (path, "--out", tmp_path / "no" / "w.safetensors")):
+        code, _, error = convert(monkeypatch, capsys, *arguments)
+        assert code == 2 and error.count("\n") == 1
+    code, _, error = convert(monkeypatch, capsys, weights, "--out", weights)
+    assert code == 2 and "the checkpoint itself" in error
+    assert sorted(os.listdir(tmp_path)) == ["a.pt", "w.safetensors"]
