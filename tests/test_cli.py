@@ -10,7 +10,7 @@ import pytest
 from humangs_jax import cli
 from humangs_jax.data.capture import load_capture, save_capture
 
-COMMANDS = ("demo", "reconstruct", "animate", "render", "export", "synth", "check", "train")
+COMMANDS = ("demo", "reconstruct", "animate", "render", "export", "synth", "check", "train", "convert")
 
 
 @pytest.fixture(scope="module")

@@ -45,11 +45,13 @@ def to_matrix(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def from_matrix(m: Float[Array, "*b 3 3"], smallest: float = 0.1) -> Float[Array, "*b 4"]:
-    """Quaternion of a rotation matrix, by the best conditioned of the four candidates.
+def candidates_from_matrix(
+    m: Float[Array, "*b 3 3"], smallest: float = 0.1
+) -> tuple[Float[Array, "*b 4 4"], Float[Array, "*b 4"]]:
+    """The four quaternions that a rotation matrix can be read as, and how well conditioned each is.
 
-    q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)); the candidate of the largest q_abs divided by 2 max(q_abs, `smallest`). A matrix
-    that is no rotation is not repaired: the result then has |q| != 1, as in the published network ("rotation" skinning).
+    q_abs = sqrt(max(0, 1 ± m00 ± m11 ± m22)); candidate c is row c divided by 2 max(q_abs, `smallest`). Of a rotation
+    they are all the same; of another matrix they are not.
     """
     m00, m11, m22 = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     squared = jnp.stack([1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], axis=-1)
@@ -67,7 +69,16 @@ def from_matrix(m: Float[Array, "*b 3 3"], smallest: float = 0.1) -> Float[Array
         ],
         axis=-2,
     )
-    candidates = candidates / (2 * jnp.maximum(q_abs, smallest))[..., None]
+    return candidates / (2 * jnp.maximum(q_abs, smallest))[..., None], q_abs
+
+
+def from_matrix(m: Float[Array, "*b 3 3"], smallest: float = 0.1) -> Float[Array, "*b 4"]:
+    """Quaternion of a rotation matrix, by the best conditioned of the four candidates (see `candidates_from_matrix`).
+
+    A matrix that is no rotation is not repaired: the result then has |q| != 1, as in the published network ("rotation"
+    skinning).
+    """
+    candidates, q_abs = candidates_from_matrix(m, smallest)
     best = jnp.argmax(q_abs, axis=-1)[..., None, None]
     return jnp.take_along_axis(candidates, best, axis=-2)[..., 0, :]
 

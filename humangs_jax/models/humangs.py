@@ -62,8 +62,8 @@ class HumanGSConfig:
     and how the Gaussians are to be skinned (recorded). body_vertices, longest_edge: vertex count to decimate bodies to,
     and metres to split their edges to afterwards, None for neither (recorded). ray_origins: the release divides camera
     centres by s and the ray origins taken from them once more, so that the moments of its rays ("twice_normalized") fit
-    no camera; needed to run its weights. dtype: of the products;
-    parameters, norms and softmax statistics stay float32 at least.
+    no camera; needed to run its weights. dtype: of the encoder's products;
+    parameters, norms, softmax statistics and the decoder stay float32 at least.
     """
 
     image_size: int = 512
@@ -320,8 +320,8 @@ def decode_heads(
 ) -> RawGaussians:
     """The first half of `decode`: heads before their activations."""
     entering = decoder_input(features, canonical_vertices / subject_unit(canonical_vertices))
-    decoder = VertexDecoder(config.decoder, config.compute_dtype)
-    return cast(RawGaussians, decoder.apply({"params": variables["params"]["decoder"]}, entering))
+    own = {"params": variables["params"]["decoder"]}
+    return cast(RawGaussians, VertexDecoder(config.decoder).apply(own, entering))
 
 
 def assemble(

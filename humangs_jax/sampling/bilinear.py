@@ -27,17 +27,21 @@ def texel_indices(
     return pixels / image * (grid - 1)
 
 
-def sample_bilinear(grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"]) -> Float[Array, "*p c"]:
+def sample_bilinear(
+    grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"], origin: float = 0.0
+) -> Float[Array, "*p c"]:
     """Bilinear interpolation between texel centres; texels outside of the grid count as zeros.
 
-    Positions that are outside by a texel or more, infinite or NaN give zero with zero gradient.
+    origin: the texel index, in both axes, that `indices` are relative to; counted from the middle, float32 positions
+    keep more digits of their fractions. Positions that are outside by a texel or more, infinite or NaN give zero with
+    zero gradient.
     """
     height, width, channels = grid.shape
     size = jnp.asarray([width, height], indices.dtype)
-    inside = jnp.all((indices > -1) & (indices < size), axis=-1, keepdims=True)
-    indices = jnp.where(inside, indices, -1.0)  # weight one on a texel that does not exist
-    corner = jnp.floor(indices)
-    fraction = indices - corner
+    absolute = indices + origin
+    inside = jnp.all((absolute > -1) & (absolute < size), axis=-1, keepdims=True)
+    corner = jnp.floor(jnp.where(inside, absolute, -1.0))  # outside: weight one on a texel that does not exist
+    fraction = jnp.where(inside, indices, corner - origin) - (corner - origin)
     x0, y0 = jnp.moveaxis(corner.astype(jnp.int32), -1, 0)
     rows = grid.reshape(height * width, channels)
 

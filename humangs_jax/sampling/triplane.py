@@ -27,8 +27,10 @@ class TriplaneConfig:
 
 def sample_triplane(texture: Float[Array, "3 r r c"], positions: Float[Array, "*p 3"]) -> Float[Array, "*p 3*c"]:
     """Features of canonical positions (normalised units): those of plane xy, then xz, then yz."""
-    indices = (positions + 1) / 2 * (texture.shape[1] - 1)
+    middle = (texture.shape[1] - 1) / 2
+    indices = positions * middle  # from the middle: a third of the rounding of (positions + 1) * middle
     features = [
-        sample_bilinear(plane, indices[..., axes]) for plane, axes in zip(texture, map(list, PLANES), strict=True)
+        sample_bilinear(plane, indices[..., axes], middle)
+        for plane, axes in zip(texture, map(list, PLANES), strict=True)
     ]
     return jnp.concatenate(features, axis=-1)

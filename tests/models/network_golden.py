@@ -56,7 +56,7 @@ def load_subject():
 def thinned_errors(found, carried):
     """Relative errors of one subject's stages, of which `carried` keeps a part."""
     expected = {name: x for name, x in carried.items() if not name.startswith("in_")}
-    return check_parity.relative_errors({name: x[THINNED.get(name, ())] for name, x in found.items()}, expected)
+    return check_parity.relative_errors({name: found[name][THINNED.get(name, ())] for name in expected}, expected)
 
 
 if __name__ == "__main__":

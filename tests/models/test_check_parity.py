@@ -123,6 +123,22 @@ def test_what_is_not_compared_fails(tmp_path, monkeypatch, capsys):
     assert printed.count("NOT COMPARED") == 2 and printed.count("TOO LARGE") == 1 and "FAILED" in printed
 
 
+def test_ties_of_posed_rotations_are_free_and_nothing_else_is():
+    """Two readings of the same blended transform, one of which is 1e-3 better conditioned."""
+    readings = np.zeros((1, 1, 4, 4))
+    readings[0, 0, :2] = [[0.6, 0.5, 0, 0], [0.4, 0.7, 0, 0]]
+    found = {
+        "posed_rotations": readings[:, :, 0],
+        check_parity.TIES: readings,
+        check_parity.TIE_LEVELS: np.asarray([[[1.001, 1, 0.2, 0]]]),
+    }
+    error = lambda reference, bound: check_parity.relative_errors(
+        found, {"posed_rotations": np.asarray(reference).reshape(1, 1, 4)}, bound
+    )["posed_rotations"]
+    assert error([0.6, 0.5, 0, 0], 0) == 0 and error([-0.4, -0.7, 0, 0], 2e-3) == 0
+    assert error([0.4, 0.7, 0, 0], 5e-4) > 0.2 and error([0, 0, 0, 0.7], 2e-3) > 0.2
+
+
 def test_nothing_not_a_number_passes():
     reference = {"mid_tokens": np.ones(3)}
     for ours, theirs in ((np.asarray([1, np.nan, 1]), np.ones(3)), (np.ones(3), np.asarray([1, np.nan, 1]))):
