@@ -83,8 +83,8 @@ DEFAULT_CONFIG = SplatConfig()
 
 SPLAT_PRESETS = {
     "exact": DEFAULT_CONFIG,
-    "near_exact": SplatConfig(alpha_min=1 / 128, transmittance_stop=1e-3),
-    "fast": SplatConfig(extent=2.0, alpha_min=1 / 64, transmittance_stop=1e-2),
+    "near_exact": SplatConfig(extent=2.5, transmittance_stop=1e-3),
+    "fast": SplatConfig(extent=1.75, transmittance_stop=3e-3),
     "inria": SplatConfig(
         near=constants.INRIA_NEAR,
         alpha_max=constants.INRIA_ALPHA_MAX,
