@@ -13,6 +13,7 @@ arrays of many images leave the cache).
 
 import argparse
 import gc
+import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -29,21 +30,28 @@ FRACTIONS = (0.125, 0.25, 0.5, 1.0, 2.0)
 VIEWS = (1, 2, 4, 8)
 VIEW_ANGLE = 0.01
 """Radians from one camera to the next."""
+TICKS = (10, 20, 50, 100, 200, 500, 1000)
 PANELS = {"pixels": "pixels", "gaussians": "Gaussians", "views, render_views": "views", "views, vmap": "views"}
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", required=True, help="npz of a scene, or 'demo'")
+    parser.add_argument("--scene", help="npz of a scene, or 'demo'")
+    parser.add_argument("--measured", type=Path, help="JSON of an earlier run, instead of a scene")
     parser.add_argument("--size", type=int, default=512, help="side of the image where pixels are not what grows")
     parser.add_argument("--repeats", type=int, default=7, help="timed rounds")
     parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument("--picture", type=Path, help="draw the growth here")
     parser.add_argument("--page", type=Path, help="Markdown page whose section 'splatting_scaling' becomes the table")
     arguments = parser.parse_args()
-    prepare_process()
-    result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats)
+    if bool(arguments.scene) == bool(arguments.measured):
+        parser.error("give either --scene or --measured")
+    if arguments.measured:
+        result = json.loads(arguments.measured.read_text())
+    else:
+        prepare_process()
+        result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats)
     text = table(result)
     print(text)
     if arguments.json:
@@ -165,7 +173,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     labels = list(dict.fromkeys(PANELS.values()))
-    figure, axes = plt.subplots(1, len(labels), figsize=(12, 4))
+    figure, axes = plt.subplots(1, len(labels), figsize=(12, 4), sharey=True)
     for panel, label in PANELS.items():
         axis, rows = axes[labels.index(label)], result["series"][panel]
         sizes = np.asarray([row["size"] for row in rows], float)
@@ -177,9 +185,13 @@ def draw(result: dict[str, Any], path: Path) -> None:
             if how != "vmap":
                 axis.loglog(sizes, times[-1] * sizes / sizes[-1], ":", color="0.8", lw=1, zorder=0)
         axis.set(xlabel=label)
+        axis.set_xticks(sizes, [f"{size:,.0f}" for size in sizes], fontsize=8)
+        axis.set_yticks(TICKS, [f"{tick}" for tick in TICKS])
+        axis.minorticks_off()
         axis.grid(alpha=0.25, which="both")
         axis.legend(fontsize=7.5)
     axes[0].set_ylabel("CPU ms (dotted: linear)")
+    axes[0].set_ylim(5, 1000)
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)

@@ -10,13 +10,14 @@ the relative L2 error, the worst of the five parameters'. Knobs that only say in
 block, chunks) are measured too: their error is rounding. Dropping the hidden: the Gaussians that weigh less than a
 threshold on every pixel from all of 24 cameras around are left out (of gradients, they count as 0).
 
-About 6 minutes for a scene of 52,375 Gaussians at 512; `--only extent scale` measures some knobs. Expected: the preset
-near_exact above 50 dB at 0.8 of the time, fast above 35 dB at half of it (docs/performance.md).
+About 8 minutes for a scene of 52,375 Gaussians at 512; `--only extent scale` measures some knobs. Expected: the preset
+near_exact above 50 dB at 0.8 of the time, fast at about 40 dB and 0.6 of it (docs/performance.md).
 """
 
 import argparse
 import dataclasses
 import gc
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -81,22 +82,29 @@ class Setting(NamedTuple):
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scene", required=True, help="npz of a scene, or 'demo'")
+    parser.add_argument("--scene", help="npz of a scene, or 'demo'")
+    parser.add_argument("--measured", type=Path, help="JSON of an earlier run, instead of a scene")
     parser.add_argument("--size", type=int, default=512, help="side of the image, pixels")
     parser.add_argument("--repeats", type=int, default=9, help="timed rounds")
     parser.add_argument("--only", nargs="+", help="knobs to measure (also: hidden, combined, preset)")
     parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument("--picture", type=Path, help="draw the Pareto front here")
-    parser.add_argument("--page", type=Path, help="Markdown page whose section 'splatting_tradeoff' becomes the table")
+    parser.add_argument("--page", type=Path, help="Markdown page to write the table into")
+    parser.add_argument("--section", default="splatting_tradeoff", help="the page's section")
     arguments = parser.parse_args()
-    prepare_process()
-    result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats, arguments.only)
+    if bool(arguments.scene) == bool(arguments.measured):
+        parser.error("give either --scene or --measured")
+    if arguments.measured:
+        result = json.loads(arguments.measured.read_text())
+    else:
+        prepare_process()
+        result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats, arguments.only)
     text = table(result)
     print(text)
     if arguments.json:
         write_json(arguments.json, result)
     if arguments.page:
-        write_section(arguments.page, "splatting_tradeoff", text)
+        write_section(arguments.page, arguments.section, text)
     if arguments.picture:
         draw(result, arguments.picture)
 
@@ -246,15 +254,17 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
     exact = {**result["exact"], "label": "exact", "knob": "preset"} | {f"{name}_cpu": 1.0 for name in DIRECTIONS}
     rows = [exact] + [r for r in result["settings"] if r["knob"] not in SCHEDULE and r["label"] != "inria"]
-    figure, axes = plt.subplots(1, 2, figsize=(13, 6), sharey=True)
+    figure, axes = plt.subplots(1, 2, figsize=(13, 6), sharex=True, sharey=True)
     for axis, name in zip(axes, DIRECTIONS, strict=True):
         _draw_panel(axis, rows, f"{name}_cpu")
         axis.set(xlabel=f"{name.replace('_', ' + ')}: CPU time relative to exact")
         axis.grid(alpha=0.25)
     axes[0].set_ylabel("PSNR to the exact image, dB")
-    axes[1].legend(fontsize=8, loc="lower right")
+    axes[1].legend(fontsize=8, loc="upper left")
+    axes[1].set_xlim(right=1.1)
     figure.suptitle(
-        f"{result['gaussians']:,} Gaussians, {result['size']} x {result['size']} pixels. Stars: presets; grey: the front",
+        f"{result['gaussians']:,} Gaussians, {result['size']} x {result['size']} pixels. Stars: presets. "
+        "Grey: the fronts, with and without leaving hidden Gaussians out",
         fontsize=10,
     )
     figure.tight_layout()
@@ -264,8 +274,11 @@ def draw(result: dict[str, Any], path: Path) -> None:
 
 
 def _draw_panel(axis, rows, time):
-    front = pareto(rows, time)
-    axis.step(*zip(*((r[time], r["psnr"]) for r in front), strict=True), where="post", color="0.8", lw=3)
+    whole = [row for row in rows if "hidden" not in row["label"]]
+    for some, color in ((rows, "0.85"), (whole, "0.65")):
+        steps = zip(*((r[time], r["psnr"]) for r in pareto(some, time)), strict=True)
+        axis.step(*steps, where="post", color=color, lw=2.5)
+    labelled = pareto(rows, time) + pareto(whole, time)
     knobs = dict.fromkeys(row["knob"] for row in rows if row["knob"] != "preset")
     for i, knob in enumerate(knobs):
         points = [(row[time], row["psnr"]) for row in rows if row["knob"] == knob]
@@ -276,7 +289,7 @@ def _draw_panel(axis, rows, time):
         if row["knob"] == "preset":
             axis.plot(*point, "*", ms=14, color="black", zorder=3)
             axis.annotate(row["label"], point, (8, 4), textcoords="offset points", weight="bold")
-        elif row in front or row["knob"] != "combined":
+        elif row in labelled or row["knob"] != "combined":
             text = row["label"].removeprefix(row["knob"]).strip()
             axis.annotate(text, point, (5, -8), textcoords="offset points", fontsize=6.5, color="0.35")
 
