@@ -93,7 +93,7 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
         runs |= {f"yardstick {name}": run for name, run in yardstick_runs(arguments.yardstick, scene, target).items()}
     load = os.getloadavg()[0]
     times = medians(runs, arguments.repeats) if arguments.repeats else {}
-    result = milliseconds(times, "")
+    result: dict[str, Any] = milliseconds(times, "")
     result["yardstick"] = milliseconds(times, "yardstick ") if arguments.yardstick else None
     result["ratio"] = result["yardstick"] and {
         key: result[key] / theirs if theirs else None for key, theirs in result["yardstick"].items()
@@ -166,6 +166,8 @@ def compiled(
 def yardstick_runs(folder: Path, scene: Scene, target: np.ndarray) -> dict[str, Callable[[], Any]]:
     """The yardstick's two programs, bound to the scene."""
     spec = importlib.util.spec_from_file_location("yardstick", folder / "yardstick.py")
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{folder}: holds no yardstick.py that can be loaded")
     module = importlib.util.module_from_spec(spec)
     sys.modules["yardstick"] = module
     spec.loader.exec_module(module)
@@ -186,7 +188,7 @@ def milliseconds(times: Mapping[str, np.ndarray], prefix: str) -> dict[str, floa
 def errors(programs: Mapping[str, Callable[[], Any]], reference: Reference | None) -> dict[str, Any]:
     """Errors of image and gradients; None where the reference lacks them."""
     image = np.asarray(programs["forward"]().rgb)
-    found = dict.fromkeys(("psnr", "max_abs_error", "fraction_above_2e-4"))
+    found: dict[str, Any] = dict.fromkeys(("psnr", "max_abs_error", "fraction_above_2e-4"))
     measures = ("relative_l2", "cosine", "signed_bias", "gain")
     found |= {f"gradient_{measure}": dict.fromkeys(PARAMETERS) for measure in measures}
     if reference is None:

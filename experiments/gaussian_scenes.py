@@ -103,8 +103,8 @@ def orbiting(scene: Scene, azimuths: np.ndarray, elevations: np.ndarray | float 
 
     own, middle = scene.camera(), np.median(scene.means, axis=0)
     distance = float(np.linalg.norm(np.asarray(own.center) - middle))
-    azimuths, elevations = (jnp.asarray(angles, jnp.float32) for angles in (azimuths, elevations))
-    return orbit(jnp.asarray(middle), distance, azimuths, elevations, own.K, scene.size, scene.size)
+    angles = (jnp.asarray(a, jnp.float32) for a in (azimuths, elevations))
+    return orbit(jnp.asarray(middle), distance, *angles, own.K, scene.size, scene.size)
 
 
 def make_target(size: int, seed: int = 1) -> np.ndarray:

@@ -406,9 +406,8 @@ def compare(scene: Scene, found: tuple, expected: tuple) -> Outcome:
     pairs = natural(scene, gradients), natural(scene, exact_gradients)
     errors = {name: relative_l2(pairs[0][name], pairs[1][name]) for name in NAMES}
     turn, stretch = (np.linalg.norm(pairs[1][name]) for name in ("quats", "scales"))
-    errors["quats"] = min(
-        errors["quats"], np.linalg.norm(pairs[0]["quats"] - pairs[1]["quats"]) / (max(turn, stretch) or np.inf)
-    )
+    absolute = float(np.linalg.norm(pairs[0]["quats"] - pairs[1]["quats"]))
+    errors["quats"] = min(errors["quats"], absolute / (float(max(turn, stretch)) or np.inf))
     worst = max(errors, key=errors.__getitem__)
     return Outcome(
         finite=all(np.isfinite(wide(leaf)).all() for leaf in jax.tree.leaves(found)),

@@ -139,7 +139,8 @@ def _append(series, panel, size, programs, facts, repeats):
 
 def slope(rows: Sequence[dict[str, Any]], name: str) -> float:
     """Of log CPU time over log size, by least squares."""
-    return float(np.polyfit(*np.log([(row["size"], row[f"{name}_cpu_ms"]) for row in rows]).T, 1)[0])
+    size, time = np.log([(row["size"], row[f"{name}_cpu_ms"]) for row in rows]).T
+    return float(np.polyfit(size, time, 1)[0])
 
 
 def table(result: dict[str, Any]) -> str:

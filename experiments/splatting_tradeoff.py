@@ -129,15 +129,13 @@ def settings(scene: Scene, only: Sequence[str] | None) -> list[Setting]:
 
 def short(value: Any) -> str:
     """1/64 rather than 0.015625."""
-    if isinstance(value, float) and 2e-3 < value < 0.1 and (1 / value).is_integer() and (1 / value) % 10:
+    if isinstance(value, float) and 2e-3 < value < 0.1 and float(1 / value).is_integer() and (1 / value) % 10:
         return f"1/{1 / value:.0f}"
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def largest_weights(scene: Scene) -> np.ndarray:
     """(g,) the largest weight of each Gaussian on any pixel of any of the cameras around the scene, and of its own."""
-    import jax
-
     from humangs_jax.rendering.splat_config import SplatConfig
     from humangs_jax.rendering.splatting import render, render_views
 
@@ -146,7 +144,7 @@ def largest_weights(scene: Scene) -> np.ndarray:
     turns = np.linspace(0, 2 * np.pi, VIEWS, endpoint=False)
     cameras = orbiting(scene, turns, np.resize([0.0, 0.4, -0.4], VIEWS))
     others = render_views(gaussians, cameras, config).visibility
-    return np.maximum(*jax.device_get((own, others.max(axis=0))))
+    return np.maximum(np.asarray(own), np.asarray(others).max(axis=0))
 
 
 def measure(scene: Scene, repeats: int, only: Sequence[str] | None = None) -> dict[str, Any]:
@@ -169,7 +167,7 @@ def measure(scene: Scene, repeats: int, only: Sequence[str] | None = None) -> di
         part = scene._replace(**{name: getattr(scene, name)[kept] for name in PARAMETERS})
         config = fitted(part, setting.config, np.float32)
         programs = compiled(part, target, config)[0]
-        row = {"knob": setting.knob, "label": setting.label, "gaussians": len(part.means)}
+        row: dict[str, Any] = {"knob": setting.knob, "label": setting.label, "gaussians": len(part.means)}
         row |= ratios(exact, programs, repeats) | differences(outputs(programs, kept), truth)
         rows.append(row | {"config": dataclasses.asdict(config)})
         print(

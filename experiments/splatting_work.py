@@ -165,8 +165,8 @@ def culling_squares(projected: "ProjectedGaussians", reach: np.ndarray) -> dict[
     larger = 0.5 * (xx + yy) + np.sqrt(0.25 * (xx - yy) ** 2 + xy**2)
     drawn = reach > 0
     three_sigma = np.where(drawn, np.ceil(INRIA_SIGMAS * np.sqrt(larger)), -1e9)
-    box = (np.where(drawn, np.sqrt(reach * variance), -1e9) for variance in (xx, yy))
-    return {"square of 3 sigma": (three_sigma, three_sigma), "opacity-aware box": tuple(box)}
+    width, height = (np.where(drawn, np.sqrt(reach * variance), -1e9) for variance in (xx, yy))
+    return {"square of 3 sigma": (three_sigma, three_sigma), "opacity-aware box": (width, height)}
 
 
 def tiles_met(

@@ -140,8 +140,9 @@ def seen_from(
 
     The others can be left out for cameras like these: an avatar's inside is never seen.
     """
-    renderings = render_views(gaussians, cameras, dataclasses.replace(config, visibility=True))
-    return jnp.max(renderings.visibility, axis=0) >= threshold
+    visibility = render_views(gaussians, cameras, dataclasses.replace(config, visibility=True)).visibility
+    assert visibility is not None
+    return jnp.max(visibility, axis=0) >= threshold
 
 
 def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
