@@ -7,8 +7,7 @@
 Pixels: the same view at 128 to 1024. Gaussians: random subsets of 1/8 to all of them, and all of them twice, the copies
 moved by a quarter of their size. Views: 1 to 8 cameras side by side (so that all have the same to draw) at half the
 size, one after the other (`render_views`) and at once (`jax.vmap`). Fits the slope of log CPU time over log size: 1 is
-linear growth. 4 minutes. Expected: 0.3 over pixels, 0.9 over Gaussians, 1 over views (`vmap` of gradients 1.06: the
-arrays of many images leave the cache).
+linear growth. 4 minutes. Expected: 0.3 over pixels, 0.9 over Gaussians, 1 over views.
 """
 
 import argparse

@@ -100,6 +100,7 @@ def render(
     background = _white(gaussians) if background is None else background
     gaussians, camera, background = at_least_float32((gaussians, camera, background))
     if _is_traced(gaussians, camera, background):
+        gaussians = jax.tree.map(lambda leaf: _once_per_image(leaf, camera), gaussians)
         return _render(gaussians, camera, background, _with_default_buffers(gaussians, camera, config), mesh)
     fitted = plan(gaussians, camera, config, margin=1.0, mesh=mesh) if config.max_pairs is None else config
     rendering = _jitted(_render, 3, 4)(gaussians, camera, background, fitted, mesh)
@@ -173,7 +174,6 @@ def _render(gaussians: Gaussians, camera: Camera, background, config: SplatConfi
     if config.scale != 1:
         return _render_resized(gaussians, camera, background, config, mesh)
     grid = _grid(camera, config)
-    gaussians = jax.tree.map(lambda leaf: _once_per_image(leaf, camera), gaussians)
     projected = _project(gaussians, camera, config)
     if gaussians.means.shape[0] == 0:
         blank = jnp.zeros((grid.tiles, FEATURE_COUNT, grid.pixels), projected.x.dtype)
