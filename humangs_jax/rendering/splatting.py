@@ -49,12 +49,13 @@ __all__ = [
 
 CPU_COMPILER_OPTIONS = {
     "xla_cpu_prefer_vector_width": 512,
-    "xla_disable_hlo_passes": "cpu-parallel-task-assigner,cse_barrier_expander",
+    "xla_disable_hlo_passes": "cpu-parallel-task-assigner,cse_barrier_expander,small-while-loop-hoisting",
 }
 """`jax.jit(..., compiler_options=CPU_COMPILER_OPTIONS)` of a program that draws on a CPU: wide vectors make the loops over
-pixels up to a third faster where there is AVX-512, and XLA no longer shares out their small kernels, tens of
-microseconds each, over several threads, which took twice the CPU time and gained nothing. Eager calls use it; options do
-not reach a jit inside a jit, so your own needs them itself."""
+pixels up to a third faster where there is AVX-512; XLA no longer shares out their small kernels, tens of microseconds each,
+over several threads, which took twice the CPU time and gained nothing; and it keeps barriers, so that tables are stored
+before they are gathered from (the loops of tiny images must then not become single kernels, which know no barriers).
+Eager calls use it; options do not reach a jit inside a jit, so your own needs them itself. Works from jax 0.10 to 0.12."""
 
 PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
 """Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024
