@@ -31,6 +31,7 @@ _PUBLIC = {
     "load_motion": "data.motion",
     "load_weights": "models.weights",
     "orbit": "geometry.camera",
+    "plan": "rendering.splatting",
     "pose_body": "body.model",
     "rasterize_mesh": "rendering.mesh_rasterizer",
     "reconstruct": "avatar.reconstruct",

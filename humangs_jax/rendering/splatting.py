@@ -117,7 +117,8 @@ def render_views(
     batch_size: int = 1,
     mesh: Mesh | None = None,
 ) -> Rendering:
-    """Draws every camera of a batch (leading axis v), `batch_size` views at a time: memory does not grow with v.
+    """Draws every camera of a batch (leading axis v), `batch_size` views at a time: working memory does not
+    grow with v (what a gradient keeps of each view does).
 
     `jax.vmap` of `render` draws all views at once (their tiles become one list of tiles) and holds the buffers of all: on
     CPUs as fast, with gradients of many views slower. mesh: of one axis, whose devices share each image.
