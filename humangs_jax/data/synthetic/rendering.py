@@ -5,7 +5,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Float
+from humangs_jax.array_types import Float, Int
 from humangs_jax.data.synthetic.fabrics import Spots
 from humangs_jax.data.synthetic.noise import Ripples
 from humangs_jax.data.synthetic.shading import bend_normals, occlusion, shade
@@ -84,8 +84,23 @@ def _shade_pixels(posed, ids, barycentrics, eye):
     inside = np.sum(flat * (eye - points), -1) < 0
     normals = normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-9)
     normals = np.where(inside[:, None], -normals, normals)
-    material_ids = subject.face_materials[ids]
-    albedo, sheen = np.empty_like(points), np.zeros(len(ids), np.float32)
+    albedo, slope, sheen = paint(subject, ids, spots)
+    normals = np.where((slope != 0).any(1, keepdims=True), bend_normals(normals, slope), normals)
+    openness = np.where(inside, INSIDE_SHADE * openness, openness)
+    return shade(subject.lights, albedo, normals, openness, sheen)
+
+
+def paint(
+    subject: SyntheticSubject, face_ids: Int[np.ndarray, " n"], spots: Spots
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """What the materials say of points on given faces: albedo (n, 3), slope (n, 3) of the painted folds, sheen (n,)."""
+    material_ids = subject.face_materials[face_ids]
+    count = len(face_ids)
+    albedo, slope, sheen = (
+        np.empty((count, 3), np.float32),
+        np.zeros((count, 3), np.float32),
+        np.zeros(count, np.float32),
+    )
     order = np.argsort(material_ids, kind="stable")
     bounds = np.searchsorted(material_ids[order], np.arange(len(subject.materials) + 1))
     for k, material in enumerate(subject.materials):
@@ -96,7 +111,5 @@ def _shade_pixels(posed, ids, barycentrics, eye):
         albedo[chosen], sheen[chosen] = material.albedo(own), material.sheen
         if material.wrinkles > 0:
             folds = Ripples(np.random.default_rng([subject.seed, 100 + k]), 0.09, 8, stretch=(1.2, 0.45, 1.2))
-            slope = 0.012 * material.wrinkles * folds.gradient(own.cloth[:, :3])
-            normals[chosen] = bend_normals(normals[chosen], slope)
-    openness = np.where(inside, INSIDE_SHADE * openness, openness)
-    return shade(subject.lights, np.clip(albedo, 0.01, None), normals, openness, sheen)
+            slope[chosen] = 0.012 * material.wrinkles * folds.gradient(own.cloth[:, :3])
+    return np.clip(albedo, 0.01, None), slope, sheen
