@@ -69,38 +69,58 @@ def _padded(vertices, faces):
     return jnp.asarray(vertices), jnp.asarray(np.concatenate([faces, np.zeros((extra_faces, 3), faces.dtype)]))
 
 
-def _shade_pixels(posed, ids, barycentrics, eye):
+def _shade_pixels(posed, ids, weights, eye):
+    albedo, slopes = paint(posed.subject, ids, spots_at(posed.subject, ids, weights))
+    return light_points(posed, ids, weights, albedo, slopes, eye)
+
+
+def light_points(
+    posed: PosedSubject,
+    face_ids: Int[np.ndarray, " m"],
+    weights: Float[np.ndarray, "m 3"],
+    albedo: Float[np.ndarray, "m 3"],
+    slopes: Float[np.ndarray, "m 3"],
+    eye: Float[np.ndarray, "3"] | None = None,
+) -> Float[np.ndarray, "m 3"]:
+    """Colours (m, 3) in the subject's light of points on faces, given by the weights of their corners, as painted (see `paint`).
+
+    eye: where they are seen from, which tells cloth's inner side; None: everything is seen from outside.
+    """
     subject = posed.subject
-    faces, attributes = subject.surface.faces, subject.surface.attributes
-    values = np.concatenate(
-        [posed.vertices, posed.normals, posed.openness[:, None], attributes["cloth"], attributes["template"]], axis=1
+    corners = subject.surface.faces[face_ids]
+    points, normals, openness = np.split(
+        _blend(np.concatenate([posed.vertices, posed.normals, posed.openness[:, None]], 1), corners, weights), [3, 6], 1
     )
-    corners = faces[ids]
-    blended = sum(barycentrics[:, i : i + 1] * values[corners[:, i]] for i in range(3))
-    points, normals, openness = blended[:, :3], blended[:, 3:6], blended[:, 6]
-    spots = Spots(blended[:, 7:11], blended[:, 11:14])
-    a, b, c = (posed.vertices[corners[:, i]] for i in range(3))
-    flat = np.cross(b - a, c - a)
-    inside = np.sum(flat * (eye - points), -1) < 0
+    openness = openness[:, 0]
     normals = normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-9)
-    normals = np.where(inside[:, None], -normals, normals)
-    albedo, slope, sheen = paint(subject, ids, spots)
-    normals = np.where((slope != 0).any(1, keepdims=True), bend_normals(normals, slope), normals)
-    openness = np.where(inside, INSIDE_SHADE * openness, openness)
-    return shade(subject.lights, albedo, normals, openness, sheen)
+    if eye is not None:
+        a, b, c = (posed.vertices[corners[:, i]] for i in range(3))
+        inside = np.sum(np.cross(b - a, c - a) * (eye - points), -1) < 0
+        normals = np.where(inside[:, None], -normals, normals)
+        openness = np.where(inside, INSIDE_SHADE * openness, openness)
+    normals = np.where((slopes != 0).any(1, keepdims=True), bend_normals(normals, slopes), normals)
+    sheens = np.asarray([material.sheen for material in subject.materials], np.float32)
+    return shade(subject.lights, albedo, normals, openness, sheens[subject.face_materials[face_ids]])
+
+
+def spots_at(subject: SyntheticSubject, face_ids: Int[np.ndarray, " m"], weights: Float[np.ndarray, "m 3"]) -> Spots:
+    """Points on faces, given by the weights of their corners, as materials see them."""
+    attributes = subject.surface.attributes
+    values = np.concatenate([attributes["cloth"], attributes["template"]], axis=1)
+    blended = _blend(values, subject.surface.faces[face_ids], weights)
+    return Spots(blended[:, :4], blended[:, 4:])
+
+
+def _blend(values, corners, weights):
+    return sum(weights[:, i : i + 1] * values[corners[:, i]] for i in range(3))
 
 
 def paint(
     subject: SyntheticSubject, face_ids: Int[np.ndarray, " n"], spots: Spots
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """What the materials say of points on given faces: albedo (n, 3), slope (n, 3) of the painted folds, sheen (n,)."""
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """What the materials say of points on given faces: albedo (n, 3) and slope (n, 3) of the painted folds."""
     material_ids = subject.face_materials[face_ids]
-    count = len(face_ids)
-    albedo, slope, sheen = (
-        np.empty((count, 3), np.float32),
-        np.zeros((count, 3), np.float32),
-        np.zeros(count, np.float32),
-    )
+    albedo, slope = np.empty((len(face_ids), 3), np.float32), np.zeros((len(face_ids), 3), np.float32)
     order = np.argsort(material_ids, kind="stable")
     bounds = np.searchsorted(material_ids[order], np.arange(len(subject.materials) + 1))
     for k, material in enumerate(subject.materials):
@@ -108,8 +128,8 @@ def paint(
         if len(chosen) == 0:
             continue
         own = Spots(spots.cloth[chosen], spots.template[chosen])
-        albedo[chosen], sheen[chosen] = material.albedo(own), material.sheen
+        albedo[chosen] = material.albedo(own)
         if material.wrinkles > 0:
             folds = Ripples(np.random.default_rng([subject.seed, 100 + k]), 0.09, 8, stretch=(1.2, 0.45, 1.2))
             slope[chosen] = 0.012 * material.wrinkles * folds.gradient(own.cloth[:, :3])
-    return np.clip(albedo, 0.01, None), slope, sheen
+    return np.clip(albedo, 0.01, None), slope
