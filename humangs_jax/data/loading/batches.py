@@ -1,0 +1,158 @@
+"""Batches by step number: a pure function of (seed, step), each process making the rows that its devices hold."""
+
+import dataclasses
+from collections.abc import Generator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.data.loading.captures import CaptureCache, CaptureSource
+from humangs_jax.data.loading.examples import Example, ViewSampling
+from humangs_jax.data.loading.order import input_count_at
+from humangs_jax.data.loading.prefetch import Waiting, prefetched
+from humangs_jax.data.loading.reading import Reader, read_in_order
+from humangs_jax.data.loading.source import Source
+
+AHEAD = 2
+"""Batches prepared while one is worked on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Loader:
+    """Batches from a source.
+
+    batch_size: subjects of the global batch, over all processes. seed: of order and views.
+    sharding: how a batch lies on the devices (only its first axis may be split); a process makes the rows that its own
+        devices hold, so that replicas hold equal rows. None: everything on the default device.
+    process_index, process_count: where `sharding` is None, the part of the batch to make: equal runs of rows.
+    reader: "grain", "plain", or "auto": grain where it is installed. Batches are the same. threads: that make examples.
+
+    Raises: ValueError if the batch cannot be divided among the processes.
+    """
+
+    source: Source
+    batch_size: int = 1
+    seed: int = 0
+    sharding: jax.sharding.Sharding | None = None
+    process_index: int = 0
+    process_count: int = 1
+    reader: Reader = "auto"
+    threads: int = 4
+
+    def __post_init__(self):
+        if self.batch_size % self.process_count or not 0 <= self.process_index < self.process_count:
+            raise ValueError(
+                f"a batch of {self.batch_size} cannot be divided among {self.process_count} processes "
+                f"(this is {self.process_index})"
+            )
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """Rows of the global batch that this process makes."""
+        if self.sharding is None:
+            share = self.batch_size // self.process_count
+            return tuple(range(self.process_index * share, (self.process_index + 1) * share))
+        parts = self.sharding.addressable_devices_indices_map((self.batch_size,)).values()
+        return tuple(sorted({row for part in parts if part is not None for row in range(self.batch_size)[part[0]]}))
+
+    def input_count(self, step: int) -> int:
+        """Number of input views of a step."""
+        return input_count_at(self.seed, step, self.source.input_counts)
+
+    def example_at(self, step: int, row: int) -> Example:
+        """Row `row` of the global batch of a step."""
+        return self.source.example(self.seed, step * self.batch_size + row, self.input_count(step))
+
+    def batch_at(self, step: int) -> Example:
+        """The batch of a step on the devices: an `Example` with a leading batch axis on every leaf.
+
+        With a sharding, global arrays; without one, the rows of this process.
+        """
+        return self._place([self.example_at(step, row) for row in self.rows])
+
+    def batches(
+        self, start: int, stop: int, ahead: int = AHEAD, waiting: Waiting | None = None
+    ) -> Generator[tuple[int, Example], None, None]:
+        """(step, batch) for start <= step < stop; `ahead` batches are made and put on the devices by threads meanwhile.
+
+        Errors of the threads are raised here. Closing the generator (or leaving the loop over it) ends them.
+        waiting: what the loop had to wait for its batches is added to it.
+        """
+
+        def make():
+            rows = self.rows
+            examples = read_in_order(
+                lambda i: self.example_at(start + i // len(rows), rows[i % len(rows)]),
+                (stop - start) * len(rows),
+                self.threads,
+                ahead * len(rows),
+                self.reader,
+            )
+            try:
+                for step in range(start, stop):
+                    yield step, self._place([next(examples) for _ in rows])
+            finally:
+                examples.close()
+
+        return prefetched(make, ahead, waiting)
+
+    def _place(self, examples):
+        """Stack the rows of this process and put them on the devices."""
+        batch = jax.tree.map(_stack, *examples)
+        sharding = self.sharding
+        if sharding is None:
+            return jax.tree.map(jnp.asarray, batch)
+        position = {row: i for i, row in enumerate(self.rows)}
+
+        def place(leaf):
+            def shard(index):
+                chosen = [position[row] for row in range(self.batch_size)[index[0]]]
+                return leaf[chosen[0] : chosen[-1] + 1][(slice(None), *index[1:])]
+
+            return jax.make_array_from_callback((self.batch_size, *leaf.shape[1:]), sharding, shard)
+
+        return jax.tree.map(place, batch)
+
+
+def _stack(*leaves):
+    """Where all were made on a device they stay there."""
+    on_device = all(isinstance(leaf, jax.Array) for leaf in leaves)
+    return jnp.stack(leaves) if on_device else np.stack([np.asarray(leaf) for leaf in leaves])
+
+
+@dataclasses.dataclass(frozen=True)
+class ExampleSource:
+    """Batches of capture folders in one process: a `Loader` of a `CaptureSource`, in short.
+
+    input_size, target_size: pixels a side of the square views.
+    """
+
+    cache: CaptureCache
+    sampling: ViewSampling
+    input_size: int
+    target_size: int
+    batch_size: int = 1
+    seed: int = 0
+
+    @property
+    def source(self) -> CaptureSource:
+        """The examples without their batches."""
+        return CaptureSource(self.cache, self.sampling, self.input_size, self.target_size)
+
+    @property
+    def loader(self) -> Loader:
+        """The batches."""
+        return Loader(self.source, self.batch_size, self.seed)
+
+    def batch_at(self, step: int) -> Example:
+        """The batch of a step: an `Example` with a leading axis of `batch_size` on every leaf."""
+        return self.loader.batch_at(step)
+
+    def example_at(self, index: int, input_count: int) -> Example:
+        """The index-th example of the run; the next usable subject in the order replaces a broken one."""
+        return jax.tree.map(jnp.asarray, self.source.example(self.seed, index, input_count))
+
+    def batches(self, start: int, stop: int, ahead: int = AHEAD) -> Generator[tuple[int, Example], None, None]:
+        """(step, batch) for start <= step < stop, prepared ahead by threads: see `Loader.batches`."""
+        return self.loader.batches(start, stop, ahead)

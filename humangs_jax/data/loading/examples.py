@@ -1,0 +1,148 @@
+"""An example to learn from: some views of a stored subject are shown, others are asked for. Everything here is numpy."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from humangs_jax.array_types import Float, Int, UInt8
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.pytree import pytree_dataclass
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewSampling:
+    """Which views of a subject are shown and which are asked for.
+
+    input_counts: numbers of input views; one is drawn per step (each compiles once). target_count: views asked for.
+    jitter: inputs stand evenly around the subject, each off by up to half this share of the spacing.
+    scattered_share: share of examples whose inputs stand anywhere instead.
+    mixed_pose_share: share of examples whose inputs may each show another pose (frame).
+    Targets are drawn from all other views of the subject, of whatever pose.
+    """
+
+    input_counts: tuple[int, ...] = (4,)
+    target_count: int = 3
+    jitter: float = 0.7
+    scattered_share: float = 0.2
+    mixed_pose_share: float = 0.3
+
+
+class StoredSubject(NamedTuple):
+    """A decoded capture as bytes on the host; azimuths (v,) of the cameras, radians, are what views are chosen by."""
+
+    images: UInt8[np.ndarray, "v h w 3"]
+    masks: UInt8[np.ndarray, "v h w"]
+    K: Float[np.ndarray, "v 3 3"]
+    cam_from_world: Float[np.ndarray, "v 4 4"]
+    frames: Int[np.ndarray, " v"]
+    azimuths: Float[np.ndarray, " v"]
+    rotations: Float[np.ndarray, "m j 3"]
+    translations: Float[np.ndarray, "m 3"]
+    betas: Float[np.ndarray, " s"]
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory that the arrays take."""
+        return sum(array.nbytes for array in self)
+
+
+@pytree_dataclass
+class Example:
+    """One subject to learn from: the views shown and the views asked for, possibly at another image size."""
+
+    inputs: SubjectViews
+    targets: SubjectViews
+
+
+def nearest_view(subject: StoredSubject, azimuth: float, allowed: np.ndarray) -> int:
+    """The allowed view (bool, (v,)) whose camera stands closest to an azimuth."""
+    away = np.abs(np.angle(np.exp(1j * (subject.azimuths - azimuth))))
+    return int(np.argmin(np.where(allowed, away, np.inf)))
+
+
+def draw_views(
+    generator: np.random.Generator, subject: StoredSubject, input_count: int, sampling: ViewSampling
+) -> tuple[list[int], list[int]]:
+    """Disjoint indices of input and target views.
+
+    Raises: ValueError if the subject has too few views for the largest of the input counts, whichever this one is: a
+    subject is usable or not, independent of the step.
+    """
+    count, needed = len(subject.frames), max(sampling.input_counts) + sampling.target_count
+    if count < needed:
+        raise ValueError(f"{count} views, but inputs and targets need {needed}")
+    spacing = 2 * np.pi / input_count
+    azimuths = generator.uniform(0, 2 * np.pi) + spacing * (
+        np.arange(input_count) + sampling.jitter * generator.uniform(-0.5, 0.5, input_count)
+    )
+    if generator.random() < sampling.scattered_share:
+        azimuths = generator.uniform(0, 2 * np.pi, input_count)
+    poses = np.unique(subject.frames)
+    slots = np.full(input_count, generator.choice(poses))
+    if generator.random() < sampling.mixed_pose_share:
+        slots = generator.choice(poses, input_count)
+    free, inputs = np.ones(count, bool), []
+    for azimuth, frame in zip(azimuths, slots, strict=True):
+        allowed = free & (subject.frames == frame)
+        inputs.append(nearest_view(subject, azimuth, allowed if allowed.any() else free))
+        free[inputs[-1]] = False
+    return inputs, generator.choice(np.flatnonzero(free), sampling.target_count, replace=False).tolist()
+
+
+def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray, "v size size *c"]:
+    """Bytes box-averaged to size x size, in [0, 1]. Raises: ValueError unless both sides are one multiple of it."""
+    height, width = images.shape[1:3]
+    factor = height // size
+    if factor < 1 or (height, width) != (factor * size, factor * size):
+        raise ValueError(f"images of {width} x {height} cannot be box-averaged to {size} x {size}")
+    if factor > 1:
+        blocks = images.reshape(len(images), size, factor, size, factor, *images.shape[3:])
+        images = blocks.mean(axis=(2, 4), dtype=np.float32)
+    return images.astype(np.float32) / np.float32(255)
+
+
+def subject_views(subject: StoredSubject, indices: Sequence[int], size: int) -> SubjectViews:
+    """Some views of a stored subject at size x size pixels, numpy leaves. Raises: ValueError, see `shrink`."""
+    chosen = np.asarray(indices)
+    height, width = subject.images.shape[1:3]
+    scale = np.asarray([size / width, size / height, 1.0], np.float32)
+    frames = subject.frames[chosen]
+    return _on_host(
+        SubjectViews,
+        images=shrink(subject.images[chosen], size),
+        masks=shrink(subject.masks[chosen], size),
+        cameras=_on_host(
+            Camera,
+            K=subject.K[chosen] * scale[:, None],
+            cam_from_world=subject.cam_from_world[chosen],
+            width=size,
+            height=size,
+        ),
+        rotations=subject.rotations[frames],
+        translations=subject.translations[frames],
+        betas=subject.betas,
+    )
+
+
+def draw_example(
+    generator: np.random.Generator,
+    subject: StoredSubject,
+    input_count: int,
+    sampling: ViewSampling,
+    input_size: int,
+    target_size: int,
+) -> Example:
+    """Random views of a subject, numpy leaves. Raises: ValueError, see `draw_views` and `shrink`."""
+    inputs, targets = draw_views(generator, subject, input_count, sampling)
+    return Example(subject_views(subject, inputs, input_size), subject_views(subject, targets, target_size))
+
+
+def _on_host(cls: type, **fields: Any) -> Any:
+    """A pytree of numpy leaves; its constructor would insist on arrays of a device."""
+    tree = object.__new__(cls)
+    for name, value in fields.items():
+        object.__setattr__(tree, name, value)
+    return tree

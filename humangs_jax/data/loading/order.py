@@ -1,0 +1,66 @@
+"""What comes when: pure functions of (seed, number), so that a run resumes exactly with no state but its step.
+
+Example e = step * batch + i is the i-th of its batch. Each purpose draws from a stream of its own.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from humangs_jax.array_types import Float, Int
+
+ORDER_STREAM, VIEW_STREAM, BATCH_STREAM, MIX_STREAM, SUBJECT_STREAM = range(5)
+"""First entry of the seeds: what a generator is for, so that no two purposes share random numbers."""
+
+MIX_BLOCK = 256
+"""Examples over which the shares of mixed sources are exact; smaller shares than one in a block are made one."""
+
+
+def subject_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " count"]:
+    """The order of subjects in one pass over them."""
+    return np.random.default_rng([ORDER_STREAM, seed, epoch]).permutation(count)
+
+
+def view_generator(seed: int, index: int) -> np.random.Generator:
+    """What draws the views of the index-th example of a source."""
+    return np.random.default_rng([VIEW_STREAM, seed, index])
+
+
+def input_count_at(seed: int, step: int, counts: Sequence[int]) -> int:
+    """How many input views a step has."""
+    return counts[int(np.random.default_rng([BATCH_STREAM, seed, step]).integers(len(counts)))]
+
+
+def block_counts(weights: Sequence[float]) -> Int[np.ndarray, " sources"]:
+    """How many of `MIX_BLOCK` examples come from each source; every source has at least one.
+
+    Raises: ValueError unless the weights are positive and finite.
+    """
+    shares = np.asarray(weights, np.float64)
+    if len(shares) == 0 or len(shares) > MIX_BLOCK or not (np.isfinite(shares).all() and (shares > 0).all()):
+        raise ValueError(f"weights of mixed sources: expected positive numbers, got {list(weights)}")
+    exact = MIX_BLOCK * shares / shares.sum()
+    counts = np.maximum(np.floor(exact), 1).astype(int)
+    while counts.sum() != MIX_BLOCK:  # by largest remainder
+        step = 1 if counts.sum() < MIX_BLOCK else -1
+        error = step * (exact - counts)
+        counts[np.argmax(np.where(counts + step >= 1, error, -np.inf))] += step
+    return counts
+
+
+def source_at(seed: int, index: int, counts: Int[np.ndarray, " sources"]) -> tuple[int, int]:
+    """(which source the index-th example comes from, its number among the examples of that source).
+
+    Blocks of `MIX_BLOCK` examples are permutations of the same multiset: shares are exact over every block, and each source
+    hands out its own examples 0, 1, 2, ... without a gap.
+    """
+    block, position = divmod(index, MIX_BLOCK)
+    labels = np.repeat(np.arange(len(counts)), counts)
+    labels = np.random.default_rng([MIX_STREAM, seed, block]).permutation(labels)
+    source = int(labels[position])
+    return source, block * int(counts[source]) + int((labels[:position] == source).sum())
+
+
+def normalized(weights: Sequence[float]) -> Float[np.ndarray, " sources"]:
+    """The shares that a mixture really has, after rounding to blocks."""
+    return block_counts(weights) / MIX_BLOCK
