@@ -21,7 +21,7 @@ class Mixture:
     """
 
     sources: tuple[Source, ...]
-    weights: tuple[float, ...]
+    weights: tuple[float | int, ...]
 
     def __post_init__(self):
         if len(self.sources) != len(self.weights):

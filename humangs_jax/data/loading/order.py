@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from humangs_jax.array_types import Float, Int
+from humangs_jax.array_types import Int
 
 ORDER_STREAM, VIEW_STREAM, BATCH_STREAM, MIX_STREAM, SUBJECT_STREAM = range(5)
 """First entry of the seeds: what a generator is for, so that no two purposes share random numbers."""
@@ -31,7 +31,7 @@ def input_count_at(seed: int, step: int, counts: Sequence[int]) -> int:
     return counts[int(np.random.default_rng([BATCH_STREAM, seed, step]).integers(len(counts)))]
 
 
-def block_counts(weights: Sequence[float]) -> Int[np.ndarray, " sources"]:
+def block_counts(weights: Sequence[float | int]) -> Int[np.ndarray, " sources"]:
     """How many of `MIX_BLOCK` examples come from each source; every source has at least one.
 
     Raises: ValueError unless the weights are positive and finite.
@@ -59,8 +59,3 @@ def source_at(seed: int, index: int, counts: Int[np.ndarray, " sources"]) -> tup
     labels = np.random.default_rng([MIX_STREAM, seed, block]).permutation(labels)
     source = int(labels[position])
     return source, block * int(counts[source]) + int((labels[:position] == source).sum())
-
-
-def normalized(weights: Sequence[float]) -> Float[np.ndarray, " sources"]:
-    """The shares that a mixture really has, after rounding to blocks."""
-    return block_counts(weights) / MIX_BLOCK

@@ -1,8 +1,15 @@
-"""Seeded synthetic clothed people, written as capture folders."""
+"""Seeded synthetic clothed people, written as capture folders.
 
-from humangs_jax.data.synthetic.seeds import SPLITS, split_of
-from humangs_jax.data.synthetic.subject import SyntheticSubject, make_subject
-from humangs_jax.data.synthetic.writer import synthesize, write_subject, write_training_subject
+Names are looked up when they are asked for: who needs the seeds alone does not import the generator.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from humangs_jax.data.synthetic.seeds import SPLITS, split_of
+    from humangs_jax.data.synthetic.subject import SyntheticSubject, make_subject
+    from humangs_jax.data.synthetic.writer import synthesize, write_subject, write_training_subject
 
 __all__ = [
     "SPLITS",
@@ -13,3 +20,11 @@ __all__ = [
     "write_subject",
     "write_training_subject",
 ]
+
+_MODULES = {"SPLITS": "seeds", "split_of": "seeds", "SyntheticSubject": "subject", "make_subject": "subject"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES.get(name, 'writer')}"), name)

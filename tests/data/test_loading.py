@@ -1,0 +1,298 @@
+"""Sources, mixtures, rows of processes, grain and the path without it."""
+
+import collections
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from humangs_jax.data.loader import (
+    Example,
+    GeneratedSource,
+    Loader,
+    Mixture,
+    Source,
+    Waiting,
+    find_people,
+    has_grain,
+)
+from humangs_jax.data.loading.order import MIX_BLOCK, block_counts, source_at
+from humangs_jax.data.loading.reading import read_in_order
+from humangs_jax.data.synthetic.manifest import begin_set
+from humangs_jax.data.synthetic.seeds import SPLITS, TRAIN, seed_of_key, split_of, subject_key
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry.camera import Camera
+
+SIZE = 4
+
+
+def toy_views(values, name):
+    """Views whose every leaf tells the numbers `values` (v,)."""
+    fill = lambda *shape: jnp.broadcast_to(values.reshape(-1, *[1] * len(shape)), (len(values), *shape))
+    return SubjectViews(
+        images=fill(SIZE, SIZE, 3),
+        masks=fill(SIZE, SIZE),
+        cameras=jax.vmap(lambda K, T: Camera(K, T, SIZE, SIZE))(fill(3, 3), fill(4, 4)),
+        rotations=fill(2, 3),
+        translations=fill(3),
+        betas=values[:1],
+    )
+
+
+class CountingSource:
+    """Example (seed, index, input_count) as numbers in its leaves; `name` tells the source."""
+
+    def __init__(self, name=0.0, counts=(1, 2, 3), delay=None, broken_at=None):
+        self.name, self.input_counts, self.broken = name, counts, {f"thing of {name}": "torn"}
+        self.delay, self.broken_at = delay, broken_at
+
+    def __len__(self):
+        return 7
+
+    def example(self, seed, index, input_count):
+        if self.delay:
+            time.sleep(self.delay(index))
+        if index == self.broken_at:
+            raise ValueError(f"example {index} of {self.name}")
+        views = lambda n: toy_views(jnp.asarray([self.name, index, seed] + [0.0] * n, jnp.float32), "")
+        return jax.tree.map(np.asarray, Example(views(input_count), views(1)))
+
+
+def told(batch):
+    """(source, index) of each row."""
+    return [tuple(row) for row in np.asarray(batch.inputs.translations)[:, :2, 0].astype(int).tolist()]
+
+
+def same(a, b):
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(x.dtype == y.dtype and np.array_equal(x, y) for x, y in pairs)
+
+
+READERS = ["plain", pytest.param("grain", marks=pytest.mark.skipif(not has_grain(), reason="grain is not installed"))]
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_batches_are_in_order_whatever_thread_is_first(reader):
+    slow_first = CountingSource(delay=lambda index: 0.02 if index % 3 == 0 else 0.0)
+    loader = Loader(slow_first, 4, seed=5, reader=reader)
+    seen = list(loader.batches(2, 6))
+    assert [step for step, _ in seen] == [2, 3, 4, 5]
+    for step, batch in seen:
+        assert told(batch) == [(0, 4 * step + i) for i in range(4)]
+        assert same(batch, loader.batch_at(step))
+        assert batch.inputs.images.shape == (4, 3 + loader.input_count(step), SIZE, SIZE, 3)
+
+
+@pytest.mark.skipif(not has_grain(), reason="grain is not installed")
+def test_grain_and_the_plain_path_give_the_same_batches(monkeypatch):
+    loader = Loader(CountingSource(), 3, seed=2)
+    with_grain = list(loader.batches(0, 5))
+    for name in [name for name in sys.modules if name == "grain" or name.startswith("grain.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "grain", None)  # as if it were not installed
+    with pytest.raises(ImportError):
+        import grain  # noqa: F401
+    assert not has_grain()
+    without = list(loader.batches(0, 5))
+    assert all(a == b and same(x, y) for (a, x), (b, y) in zip(with_grain, without, strict=True))
+    with pytest.raises(ImportError):
+        next(read_in_order(lambda i: i, 3, 1, 1, "grain"))
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_a_resumed_run_sees_the_rest_of_the_batches(reader):
+    loader = Loader(CountingSource(), 2, seed=9, reader=reader)
+    whole, rest = dict(loader.batches(0, 8)), dict(loader.batches(5, 8))
+    assert sorted(rest) == [5, 6, 7] and all(same(whole[step], rest[step]) for step in rest)
+    assert not same(whole[6], whole[7])
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_errors_of_threads_end_the_loop_at_their_place(reader):
+    steps = Loader(CountingSource(broken_at=5), 2, reader=reader).batches(0, 9)
+    assert [next(steps)[0], next(steps)[0]] == [0, 1]
+    with pytest.raises(ValueError, match="example 5 of"):
+        next(steps)
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_leaving_the_loop_ends_all_threads(reader):
+    before = set(threading.enumerate())
+    steps = Loader(CountingSource(delay=lambda _: 0.001), 2, reader=reader).batches(0, 10_000)
+    next(steps)
+    steps.close()
+    deadline = time.time() + 10
+    while (left := set(threading.enumerate()) - before) and time.time() < deadline:
+        time.sleep(0.05)
+    assert not left
+
+
+@given(st.integers(1, 4), st.integers(1, 3), st.integers(0, 50))
+@settings(deadline=None, max_examples=20)
+def test_processes_together_make_the_batch_of_one(process_count, share, step):
+    size = process_count * share
+    whole = Loader(CountingSource(), size, seed=1)
+    parts = [
+        Loader(CountingSource(), size, seed=1, process_index=i, process_count=process_count)
+        for i in range(process_count)
+    ]
+    assert [row for part in parts for row in part.rows] == list(range(size))
+    together = jax.tree.map(lambda *leaves: np.concatenate(leaves), *[part.batch_at(step) for part in parts])
+    assert same(together, whole.batch_at(step))
+
+
+def test_a_batch_that_cannot_be_divided_is_refused():
+    with pytest.raises(ValueError, match="batch of 3 cannot be divided among 2 processes"):
+        Loader(CountingSource(), 3, process_count=2)
+
+
+SHARDED = """
+import jax, json, numpy as np
+from jax.sharding import AxisType, NamedSharding, PartitionSpec
+from tests.data.test_loading import CountingSource, same
+from humangs_jax.data.loader import Loader
+mesh = jax.make_mesh((2, 2), ("data", "model"), axis_types=(AxisType.Auto,) * 2)
+plain = Loader(CountingSource(), 4, seed=1)
+for spec in (PartitionSpec("data"), PartitionSpec(("data", "model")), PartitionSpec()):
+    loader = Loader(CountingSource(), 4, seed=1, sharding=NamedSharding(mesh, spec))
+    assert loader.rows == (0, 1, 2, 3)
+    (_, batch), = loader.batches(3, 4)
+    assert all(leaf.sharding.is_equivalent_to(loader.sharding, leaf.ndim) for leaf in jax.tree.leaves(batch))
+    assert same(batch, plain.batch_at(3))
+    assert same(jax.tree.map(lambda x: x.addressable_shards[-1].data, batch),
+                jax.tree.map(lambda x: x[loader.sharding.devices_indices_map(x.shape)[mesh.devices[-1, -1]]], batch))
+
+
+class Half:
+    '''A process that has the second half of the devices.'''
+    def addressable_devices_indices_map(self, shape):
+        all_devices = NamedSharding(mesh, PartitionSpec("data")).devices_indices_map(shape)
+        return {device: all_devices[device] for device in mesh.devices[1]}
+assert Loader(CountingSource(), 4, sharding=Half()).rows == (2, 3)
+print("equal")
+"""
+
+
+def test_batches_lie_on_the_devices_as_the_sharding_says():
+    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
+    root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))
+    done = subprocess.run([sys.executable, "-c", SHARDED], cwd=root, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.split() == ["equal"], done.stderr[-3000:]
+
+
+@given(st.lists(st.floats(0.01, 100.0), min_size=1, max_size=5), st.integers(0, 5), st.integers(0, 3))
+@settings(deadline=None, max_examples=20)
+def test_mixing_is_exact_over_blocks_and_gapless_in_every_source(weights, seed, block):
+    counts = block_counts(weights)
+    assert counts.sum() == MIX_BLOCK and (counts >= 1).all()
+    shares = np.asarray(weights) / sum(weights)
+    assert (np.abs(counts - MIX_BLOCK * shares) <= len(weights)).all()
+    drawn = collections.defaultdict(list)
+    for index in range(block * MIX_BLOCK, (block + 1) * MIX_BLOCK):
+        source, number = source_at(seed, index, counts)
+        drawn[source].append(number)
+    for source, numbers in drawn.items():
+        assert numbers == list(range(block * counts[source], (block + 1) * counts[source]))
+
+
+def test_a_mixture_is_a_source_of_its_sources():
+    mixture = Mixture((CountingSource(1.0), CountingSource(2.0)), (3.0, 1.0))
+    assert isinstance(mixture, Source) and len(mixture) == 14
+    assert sorted(mixture.broken) == ["thing of 1.0", "thing of 2.0"]
+    loader = Loader(mixture, 64, seed=4)
+    rows = [row for step in range(4) for row in told(loader.batch_at(step))]
+    assert [index for source, index in rows if source == 1] == list(range(192))
+    assert [index for source, index in rows if source == 2] == list(range(64))
+    assert {source for source, _ in rows[:20]} == {1, 2}  # mixed, not one after the other
+    other = Loader(mixture, 64, seed=5)
+    assert [s for s, _ in told(other.batch_at(0))] != [s for s, _ in rows[:64]]
+
+
+def test_mixtures_are_checked():
+    with pytest.raises(ValueError, match="2 sources, but 1 weights"):
+        Mixture((CountingSource(), CountingSource()), (1.0,))
+    with pytest.raises(ValueError, match="positive"):
+        Mixture((CountingSource(), CountingSource()), (1.0, 0.0))
+    with pytest.raises(ValueError, match="input_counts differ"):
+        Mixture((CountingSource(), CountingSource(counts=(4,))), (1.0, 1.0))
+
+
+def toy_person(key, input_count):
+    """A person of a key, as made on the fly: all of it random."""
+    values = jax.random.uniform(key, (input_count + 1,))
+    return Example(toy_views(values[:input_count], ""), toy_views(values[input_count:], ""))
+
+
+def test_people_of_keys_look_like_any_source():
+    source = GeneratedSource(jax.jit(toy_person, static_argnums=1), "train", input_counts=(1, 2))
+    assert isinstance(source, Source) and len(source) == len(TRAIN)
+    loader = Loader(source, 2, seed=3)
+    batches = dict(loader.batches(0, 4))
+    assert all(same(batches[step], loader.batch_at(step)) for step in batches)
+    everything = [leaf for batch in batches.values() for leaf in np.asarray(batch.targets.betas).ravel()]
+    assert len(set(everything)) == 8  # never the same example again
+    on_host = GeneratedSource(source.make, "train", input_counts=(1, 2), on_host=True)
+    assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(on_host.example(0, 0, 1)))
+    files = CountingSource(2.0, counts=(1, 2))
+    assert same(on_host.example(0, 3, 2), source.example(0, 3, 2))
+    assert isinstance(Mixture((files, on_host), (1, 1)), Source)
+
+
+@given(st.integers(0, 2**31), st.integers(0, 2**40), st.sampled_from(sorted(SPLITS)))
+@settings(deadline=None, max_examples=60)
+def test_keys_drawn_for_a_split_are_of_its_people(seed, index, split):
+    key = GeneratedSource(toy_person, split).drawn_key(seed, index)
+    assert split_of(seed_of_key(key)) == split
+
+
+@given(st.sampled_from(sorted(SPLITS)), st.integers(0, 999), st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=60)
+def test_a_key_is_its_person_and_appearance(split, number, appearance):
+    """The words of keys are (appearance, seed): keys of different splits cannot be equal, whatever the appearance."""
+    seed = SPLITS[split][number]
+    key = subject_key(seed, appearance)
+    np.testing.assert_array_equal(jax.random.key_data(key), np.asarray([appearance, seed], np.uint32))
+    assert seed_of_key(key) == seed
+
+
+def test_no_key_is_for_nobody():
+    with pytest.raises(ValueError, match="no range"):
+        subject_key(SPLITS["demo"].stop)
+    with pytest.raises(ValueError, match="no split 'tests'"):
+        GeneratedSource(toy_person, "tests")
+
+
+def test_people_of_another_split_are_refused(tmp_path):
+    for seed in (5, SPLITS["test"][3]):
+        (tmp_path / f"{seed:07d}").mkdir()
+        (tmp_path / f"{seed:07d}" / "capture.json").write_text("{}")
+    (tmp_path / ".0000006.123").mkdir()
+    (tmp_path / ".0000006.123" / "capture.json").write_text("{}")  # half written
+    assert [f.name for f in find_people(tmp_path)] == ["0000005", "2000003"]  # no manifest: not ours
+    begin_set(tmp_path, "train", {})
+    with pytest.raises(ValueError, match=r"2000003: a subject of the split 'test', where 'train' was expected"):
+        find_people(tmp_path)
+    assert len(find_people(tmp_path, None)) == 2
+    (tmp_path / "manifest.json").write_text(json.dumps({"format": "other"}))
+    with pytest.raises(ValueError, match="expected a manifest of"):
+        find_people(tmp_path)
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_waiting_is_measured(reader):
+    slow = Waiting()
+    list(Loader(CountingSource(delay=lambda _: 0.03), 1, threads=1, reader=reader).batches(0, 6, waiting=slow))
+    assert slow.items == 6 and slow.seconds > 0.1
+    fast = Waiting()
+    for _ in Loader(CountingSource(), 1, reader=reader).batches(0, 6, waiting=fast):
+        time.sleep(0.05)
+    assert fast.seconds - fast.first_seconds < 0.5 * slow.seconds
