@@ -34,7 +34,7 @@ CELLS = 128
 """Cells a side of the square as it is packed."""
 SHRINKING = 0.97
 """Scale of the next try to pack, from that of the last."""
-VERTEX_STEP, FACE_STEP = 8192, 8192
+VERTEX_STEP, FACE_STEP = 32768, 32768
 """Charts are padded to multiples of these for the rasterizer: few shapes are compiled."""
 
 

@@ -1,0 +1,273 @@
+"""People on the fly: a pure, jittable function of a key from a bank of dressed people to views to learn from.
+
+A key picks a person of the bank, dyes the clothes anew, mirrors left and right, picks poses, light and cameras, and draws
+the views with the project's rasterizer. The same key gives the same bits on the same platform; nothing but jax.numpy runs,
+on CPU, GPU and TPU alike. What differs from `rendering.render_view`: colours come from baked textures, normals are
+skinned instead of measured, the key light throws soft shadows.
+
+    bank = load_bank("people.npz")
+    example = jax.jit(live_example, static_argnames="config")(bank, key, LiveConfig())
+    batch = jax.vmap(live_example, in_axes=(None, 0, None))(bank, keys, LiveConfig())
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from humangs_jax.array_types import Array, Bool, Float, Int, Key
+from humangs_jax.data.loading.examples import Example
+from humangs_jax.data.synthetic.baking import SLOPE_STEP, SLOPE_ZERO
+from humangs_jax.data.synthetic.live_bank import UV_STEPS, PeopleBank
+from humangs_jax.data.synthetic.live_camera import draw_camera, spread_azimuths
+from humangs_jax.data.synthetic.live_light import LiveLights, bend_normals, draw_lights, dyes, shade, shaded_vertices
+from humangs_jax.data.synthetic.live_pose import draw_rotations, pose_person
+from humangs_jax.data.synthetic.poses import MIRROR
+from humangs_jax.data.synthetic.rendering import INSIDE_SHADE
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.pytree import pytree_dataclass, replace
+from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
+from humangs_jax.rendering.tiling import cumsum
+
+BACKGROUND = 1.0
+DARKEST_ALBEDO = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class LiveConfig:
+    """What an example shows.
+
+    input_views, target_views; input_size, target_size: pixels a side. poses: poses per example; targets show any of them.
+    mixed_pose_share: share of examples whose inputs show any of the poses too, each; otherwise all show the first.
+    jitter, scattered_share: see `live_camera.spread_azimuths`. close_share: share of close cameras among the targets.
+    mirrored_share, dyed_share: of examples. supersampling: samples a side of each pixel.
+    views_at_once: views drawn side by side: 1 suits CPUs, all of them accelerators. pixels_per_step: of the person, that are
+    coloured at a time: few suit CPUs, whole pictures accelerators.
+    """
+
+    input_views: int = 4
+    target_views: int = 3
+    input_size: int = 256
+    target_size: int = 256
+    poses: int = 2
+    mixed_pose_share: float = 0.3
+    jitter: float = 0.7
+    scattered_share: float = 0.2
+    close_share: float = 0.2
+    mirrored_share: float = 0.5
+    dyed_share: float = 0.7
+    supersampling: int = 2
+    views_at_once: int = 1
+    pixels_per_step: int = 1 << 14
+
+
+@pytree_dataclass
+class LiveScene:
+    """A person as a key has them stand there, in several poses o; what all views of an example share.
+
+    person: () index in the bank. rotations: (o, j, 3). translations: (o, 3). vertices: (o, n, 3) metres.
+    corners: (o, f, 15) of every face's corners normal, openness and share of the key light that arrives.
+    dyes: (m, 3, 3) what turns the colours of every piece. lights.
+    """
+
+    person: Int[Array, ""]
+    rotations: Float[Array, "o j 3"]
+    translations: Float[Array, "o 3"]
+    vertices: Float[Array, "o n 3"]
+    corners: Float[Array, "o f 15"]
+    dyes: Float[Array, "m 3 3"]
+    lights: LiveLights
+
+
+def live_example(bank: PeopleBank, key: Key, config: LiveConfig = LiveConfig()) -> Example:
+    """Views of somebody of the bank: some shown, others asked for."""
+    keys = jax.random.split(key, 4)
+    scene = draw_scene(bank, keys[0], config)
+    plans = _input_plan(keys[1], config), _target_plan(keys[2], config)
+    if config.input_size == config.target_size:  # one loop over all views: half of the compilation
+        both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *plans)
+        views = _views(bank, scene, both, config, config.input_size)
+        parts = [_some(views, part) for part in (slice(config.input_views), slice(config.input_views, None))]
+    else:
+        parts = [
+            _views(bank, scene, p, config, s)
+            for p, s in zip(plans, (config.input_size, config.target_size), strict=True)
+        ]
+    flipped = jax.random.bernoulli(keys[3], config.mirrored_share)
+    choose = lambda a, b: jnp.where(flipped, a, b)
+    return Example(*(jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts))
+
+
+def draw_scene(bank: PeopleBank, key: Key, config: LiveConfig) -> LiveScene:
+    """Who, in which poses, colours and light."""
+    keys = jax.random.split(key, 5)
+    person = jax.random.randint(keys[0], (), 0, bank.people)
+    rotations = jax.vmap(lambda k: draw_rotations(bank, person, k))(jax.random.split(keys[1], config.poses))
+    lights = draw_lights(keys[2])
+    dyed = jax.random.bernoulli(keys[3], config.dyed_share)
+    matrices = dyes(keys[4], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
+    return make_scene(bank, person, rotations, lights, jnp.where(dyed, matrices, jnp.eye(3)))
+
+
+def make_scene(
+    bank: PeopleBank,
+    person: Int[Array, ""],
+    rotations: Float[Array, "o j 3"],
+    lights: LiveLights,
+    dye: Float[Array, "m 3 3"],
+) -> LiveScene:
+    """A person of the bank in given poses, light and dyes."""
+    faces = bank.faces[person].astype(jnp.int32)
+
+    def pose(rotations):
+        vertices, normals, translation = pose_person(bank, person, rotations)
+        openness, lit = shaded_vertices(vertices, normals, faces, lights.directions[0])
+        values = jnp.concatenate([normals, openness[:, None], lit[:, None]], axis=-1)
+        return vertices, translation, values[faces].reshape(faces.shape[0], 15)
+
+    vertices, translations, corners = lax.map(pose, rotations)
+    return LiveScene(person, rotations, translations, vertices, corners, dye, lights)
+
+
+class _Plan(NamedTuple):
+    """Views to draw (v,): keys of their cameras, azimuths, numbers of poses, shares of close cameras."""
+
+    keys: Key
+    azimuths: Float[Array, " v"]
+    poses: Int[Array, " v"]
+    close_shares: Float[Array, " v"]
+
+
+def _input_plan(key, config):
+    keys = jax.random.split(key, 4)
+    count = config.input_views
+    azimuths = spread_azimuths(keys[0], count, config.jitter, config.scattered_share)
+    mixed = jax.random.bernoulli(keys[1], config.mixed_pose_share)
+    poses = jnp.where(mixed, jax.random.randint(keys[2], (count,), 0, config.poses), 0)
+    return _Plan(jax.random.split(keys[3], count), azimuths, poses, jnp.zeros(count))
+
+
+def _target_plan(key, config):
+    keys = jax.random.split(key, 3)
+    count = config.target_views
+    azimuths = spread_azimuths(keys[0], count, 0.0, 1.0)
+    poses = jax.random.randint(keys[1], (count,), 0, config.poses)
+    return _Plan(jax.random.split(keys[2], count), azimuths, poses, jnp.full(count, config.close_share))
+
+
+def _views(bank, scene, plan: _Plan, config, size):
+    """Views of some of the scene's poses."""
+
+    def view(plan):
+        camera = draw_camera(plan.keys, scene.vertices[plan.poses], plan.azimuths, plan.close_shares, size)
+        return *draw_view(bank, scene, plan.poses, camera, config), camera
+
+    images, masks, cameras = lax.map(view, plan, batch_size=_batch(config, len(plan.poses)))
+    return SubjectViews(
+        images, masks, cameras, scene.rotations[plan.poses], scene.translations[plan.poses], bank.betas[scene.person]
+    )
+
+
+def _some(views, part):
+    """Views of a range; betas have no axis of views."""
+    chosen = jax.tree.map(lambda x: x[part], replace(views, betas=None))
+    return replace(chosen, betas=views.betas)
+
+
+def _batch(config, count):
+    return None if config.views_at_once == 1 else min(config.views_at_once, count)
+
+
+def draw_view(
+    bank: PeopleBank, scene: LiveScene, pose: Int[Array, ""], camera: Camera, config: LiveConfig = LiveConfig()
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
+    """(h, w, 3) picture on white and (h, w) coverage of one of the scene's poses, both in [0, 1]."""
+    s = config.supersampling
+    fine = camera.resized(camera.width * s, camera.height * s)
+    vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
+    fragments = rasterize_mesh(vertices, faces, fine)
+    behind = _seen_from_behind(vertices, faces, camera.center)
+    colors = _light_pixels(bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step)
+    mean = lambda x: x.reshape(camera.height, s, camera.width, s, -1).mean(axis=(1, 3))
+    return mean(colors), mean((fragments.face_ids >= 0).astype(colors.dtype))[..., 0]
+
+
+def _seen_from_behind(vertices, faces, eye) -> Bool[Array, " f"]:
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return jnp.sum(jnp.cross(b - a, c - a) * (eye - a), axis=-1) < 0
+
+
+def _light_pixels(bank, scene, corners, behind, fragments, step):
+    """(h w, 3) colours of all pixels, white where nobody is; covered ones `step` at a time, as many steps as it takes."""
+    ids, weights = fragments.face_ids.reshape(-1), fragments.barycentrics.reshape(-1, 3)
+    covered = ids >= 0
+    count = ids.shape[0]
+    step = min(step, count)
+    place = jnp.where(covered, cumsum(covered.astype(jnp.int32)) - 1, count)
+    # the numbers of the covered pixels in order; steps may reach beyond their end, where "no pixel" is
+    listed = jnp.full(-(-count // step) * step, count, jnp.int32).at[place].set(jnp.arange(count), mode="drop")
+    total = jnp.sum(covered, dtype=jnp.int32)
+
+    def light(state):
+        start, colors = state
+        pixels = lax.dynamic_slice_in_dim(listed, start, step)
+        face, weight = jnp.maximum(ids.at[pixels].get(mode="fill", fill_value=0), 0), weights[pixels]
+        lit = _light_points(bank, scene, corners[face], face, weight, behind[face])
+        return start + step, colors.at[pixels].set(lit, mode="drop")
+
+    blank = jnp.full((count, 3), BACKGROUND, weights.dtype)
+    return lax.while_loop(lambda state: state[0] < total, light, (jnp.zeros((), jnp.int32), blank))[1]
+
+
+def _light_points(bank, scene, corners, faces, weights, behind):
+    """(p, 3) colours of points on faces (p,): corners (p, 15), see `LiveScene`; their weights (p, 3); inner sides (p,)."""
+    person = scene.person
+    wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
+    blended = wa * corners[:, :5] + wb * corners[:, 5:10] + wc * corners[:, 10:]
+    normals, openness, lit = blended[:, :3], blended[:, 3], blended[:, 4]
+    normals = normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9)
+    normals = jnp.where(behind[:, None], -normals, normals)
+    openness = jnp.where(behind, INSIDE_SHADE, 1.0) * openness
+    uv = bank.uvs[person, faces].astype(weights.dtype)
+    painted = _sample(bank.texture, person, (wa * uv[:, 0] + wb * uv[:, 1] + wc * uv[:, 2]) / UV_STEPS)
+    pieces = bank.face_pieces[person, faces].astype(jnp.int32)
+    dye = scene.dyes[pieces]
+    albedo = sum(painted[:, i : i + 1] * dye[:, :, i] for i in range(3)) / 255
+    slopes = (painted[:, 3:] - SLOPE_ZERO) * SLOPE_STEP
+    albedo, sheen = jnp.clip(albedo, DARKEST_ALBEDO, None), bank.sheen[person, pieces]
+    return shade(scene.lights, albedo, bend_normals(normals, slopes), openness, lit, sheen)
+
+
+def _sample(texture, person, at):
+    """(p, 6) texture of a person at (p, 2) places in [0, 1], v down, bilinear; bytes as floats."""
+    size = texture.shape[1]
+    at = jnp.clip(at * size - 0.5, 0, size - 1)
+    low = jnp.floor(at)
+    along = at - low
+    column, row = low[:, 0].astype(jnp.int32), low[:, 1].astype(jnp.int32)
+    right, below = jnp.minimum(column + 1, size - 1), jnp.minimum(row + 1, size - 1)
+    texel = lambda r, c: texture[person, r, c].astype(at.dtype)
+    x, y = along[:, :1], along[:, 1:]
+    upper = texel(row, column) * (1 - x) + texel(row, right) * x
+    lower = texel(below, column) * (1 - x) + texel(below, right) * x
+    return upper * (1 - y) + lower * y
+
+
+def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
+    """The views of a world with left and right exchanged; joints: each one's mirror image. Batched cameras."""
+    flip = jnp.asarray(MIRROR, views.images.dtype)
+    side = jnp.asarray([-1.0, 1.0, 1.0], views.images.dtype)
+    camera = views.cameras
+    K = camera.K.at[..., 0, 2].set(camera.width - camera.K[..., 0, 2])
+    signs = jnp.concatenate([side, jnp.ones(1, side.dtype)])
+    return replace(
+        views,
+        images=views.images[..., :, ::-1, :],
+        masks=views.masks[..., :, ::-1],
+        cameras=replace(camera, K=K, cam_from_world=camera.cam_from_world * signs[:, None] * signs),
+        rotations=views.rotations[..., jnp.asarray(joints), :] * flip,
+        translations=views.translations * side,
+    )
