@@ -3,6 +3,7 @@
 What the user got wrong (a capture, a file, an option) ends in one line on stderr and exit code 2; nothing is written then.
 """
 
+import dataclasses
 import os
 import sys
 from collections.abc import Callable
@@ -29,13 +30,22 @@ def demo(out: Path = Path("demo_out"), weights: Path | None = None, size: int = 
     run_demo(out, weights=weights, frame_size=size)
 
 
-def reconstruct(capture: Positional[Path], out: Path = Path("avatar.npz"), weights: Path | None = None) -> None:
+def reconstruct(
+    capture: Positional[Path],
+    out: Path = Path("avatar.npz"),
+    weights: Path | None = None,
+    tokens: Literal["as_trained", "all", "foreground"] = "as_trained",
+    dtype: Literal["as_trained", "float32", "bfloat16"] = "as_trained",
+) -> None:
     """Reconstruct an avatar from a capture folder (photos, cameras, body poses: docs/capture_format.md).
 
     Args:
         capture: folder with capture.json.
         out: the avatar file to write.
         weights: network weights (.safetensors); the shipped ones if not given.
+        tokens: the patches of the photos that the network looks at: all, or those that the person touches, which is several
+            times faster. For weights that were trained with the other setting it is an approximation (docs/performance.md).
+        dtype: of the encoder's products; bfloat16 is faster on GPU and TPU.
     """
     from humangs_jax.avatar.reconstruct import reconstruct as run
     from humangs_jax.data.capture import load_capture
@@ -44,6 +54,10 @@ def reconstruct(capture: Positional[Path], out: Path = Path("avatar.npz"), weigh
     photos = load_capture(capture)
     _require_parent(out)
     variables, config = load_weights(weights)
+    if tokens != "as_trained":
+        config = dataclasses.replace(config, tokens=tokens)
+    if dtype != "as_trained":
+        config = dataclasses.replace(config, dtype=dtype)
     avatar = run(variables, config, photos)
     avatar.save(out)
     print(f"{out}: {len(avatar.gaussians.means):,} Gaussians from {len(photos.images)} photos")

@@ -33,7 +33,8 @@ class Avatar:
     """A person who can be animated: Gaussians in the T-pose (theta = 0), vertex-major, k Gaussians of a vertex together.
 
     gaussians: canonical, metres. skinning_weights: (g, j), rows sum to 1. rest_vertices: (n, 3) and rest_joints: (j, 3), the
-    shaped body in the T-pose. faces: (f, 3). parents: joint tree, root -1. skinning: "affine" or "rotation".
+    shaped body in the T-pose. faces: (f, 3). parents: joint tree, root -1. skinning: "affine" or "rotation". rendering: the
+    splatting that the Gaussians were trained for, a name in `SPLAT_PRESETS`.
     """
 
     gaussians: Gaussians
@@ -44,6 +45,7 @@ class Avatar:
     parents: tuple[int, ...] = static_field()
     joint_names: tuple[str, ...] = static_field()
     skinning: Literal["affine", "rotation"] = static_field(default="affine")
+    rendering: Literal["exact", "inria"] = static_field(default="exact")
 
     def save(self, path: str | os.PathLike) -> None:
         """Write one compressed `.npz` (no pickle), under a temporary name first."""
@@ -54,6 +56,7 @@ class Avatar:
             "parents": self.parents,
             "joint_names": self.joint_names,
             "skinning": self.skinning,
+            "rendering": self.rendering,
         }
         values = {name: getattr(self.gaussians, name) for name in _ARRAYS[:5]}
         values |= {name: getattr(self, name) for name in _ARRAYS[5:]}
@@ -114,4 +117,5 @@ class Avatar:
             parents=tuple(header["parents"]),
             joint_names=tuple(header["joint_names"]),
             skinning=header["skinning"],
+            rendering=header.get("rendering", "exact"),  # the first files do not say
         )

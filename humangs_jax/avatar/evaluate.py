@@ -15,7 +15,6 @@ from humangs_jax.rendering.mesh_rasterizer import interpolate, rasterize_mesh
 from humangs_jax.sampling.pixel_aligned import (
     photo_colors,
     project_vertices,
-    sample_views,
     visible_vertices,
 )
 
@@ -59,7 +58,7 @@ def painted_body(inputs: Capture) -> Float[Array, "n 3"]:
 
     seen = [view(int(frame), inputs.cameras[i]) for i, frame in enumerate(inputs.frames)]
     pixels, visible = (jnp.stack(x) for x in zip(*seen, strict=True))
-    return photo_colors(sample_views(jnp.asarray(inputs.images), pixels, size, "half_pixel"), visible)
+    return photo_colors(jnp.asarray(inputs.images), pixels, visible, "half_pixel")
 
 
 def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.ndarray, "v h w 3"]:

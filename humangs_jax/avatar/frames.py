@@ -16,6 +16,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.splatting import BufferOverflowError, Rendering, plan, render
 
 VERTICAL_FOV = np.pi / 6
@@ -34,11 +35,14 @@ def draw(
     avatar: Avatar, poses: Iterator[BodyPose], cameras: Iterator[Camera], background: Float[Array, "3"] | None = None
 ) -> Iterator[Rendering]:
     """One rendering per pose and camera."""
-    return draw_gaussians((posed(avatar, pose) for pose in poses), cameras, background)
+    return draw_gaussians((posed(avatar, pose) for pose in poses), cameras, background, SPLAT_PRESETS[avatar.rendering])
 
 
 def draw_gaussians(
-    gaussians: Iterator[Gaussians], cameras: Iterator[Camera], background: Float[Array, "3"] | None = None
+    gaussians: Iterator[Gaussians],
+    cameras: Iterator[Camera],
+    background: Float[Array, "3"] | None = None,
+    how: SplatConfig = SPLAT_PRESETS["exact"],
 ) -> Iterator[Rendering]:
     """One rendering per frame of Gaussians and camera.
 
@@ -47,11 +51,11 @@ def draw_gaussians(
     """
     config = None
     for frame, camera in zip(gaussians, cameras, strict=True):
-        config = config or plan(frame, camera)
+        config = config or plan(frame, camera, how)
         try:
             rendering = render(frame, camera, config, background)
         except BufferOverflowError:
-            config = plan(frame, camera)
+            config = plan(frame, camera, how)
             rendering = render(frame, camera, config, background)
         yield rendering
 

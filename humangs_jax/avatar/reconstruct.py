@@ -1,37 +1,81 @@
-"""Photos with body poses -> one forward pass -> an avatar."""
+"""Photos with body poses -> one forward pass -> an avatar; one person, or many in one batch.
+
+Programs are compiled once per bucket: numbers of views and of foreground tokens are rounded up to few sizes
+(`capacity.round_up`), and what was added is masked.
+"""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from humangs_jax.array_types import Array, Int, PyTree
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.capacity import round_up
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import SubjectViews, gaussian_body, prepare_inputs, standardize
-from humangs_jax.models.humangs import HumanGSConfig, apply_humangs, touched_patches
+from humangs_jax.data.views import SubjectViews, gaussian_body, pad_views, prepare_inputs, standardize
+from humangs_jax.models.humangs import HumanGSConfig, HumanGSInputs, apply_humangs, touched_patches
 from humangs_jax.models.vertex_decoder import corrected_skinning_weights
+from humangs_jax.pytree import replace
 
 
 def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar:
     """Reconstruct the person of a capture.
 
-    The photos are brought to the network's image size (white, centred square), the body to the vertices that the weights want
-    (`gaussian_body`), and the token capacity to what these photos need. Compiles once per number of
-    views, body and capacity, which is rounded up to few sizes.
+    The photos are brought to the network's image size (white, centred square), the body to the vertices that the weights
+    want (`gaussian_body`), and the token capacity to what these photos need. Up to 8 views each number has a program of
+    its own, beyond that at most a fifth of the views is padding.
 
     Raises: ValueError if the capture has no view.
     """
-    if capture.view_count == 0:
-        raise ValueError("capture: 0 views; at least one photo is needed")
+    _require_views(capture, "capture")
     body = gaussian_body(capture.body, config)
     views = standardize(capture, config.image_size)
+    bucket = round_up(capture.view_count, smallest=1)
+    if bucket > capture.view_count:
+        views = pad_views(views, bucket)
     inputs = _prepare(body, views, config)
-    if config.tokens == "foreground":
-        capacity = round_up(int(_touched_patches(inputs, config)))
-        config = dataclasses.replace(config, token_capacity=capacity)
-    return _assemble_compiled(variables, config, body, views, inputs)[0]
+    return _assemble_compiled(variables, fit_tokens(inputs, config), body, views, inputs)[0]
+
+
+def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
+    """Reconstruct several people in one program: `reconstruct` for each, whatever their numbers of views.
+
+    A batch keeps an accelerator busy that one person does not; on a CPU it takes as long as one person after the other.
+
+    Raises: ValueError if there is no capture, one has no view, or their bodies differ (their shapes may).
+    """
+    if not captures:
+        raise ValueError("captures: none given")
+    model = captures[0].body
+    for index, capture in enumerate(captures):
+        _require_views(capture, f"captures[{index}]")
+        if capture.body is not model and not _equal(capture.body, model):
+            raise ValueError(
+                f"captures[{index}]: its body is not the one of captures[0]; a batch shares one body model"
+            )
+    body = gaussian_body(model, config)
+    bucket = round_up(max(capture.view_count for capture in captures), smallest=1)
+    coefficients = max(len(capture.betas) for capture in captures)
+    subjects = []
+    for capture in captures:
+        views = pad_views(standardize(capture, config.image_size), bucket)
+        betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
+        subjects.append(replace(views, betas=betas))
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
+    inputs = _prepare_batch(body, batch, config)
+    avatars, _ = _assemble_batch(variables, fit_tokens(inputs, config), body, batch, inputs)
+    return [jax.tree.map(lambda leaf, i=index: leaf[i], avatars) for index in range(len(captures))]
+
+
+def fit_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
+    """The configuration with room for the foreground tokens of some inputs, those of one subject or of a batch."""
+    if config.tokens == "all":
+        return config
+    return dataclasses.replace(config, token_capacity=round_up(int(_touched_patches(inputs, config))))
 
 
 def reconstruct_views(
@@ -59,10 +103,38 @@ def _assemble(variables, config, body, views, inputs):
         parents=body.parents,
         joint_names=body.joint_names,
         skinning=config.skinning,
+        rendering=config.rendering,
     )
     return avatar, outputs.dropped_tokens
 
 
+def _prepare_subjects(body, batch, config):
+    return jax.lax.map(lambda views: prepare_inputs(body, views, config), batch)
+
+
+def _most_touched(inputs, config):
+    count = lambda subject: touched_patches(subject, config)
+    return jnp.max(jax.vmap(count)(inputs)) if inputs.images.ndim == 5 else count(inputs)
+
+
+def _require_views(capture, name):
+    if capture.view_count == 0:
+        raise ValueError(f"{name}: 0 views; at least one photo is needed")
+
+
+def _equal(body, other):
+    if jax.tree.structure(body) != jax.tree.structure(other):
+        return False
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(body), jax.tree.leaves(other), strict=True))
+
+
 _assemble_compiled = jax.jit(_assemble, static_argnames="config")
+_assemble_batch = jax.jit(
+    lambda variables, config, body, batch, inputs: jax.vmap(_assemble, in_axes=(None, None, None, 0, 0))(
+        variables, config, body, batch, inputs
+    ),
+    static_argnames="config",
+)
 _prepare = jax.jit(prepare_inputs, static_argnames="config")
-_touched_patches = jax.jit(touched_patches, static_argnames="config")
+_prepare_batch = jax.jit(_prepare_subjects, static_argnames="config")
+_touched_patches = jax.jit(_most_touched, static_argnames="config")

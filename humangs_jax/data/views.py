@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.body.subdivision import split_long_edges
@@ -24,7 +24,8 @@ class SubjectViews:
     """Views of one subject; each has a pose of its own, so that inputs of varying poses are nothing special.
 
     images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) coverage in [0, 1]. cameras: a batch of v, metric.
-    rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients.
+    rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients. view_count: views beyond the
+    first so many are padding (see `pad_views`); None: none is.
     """
 
     images: Float[Array, "v h w 3"]
@@ -33,6 +34,21 @@ class SubjectViews:
     rotations: Float[Array, "v j 3"]
     translations: Float[Array, "v 3"]
     betas: Float[Array, " s"]
+    view_count: Int[Array, ""] | None = None
+
+
+def pad_views(views: SubjectViews, count: int) -> SubjectViews:
+    """The same views and copies of the last one that count for nothing, so that subjects with fewer views share a batch.
+
+    Raises: ValueError if there are no views, or more than `count`.
+    """
+    own = len(views.images)
+    if not 0 < own <= count:
+        raise ValueError(f"{own} views cannot be padded to {count}")
+    repeated = np.minimum(np.arange(count), own - 1)
+    per_view = ("images", "masks", "cameras", "rotations", "translations")
+    padded = {name: jax.tree.map(lambda x: x[repeated], getattr(views, name)) for name in per_view}
+    return replace(views, **padded, view_count=jnp.asarray(own, jnp.int32))
 
 
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
@@ -74,6 +90,7 @@ def prepare_inputs(
         position_maps=position_maps,
         depth_maps=depth_maps,
         foreground=(views.masks > MASK_THRESHOLD) | (depth_maps >= 0),
+        view_count=views.view_count,
     )
 
 

@@ -2,8 +2,8 @@
 
 Tokens that are padding stand at the end; the first `count` ones are attended to. Three exact implementations:
 
-- "chunked": einsums over blocks of queries, recomputed in the backward pass, so that memory grows with L and not with
-  L^2;
+- "chunked": matrix products over blocks of one head's queries, recomputed in the backward pass, so that memory grows
+  with L and not with L^2;
 - "xla": `jax.nn.dot_product_attention`, which materialises L x L logits;
 - "cudnn": its fused flash attention (NVIDIA, half precision only).
 
@@ -39,7 +39,7 @@ class AttentionConfig:
     head_width: int = 64
     qk_norm: bool = True
     implementation: Implementation = "auto"
-    query_chunk: int = 512
+    query_chunk: int = 1024
 
 
 def resolve_implementation(implementation: Implementation, tokens: int, dtype: Any) -> Resolved:
@@ -60,30 +60,30 @@ def chunked_attention(
     count: Int[Array, ""] | None,
     query_chunk: int,
 ) -> Float[Array, "l h e"]:
-    """Exact attention, one block of queries after the other; softmax statistics in float32 at least."""
+    """Exact attention, head by head and one block of queries after the other; softmax statistics in float32 at least."""
     length, heads, width = q.shape
     blocks = -(-length // query_chunk)
     block = -(-length // blocks)
-    q, k, v = (jnp.swapaxes(x, 0, 1) for x in (q * width**-0.5, k, v))  # heads first: batched matrix products
-    q = jnp.pad(q, ((0, 0), (0, blocks * block - length), (0, 0)))
+    q, k, v = (jnp.swapaxes(x, 0, 1) for x in (q * width**-0.5, k, v))
+    q = jnp.pad(q, ((0, 0), (0, blocks * block - length), (0, 0))).reshape(heads, blocks, block, width)
     statistics = jnp.promote_types(q.dtype, jnp.float32)
     absent = None if count is None else jnp.arange(length) >= count
 
     @jax.checkpoint
-    def attend(queries):
-        logits = jnp.einsum("hqe,hke->hqk", queries, k, preferred_element_type=statistics)
+    def attend(queries, keys, values):
+        logits = jnp.einsum("qe,ke->qk", queries, keys, preferred_element_type=statistics)
         if absent is not None:
             logits = jnp.where(absent, jnp.finfo(statistics).min, logits)
         weights = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True)))
         total = jnp.sum(weights, axis=-1, keepdims=True)
-        out = jnp.einsum("hqk,hke->hqe", weights.astype(v.dtype), v, preferred_element_type=statistics)
-        return (out / total).astype(v.dtype)  # dividing the sum spares a pass over the L x L weights
+        out = jnp.einsum("qk,ke->qe", weights.astype(values.dtype), values, preferred_element_type=statistics)
+        return (out / total).astype(values.dtype)  # dividing the sum spares a pass over the L x L weights
 
-    if blocks == 1:
-        out = attend(q)
-    else:
-        out = jax.lax.map(attend, jnp.moveaxis(q.reshape(heads, blocks, block, width), 1, 0))
-        out = jnp.moveaxis(out, 0, 1).reshape(heads, blocks * block, width)
+    def attend_head(head):
+        queries, keys, values = head
+        return jax.lax.map(lambda block: attend(block, keys, values), queries)
+
+    out = jax.lax.map(attend_head, (q, k, v)).reshape(heads, blocks * block, width)
     return jnp.swapaxes(out[:, :length], 0, 1)
 
 
@@ -93,7 +93,7 @@ def attention(
     v: Float[Array, "l h e"],
     count: Int[Array, ""] | None = None,
     implementation: Implementation = "auto",
-    query_chunk: int = 512,
+    query_chunk: int = 1024,
 ) -> Float[Array, "l h e"]:
     """Attention of every token to the first `count` tokens (None: to all)."""
     resolved = resolve_implementation(implementation, q.shape[0], q.dtype)

@@ -83,7 +83,7 @@ MODULES = {  # our module: the release's, and the layout of its weight
     "encoder/upsampler/conv1_norm": ("upsampler.up1.4", SAME),
     "encoder/upsampler/up2": ("upsampler.up2.0", TRANSPOSED_CONVOLUTION),
     "encoder/upsampler/up2_norm": ("upsampler.up2.1", SAME),
-    "encoder/upsampler/conv2": ("upsampler.up2.3", CONVOLUTION),
+    "readout": ("upsampler.up2.3", CONVOLUTION),
     "decoder/trunk_0": ("vertex_decoder.trunk.0", LINEAR),
     "decoder/trunk_1": ("vertex_decoder.trunk.2", LINEAR),
     "decoder/geometry_hidden": ("vertex_decoder.geo_head.0", LINEAR),

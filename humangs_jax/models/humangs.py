@@ -1,7 +1,8 @@
 """The network: photographs with poses in, canonical 3D Gaussians out, in one forward pass.
 
     encode          photos -> tokens -> transformer -> feature maps and a global token
-    sample_vertices feature maps -> features of every posed body vertex, pooled over views
+    sample_vertices feature maps -> features of every posed body vertex, pooled over views (the upsampler's last
+                    convolution is evaluated here, where it is read)
     decode          features -> K Gaussians per vertex of the canonical body
 
 Everything is written for ONE subject; batch with `jax.vmap` over `inputs` (variables unbatched). Callers jit, with
@@ -23,7 +24,7 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.rays import plucker_rays
 from humangs_jax.models.tokenizer import Packing, Tokenizer, TokenSelection, pack_patches, patchify, unpack_tokens
 from humangs_jax.models.transformer import INIT_STD, Transformer, TransformerConfig
-from humangs_jax.models.upsampler import Upsampler, UpsamplerConfig
+from humangs_jax.models.upsampler import Readout, Upsampler, UpsamplerConfig
 from humangs_jax.models.vertex_decoder import (
     RawGaussians,
     VertexDecoder,
@@ -34,12 +35,15 @@ from humangs_jax.models.vertex_decoder import (
 )
 from humangs_jax.pytree import pytree_dataclass, replace
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.sampling.bilinear import sample_bilinear, texel_indices
+from humangs_jax.sampling.neighborhoods import KERNEL, sample_neighborhoods
 from humangs_jax.sampling.pixel_aligned import (
+    COUNT_EPSILON,
     PixelAlignedConfig,
+    dropped_reads,
     photo_colors,
-    pool_views,
     project_vertices,
-    sample_views,
+    sum_over_views,
     visible_vertices,
 )
 from humangs_jax.sampling.triplane import TriplaneConfig
@@ -58,12 +62,12 @@ class HumanGSConfig:
 
     image_size: side of the photographs, pixels (recorded: the network takes any multiple of the patch size).
     patch_size: side of a token's patch, pixels. tokens: "all" patches, or those that the "foreground" touches, packed
-    into `token_capacity` slots over all views. position_map, skinning: how the position map that comes in was shaded,
-    and how the Gaussians are to be skinned (recorded). body_vertices, longest_edge: vertex count to decimate bodies to,
-    and metres to split their edges to afterwards, None for neither (recorded). ray_origins: the release divides camera
-    centres by s and the ray origins taken from them once more, so that the moments of its rays ("twice_normalized") fit
-    no camera; needed to run its weights. dtype: of the encoder's products;
-    parameters, norms, softmax statistics and the decoder stay float32 at least.
+    into `token_capacity` slots over all views, 0 for room for all patches. position_map, skinning, rendering: how the
+    position map that comes in was shaded, and how the Gaussians are to be skinned and drawn (recorded). body_vertices,
+    longest_edge: vertex count to decimate bodies to, and metres to split their edges to afterwards, None for neither
+    (recorded). ray_origins: the release divides camera centres by s and the ray origins taken from them once more, so
+    that the moments of its rays ("twice_normalized") fit no camera; needed to run its weights. dtype: of the encoder's
+    products; parameters, norms, softmax statistics and the decoder stay float32 at least.
     """
 
     image_size: int = 512
@@ -72,6 +76,7 @@ class HumanGSConfig:
     token_capacity: int = 0
     position_map: Literal["plain", "gouraud"] = "plain"
     skinning: Literal["affine", "rotation"] = "affine"
+    rendering: Literal["exact", "inria"] = "exact"
     body_vertices: int | None = None
     longest_edge: float | None = None
     ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
@@ -94,8 +99,6 @@ class HumanGSConfig:
         quarters = self.upsampler.enabled and self.upsampler.features == "intermediate"
         if transformer.layers < 1 or (quarters and (transformer.layers < 4 or transformer.layers % 2)):
             raise ValueError(f"layers must be even and at least 4, to have quarters; got {transformer.layers}")
-        if self.tokens == "foreground" and self.token_capacity < 1:
-            raise ValueError("tokens = 'foreground' needs a token_capacity of at least 1")
         if decoder.residual_color and not self.sampling.sample_rgb:
             raise ValueError("decoder.residual_color needs sampling.sample_rgb: there is no photo colour to correct")
         if decoder.gaussians_per_vertex < 1:
@@ -105,6 +108,11 @@ class HumanGSConfig:
     def compute_dtype(self) -> Any:
         """For Linen modules; None promotes inputs and parameters, so that float64 stays float64."""
         return jnp.bfloat16 if self.dtype == "bfloat16" else None
+
+    @property
+    def readout(self) -> Readout:
+        """The upsampler's last convolution."""
+        return Readout(self.upsampler.out, self.upsampler.hidden // 2, self.compute_dtype)
 
     @property
     def decoder_width(self) -> int:
@@ -121,7 +129,8 @@ class HumanGSInputs:
     images: (v, h, w, 3) in [0, 1], white background. cameras: a batch of v, metric. posed_vertices: (v, n, 3) metric,
     the body in the pose of each photo. canonical_vertices: (n, 3) metric, T-pose. position_maps: (v, h, w, 3) canonical
     position of each pixel, normalised units, 1 on background. depth_maps: (v, h, w) rasterized z, normalised units, -1
-    on background. foreground: (v, h, w) pixels of the person (used by `tokens = "foreground"`).
+    on background. foreground: (v, h, w) pixels of the person (used by `tokens = "foreground"`). view_count: views beyond
+    the first so many are padding, whatever they show, and change nothing; None: none is.
     """
 
     images: Float[Array, "v h w 3"]
@@ -131,12 +140,20 @@ class HumanGSInputs:
     position_maps: Float[Array, "v h w 3"]
     depth_maps: Float[Array, "v h w"]
     foreground: Bool[Array, "v h w"]
+    view_count: Int[Array, ""] | None = None
+
+    @property
+    def present(self) -> Bool[Array, " v"]:
+        """Which views are no padding."""
+        views = jnp.arange(len(self.images))
+        return views < (len(self.images) if self.view_count is None else self.view_count)
 
 
 class Encoding(NamedTuple):
     """What the encoder makes of the photographs: maps, global_token = encode(variables, inputs, config).
 
-    maps: (v, h', w', d) feature maps. global_token: (d',) or None without a class token.
+    maps: (v, h', w', d) maps, read by vertices through `Readout` where there is an upsampler. global_token: (d',) or None
+    without a class token.
     """
 
     maps: Float[Array, "v h w d"]
@@ -150,13 +167,15 @@ class HumanGSOutputs:
     gaussians: g = n * k of them, metric, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from the vertex,
     normalised units (for the tightness loss). skinning_offsets: (n * k, j) logits of the skinning head, or None (see
     `vertex_decoder.corrected_skinning_weights`). dropped_tokens: foreground
-    patches that the token capacity had no room for.
+    patches that the token capacity had no room for. dropped_reads: vertices, summed over views, that
+    `sampling.vertex_capacity` had no room for.
     """
 
     gaussians: Gaussians
     tight_offsets: Float[Array, "n t 3"]
     skinning_offsets: Float[Array, "g j"] | None
     dropped_tokens: Int[Array, ""]
+    dropped_reads: Int[Array, ""]
 
 
 class Encoder(nn.Module):
@@ -167,7 +186,11 @@ class Encoder(nn.Module):
 
     @nn.compact
     def __call__(
-        self, pixels: Float[Array, "v h w 12"], packing: Packing | None = None, train: bool = False
+        self,
+        pixels: Float[Array, "v h w 12"],
+        packing: Packing | None = None,
+        view_count: Int[Array, ""] | None = None,
+        train: bool = False,
     ) -> tuple[Float[Array, "v i j d"], Float[Array, " e"] | None]:
         config, dtype = self.config, self.config.compute_dtype
         width = config.transformer.width
@@ -177,7 +200,9 @@ class Encoder(nn.Module):
         if packing is not None:
             patches = patches.at[packing.indices].get(mode="fill", fill_value=0)
         tokens = Tokenizer(width, config.texture, dtype, name="tokenizer")(patches)
-        count = None if packing is None else packing.count
+        count = None if view_count is None else view_count * (grid[1] * grid[2])
+        if packing is not None:
+            count = packing.count
         if config.transformer.class_token:
             class_token = self.param("class_token", nn.initializers.truncated_normal(INIT_STD), (1, width))
             tokens = jnp.concatenate([class_token.astype(tokens.dtype), tokens])
@@ -194,7 +219,8 @@ class Encoder(nn.Module):
         maps = [x.reshape(*grid, width) for x in depths]
         if not config.upsampler.enabled:
             return maps[0], global_token
-        return Upsampler(config.upsampler, dtype, self.axis_name, name="upsampler")(maps, train), global_token
+        present = None if view_count is None else jnp.arange(grid[0]) < view_count
+        return Upsampler(config.upsampler, dtype, self.axis_name, name="upsampler")(maps, train, present), global_token
 
 
 def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
@@ -205,13 +231,20 @@ def subject_unit(canonical_vertices: Float[Array, "n 3"]) -> Scalar:
 
 @functools.partial(jax.jit, static_argnames="config")
 def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
-    """Fresh variables {"params": {"encoder", "decoder"}, "batch_stats": {"encoder"} or {}}, float32."""
+    """Fresh variables {"params": {"encoder", "decoder", "readout"}, "batch_stats": {"encoder"}}, float32.
+
+    Without an upsampler there is neither "readout" nor anything in "batch_stats".
+    """
     encoder_key, decoder_key = jax.random.split(key)
     pixels = jnp.zeros((1, 2 * config.patch_size, 2 * config.patch_size, 12))
     encoder = Encoder(config).init(encoder_key, pixels)
     decoder = VertexDecoder(config.decoder).init(decoder_key, jnp.zeros((1, config.decoder_width)))
+    params = {"encoder": encoder["params"], "decoder": decoder["params"]}
+    if config.upsampler.enabled:
+        neighborhoods = jnp.zeros((1, KERNEL**2 * config.readout.channels))
+        params["readout"] = config.readout.init(jax.random.fold_in(key, 2), neighborhoods, jnp.zeros(1))["params"]
     batch_stats = {"encoder": encoder["batch_stats"]} if "batch_stats" in encoder else {}
-    return {"params": {"encoder": encoder["params"], "decoder": decoder["params"]}, "batch_stats": batch_stats}
+    return {"params": params, "batch_stats": batch_stats}
 
 
 def touched_patches(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]:
@@ -221,9 +254,8 @@ def touched_patches(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, 
 
 def dropped_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]:
     """How many foreground patches the token capacity has no room for."""
-    if config.tokens == "all":
-        return jnp.zeros((), jnp.int32)
-    return jnp.maximum(touched_patches(inputs, config) - config.token_capacity, 0)
+    packing = select_tokens(inputs, config)
+    return jnp.zeros((), jnp.int32) if packing is None else touched_patches(inputs, config) - packing.count
 
 
 def select_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Packing | None:
@@ -231,11 +263,12 @@ def select_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Packing | Non
     if config.tokens == "all":
         return None
     touched = _touched(inputs, config)
-    return pack_patches(touched, min(config.token_capacity, len(touched)))
+    return pack_patches(touched, min(config.token_capacity or len(touched), len(touched)))
 
 
 def _touched(inputs, config):
-    return jnp.any(patchify(inputs.foreground[..., None].astype(jnp.float32), config.patch_size) > 0, axis=(1, 2))
+    foreground = inputs.foreground & inputs.present[:, None, None]
+    return jnp.any(patchify(foreground[..., None].astype(jnp.float32), config.patch_size) > 0, axis=(1, 2))
 
 
 def encoder_pixels(inputs: HumanGSInputs, config: HumanGSConfig) -> Float[Array, "v h w 12"]:
@@ -271,7 +304,8 @@ def encode_with_statistics(
     if batch_stats:
         own["batch_stats"] = batch_stats["encoder"]
     update = train and bool(batch_stats)
-    result = Encoder(config, axis_name).apply(own, pixels, packing, train, mutable=["batch_stats"] if update else False)
+    mutable = ["batch_stats"] if update else False
+    result = Encoder(config, axis_name).apply(own, pixels, packing, inputs.view_count, train, mutable=mutable)
     if update:
         result, updated = cast(tuple[Any, Variables], result)
         batch_stats = {"encoder": updated["batch_stats"]}
@@ -289,21 +323,48 @@ def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def sample_vertices(encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig) -> VertexFeatures:
+def sample_vertices(
+    variables: Variables, encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig
+) -> VertexFeatures:
     """Feature maps (and photographs, if configured) at the projections of the posed vertices, pooled over views."""
     sampling = config.sampling
+    pixels, visible = project_and_test(inputs, config)
+    weights = _view_weights(visible, inputs, config).astype(pixels.dtype)
+    size = (inputs.cameras.width, inputs.cameras.height)
+    indices = texel_indices(pixels, size, (encoding.maps.shape[2], encoding.maps.shape[1]), sampling.convention)
+    read = sample_neighborhoods if config.upsampler.enabled else sample_bilinear
+    sums = sum_over_views(read, encoding.maps, indices, weights, sampling.vertex_capacity)
+    local = jax.tree.map(lambda x: jnp.einsum("n...,n->n...", x, 1 / (jnp.sum(weights, axis=0) + COUNT_EPSILON)), sums)
+    if config.upsampler.enabled:
+        local = config.readout.apply({"params": variables["params"]["readout"]}, *local)
+    features = VertexFeatures(
+        cast(Array, local), encoding.global_token, dropped_reads=dropped_reads(weights, sampling.vertex_capacity)
+    )
+    if not sampling.sample_rgb:
+        return features
+    fraction = jnp.sum(visible, axis=0) / jnp.sum(inputs.present)
+    colors = photo_colors(inputs.images, pixels, visible, sampling.convention)
+    return replace(features, photo_colors=colors, visible_fraction=fraction.astype(pixels.dtype))
+
+
+def project_and_test(inputs: HumanGSInputs, config: HumanGSConfig) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
+    """Pixel positions of the posed vertices in every view, and which of them it sees; padding sees none."""
     unit = subject_unit(inputs.canonical_vertices)
     cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
-    size = (cameras.width, cameras.height)
     pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
-    see = lambda p, z, surface: visible_vertices(p, z, surface, size, sampling.convention)
-    visible = jax.vmap(see)(pixels, depths, inputs.depth_maps)
-    weights = visible.astype(pixels.dtype) if sampling.pool == "visible" else jnp.ones_like(depths)
-    local = pool_views(sample_views(encoding.maps, pixels, size, sampling.convention), weights)
-    if not sampling.sample_rgb:
-        return VertexFeatures(local, encoding.global_token)
-    colors = photo_colors(sample_views(inputs.images, pixels, size, sampling.convention), visible)
-    return VertexFeatures(local, encoding.global_token, colors, jnp.mean(visible.astype(pixels.dtype), axis=0))
+    size = (cameras.width, cameras.height)
+    see = lambda p, z, surface: visible_vertices(p, z, surface, size, config.sampling.convention)
+    return pixels, jax.vmap(see)(pixels, depths, inputs.depth_maps) & inputs.present[:, None]
+
+
+def _view_weights(visible, inputs, config):
+    return visible if config.sampling.pool == "visible" else jnp.broadcast_to(inputs.present[:, None], visible.shape)
+
+
+def read_vertices(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]:
+    """The most vertices that any view is read for: the `sampling.vertex_capacity` that these photographs need."""
+    counted = _view_weights(project_and_test(inputs, config)[1], inputs, config)
+    return jnp.max(jnp.sum(counted, axis=1, dtype=jnp.int32))
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -344,6 +405,7 @@ def assemble(
         tight_offsets=at_vertices.offsets[:, : config.decoder.tight],
         skinning_offsets=None if raw.skinning is None else flat(raw.skinning),
         dropped_tokens=jnp.zeros((), jnp.int32),
+        dropped_reads=jnp.zeros((), jnp.int32) if features.dropped_reads is None else features.dropped_reads,
     )
 
 
@@ -361,6 +423,6 @@ def apply_humangs(
     Raises: see `encode`.
     """
     encoding, batch_stats = encode_with_statistics(variables, inputs, config, train, axis_name)
-    features = sample_vertices(encoding, inputs, config)
+    features = sample_vertices(variables, encoding, inputs, config)
     outputs = decode(variables, features, inputs.canonical_vertices, config)
     return replace(outputs, dropped_tokens=dropped_tokens(inputs, config)), batch_stats

@@ -16,6 +16,7 @@ def published() -> HumanGSConfig:
     return HumanGSConfig(
         position_map="gouraud",
         skinning="rotation",
+        rendering="inria",
         ray_origins="twice_normalized",
         dtype="bfloat16",
         sampling=PixelAlignedConfig(pool="all", convention="mixed"),

@@ -4,6 +4,7 @@ The forward pass is the one of `models.humangs`; what its modules return is reco
 knows nothing of being watched.
 """
 
+import dataclasses
 from typing import Any, cast
 
 from humangs_jax.array_types import Array, Float
@@ -32,7 +33,8 @@ class Stages:
     """Every stage of one subject's pass, p patches, l tokens (those and the class token, which comes first).
 
     rays: (v, h, w, 6) moment, direction. pose_features: (v, h, w, c) of the neural texture. tokens: (p, d). first_block,
-    encoded: (l, d) after the first block, and after the final norm. maps: (v, h', w', d). features: of the vertices.
+    encoded: (l, d) after the first block, and after the final norm. maps: (v, h', w', d) with the last convolution evaluated
+    everywhere, for looking at. features: of the vertices.
     raw: heads before their activations. outputs: canonical Gaussians.
     """
 
@@ -49,19 +51,24 @@ class Stages:
 
 def network_stages(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -> Stages:
     """The evaluating pass of `apply_humangs`, and all that it computes on its way. Raises: see `encode`."""
+    config = dataclasses.replace(config, transformer=dataclasses.replace(config.transformer, scan=False))
     pixels = encoder_pixels(inputs, config)
     own = {kind: tree["encoder"] for kind, tree in variables.items() if tree}
     result, recorded = Encoder(config).apply(
         own,
         pixels,
         select_tokens(inputs, config),
+        inputs.view_count,
         capture_intermediates=lambda module, _: isinstance(module, Tokenizer | Transformer | Block),
         mutable=["intermediates"],
     )
     maps, global_token = cast(tuple[Array, Array | None], result)
     seen = cast(dict[str, Any], recorded)["intermediates"]
     output = lambda module: module["__call__"][0]
-    features = sample_vertices(Encoding(maps, global_token), inputs, config)
+    features = sample_vertices(variables, Encoding(maps, global_token), inputs, config)
+    if config.upsampler.enabled:
+        readout = {"params": variables["params"]["readout"]}
+        maps = cast(Array, config.readout.apply(readout, maps, method="everywhere"))
     raw = decode_heads(variables, features, inputs.canonical_vertices, config)
     return Stages(
         rays=pixels[..., 3:9],

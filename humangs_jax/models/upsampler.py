@@ -3,6 +3,9 @@
 With hidden width H: each map 1x1 -> H, concatenated, 3x3 -> 2H, norm, LeakyReLU; then twice a 4x4 transposed
 convolution of stride 2 (2H -> H, H -> H/2), norm, LeakyReLU, and a 3x3 convolution (-> H, norm, LeakyReLU; -> out,
 bare). Maps are (v, h, w, c).
+
+The last convolution is half of that arithmetic, and only body vertices read what it computes, from positions between
+its pixels. So it is a module of its own, `Readout`, that is applied to what the vertices have read of its input.
 """
 
 import dataclasses
@@ -13,7 +16,8 @@ import jax
 import jax.numpy as jnp
 from flax.linen.dtypes import promote_dtype
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.array_types import Array, Bool, Float
+from humangs_jax.sampling.neighborhoods import KERNEL
 
 SLOPE = 0.2
 MOMENTUM = 0.9
@@ -66,16 +70,51 @@ class UpConvolution(nn.Module):
         return y.reshape(views, 2 * height, 2 * width, self.features) + bias
 
 
+class Readout(nn.Module):
+    """The last convolution, 3x3: (n, 9 c) neighbourhoods and (n,) coverages, pooled over views -> (n, features).
+
+    See `sampling.neighborhoods`. `everywhere` convolves a map instead; it is for looking at maps.
+    """
+
+    features: int
+    channels: int
+    dtype: Any = None
+
+    def setup(self):
+        """Parameters of a 3x3 convolution."""
+        self.kernel = self.param("kernel", KAIMING, (KERNEL, KERNEL, self.channels, self.features))
+        self.bias = self.param("bias", nn.initializers.zeros, (self.features,))
+
+    def __call__(self, neighborhoods: Float[Array, "n k"], coverages: Float[Array, " n"]) -> Float[Array, "n d"]:
+        """Features of positions, in the dtype of the coverages."""
+        x, kernel = promote_dtype(neighborhoods, self.kernel, dtype=self.dtype)
+        kernel = kernel.reshape(-1, self.features)
+        return jnp.matmul(x, kernel, preferred_element_type=coverages.dtype) + coverages[:, None] * self.bias
+
+    def everywhere(self, x: Float[Array, "v h w c"]) -> Float[Array, "v h w d"]:
+        """Features of every pixel."""
+        x, kernel, bias = promote_dtype(x, self.kernel, self.bias, dtype=self.dtype)
+        layout = ("NHWC", "HWIO", "NHWC")
+        return jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=layout) + bias
+
+
 class Upsampler(nn.Module):
-    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, out). `axis_name`: vmap axis to share batch statistics over."""
+    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, hidden / 2), input of `Readout`.
+
+    axis_name: vmap axis to share batch statistics over.
+    """
 
     config: UpsamplerConfig
     dtype: Any = None
     axis_name: str | None = None
 
     @nn.compact
-    def __call__(self, maps: list[Float[Array, "v h w d"]], train: bool = False) -> Float[Array, "v 4*h 4*w out"]:
+    def __call__(
+        self, maps: list[Float[Array, "v h w d"]], train: bool = False, present: Bool[Array, " v"] | None = None
+    ) -> Float[Array, "v 4*h 4*w c"]:
+        """present: views that count in the batch statistics; None: all."""
         hidden = self.config.hidden
+        mask = None if present is None else present[:, None, None, None]
 
         def norm_relu(x, name):
             norm = nn.BatchNorm(
@@ -86,7 +125,7 @@ class Upsampler(nn.Module):
                 axis_name=self.axis_name if train else None,
                 name=name,
             )
-            return jax.nn.leaky_relu(norm(x), SLOPE)
+            return jax.nn.leaky_relu(norm(x, mask=mask), SLOPE)
 
         def convolution(features, name):
             return nn.Conv(features, (3, 3), dtype=self.dtype, kernel_init=KAIMING, name=name)
@@ -97,5 +136,4 @@ class Upsampler(nn.Module):
         x = norm_relu(convolution(2 * hidden, "fuse")(jnp.concatenate(projected, axis=-1)), "fuse_norm")
         x = norm_relu(UpConvolution(hidden, self.dtype, name="up1")(x), "up1_norm")
         x = norm_relu(convolution(hidden, "conv1")(x), "conv1_norm")
-        x = norm_relu(UpConvolution(hidden // 2, self.dtype, name="up2")(x), "up2_norm")
-        return convolution(self.config.out, "conv2")(x)
+        return norm_relu(UpConvolution(hidden // 2, self.dtype, name="up2")(x), "up2_norm")

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.geometry import quaternion
 from humangs_jax.numerics import inverse_sigmoid
 from humangs_jax.pytree import pytree_dataclass
@@ -56,12 +56,14 @@ class VertexFeatures:
     """What the photographs say of each vertex.
 
     local: (n, d) pooled feature. global_token: (d',) or None. photo_colors: (n, 3) and visible_fraction: (n,), or None.
+    dropped_reads: how many vertices, over all views, were not read for want of capacity; None: not counted.
     """
 
     local: Float[Array, "n d"]
     global_token: Float[Array, " e"] | None = None
     photo_colors: Float[Array, "n 3"] | None = None
     visible_fraction: Float[Array, " n"] | None = None
+    dropped_reads: Int[Array, ""] | None = None
 
 
 @pytree_dataclass

@@ -4,12 +4,13 @@ Lengths are normalised units throughout (see `models.humangs`): cameras, vertice
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Bool, Float
+from humangs_jax.array_types import Array, Bool, Float, Int, PyTree
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.sampling.bilinear import Convention, sample_bilinear, sample_nearest, texel_indices
@@ -31,11 +32,13 @@ class PixelAlignedConfig:
     pool: "visible" averages over the views that see the vertex (paper), "all" over every view (release).
     convention: "half_pixel" is correct, "mixed" is the published one (see `sampling.bilinear`).
     sample_rgb: also read the photo colour at each vertex, averaged over the views that see it, and their fraction.
+    vertex_capacity: vertices that a view is read for at most, None for all: views cost nothing where they see nothing.
     """
 
     pool: Literal["visible", "all"] = "visible"
     convention: Convention = "half_pixel"
     sample_rgb: bool = False
+    vertex_capacity: int | None = None
 
 
 def project_vertices(camera: Camera, vertices: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
@@ -66,20 +69,53 @@ def visible_vertices(
     return inside & (depths > 0) & (depths < surface + DEPTH_TOLERANCE)
 
 
-def sample_views(
-    maps: Float[Array, "v h w c"], pixels: Float[Array, "v n 2"], image_size: tuple[int, int], convention: Convention
-) -> Float[Array, "v n c"]:
-    """Each view's map at its projected vertices."""
-    indices = texel_indices(pixels, image_size, (maps.shape[2], maps.shape[1]), convention)
-    return jax.vmap(sample_bilinear)(maps, indices)
+def sum_over_views(
+    read: Callable[[Array, Array], PyTree],
+    maps: Float[Array, "v h w c"],
+    indices: Float[Array, "v n 2"],
+    weights: Float[Array, "v n"],
+    capacity: int | None = None,
+) -> PyTree:
+    """Sum over views of weight * read(map of the view, texel indices), one view after the other: memory for one.
+
+    read: (h, w, c), (m, 2) -> a pytree of (m, ...). capacity: a view is read for so many vertices at most, the first
+    ones of positive weight; None reads it for all of them, also where the weight is zero.
+    """
+    vertices = weights.shape[1]
+
+    @jax.checkpoint  # what was read is read again for gradients: it is larger than the maps
+    def add_view(total, view):
+        grid, positions, weight = view
+        if capacity is None or capacity >= vertices:
+            values = read(grid, positions)
+            return jax.tree.map(lambda t, x: t + _times(weight, x), total, values), None
+        seen = jnp.nonzero(weight > 0, size=capacity, fill_value=vertices)[0]
+        values = read(grid, positions.at[seen].get(mode="fill", fill_value=0))
+        weight = weight.at[seen].get(mode="fill", fill_value=0)
+        return jax.tree.map(lambda t, x: t.at[seen].add(_times(weight, x), mode="drop"), total, values), None
+
+    shapes = jax.eval_shape(read, maps[0], indices[0])
+    empty = jax.tree.map(lambda x: jnp.zeros(x.shape, jnp.result_type(x, weights)), shapes)
+    return jax.lax.scan(add_view, empty, (maps, indices, weights))[0]
 
 
-def pool_views(samples: Float[Array, "v n c"], weights: Float[Array, "v n"]) -> Float[Array, "n c"]:
-    """Weighted mean over views; zeros where no view counts."""
-    return jnp.einsum("vnc,vn->nc", samples, weights) / (jnp.sum(weights, axis=0) + COUNT_EPSILON)[:, None]
+def _times(weight, values):
+    return weight.reshape(-1, *[1] * (values.ndim - 1)) * values
 
 
-def photo_colors(samples: Float[Array, "v n 3"], visible: Bool[Array, "v n"]) -> Float[Array, "n 3"]:
+def dropped_reads(weights: Float[Array, "v n"], capacity: int | None) -> Int[Array, ""]:
+    """How many vertices, over all views, `sum_over_views` has no room for."""
+    if capacity is None:
+        return jnp.zeros((), jnp.int32)
+    return jnp.sum(jnp.maximum(jnp.sum(weights > 0, axis=1, dtype=jnp.int32) - capacity, 0))
+
+
+def photo_colors(
+    images: Float[Array, "v h w 3"], pixels: Float[Array, "v n 2"], visible: Bool[Array, "v n"], convention: Convention
+) -> Float[Array, "n 3"]:
     """Mean photo colour over the views that see each vertex, grey where none does."""
-    seen = jnp.any(visible, axis=0)
-    return jnp.where(seen[:, None], pool_views(samples, visible.astype(samples.dtype)), UNSEEN_COLOR)
+    size = (images.shape[2], images.shape[1])
+    colors = jax.vmap(sample_bilinear)(images, texel_indices(pixels, size, size, convention))
+    counts = jnp.sum(visible, axis=0)[:, None]
+    mean = jnp.einsum("vnc,vn->nc", colors, visible.astype(colors.dtype)) / jnp.maximum(counts, 1)
+    return jnp.where(counts > 0, mean, UNSEEN_COLOR)

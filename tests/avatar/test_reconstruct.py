@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from humangs_jax.avatar.animate import skin
-from humangs_jax.avatar.reconstruct import reconstruct, reconstruct_views
+from humangs_jax.avatar.reconstruct import _assemble_compiled, reconstruct, reconstruct_batch, reconstruct_views
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import capture_from_arrays
-from humangs_jax.data.views import SubjectViews, standardize
+from humangs_jax.data.views import SubjectViews, pad_views, standardize
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.models.humangs import init_humangs
 from humangs_jax.models.presets import tiny
@@ -142,3 +142,60 @@ def test_the_body_is_decimated_to_what_the_weights_want(body, network):
     per_vertex = config.decoder.gaussians_per_vertex
     assert len(avatar.rest_vertices) == 300 and len(avatar.gaussians.means) == 300 * per_vertex
     np.testing.assert_allclose(np.asarray(avatar.skinning_weights).sum(-1), 1, atol=1e-5)
+
+
+def capture_of(body, seed, views):
+    """Photos of noise, a pose in each."""
+    subject = subject_views(seed, views)
+    return capture_from_arrays(
+        np.asarray(subject.images),
+        np.asarray(subject.cameras.K),
+        np.asarray(subject.cameras.cam_from_world),
+        np.asarray(subject.rotations),
+        np.asarray(subject.translations),
+        betas=np.asarray(subject.betas)[: 4 - seed],
+        masks=np.asarray(subject.masks),
+        frames=np.arange(views),
+        body=body,
+    )
+
+
+@pytest.mark.parametrize("tokens", ["foreground", "all"])
+def test_a_batch_of_people_with_different_numbers_of_views(body, network, tokens):
+    variables, config = network
+    config = dataclasses.replace(config, tokens=tokens)
+    captures = [capture_of(body, seed, views) for seed, views in enumerate((2, 1))]
+    together = reconstruct_batch(variables, config, captures)
+    for avatar, photos in zip(together, captures, strict=True):
+        alone = reconstruct(variables, config, photos)
+        assert jax.tree.structure(avatar) == jax.tree.structure(alone)
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4), avatar, alone)
+
+
+def test_programs_are_compiled_once_per_bucket(body, network):
+    variables, config = network
+    config = dataclasses.replace(config, tokens="all")
+    before = _assemble_compiled._cache_size()
+    for views in (17, 18, 19):
+        reconstruct(variables, config, capture_of(body, 0, views))
+    assert _assemble_compiled._cache_size() == before + 1
+
+
+def test_what_cannot_be_one_batch_is_named(body, network):
+    photos = capture(body, SIZE, SIZE)
+    with pytest.raises(ValueError, match="none given"):
+        reconstruct_batch(*network, [])
+    with pytest.raises(ValueError, match=r"captures\[1\]: 0 views"):
+        reconstruct_batch(*network, [photos, photos.select([])])
+    other = capture(decimate(load_body(), 400), SIZE, SIZE)
+    with pytest.raises(ValueError, match=r"captures\[1\]: its body is not the one of captures\[0\]"):
+        reconstruct_batch(*network, [photos, other])
+
+
+def test_views_are_padded_to_a_number_not_below_their_own():
+    views = subject_views(0)
+    padded = pad_views(views, 3)
+    assert padded.view_count == 2 and len(padded.cameras.K) == len(padded.images) == 3
+    assert np.array_equal(padded.images[:2], views.images) and np.array_equal(padded.rotations[2], views.rotations[1])
+    with pytest.raises(ValueError, match="2 views cannot be padded to 1"):
+        pad_views(views, 1)

@@ -14,6 +14,8 @@ from humangs_jax.models.humangs import (
     apply_humangs,
     dropped_tokens,
     encode,
+    project_and_test,
+    read_vertices,
     sample_vertices,
     select_tokens,
     subject_unit,
@@ -57,7 +59,7 @@ def test_presets_have_the_shapes_they_promise(name):
     variables = expected_variables(config)
     encoding, outputs = jax.eval_shape(lambda v, x: run(v, x, config), variables, inputs)
     side = size // config.patch_size * (4 if config.upsampler.enabled else 1)
-    width = config.upsampler.out if config.upsampler.enabled else config.transformer.width
+    width = config.upsampler.hidden // 2 if config.upsampler.enabled else config.transformer.width
     assert encoding.maps.shape == (views, side, side, width)
     assert encoding.maps.dtype == (jnp.bfloat16 if config.dtype == "bfloat16" else jnp.float32) or side == size // 8
     assert outputs.gaussians.means.shape == (vertices * config.decoder.gaussians_per_vertex, 3)
@@ -180,15 +182,72 @@ def test_bfloat16_is_close():
 
 def test_unseen_vertices_are_grey_and_pool_nothing():
     inputs = replace(random_inputs(), depth_maps=jnp.full((2, 32, 32), -1.0))
-    encoding = Encoding(jnp.ones((2, 16, 16, 8)), jnp.ones(16))
-    sample = jax.jit(sample_vertices, static_argnames="config")
-    features = sample(encoding, inputs, TINY)
+    encoding = Encoding(jnp.ones((2, 16, 16, 4)), jnp.ones(16))
+    variables = variables_of(TINY)
+    features = sample_vertices(variables, encoding, inputs, TINY)
     assert np.array_equal(features.local, np.zeros((20, 8))) and np.array_equal(
         features.photo_colors, np.full((20, 3), 0.5)
     )
     assert np.array_equal(features.visible_fraction, np.zeros(20))
     every = dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, pool="all"))
-    assert np.allclose(sample(encoding, inputs, every).local, 1, atol=1e-6)
+    assert np.abs(sample_vertices(variables, encoding, inputs, every).local).min(axis=1).max() > 0
+
+
+# views that are padding, vertices that are not seen
+
+
+def padded(inputs, views):
+    """Garbage behind the views that there are."""
+    missing = views - len(inputs.images)
+    extend = lambda x, junk: jnp.concatenate([x, jnp.broadcast_to(jnp.asarray(junk, x.dtype), (missing, *x.shape[1:]))])
+    return replace(
+        inputs,
+        images=extend(inputs.images, 0.9),
+        cameras=jax.tree.map(lambda x: extend(x, x[-1]), inputs.cameras),
+        posed_vertices=extend(inputs.posed_vertices, 0.1),
+        position_maps=extend(inputs.position_maps, 0.2),
+        depth_maps=extend(inputs.depth_maps, 9.0),
+        foreground=extend(inputs.foreground, True),
+        view_count=jnp.asarray(len(inputs.images)),
+    )
+
+
+PUBLISHED_LIKE = dataclasses.replace(
+    ALL_TOKENS,
+    sampling=dataclasses.replace(ALL_TOKENS.sampling, pool="all", convention="mixed"),
+)
+
+
+@pytest.mark.parametrize("train", [False, True])
+@pytest.mark.parametrize("config", [dataclasses.replace(TINY, token_capacity=64), PUBLISHED_LIKE])
+def test_padding_views_change_nothing(config, train):
+    inputs, variables = random_inputs(), variables_of(PUBLISHED_LIKE)
+    apply = jax.jit(lambda x: apply_humangs(variables, x, config, train))
+    (outputs, statistics), (expected, expected_statistics) = apply(padded(inputs, 3)), apply(inputs)
+    assert close((outputs, statistics), (expected, expected_statistics), 10 * FLOAT32_TOLERANCE)
+    assert not close(outputs, apply(replace(padded(inputs, 3), view_count=jnp.asarray(3)))[0], 1e-3)
+
+
+def test_subjects_with_different_numbers_of_views_share_a_batch():
+    subjects = [random_inputs(seed, views) for seed, views in enumerate((1, 3, 2))]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(padded(x, 3) for x in subjects))
+    variables = variables_of(PUBLISHED_LIKE)
+    apply = lambda x: apply_humangs(variables, x, PUBLISHED_LIKE)[0]
+    together = jax.jit(jax.vmap(apply))(batch)
+    for index, subject in enumerate(subjects):
+        assert close(jax.tree.map(lambda x, i=index: x[i], together), jax.jit(apply)(subject), 10 * FLOAT32_TOLERANCE)
+
+
+def test_views_are_read_only_for_the_vertices_they_see():
+    inputs = random_inputs()
+    inputs = replace(inputs, depth_maps=inputs.depth_maps.at[0, :, :16].set(-1.0))
+    variables, needed = variables_of(TINY), int(read_vertices(inputs, TINY))
+    seen = project_and_test(inputs, TINY)[1].sum(axis=1)
+    assert needed == seen.max() and seen.min() < needed
+    of_capacity = lambda n: dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, vertex_capacity=n))
+    reference, exact, tight = (run(variables, inputs, of_capacity(n))[1] for n in (None, needed, needed - 1))
+    assert close(exact, reference) and exact.dropped_reads == 0
+    assert tight.dropped_reads == (seen == needed).sum() and not close(tight.gaussians, reference.gaussians)
 
 
 # gradients and batches
@@ -238,7 +297,6 @@ def test_a_vmap_over_subjects_is_a_loop():
     ("changes", "message"),
     [
         ({"image_size": 100}, "no multiple of patch_size"),
-        ({"tokens": "foreground"}, "token_capacity"),
         ({"transformer": presets.TransformerConfig(width=100)}, "head_width"),
         ({"transformer": presets.TransformerConfig(layers=3)}, "layers"),
         ({"decoder": presets.VertexDecoderConfig(residual_color=True)}, "sample_rgb"),

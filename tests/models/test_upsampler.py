@@ -5,7 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from network_cases import random_like
 
-from humangs_jax.models.upsampler import MOMENTUM, UpConvolution, Upsampler, UpsamplerConfig
+from humangs_jax.models.upsampler import MOMENTUM, Readout, UpConvolution, Upsampler, UpsamplerConfig
+from humangs_jax.sampling.bilinear import sample_bilinear
+from humangs_jax.sampling.neighborhoods import sample_neighborhoods
 
 CONFIG = UpsamplerConfig(hidden=4, out=5)
 
@@ -37,7 +39,9 @@ def test_statistics_follow_the_batch_only_in_training():
     evaluate = jax.jit(module.apply)
     trained, updated = jax.jit(lambda v, m: module.apply(v, m, True, mutable=["batch_stats"]))(variables, maps)
     still = evaluate(variables, maps)
-    assert still.shape == trained.shape == (2, 12, 12, CONFIG.out) and not np.allclose(still, trained, atol=1e-3)
+    assert still.shape == trained.shape == (2, 12, 12, CONFIG.hidden // 2) and not np.allclose(
+        still, trained, atol=1e-3
+    )
     of_the_batch = lambda new, old: (new - MOMENTUM * old) / (1 - MOMENTUM)
     statistics = jax.tree.map(of_the_batch, updated["batch_stats"], variables["batch_stats"])
     assert all((norm["var"] > 0).all() for norm in statistics.values())
@@ -63,3 +67,29 @@ def test_final_features_only():
     shapes = jax.eval_shape(module.init, jax.random.key(0), random_maps(depths=1))
     assert [name for name in shapes["params"] if name.startswith("project")] == ["project_0"]
     assert shapes["params"]["fuse"]["kernel"].shape == (3, 3, CONFIG.hidden, 2 * CONFIG.hidden)
+
+
+def test_what_vertices_read_is_what_the_convolved_map_says():
+    rng = np.random.default_rng(2)
+    stem = jnp.asarray(rng.normal(size=(1, 6, 8, 3)), jnp.float32)
+    positions = jnp.asarray(rng.uniform(-1, 9, (50, 2)), jnp.float32)
+    readout = Readout(5, 3)
+    neighborhoods, coverages = sample_neighborhoods(stem[0], positions)
+    variables = random_like(jax.eval_shape(readout.init, jax.random.key(0), neighborhoods, coverages))
+    everywhere = readout.apply(variables, stem, method="everywhere")
+    assert everywhere.shape == (1, 6, 8, 5)
+    ours = readout.apply(variables, neighborhoods, coverages)
+    assert np.allclose(ours, sample_bilinear(everywhere[0], positions), atol=1e-5) and np.abs(ours).max() > 0.1
+
+
+def test_padding_does_not_count_in_the_statistics():
+    maps = random_maps()
+    module = Upsampler(CONFIG)
+    variables = random_like(jax.eval_shape(module.init, jax.random.key(0), maps))
+    run = jax.jit(lambda m, present: module.apply(variables, m, True, present, mutable=["batch_stats"]))
+    padded = [jnp.concatenate([x, 100 * jnp.ones_like(x)]) for x in maps]
+    ours, statistics = run(padded, jnp.asarray([True, True, False, False]))
+    expected, expected_statistics = run(maps, None)
+    assert np.allclose(ours[:2], expected, atol=1e-4)
+    for a, b in zip(jax.tree.leaves(statistics), jax.tree.leaves(expected_statistics), strict=True):
+        assert np.allclose(a, b, rtol=1e-5, atol=1e-6)

@@ -6,10 +6,10 @@ import pytest
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, project
 from humangs_jax.sampling.pixel_aligned import (
     DEPTH_TOLERANCE,
+    dropped_reads,
     photo_colors,
-    pool_views,
     project_vertices,
-    sample_views,
+    sum_over_views,
     visible_vertices,
 )
 
@@ -50,27 +50,51 @@ def test_visibility_reads_the_pixel_that_holds_the_vertex():
     assert np.array_equal(visible_vertices(pixels, depths, depth_map, SIZE, "mixed"), expected)
 
 
-def test_pooling_averages_the_views_that_count():
-    samples = jnp.asarray([[[1.0, 2], [3, 4]], [[5, 6], [7, 8]], [[9, 9], [9, 9]]])
-    weights = jnp.asarray([[1.0, 0], [1, 0], [0, 0]])
-    assert np.allclose(pool_views(samples, weights), [[3, 4], [0, 0]])
+def read_row(grid, positions):
+    """A stand-in for a lookup: the first row of the map, plus the positions."""
+    return {"row": grid[0, 0] + positions[:, :1], "first": positions[:, 0]}
+
+
+def views_to_read(views=3, vertices=6):
+    rng = np.random.default_rng(3)
+    maps = jnp.asarray(rng.normal(size=(views, 2, 2, 4)), jnp.float32)
+    positions = jnp.asarray(rng.normal(size=(views, vertices, 2)), jnp.float32)
+    weights = jnp.asarray([[1.0, 0, 1, 0, 0, 1], [0, 0, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0]])
+    return maps, positions, weights
+
+
+@pytest.mark.parametrize("capacity", [None, 6, 3])
+def test_reads_are_summed_over_the_views_that_count(capacity):
+    maps, positions, weights = views_to_read()
+    sums = sum_over_views(read_row, maps, positions, weights, capacity)
+    row = np.einsum("vn,vnc->nc", weights, maps[:, 0, 0][:, None] + positions[..., :1])
+    assert np.allclose(sums["row"], row, atol=1e-6)
+    assert np.allclose(sums["first"], np.sum(weights * positions[..., 0], axis=0), atol=1e-6)
+    assert dropped_reads(weights, capacity) == 0
+
+
+def test_reads_beyond_the_capacity_are_left_out_and_counted():
+    maps, positions, weights = views_to_read()
+    sums = sum_over_views(read_row, maps, positions, weights, 2)
+    without_the_last = weights.at[0, 5].set(0)
+    assert np.allclose(sums["row"], sum_over_views(read_row, maps, positions, without_the_last)["row"], atol=1e-6)
+    assert dropped_reads(weights, 2) == 1 and dropped_reads(weights, 1) == 3
+
+
+def test_gradients_of_reads_do_not_depend_on_the_capacity():
+    maps, positions, weights = views_to_read()
+
+    def gradient(capacity):
+        total = lambda m, p: jnp.sum(jnp.sin(sum_over_views(read_row, m, p, weights, capacity)["row"]))
+        return jax.grad(total, (0, 1))(maps, positions)
+
+    for ours, reference in zip(gradient(4), gradient(None), strict=True):
+        assert np.allclose(ours, reference, atol=1e-6) and np.abs(reference).max() > 0
 
 
 def test_photo_colors_are_grey_where_nothing_is_seen():
-    samples = jnp.asarray([[[1.0, 0, 0], [1, 1, 1]], [[0, 0, 1], [1, 1, 1]]])
-    colors = photo_colors(samples, jnp.asarray([[True, False], [True, False]]))
-    assert np.allclose(colors, [[0.5, 0, 0.5], [0.5, 0.5, 0.5]])
-
-
-@pytest.mark.parametrize("convention", CONVENTIONS)
-def test_maps_are_read_at_the_projections(convention):
-    maps = jnp.asarray(np.random.default_rng(2).random((2, 8, 16, 3)), jnp.float32)
-    sampled = sample_views(maps, jnp.asarray([[[17.0, 9.0]], [[1.0, 1.0]]]), SIZE, convention)
-    assert sampled.shape == (2, 1, 3)
-    if convention == "half_pixel":
-        assert np.allclose(sampled[:, 0], [maps[0, 4, 8], maps[1, 0, 0]], atol=1e-6)
-    else:
-        x, y = 17 / 32 * 15, 9 / 16 * 7
-        a, b = x - 7, y - 3
-        corner = lambda i, j: maps[0, 3 + j, 7 + i] * (a if i else 1 - a) * (b if j else 1 - b)
-        assert np.allclose(sampled[0, 0], sum(corner(i, j) for i in (0, 1) for j in (0, 1)), atol=1e-5)
+    images = jnp.zeros((2, 4, 4, 3)).at[0].set(jnp.asarray([1.0, 0, 0])).at[1].set(jnp.asarray([0, 0, 1.0]))
+    pixels = jnp.full((2, 3, 2), 2.0)
+    visible = jnp.asarray([[True, False, False], [True, True, False]])
+    colors = photo_colors(images, pixels, visible, "half_pixel")
+    assert np.allclose(colors, [[0.5, 0, 0.5], [0, 0, 1], [0.5, 0.5, 0.5]])
