@@ -9,7 +9,7 @@ import pytest
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.synthetic import cameras, fabrics, poses, rendering, seeds, subject, writer
+from humangs_jax.data.synthetic import cameras, fabrics, patterns, poses, rendering, seeds, subject, writer
 from humangs_jax.data.synthetic.seeds import DEMO, SPLITS, split_of
 from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
 
@@ -213,7 +213,7 @@ def test_patterns_stay_in_range_and_differ():
     cloth[:, 3] = 0.16
     spots = fabrics.Spots(cloth, cloth[:, :3])
     seen = []
-    for name, (_, make) in fabrics.PATTERNS.items():
+    for name, (_, make) in patterns.PATTERNS.items():
         base, other = fabrics.colour(0.6, 0.7, 0.5), fabrics.colour(0.1, 0.6, 0.8)
         colours = make(np.random.default_rng(1), base, other)(spots)
         assert colours.shape == (500, 3) and np.isfinite(colours).all(), name

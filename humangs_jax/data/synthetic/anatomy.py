@@ -19,6 +19,10 @@ BODY_NAME, BODY_VERTICES = "makehuman", 13380
 WAIST, HIP, CROTCH, KNEE, ANKLE, FLOOR = -0.2, -0.33, -0.425, -0.764, -1.159, -1.2285
 ARM_HEIGHT, SHOULDER, ELBOW, WRIST = 0.096, 0.171, 0.411, 0.651
 """Heights (y) of the trunk and legs, and distances from the middle (|x|) of the arms, in template coordinates."""
+ARMHOLE = 0.185
+"""Distance from the middle at which sleeves are sewn on."""
+TRUNK_GIRTH, LEG_GIRTH, ARM_GIRTH = 0.16, 0.08, 0.06
+"""Radii that turn angles around trunk, legs and arms into metres of cloth."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Anatomy:
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
-    """0 below `low`, 1 above `high`, smooth between."""
+    """0 at `low`, 1 at `high`, smooth between, constant beyond (either may be the larger one)."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
 
@@ -57,18 +61,39 @@ def leg_membership(template: np.ndarray) -> np.ndarray:
 
 
 def cloth_coordinates(template: np.ndarray) -> np.ndarray:
-    """(n, 4) x, y, z around the axis of trunk, arm or leg, and the girth radius that turns angles into metres.
+    """(n, 4) x, y, z around the axis of trunk or leg, and the girth radius that turns angles into metres.
 
-    Arms are turned down, so that y runs along every limb; the angle atan2(x, z) is 0 in front.
+    The angle atan2(x, z) is 0 in front. Arms go on as the trunk does; `sleeve_coordinates` gives them their own.
     """
     x, y, z = template.T
-    side = np.where(x < 0, -1.0, 1.0)
-    trunk = np.stack([x, y, z - 0.02, np.full_like(x, 0.16)], -1)
+    trunk = np.stack([x, y, z - 0.02, np.full_like(x, TRUNK_GIRTH)], -1)
+    on_leg = leg_membership(template)[:, None]
+    return (trunk * (1 - on_leg) + leg_coordinates(template) * on_leg).astype(np.float32)
+
+
+def leg_coordinates(template: np.ndarray) -> np.ndarray:
+    """(n, 4) cloth coordinates around the axis of the nearer leg, from the waist down: trousers, sewn along the middle."""
+    x, y, z = template.T
     knee = np.interp(-y, [0.358, 0.764, 1.159], [0.101, 0.130, 0.137])
-    leg = np.stack([x - side * knee, y, z + 0.01, np.full_like(x, 0.08)], -1)
-    arm = np.stack([side * (y - ARM_HEIGHT), ARM_HEIGHT - (np.abs(x) - SHOULDER), z, np.full_like(x, 0.06)], -1)
-    on_arm, on_leg = arm_membership(template)[:, None], leg_membership(template)[:, None]
-    return ((trunk * (1 - on_leg) + leg * on_leg) * (1 - on_arm) + arm * on_arm).astype(np.float32)
+    leg = np.stack([x - np.where(x < 0, -1.0, 1.0) * knee, y, z + 0.01, np.full_like(x, LEG_GIRTH)], -1)
+    return leg.astype(np.float32)
+
+
+def sleeve_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
+    """Cloth coordinates (n, 4) with those beyond the armhole replaced by coordinates around the arm.
+
+    Arms are turned down, so that y runs along every limb. Only cloth with the trunk's girth has sleeves.
+    """
+    x, y, z = template.T
+    on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(cloth[:, 3] - TRUNK_GIRTH) < 0.004)
+    if not on_arm.any():
+        return cloth
+    x, y, z = x[on_arm], y[on_arm], z[on_arm]
+    around = np.where(x < 0, -1.0, 1.0) * (y - ARM_HEIGHT)
+    arm = np.stack([around, ARM_HEIGHT - (np.abs(x) - SHOULDER), z, np.full_like(x, ARM_GIRTH)], -1)
+    result = np.array(cloth)
+    result[on_arm] = arm
+    return result
 
 
 @functools.lru_cache(maxsize=1)

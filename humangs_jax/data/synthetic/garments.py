@@ -10,7 +10,7 @@ import numpy as np
 
 from humangs_jax.data.synthetic import anatomy as anatomy_module
 from humangs_jax.data.synthetic import slices
-from humangs_jax.data.synthetic.anatomy import ANKLE, Anatomy, smoothstep
+from humangs_jax.data.synthetic.anatomy import ANKLE, Anatomy, sleeve_coordinates, smoothstep
 from humangs_jax.data.synthetic.noise import ripples
 from humangs_jax.data.synthetic.surfaces import (
     Surface,
@@ -34,6 +34,8 @@ class Fit:
 
     ease: distance from skin (at least) and from the outlines. hang: slope by which hanging cloth may narrow downwards (metres
     per metre; large clings). sleeve, leg: width added at the end of the limb. fold: height of the folds. hem: depth of the hem.
+    quilt: period of padded rings, 0 for none. inner: nothing comes nearer to the skin than this (what is worn below).
+    calm: height above which there are no folds.
     """
 
     ease: float
@@ -43,6 +45,9 @@ class Fit:
     leg_hang: float = 3.0
     fold: float = 0.004
     hem: float = 0.008
+    quilt: float = 0.0
+    inner: float = 0.0
+    calm: float = 9.0
 
 
 def shell(rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], fit: Fit) -> Surface:
@@ -83,15 +88,42 @@ def _drape(rng, anatomy, surface, fit):
     points = smooth(points, surface.faces, 3, keep_hems=True)
     outer = vertex_normals(points, surface.faces)
     cloth = smooth(surface.attributes["cloth"], surface.faces, 10, keep_hems=True)  # as the points were
-    points = points + (fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11))[:, None] * outer
+    template = smooth(surface.attributes["template"], surface.faces, 8, keep_hems=True)
+    along_limbs = sleeve_coordinates(cloth, template)
+    points = points + fold_heights(rng, along_limbs, arm, leg, fit)[:, None] * outer
     distance = np.sum((points - below) * surface.attributes["normals"], -1)
-    points = points + np.maximum(0.55 * fit.ease - distance, 0)[:, None] * surface.attributes["normals"]
+    least = max(0.55 * fit.ease, fit.inner)
+    points = points + np.maximum(least - distance, 0)[:, None] * surface.attributes["normals"]
     hems = np.unique(boundary_edges(surface.faces))
     points[hems] = smooth(points, surface.faces, 4, keep_hems=True)[hems]
     side = np.sign(surface.attributes["template"][:, 0])
     thighs = leg > 0.6  # trouser legs do not cross the middle
     points[:, 0] = np.where(thighs, side * np.maximum(side * points[:, 0], 0.004), points[:, 0])
-    return surface.moved(points).with_attributes(cloth=cloth)
+    return surface.moved(points).with_attributes(cloth=cloth, template=template)
+
+
+def fold_heights(rng, cloth: np.ndarray, arm: np.ndarray, leg: np.ndarray, fit: Fit) -> np.ndarray:
+    """(n,) metres outwards: soft waves, drapes that fall from chest and hips, rings where joints and cuffs gather cloth."""
+    along, around = cloth[:, 1], np.arctan2(cloth[:, 0], cloth[:, 2]) * cloth[:, 3]
+    heights = fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11)
+    if fit.fold == 0:
+        return heights
+    wander = ripples(rng, cloth[:, :3], wavelength=0.3)
+    drapes = np.sin(2 * np.pi * around / 0.09 + 2.5 * wander) * np.clip(-along / 0.35, 0, 1)
+    heights = heights + 0.8 * fit.fold * drapes * (1 - arm) * np.where(leg > 0.5, 0.35, 1.0)
+    slanted = along + 0.25 * around + 0.012 * ripples(rng, cloth[:, :3], wavelength=0.12)
+    rings = np.sin(2 * np.pi * slanted / 0.055) * (0.6 + 0.4 * ripples(rng, cloth[:, :3], wavelength=0.1))
+    elbows = arm * (np.exp(-(((along + 0.14) / 0.07) ** 2)) + 0.8 * np.exp(-(((along + 0.34) / 0.06) ** 2)))
+    knees = leg * (
+        np.exp(-(((along + 0.79) / 0.07) ** 2))
+        + 1.3 * np.exp(-(((along + 1.12) / 0.07) ** 2))
+        + 0.6 * np.exp(-(((along + 0.46) / 0.05) ** 2))
+    )
+    heights = heights + 1.3 * fit.fold * rings * (elbows + knees)
+    heights = heights * (1 - smoothstep(fit.calm - 0.08, fit.calm, along))
+    if fit.quilt > 0:
+        heights = heights + 0.011 * (np.abs(np.sin(np.pi * along / fit.quilt)) - 0.4)
+    return heights
 
 
 def _push_trunk(anatomy, points, arm, leg, fit):
@@ -141,7 +173,11 @@ def _push_leg(anatomy, points, leg, side, fit):
 
 @dataclasses.dataclass(frozen=True)
 class Skirt:
-    """top, bottom: template heights. ease, flare: metres added at the top, and per metre further down. pleats: count, depth."""
+    """top, bottom: template heights. ease, flare: metres added at the top, and per metre further down. pleats: count, depth.
+
+    gap: half width of an opening in front, metres, negative for none; it widens by `spread` metres per metre downwards.
+    cling: metres from the top over which it does not flare.
+    """
 
     top: float
     bottom: float
@@ -149,6 +185,9 @@ class Skirt:
     flare: float
     pleats: int = 0
     pleat_depth: float = 0.0
+    gap: float = -1.0
+    spread: float = 0.0
+    cling: float = 0.0
 
 
 def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
@@ -161,10 +200,11 @@ def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
     height, around = (x.reshape(-1) for x in np.meshgrid(y, angle, indexing="ij"))
     down = np.repeat((cut_of.top - template_y) / max(cut_of.top - cut_of.bottom, 1e-6), TUBE_COLUMNS)
     drop = np.repeat(cut_of.top - template_y, TUBE_COLUMNS)
-    radius = outline.radius(height, around) + cut_of.ease + cut_of.flare * drop
+    radius = outline.radius(height, around) + cut_of.ease + cut_of.flare * np.maximum(drop - cut_of.cling, 0)
     pleats = np.cos(cut_of.pleats * around) if cut_of.pleats else 0
     wave = ripples(rng, np.stack([np.sin(around), 0.3 * height, np.cos(around)], -1), wavelength=0.9)
-    radius = radius + down * (cut_of.pleat_depth * pleats + 0.012 * (1 + 4 * cut_of.flare) * wave)
+    loose = np.clip((drop - cut_of.cling) / 0.25, 0, 1) * down**0.5
+    radius = radius + loose * (cut_of.pleat_depth * pleats + 0.012 * (1 + 4 * cut_of.flare) * wave)
     vertices = np.stack([radius * np.sin(around), height, radius * np.cos(around)], -1).astype(np.float32)
     template = np.stack([0.16 * np.sin(around), np.repeat(template_y, TUBE_COLUMNS), 0.02 + 0.16 * np.cos(around)], -1)
     cloth = np.stack([template[:, 0], template[:, 1], template[:, 2] - 0.02, np.full(len(template), 0.16)], -1)
@@ -173,6 +213,9 @@ def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
     surface = Surface(
         vertices, faces, weights, {"template": template.astype(np.float32), "cloth": cloth.astype(np.float32)}
     )
+    if cut_of.gap > 0:
+        front = np.where(vertices[:, 2] > 0, np.abs(vertices[:, 0]) - cut_of.gap - cut_of.spread * drop, 1.0)
+        surface = cut(surface, front)
     return turn_in_hems(surface, 0.008)
 
 

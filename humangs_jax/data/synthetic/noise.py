@@ -28,6 +28,36 @@ class Ripples:
         return self.amplitude * np.cos(points.astype(np.float32) @ self.k + self.phase) @ self.k.T
 
 
+class Folds:
+    """Creases of cloth: ridges in a few directions, each in patches of its own. The same object is the same function always.
+
+    upright: all of them run along y.
+    """
+
+    def __init__(self, rng: np.random.Generator, wavelength: float = 0.09, directions: int = 6, upright: bool = False):
+        tilt, turn = (
+            rng.uniform(*((1.25, 1.57) if upright else (0.25, 1.5)), directions),
+            rng.uniform(0, 2 * np.pi, directions),
+        )
+        k = np.stack([np.sin(tilt) * np.cos(turn), np.cos(tilt), np.sin(tilt) * np.sin(turn)], -1)
+        self.directions = k.astype(np.float32)
+        self.k = (k * (2 * np.pi / wavelength * rng.uniform(0.6, 1.4, (directions, 1)))).astype(np.float32)
+        self.phase = rng.uniform(0, 2 * np.pi, directions).astype(np.float32)
+        self.warp = Ripples(rng, 3 * wavelength)
+        self.patches = [Ripples(rng, 4 * wavelength) for _ in range(directions)]
+
+    def slope(self, points: np.ndarray) -> np.ndarray:
+        """(n, 3) slopes at (n, 3) points, about 1 on the flanks of a crease, 0 between patches."""
+        points = points.astype(np.float32)
+        total, warp = np.zeros_like(points), 2.2 * self.warp(points)
+        for k, direction, phase, patch in zip(self.k, self.directions, self.phase, self.patches, strict=True):
+            angle = points @ k + phase + warp
+            crest = np.sin(angle)
+            flank = np.cos(angle) * crest / np.sqrt(crest * crest + 0.15)  # of a ridge |sin| with a rounded top
+            total += (np.clip(patch(points) - 0.25, 0, 1) * flank)[:, None] * direction
+        return total
+
+
 def lattice(points: np.ndarray, seed: int) -> np.ndarray:
     """(n,) value noise in [0, 1] of (n, d) points: random values on the integer lattice, blended smoothly; d = 1, 2 or 3."""
     base = np.floor(points)

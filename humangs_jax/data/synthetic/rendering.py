@@ -7,8 +7,8 @@ import numpy as np
 
 from humangs_jax.array_types import Float, Int
 from humangs_jax.data.synthetic.fabrics import Spots
-from humangs_jax.data.synthetic.noise import Ripples
-from humangs_jax.data.synthetic.shading import bend_normals, occlusion, shade
+from humangs_jax.data.synthetic.noise import Folds
+from humangs_jax.data.synthetic.shading import bend_normals, lit_share, occlusion, shade
 from humangs_jax.data.synthetic.subject import SyntheticSubject
 from humangs_jax.data.synthetic.surfaces import vertex_normals
 from humangs_jax.geometry.camera import Camera
@@ -19,11 +19,15 @@ VERTEX_STEP, FACE_STEP = 4096, 8192
 """Meshes are padded to multiples of these, so that few shapes are compiled."""
 INSIDE_SHADE = 0.45
 """Brightness of the inner side of cloth."""
+FOLD_SLOPE = 0.8
+"""Slope of painted creases on the most wrinkled cloth."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PosedSubject:
-    """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n, 3), openness (n,)."""
+    """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n, 3), openness (n,), share of
+    the key light that arrives (n,).
+    """
 
     subject: SyntheticSubject
     rotations: Float[np.ndarray, "j 3"]
@@ -31,6 +35,7 @@ class PosedSubject:
     vertices: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
     openness: Float[np.ndarray, " n"]
+    lit: Float[np.ndarray, " n"]
 
 
 def pose_subject(
@@ -39,7 +44,8 @@ def pose_subject(
     """Skin the mesh and gather what its shading needs."""
     vertices = subject.posed_vertices(rotations, translation).astype(np.float32)
     normals = vertex_normals(vertices, subject.surface.faces)
-    return PosedSubject(subject, rotations, translation, vertices, normals, occlusion(vertices, normals))
+    lit = lit_share(vertices, normals, subject.lights.directions[0])
+    return PosedSubject(subject, rotations, translation, vertices, normals, occlusion(vertices, normals), lit)
 
 
 def render_view(
@@ -88,10 +94,9 @@ def light_points(
     """
     subject = posed.subject
     corners = subject.surface.faces[face_ids]
-    points, normals, openness = np.split(
-        _blend(np.concatenate([posed.vertices, posed.normals, posed.openness[:, None]], 1), corners, weights), [3, 6], 1
-    )
-    openness = openness[:, 0]
+    values = np.concatenate([posed.vertices, posed.normals, posed.openness[:, None], posed.lit[:, None]], 1)
+    points, normals, shades = np.split(_blend(values, corners, weights), [3, 6], 1)
+    openness, lit = shades.T
     normals = normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-9)
     if eye is not None:
         a, b, c = (posed.vertices[corners[:, i]] for i in range(3))
@@ -100,7 +105,7 @@ def light_points(
         openness = np.where(inside, INSIDE_SHADE * openness, openness)
     normals = np.where((slopes != 0).any(1, keepdims=True), bend_normals(normals, slopes), normals)
     sheens = np.asarray([material.sheen for material in subject.materials], np.float32)
-    return shade(subject.lights, albedo, normals, openness, sheens[subject.face_materials[face_ids]])
+    return shade(subject.lights, albedo, normals, openness, sheens[subject.face_materials[face_ids]], lit)
 
 
 def spots_at(subject: SyntheticSubject, face_ids: Int[np.ndarray, " m"], weights: Float[np.ndarray, "m 3"]) -> Spots:
@@ -130,6 +135,6 @@ def paint(
         own = Spots(spots.cloth[chosen], spots.template[chosen])
         albedo[chosen] = material.albedo(own)
         if material.wrinkles > 0:
-            folds = Ripples(np.random.default_rng([subject.seed, 100 + k]), 0.09, 8, stretch=(1.2, 0.45, 1.2))
-            slope[chosen] = 0.012 * material.wrinkles * folds.gradient(own.cloth[:, :3])
+            folds = Folds(np.random.default_rng([subject.seed, 100 + k]), upright=material.draped)
+            slope[chosen] = FOLD_SLOPE * material.wrinkles * folds.slope(own.cloth[:, :3])
     return np.clip(albedo, 0.01, None), slope

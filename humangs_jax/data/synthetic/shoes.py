@@ -25,7 +25,8 @@ def _shoe(anatomy, side, height, sole, ease):
     shaft = (
         np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1)) if height > 0.1 else np.asarray([height])
     )
-    levels = floor + np.concatenate([[0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072], shaft])
+    low = np.asarray([0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072])
+    levels = floor + np.concatenate([low[low < height - 0.004], shaft])
     shape = slices.outlines(points[:, 1], points[:, [0, 2]], levels, None, 0.012)
     shape = slices.hanging(shape, 0.6)  # the sole is as wide as what is above it
     angle = np.arange(COLUMNS) * (2 * np.pi / COLUMNS)

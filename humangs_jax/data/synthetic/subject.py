@@ -9,14 +9,15 @@ import numpy as np
 from humangs_jax.array_types import Bool, Float, Int
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.data.synthetic import anatomy as anatomy_module
-from humangs_jax.data.synthetic import complexion, fabrics, hair, poses, wardrobe
+from humangs_jax.data.synthetic import complexion, hair, poses, wardrobe
 from humangs_jax.data.synthetic.anatomy import Anatomy
 from humangs_jax.data.synthetic.fabrics import Material
-from humangs_jax.data.synthetic.shading import Lights, sample_lights
+from humangs_jax.data.synthetic.person import Person, describe
+from humangs_jax.data.synthetic.shading import Lights
 from humangs_jax.data.synthetic.surfaces import Surface, compact, join
 
-SHAPE_SPREAD = 0.55
-"""Standard deviation of the shape coefficients other than sex; beyond 2 of them nothing is drawn."""
+UNDER_CLOTH = 0.003
+"""Skin this far inside of a hem is meant to be covered, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +26,8 @@ class SyntheticSubject:
 
     seed. betas: (s,) shape of the body. surface: the mesh at rest with attributes `template`, `cloth`. face_materials: (f,)
     indices into materials. lights. build: what the pose prior knows. under_cloth: (n,) skin vertices kept below a hem.
+    cover: (n,) metres that a vertex of the skin lies inside of a hem, negative on bare skin and on everything else.
+    person: what all of this was built from.
     """
 
     seed: int
@@ -35,6 +38,8 @@ class SyntheticSubject:
     lights: Lights
     build: poses.Build
     under_cloth: Bool[np.ndarray, " n"]
+    cover: Float[np.ndarray, " n"]
+    person: Person
 
     def posed_vertices(
         self, rotations: Float[np.ndarray, "j 3"], translation: Float[np.ndarray, "3"]
@@ -64,45 +69,39 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
     """
     if body.name != anatomy_module.BODY_NAME or body.template.shape[0] != anatomy_module.BODY_VERTICES:
         raise ValueError(f"synthetic people need the shipped body '{anatomy_module.BODY_NAME}', got '{body.name}'")
-    rng = np.random.default_rng([seed, 0])
-    betas, male = sample_shape(rng, body.shape_names)
-    rest = _shape(body, jnp.asarray(betas))
+    person = describe(seed, body)
+    rest = _shape(body, jnp.asarray(person.betas))
     template, faces, weights = _host_arrays(body)
     anatomy = anatomy_module.measure(
         np.asarray(rest.vertices), np.asarray(rest.joints), template, faces, weights, body.parents
     )
-    outfit = wardrobe.dress_up(rng, anatomy, male)
-    tones, styled = _style_hair(rng, anatomy, male)
-    for piece in styled:
-        outfit.add(piece.surface, piece.material)
-    skin, under = _visible_skin(anatomy, outfit.hidden)
+    rng = np.random.default_rng([seed, 20])
+    outfit = wardrobe.dress_up(rng, anatomy, person.garments)
+    if hair.over_ears(person.haircut) or any(g.kind == "headscarf" or "hood_up" in g.details for g in person.garments):
+        outfit.removed = outfit.removed | hair.ears(template)
+    hairs = _hair(np.random.default_rng([seed, 21]), anatomy, person)
+    skin, cover = _visible_skin(anatomy, outfit)
+    tones = person.complexion
     pieces = [
-        wardrobe.Piece(skin, complexion.skin_material(rng, tones)),
+        wardrobe.Piece(skin, complexion.skin_material(np.random.default_rng([seed, 22]), tones, person.haircut)),
         wardrobe.Piece(hair.eyeballs(anatomy), complexion.eye_material(tones)),
         *outfit.pieces,
+        *hairs,
     ]
     surface = join([piece.surface for piece in pieces])
+    cover = np.concatenate([cover, np.full(len(surface.vertices) - len(cover), -1.0, np.float32)])
     return SyntheticSubject(
         seed=seed,
-        betas=betas,
+        betas=person.betas,
         surface=surface,
         face_materials=np.concatenate([np.full(len(p.surface.faces), i, np.int32) for i, p in enumerate(pieces)]),
         materials=tuple(piece.material for piece in pieces),
-        lights=sample_lights(rng),
+        lights=person.lights,
         build=_build(anatomy, surface),
-        under_cloth=np.concatenate([under, np.zeros(len(surface.vertices) - len(under), bool)]),
+        under_cloth=cover > UNDER_CLOTH,
+        cover=cover,
+        person=person,
     )
-
-
-def sample_shape(rng: np.random.Generator, names: tuple[str, ...]) -> tuple[Float[np.ndarray, " s"], bool]:
-    """(s,) shape coefficients and whether the person is dressed as a man."""
-    betas = np.clip(rng.normal(0, 1, len(names)), -2, 2) * SHAPE_SPREAD
-    male = bool(rng.random() < 0.5)
-    at = {name: i for i, name in enumerate(names)}
-    betas[at["sex_male"]] = (1 if male else -1) * rng.uniform(0.55, 1.0)
-    betas[at["age"]] = rng.uniform(-0.2, 0.8)
-    betas[at["weight"]] = np.clip(rng.normal(0.1, 0.6), -0.9, 1.6)
-    return betas.astype(np.float32), male
 
 
 _HOST: dict[int, tuple] = {}
@@ -117,60 +116,25 @@ def _host_arrays(body):
     return _HOST[id(body)][1:]
 
 
-def _visible_skin(anatomy: Anatomy, hidden: np.ndarray) -> tuple[Surface, np.ndarray]:
-    """Skin without the faces that are wholly under cloth, and which of its vertices (n,) are under cloth."""
-    skin = anatomy.skin.with_attributes(hidden=hidden)
-    bare = compact(skin, ~hidden[skin.faces].all(1))
+def _visible_skin(anatomy: Anatomy, outfit: wardrobe.Outfit) -> tuple[Surface, np.ndarray]:
+    """Skin without the faces that nobody can see, and how far inside of a hem its vertices (n,) lie, metres."""
+    skin = anatomy.skin.with_attributes(cover=outfit.cover.astype(np.float32))
+    bare = compact(skin, ~outfit.removed[skin.faces].all(1))
     kept = {name: bare.attributes[name] for name in ("template", "cloth")}
-    return Surface(bare.vertices, bare.faces, bare.weights, kept), bare.attributes["hidden"]
+    return Surface(bare.vertices, bare.faces, bare.weights, kept), bare.attributes["cover"]
 
 
-def _style_hair(rng, anatomy, male):
-    """Complexion, and the pieces of hair (or a cap)."""
-    tones = complexion.sample_complexion(rng, male)
-    odds = {
-        "cropped": (0.3, 0.04),
-        "short": (0.32, 0.12),
-        "curly": (0.1, 0.12),
-        "buzz": (0.1, 0.02),
-        "bob": (0.03, 0.2),
-        "long": (0.05, 0.26),
-        "ponytail": (0.02, 0.12),
-        "bun": (0.02, 0.07),
-        "cap": (0.06, 0.05),
-    }
-    column = np.asarray([value[0 if male else 1] for value in odds.values()])
-    style = list(odds)[rng.choice(len(odds), p=column / column.sum())]
-    material = complexion.hair_material(rng, tones.hair, rng.uniform(0.35, 0.7))
-    pieces, receding = [], rng.uniform(-0.004, 0.012) if male else rng.uniform(-0.006, 0.004)
-    if style == "buzz":
-        tones = dataclasses.replace(tones, scalp_stubble=rng.uniform(0.5, 0.9))
-    elif style == "bob" or style == "long":
-        bottom = rng.uniform(0.16, 0.2) if style == "bob" else rng.uniform(-0.12, 0.1)
-        tube = hair.falling_tube(rng, anatomy, rng.uniform(0.014, 0.026), bottom, wave=rng.uniform(0.003, 0.01))
-        pieces.append(wardrobe.Piece(tube, material))
-        tones = dataclasses.replace(tones, scalp_stubble=0.9)
-    else:
-        thickness = {
-            "cropped": rng.uniform(0.006, 0.011),
-            "short": rng.uniform(0.013, 0.026),
-            "curly": rng.uniform(0.03, 0.06),
-        }.get(style, 0.009)
-        bumps = {"curly": 0.22, "short": 0.16}.get(style, 0.1)
-        pieces.append(wardrobe.Piece(hair.scalp_shell(rng, anatomy, thickness, bumps, shift=receding), material))
-        tones = dataclasses.replace(tones, scalp_stubble=0.9)
-    if style == "ponytail":
-        pieces.append(wardrobe.Piece(hair.ponytail(rng, anatomy, rng.uniform(0.2, 0.38)), material))
-    if style == "bun":
-        pieces.append(wardrobe.Piece(hair.bun(rng, anatomy, rng.uniform(0.032, 0.05), rng.uniform(0.0, 1.1)), material))
-    if style == "cap":
-        knit = Material(fabrics.random_fabric(rng, plainness=0.5), wrinkles=0.2)
-        pieces.append(
-            wardrobe.Piece(hair.scalp_shell(rng, anatomy, rng.uniform(0.012, 0.018), 0.03, hair.CAP_LINE), knit)
-        )
-    if male and rng.random() < 0.25:
-        pieces.append(wardrobe.Piece(hair.beard(rng, anatomy, rng.uniform(0.004, 0.018)), material))
-    return tones, pieces
+def _hair(rng, anatomy, person):
+    """The pieces of hair; what a hat or hood covers is left out."""
+    material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
+    if any("hood_up" in g.details or g.kind == "headscarf" for g in person.garments):
+        parts = hair.style(rng, anatomy, dataclasses.replace(person.haircut, cut="buzz"))
+        return [wardrobe.Piece(surface, material) for surface in parts]
+    pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, person.haircut)]
+    if not any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments):
+        return pieces
+    hidden = [hair.above_line(p.surface.attributes["template"], hair.CAP_LINE) > 0.008 for p in pieces]
+    return [dataclasses.replace(p, hidden=h).visible() for p, h in zip(pieces, hidden, strict=True)]
 
 
 def _build(anatomy, surface):

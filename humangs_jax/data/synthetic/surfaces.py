@@ -191,3 +191,29 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Int[np.ndarray, "f 3"]:
     a, b = row * columns + column, row * columns + right
     c, d = (row + 1) * columns + column, (row + 1) * columns + right
     return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.int32)
+
+
+def sweep(
+    path: Float[np.ndarray, "m 3"],
+    across: Float[np.ndarray, "m 3"],
+    widths: Float[np.ndarray, "m 2"],
+    columns: int = 10,
+    closed: bool = False,
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]:
+    """Vertices (m columns, 3) and faces of a tube of elliptic sections along a path (m, 3).
+
+    across: (m, 3) directions of the first half axis, made normal to the path. widths: (m, 2) half axes, metres.
+    closed: the path's end joins its start; otherwise the ends are open (let the widths run out to close them).
+    """
+    tangent = unit(np.roll(path, -1, 0) - np.roll(path, 1, 0)) if closed else unit(np.gradient(path, axis=0))
+    first = unit(across - np.sum(across * tangent, -1, keepdims=True) * tangent)
+    second = np.cross(tangent, first)
+    angle = np.arange(columns) * (2 * np.pi / columns)
+    ring = (
+        np.cos(angle)[None, :, None] * (widths[:, :1] * first)[:, None]
+        + np.sin(angle)[None, :, None] * (widths[:, 1:] * second)[:, None]
+    )
+    vertices = (path[:, None] + ring).reshape(-1, 3).astype(np.float32)
+    rows = len(path) + closed
+    faces = grid_faces(rows, columns, closed=True) % len(vertices)
+    return vertices, np.ascontiguousarray(faces[:, ::-1])
