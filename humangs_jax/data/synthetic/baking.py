@@ -9,7 +9,7 @@ import dataclasses
 
 import numpy as np
 
-from humangs_jax.array_types import Float, Int, UInt8
+from humangs_jax.array_types import Bool, Float, Int, UInt8
 from humangs_jax.data.synthetic import poses
 from humangs_jax.data.synthetic.atlas import Atlas, texels, unwrap
 from humangs_jax.data.synthetic.rendering import paint, spots_at
@@ -100,8 +100,8 @@ def strongest_joints(
     return ids.astype(np.uint8), (kept / kept.sum(1, keepdims=True)).astype(np.float32)
 
 
-def fill_gaps(image: Float[np.ndarray, "t t c"], known: np.ndarray) -> Float[np.ndarray, "t t c"]:
-    """The image with every unknown texel (t, t) bool replaced by the nearest known one."""
+def fill_gaps(image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w c"]:
+    """The image with every unknown texel replaced by the nearest known one."""
     from scipy.ndimage import distance_transform_edt
 
     rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)

@@ -11,19 +11,29 @@ skinned instead of measured, the key light throws soft shadows.
 """
 
 import dataclasses
+import math
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 
 from humangs_jax.array_types import Array, Bool, Float, Int, Key
 from humangs_jax.data.loading.examples import Example
 from humangs_jax.data.synthetic.baking import SLOPE_STEP, SLOPE_ZERO
 from humangs_jax.data.synthetic.live_bank import UV_STEPS, PeopleBank
-from humangs_jax.data.synthetic.live_camera import draw_camera, spread_azimuths
-from humangs_jax.data.synthetic.live_light import LiveLights, bend_normals, draw_lights, dyes, shade, shaded_vertices
-from humangs_jax.data.synthetic.live_pose import draw_rotations, pose_person
+from humangs_jax.data.synthetic.live_camera import CAMERA_NUMBERS, azimuths_from, camera_from
+from humangs_jax.data.synthetic.live_light import (
+    LIGHT_NUMBERS,
+    LiveLights,
+    bend_normals,
+    dyes_from,
+    lights_from,
+    shade,
+    shaded_vertices,
+)
+from humangs_jax.data.synthetic.live_pose import pick, pose_person, rotations_from
 from humangs_jax.data.synthetic.poses import MIRROR
 from humangs_jax.data.synthetic.rendering import INSIDE_SHADE
 from humangs_jax.data.views import SubjectViews
@@ -42,7 +52,7 @@ class LiveConfig:
 
     input_views, target_views; input_size, target_size: pixels a side. poses: poses per example; targets show any of them.
     mixed_pose_share: share of examples whose inputs show any of the poses too, each; otherwise all show the first.
-    jitter, scattered_share: see `live_camera.spread_azimuths`. close_share: share of close cameras among the targets.
+    jitter, scattered_share: see `live_camera.azimuths_from`. close_share: share of close cameras among the targets.
     mirrored_share, dyed_share: of examples. supersampling: samples a side of each pixel.
     views_at_once: views drawn side by side: 1 suits CPUs, all of them accelerators. pixels_per_step: of the person, that are
     coloured at a time: few suit CPUs, whole pictures accelerators.
@@ -84,32 +94,56 @@ class LiveScene:
 
 def live_example(bank: PeopleBank, key: Key, config: LiveConfig = LiveConfig()) -> Example:
     """Views of somebody of the bank: some shown, others asked for."""
-    keys = jax.random.split(key, 4)
-    scene = draw_scene(bank, keys[0], config)
-    plans = _input_plan(keys[1], config), _target_plan(keys[2], config)
+    numbers = _draw_numbers(bank, key, config)
+    scene = scene_from(numbers, bank, config)
+    plans = _input_plan(numbers, config), _target_plan(numbers, config)
     if config.input_size == config.target_size:  # one loop over all views: half of the compilation
         both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *plans)
         views = _views(bank, scene, both, config, config.input_size)
         parts = [_some(views, part) for part in (slice(config.input_views), slice(config.input_views, None))]
     else:
-        parts = [
-            _views(bank, scene, p, config, s)
-            for p, s in zip(plans, (config.input_size, config.target_size), strict=True)
-        ]
-    flipped = jax.random.bernoulli(keys[3], config.mirrored_share)
+        sizes = config.input_size, config.target_size
+        parts = [_views(bank, scene, plan, config, size) for plan, size in zip(plans, sizes, strict=True)]
+    flipped = numbers["mirrored"] < config.mirrored_share
     choose = lambda a, b: jnp.where(flipped, a, b)
     return Example(*(jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts))
 
 
-def draw_scene(bank: PeopleBank, key: Key, config: LiveConfig) -> LiveScene:
-    """Who, in which poses, colours and light."""
-    keys = jax.random.split(key, 5)
-    person = jax.random.randint(keys[0], (), 0, bank.people)
-    rotations = jax.vmap(lambda k: draw_rotations(bank, person, k))(jax.random.split(keys[1], config.poses))
-    lights = draw_lights(keys[2])
-    dyed = jax.random.bernoulli(keys[3], config.dyed_share)
-    matrices = dyes(keys[4], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
-    return make_scene(bank, person, rotations, lights, jnp.where(dyed, matrices, jnp.eye(3)))
+def draw_scene(bank: PeopleBank, key: Key, config: LiveConfig = LiveConfig()) -> LiveScene:
+    """What the views of `live_example` of this key show."""
+    return scene_from(_draw_numbers(bank, key, config), bank, config)
+
+
+def _draw_numbers(bank, key, config):
+    """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
+    inputs, targets = config.input_views, config.target_views
+    shapes = {
+        "person": (),
+        "poses": (config.poses, 2),
+        "lights": (LIGHT_NUMBERS,),
+        "dyed": (),
+        "dyes": (4, bank.groups.shape[1]),
+        "mirrored": (),
+        "mixed": (),
+        "input_azimuths": (2 + 2 * inputs,),
+        "input_poses": (inputs,),
+        "input_cameras": (inputs, CAMERA_NUMBERS),
+        "target_azimuths": (2 + 2 * targets,),
+        "target_poses": (targets,),
+        "target_cameras": (targets, CAMERA_NUMBERS),
+    }
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
+    parts = jnp.split(jax.random.uniform(key, (ends[-1],)), ends[:-1])
+    return {name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
+
+
+def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: LiveConfig) -> LiveScene:
+    """Who, in which poses, colours and light; numbers in [0, 1) by name."""
+    person = pick(numbers["person"], bank.people)
+    rotations = jax.vmap(lambda u: rotations_from(u, bank, person))(numbers["poses"])
+    dyes = dyes_from(numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
+    dyes = jnp.where(numbers["dyed"] < config.dyed_share, dyes, jnp.eye(3))
+    return make_scene(bank, person, rotations, lights_from(numbers["lights"]), dyes)
 
 
 def make_scene(
@@ -133,36 +167,33 @@ def make_scene(
 
 
 class _Plan(NamedTuple):
-    """Views to draw (v,): keys of their cameras, azimuths, numbers of poses, shares of close cameras."""
+    """Views to draw (v,): numbers for their cameras (v, c), azimuths, numbers of poses, shares of close cameras."""
 
-    keys: Key
+    cameras: Float[Array, "v c"]
     azimuths: Float[Array, " v"]
     poses: Int[Array, " v"]
     close_shares: Float[Array, " v"]
 
 
-def _input_plan(key, config):
-    keys = jax.random.split(key, 4)
-    count = config.input_views
-    azimuths = spread_azimuths(keys[0], count, config.jitter, config.scattered_share)
-    mixed = jax.random.bernoulli(keys[1], config.mixed_pose_share)
-    poses = jnp.where(mixed, jax.random.randint(keys[2], (count,), 0, config.poses), 0)
-    return _Plan(jax.random.split(keys[3], count), azimuths, poses, jnp.zeros(count))
+def _input_plan(numbers, config):
+    azimuths = azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share)
+    mixed = numbers["mixed"] < config.mixed_pose_share
+    poses = jnp.where(mixed, pick(numbers["input_poses"], config.poses), 0)
+    return _Plan(numbers["input_cameras"], azimuths, poses, jnp.zeros(config.input_views))
 
 
-def _target_plan(key, config):
-    keys = jax.random.split(key, 3)
-    count = config.target_views
-    azimuths = spread_azimuths(keys[0], count, 0.0, 1.0)
-    poses = jax.random.randint(keys[1], (count,), 0, config.poses)
-    return _Plan(jax.random.split(keys[2], count), azimuths, poses, jnp.full(count, config.close_share))
+def _target_plan(numbers, config):
+    azimuths = azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
+    close_shares = jnp.full(config.target_views, config.close_share)
+    return _Plan(numbers["target_cameras"], azimuths, pick(numbers["target_poses"], config.poses), close_shares)
 
 
 def _views(bank, scene, plan: _Plan, config, size):
     """Views of some of the scene's poses."""
 
     def view(plan):
-        camera = draw_camera(plan.keys, scene.vertices[plan.poses], plan.azimuths, plan.close_shares, size)
+        vertices, count = scene.vertices[plan.poses], bank.vertex_counts[scene.person]
+        camera = camera_from(plan.cameras, vertices, count, plan.azimuths, plan.close_shares, size)
         return *draw_view(bank, scene, plan.poses, camera, config), camera
 
     images, masks, cameras = lax.map(view, plan, batch_size=_batch(config, len(plan.poses)))

@@ -19,7 +19,7 @@ from humangs_jax.data.atomic import replace_file
 from humangs_jax.data.npz import read_npz
 from humangs_jax.data.synthetic import poses
 from humangs_jax.data.synthetic.baking import BakedSubject, bake_subject
-from humangs_jax.data.synthetic.seeds import split_of
+from humangs_jax.data.synthetic.seeds import GENERATOR_VERSION, split_of
 from humangs_jax.data.synthetic.subject import SyntheticSubject, make_subject
 from humangs_jax.pytree import pytree_dataclass, static_field
 
@@ -37,19 +37,22 @@ MOST_MATERIALS = 32
 class PeopleBank:
     """Dressed people p, padded to one size and stacked. Padding repeats a vertex, and faces without area.
 
-    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres.
+    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts, face_counts: (p,) without padding.
     vertices: (p, n, 3) at rest, metres. normals: (p, n, 3) unit. joint_ids, joint_weights: (p, n, k).
     faces: (p, f, 3). uvs: (p, f, 3, 2) texture coordinates of the corners, steps of 1 / `UV_STEPS`, v DOWN.
     face_pieces: (p, f) piece of each face; of the pieces m: sheen (p, m), groups (p, m): pieces of one number are dyed
     alike, dyeable (p, m): 1 where a piece is cloth that may have another colour.
     texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `baking.BakedSubject`).
     rotations: (p, q, j, 3) poses; nearest: (p, q) the pose that is most like each.
-    parents, mirrored_joints: static; the joint that is each one's mirror image. split: static, the range of the seeds.
+    parents, mirrored_joints: static; the joint that is each one's mirror image. split: static, the range of the seeds. generator:
+    static, `seeds.GENERATOR_VERSION` of who made the people.
     """
 
     seeds: Int[Array, " p"]
     betas: Float[Array, "p s"]
     joints: Float[Array, "p j 3"]
+    vertex_counts: Int[Array, " p"]
+    face_counts: Int[Array, " p"]
     vertices: Float[Array, "p n 3"]
     normals: Float[Array, "p n 3"]
     joint_ids: UInt8[Array, "p n k"]
@@ -66,6 +69,7 @@ class PeopleBank:
     parents: tuple[int, ...] = static_field(default=())
     mirrored_joints: tuple[int, ...] = static_field(default=())
     split: str = static_field(default="")
+    generator: int = static_field(default=GENERATOR_VERSION)
 
     @property
     def people(self) -> int:
@@ -117,8 +121,9 @@ def save_bank(path: str | Path, bank: PeopleBank) -> None:
     """Write one .npz, whole or not at all."""
     fields = {name: np.asarray(getattr(bank, name)) for name in _ARRAYS}
     fields |= {"parents": np.asarray(bank.parents), "mirrored_joints": np.asarray(bank.mirrored_joints)}
-    header = {"format": np.asarray(FORMAT), "version": np.asarray(VERSION), "split": np.asarray(bank.split)}
-    replace_file(path, lambda temporary: np.savez_compressed(temporary, **header, **fields))
+    fields |= {"format": np.asarray(FORMAT), "version": np.asarray(VERSION), "split": np.asarray(bank.split)}
+    fields |= {"generator": np.asarray(bank.generator)}
+    replace_file(path, lambda temporary: np.savez_compressed(temporary, **fields))  # ty: ignore[invalid-argument-type]
 
 
 def load_bank(path: str | Path) -> PeopleBank:
@@ -128,7 +133,7 @@ def load_bank(path: str | Path) -> PeopleBank:
         raise ValueError(f"{path}: not a bank of people")
     if int(arrays["version"]) != VERSION:
         raise ValueError(f"{path}: a bank of version {int(arrays['version'])}; this program reads version {VERSION}")
-    if missing := {*_ARRAYS, "parents", "mirrored_joints", "split"} - set(arrays):
+    if missing := {*_ARRAYS, *_STATIC} - set(arrays):
         raise ValueError(f"{path}: a bank without {sorted(missing)}")
     split = str(arrays["split"])
     for seed in arrays["seeds"].tolist():
@@ -139,10 +144,12 @@ def load_bank(path: str | Path) -> PeopleBank:
         parents=tuple(arrays["parents"].tolist()),
         mirrored_joints=tuple(arrays["mirrored_joints"].tolist()),
         split=split,
+        generator=int(arrays["generator"]),
     )
 
 
-_ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in ("parents", "mirrored_joints", "split"))
+_STATIC = ("parents", "mirrored_joints", "split", "generator")
+_ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in _STATIC)
 
 _shipped_body: list[BodyModel] = []
 
@@ -174,6 +181,8 @@ def _arrays(subject: SyntheticSubject, baked: BakedSubject, pose_count):
         "seeds": np.int32(subject.seed),
         "betas": baked.betas,
         "joints": subject.build.joints.astype(np.float32),
+        "vertex_counts": np.int32(len(baked.vertices)),
+        "face_counts": np.int32(len(baked.faces)),
         "vertices": baked.vertices.astype(np.float32),
         "normals": baked.normals.astype(np.float16),
         "joint_ids": baked.joint_ids,

@@ -1,42 +1,54 @@
 """Random cameras on the device, by the protocol of `cameras`: around the person, and for some views close to it."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float, Key
-from humangs_jax.data.synthetic.cameras import DISTANCE_FACTOR, ELEVATION, FRAME, VERTICAL_FOV
+from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.data.synthetic.cameras import (
+    CLEARANCE,
+    CLOSE_FACTOR,
+    CLOSE_SPREAD,
+    DISTANCE_FACTOR,
+    ELEVATION,
+    FRAME,
+    VERTICAL_FOV,
+)
+from humangs_jax.data.synthetic.live_pose import pick
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at
 
-CLOSE_FACTOR = (0.8, 1.7)
-"""Distances of close cameras, in bounding radii."""
-AIM = (0.05, 0.95)
-"""Heights of the person that close cameras look at, shares of the whole."""
-CLEARANCE = 0.25
-"""Metres that any camera keeps from the person, along its axis."""
+CAMERA_NUMBERS = 5
 
 
-def draw_camera(
-    key: Key, vertices: Float[Array, "n 3"], azimuth: Float[Array, ""], close_share: Float[Array, ""] | float, size: int
+def camera_from(
+    u: Float[Array, "5"],
+    vertices: Float[Array, "n 3"],
+    count: Int[Array, ""] | int,
+    azimuth: Float[Array, ""],
+    close_share: Float[Array, ""] | float,
+    size: int,
 ) -> Camera:
     """A square camera of `size` pixels that looks at a posed person from an azimuth.
 
-    With probability close_share it is a close one, which looks at some height of the person; others see all of it.
+    u: in [0, 1). count: vertices that are no padding. With probability close_share it is a close one, see
+    `cameras.close_cameras`; others see all of the person.
     """
-    is_close, tilt, spread, level = jax.random.uniform(key, (4,), vertices.dtype)  # one draw: each costs compile time
+    is_close, tilt, spread, outwards, place = u
     low, high = vertices.min(0), vertices.max(0)
     center = 0.5 * (low + high)
     radius = jnp.sqrt(jnp.max(jnp.sum((vertices - center) ** 2, -1)))
     close = is_close < close_share
     elevation = _within(ELEVATION, tilt)
     factor = jnp.where(close, _within(CLOSE_FACTOR, spread), _within(DISTANCE_FACTOR, spread))
-    height = low[1] + _within(AIM, level) * (high[1] - low[1])
-    target = center.at[1].set(jnp.where(close, height, center[1]))
+    towards_vertex = vertices[pick(place, count)] - center
+    target = center + jnp.where(close, CLOSE_SPREAD * outwards, 0.0) * towards_vertex
     towards, up, right = _axes(azimuth, elevation)
     points = vertices - target
-    ahead, above, aside = (points @ axis for axis in (towards, up, right))
-    needed = jnp.max(jnp.maximum(jnp.abs(above), jnp.abs(aside)) / (FRAME * np.tan(VERTICAL_FOV / 2)) + ahead)
-    distance = jnp.maximum(factor * radius, jnp.where(close, jnp.max(ahead) + CLEARANCE, needed))
+    # written out: matrix products are of low precision on GPU and TPU
+    ahead, above, aside = (jnp.sum(points * axis, -1) for axis in (towards, up, right))
+    whole = jnp.max(jnp.maximum(jnp.abs(above), jnp.abs(aside)) / (FRAME * np.tan(VERTICAL_FOV / 2)) + ahead)
+    beside = CLEARANCE**2 - (above * above + aside * aside)  # a camera on its axis comes no nearer than that to a point
+    clear = jnp.max(jnp.where(beside > 0, ahead + jnp.sqrt(jnp.maximum(beside, 0)), -jnp.inf))
+    distance = jnp.maximum(factor * radius, jnp.where(close, clear, whole))
     K = intrinsics_from_fov(VERTICAL_FOV, size, size).astype(vertices.dtype)
     return look_at(target + distance * towards, target, jnp.asarray([0.0, 1.0, 0.0], vertices.dtype), K, size, size)
 
@@ -52,9 +64,12 @@ def _axes(azimuth, elevation):
     return jnp.stack([ce * sa, se, ce * ca]), jnp.stack([-se * sa, ce, -se * ca]), jnp.stack([ca, zero, -sa])
 
 
-def spread_azimuths(key: Key, count: int, jitter: float, scattered_share: float) -> Float[Array, " count"]:
-    """(count,) azimuths all around from a random start, each off by up to half `jitter` of the spacing; or anywhere."""
-    drawn = jax.random.uniform(key, (2 + 2 * count,))
-    scattered, start, offsets, places = drawn[0], drawn[1], drawn[2 : 2 + count], drawn[2 + count :]
+def azimuths_from(u: Float[Array, " numbers"], jitter: float, scattered_share: float) -> Float[Array, " v"]:
+    """(v,) azimuths all around from a random start, each off by up to half `jitter` of the spacing; or anywhere.
+
+    u: 2 + 2 v numbers in [0, 1).
+    """
+    count = len(u) // 2 - 1
+    scattered, start, offsets, places = u[0], u[1], u[2 : 2 + count], u[2 + count :]
     even = 2 * np.pi / count * (jnp.arange(count) + jitter * (offsets - 0.5)) + 2 * np.pi * start
     return jnp.where(scattered < scattered_share, 2 * np.pi * places, even)

@@ -7,12 +7,11 @@ balance differ from example to example, so that colours are no constants of a pe
 
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from humangs_jax.array_types import Array, Float, Int, Key
+from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.data.synthetic.fabrics import ALBEDO_LIMIT
 from humangs_jax.data.synthetic.shading import CELL, REACH
 from humangs_jax.pytree import pytree_dataclass
@@ -50,6 +49,9 @@ _LIGHT_RANGES = {
 }
 
 
+LIGHT_NUMBERS = len(_LIGHT_RANGES) + 9
+
+
 @pytree_dataclass
 class LiveLights:
     """directions: (k, 3) towards the lights, the key light first. strengths: (k, 3). sky, ground: (3,) ambient.
@@ -64,9 +66,8 @@ class LiveLights:
     gain: Float[Array, "3"]
 
 
-def draw_lights(key: Key) -> LiveLights:
-    """A key light from above, mostly in front, a fill from the other side, one from behind; tinted by the gain."""
-    u = jax.random.uniform(key, (len(_LIGHT_RANGES) + 9,))  # one draw: each costs compile time
+def lights_from(u: Float[Array, " light_numbers"]) -> LiveLights:
+    """A key light from above, mostly in front, a fill from the other side, one from behind; `LIGHT_NUMBERS` in [0, 1)."""
     low, high = jnp.asarray(list(_LIGHT_RANGES.values())).T
     drawn = dict(zip(_LIGHT_RANGES, low + (high - low) * u[: len(_LIGHT_RANGES)], strict=True))
     azimuth = drawn["azimuth"] * jnp.where(drawn["anywhere"] > 0, np.pi, 0.8)
@@ -167,12 +168,13 @@ def bend_normals(normals: Float[Array, "*p 3"], slopes: Float[Array, "*p 3"]) ->
     return bent / (jnp.linalg.norm(bent, axis=-1, keepdims=True) + 1e-9)
 
 
-def dyes(key: Key, groups: Int[Array, " m"], dyeable: Float[Array, " m"]) -> Float[Array, "m 3 3"]:
+def dyes_from(u: Float[Array, "4 m"], groups: Int[Array, " m"], dyeable: Float[Array, " m"]) -> Float[Array, "m 3 3"]:
     """(m, 3, 3) what turns the colours of each piece into other ones: hue, saturation and brightness of cloth.
 
-    Pieces of one group are dyed alike. Hues are turned about the grey axis for half of the pieces, brightness for all.
+    Pieces of one group are dyed alike. u: in [0, 1). Hues are turned about the grey axis for half of the pieces,
+    brightness changes for all.
     """
-    turned, turn, pale, bright = jax.random.uniform(key, (4, groups.shape[0]))
+    turned, turn, pale, bright = u
     hue = jnp.where(turned < 0.5, 2 * np.pi * (turn - 0.5), 0.0)
     saturation, brightness = jnp.exp(-0.4 + 0.6 * pale), jnp.exp(-0.5 + 0.8 * bright)
     grey = jnp.full((3, 3), 1 / 3)

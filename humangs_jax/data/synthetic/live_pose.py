@@ -1,9 +1,8 @@
 """Poses on the device: between two poses of a person's own that are alike; skinning by a few joints per vertex."""
 
-import jax
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float, Int, Key, UInt8
+from humangs_jax.array_types import Array, Float, Int, UInt8
 from humangs_jax.body.skinning import joint_transforms
 from humangs_jax.data.synthetic.live_bank import PeopleBank
 from humangs_jax.geometry import quaternion
@@ -12,13 +11,16 @@ MIXING = 0.5
 """Farthest that a pose is moved towards the nearest one: everything between the two is then reached from one of them."""
 
 
-def draw_rotations(bank: PeopleBank, person: Int[Array, ""], key: Key) -> Float[Array, "j 3"]:
-    """(j, 3) rotation vectors of a random pose of a person."""
-    which, amount = jax.random.uniform(key, (2,))
-    count = bank.rotations.shape[1]
-    pose = jnp.minimum((which * count).astype(jnp.int32), count - 1)
+def rotations_from(u: Float[Array, "2"], bank: PeopleBank, person: Int[Array, ""]) -> Float[Array, "j 3"]:
+    """(j, 3) rotation vectors of a pose of a person; u in [0, 1) says which and how far on the way to the next."""
+    pose = pick(u[0], bank.rotations.shape[1])
     other = bank.nearest[person, pose]
-    return between(bank.rotations[person, pose], bank.rotations[person, other], MIXING * amount)
+    return between(bank.rotations[person, pose], bank.rotations[person, other], MIXING * u[1])
+
+
+def pick(u: Float[Array, "*b"], count: Int[Array, ""] | int) -> Int[Array, "*b"]:
+    """One of the numbers 0 .. count - 1 for each u in [0, 1)."""
+    return jnp.minimum((u * count).astype(jnp.int32), count - 1)
 
 
 def between(a: Float[Array, "j 3"], b: Float[Array, "j 3"], amount: Float[Array, ""] | float) -> Float[Array, "j 3"]:

@@ -76,11 +76,13 @@ def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "
 def _write_mesh(folder: Path, vertices: Float[np.ndarray, "u 3"], baked, texture, formats):
     import trimesh
     from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
     picture = Image.fromarray(texture)
-    simple = trimesh.visual.material.SimpleMaterial(image=picture, diffuse=[255, 255, 255, 255])
-    physical = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0)
+    simple = SimpleMaterial(image=picture, diffuse=[255, 255, 255, 255])
+    physical = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0)
     for kind, material in (("obj", simple), ("glb", physical)):
         if kind in formats:
-            visual = trimesh.visual.TextureVisuals(uv=baked.atlas.uvs, material=material)
+            visual = TextureVisuals(uv=baked.atlas.uvs, material=material)
             trimesh.Trimesh(vertices, baked.atlas.faces, visual=visual, process=False).export(folder / f"{SCAN}.{kind}")
