@@ -14,6 +14,7 @@ SHEETS = ("front_back", "views", "close", "sequences")
 FRONT_BACK_SIZE, VIEW_SIZE, CLOSE_SIZE = (112, 208), (128, 208), (224, 224)
 """Width and height of one picture, pixels."""
 COLUMNS = 16
+MOTION_FRAMES = 75
 TELE = 0.42
 """Vertical field of view of pictures that show the whole person, radians."""
 
@@ -94,8 +95,32 @@ def close_ups(body, arguments):
 
 
 def sequences(body, arguments):
-    """One row a sequence, eight frames from a camera that stands still."""
-    raise NotImplementedError
+    """One row a sequence, eight frames over two and a half seconds, the camera beside the walker; two sequences side by side."""
+    import numpy as np
+
+    from humangs_jax.data.synthetic.rendering import pose_subject
+    from humangs_jax.data.synthetic.subject import make_subject
+    from humangs_jax.data.synthetic.writer import sample_motion
+
+    rows = []
+    for seed in _seeds(arguments, arguments.sequences, offset=300):
+        subject = make_subject(seed, body)
+        motion = sample_motion(subject, MOTION_FRAMES)
+        rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
+        frames = np.linspace(0, len(rotations) - 1, 8).astype(int)
+        start = pose_subject(subject, rotations[0], translations[0])
+        facing = _azimuth(poses_world(subject, rotations[0]) @ [0, 0, 1])
+        posed = [start if i == 0 else pose_subject(subject, rotations[i], translations[i]) for i in frames]
+        rows.append([_whole(p, facing + 0.7, VIEW_SIZE, arguments.scale) for p in posed])
+    half = (len(rows) + 1) // 2
+    return _grid([a + b for a, b in zip(rows[:half], rows[half:] or rows[:half], strict=False)])
+
+
+def poses_world(subject, rotations):
+    """(3, 3) rotation of the pelvis."""
+    from humangs_jax.data.synthetic import poses
+
+    return poses.joint_positions(subject.build, rotations.astype(float))[0][poses.PELVIS]
 
 
 def _seeds(arguments, count, offset=0):

@@ -31,13 +31,13 @@ def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: fl
         return [
             (
                 hair.scalp_shell(
-                    rng, anatomy, rng.uniform(0.014, 0.019), 0.04, hair.CAP_LINE, crown=rng.uniform(0, 0.03)
+                    rng, anatomy, rng.uniform(0.014, 0.019), 0.04, hair.CAP_LINE, rim=0.011, crown=rng.uniform(0, 0.03)
                 ),
                 knit,
             )
         ]
     if kind == "cap":
-        crown = hair.scalp_shell(rng, anatomy, 0.016, 0.0, hair.CAP_LINE, crown=0.008)
+        crown = hair.scalp_shell(rng, anatomy, 0.016, 0.0, hair.CAP_LINE, rim=0.011, crown=0.008)
         return [
             (
                 join([crown, peak(anatomy, sizes["brim"], sizes["backwards"] > 0)]),
@@ -45,7 +45,7 @@ def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: fl
             )
         ]
     if kind == "brim_hat":
-        crown = hair.scalp_shell(rng, anatomy, 0.017, 0.0, hair.CAP_LINE, crown=0.05)
+        crown = hair.scalp_shell(rng, anatomy, 0.017, 0.0, hair.CAP_LINE, rim=0.011, crown=0.05)
         ribbon = _ribboned(cloth, garment.fabric.other)
         return [(join([crown, brim(rng, anatomy, sizes["brim"])]), Material(ribbon, wrinkles=0.05))]
     if kind == "headscarf":

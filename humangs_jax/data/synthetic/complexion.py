@@ -258,7 +258,7 @@ def _stubble(tones, haircut, result, x, y, z, lips, template, seed):
     chin = {"none": 0.0, "stubble": 0.75}.get(haircut.beard, 0.9)
     if chin > 0:
         kind = haircut.beard if haircut.beard in ("moustache", "goatee") else "full"
-        jaw = np.clip((beard_field(template, kind) + 0.004) / 0.008, 0, 1) * (1 - lips)
+        jaw = np.clip((beard_field(template, kind) + 0.005) / 0.018, 0, 1) * (1 - lips)
         result = mix(result, 0.6 * tones.hair + 0.15 * result, np.clip(0.8 * chin * jaw * grain, 0, 1))
     return result
 

@@ -123,11 +123,13 @@ def scalp_shell(
     bump_size: float = 0.05,
     quiff: float = 0.0,
     side: float = 0.0,
+    rim: float = 0.0025,
 ) -> Surface:
     """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the hairline.
 
     bumps: share of the thickness, `bump_size` metres wide. crown: metres that the top rises above that. quiff: metres that the
-    hair stands up above the forehead. side: +1 or -1 for a parting on that side of the head, 0 for none.
+    hair stands up above the forehead. side: +1 or -1 for a parting on that side of the head, 0 for none. rim: metres that its
+    edge stands off.
     """
     template = anatomy.skin.attributes["template"]
     above = above_line(template, line, shift)
@@ -136,7 +138,8 @@ def scalp_shell(
     surface = cut(anatomy.skin.with_attributes(above=above), above)
     normals = unit(smooth(surface.attributes["normals"], surface.faces, 8))
     full = smoothstep(-0.002, 0.022, surface.attributes["above"])
-    grown = thickness * full * (1 + bumps * ripples(rng, surface.attributes["template"], bump_size)) + 0.0025
+    grown = thickness * full * (1 + bumps * ripples(rng, surface.attributes["template"], bump_size))
+    grown = np.maximum(grown, rim) + 0.3 * rim
     base = smooth(surface.vertices, surface.faces, 3, keep_hems=True)
     x, y, z = surface.attributes["template"].T
     top = smoothstep(0.385, 0.425, y)

@@ -133,8 +133,10 @@ def _hair(rng, anatomy, person):
     pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, person.haircut)]
     if not any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments):
         return pieces
-    hidden = [hair.above_line(p.surface.attributes["template"], hair.CAP_LINE) > 0.008 for p in pieces]
-    return [dataclasses.replace(p, hidden=h).visible() for p, h in zip(pieces, hidden, strict=True)]
+    if pieces:  # the scalp's; tails, buns and beards hang out
+        hidden = hair.above_line(pieces[0].surface.attributes["template"], hair.CAP_LINE) > 0.008
+        pieces[0] = dataclasses.replace(pieces[0], hidden=hidden).visible()
+    return pieces
 
 
 def _build(anatomy, surface):
