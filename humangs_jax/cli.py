@@ -164,35 +164,55 @@ def synth(
     subjects: int = 8,
     split: Literal["train", "validation", "test", "demo"] = "train",
     first: int = 0,
-    size: int = 256,
-    views: int = 4,
-    held_out: int = 8,
+    size: int = 512,
+    views: int = 60,
+    close_views: int = 12,
+    poses: int = 1,
+    held_out: int = 0,
+    depth: bool = False,
+    maps: bool = False,
+    sequences: bool = False,
+    frames: int = 60,
     for_training: bool = False,
+    workers: int | None = None,
 ) -> None:
-    """Make synthetic clothed people and write them as capture folders with held-out views. Can be interrupted and resumed.
+    """Make synthetic clothed people and write them as capture folders. Can be interrupted and resumed, or added to.
 
     Args:
         out: folder for one capture folder per subject and manifest.json.
         subjects: how many.
         split: the seeds of the splits never overlap.
         first: number of the first subject within the split.
-        size: side of the photos in pixels.
-        views: photos per subject, evenly spread around the person.
-        held_out: further views of the same pose, in the sub-folder held_out/.
-        for_training: instead, one capture of 2 poses x 12 views per subject, for `humangs train`.
+        size: side of the photos in pixels: 128, 256, 512 (a set of 512 is read at all three).
+        views: photos of each pose, around the person, 1.8 to 2.2 bounding radii away.
+        close_views: further ones of each pose, 0.8 to 1.7 radii away, of parts of the person.
+        poses: per subject.
+        held_out: views of the first pose from yet other cameras, in the sub-folder held_out/.
+        depth: also write 16-bit depth maps, depth/NAME.png (steps of 0.1 mm).
+        maps: also write maps/NAME.exr: float32 colours, coverage, depth, positions in T-pose, the camera in the header.
+        sequences: the poses are frames of a walk, a turn or a reach, which is written as motion.npz.
+        frames: length of that motion, 30 a second.
+        for_training: short for 2 poses x 12 views at 256 pixels and no others, enough for `humangs train`.
+        workers: processes; as many as there are cores if not given.
     """
-    from humangs_jax.data.synthetic import synthesize
-    from humangs_jax.data.synthetic.seeds import SPLITS
+    from humangs_jax.data.synthetic.writer import Layout, write_set
 
-    if subjects < 1 or views < 1 or held_out < 0 or size < 1 or first < 0:
-        raise ValueError("--subjects, --views and --size must be at least 1, --held-out and --first at least 0")
-    first_seed = SPLITS[split].start + first
+    counts = {"subjects": subjects, "size": size, "views": views, "poses": poses, "frames": frames}
+    if wrong := [name for name, count in counts.items() if count < 1]:
+        raise ValueError(f"--{wrong[0]} {counts[wrong[0]]}: expected at least 1")
+    counts = {"first": first, "close-views": close_views, "held-out": held_out}
+    if wrong := [name for name, count in counts.items() if count < 0]:
+        raise ValueError(f"--{wrong[0]} {counts[wrong[0]]}: expected at least 0")
+    if sequences and poses > frames:
+        raise ValueError(f"--poses {poses}: a motion of --frames {frames} has no more of them")
+    layout = Layout(
+        size, poses, views, close_views, held_out, frames=frames if sequences else 0, depth=depth, maps=maps
+    )
     if for_training:
-        folders = synthesize(out, subjects, first_seed, image_size=size)
-    else:
-        folders = synthesize(
-            out, subjects, first_seed, training=False, image_size=size, views=views, poses=1, held_out_views=held_out
-        )
+        layout = Layout(256, poses=2, views=12)
+    if workers is None:
+        workers = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    folders = write_set(out, subjects, layout, split, first, workers=workers)
     print(f"{out}: {len(folders)} people")
 
 

@@ -30,7 +30,7 @@ def _orbits(targets, distances, azimuths, elevations, K, width, height):
     """Cameras that each look at a target of their own."""
 
     def one(target, distance, azimuth, elevation):
-        return orbit(target, distance, azimuth[None], elevation, K, width, height)[0]
+        return orbit(target, distance[None], azimuth[None], elevation[None], K, width, height)[0]
 
     return jax.vmap(one)(targets, distances, azimuths, elevations)
 
