@@ -10,46 +10,29 @@ import math
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.scipy.special import ndtri
 
 from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.data.synthetic.fabrics import ALBEDO_LIMIT
-from humangs_jax.data.synthetic.shading import CELL, REACH
+from humangs_jax.data.synthetic.shading import (
+    CELL,
+    DARKEST,
+    LIFT,
+    REACH,
+    SCENES,
+    SHADOW_DENSITY,
+    STRIDES,
+)
 from humangs_jax.pytree import pytree_dataclass
 
 GRID = (112, 104, 80)
 """Voxels along x, y and z: 2.8 m x 2.6 m x 2 m, more than any pose takes; what lies beyond casts no shade."""
 MARGIN = 6
 """Empty voxels around the person."""
-STRIDES = (0.06, 0.085, 0.115, 0.155, 0.205, 0.27, 0.36, 0.47, 0.6)
-"""Distances towards the key light at which the grid is sampled for shadows, metres."""
-LIFT = 0.03
-"""Metres above the surface at which the way to the light begins."""
 WRAP, GLOSS = 0.25, 0.12
-SHADOW_DENSITY, DARKEST = 3.0, 0.35
-"""Extinction per unit of what the samples find, and the share of the key light that is left at least."""
-
-
-TINT = 0.05
-"""Colours of single lights differ from white by up to this."""
-_LIGHT_RANGES = {
-    "azimuth": (-1.0, 1.0),
-    "anywhere": (-3.0, 1.0),  # a quarter of the key lights stand anywhere around
-    "side": (-1.0, 1.0),
-    "fill_azimuth": (1.4, 2.4),
-    "back_azimuth": (-0.5, 0.5),
-    "key_elevation": (0.5, 1.0),
-    "fill_elevation": (0.1, 0.5),
-    "back_elevation": (0.4, 0.9),
-    "key": (0.5, 0.85),
-    "fill": (0.15, 0.36),
-    "back": (0.2, 0.44),
-    "sky": (0.55, 0.78),
-    "warmth": (-0.07, 0.07),
-    "exposure": (-0.15, 0.2),  # natural logarithm
-}
-
-
-LIGHT_NUMBERS = len(_LIGHT_RANGES) + 9
+LIGHT_NUMBERS = 28
+_SCENES = np.asarray([np.hstack(row) for row in SCENES.values()], np.float32)
+"""Rows of `shading.SCENES`: odds; ranges of azimuth, height, key, fill and sky; warmth; bounce."""
 
 
 @pytree_dataclass
@@ -67,21 +50,31 @@ class LiveLights:
 
 
 def lights_from(u: Float[Array, " light_numbers"]) -> LiveLights:
-    """A key light from above, mostly in front, a fill from the other side, one from behind; `LIGHT_NUMBERS` in [0, 1)."""
-    low, high = jnp.asarray(list(_LIGHT_RANGES.values())).T
-    drawn = dict(zip(_LIGHT_RANGES, low + (high - low) * u[: len(_LIGHT_RANGES)], strict=True))
-    azimuth = drawn["azimuth"] * jnp.where(drawn["anywhere"] > 0, np.pi, 0.8)
-    side = jnp.sign(drawn["side"])
-    angles = azimuth + jnp.stack([jnp.zeros(()), side * drawn["fill_azimuth"], np.pi + drawn["back_azimuth"]])
-    elevation = jnp.stack([drawn[f"{name}_elevation"] for name in ("key", "fill", "back")])
-    horizontal = jnp.cos(elevation)
-    directions = jnp.stack([horizontal * jnp.sin(angles), jnp.sin(elevation), horizontal * jnp.cos(angles)], -1)
-    power = jnp.stack([drawn[name] for name in ("key", "fill", "back")])
-    strengths = power[:, None] * (1 + TINT * (2 * u[-9:].reshape(3, 3) - 1))
-    sky = drawn["sky"] * jnp.ones(3)
-    warmth = drawn["warmth"]
-    gain = jnp.exp(drawn["exposure"]) * jnp.stack([1 + warmth, jnp.ones(()), 1 - warmth])
-    return LiveLights(directions, strengths, sky, 0.62 * sky, gain)
+    """The scenes of `shading.sample_lights`; u: `LIGHT_NUMBERS` numbers in [0, 1)."""
+    odds = np.cumsum(_SCENES[:, 0])
+    row = jnp.asarray(_SCENES)[jnp.sum(u[0] * odds[-1] >= odds[:-1])]
+    azimuth, height, key, fill, sky = row[1:11].reshape(5, 2)
+    warmth, bounce = row[11], row[12]
+    within = lambda limits, share: limits[0] + (limits[1] - limits[0]) * share
+    sign = lambda number: jnp.where(number < 0.5, -1.0, 1.0)
+    turns = jnp.stack([jnp.zeros(()), sign(u[1]) * within((1.4, 2.4), u[2]), np.pi + within((-0.5, 0.5), u[3])])
+    angles = within(azimuth, u[4]) * sign(u[5]) + turns
+    heights = jnp.stack([within(height, u[6]), within((0.1, 0.5), u[7]), within((0.4, 0.9), u[8])])
+    horizontal = jnp.cos(heights)
+    directions = jnp.stack([horizontal * jnp.sin(angles), jnp.sin(heights), horizontal * jnp.cos(angles)], -1)
+    power = jnp.stack([within(key, u[9]), within(fill, u[10]), within((0.4, 1.2), u[11]) * fill[1]])
+    warm = jnp.asarray([1.0, 0.0, -1.0])
+    tint = 1 + within((-0.03, 0.03), u[12:21].reshape(3, 3)) + warmth * jnp.outer(jnp.asarray([1.0, 0.0, 0.0]), warm)
+    colour = within(sky, u[21]) * (1 - 0.5 * warmth * warm)
+    exposure, balance, green = 0.12 * _normal(u[22]) + 0.06, 0.045 * _normal(u[23]), 0.012 * _normal(u[24])
+    gain = jnp.clip(jnp.exp(exposure), 0.72, 1.35) * jnp.stack([1 + balance, 1 + green, 1 - balance])
+    ground = bounce * colour * (1 + within((-0.06, 0.06), u[25:28]))
+    return LiveLights(directions, power[:, None] * tint, colour, ground, gain)
+
+
+def _normal(u):
+    """A normal number for one in [0, 1)."""
+    return ndtri(jnp.clip(u, 1e-4, 1 - 1e-4))
 
 
 def shaded_vertices(
