@@ -1,0 +1,382 @@
+"""Gradients through all of it: photographs -> network -> skinned Gaussians -> pictures -> loss, in float64.
+
+Differentiable are the network's parameters, the photographs, the cameras, posed and canonical vertices and position
+maps that come with them, and pose, shape and camera of every target. Depth maps and foreground only decide; and
+`prepare_inputs`, which rasterizes, is not differentiated: training stops gradients there.
+
+The loss has jumps and kinks: a splat's alpha crosses 1/255 on a pixel, two splats change places, a unit of a ReLU turns
+on, a position leaves a texel. A jump within a step spoils its difference, so smaller steps are tried as well: no step
+rescues a wrong gradient.
+"""
+
+import dataclasses
+import functools
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.library import load_body
+from humangs_jax.data.views import SubjectViews, prepare_inputs
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.models.humangs import apply_humangs
+from humangs_jax.models.presets import tiny
+from humangs_jax.models.weights import expected_variables
+from humangs_jax.pytree import replace
+from humangs_jax.training.config import LossConfig, TrainConfig
+from humangs_jax.training.forward import draw_targets, white_backgrounds
+from humangs_jax.training.step import loss_terms
+
+VERTICES, VIEWS, TARGETS, SIZE, TARGET_SIZE = 300, 2, 2, 32, 24
+CHANGES = (1e-8, 1e-9, 1e-10)
+"""What a step is to change the loss by. The loss is about 0.4, its rounding a few 1e-17."""
+AGREEMENT = 5e-6
+"""Of the expected derivative: what rounding leaves of a change of 1e-10."""
+SMALLEST_DERIVATIVE = 1e-6
+"""Where everything moves by its own size. The neural texture's is 1e-5; something cut off would have none."""
+SEEN = (0.05, 0.5)
+"""Mean coverage of the pictures: there is somebody to see."""
+FLOAT32_COSINE = 0.999
+DTYPES = (jnp.float32, jnp.float64)
+PARAMETER_GROUPS = ("texture", "tokenizer", "transformer", "upsampler", "decoder")
+OTHERS = ("images", "input_geometry", "target_pose", "target_cameras")
+GEOMETRY = ("cameras", "posed_vertices", "canonical_vertices", "position_maps")
+INSIDE = 0.93
+"""Of the texture: 3.255 texels from its middle."""
+POSE = ("rotations", "translations", "betas")
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """style: as the published network (mixed convention, rotation skinning, offsets without bound, Gouraud maps) or as
+    the small one (photo colours corrected, affine skinning, bounded offsets). train: statistics of the batch.
+    """
+
+    style: str
+    tokens: str
+    pool: str
+    remat: bool
+    train: bool = False
+    scan: bool = False
+
+    @property
+    def config(self) -> TrainConfig:
+        """Tiny, otherwise as in training."""
+        model = tiny()
+        published = self.style == "published"
+        sampling = dataclasses.replace(
+            model.sampling,
+            pool=self.pool,
+            convention="mixed" if published else "half_pixel",
+            sample_rgb=not published,
+        )
+        decoder = dataclasses.replace(
+            model.decoder, residual_color=not published, offset_scale=None if published else 0.25
+        )
+        model = dataclasses.replace(
+            model,
+            tokens=self.tokens,
+            token_capacity=40,
+            skinning="rotation" if published else "affine",
+            position_map="gouraud" if published else "plain",
+            ray_origins="twice_normalized" if published else "normalized",
+            transformer=dataclasses.replace(model.transformer, remat=self.remat, scan=self.scan),
+            sampling=sampling,
+            decoder=decoder,
+        )
+        return TrainConfig(model=model, loss=LossConfig(structural_scales=2), target_size=TARGET_SIZE)
+
+
+PUBLISHED = Case("published", "all", "all", remat=False)
+SMALL = Case("small", "foreground", "visible", remat=True, train=True, scan=True)
+FAST = (PUBLISHED, SMALL)
+SLOW = [
+    case
+    for factors in itertools.product(("published", "small"), ("all", "foreground"), ("all", "visible"), (False, True))
+    for case in [Case(*factors, train=factors[1] == "all", scan=factors[3] and factors[2] == "all")]
+]
+
+
+@pytest.fixture(autouse=True)
+def float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def as_dtype(tree, dtype):
+    return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+
+
+@functools.cache
+def body():
+    return as_dtype(decimate(load_body(), VERTICES), jnp.float64)
+
+
+def cameras(count, size, distance, azimuth):
+    K = intrinsics_from_fov(0.9, size, size).astype(jnp.float64)
+    azimuths = azimuth + 2.1 * jnp.arange(count, dtype=jnp.float64)
+    return orbit(jnp.asarray([0.0, 0.95, 0.0], jnp.float64), distance, azimuths, 0.2, K, size, size)
+
+
+def random_views(seed, count, size, betas):
+    """Noise in a pose: pictures far from what they are to show give every pixel a say."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:size, :size] / size - 0.5
+    masks = np.broadcast_to((x / 0.25) ** 2 + (y / 0.45) ** 2 < 1, (count, size, size)).astype(np.float64)
+    return SubjectViews(
+        images=jnp.asarray(rng.uniform(0.1, 0.9, (count, size, size, 3))),
+        masks=jnp.asarray(masks),
+        cameras=cameras(count, size, 2.3, 0.3 * seed),
+        rotations=jnp.asarray(0.25 * rng.normal(size=(count, 55, 3))),
+        translations=jnp.asarray(0.05 * rng.normal(size=(count, 3))),
+        betas=betas,
+    )
+
+
+def random_variables(config):
+    """Variables in which every number matters, of Gaussians that are as large as their distance."""
+    rng = np.random.default_rng(0)
+    shapes = expected_variables(config)
+
+    def draw(path, leaf):
+        names = [entry.key for entry in path]
+        noise = rng.normal(size=leaf.shape)
+        if names[-1] in ("scale", "var"):
+            return 1 + 0.1 * np.abs(noise)
+        if names[-1] == "bias" and names[-2] == "geometry_out":
+            bias = [0, 0, 0, 1, 0, 0, 0, -3, -3, -3]  # softplus(-3) is 5 cm
+            return np.tile(bias, len(noise) // len(bias)) + 0.2 * noise * (np.abs(np.tile(bias, len(noise) // 10)) > 0)
+        small = 0.1 if names[-2] in ("geometry_out",) else 1.0
+        fan_in = np.prod(leaf.shape[:-1]) if leaf.ndim > 1 else 100
+        return small * noise / np.sqrt(fan_in)
+
+    return jax.tree_util.tree_map_with_path(lambda path, leaf: jnp.asarray(draw(path, leaf), jnp.float64), shapes)
+
+
+def group_of(path):
+    names = [entry.key for entry in path]
+    if "texture" in names:
+        return "texture"
+    if "class_token" in names:
+        return "tokenizer"
+    return next({"readout": "upsampler"}.get(name, name) for name in names if name not in ("params", "encoder"))
+
+
+@functools.cache
+def in_a_hurry():
+    """Options with which XLA compiles ten times the code that it saves running; one of them is gone in jax 0.12."""
+    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+    try:
+        jax.jit(jnp.sin, compiler_options=options)(0.0)
+    except RuntimeError:
+        options.pop("xla_cpu_use_fusion_emitters")
+    return options
+
+
+@functools.cache
+def subject(position_map):
+    """(network's inputs, targets) of one person."""
+    betas = jnp.asarray(np.random.default_rng(5).normal(size=4))
+    inputs = prepared(random_views(1, VIEWS, SIZE, betas), position_map)
+    return inputs, random_views(2, TARGETS, TARGET_SIZE, betas)
+
+
+def prepared(views, position_map):
+    prepare = jax.jit(prepare_inputs, static_argnames="config", compiler_options=in_a_hurry())
+    return prepare(body(), views, config=dataclasses.replace(tiny(), position_map=position_map))
+
+
+def starting_point(inputs, targets, params):
+    """Everything that is differentiable, by group.
+
+    Pixels beside the body have a position on the very border of the texture, where a step out of it is not a step in:
+    they are moved inside, between texels.
+    """
+    positions = jnp.where((inputs.depth_maps >= 0)[..., None], inputs.position_maps, INSIDE)
+    return {
+        "params": params,
+        "images": inputs.images,
+        "input_geometry": {name: getattr(inputs, name) for name in GEOMETRY} | {"position_maps": positions},
+        "target_pose": {name: getattr(targets, name) for name in POSE},
+        "target_cameras": targets.cameras,
+    }
+
+
+@functools.cache
+def compiled(case, dtype):
+    """f(point, fixed) -> ((loss, facts), gradients), a point, and what is fixed there."""
+    config = case.config
+    variables = random_variables(config.model)
+    inputs, targets = subject(config.model.position_map)
+    point = starting_point(inputs, targets, variables["params"])
+    point, fixed, own_body = as_dtype((point, (inputs, targets, variables["batch_stats"]), body()), dtype)
+
+    def loss(point, fixed):
+        inputs, targets, batch_stats = fixed
+        inputs = replace(inputs, images=point["images"], **point["input_geometry"])
+        targets = replace(targets, cameras=point["target_cameras"], **point["target_pose"])
+        variables = {"params": point["params"], "batch_stats": batch_stats}
+        outputs, _ = apply_humangs(variables, inputs, config.model, case.train)
+        drawn = draw_targets(outputs, own_body, targets, white_backgrounds(targets), config)
+        terms = loss_terms(drawn, outputs, targets.images, targets, config.loss)
+        total = sum(getattr(config.loss, name) * term for name, term in terms.items())
+        return total, {"overflow": jnp.sum(drawn.overflow), "dropped": outputs.dropped_tokens, "alpha": drawn.alpha}
+
+    differentiated = jax.jit(jax.value_and_grad(loss, has_aux=True), compiler_options=in_a_hurry())
+    return differentiated.lower(point, fixed).compile(), point, fixed
+
+
+def by_group(point):
+    """Paths of the leaves of a point: of the network's parts, and of what else is varied."""
+    found = {}
+    for path, _ in jax.tree_util.tree_leaves_with_path(point):
+        name = path[0].key
+        found.setdefault(group_of(path[1:]) if name == "params" else name, set()).add(path)
+    return found
+
+
+def root_mean_square(x):
+    return jnp.sqrt(jnp.mean(x**2))
+
+
+def random_direction(point, paths, rng):
+    """Moves those leaves, each by about its own size, and nothing else."""
+
+    def draw(path, leaf):
+        return jnp.asarray(rng.normal(size=leaf.shape)) * root_mean_square(leaf) * (path in paths)
+
+    return jax.tree_util.tree_map_with_path(draw, point)
+
+
+def inner(a, b):
+    return sum(float(jnp.vdot(x, y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def check_gradients(case):
+    function, point, fixed = compiled(case, jnp.float64)
+    (_, facts), gradients = function(point, fixed)
+    assert int(facts["overflow"]) == int(facts["dropped"]) == 0
+    assert SEEN[0] < float(jnp.mean(facts["alpha"])) < SEEN[1]
+    rng = np.random.default_rng(3)
+    assert set(by_group(point)) == {*PARAMETER_GROUPS, *OTHERS}
+    for group, paths in by_group(point).items():
+        direction = random_direction(point, paths, rng)
+        derivative = inner(gradients, direction)
+        # its standard deviation over directions of this size
+        weighted = jax.tree.map(lambda x, d: x * root_mean_square(d), gradients, direction)
+        expected = np.sqrt(inner(weighted, weighted))
+        assert expected > SMALLEST_DERIVATIVE, f"nothing depends on {group}"
+
+        def value(step, direction=direction):
+            return float(function(jax.tree.map(lambda x, d: x + step * d, point, direction), fixed)[0][0])
+
+        errors = []
+        for change in CHANGES:
+            step = change / expected
+            errors.append(abs((value(step) - value(-step)) / (2 * step) - derivative) / expected)
+            if errors[-1] < AGREEMENT:
+                break
+        assert errors[-1] < AGREEMENT, f"{group}: {errors}"
+
+
+@pytest.mark.parametrize("case", FAST, ids=lambda case: case.style)
+def test_gradients_agree_with_differences(case):
+    check_gradients(case)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SLOW, ids=str)
+def test_gradients_agree_with_differences_however_configured(case):
+    check_gradients(case)
+
+
+def turned_away(cameras):
+    """The same cameras looking in the opposite direction."""
+    about = jnp.diag(jnp.asarray([-1.0, 1.0, -1.0, 1.0], cameras.cam_from_world.dtype))
+    return replace(cameras, cam_from_world=about @ cameras.cam_from_world)
+
+
+def nobody_in_the_photographs(case, point, fixed):
+    """White photographs, and a body that stands beside what they show."""
+    inputs, *rest = fixed
+    blank = replace(inputs, depth_maps=-jnp.ones_like(inputs.depth_maps), foreground=jnp.zeros_like(inputs.foreground))
+    geometry = point["input_geometry"]
+    nowhere = geometry | {
+        "position_maps": jnp.ones_like(inputs.position_maps),
+        "posed_vertices": geometry["posed_vertices"] + 10.0,
+    }
+    return point | {"images": jnp.ones_like(point["images"]), "input_geometry": nowhere}, (blank, *rest)
+
+
+def subject_behind_the_cameras(case, point, fixed):
+    """Photographs taken in the other direction, prepared like any."""
+    inputs, *rest = fixed
+    position_map = case.config.model.position_map
+    views = random_views(1, VIEWS, SIZE, point["target_pose"]["betas"].astype(jnp.float64))
+    views = replace(views, cameras=turned_away(views.cameras), masks=jnp.zeros_like(views.masks))
+    behind = as_dtype(prepared(views, position_map), inputs.images.dtype)
+    assert jnp.all(behind.depth_maps == -1) and not jnp.any(behind.foreground)
+    geometry = {name: getattr(behind, name) for name in GEOMETRY}
+    return point | {"input_geometry": geometry}, (behind, *rest)
+
+
+def vertices_in_the_cameras(case, point, fixed):
+    """Every posed vertex at its camera's centre: nothing divides by its depth."""
+    geometry = point["input_geometry"]
+    centers = jnp.broadcast_to(geometry["cameras"].center[:, None], geometry["posed_vertices"].shape)
+    return point | {"input_geometry": geometry | {"posed_vertices": centers}}, fixed
+
+
+def every_gaussian_culled(case, point, fixed):
+    """Targets that look away from the person."""
+    return point | {"target_cameras": turned_away(point["target_cameras"])}, fixed
+
+
+DEGENERATE = (
+    nobody_in_the_photographs,
+    subject_behind_the_cameras,
+    vertices_in_the_cameras,
+    every_gaussian_culled,
+)
+
+
+def check_degenerate(case, degenerate, dtype):
+    function, point, fixed = compiled(case, dtype)
+    (loss, facts), gradients = function(*degenerate(case, point, fixed))
+    assert jnp.isfinite(loss)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(gradients):
+        assert jnp.all(jnp.isfinite(leaf)), jax.tree_util.keystr(path)
+    culled = degenerate is every_gaussian_culled
+    assert bool(jnp.all(facts["alpha"] == 0)) == culled
+    if culled:  # nothing that only pictures tell of has a gradient
+        assert all(jnp.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_cameras"]))
+        assert all(jnp.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_pose"]))
+
+
+@pytest.mark.parametrize("degenerate", DEGENERATE, ids=lambda f: f.__name__)
+@pytest.mark.parametrize("case", FAST, ids=lambda case: case.style)
+def test_gradients_are_finite_where_there_is_nothing_to_see(case, degenerate):
+    check_degenerate(case, degenerate, jnp.float64)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("degenerate", DEGENERATE, ids=lambda f: f.__name__)
+@pytest.mark.parametrize("case", FAST, ids=lambda case: case.style)
+def test_gradients_are_finite_in_float32_too(case, degenerate):
+    check_degenerate(case, degenerate, jnp.float32)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", FAST, ids=lambda case: case.style)
+def test_gradients_in_float32_point_the_same_way(case):
+    gradients = [function(point, fixed)[1] for function, point, fixed in (compiled(case, x) for x in DTYPES)]
+    for group, paths in by_group(gradients[0]).items():
+        chosen = [
+            np.concatenate([np.ravel(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(x) if path in paths])
+            for x in gradients
+        ]
+        cosine = np.dot(*chosen) / np.prod([np.linalg.norm(x) for x in chosen])
+        assert cosine > FLOAT32_COSINE, group
