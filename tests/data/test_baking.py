@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -119,9 +120,13 @@ def test_a_few_joints_move_the_mesh_as_all_of_them(person):
     assert moved(2) > moved(baking.JOINTS_PER_VERTEX)
 
 
-def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
+def read_mesh(path) -> Any:
     import trimesh
 
+    return trimesh.load(path, process=False, force="mesh")
+
+
+def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
     posed = writer.sample_pose(person, 0)
     pose = BodyPose(jnp.asarray(posed.rotations), jnp.asarray(posed.translation))
     folder = scans.export_scan(person, tmp_path / "scan", pose, lit=True, texture_size=SIZE)
@@ -130,8 +135,9 @@ def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
     assert known["seed"] == person.seed and known["lit"]
     np.testing.assert_allclose(known["rotations"], posed.rotations)
     textures = []
+    mesh = None
     for name in ("scan.obj", "scan.glb"):
-        mesh = trimesh.load(folder / name, process=False, force="mesh")
+        mesh = read_mesh(folder / name)
         np.testing.assert_array_equal(mesh.faces, baked.atlas.faces)
         np.testing.assert_allclose(mesh.vertices, posed.vertices[baked.atlas.vertices], atol=1e-6)
         np.testing.assert_allclose(mesh.visual.uv, baked.atlas.uvs, atol=1e-6)
@@ -149,11 +155,9 @@ def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
 
 
 def test_a_scan_without_a_pose_is_at_rest_in_albedo(person, baked, tmp_path):
-    import trimesh
-
     folder = scans.export_scan(person, tmp_path / "rest", texture_size=SIZE, formats=("glb",))
     assert sorted(file.name for file in folder.iterdir()) == ["scan.glb", "scan.json"]
-    mesh = trimesh.load(folder / "scan.glb", process=False, force="mesh")
+    mesh = read_mesh(folder / "scan.glb")
     np.testing.assert_allclose(mesh.vertices, person.surface.vertices[baked.atlas.vertices], atol=1e-6)
     np.testing.assert_array_equal(np.asarray(mesh.visual.material.baseColorTexture)[..., :3], baked.albedo)
 

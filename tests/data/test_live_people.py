@@ -130,7 +130,9 @@ def test_batches_by_vmap_are_the_examples(bank, example):
 def test_it_lowers_for_accelerators(bank, platform):
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (bank, jax.random.key(0)))
     config = dataclasses.replace(CONFIG, views_at_once=3, pixels_per_step=1 << 30)
-    exported = jax.export.export(jitted_example, platforms=[platform])(*shapes, config=config)
+    exported = jax.export.export(jax.jit(live.live_example, static_argnames="config"), platforms=[platform])(
+        *shapes, config=config
+    )
     assert exported.platforms == (platform,)
     assert "callback" not in exported.mlir_module()
 
@@ -181,7 +183,8 @@ def test_bare_skin_is_where_the_body_is(bank, scene, body):
     skin = (ids >= 0) & (np.asarray(bank.face_pieces[scene.person])[ids] == 0)
     assert skin.sum() > 50
     views = views_of(bank, scene, camera)
-    inputs = prepare_inputs(body, views, dataclasses.replace(tiny(), image_size=SIZE))
+    prepare = jax.jit(prepare_inputs, static_argnames="config")
+    inputs = prepare(body, views, config=dataclasses.replace(tiny(), image_size=SIZE))
     unit = float(subject_unit(inputs.canonical_vertices))
     depth = np.asarray(inputs.depth_maps[0]) * unit
     alike = np.abs(depth - np.asarray(fragments.depth))[skin] < SKIN_DEPTH

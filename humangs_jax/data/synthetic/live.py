@@ -74,6 +74,9 @@ class LiveConfig:
     pixels_per_step: int = 1 << 14
 
 
+DEFAULT_CONFIG = LiveConfig()
+
+
 @pytree_dataclass
 class LiveScene:
     """A person as a key has them stand there, in several poses o; what all views of an example share.
@@ -92,7 +95,7 @@ class LiveScene:
     lights: LiveLights
 
 
-def live_example(bank: PeopleBank, key: Key, config: LiveConfig = LiveConfig()) -> Example:
+def live_example(bank: PeopleBank, key: Key, config: LiveConfig = DEFAULT_CONFIG) -> Example:
     """Views of somebody of the bank: some shown, others asked for."""
     numbers = _draw_numbers(bank, key, config)
     scene = scene_from(numbers, bank, config)
@@ -109,7 +112,7 @@ def live_example(bank: PeopleBank, key: Key, config: LiveConfig = LiveConfig()) 
     return Example(*(jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts))
 
 
-def draw_scene(bank: PeopleBank, key: Key, config: LiveConfig = LiveConfig()) -> LiveScene:
+def draw_scene(bank: PeopleBank, key: Key, config: LiveConfig = DEFAULT_CONFIG) -> LiveScene:
     """What the views of `live_example` of this key show."""
     return scene_from(_draw_numbers(bank, key, config), bank, config)
 
@@ -213,7 +216,7 @@ def _batch(config, count):
 
 
 def draw_view(
-    bank: PeopleBank, scene: LiveScene, pose: Int[Array, ""], camera: Camera, config: LiveConfig = LiveConfig()
+    bank: PeopleBank, scene: LiveScene, pose: Int[Array, ""], camera: Camera, config: LiveConfig = DEFAULT_CONFIG
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
     """(h, w, 3) picture on white and (h, w) coverage of one of the scene's poses, both in [0, 1]."""
     s = config.supersampling

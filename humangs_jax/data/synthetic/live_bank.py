@@ -8,6 +8,7 @@ import concurrent.futures
 import functools
 import multiprocessing
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -226,8 +227,11 @@ def _stacked(people, body: BodyModel, split) -> PeopleBank:
             return np.pad(array, [(0, extra)] + [(0, 0)] * (array.ndim - 1))
         return np.concatenate([array, np.repeat(array[:1], extra, axis=0)])
 
+    fields: dict[str, Any] = {}
+    for name in _ARRAYS:
+        fields[name] = jnp.asarray(np.stack([padded(name, p[name]) for p in people]))
     return PeopleBank(
-        **{name: jnp.asarray(np.stack([padded(name, p[name]) for p in people])) for name in _ARRAYS},
+        **fields,
         parents=body.parents,
         mirrored_joints=mirrored_joints(body.joint_names),
         split=split,

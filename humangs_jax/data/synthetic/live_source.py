@@ -8,11 +8,20 @@ import jax
 from humangs_jax.array_types import Key
 from humangs_jax.data.loading.examples import Example
 from humangs_jax.data.loading.generated import GeneratedSource
-from humangs_jax.data.synthetic.live import LiveConfig, live_example
+from humangs_jax.data.synthetic.live import DEFAULT_CONFIG, LiveConfig, live_example
 from humangs_jax.data.synthetic.live_bank import PeopleBank
+from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
 
-jitted_example = functools.partial(jax.jit, static_argnames="config")(live_example)
-"""`live_example`, compiled once per configuration and shape of the bank."""
+
+def jitted_example(bank: PeopleBank, key: Key, config: LiveConfig = DEFAULT_CONFIG) -> Example:
+    """`live_example`, compiled once per configuration and shape of the bank; on a CPU with the options that suit drawing."""
+    return _compiled()(bank, key, config=config)
+
+
+@functools.cache
+def _compiled():
+    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    return jax.jit(live_example, static_argnames="config", compiler_options=options)
 
 
 def live_source(
