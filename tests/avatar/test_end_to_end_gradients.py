@@ -30,7 +30,7 @@ from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.forward import draw_targets, white_backgrounds
 from humangs_jax.training.step import loss_terms
 
-VERTICES, VIEWS, TARGETS, SIZE, TARGET_SIZE = 300, 2, 2, 32, 24
+VERTICES, JOINTS, VIEWS, TARGETS, SIZE, TARGET_SIZE = 300, 55, 2, 2, 32, 24
 CHANGES = (1e-8, 1e-9, 1e-10)
 """What a step is to change the loss by. The loss is about 0.4, its rounding a few 1e-17."""
 AGREEMENT = 5e-6
@@ -44,6 +44,7 @@ DTYPES = (jnp.float32, jnp.float64)
 PARAMETER_GROUPS = ("texture", "tokenizer", "transformer", "upsampler", "decoder")
 OTHERS = ("images", "input_geometry", "target_pose", "target_cameras")
 GEOMETRY = ("cameras", "posed_vertices", "canonical_vertices", "position_maps")
+FLAGS = ("remat", "train", "scan", "bare")
 INSIDE = 0.93
 """Of the texture: 3.255 texels from its middle."""
 POSE = ("rotations", "translations", "betas")
@@ -53,6 +54,7 @@ POSE = ("rotations", "translations", "betas")
 class Case:
     """style: as the published network (mixed convention, rotation skinning, offsets without bound, Gouraud maps) or as
     the small one (photo colours corrected, affine skinning, bounded offsets). train: statistics of the batch.
+    bare: neither class token nor upsampler, but a head that corrects skinning weights.
     """
 
     style: str
@@ -61,6 +63,10 @@ class Case:
     remat: bool
     train: bool = False
     scan: bool = False
+    bare: bool = False
+
+    def __str__(self):
+        return "-".join([self.style, self.tokens, self.pool, *(flag for flag in FLAGS if getattr(self, flag))])
 
     @property
     def config(self) -> TrainConfig:
@@ -74,7 +80,13 @@ class Case:
             sample_rgb=not published,
         )
         decoder = dataclasses.replace(
-            model.decoder, residual_color=not published, offset_scale=None if published else 0.25
+            model.decoder,
+            residual_color=not published,
+            offset_scale=None if published else 0.25,
+            skinning_joints=JOINTS if self.bare else None,
+        )
+        transformer = dataclasses.replace(
+            model.transformer, class_token=not self.bare, remat=self.remat, scan=self.scan
         )
         model = dataclasses.replace(
             model,
@@ -83,7 +95,8 @@ class Case:
             skinning="rotation" if published else "affine",
             position_map="gouraud" if published else "plain",
             ray_origins="twice_normalized" if published else "normalized",
-            transformer=dataclasses.replace(model.transformer, remat=self.remat, scan=self.scan),
+            transformer=transformer,
+            upsampler=dataclasses.replace(model.upsampler, enabled=not self.bare),
             sampling=sampling,
             decoder=decoder,
         )
@@ -98,6 +111,7 @@ SLOW = [
     for factors in itertools.product(("published", "small"), ("all", "foreground"), ("all", "visible"), (False, True))
     for case in [Case(*factors, train=factors[1] == "all", scan=factors[3] and factors[2] == "all")]
 ]
+SLOW += [Case(style, "foreground", "visible", remat=False, bare=True) for style in ("published", "small")]
 
 
 @pytest.fixture(autouse=True)
@@ -130,7 +144,7 @@ def random_views(seed, count, size, betas):
         images=jnp.asarray(rng.uniform(0.1, 0.9, (count, size, size, 3))),
         masks=jnp.asarray(masks),
         cameras=cameras(count, size, 2.3, 0.3 * seed),
-        rotations=jnp.asarray(0.25 * rng.normal(size=(count, 55, 3))),
+        rotations=jnp.asarray(0.25 * rng.normal(size=(count, JOINTS, 3))),
         translations=jnp.asarray(0.05 * rng.normal(size=(count, 3))),
         betas=betas,
     )
@@ -261,7 +275,7 @@ def check_gradients(case):
     assert int(facts["overflow"]) == int(facts["dropped"]) == 0
     assert SEEN[0] < float(jnp.mean(facts["alpha"])) < SEEN[1]
     rng = np.random.default_rng(3)
-    assert set(by_group(point)) == {*PARAMETER_GROUPS, *OTHERS}
+    assert set(by_group(point)) == {*PARAMETER_GROUPS, *OTHERS} - ({"upsampler"} if case.bare else set())
     for group, paths in by_group(point).items():
         direction = random_direction(point, paths, rng)
         derivative = inner(gradients, direction)
@@ -282,7 +296,7 @@ def check_gradients(case):
         assert errors[-1] < AGREEMENT, f"{group}: {errors}"
 
 
-@pytest.mark.parametrize("case", FAST, ids=lambda case: case.style)
+@pytest.mark.parametrize("case", FAST, ids=str)
 def test_gradients_agree_with_differences(case):
     check_gradients(case)
 
@@ -357,20 +371,20 @@ def check_degenerate(case, degenerate, dtype):
 
 
 @pytest.mark.parametrize("degenerate", DEGENERATE, ids=lambda f: f.__name__)
-@pytest.mark.parametrize("case", FAST, ids=lambda case: case.style)
+@pytest.mark.parametrize("case", FAST, ids=str)
 def test_gradients_are_finite_where_there_is_nothing_to_see(case, degenerate):
     check_degenerate(case, degenerate, jnp.float64)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("degenerate", DEGENERATE, ids=lambda f: f.__name__)
-@pytest.mark.parametrize("case", FAST, ids=lambda case: case.style)
+@pytest.mark.parametrize("case", FAST, ids=str)
 def test_gradients_are_finite_in_float32_too(case, degenerate):
     check_degenerate(case, degenerate, jnp.float32)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", FAST, ids=lambda case: case.style)
+@pytest.mark.parametrize("case", FAST, ids=str)
 def test_gradients_in_float32_point_the_same_way(case):
     gradients = [function(point, fixed)[1] for function, point, fixed in (compiled(case, x) for x in DTYPES)]
     for group, paths in by_group(gradients[0]).items():
