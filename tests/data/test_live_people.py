@@ -117,6 +117,13 @@ def test_examples_look_like_those_of_the_loader(bank, example, body):
     assert any(np.array_equal(example.inputs.betas, betas) for betas in np.asarray(bank.betas))
 
 
+def test_it_can_be_vmapped_over_keys(bank):
+    keys = jax.random.split(jax.random.key(0), 5)
+    shapes = jax.eval_shape(jax.vmap(lambda key: live.live_example(bank, key, CONFIG)), keys)
+    assert shapes.inputs.images.shape == (5, 2, 48, 48, 3) and shapes.targets.betas.shape == (5, bank.betas.shape[1])
+
+
+@pytest.mark.slow
 def test_batches_by_vmap_are_the_examples(bank, example):
     keys = jnp.stack([jax.random.key(7), jax.random.key(1)])
     batch = jax.jit(jax.vmap(lambda key: live.live_example(bank, key, CONFIG)))(keys)
@@ -200,9 +207,9 @@ def test_bare_skin_is_where_the_body_is(bank, scene, body):
 
 
 def test_examples_are_of_the_body_mirrored_or_not(bank, body):
-    keys = [jax.random.key(i) for i in range(8)]
-    numbers = [live._draw_numbers(bank, key, CONFIG) for key in keys]
-    flipped = [float(u["mirrored"]) < CONFIG.mirrored_share for u in numbers]
+    keys = jax.random.split(jax.random.key(0), 8)
+    numbers = jax.jit(jax.vmap(lambda key: live._draw_numbers(bank, key, CONFIG)["mirrored"]))(keys)
+    flipped = (np.asarray(numbers) < CONFIG.mirrored_share).tolist()
     for key in (keys[flipped.index(True)], keys[flipped.index(False)]):
         views = jitted_example(bank, key, config=CONFIG).inputs
         inside = []
@@ -222,8 +229,9 @@ def pose(body, betas, rotations, translation):
 
 def test_mirroring_twice_changes_nothing(bank, example):
     views = example.inputs
-    once = live.mirrored(views, bank.mirrored_joints)
-    twice = live.mirrored(once, bank.mirrored_joints)
+    mirror = jax.jit(live.mirrored, static_argnums=1)
+    once = mirror(views, bank.mirrored_joints)
+    twice = mirror(once, bank.mirrored_joints)
     for a, b in zip(jax.tree.leaves(twice), jax.tree.leaves(views), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-5)
     assert np.abs(np.asarray(once.rotations - views.rotations)).max() > 0.1
@@ -282,7 +290,7 @@ def test_openness_is_that_of_the_host(bank, scene):
     normals = np.zeros_like(vertices)
     normals[np.asarray(faces).reshape(-1)] = corners[:, :3]
     up = jnp.asarray([0.0, 1.0, 0.0])
-    openness, lit = live_light.shaded_vertices(jnp.asarray(vertices), jnp.asarray(normals), faces, up)
+    openness, lit = jax.jit(live_light.shaded_vertices)(jnp.asarray(vertices), jnp.asarray(normals), faces, up)
     expected = shading.occlusion(vertices, normals)
     used = np.unique(np.asarray(faces))
     assert np.abs(np.asarray(openness) - expected)[used].mean() < 0.03  # here the middles of faces count as well
