@@ -161,16 +161,20 @@ def capture_from_arrays(
     return _assemble(images, masks, cameras, frames, body, betas, rotations, translations, names, body_file)
 
 
-def load_capture(path: str | Path, *, body: BodyModel | None = None) -> Capture:
+def load_capture(
+    path: str | Path, *, body: BodyModel | None = None, views: Sequence[int] | Int[np.ndarray, " any"] | None = None
+) -> Capture:
     """Read and check a capture folder.
 
     Arguments:
         path: the folder that holds capture.json. "demo_capture", where no such folder is, stands for the one that comes
             with the package (and "demo_capture/held_out" for its held-out views).
         body: a model to use in place of the one that body.npz names.
+        views: read these views only, in this order; the photographs of others are not looked at.
 
     Raises: CaptureError, one line naming file and field.
     """
+    chosen = views
     folder = Path(path)
     if not folder.exists() and folder.parts[:1] == (DEMO_CAPTURE,):
         folder = Path(str(resources.files("humangs_jax"))) / "assets" / folder
@@ -183,6 +187,8 @@ def load_capture(path: str | Path, *, body: BodyModel | None = None) -> Capture:
     betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
 
     views = description["views"]
+    if chosen is not None:
+        views = [views[i] for i in chosen]
     with_mask = ["mask" in view for view in views]
     if any(with_mask) and not all(with_mask):
         raise CaptureError(

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.capture import capture_from_arrays, save_capture
+from humangs_jax.data import capture_reading
+from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.loader import (
     CaptureCache,
     ExampleSource,
@@ -212,6 +213,31 @@ def test_the_memory_limit_only_costs_time(folder):
     bounded = CaptureCache(find_captures(folder), small_body(), limit_bytes=store_bytes(folder))
     assert [bounded.load(i) is bounded.load(i) for i in range(3)] == [True, False, False]
     assert same(bounded.load(2), CaptureCache(find_captures(folder), small_body()).load(2))
+
+
+def test_beyond_the_memory_limit_only_the_views_in_question_are_read(folder, monkeypatch):
+    examples = lambda cache: [
+        ExampleSource(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(step) for step in range(6)
+    ]
+    kept = examples(CaptureCache(find_captures(folder), small_body()))
+    forgetful = CaptureCache(find_captures(folder), small_body(), limit_bytes=0)
+    assert all(same(a, b) for a, b in zip(kept, examples(forgetful), strict=True))
+    read = []
+    monkeypatch.setattr(
+        "humangs_jax.data.capture.read_view", lambda *a: read.append(a) or capture_reading.read_view(*a)
+    )
+    again = examples(forgetful)
+    assert len(read) == 6 * 2 * 4  # of 6 views each, 2 are shown and 2 asked for
+    assert all(same(a, b) for a, b in zip(kept, again, strict=True))
+
+
+def test_some_views_of_a_capture(folder):
+    whole, some = (load_capture(folder / "s1", body=small_body(), views=v) for v in (None, [4, 1]))
+    np.testing.assert_array_equal(some.images, whole.images[[4, 1]])
+    np.testing.assert_array_equal(some.masks, whole.masks[[4, 1]])
+    np.testing.assert_array_equal(some.cameras.cam_from_world, whole.cameras.cam_from_world[jnp.asarray([4, 1])])
+    assert some.names == ("004", "001") and some.frames.tolist() == [0, 1]
+    np.testing.assert_array_equal(some.poses.rotations, whole.poses.rotations)
 
 
 def store_bytes(folder):

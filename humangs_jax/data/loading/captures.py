@@ -11,7 +11,7 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.images import to_uint8
-from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_example
+from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_views, subject_views
 from humangs_jax.data.loading.order import subject_order, view_generator
 
 logger = logging.getLogger("humangs_jax.data.loader")
@@ -30,9 +30,12 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
     return tuple(folders)
 
 
-def store_capture(path: str | Path, body: BodyModel) -> StoredSubject:
-    """Read a capture folder whose parameters belong to `body`. Raises: ValueError naming file and field."""
-    capture = load_capture(path, body=body)
+def store_capture(path: str | Path, body: BodyModel, views: Sequence[int] | None = None) -> StoredSubject:
+    """Read a capture folder whose parameters belong to `body`, or some of its views. Raises: ValueError naming file and field.
+
+    Azimuths are about the middle of the cameras read.
+    """
+    capture = load_capture(path, body=body, views=views)
     if capture.masks is None:
         raise ValueError(f"{path}: no masks: training needs to know where the person is")
     shape_count = body.shape_directions.shape[-1]
@@ -53,9 +56,10 @@ def store_capture(path: str | Path, body: BodyModel) -> StoredSubject:
 
 
 class CaptureCache:
-    """Capture folders, decoded when first asked for and kept as bytes up to a limit; later ones are read every time.
+    """Capture folders, checked as a whole when first asked for and kept as bytes up to a limit.
 
-    Several threads may ask at once. broken: folder -> what is wrong with it, in the order of discovery.
+    Of those beyond the limit all but the pixels is kept, and the views that are wanted are read again. Several threads may
+    ask at once. broken: folder -> what is wrong with it, in the order of discovery.
     """
 
     def __init__(self, folders: Sequence[str | Path], body: BodyModel, limit_bytes: int = 4 << 30):
@@ -65,6 +69,7 @@ class CaptureCache:
         self.broken: dict[Path, str] = {}
         self._body, self._free_bytes = body, limit_bytes
         self._stored: dict[Path, StoredSubject] = {}
+        self._outlines: dict[Path, StoredSubject] = {}
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -84,10 +89,28 @@ class CaptureCache:
             self.report(index, str(error))
             return None
         with self._lock:
+            nothing = {name: getattr(subject, name)[:0] for name in ("images", "masks")}
+            self._outlines[folder] = subject._replace(**{name: array.copy() for name, array in nothing.items()})
             if folder not in self._stored and folder not in self.broken and subject.size_bytes <= self._free_bytes:
                 self._stored[folder] = subject
                 self._free_bytes -= subject.size_bytes
         return subject
+
+    def outline(self, index: int) -> StoredSubject | None:
+        """The subject of folder `index`, images and masks possibly empty; None if it is broken."""
+        with self._lock:
+            known = self._outlines.get(self.folders[index])
+        return self.load(index) if known is None or self.folders[index] in self.broken else known
+
+    def some_views(self, index: int, views: Sequence[int]) -> StoredSubject:
+        """The subject of folder `index` with these views alone, in this order. Raises: ValueError, OSError."""
+        with self._lock:
+            stored = self._stored.get(self.folders[index])
+        if stored is None:
+            return store_capture(self.folders[index], self._body, views)
+        chosen = np.asarray(views)
+        of_views = ("images", "masks", "K", "cam_from_world", "frames", "azimuths")
+        return stored._replace(**{name: getattr(stored, name)[chosen] for name in of_views})
 
     def report(self, index: int, problem: str) -> None:
         """Leave folder `index` out from now on.
@@ -137,13 +160,17 @@ class CaptureSource:
         epoch, position = divmod(index, len(self.cache))
         order = subject_order(seed, epoch, len(self.cache))
         for subject_index in np.roll(order, -position).tolist():
-            subject = self.cache.load(subject_index)
-            if subject is None:
+            outline = self.cache.outline(subject_index)
+            if outline is None:
                 continue
-            generator = view_generator(seed, index)
-            sizes = self.input_size, self.target_size
             try:
-                return draw_example(generator, subject, input_count, self.sampling, *sizes)
-            except ValueError as error:
+                inputs, targets = draw_views(view_generator(seed, index), outline, input_count, self.sampling)
+                seen = self.cache.some_views(subject_index, [*inputs, *targets])
+                order_of = range(len(seen.frames))
+                return Example(
+                    subject_views(seen, order_of[: len(inputs)], self.input_size),
+                    subject_views(seen, order_of[len(inputs) :], self.target_size),
+                )
+            except (ValueError, OSError) as error:
                 self.cache.report(subject_index, f"{self.cache.folders[subject_index]}: {error}")
         raise ValueError(f"none of the {len(self.cache)} capture folders can be used")

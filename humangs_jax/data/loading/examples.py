@@ -98,10 +98,14 @@ def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray
     factor = height // size
     if factor < 1 or (height, width) != (factor * size, factor * size):
         raise ValueError(f"images of {width} x {height} cannot be box-averaged to {size} x {size}")
-    if factor > 1:
-        blocks = images.reshape(len(images), size, factor, size, factor, *images.shape[3:])
-        images = blocks.mean(axis=(2, 4), dtype=np.float32)
-    return images.astype(np.float32) / np.float32(255)
+    if factor == 1:
+        return images.astype(np.float32) / np.float32(255)
+    # sums of strided bytes, exact in 32 bits: several times as fast as means over axes
+    total = np.zeros((len(images), size, size, *images.shape[3:]), np.uint32 if factor > 16 else np.uint16)
+    for row in range(factor):
+        for column in range(factor):
+            total += images[:, row::factor, column::factor]
+    return total.astype(np.float32) / np.float32(factor**2) / np.float32(255)
 
 
 def subject_views(subject: StoredSubject, indices: Sequence[int], size: int) -> SubjectViews:
@@ -125,19 +129,6 @@ def subject_views(subject: StoredSubject, indices: Sequence[int], size: int) -> 
         translations=subject.translations[frames],
         betas=subject.betas,
     )
-
-
-def draw_example(
-    generator: np.random.Generator,
-    subject: StoredSubject,
-    input_count: int,
-    sampling: ViewSampling,
-    input_size: int,
-    target_size: int,
-) -> Example:
-    """Random views of a subject, numpy leaves. Raises: ValueError, see `draw_views` and `shrink`."""
-    inputs, targets = draw_views(generator, subject, input_count, sampling)
-    return Example(subject_views(subject, inputs, input_size), subject_views(subject, targets, target_size))
 
 
 def _on_host(cls: type, **fields: Any) -> Any:
