@@ -38,7 +38,7 @@ class Complexion:
 def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Complexion:
     """Random colouring; fair skin goes with any hair, dark skin with dark hair, age with grey."""
     darkness = rng.beta(1.05, 1.15)
-    fair, mid, dark = np.asarray([0.90, 0.71, 0.61]), np.asarray([0.70, 0.49, 0.36]), np.asarray([0.26, 0.155, 0.105])
+    fair, mid, dark = np.asarray([0.86, 0.67, 0.57]), np.asarray([0.70, 0.49, 0.36]), np.asarray([0.26, 0.155, 0.105])
     skin = fair + (mid - fair) * min(2 * darkness, 1) if darkness < 0.5 else mid + (dark - mid) * (2 * darkness - 1)
     undertone = rng.normal(0, 0.035)
     skin = np.clip(skin * (1 + rng.normal(0, 0.02, 3)) * [1 + undertone, 1, 1 - 1.3 * undertone], 0.05, 0.92)

@@ -11,8 +11,10 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.array_types import Float
-from humangs_jax.data.synthetic.anatomy import sleeve_coordinates
+from humangs_jax.data.synthetic.anatomy import ARMHOLE, TRUNK_GIRTH, sleeve_coordinates
 
+SHOULDER_RIDGE = -0.02
+"""Template z of the line from neck to shoulder on which front and back are sewn together."""
 ALBEDO_LIMIT = 0.88
 """White clothes stay darker than the white background."""
 
@@ -32,13 +34,32 @@ class Spots:
 
     @property
     def around(self) -> Float[np.ndarray, " n"]:
-        """(n,) metres around the trunk or limb, 0 in front."""
-        return np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * self.cloth[:, 3]
+        """(n,) metres around the trunk or limb, 0 in front; on the shoulders metres from the middle, back and front apart."""
+        girth = self.cloth[:, 3]
+        turned = np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * girth
+        flat = self._on_shoulders
+        if not flat.any():
+            return turned
+        x = self.cloth[:, 0]
+        across = np.where(self.template[:, 2] > SHOULDER_RIDGE, x, np.sign(x) * np.pi * girth - x)
+        return turned + flat * (across - turned)
 
     @property
     def along(self) -> Float[np.ndarray, " n"]:
-        """(n,) metres along the trunk or limb (height)."""
-        return self.cloth[:, 1]
+        """(n,) metres along the trunk or limb: height, but towards the shoulders the way up to their ridge."""
+        rising = np.clip((self.template[:, 1] + 0.25) / 0.35, 0, 1) * self._on_trunk
+        return self.cloth[:, 1] - rising * np.abs(self.template[:, 2] - SHOULDER_RIDGE)
+
+    @property
+    def _on_trunk(self):
+        """(n,) whether this is cloth of a trunk, inside of the armholes."""
+        return (np.abs(self.cloth[:, 3] - TRUNK_GIRTH) < 0.004) & (np.abs(self.template[:, 0]) <= ARMHOLE)
+
+    @property
+    def _on_shoulders(self):
+        """(n,) 1 where a trunk's cloth lies flat, 0 where it hangs."""
+        height = np.clip((self.cloth[:, 1] - 0.03) / 0.09, 0, 1)
+        return height * self._on_trunk
 
 
 @dataclasses.dataclass(frozen=True)

@@ -25,6 +25,8 @@ from humangs_jax.data.synthetic.surfaces import (
 
 HEM_MARGIN = 0.012
 """Skin is removed below cloth from this far inside the hem (metres of template coordinates)."""
+UNDER_A_HEM = 0.009
+"""Metres that a skirt is narrower where something hangs over it."""
 TUBE_COLUMNS, TUBE_STEP = 72, 0.035
 
 
@@ -35,7 +37,7 @@ class Fit:
     ease: distance from skin (at least) and from the outlines. hang: slope by which hanging cloth may narrow downwards (metres
     per metre; large clings). sleeve, leg: width added at the end of the limb. fold: height of the folds. hem: depth of the hem.
     quilt: period of padded rings, 0 for none. inner: nothing comes nearer to the skin than this (what is worn below).
-    calm: height above which there are no folds.
+    calm: height above which there are no folds. skirted: below the hips it goes around both legs (tops), not around each.
     """
 
     ease: float
@@ -48,6 +50,7 @@ class Fit:
     quilt: float = 0.0
     inner: float = 0.0
     calm: float = 9.0
+    skirted: bool = False
 
 
 def shell(rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], fit: Fit) -> Surface:
@@ -84,8 +87,11 @@ def _drape(rng, anatomy, surface, fit):
     points = _push_trunk(anatomy, points, arm, leg, fit)
     for side in (0, 1):
         points = _push_arm(anatomy, points, arm, side, fit)
-        points = _push_leg(anatomy, points, leg, side, fit)
+        points = points if fit.skirted else _push_leg(anatomy, points, leg, side, fit)
     points = smooth(points, surface.faces, 3, keep_hems=True)
+    seat = _over_the_seat(surface.attributes["template"])
+    if seat.any():
+        points = points + seat[:, None] * (smooth(points, surface.faces, 15, keep_hems=True) - points)
     outer = vertex_normals(points, surface.faces)
     cloth = smooth(surface.attributes["cloth"], surface.faces, 10, keep_hems=True)  # as the points were
     template = smooth(surface.attributes["template"], surface.faces, 8, keep_hems=True)
@@ -100,6 +106,12 @@ def _drape(rng, anatomy, surface, fit):
     thighs = leg > 0.6  # trouser legs do not cross the middle
     points[:, 0] = np.where(thighs, side * np.maximum(side * points[:, 0], 0.004), points[:, 0])
     return surface.moved(points).with_attributes(cloth=cloth, template=template)
+
+
+def _over_the_seat(template):
+    """(n,) 1 between the buttocks and below the belly, where skin has a cleft and cloth has none."""
+    x, y, _ = template.T
+    return np.exp(-((x / 0.045) ** 2)) * smoothstep(0.22, 0.28, -y) * (y > -0.5)
 
 
 def fold_heights(rng, cloth: np.ndarray, arm: np.ndarray, leg: np.ndarray, fit: Fit) -> np.ndarray:
@@ -131,7 +143,7 @@ def _push_trunk(anatomy, points, arm, leg, fit):
     angle, radius = slices.polar(points[:, [0, 2]], np.zeros((1, 2)))
     wanted = outline.radius(points[:, 1], angle) + fit.ease
     below_armpit = 1 - smoothstep(-0.03, 0.06, anatomy_height(anatomy, points))
-    amount = (1 - arm) * (1 - leg) * below_armpit
+    amount = (1 - arm) * (1 if fit.skirted else 1 - leg) * below_armpit
     grown = radius + amount * np.maximum(wanted - radius, 0)
     scale = grown / np.maximum(radius, 1e-4)
     return np.stack([points[:, 0] * scale, points[:, 1], points[:, 2] * scale], -1)
@@ -201,6 +213,7 @@ def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
     down = np.repeat((cut_of.top - template_y) / max(cut_of.top - cut_of.bottom, 1e-6), TUBE_COLUMNS)
     drop = np.repeat(cut_of.top - template_y, TUBE_COLUMNS)
     radius = outline.radius(height, around) + cut_of.ease + cut_of.flare * np.maximum(drop - cut_of.cling, 0)
+    radius = radius - UNDER_A_HEM * np.clip(1 - (drop - cut_of.cling) / 0.06, 0, 1) * (cut_of.cling > 0)
     pleats = np.cos(cut_of.pleats * around) if cut_of.pleats else 0
     wave = ripples(rng, np.stack([np.sin(around), 0.3 * height, np.cos(around)], -1), wavelength=0.9)
     loose = np.clip((drop - cut_of.cling) / 0.25, 0, 1) * down**0.5
@@ -220,13 +233,17 @@ def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
 
 
 def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
-    """Rest heights of the person for heights on the trunk and the legs of the template."""
-    names = (anatomy_module.LEFT_ANKLE, anatomy_module.LEFT_KNEE, anatomy_module.LEFT_HIP, anatomy_module.LEFT_SHOULDER)
-    marks = [ANKLE, -0.764, -0.358, anatomy_module.ARM_HEIGHT]
-    person = [anatomy.joints[i, 1] for i in names]
-    slope_low, slope_high = template_y - marks[0], template_y - marks[-1]
-    inside = np.interp(template_y, marks, person)
-    return inside + np.minimum(slope_low, 0) + np.maximum(slope_high, 0)
+    """Rest heights of the person for heights on the trunk and the legs of the template: where the skin of that height is."""
+    x, y, _ = anatomy.skin.attributes["template"].T
+    own = (np.abs(x) < 0.2) & (y < 0.14) & (y > ANKLE)
+    bins = np.floor((y[own] - ANKLE) / 0.03).astype(int)
+    counts = np.maximum(np.bincount(bins), 1)
+    template = np.bincount(bins, y[own]) / counts
+    rest = np.bincount(bins, anatomy.skin.vertices[own, 1]) / counts
+    known = np.bincount(bins) > 0
+    inside = np.interp(template_y, template[known], rest[known])
+    below, above = template_y - template[known][0], template_y - template[known][-1]
+    return inside + np.minimum(below, 0) + np.maximum(above, 0)
 
 
 def _skirt_weights(anatomy, vertices, template_y):
@@ -235,8 +252,8 @@ def _skirt_weights(anatomy, vertices, template_y):
     near = np.flatnonzero((np.abs(template[:, 0]) < 0.2) & (template[:, 1] < 0.0) & (template[:, 1] > -0.4))[::2]
     trunk = nearest_weights(anatomy, vertices, near)
     left = smoothstep(-0.09, 0.09, vertices[:, 0])
-    thigh = 0.92 * smoothstep(0.30, 0.58, -template_y)
-    shin = 0.75 * smoothstep(0.70, 0.98, -template_y)
+    thigh = 0.96 * smoothstep(0.27, 0.47, -template_y)
+    shin = 0.92 * smoothstep(0.68, 0.9, -template_y)
     legs = np.zeros_like(trunk)
     for joint, share in (
         (anatomy_module.LEFT_HIP, left * (1 - shin)),

@@ -48,12 +48,14 @@ FRINGE_LINES = {
 """Signed azimuths and heights above which longer hair covers the face: blunt, parted in the middle, combed to the right."""
 
 
-def style(rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut) -> list[Surface]:
-    """The surfaces of a haircut, beard included."""
+def style(rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: float = 0.0) -> list[Surface]:
+    """The surfaces of a haircut, beard included, over clothes that are `over` metres from the skin."""
     cut_name, thick, shift = haircut.cut, haircut.thickness, haircut.receding
     parts = []
     if cut_name in LONG_CUTS:
-        parts.append(falling_tube(rng, anatomy, thick, haircut.bottom, fringe(rng, haircut), wave=haircut.wave))
+        parts.append(
+            falling_tube(rng, anatomy, thick, haircut.bottom, fringe(rng, haircut), wave=haircut.wave, over=over)
+        )
     elif cut_name in ("curly", "afro"):
         bumps, size = (0.3, 0.035) if cut_name == "curly" else (0.1, 0.05)
         parts.append(scalp_shell(rng, anatomy, thick, bumps, shift=shift, bump_size=size))
@@ -161,11 +163,12 @@ def falling_tube(
     opening: Callable[[np.ndarray, np.ndarray], np.ndarray],
     wave: float = 0.004,
     ends: float | None = None,
+    over: float = 0.0,
 ) -> Surface:
     """Long hair, a hood or a headscarf: the skull's outline scaled up, then falling to the height `bottom` at the back.
 
     opening(azimuths in (-pi, pi], template heights): positive outside of the face. ends: height at which it ends in front;
-    hair ends on the shoulders at the sides.
+    hair ends on the shoulders at the sides. over: metres between skin and what is worn below it.
     """
     skin, template = anatomy.skin, anatomy.skin.attributes["template"]
     to_rest = _rest_heights(anatomy)
@@ -194,7 +197,8 @@ def falling_tube(
     radius = scale * vault * falling.radius(np.minimum(inner, brim), around)
     below = smoothstep(0.0, 0.12, SKULL[1] - row_height)
     radius = np.maximum(
-        radius, (back.radius(height, around) + 0.034 * smoothstep(-0.23, -0.17, -row_height)) * (row_height < 0.24)
+        radius,
+        (back.radius(height, around) + (0.034 + over) * smoothstep(-0.23, -0.17, -row_height)) * (row_height < 0.24),
     )
     radius = radius + below * wave * ripples(
         rng, np.stack([3 * np.sin(around), height * 4, 3 * np.cos(around)], -1), 1.2

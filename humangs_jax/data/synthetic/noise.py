@@ -36,7 +36,7 @@ class Folds:
 
     def __init__(self, rng: np.random.Generator, wavelength: float = 0.09, directions: int = 6, upright: bool = False):
         tilt, turn = (
-            rng.uniform(*((1.25, 1.57) if upright else (0.25, 1.5)), directions),
+            rng.uniform(*((1.25, 1.57) if upright else (0.5, 1.5)), directions),
             rng.uniform(0, 2 * np.pi, directions),
         )
         k = np.stack([np.sin(tilt) * np.cos(turn), np.cos(tilt), np.sin(tilt) * np.sin(turn)], -1)
@@ -49,12 +49,12 @@ class Folds:
     def slope(self, points: np.ndarray) -> np.ndarray:
         """(n, 3) slopes at (n, 3) points, about 1 on the flanks of a crease, 0 between patches."""
         points = points.astype(np.float32)
-        total, warp = np.zeros_like(points), 2.2 * self.warp(points)
+        total, warp = np.zeros_like(points), 3.0 * self.warp(points)
         for k, direction, phase, patch in zip(self.k, self.directions, self.phase, self.patches, strict=True):
             angle = points @ k + phase + warp
             crest = np.sin(angle)
             flank = np.cos(angle) * crest / np.sqrt(crest * crest + 0.15)  # of a ridge |sin| with a rounded top
-            total += (np.clip(patch(points) - 0.25, 0, 1) * flank)[:, None] * direction
+            total += (np.clip(patch(points) - 0.3, 0, 1) * flank)[:, None] * direction
         return total
 
 

@@ -19,7 +19,7 @@ VERTEX_STEP, FACE_STEP = 4096, 8192
 """Meshes are padded to multiples of these, so that few shapes are compiled."""
 INSIDE_SHADE = 0.45
 """Brightness of the inner side of cloth."""
-FOLD_SLOPE = 0.8
+FOLD_SLOPE = 0.6
 """Slope of painted creases on the most wrinkled cloth."""
 
 

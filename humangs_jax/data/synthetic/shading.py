@@ -24,6 +24,9 @@ LIFT = 0.03
 SHADOW_DENSITY, DARKEST = 2.2, 0.4
 """Extinction per unit of what the samples find, and the share of the key light that is left at least."""
 
+SHOULDER, WHITEST = 0.72, 0.97
+"""Brightness from which highlights are compressed, and the one that they approach."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Lights:
@@ -66,7 +69,7 @@ def sample_lights(rng: np.random.Generator) -> Lights:
     tint = 1 + rng.uniform(-0.03, 0.03, (3, 3)) + warmth * np.asarray([[1.0], [0.0], [0.0]]) * warm
     sky = rng.uniform(*sky_range) * (1 + rng.uniform(-0.02, 0.02, 3) - 0.5 * warmth * warm)
     exposure, balance, green = np.exp(rng.normal(0.06, 0.12)), rng.normal(0, 0.045), rng.normal(0, 0.012)
-    gain = np.clip(exposure, 0.72, 1.35) * np.asarray([1 + balance, 1 + green, 1 - balance])
+    gain = np.clip(exposure, 0.75, 1.3) * np.asarray([1 + balance, 1 + green, 1 - balance])
     return Lights(
         directions.astype(np.float32),
         (power[:, None] * tint).astype(np.float32),
@@ -145,7 +148,14 @@ def shade(
         light = light + strength * wrapped[:, None] * half
         gloss = np.clip(cosine, 0, 1) ** 12 * sheen
         albedo = albedo + 0.12 * gloss[:, None] * strength
-    return np.clip(np.minimum(albedo, ALBEDO_LIMIT) * light * lights.gain, 0, 0.97).astype(np.float32)
+    return rolled_off(np.minimum(albedo, ALBEDO_LIMIT) * light * lights.gain).astype(np.float32)
+
+
+def rolled_off(colours: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """Colours (n, 3) from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns out at once."""
+    above = np.maximum(colours - SHOULDER, 0)
+    reach = WHITEST - SHOULDER
+    return np.minimum(np.maximum(colours, 0), SHOULDER) + reach * (1 - np.exp(-above / reach))
 
 
 def bend_normals(normals: Float[np.ndarray, "n 3"], slope: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:

@@ -27,7 +27,7 @@ def _shoe(anatomy, side, height, sole, ease):
     )
     low = np.asarray([0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072])
     levels = floor + np.concatenate([low[low < height - 0.004], shaft])
-    shape = slices.outlines(points[:, 1], points[:, [0, 2]], levels, None, 0.012)
+    shape = _outlines(points, levels)
     shape = slices.hanging(shape, 0.6)  # the sole is as wide as what is above it
     angle = np.arange(COLUMNS) * (2 * np.pi / COLUMNS)
     rows = [
@@ -63,3 +63,12 @@ def _shoe(anatomy, side, height, sole, ease):
         vertices, np.ascontiguousarray(faces), weights, {"template": local.astype(np.float32), "cloth": cloth}
     )
     return turn_in_hems(surface, 0.01)
+
+
+def _outlines(points, levels):
+    """Thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices."""
+    thin, thick = (slices.outlines(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03))
+    shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
+    smooth = slices.blurred(thick, 2)
+    mixed = [a + (b - a) * shin for a, b in ((thin.centers, thick.centers), (thin.radii, smooth.radii))]
+    return slices.Outlines(levels, *mixed)

@@ -79,7 +79,7 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
     outfit = wardrobe.dress_up(rng, anatomy, person.garments)
     if hair.over_ears(person.haircut) or any(g.kind == "headscarf" or "hood_up" in g.details for g in person.garments):
         outfit.removed = outfit.removed | hair.ears(template)
-    hairs = _hair(np.random.default_rng([seed, 21]), anatomy, person)
+    hairs = _hair(np.random.default_rng([seed, 21]), anatomy, person, outfit.trunk)
     skin, cover = _visible_skin(anatomy, outfit)
     tones = person.complexion
     pieces = [
@@ -124,13 +124,13 @@ def _visible_skin(anatomy: Anatomy, outfit: wardrobe.Outfit) -> tuple[Surface, n
     return Surface(bare.vertices, bare.faces, bare.weights, kept), bare.attributes["cover"]
 
 
-def _hair(rng, anatomy, person):
+def _hair(rng, anatomy, person, over):
     """The pieces of hair; what a hat or hood covers is left out."""
     material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
     if any("hood_up" in g.details or g.kind == "headscarf" for g in person.garments):
         parts = hair.style(rng, anatomy, dataclasses.replace(person.haircut, cut="buzz"))
         return [wardrobe.Piece(surface, material) for surface in parts]
-    pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, person.haircut)]
+    pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, person.haircut, over)]
     if not any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments):
         return pieces
     if pieces:  # the scalp's; tails, buns and beards hang out

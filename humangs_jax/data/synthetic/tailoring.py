@@ -99,7 +99,10 @@ def sash(template: Points, shoulder: float, hip: float, half_width: float) -> Fi
     along = np.asarray([hip - shoulder, -0.30 - 0.17])
     along = along / np.linalg.norm(along)
     across = (x - shoulder) * along[1] - (y - 0.17) * along[0]
-    return np.minimum.reduce([half_width - np.abs(across), y + 0.3, 0.186 - np.abs(x) + 0.5 * np.maximum(-y, 0)])
+    half_width = half_width * (
+        1 - 0.6 * np.clip((x * np.sign(hip) - 0.06) / 0.08, 0, 1)
+    )  # the side of the trunk is steep
+    return np.minimum.reduce([half_width - np.abs(across), y + 0.29, np.where(y > -0.02, 0.186, 0.25) - np.abs(x)])
 
 
 def necktie(template: Points, length: float, width: float) -> Field:

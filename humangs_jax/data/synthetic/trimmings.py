@@ -20,12 +20,6 @@ def _trunk(s: Spots):
     return band(s.cloth[:, 3], 0.13, 1.0, 0.01)
 
 
-def _behind(s: Spots):
-    """(n,) metres around from the middle of the back, to the right as one sees it from behind."""
-    half = np.pi * s.cloth[:, 3]
-    return np.where(s.around > 0, s.around - half, s.around + half)
-
-
 def printed(rng: np.random.Generator, fabric: Colouring, base: np.ndarray, number: bool = False) -> Colouring:
     """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a picture."""
     ink = accent(rng, base)
@@ -70,9 +64,9 @@ def printed(rng: np.random.Generator, fabric: Colouring, base: np.ndarray, numbe
         return result
 
     def albedo(s):
-        trunk, y = _trunk(s), s.along - height
-        result = motif(fabric(s), s.around, y, trunk * (s.cloth[:, 2] > 0))
-        return motif(result, _behind(s), y - 0.02, trunk * (s.cloth[:, 2] < 0)) if on_back else result
+        trunk, x, y = _trunk(s), 1.1 * s.template[:, 0], s.template[:, 1] - height
+        result = motif(fabric(s), x, y, trunk * (s.cloth[:, 2] > 0))
+        return motif(result, -x, y - 0.02, trunk * (s.cloth[:, 2] < 0)) if on_back else result
 
     return albedo
 
@@ -83,7 +77,7 @@ def buttoned(rng: np.random.Generator, fabric: Colouring, base: np.ndarray, low:
     pitch, size = rng.uniform(0.07, 0.1), rng.uniform(0.005, 0.0075)
 
     def albedo(s):
-        x, y = s.cloth[:, 0], s.along
+        x, y = s.cloth[:, 0], s.cloth[:, 1]
         front = (s.cloth[:, 2] > 0) * _trunk(s) * band(y, low, high)
         result = fabric(s)
         result = mix(result, result * 0.6, band(np.abs(x - 0.002), 0.0135, 0.016) * front)
@@ -98,7 +92,7 @@ def zipped(rng: np.random.Generator, fabric: Colouring, low: float, high: float,
     ink = colour(0.1, 0.05, rng.choice([0.15, 0.6, 0.75]))
 
     def albedo(s):
-        front = (s.cloth[:, 2] > 0) * _trunk(s) * band(s.along, low, high)
+        front = (s.cloth[:, 2] > 0) * _trunk(s) * band(s.cloth[:, 1], low, high)
         away = np.abs(np.abs(s.cloth[:, 0]) - edge)
         result = fabric(s)
         result = mix(result, result * 0.55, band(away, 0.004, 0.011) * front)
@@ -190,7 +184,7 @@ def banded(fabric: Colouring, ink: np.ndarray, low: float, high: float) -> Colou
     """A sash or waistband between two heights of the trunk."""
 
     def albedo(s):
-        return mix(fabric(s), ink, band(s.along, low, high) * band(s.cloth[:, 3], 0.1, 1.0, 0.01))
+        return mix(fabric(s), ink, band(s.cloth[:, 1], low, high) * band(s.cloth[:, 3], 0.1, 1.0, 0.01))
 
     return albedo
 

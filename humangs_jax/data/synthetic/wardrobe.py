@@ -41,6 +41,7 @@ class Outfit:
     """What has been put on so far. cover: (n,) how far inside of some hem each body vertex is, metres; negative on bare skin.
 
     removed: (n,) body vertices that nobody can see. trunk, legs: distances from the skin of the outermost layer, metres.
+    fit: of the outermost layer on the trunk.
     """
 
     anatomy: Anatomy
@@ -49,18 +50,19 @@ class Outfit:
     removed: np.ndarray
     trunk: float = 0.0
     legs: float = 0.0
+    fit: Fit = dataclasses.field(default_factory=lambda: Fit(ease=0.0))
 
     def add(self, surface: Surface, material: Material, layered: bool = True) -> None:
         """Put one more piece on. layered: whether later layers can hide parts of it."""
         self.pieces.append(Piece(surface, material, np.zeros(len(surface.vertices), bool) if layered else None))
 
-    def hide(self, cover: Cover, margin: float) -> None:
-        """Take away what lies further than a margin inside of a garment that is put on next."""
+    def hide(self, cover: Cover, margin: float, cloth: bool = True) -> None:
+        """Take away what lies further than a margin inside of a garment that is put on next: skin, and cloth if it is below."""
         field = cover(self.anatomy.skin.attributes["template"])
         self.cover = np.maximum(self.cover, field)
         self.removed = self.removed | (field > margin)
         for i, piece in enumerate(self.pieces):
-            if piece.hidden is not None:
+            if cloth and piece.hidden is not None:
                 below = cover(piece.surface.attributes["template"]) > max(margin, 0.03)
                 self.pieces[i] = dataclasses.replace(piece, hidden=piece.hidden | below)
 
@@ -91,7 +93,7 @@ def _builder(kind):
     }.get(kind, _accessory)  # fmt: skip
 
 
-def _put(rng, outfit, fields, fit, material, margin=HEM_MARGIN, finish=lambda surface: surface):
+def _put(rng, outfit, fields, fit, material, margin=HEM_MARGIN, finish=lambda surface: surface, over=True):
     """A shell where all fields (functions of template points) are positive, and what it hides."""
 
     def covered(points):
@@ -99,7 +101,7 @@ def _put(rng, outfit, fields, fit, material, margin=HEM_MARGIN, finish=lambda su
 
     template = outfit.anatomy.skin.attributes["template"]
     surface = finish(shell(rng, outfit.anatomy, [field(template) for field in fields], fit))
-    outfit.hide(covered, margin)
+    outfit.hide(covered, margin, over)
     outfit.add(surface, material)
 
 
@@ -140,6 +142,7 @@ def _top(rng, outfit, garment):
         sleeve=0.003 + (0.035 if sleeve < 0.45 else 0.016) * loose,
         fold=0.0015 + 0.0055 * loose,
         inner=outfit.trunk + 0.5 * LAYER if outfit.trunk else 0.0,
+        skirted=True,
     )
     colours = _sewn(rng, garment, bottom, sleeve if sleeve > 0.2 else None)
     own = garment.fabric.rng(2)
@@ -153,7 +156,7 @@ def _top(rng, outfit, garment):
         colours = trimmings.zipped(own, colours, bottom, 0.2)
     material = Material(colours, wrinkles=0.25 + 0.45 * loose, sheen=0.04)
     _put(rng, outfit, fields, fit, material, HEM_MARGIN + 0.03 * loose)
-    outfit.trunk = ease
+    outfit.trunk, outfit.fit = ease, fit
     if kind in ("shirt", "polo", "blouse") and "collar" in garment.details:
         _collar(rng, outfit, material, fit)
     if kind == "hoodie":
@@ -189,6 +192,7 @@ def _outer(rng, outfit, garment):
         fold=0.002 if padded or kind == "blazer" else 0.002 + 0.003 * loose,
         hem=0.014,
         quilt=0.075 if padded else 0.0,
+        skirted=True,
         inner=outfit.trunk + 0.5 * LAYER,
     )
     colours = _sewn(rng, garment, bottom, sizes["sleeve"] if kind != "vest" else None)
@@ -207,7 +211,7 @@ def _outer(rng, outfit, garment):
         colours, wrinkles=0.15 if kind == "blazer" else 0.3 + 0.2 * loose, sheen=0.12 if padded else 0.05
     )
     _put(rng, outfit, fields, fit, material, 0.03)
-    outfit.trunk = ease
+    outfit.trunk, outfit.fit = ease, fit
     if long:
         width = max(outfit.legs, ease) + 0.002
         tube = Skirt(WAIST + 0.02, bottom, width, sizes["flare"], 5, 0.008, gap, 0.5 * spread)
@@ -256,7 +260,16 @@ def _trousers(rng, outfit, garment):
     material = Material(colours, wrinkles=0.15 + 0.4 * loose, sheen=0.03)
     in_two_legs = lambda surface: surface.with_attributes(cloth=leg_coordinates(surface.attributes["template"]))
     seat = _hips(outfit.anatomy.skin.attributes["template"], top, end)
-    _put(rng, outfit, fields, fit, material, HEM_MARGIN + 0.03 * loose * (kind in ("wide", "shorts")), in_two_legs)
+    _put(
+        rng,
+        outfit,
+        fields,
+        fit,
+        material,
+        HEM_MARGIN + 0.03 * loose * (kind in ("wide", "shorts")),
+        in_two_legs,
+        tucked,
+    )
     outfit.removed = outfit.removed | (seat & (outfit.cover > 0))
     outfit.legs = ease + sizes["width"]
     if not tucked:  # the top hangs over it
@@ -290,7 +303,7 @@ def _skirt(rng, outfit, garment):
     colours = trimmings.hemmed(weave(garment.fabric), (sizes["end"] + 0.02,))
     colours = trimmings.banded(colours, garment.fabric.base * 0.8, sizes["top"] - 0.035, sizes["top"])
     surface = skirt(rng, outfit.anatomy, tube)
-    outfit.hide(lambda t: tailoring.hips_and_legs(t, sizes["top"], sizes["end"]), 0.0)
+    outfit.hide(lambda t: tailoring.hips_and_legs(t, sizes["top"], sizes["end"]), 0.0, tucked)
     outfit.add(surface, Material(colours, wrinkles=0.35, sheen=0.05, draped=True))
     outfit.legs = ease + 0.02
     if not tucked:
@@ -320,7 +333,7 @@ def _dress(rng, outfit, garment):
         colours = trimmings.banded(colours, garment.fabric.other, waist - 0.01, waist + own.uniform(0.02, 0.05))
     material = Material(colours, wrinkles=0.3, sheen=0.05)
     _put(rng, outfit, fields, fit, material, HEM_MARGIN + 0.02 * sizes["loose"])
-    outfit.trunk = fit.ease
+    outfit.trunk, outfit.fit = fit.ease, fit
     tube = Skirt(waist, end, 0.010, _flare(sizes), int(sizes["pleats"]), sizes["depth"])
     surface = skirt(rng, outfit.anatomy, tube)
     outfit.hide(lambda t: tailoring.hips_and_legs(t, waist + 0.03, end), 0.0)
@@ -376,8 +389,8 @@ def _belt(rng, outfit, garment):
 def _tie(rng, outfit, garment):
     template = outfit.anatomy.skin.attributes["template"]
     field = tailoring.necktie(template, garment.sizes["length"], garment.sizes["width"])
-    under = min(outfit.trunk, 0.02)
-    fit = Fit(ease=under + 0.005, fold=0.0, hem=0.004, hang=1.0)
+    raised = outfit.trunk + 0.005 + outfit.fit.fold
+    fit = dataclasses.replace(outfit.fit, ease=raised, inner=raised - 0.002, fold=0.0, hem=0.004)
     outfit.add(shell(rng, outfit.anatomy, [field], fit), Material(weave(garment.fabric), sheen=0.15))
 
 
@@ -388,13 +401,21 @@ def _watch(rng, outfit, garment):
     outfit.add(shell(rng, outfit.anatomy, [field], Fit(ease=0.003, fold=0.0, hem=0.002)), material, layered=False)
 
 
+def _strapped(outfit):
+    """Straps lie on what is worn."""
+    raised = outfit.trunk + 0.009 + 1.5 * outfit.fit.fold
+    return dataclasses.replace(
+        outfit.fit, ease=raised, inner=raised - 0.002, fold=0.0, hem=0.006, quilt=0.0, skirted=True
+    )
+
+
 def _backpack(rng, outfit, garment):
     material = Material(
         trimmings.zipped_bag(garment.fabric.rng(2), weave(garment.fabric), garment.fabric.base), wrinkles=0.1
     )
     outfit.add(accessories.backpack(outfit.anatomy, garment.sizes["size"], outfit.trunk), material, layered=False)
     template = outfit.anatomy.skin.attributes["template"]
-    fit = Fit(ease=outfit.trunk + 0.009, fold=0.0, hem=0.007, inner=outfit.trunk + 0.006)
+    fit = _strapped(outfit)
     strip = shell(rng, outfit.anatomy, [tailoring.straps(template, -0.16, -0.03)], fit)
     outfit.add(strip, Material(weave(garment.fabric)), layered=False)
 
@@ -407,7 +428,7 @@ def _shoulder_bag(rng, outfit, garment):
     outer = max(outfit.trunk, min(outfit.legs, 0.02))
     outfit.add(accessories.shoulder_bag(outfit.anatomy, size, side, outer), material, layered=False)
     template = outfit.anatomy.skin.attributes["template"]
-    fit = Fit(ease=outfit.trunk + 0.009, fold=0.0, hem=0.005, inner=outfit.trunk + 0.006)
+    fit = _strapped(outfit)
     strip = shell(rng, outfit.anatomy, [tailoring.sash(template, -side * 0.105, side * 0.165, 0.014)], fit)
     outfit.add(strip, Material(weave(garment.fabric), sheen=0.12), layered=False)
 
