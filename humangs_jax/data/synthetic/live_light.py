@@ -21,7 +21,9 @@ from humangs_jax.data.synthetic.shading import (
     REACH,
     SCENES,
     SHADOW_DENSITY,
+    SHOULDER,
     STRIDES,
+    WHITEST,
 )
 from humangs_jax.pytree import pytree_dataclass
 
@@ -152,7 +154,9 @@ def shade(
         light += lights.strengths[k] * (wrapped * arrives)[..., None]
         gloss = GLOSS * jnp.clip(cosine, 0, 1) ** 12 * sheen * (lit if k == 0 else 1.0)
         albedo = albedo + gloss[..., None] * lights.strengths[k]
-    return jnp.clip(jnp.minimum(albedo, ALBEDO_LIMIT) * light * lights.gain, 0, 0.97)
+    colours = jnp.maximum(jnp.minimum(albedo, ALBEDO_LIMIT) * light * lights.gain, 0)
+    reach = WHITEST - SHOULDER  # highlights are bent as in `shading.rolled_off`
+    return jnp.minimum(colours, SHOULDER) + reach * (1 - jnp.exp(-jnp.maximum(colours - SHOULDER, 0) / reach))
 
 
 def bend_normals(normals: Float[Array, "*p 3"], slopes: Float[Array, "*p 3"]) -> Float[Array, "*p 3"]:
