@@ -87,6 +87,13 @@ def test_banks_are_read_back_as_they_were(bank, tmp_path):
         live_bank.load_bank(tmp_path / "other.npz")
 
 
+@pytest.mark.slow
+def test_processes_make_the_same_bank(bank, body):
+    apart = live_bank.build_bank(list(SEEDS), body, "demo", texture_size=256, pose_count=4, processes=2)
+    for a, b in zip(jax.tree.leaves(apart), jax.tree.leaves(bank), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
 def test_keys_choose_among_the_people_of_the_bank(bank):
     draw = jax.jit(jax.vmap(lambda key: live._draw_numbers(bank, key, CONFIG)["person"]))
     people = np.asarray(live_pose.pick(draw(jax.random.split(jax.random.key(0), 200)), bank.people))

@@ -173,7 +173,7 @@ def dyes_from(u: Float[Array, "4 m"], groups: Int[Array, " m"], dyeable: Float[A
     """
     turned, turn, pale, bright = u
     hue = jnp.where(turned < 0.5, 2 * np.pi * (turn - 0.5), 0.0)
-    saturation, brightness = jnp.exp(-0.4 + 0.6 * pale), jnp.exp(-0.5 + 0.8 * bright)
+    saturation, brightness = jnp.exp(-0.6 + 0.6 * pale), jnp.exp(-0.5 + 0.8 * bright)
     grey = jnp.full((3, 3), 1 / 3)
     # Rodrigues' formula about (1, 1, 1) / sqrt(3)
     skew = jnp.asarray([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / math.sqrt(3)
