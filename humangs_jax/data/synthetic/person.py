@@ -19,6 +19,7 @@ SHAPE_SPREAD = 0.55
 HEIGHTS = {True: (1.765, 0.085), False: (1.645, 0.08)}
 """Mean and standard deviation of the stature in metres of men (True) and women."""
 HEIGHT_RANGE = (1.42, 2.08)
+TALLEST_WOMAN = 1.95
 YEARS = (15.0, 85.0)
 YOUNG, OLD = 25.0, 90.0
 """Years at which the body's age coefficient is 0 and 1."""
@@ -73,7 +74,7 @@ def sample_shape(
     mean, spread = HEIGHTS[male]
     youth = 0.04 * np.clip(18 - years, 0, 3) / 3 + 0.03 * np.clip((years - 60) / 25, 0, 1)
     tall = rng.standard_t(5) if rng.random() < 0.85 else rng.uniform(-2.6, 3.4)
-    wanted = np.clip(mean - youth + spread * tall, *HEIGHT_RANGE)
+    wanted = np.clip(mean - youth + spread * tall, HEIGHT_RANGE[0], HEIGHT_RANGE[1] if male else TALLEST_WOMAN)
     stature, gains = _stature(body)
     share = np.asarray([gains[at[name]] for name in LENGTHS])
     missing = wanted - (stature + gains @ betas)

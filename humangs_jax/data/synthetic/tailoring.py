@@ -76,9 +76,9 @@ def lapel(template: Points, gap: float, spread: float, bottom: float) -> Field:
 
 
 def hips_and_legs(template: Points, top: float, bottom: float) -> Field:
-    """Positive on what a tube around hips and legs hides, down to a hand's breadth above its hem: it may be seen from below."""
+    """Positive on what a tube around hips and legs hides, down to two hands above its hem: they may be seen from below."""
     x, y, _ = template.T
-    return np.minimum.reduce([top - 0.03 - y, y - bottom - 0.06, TRUNK_HALF_WIDTH - np.abs(x)])
+    return np.minimum.reduce([top - 0.03 - y, y - bottom - 0.16, TRUNK_HALF_WIDTH - np.abs(x)])
 
 
 def shaft(template: Points, height: float) -> Field:
