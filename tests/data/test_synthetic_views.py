@@ -205,6 +205,42 @@ def test_processes_write_the_same_files(tmp_path):
         assert all(np.array_equal(a[key], b[key]) for key in a)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "layout", "first"),
+    [
+        (("--subjects", "3"), writer.Layout(512, 1, 60, 12), 0),
+        (("--size", "128", "--poses", "4", "--sequences", "--frames", "30", "--depth", "--first", "7"),
+         writer.Layout(128, 4, 60, 12, frames=30, depth=True), 7),
+        (("--views", "4", "--close-views", "0", "--held-out", "8", "--maps"),
+         writer.Layout(512, 1, 4, 0, 8, maps=True), 0),
+        (("--for-training",), writer.Layout(256, 2, 12), 0),
+    ],
+)  # fmt: skip
+def test_the_command_line_asks_for_layouts(arguments, layout, first, tmp_path, monkeypatch):
+    from humangs_jax import cli
+
+    asked = []
+    monkeypatch.setattr(writer, "write_set", lambda *a, **k: asked.append((a, k)) or [tmp_path])
+    monkeypatch.setattr("sys.argv", ["humangs", "synth", "--out", str(tmp_path), *arguments])
+    cli.main()
+    ((_, _, *rest), keywords) = asked[0]
+    assert rest == [layout, "train", first] and keywords["workers"] >= 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--subjects", "0"), ("--held-out", "-1"), ("--sequences", "--poses", "9", "--frames", "8")]
+)
+def test_wrong_numbers_are_one_line(arguments, tmp_path, monkeypatch, capsys):
+    from humangs_jax import cli
+
+    monkeypatch.setattr("sys.argv", ["humangs", "synth", "--out", str(tmp_path / "new"), *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and error.count("\n") == 1 and arguments[-2] in error
+    assert not (tmp_path / "new").exists()
+
+
 # Nobody of the test split can be drawn in training: all ways to people go through seeds of a split ----------------------
 
 

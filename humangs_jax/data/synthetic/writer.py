@@ -258,7 +258,7 @@ def _make(seeds, folders, layout, body, workers):
         for seed in seeds:
             yield seed, _attempt(folders[seed], seed, body, layout)
         return
-    import concurrent.futures
+    import concurrent.futures.process
     import multiprocessing
 
     context = multiprocessing.get_context("spawn")
@@ -268,6 +268,10 @@ def _make(seeds, folders, layout, body, workers):
         try:
             for future in concurrent.futures.as_completed(futures):
                 yield futures[future], future.result()
+        except concurrent.futures.process.BrokenProcessPool as error:
+            raise OSError(
+                "a process that makes people was killed, perhaps for want of memory: try fewer workers"
+            ) from error
         except BaseException:  # interrupted: nobody waits for people half made
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
