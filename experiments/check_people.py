@@ -136,11 +136,14 @@ def look_at_all(body, arguments):
                 | dict(zip(names, counts[1:] / counts[0], strict=True))
             )
     pixels = np.asarray([row["pixels"] for row in rows])
-    numbers = {"built": arguments.subjects, "pictures": len(rows) * arguments.views}
+    numbers: dict = {"built": arguments.subjects, "pictures": len(rows) * arguments.views}
     for name in ("poking", "poking_deep", "hollow", "gaps"):
         each = np.asarray([row[name] for row in rows])
-        numbers[name] = {"mean": float((each * pixels).sum() / pixels.sum()), "worst": float(each.max())}
-        numbers[name]["poses_above_0.1_percent"] = float((each > 1e-3).mean())
+        numbers[name] = {
+            "mean": float((each * pixels).sum() / pixels.sum()),
+            "worst": float(each.max()),
+            "poses_above_0.1_percent": float((each > 1e-3).mean()),
+        }
     numbers["foreground_share"] = _spread(np.asarray(shares))
     numbers["colour_cells_used"] = float((colours / colours.sum() > 1e-3).mean())
     angles = np.stack(angles)

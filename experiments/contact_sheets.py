@@ -11,10 +11,11 @@ import argparse
 from pathlib import Path
 
 SHEETS = ("front_back", "views", "close", "sequences")
-FRONT_BACK_SIZE, VIEW_SIZE, CLOSE_SIZE = (112, 208), (128, 208), (224, 224)
+FRONT_BACK_SIZE, VIEW_SIZE, CLOSE_SIZE = (152, 188), (148, 176), (256, 256)
 """Width and height of one picture, pixels."""
 COLUMNS = 16
 MOTION_FRAMES = 75
+QUALITY = 85
 TELE = 0.42
 """Vertical field of view of pictures that show the whole person, radians."""
 
@@ -190,8 +191,10 @@ def _write(file, picture):
     import numpy as np
 
     pixels = np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8)
-    options = {"quality": 85} if file.suffix == ".jpg" else {}
-    iio.imwrite(file, pixels, **options)
+    if file.suffix == ".jpg":
+        iio.imwrite(file, pixels, quality=QUALITY)
+    else:
+        iio.imwrite(file, pixels)
 
 
 if __name__ == "__main__":

@@ -142,11 +142,7 @@ def scarf(rng: np.random.Generator, anatomy: Anatomy, thickness: float, tails: f
     for turn, lift in enumerate((-0.004, 0.022)):
         ring, outwards = neck_ring(anatomy, lift)
         lumps = 1 + 0.16 * ripples(rng, 3 * ring + turn, 0.25)
-        path = (
-            ring + outwards * (0.75 * thickness + min(ease, 0.015))[:, None]
-            if np.ndim(thickness)
-            else ring + outwards * (0.75 * thickness + min(ease, 0.015))
-        )
+        path = ring + outwards * (0.75 * thickness + min(ease, 0.015))
         path[:, 1] += 0.014 + 0.006 * np.sin(np.arange(RING) * (2 * np.pi / RING) + turn * 2.1)
         widths = np.stack([1.15 * thickness * lumps, 0.85 * thickness / lumps], -1)
         vertices, faces = sweep(path, np.tile([0.0, 1.0, 0.0], (RING, 1)), widths, 12, closed=True)

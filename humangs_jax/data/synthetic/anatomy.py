@@ -23,6 +23,8 @@ ARMHOLE = 0.185
 """Distance from the middle at which sleeves are sewn on."""
 TRUNK_GIRTH, LEG_GIRTH, ARM_GIRTH = 0.16, 0.08, 0.06
 """Radii that turn angles around trunk, legs and arms into metres of cloth."""
+SAME_GIRTH = 1e-4
+"""What rounding may do to them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +65,7 @@ def leg_membership(template: np.ndarray) -> np.ndarray:
 def cloth_coordinates(template: np.ndarray) -> np.ndarray:
     """(n, 4) x, y, z around the axis of trunk or leg, and the girth radius that turns angles into metres.
 
-    The angle atan2(x, z) is 0 in front. Arms go on as the trunk does; `sleeve_coordinates` gives them their own.
+    The angle atan2(x, z) is 0 in front. Arms go on as the trunk does; `sewn_coordinates` gives them their own.
     """
     x, y, z = template.T
     trunk = np.stack([x, y, z - 0.02, np.full_like(x, TRUNK_GIRTH)], -1)
@@ -79,20 +81,23 @@ def leg_coordinates(template: np.ndarray) -> np.ndarray:
     return leg.astype(np.float32)
 
 
-def sleeve_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
-    """Cloth coordinates (n, 4) with those beyond the armhole replaced by coordinates around the arm.
+def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
+    """Cloth coordinates (n, 4) with those of arms and legs replaced by coordinates around the limb that the point is on.
 
-    Arms are turned down, so that y runs along every limb. Only cloth with the trunk's girth has sleeves.
+    What was interpolated across a seam (armholes; the middle of trousers) is sharp there again. Arms are turned down, so that y
+    runs along every limb. Only cloth with the trunk's girth has sleeves, only cloth with the legs' girth has legs.
     """
     x, y, z = template.T
-    on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(cloth[:, 3] - TRUNK_GIRTH) < 0.004)
-    if not on_arm.any():
+    girth = cloth[:, 3]
+    on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(girth - TRUNK_GIRTH) < SAME_GIRTH)
+    on_leg = (np.abs(girth - LEG_GIRTH) < SAME_GIRTH) & (y < -0.15) & (y > -1.3)
+    if not (on_arm.any() or on_leg.any()):
         return cloth
+    result = np.array(cloth)
+    result[on_leg] = leg_coordinates(template[on_leg])
     x, y, z = x[on_arm], y[on_arm], z[on_arm]
     around = np.where(x < 0, -1.0, 1.0) * (y - ARM_HEIGHT)
-    arm = np.stack([around, ARM_HEIGHT - (np.abs(x) - SHOULDER), z, np.full_like(x, ARM_GIRTH)], -1)
-    result = np.array(cloth)
-    result[on_arm] = arm
+    result[on_arm] = np.stack([around, ARM_HEIGHT - (np.abs(x) - SHOULDER), z, np.full_like(x, ARM_GIRTH)], -1)
     return result
 
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.array_types import Float
-from humangs_jax.data.synthetic.anatomy import ARMHOLE, TRUNK_GIRTH, sleeve_coordinates
+from humangs_jax.data.synthetic.anatomy import ARMHOLE, SAME_GIRTH, TRUNK_GIRTH, sewn_coordinates
 
 SHOULDER_RIDGE = -0.02
 """Template z of the line from neck to shoulder on which front and back are sewn together."""
@@ -23,14 +23,14 @@ ALBEDO_LIMIT = 0.88
 class Spots:
     """Points on a surface. cloth: (n, 4), see `anatomy.cloth_coordinates`. template: (n, 3) template coordinates.
 
-    Beyond the armhole the cloth's coordinates are those of the sleeve, whatever was given: patterns meet at a seam there.
+    Coordinates of sleeves and trouser legs are made sharp at their seams, where patterns meet, whatever was given.
     """
 
     cloth: Float[np.ndarray, "n 4"]
     template: Float[np.ndarray, "n 3"]
 
     def __post_init__(self):
-        object.__setattr__(self, "cloth", sleeve_coordinates(self.cloth, self.template))
+        object.__setattr__(self, "cloth", sewn_coordinates(self.cloth, self.template))
 
     @property
     def around(self) -> Float[np.ndarray, " n"]:
@@ -53,7 +53,7 @@ class Spots:
     @property
     def _on_trunk(self):
         """(n,) whether this is cloth of a trunk, inside of the armholes."""
-        return (np.abs(self.cloth[:, 3] - TRUNK_GIRTH) < 0.004) & (np.abs(self.template[:, 0]) <= ARMHOLE)
+        return (np.abs(self.cloth[:, 3] - TRUNK_GIRTH) < SAME_GIRTH) & (np.abs(self.template[:, 0]) <= ARMHOLE)
 
     @property
     def _on_shoulders(self):

@@ -10,7 +10,7 @@ import numpy as np
 
 from humangs_jax.data.synthetic import anatomy as anatomy_module
 from humangs_jax.data.synthetic import slices
-from humangs_jax.data.synthetic.anatomy import ANKLE, Anatomy, sleeve_coordinates, smoothstep
+from humangs_jax.data.synthetic.anatomy import ANKLE, Anatomy, sewn_coordinates, smoothstep
 from humangs_jax.data.synthetic.noise import ripples
 from humangs_jax.data.synthetic.surfaces import (
     Surface,
@@ -95,7 +95,7 @@ def _drape(rng, anatomy, surface, fit):
     outer = vertex_normals(points, surface.faces)
     cloth = smooth(surface.attributes["cloth"], surface.faces, 10, keep_hems=True)  # as the points were
     template = smooth(surface.attributes["template"], surface.faces, 8, keep_hems=True)
-    along_limbs = sleeve_coordinates(cloth, template)
+    along_limbs = sewn_coordinates(cloth, template)
     points = points + fold_heights(rng, along_limbs, arm, leg, fit)[:, None] * outer
     distance = np.sum((points - below) * surface.attributes["normals"], -1)
     least = max(0.55 * fit.ease, fit.inner)

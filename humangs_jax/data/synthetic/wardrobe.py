@@ -114,7 +114,7 @@ def _sewn(rng, garment, bottom=None, sleeve=None):
         colours, () if bottom is None else (bottom + 0.018,), None if sleeve is None else sleeve - 0.016
     )
     colours = trimmings.seamed(colours)
-    if "ribbed" in garment.details and sleeve is not None:
+    if "ribbed" in garment.details and bottom is not None and sleeve is not None:
         colours = trimmings.ribbed(colours, bottom, sleeve)
     if "print" in garment.details or "number" in garment.details:
         colours = trimmings.printed(own, colours, base, number="number" in garment.details)
