@@ -1,6 +1,8 @@
 """The loader: deterministic, resumable, and never silent about what it leaves out."""
 
+import json
 import logging
+import shutil
 import threading
 
 import jax
@@ -13,6 +15,7 @@ from hypothesis import strategies as st
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data import capture_reading
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
+from humangs_jax.data.images import write_png
 from humangs_jax.data.loader import (
     CaptureCache,
     ExampleSource,
@@ -25,6 +28,7 @@ from humangs_jax.data.loader import (
     store_capture,
     subject_order,
 )
+from humangs_jax.data.loading.outlines import read_outline
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 FLOAT32 = 1e-6
@@ -209,26 +213,104 @@ def test_leaving_the_loop_ends_the_thread(source):
     assert not [t for t in threading.enumerate() if t.name == "humangs-loader"]
 
 
-def test_the_memory_limit_only_costs_time(folder):
-    bounded = CaptureCache(find_captures(folder), small_body(), limit_bytes=store_bytes(folder))
-    assert [bounded.load(i) is bounded.load(i) for i in range(3)] == [True, False, False]
-    assert same(bounded.load(2), CaptureCache(find_captures(folder), small_body()).load(2))
-
-
-def test_beyond_the_memory_limit_only_the_views_in_question_are_read(folder, monkeypatch):
-    examples = lambda cache: [
-        ExampleSource(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(step) for step in range(6)
-    ]
-    kept = examples(CaptureCache(find_captures(folder), small_body()))
-    forgetful = CaptureCache(find_captures(folder), small_body(), limit_bytes=0)
-    assert all(same(a, b) for a, b in zip(kept, examples(forgetful), strict=True))
+@pytest.mark.parametrize("limit", [0, 20 * SIZE * SIZE * 4, 1 << 30])
+def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder, monkeypatch, limit):
     read = []
-    monkeypatch.setattr(
-        "humangs_jax.data.capture.read_view", lambda *a: read.append(a) or capture_reading.read_view(*a)
+
+    def reading(*arguments):
+        if threading.current_thread() is threading.main_thread():  # threads of tests before this one may still be at it
+            read.append(arguments)
+        return capture_reading.read_view(*arguments)
+
+    monkeypatch.setattr("humangs_jax.data.capture.read_view", reading)
+    examples = lambda cache: [
+        ExampleSource(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(s) for s in range(6)
+    ]
+    cache = CaptureCache(find_captures(folder), small_body(), limit_bytes=limit)
+    first = examples(cache)
+    counts = [len(read)]
+    again = examples(cache)
+    counts.append(len(read) - counts[0])
+    drawn = 6 * 2 * 4  # 2 views shown and 2 asked for
+    distinct = len({(path, view["image"]) for path, view, _ in read})
+    if limit == 0:
+        assert counts == [drawn, drawn]
+    elif limit == 1 << 30:
+        assert counts == [distinct, 0]
+    else:  # of 20 views there is room
+        assert counts[1] < counts[0] <= drawn and counts[1] > 0
+    stored = [store_capture(path, small_body()) for path in find_captures(folder)]
+    for batch, same_batch in zip(first, again, strict=True):
+        assert same(batch, same_batch)
+        for (subject, view), image in zip(
+            [g for row in range(2) for g in greys(jax.tree.map(lambda x, row=row: x[row], batch.inputs))],
+            np.asarray(batch.inputs.images).reshape(-1, SIZE, SIZE, 3),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(image, stored[subject].images[view] / np.float32(255))
+
+
+def test_a_picture_that_only_decoding_finds_broken_costs_its_examples_alone(folder, tmp_path, monkeypatch):
+    """Whatever was asked for before: a resumed run does not know what an earlier one found out."""
+    write_subject(tmp_path / "s2", 2)
+    folders = (folder / "s0", tmp_path / "s2")
+
+    def reading(path, view, on_white):
+        if path == tmp_path / "s2" and view["image"].endswith("003.png"):
+            raise OSError("003.png: bad bytes with a right checksum")
+        return capture_reading.read_view(path, view, on_white)
+
+    monkeypatch.setattr("humangs_jax.data.capture.read_view", reading)
+    new = lambda: ExampleSource(CaptureCache(folders, small_body()), SAMPLING, SIZE, SIZE)
+    whole = new()
+    examples = [whole.example_at(i, 2) for i in range(40)]
+    subjects = [greys(example.inputs)[0][0] for example in examples]
+    assert 40 > subjects.count(0) > 20 and subjects.count(2) > 0
+    seen = {view for example in examples for views in (example.inputs, example.targets) for view in greys(views)}
+    assert (2, 3) not in seen and (2, 4) in seen
+    assert list(whole.cache.broken) == [tmp_path / "s2"]
+    assert all(same(examples[i], new().example_at(i, 2)) for i in range(0, 40, 3))
+
+
+def test_outlines_find_every_fault_without_decoding(folder, tmp_path, monkeypatch):
+    monkeypatch.setattr("humangs_jax.data.capture.read_view", None)
+    whole = read_outline(folder / "s1", small_body())
+    assert whole.images.shape == (0, SIZE, SIZE, 3) and whole.frames.tolist() == [0, 1, 0, 1, 0, 1]
+
+    def broken(change):
+        root = tmp_path / str(len(list(tmp_path.iterdir())))
+        shutil.copytree(folder / "s1", root)
+        change(root)
+        with pytest.raises(ValueError) as error:
+            read_outline(root, small_body())
+        return str(error.value)
+
+    def flip(root):
+        data = bytearray((root / "images" / "002.png").read_bytes())
+        data[-20] ^= 1
+        (root / "images" / "002.png").write_bytes(bytes(data))
+
+    def edit(**changes):
+        def change(root):
+            description = json.loads((root / "capture.json").read_text())
+            description["views"][4] |= changes
+            (root / "capture.json").write_text(json.dumps(description))
+
+        return change
+
+    assert "002.png: not a readable image" in broken(flip)
+    cut = lambda root: (root / "masks" / "001.png").write_bytes((root / "masks" / "001.png").read_bytes()[:60])
+    assert "001.png: not a readable image" in broken(cut)
+    assert "005.png: no such image file" in broken(lambda root: (root / "images" / "005.png").unlink())
+    small = np.zeros((SIZE // 2, SIZE, 3), np.float32)
+    assert "003.png: size: (16, 8), but the first" in broken(lambda root: write_png(root / "images" / "003.png", small))
+    assert "000.png: size: (16, 8), but its image" in broken(
+        lambda root: write_png(root / "masks" / "000.png", small[..., 0])
     )
-    again = examples(forgetful)
-    assert len(read) == 6 * 2 * 4  # of 6 views each, 2 are shown and 2 asked for
-    assert all(same(a, b) for a, b in zip(kept, again, strict=True))
+    assert "views[4].frame: expected 0 to 1" in broken(edit(frame=2))
+    assert "views[4].K: expected shape (3, 3)" in broken(edit(K=[1, 2]))
+    assert "views[4]" in broken(edit(cam_from_world=np.zeros((4, 4)).tolist()))
+    assert "no such file" in broken(lambda root: (root / "body.npz").unlink())
 
 
 def test_some_views_of_a_capture(folder):
@@ -238,10 +320,6 @@ def test_some_views_of_a_capture(folder):
     np.testing.assert_array_equal(some.cameras.cam_from_world, whole.cameras.cam_from_world[jnp.asarray([4, 1])])
     assert some.names == ("004", "001") and some.frames.tolist() == [0, 1]
     np.testing.assert_array_equal(some.poses.rotations, whole.poses.rotations)
-
-
-def store_bytes(folder):
-    return store_capture(folder / "s0", small_body()).size_bytes
 
 
 def test_a_folder_without_captures_is_named(tmp_path):

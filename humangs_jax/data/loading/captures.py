@@ -1,4 +1,4 @@
-"""Capture folders as a source: subjects are kept decoded as bytes; a folder that cannot be used is left out, and named."""
+"""Capture folders as a source: pictures are kept decoded as bytes; a folder that cannot be used is left out, and named."""
 
 import dataclasses
 import logging
@@ -11,8 +11,9 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.images import to_uint8
-from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_views, subject_views
+from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_views, shrink, subject_views
 from humangs_jax.data.loading.order import subject_order, view_generator
+from humangs_jax.data.loading.outlines import read_outline
 
 logger = logging.getLogger("humangs_jax.data.loader")
 
@@ -30,36 +31,17 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
     return tuple(folders)
 
 
-def store_capture(path: str | Path, body: BodyModel, views: Sequence[int] | None = None) -> StoredSubject:
-    """Read a capture folder whose parameters belong to `body`, or some of its views. Raises: ValueError naming file and field.
-
-    Azimuths are about the middle of the cameras read.
-    """
-    capture = load_capture(path, body=body, views=views)
-    if capture.masks is None:
-        raise ValueError(f"{path}: no masks: training needs to know where the person is")
-    shape_count = body.shape_directions.shape[-1]
-    centers = np.asarray(capture.cameras.center)
-    offsets = centers - centers.mean(axis=0)
-    return StoredSubject(
-        images=to_uint8(capture.images),
-        masks=to_uint8(capture.masks),
-        K=np.asarray(capture.cameras.K),
-        cam_from_world=np.asarray(capture.cameras.cam_from_world),
-        frames=np.asarray(capture.frames),
-        azimuths=np.arctan2(offsets[:, 0], offsets[:, 2]),
-        rotations=np.asarray(capture.poses.rotations),
-        translations=np.asarray(capture.poses.translation),
-        # coefficients that a capture leaves out are 0: one length for all, so that subjects stack
-        betas=np.pad(np.asarray(capture.betas, np.float32), (0, shape_count - len(capture.betas))),
-    )
+def store_capture(path: str | Path, body: BodyModel) -> StoredSubject:
+    """Read a whole capture folder whose parameters belong to `body`. Raises: ValueError naming file and field."""
+    cache = CaptureCache([path], body)
+    outline = read_outline(path, body)
+    return cache.some_views(0, range(len(outline.frames)))
 
 
 class CaptureCache:
-    """Capture folders, checked as a whole when first asked for and kept as bytes up to a limit.
+    """Capture folders: each is checked when first asked for; pictures are decoded when wanted, and kept as bytes up to a limit.
 
-    Of those beyond the limit all but the pixels is kept, and the views that are wanted are read again. Several threads may
-    ask at once. broken: folder -> what is wrong with it, in the order of discovery.
+    Several threads may ask at once. broken: folder -> what is wrong with it, in the order of discovery.
     """
 
     def __init__(self, folders: Sequence[str | Path], body: BodyModel, limit_bytes: int = 4 << 30):
@@ -68,66 +50,89 @@ class CaptureCache:
         self.folders = tuple(Path(folder) for folder in folders)
         self.broken: dict[Path, str] = {}
         self._body, self._free_bytes = body, limit_bytes
-        self._stored: dict[Path, StoredSubject] = {}
+        self._left_out: set[Path] = set()
         self._outlines: dict[Path, StoredSubject] = {}
+        self._pictures: dict[tuple[Path, int], tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self.folders)
 
-    def load(self, index: int) -> StoredSubject | None:
-        """The subject of folder `index`; None if it is broken, which is told once."""
+    def outline(self, index: int) -> StoredSubject | None:
+        """The subject of folder `index` without pictures, see `read_outline`; None if it is broken, which is told once."""
         folder = self.folders[index]
         with self._lock:
-            if folder in self.broken:
+            if folder in self._left_out:
                 return None
-            if folder in self._stored:
-                return self._stored[folder]
+            if folder in self._outlines:
+                return self._outlines[folder]
         try:
-            subject = store_capture(folder, self._body)
+            outline = read_outline(folder, self._body)
         except (ValueError, OSError) as error:
             self.report(index, str(error))
             return None
         with self._lock:
-            nothing = {name: getattr(subject, name)[:0] for name in ("images", "masks")}
-            self._outlines[folder] = subject._replace(**{name: array.copy() for name, array in nothing.items()})
-            if folder not in self._stored and folder not in self.broken and subject.size_bytes <= self._free_bytes:
-                self._stored[folder] = subject
-                self._free_bytes -= subject.size_bytes
-        return subject
-
-    def outline(self, index: int) -> StoredSubject | None:
-        """The subject of folder `index`, images and masks possibly empty; None if it is broken."""
-        with self._lock:
-            known = self._outlines.get(self.folders[index])
-        return self.load(index) if known is None or self.folders[index] in self.broken else known
+            return self._outlines.setdefault(folder, outline)
 
     def some_views(self, index: int, views: Sequence[int]) -> StoredSubject:
-        """The subject of folder `index` with these views alone, in this order. Raises: ValueError, OSError."""
+        """The subject of folder `index` with these views alone, in this order. Raises: ValueError naming file and field."""
+        folder = self.folders[index]
         with self._lock:
-            stored = self._stored.get(self.folders[index])
-        if stored is None:
-            return store_capture(self.folders[index], self._body, views)
+            outline = self._outlines.get(folder)
+            pictures = {view: self._pictures[folder, view] for view in views if (folder, view) in self._pictures}
+        outline = read_outline(folder, self._body) if outline is None else outline
+        if missing := [view for view in views if view not in pictures]:
+            capture = load_capture(folder, body=self._body, views=missing)
+            assert capture.masks is not None  # the outline has seen them
+            images, masks = to_uint8(capture.images), to_uint8(capture.masks)
+            for view, image, mask in zip(missing, images, masks, strict=True):
+                pictures[view] = image, mask
+                self._keep(folder, view, image, mask)
         chosen = np.asarray(views)
-        of_views = ("images", "masks", "K", "cam_from_world", "frames", "azimuths")
-        return stored._replace(**{name: getattr(stored, name)[chosen] for name in of_views})
+        images, masks = (np.stack(column) for column in zip(*(pictures[view] for view in views), strict=True))
+        of_views = {name: getattr(outline, name)[chosen] for name in ("K", "cam_from_world", "frames", "azimuths")}
+        return outline._replace(images=images, masks=masks, **of_views)
 
-    def report(self, index: int, problem: str) -> None:
-        """Leave folder `index` out from now on.
+    def load(self, index: int) -> StoredSubject | None:
+        """The whole subject of folder `index`; None if it is broken, which is told once."""
+        outline = self.outline(index)
+        if outline is None:
+            return None
+        try:
+            return self.some_views(index, range(len(outline.frames)))
+        except (ValueError, OSError) as error:
+            self.note(index, str(error))
+            return None
 
-        Raises: ValueError, naming the last problem, once every folder is left out.
-        """
+    def note(self, index: int, problem: str) -> None:
+        """Name folder `index` as broken, in the log the first time; what is not wrong with it is still used."""
         folder = self.folders[index]
         with self._lock:
             known = folder in self.broken
-            self.broken[folder] = problem
-            dropped = self._stored.pop(folder, None)
-            self._free_bytes += dropped.size_bytes if dropped is not None else 0
+            self.broken.setdefault(folder, problem)
             count = len(self.broken)
         if not known:
             logger.warning("left out %s (%d of %d folders so far): %s", folder, count, len(self), problem)
+
+    def report(self, index: int, problem: str) -> None:
+        """Leave folder `index` out from now on. That must depend on the folder alone, never on when or for what it is asked.
+
+        Raises: ValueError, naming the last problem, once every folder is left out.
+        """
+        self.note(index, problem)
+        with self._lock:
+            self._left_out.add(self.folders[index])
+            count = len(self._left_out)
         if count == len(set(self.folders)):
             raise ValueError(f"none of the {len(self)} capture folders can be used; the last one: {problem}")
+
+    def _keep(self, folder, view, image, mask):
+        size = image.nbytes + mask.nbytes
+        with self._lock:
+            if (folder, view) not in self._pictures and size <= self._free_bytes:
+                # copies: a slice would keep the memory of all views that were read with it
+                self._pictures[folder, view] = image.copy(), mask.copy()
+                self._free_bytes -= size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,12 +170,17 @@ class CaptureSource:
                 continue
             try:
                 inputs, targets = draw_views(view_generator(seed, index), outline, input_count, self.sampling)
-                seen = self.cache.some_views(subject_index, [*inputs, *targets])
-                order_of = range(len(seen.frames))
-                return Example(
-                    subject_views(seen, order_of[: len(inputs)], self.input_size),
-                    subject_views(seen, order_of[len(inputs) :], self.target_size),
-                )
-            except (ValueError, OSError) as error:
+                for size in (self.input_size, self.target_size):
+                    shrink(outline.images, size)  # of no views: can pictures of this size be shrunk so?
+            except ValueError as error:
                 self.cache.report(subject_index, f"{self.cache.folders[subject_index]}: {error}")
+                continue
+            try:
+                seen = self.cache.some_views(subject_index, [*inputs, *targets])
+            except (ValueError, OSError) as error:
+                # this example goes to the next subject; others, of other views, do not: the order depends on files alone
+                self.cache.note(subject_index, str(error))
+                continue
+            shown, asked = range(len(inputs)), range(len(inputs), len(inputs) + len(targets))
+            return Example(subject_views(seen, shown, self.input_size), subject_views(seen, asked, self.target_size))
         raise ValueError(f"none of the {len(self.cache)} capture folders can be used")
