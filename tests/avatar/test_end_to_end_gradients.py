@@ -5,8 +5,8 @@ maps that come with them, and pose, shape and camera of every target. Depth maps
 `prepare_inputs`, which rasterizes, is not differentiated: training stops gradients there.
 
 The loss has jumps and kinks: a splat's alpha crosses 1/255 on a pixel, two splats change places, a unit of a ReLU turns
-on, a position leaves a texel. A jump within a step spoils its difference, so smaller steps are tried as well: no step
-rescues a wrong gradient.
+on, a position leaves a texel. A jump within a step spoils its difference, so differences to both sides and smaller steps
+are tried as well: none of them rescues a wrong gradient.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.forward import draw_targets, white_backgrounds
 from humangs_jax.training.step import loss_terms
 
-VERTICES, JOINTS, VIEWS, TARGETS, SIZE, TARGET_SIZE = 300, 55, 2, 2, 32, 24
+VERTICES, JOINTS, VIEWS, TARGETS, SIZE, TARGET_SIZE = 200, 55, 2, 2, 32, 24
 CHANGES = (1e-8, 1e-9, 1e-10)
 """What a step is to change the loss by. The loss is about 0.4, its rounding a few 1e-17."""
 AGREEMENT = 5e-6
@@ -121,12 +121,18 @@ def float64():
 
 
 def as_dtype(tree, dtype):
-    return jax.tree.map(lambda x: x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x, tree)
+    """In numpy, as all sums over points are here: jax would compile an operation for every shape of a leaf."""
+    cast = lambda x: x.astype(dtype) if np.issubdtype(x.dtype, np.floating) else x
+    return jax.tree.map(lambda x: cast(np.asarray(x)), tree)
+
+
+def as_jax(tree):
+    return jax.tree.map(jnp.asarray, tree)
 
 
 @functools.cache
 def body():
-    return as_dtype(decimate(load_body(), VERTICES), jnp.float64)
+    return as_jax(as_dtype(decimate(load_body(), VERTICES), np.float64))
 
 
 def cameras(count, size, distance, azimuth):
@@ -167,7 +173,7 @@ def random_variables(config):
         fan_in = np.prod(leaf.shape[:-1]) if leaf.ndim > 1 else 100
         return small * noise / np.sqrt(fan_in)
 
-    return jax.tree_util.tree_map_with_path(lambda path, leaf: jnp.asarray(draw(path, leaf), jnp.float64), shapes)
+    return jax.tree_util.tree_map_with_path(draw, shapes)
 
 
 def group_of(path):
@@ -234,7 +240,7 @@ def compiled(case, dtype):
         targets = replace(targets, cameras=point["target_cameras"], **point["target_pose"])
         variables = {"params": point["params"], "batch_stats": batch_stats}
         outputs, _ = apply_humangs(variables, inputs, config.model, case.train)
-        drawn = draw_targets(outputs, own_body, targets, white_backgrounds(targets), config)
+        drawn = draw_targets(outputs, as_jax(own_body), targets, white_backgrounds(targets), config)
         terms = loss_terms(drawn, outputs, targets.images, targets, config.loss)
         total = sum(getattr(config.loss, name) * term for name, term in terms.items())
         return total, {"overflow": jnp.sum(drawn.overflow), "dropped": outputs.dropped_tokens, "alpha": drawn.alpha}
@@ -253,27 +259,27 @@ def by_group(point):
 
 
 def root_mean_square(x):
-    return jnp.sqrt(jnp.mean(x**2))
+    return np.sqrt(np.mean(np.square(x)))
 
 
 def random_direction(point, paths, rng):
     """Moves those leaves, each by about its own size, and nothing else."""
 
     def draw(path, leaf):
-        return jnp.asarray(rng.normal(size=leaf.shape)) * root_mean_square(leaf) * (path in paths)
+        return rng.normal(size=leaf.shape) * root_mean_square(leaf) * (path in paths)
 
     return jax.tree_util.tree_map_with_path(draw, point)
 
 
 def inner(a, b):
-    return sum(float(jnp.vdot(x, y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+    return sum(float(np.vdot(x, y)) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
 
 
 def check_gradients(case):
     function, point, fixed = compiled(case, jnp.float64)
-    (_, facts), gradients = function(point, fixed)
+    (loss, facts), gradients = jax.device_get(function(point, fixed))
     assert int(facts["overflow"]) == int(facts["dropped"]) == 0
-    assert SEEN[0] < float(jnp.mean(facts["alpha"])) < SEEN[1]
+    assert SEEN[0] < np.mean(facts["alpha"]) < SEEN[1]
     rng = np.random.default_rng(3)
     assert set(by_group(point)) == {*PARAMETER_GROUPS, *OTHERS} - ({"upsampler"} if case.bare else set())
     for group, paths in by_group(point).items():
@@ -290,7 +296,9 @@ def check_gradients(case):
         errors = []
         for change in CHANGES:
             step = change / expected
-            errors.append(abs((value(step) - value(-step)) / (2 * step) - derivative) / expected)
+            forward, backward = (value(step) - loss) / step, (loss - value(-step)) / step
+            differences = np.asarray([(forward + backward) / 2, forward, backward])
+            errors.append(np.abs(differences - derivative).min() / expected)
             if errors[-1] < AGREEMENT:
                 break
         assert errors[-1] < AGREEMENT, f"{group}: {errors}"
@@ -309,30 +317,31 @@ def test_gradients_agree_with_differences_however_configured(case):
 
 def turned_away(cameras):
     """The same cameras looking in the opposite direction."""
-    about = jnp.diag(jnp.asarray([-1.0, 1.0, -1.0, 1.0], cameras.cam_from_world.dtype))
+    about = np.diag(np.asarray([-1.0, 1.0, -1.0, 1.0], cameras.cam_from_world.dtype))
     return replace(cameras, cam_from_world=about @ cameras.cam_from_world)
 
 
 def nobody_in_the_photographs(case, point, fixed):
     """White photographs, and a body that stands beside what they show."""
     inputs, *rest = fixed
-    blank = replace(inputs, depth_maps=-jnp.ones_like(inputs.depth_maps), foreground=jnp.zeros_like(inputs.foreground))
+    blank = replace(inputs, depth_maps=-np.ones_like(inputs.depth_maps), foreground=np.zeros_like(inputs.foreground))
     geometry = point["input_geometry"]
     nowhere = geometry | {
-        "position_maps": jnp.ones_like(inputs.position_maps),
+        "position_maps": np.ones_like(inputs.position_maps),
         "posed_vertices": geometry["posed_vertices"] + 10.0,
     }
-    return point | {"images": jnp.ones_like(point["images"]), "input_geometry": nowhere}, (blank, *rest)
+    return point | {"images": np.ones_like(point["images"]), "input_geometry": nowhere}, (blank, *rest)
 
 
 def subject_behind_the_cameras(case, point, fixed):
     """Photographs taken in the other direction, prepared like any."""
     inputs, *rest = fixed
     position_map = case.config.model.position_map
-    views = random_views(1, VIEWS, SIZE, point["target_pose"]["betas"].astype(jnp.float64))
-    views = replace(views, cameras=turned_away(views.cameras), masks=jnp.zeros_like(views.masks))
+    betas = point["target_pose"]["betas"].astype(np.float64)
+    views = random_views(1, VIEWS, SIZE, jnp.asarray(betas))
+    views = as_jax(replace(views, cameras=as_jax(turned_away(views.cameras)), masks=0 * views.masks))
     behind = as_dtype(prepared(views, position_map), inputs.images.dtype)
-    assert jnp.all(behind.depth_maps == -1) and not jnp.any(behind.foreground)
+    assert np.all(behind.depth_maps == -1) and not np.any(behind.foreground)
     geometry = {name: getattr(behind, name) for name in GEOMETRY}
     return point | {"input_geometry": geometry}, (behind, *rest)
 
@@ -340,7 +349,7 @@ def subject_behind_the_cameras(case, point, fixed):
 def vertices_in_the_cameras(case, point, fixed):
     """Every posed vertex at its camera's centre: nothing divides by its depth."""
     geometry = point["input_geometry"]
-    centers = jnp.broadcast_to(geometry["cameras"].center[:, None], geometry["posed_vertices"].shape)
+    centers = np.broadcast_to(as_jax(geometry["cameras"]).center[:, None], geometry["posed_vertices"].shape)
     return point | {"input_geometry": geometry | {"posed_vertices": centers}}, fixed
 
 
@@ -359,15 +368,15 @@ DEGENERATE = (
 
 def check_degenerate(case, degenerate, dtype):
     function, point, fixed = compiled(case, dtype)
-    (loss, facts), gradients = function(*degenerate(case, point, fixed))
-    assert jnp.isfinite(loss)
+    (loss, facts), gradients = jax.device_get(function(*degenerate(case, point, fixed)))
+    assert np.isfinite(loss)
     for path, leaf in jax.tree_util.tree_leaves_with_path(gradients):
-        assert jnp.all(jnp.isfinite(leaf)), jax.tree_util.keystr(path)
+        assert np.all(np.isfinite(leaf)), jax.tree_util.keystr(path)
     culled = degenerate is every_gaussian_culled
-    assert bool(jnp.all(facts["alpha"] == 0)) == culled
+    assert np.all(facts["alpha"] == 0) == culled
     if culled:  # nothing that only pictures tell of has a gradient
-        assert all(jnp.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_cameras"]))
-        assert all(jnp.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_pose"]))
+        assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_cameras"]))
+        assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_pose"]))
 
 
 @pytest.mark.parametrize("degenerate", DEGENERATE, ids=lambda f: f.__name__)
