@@ -18,10 +18,13 @@ from typing import Any, Literal
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
 
 from humangs_jax.array_types import Array, Float, Int
 
 NORM_EPSILON = 1e-5
+PRODUCT = "product"
+"""Name of the arrays of a block that `TransformerConfig.remat_policy` may keep for the backward pass."""
 XLA_TOKENS = 8192
 """Up to here L x L logits of all heads fit beside a model on any accelerator (12 heads, float32: 3 GB a layer)."""
 
@@ -120,10 +123,12 @@ class Attention(nn.Module):
         dense = lambda features, name: nn.Dense(
             features, use_bias=False, dtype=self.dtype, kernel_init=self.kernel_init, name=name
         )
-        qkv = dense(3 * width, "qkv")(tokens).reshape(length, 3, heads, self.config.head_width)
+        qkv = checkpoint_name(dense(3 * width, "qkv")(tokens), PRODUCT)
+        qkv = qkv.reshape(length, 3, heads, self.config.head_width)
         q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
         if self.config.qk_norm:
             q = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=self.dtype, name="q_norm")(q)
             k = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=self.dtype, name="k_norm")(k)
         out = attention(q, k, v, count, self.config.implementation, self.config.query_chunk)
+        out = checkpoint_name(out, PRODUCT)
         return dense(width, "out")(out.reshape(length, width))
