@@ -59,6 +59,8 @@ PER_VIEW = ("mid_tokens", "mid_feature_map_stride4")
 """Stages whose first axis is subjects times views."""
 TIES, TIE_LEVELS = "candidates of posed_rotations", "their q_abs"
 """What `compute_stages` gives beside the stages: see `nearest_candidates`."""
+RENDER_SIZE = 256
+"""Pixels a side of the pictures that --render compares."""
 MAP_STRIDE, WEIGHTS_STRIDE = 4, 5
 """Which pixels of the feature map and which Gaussians' skinning weights are stored."""
 
@@ -284,8 +286,21 @@ def relative_errors(found: dict[str, Any], expected: dict[str, Any], bound: floa
     return errors
 
 
-def check(checkpoint: Path, arrays: Path, config: Path, dtype: str) -> dict[str, Any]:
+def check(checkpoint: Path, arrays: Path, config: Path, dtype: str, render: bool = False) -> dict[str, Any]:
     """The result that --json writes. For float64 `jax_enable_x64` must be set."""
+    found, expected = run_checkpoint(checkpoint, arrays, config, dtype)
+    bound = BOUNDS[dtype]
+    errors = relative_errors(found, {name: x for name, x in expected.items() if not name.startswith("in_")}, bound)
+    passed = all(error is not None and error <= bound for error in errors.values())
+    result = {"dtype": dtype, "bound": bound, "stages": errors, "passed": passed}
+    if render:
+        reference, _ = run_checkpoint(checkpoint, arrays, config, "float32")
+        result["render_psnr"] = render_psnr(found, reference, expected)
+    return result
+
+
+def run_checkpoint(checkpoint: Path, arrays: Path, config: Path, dtype: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(what `compute_stages` gives for all subjects, the arrays of the file)."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -312,10 +327,35 @@ def check(checkpoint: Path, arrays: Path, config: Path, dtype: str) -> dict[str,
         name: (np.concatenate if name in PER_VIEW else np.stack)([subject[name] for subject in subjects])
         for name in subjects[0]
     }
-    bound = BOUNDS[dtype]
-    errors = relative_errors(found, {name: x for name, x in expected.items() if not name.startswith("in_")}, bound)
-    passed = all(error is not None and error <= bound for error in errors.values())
-    return {"dtype": dtype, "bound": bound, "stages": errors, "passed": passed}
+    return found, expected
+
+
+def render_psnr(found: dict[str, Any], reference: dict[str, Any], arrays: dict[str, Any]) -> float:
+    """The lowest PSNR, dB, of pictures of the posed Gaussians to those of the reference, as all input cameras see them.
+
+    Drawn as the release draws, RENDER_SIZE pixels high.
+    """
+    import jax.numpy as jnp
+    import numpy as np
+
+    from humangs_jax.rendering.gaussians import Gaussians
+    from humangs_jax.rendering.splat_config import SPLAT_PRESETS
+    from humangs_jax.rendering.splatting import render
+
+    names = ("posed_means3D", "posed_rotations", "asset_scales", "asset_opacity", "asset_colors")
+    worst = np.inf
+    for index in range(len(arrays["in_image"])):
+        cameras = subject_inputs(arrays, index, jnp.float32)[0].cameras
+        cameras = cameras.resized(RENDER_SIZE * cameras.width // cameras.height, RENDER_SIZE)
+        pictures = []
+        for stages in (found, reference):
+            means, quats, scales, opacities, colors = (jnp.asarray(stages[n][index], jnp.float32) for n in names)
+            gaussians = Gaussians(means, quats, scales, opacities[:, 0], colors)
+            draw = lambda camera, drawn=gaussians: render(drawn, camera, SPLAT_PRESETS["inria"]).rgb
+            pictures.append(np.stack([np.asarray(draw(cameras[i])) for i in range(len(cameras.K))]))
+        mean_square = np.mean((np.clip(pictures[0], 0, 1) - np.clip(pictures[1], 0, 1)) ** 2, axis=(1, 2, 3))
+        worst = min(worst, -10 * np.log10(max(mean_square.max(), 1e-30)))
+    return float(worst)
 
 
 def _head_width(release: dict[str, Any]) -> int | None:
@@ -337,6 +377,8 @@ def report(result: dict[str, Any]) -> str:
     largest = max((error for error in errors.values() if error is not None), default=float("nan"))
     verdict = f"{result['dtype']}: largest {largest:.2e}, allowed {bound:.0e}"
     verdict += f", {uncompared} not compared" if uncompared else ""
+    if "render_psnr" in result:
+        lines.append(f"drawn, against float32: at least {result['render_psnr']:.1f} dB")
     return "\n".join([*lines, f"{verdict}: {'ok' if result['passed'] else 'FAILED'}"])
 
 
@@ -348,6 +390,7 @@ def main() -> None:
     parser.add_argument("config", type=Path, metavar="CONFIG.json", help="the release's configuration")
     parser.add_argument("--dtype", choices=list(BOUNDS), default="float32", help="to compute in")
     parser.add_argument("--json", type=Path, metavar="OUT", help="write the errors here")
+    parser.add_argument("--render", action="store_true", help="also draw the result and compare it with float32's")
     arguments = parser.parse_args()
 
     import jax
@@ -355,7 +398,7 @@ def main() -> None:
 
     jax.config.update("jax_enable_x64", arguments.dtype == "float64")
     try:
-        result = check(arguments.checkpoint, arguments.arrays, arguments.config, arguments.dtype)
+        result = check(arguments.checkpoint, arguments.arrays, arguments.config, arguments.dtype, arguments.render)
         if arguments.json:
             write_json(arguments.json, result)
     except (ValueError, OSError) as error:
