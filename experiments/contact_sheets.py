@@ -3,15 +3,15 @@
     python experiments/contact_sheets.py --out docs/images [--subjects 64] [--sheets front_back views close sequences]
 
 Writes people_front_back.jpg (subjects, front over back), people_views.jpg (16 subjects over 8 views), people_close.jpg (8 heads
-and 8 hands) and people_sequences.jpg (8 sequences of 8 frames). All four take about 4 minutes on 2 CPU cores, nothing else
-running. People are those of the demo seeds; the same command gives the same pictures bit for bit on the same machine.
+from two sides, 8 hands) and people_sequences.jpg (8 sequences of 8 frames). All four take 90 s of one CPU core. People are those
+of the demo seeds; the same command gives the same pictures bit for bit on the same machine.
 """
 
 import argparse
 from pathlib import Path
 
 SHEETS = ("front_back", "views", "close", "sequences")
-FRONT_BACK_SIZE, VIEW_SIZE, CLOSE_SIZE = (152, 188), (148, 176), (256, 256)
+FRONT_BACK_SIZE, VIEW_SIZE, CLOSE_SIZE = (184, 228), (148, 176), (256, 256)
 """Width and height of one picture, pixels."""
 COLUMNS = 16
 MOTION_FRAMES = 75

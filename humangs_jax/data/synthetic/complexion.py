@@ -46,7 +46,7 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
     lips = skin * np.asarray([0.90, 0.64, 0.64])
     if made_up and rng.random() < 0.75:
         dye = colour(
-            rng.choice([rng.uniform(0.94, 1.03), rng.uniform(0.88, 0.95)]),
+            rng.choice([rng.uniform(0.94, 1.03), rng.uniform(0.935, 0.97)]),
             rng.uniform(0.45, 0.8),
             rng.uniform(0.35, 0.75),
         )
