@@ -5,12 +5,13 @@
 For every picture size, on this machine: `synth` (people written to disk: subjects and views per second of one process),
 `read` (written people through the loader: every example decoded from disk, and kept in memory), and `live` (people on the
 fly from a bank: building it, compiling, views per second). Then the time of one step of the small preset (measured at its own
-sizes unless --train-step-s gives it), which consumes the views of one example, and whether a trainer would wait: the loader
-works beside the step, so a step waits for what a batch takes beyond it; live people are drawn on the device of the step, so
-all of their time is added. CPU seconds count the work of all threads and hardly depend on who else uses the machine.
+sizes unless --train-step-s gives it), which consumes the views of one example, and what a step would wait: the loader works
+beside the step, so a step waits for what a batch takes beyond it; live people are drawn on the device of the step, so all of
+their time is added, unless the device has time to spare (CPUs of several cores). Where the step is measured, so is what it
+waits when the loader feeds it with either. CPU seconds count the work of all threads and hardly depend on other programs.
 
-About 5 minutes on 2 CPU cores, 2 of them with --train-step-s. Expected there, views a second at 256: synth 10, read 100 and
-more, live 25; an example takes a quarter of a step to draw.
+About 4 minutes on 2 CPU cores to themselves, 2 of them with --train-step-s. Expected there, CPU ms a view at 256: written
+170, live 32, read 9 from disk and 1 from memory; drawing an example live takes a sixth of the CPU time of a step.
 """
 
 import argparse
@@ -29,6 +30,8 @@ INPUTS, TARGETS = 4, 3
 """Views of an example."""
 POSES, VIEWS = 2, 6
 """Of written people: poses, and cameras around each."""
+STEPS = 5
+"""Training steps that are timed."""
 
 
 def seconds(work: Callable[[], object]) -> dict[str, float]:
@@ -63,8 +66,7 @@ def measure_read(out: Path, size: int, examples: int, body: Any) -> dict[str, di
     for name, limit in (("disk", 0), ("memory", 4 << 30)):
         cache = CaptureCache(find_people(out), body, limit)
         loader = Loader(CaptureSource(cache, sampling, size, size), seed=1)
-        if limit:
-            list(loader.batches(0, 2 * len(cache)))  # read all of them once
+        list(loader.batches(0, 2 * len(cache) if limit else 2))  # with a limit: read all of them once
         spent = seconds(lambda loader=loader: list(loader.batches(0, examples)))
         results[name] = rates(spent, examples, examples * (INPUTS + TARGETS))
     return results
@@ -95,40 +97,51 @@ def measure_live(size: int, people: int, examples: int, body: Any) -> dict[str, 
     return {"bank": bank, "compile": first, **rates(spent, examples, examples * views)}
 
 
-def measure_step(body: Any) -> dict[str, float]:
-    """One step of the small preset at its own sizes, of a live example."""
+def measure_training(folder: Path, body: Any) -> dict[str, Any]:
+    """Steps of the small preset at its own sizes: alone, and fed by the loader with written and with live people."""
     import dataclasses
 
     import jax
 
+    from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling, Waiting, find_people
     from humangs_jax.data.synthetic.live import LiveConfig
     from humangs_jax.data.synthetic.live_bank import build_bank
-    from humangs_jax.data.synthetic.live_source import jitted_example
+    from humangs_jax.data.synthetic.live_source import live_source
+    from humangs_jax.data.synthetic.writer import Layout, write_set
     from humangs_jax.data.views import gaussian_body
     from humangs_jax.training.config import small
     from humangs_jax.training.state import init_state
     from humangs_jax.training.step import train_step
 
-    config = dataclasses.replace(small(), views=dataclasses.replace(small().views, target_count=TARGETS))
+    sampling = ViewSampling(input_counts=(INPUTS,), target_count=TARGETS)
+    config = dataclasses.replace(small(), views=sampling)
     sizes = config.model.image_size, config.target_size
-    live = LiveConfig(INPUTS, TARGETS, *sizes)
+    write_set(folder, 2, Layout(max(sizes), poses=POSES, views=VIEWS), "train", 0, body=body, progress=False)
     bank = build_bank([0, 1], body, "train", pose_count=4)
-    batch = jax.tree.map(lambda x: x[None], jitted_example(bank, jax.random.key(0), live))
-    state, body = init_state(config, None), gaussian_body(body, config.model)
+    sources = {
+        "live": live_source(bank, LiveConfig(INPUTS, TARGETS, *sizes), (INPUTS,)),
+        "read": CaptureSource(CaptureCache(find_people(folder), body), sampling, *sizes),
+    }
+    state, model_body = init_state(config, None), gaussian_body(body, config.model)
 
-    def step():
+    def step(batch):
         nonlocal state
-        state, metrics = train_step(state, batch, body, config)
+        state, metrics = train_step(state, batch, model_body, config)
         jax.block_until_ready(metrics)
 
-    compiled = seconds(step)
-    step()
-    spent = seconds(lambda: [step() for _ in range(4)])
-    return {name: value / 4 for name, value in spent.items()} | {
-        "compile_s": compiled["wall_s"],
-        "input_size": sizes[0],
-        "target_size": sizes[1],
-    }
+    batch = Loader(sources["live"]).batch_at(0)
+    compiled = seconds(lambda: step(batch))
+    step(batch)
+    spent = seconds(lambda: [step(batch) for _ in range(STEPS)])
+    result: dict[str, Any] = {name: value / STEPS for name, value in spent.items()}
+    result |= {"compile_s": compiled["wall_s"], "input_size": sizes[0], "target_size": sizes[1]}
+    for name, source in sources.items():
+        waiting = Waiting()
+        feed = Loader(source, seed=1).batches(0, STEPS + 1, waiting=waiting)
+        fed = seconds(lambda feed=feed: [step(batch) for _, batch in feed])
+        waited = (waiting.seconds - waiting.first_seconds) / STEPS
+        result[f"fed_{name}"] = {"waited_s": waited, "step_s": (fed["wall_s"] - waiting.first_seconds) / (STEPS + 1)}
+    return result
 
 
 def waits(sizes: dict[str, Any], step_s: float) -> dict[str, dict[str, float]]:
@@ -188,7 +201,11 @@ def main() -> None:
                 rows[-1].append(f"{1e3 * numbers['cpu_s_per_view']:.1f}")
             print(markdown_table(["way", "size", "subjects/s", "views/s", "CPU ms/view"], rows), flush=True)
     given = arguments.train_step_s
-    result["train_step"] = measure_step(body) if given is None else {"wall_s": given, "given": True}
+    if given is None:
+        with tempfile.TemporaryDirectory() as folder:
+            result["train_step"] = measure_training(Path(folder), body)
+    else:
+        result["train_step"] = {"wall_s": given, "given": True}
     step_s = result["train_step"]["wall_s"]
     result["waits"] = waits(sizes, step_s)
     print(f"a training step takes {step_s:.3g} s and consumes {(INPUTS + TARGETS) / step_s:.3g} views a second")
@@ -198,6 +215,12 @@ def main() -> None:
             for n in ("read_disk", "read_memory", "live")
         )
         print(f"at {size} pixels a step waits for its data: {told}")
+    for name in ("read", "live"):
+        fed: Any = result["train_step"].get(f"fed_{name}")
+        if fed:
+            print(
+                f"fed by the loader ({name}): a step takes {fed['step_s']:.3g} s, {fed['waited_s']:.3g} s of it waiting"
+            )
     if arguments.json:
         write_json(arguments.json, result)
 
