@@ -183,7 +183,7 @@ def table(result: dict[str, Any]) -> str:
     return (
         f"{result['weights']} weights, {result['preset']}, {result['views']} views of {result['size']}, "
         f"pool {result['pool']}, foreground share {result['foreground_share']:.3f}, "
-        f"at most {result['vertices_read']} of {result['vertices']} vertices seen by a view\n"
+        f"at most {result['vertices_read']} of {result['vertices']} vertices seen by a view\n\n"
         f"{markdown_table(header, rows)}"
     )
 

@@ -248,10 +248,8 @@ def train(
         steps: length of the run; the preset's if not given. All settings: experiments/train_small.py --help.
         init_weights: start from these weights instead of fresh ones.
     """
-    import dataclasses
-
     from humangs_jax.body.library import load_body
-    from humangs_jax.data.loader import find_captures
+    from humangs_jax.data.loader import find_people
     from humangs_jax.models.weights import load_weights
     from humangs_jax.training.config import small
     from humangs_jax.training.loop import train as run
@@ -259,8 +257,8 @@ def train(
     config = small()
     if steps is not None:
         config = dataclasses.replace(config, steps=steps)
-    people = find_captures(data)
-    others = find_captures(validation) if validation is not None else ()
+    people = find_people(data)
+    others = find_people(validation, None) if validation is not None else ()
     variables = None
     if init_weights is not None:
         variables, model = load_weights(init_weights)
@@ -286,8 +284,6 @@ def convert(
         pool: average a vertex's features over all views (as released) or over those that see it.
         dtype: to store; float16 halves the file.
     """
-    import dataclasses
-
     from humangs_jax.models.conversion import LOSS_PREFIX, describe, load_checkpoint
     from humangs_jax.models.weights import save_weights
 
