@@ -2,10 +2,11 @@
 
     python experiments/evaluate_synthetic.py --subjects 8 --views 4 --json evaluation.json [--pictures sheet.png]
 
-Subjects are drawn from the test seeds (`humangs_jax.data.synthetic.seeds`), which training never sees. Prints a table, one row
-a subject, and writes {"psnr", "ssim", "psnr_foreground", "baseline_psnr", "baseline_psnr_foreground", "foreground",
-"subjects": [...]}. The baseline is the body mesh, each vertex painted with the mean photo colour over the input views that
-see it (grey where none does). About 8 s a subject on 2 CPU cores.
+Subjects are drawn from the test seeds (`humangs_jax.data.synthetic.seeds`), which training never sees; choices are made
+on `--split validation`. Prints a table, one row a subject, and writes {"psnr", "ssim", "psnr_foreground",
+"baseline_psnr", "baseline_psnr_foreground", "foreground", "subjects": [...]}. The baseline is the body mesh, each vertex
+painted with the mean photo colour over the input views that see it (grey where none does). About 8 s a subject on 2 CPU
+cores.
 """
 
 import argparse
@@ -19,12 +20,18 @@ from pathlib import Path
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--subjects", type=int, default=8, help="how many people of the test split")
+    parser.add_argument("--subjects", type=int, default=8, help="how many people")
     parser.add_argument("--views", type=int, default=4, help="photos that the network sees")
     parser.add_argument("--held-out", type=int, default=8, help="views to compare with")
     parser.add_argument("--size", type=int, default=256, help="side of the photos in pixels")
-    parser.add_argument("--first", type=int, default=0, help="index of the first subject within the test split")
+    parser.add_argument("--first", type=int, default=0, help="index of the first subject within the split")
     parser.add_argument("--weights", type=Path, help="weights file; the shipped ones if not given")
+    parser.add_argument("--split", choices=("validation", "test"), default="test", help="whom to look at")
+    parser.add_argument(
+        "--tokens",
+        choices=("all", "foreground"),
+        help="patches that the network looks at; as it was trained if not given",
+    )
     parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument(
         "--pictures", type=Path, help="write truth, ours and baseline of two views of every subject here"
@@ -49,16 +56,17 @@ def evaluate(arguments: argparse.Namespace) -> dict:
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.body.library import load_body
     from humangs_jax.data.capture import load_capture
-    from humangs_jax.data.synthetic.seeds import TEST
+    from humangs_jax.data.synthetic.seeds import SPLITS
     from humangs_jax.data.synthetic.writer import write_subject
     from humangs_jax.models.weights import load_weights
 
     body, (variables, config) = load_body(), load_weights(arguments.weights)
+    config = dataclasses.replace(config, tokens=arguments.tokens or config.tokens)
     rows, pictures = [], []
     print(f"{'subject':>8}{'PSNR':>8}{'SSIM':>8}{'fg PSNR':>9}{'base':>8}{'base fg':>9}{'share':>8}")
     with tempfile.TemporaryDirectory() as folder:
         for index in range(arguments.first, arguments.first + arguments.subjects):
-            seed = TEST[index]
+            seed = SPLITS[arguments.split][index]
             path = Path(folder) / f"subject_{index:05d}"
             write_subject(
                 path,
@@ -98,7 +106,14 @@ def evaluate(arguments: argparse.Namespace) -> dict:
             labels=["truth", "ours", "painted body"] * (len(pictures) // 3),
             columns=6,
         )
-    return {**means, "views": arguments.views, "image_size": arguments.size, "subjects": rows}
+    return {
+        **means,
+        "split": arguments.split,
+        "tokens": config.tokens,
+        "views": arguments.views,
+        "image_size": arguments.size,
+        "subjects": rows,
+    }
 
 
 if __name__ == "__main__":
