@@ -6,6 +6,7 @@ Faults are counted in pictures of random poses from random cameras, as shares of
 - poking: skin that lies inside of a hem and is seen although the OUTER side of cloth is at most 6 cm behind it on the same ray,
   of which skin deeper than 1 cm inside of the hem is `poking_deep`. (Skin seen up a sleeve or under a skirt has the inner side
   of cloth behind it: no fault.) Skin that cloth covers well is not in the mesh at all and cannot poke: see `hollow`.
+- inside: all skin deeper than 1 cm inside of a hem that is seen at all, rightly (up a sleeve) or not: an upper bound.
 - hollow: the INNER side of cloth is seen where the naked body, posed alike, would be at least 1 cm nearer: one looks through a
   neckline, a cuff or a hem into empty clothes.
 - gaps: the background is seen where the naked body would be.
@@ -22,6 +23,7 @@ from pathlib import Path
 
 DEPTH, HOLLOW_DEPTH = 0.06, 0.01
 """Metres: how far behind poking skin its cloth may lie; how much nearer the missing body must be."""
+FAULTS = ("poking", "poking_deep", "inside", "hollow", "gaps")
 DEEP = 0.01
 """Metres inside of a hem: deep."""
 SHARE_BINS = 40
@@ -123,21 +125,20 @@ def look_at_all(body, arguments):
             batch = cameras.cameras_around(
                 rng, posed.vertices, cameras.spread_azimuths(rng, arguments.views), arguments.size
             )
-            counts = np.zeros(5)
+            counts = np.zeros(1 + len(FAULTS))
             for k in range(arguments.views):
                 counts += count_faults(body, posed, batch[k])
                 if pose == 0 and k == 0:
                     image, mask = rendering.render_view(posed, batch[k])
                     colours += _colour_histogram(image[mask == 1])
                     shares.append(float(mask.mean()))
-            names = ("poking", "poking_deep", "hollow", "gaps")
             rows.append(
                 {"seed": seed, "pose": pose, "pixels": counts[0]}
-                | dict(zip(names, counts[1:] / counts[0], strict=True))
+                | dict(zip(FAULTS, counts[1:] / counts[0], strict=True))
             )
     pixels = np.asarray([row["pixels"] for row in rows])
     numbers: dict = {"built": arguments.subjects, "pictures": len(rows) * arguments.views}
-    for name in ("poking", "poking_deep", "hollow", "gaps"):
+    for name in FAULTS:
         each = np.asarray([row[name] for row in rows])
         numbers[name] = {
             "mean": float((each * pixels).sum() / pixels.sum()),
@@ -151,7 +152,7 @@ def look_at_all(body, arguments):
 
 
 def count_faults(body, posed, camera):
-    """(5,) pixels of the person, poking, poking deep, hollow, gaps."""
+    """(6,) pixels of the person, then those of FAULTS."""
     import jax.numpy as jnp
     import numpy as np
 
@@ -179,9 +180,9 @@ def count_faults(body, posed, camera):
     bare, bare_depth = np.asarray(body_alone.face_ids) >= 0, np.asarray(body_alone.depth)
     inner = seen & (materials[ids] >= 2) & ~_faces_the_eye(posed.vertices, faces, eye)[ids]
     hollow = inner & bare & (depth - bare_depth > HOLLOW_DEPTH)
-    return np.asarray(
-        [seen.sum(), poking.sum(), (poking & (cover > DEEP)).sum(), hollow.sum(), (bare & ~seen).sum()], float
-    )
+    deep = cover > DEEP
+    found = (seen, poking, poking & deep, inside & deep, hollow, bare & ~seen)
+    return np.asarray([pixels.sum() for pixels in found], float)
 
 
 def _faces_the_eye(vertices, faces, eye):
@@ -250,34 +251,42 @@ def draw(file, people, seen):
 
     from humangs_jax.data.synthetic import poses
 
-    figure, axes = plt.subplots(2, 4, figsize=(16, 7.2))
+    figure = plt.figure(figsize=(17, 9.5))
+    grid = figure.add_gridspec(2, 5)
+    stature, years, build, share, worn, woven, hue, bent = (
+        figure.add_subplot(grid[at])
+        for at in ((0, 0), (0, 1), (0, 2), (0, 3), (slice(None), 4), (1, 0), (1, slice(1, 3)), (1, 3))
+    )
     male, numbers = np.asarray(people["male"]), people["numbers"]
-    for values, name, ax in ((people["stature"], "stature, m", axes[0, 0]), (people["years"], "years", axes[0, 1])):
+    for values, name, ax in ((people["stature"], "stature, m", stature), (people["years"], "years", years)):
         ax.hist([values[male], values[~male]], 30, stacked=True, label=["men", "women"])
         ax.set_xlabel(name)
         ax.legend()
-    axes[0, 2].scatter(people["stature"], people["betas"][:, 2], s=5, c=np.clip(people["skin"], 0, 1))
-    axes[0, 2].set_xlabel("stature, m")
-    axes[0, 2].set_ylabel("weight coefficient (colour: skin)")
-    axes[0, 3].hist(seen["shares"], SHARE_BINS)
-    axes[0, 3].set_xlabel("share of the picture that is person")
-    kinds = numbers["garments"]
-    axes[1, 0].barh(list(kinds)[::-1], list(kinds.values())[::-1])
-    axes[1, 0].tick_params(axis="y", labelsize=4.5)
-    axes[1, 0].set_xlabel("garments among the people")
-    patterns = {k: v for k, v in numbers["patterns"].items() if k != "plain"}
-    axes[1, 1].barh(list(patterns)[::-1], list(patterns.values())[::-1])
-    axes[1, 1].tick_params(axis="y", labelsize=7)
-    axes[1, 1].set_xlabel(f"patterns (plain: {numbers['patterns']['plain']})")
+    build.scatter(people["stature"], people["betas"][:, 2], s=6, c=np.clip(people["skin"], 0, 1))
+    build.set_xlabel("stature, m")
+    build.set_ylabel("weight coefficient (colour: skin)")
+    share.hist(seen["shares"], SHARE_BINS)
+    share.set_xlabel("share of the picture that is person")
+    for kinds, ax, label in (
+        (numbers["garments"], worn, f"garments among {numbers['described']} people"),
+        (
+            {k: v for k, v in numbers["patterns"].items() if k != "plain"},
+            woven,
+            f"patterns (plain: {numbers['patterns']['plain']})",
+        ),
+    ):
+        ax.barh(list(kinds)[::-1], list(kinds.values())[::-1])
+        ax.margins(y=0.01)
+        ax.set_xlabel(label)
     shares = seen["colours"].sum((1, 2)) / seen["colours"].sum()
-    axes[1, 2].bar(range(12), shares, color=[colorsys.hsv_to_rgb((i + 0.5) / 12, 0.8, 0.8) for i in range(12)])
-    axes[1, 2].set_xlabel("hue of the person's pixels")
+    hue.bar(range(12), shares, color=[colorsys.hsv_to_rgb((i + 0.5) / 12, 0.8, 0.8) for i in range(12)])
+    hue.set_xlabel("hue of the person's pixels")
     joints = {"hip": poses.LEFT_HIP, "knee": poses.LEFT_KNEE, "shoulder": poses.LEFT_SHOULDER, "elbow": poses.LEFT_ELBOW,
               "spine": poses.SPINE2, "neck": poses.NECK}  # fmt: skip
-    axes[1, 3].boxplot(
+    bent.boxplot(
         [np.rad2deg(seen["angles"][:, j]) for j in joints.values()], tick_labels=list(joints), showfliers=False
     )
-    axes[1, 3].set_ylabel("joint angle, degrees")
+    bent.set_ylabel("joint angle, degrees")
     figure.tight_layout()
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=70)
