@@ -2,8 +2,8 @@
 
     python experiments/benchmark_attention.py --tokens 1537 4097 --heads 12 --json OUT
 
-Forward and with gradients, CPU ms of all threads and the ratio of wall time to that of the same operations as plain
-products (gradients: 3.5 times the forward operations); memory by XLA's analysis. A minute on 2 cores. Numbers:
+Forward and with gradients, CPU ms of all threads, and the ratio to those of the same operations as plain products
+(gradients: 3.5 times the forward operations); memory by XLA's analysis. A minute on 2 cores. Numbers:
 docs/performance_reconstruction.md.
 """
 
@@ -58,11 +58,11 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
                 memory[name] = program.memory_analysis().temp_size_in_bytes / 2**20
                 runs[name] = functools.partial(wait, program, q, k, v)
         times = medians(runs, arguments.repeats)
-        rate = product_flops / times["matmul"][0]
+        rate = product_flops / times["matmul"][1]
         for name, megabytes in memory.items():
             operations = flops * (GRADIENT_PRODUCTS if "gradient" in name else 1)
             wall, cpu = times[name]
-            ratio = float(wall * rate / operations)
+            ratio = float(cpu * rate / operations)
             rows.append({"tokens": tokens, "form": name, "ms": float(wall), "cpu_ms": float(cpu), "ratio": ratio})
             rows[-1]["temporary_mb"] = megabytes
     return {"rows": rows, "heads": arguments.heads, "device": jax.devices()[0].device_kind, "jax": jax.__version__}

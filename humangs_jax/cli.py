@@ -171,6 +171,7 @@ def synth(
     held_out: int = 0,
     depth: bool = False,
     maps: bool = False,
+    scans: bool = False,
     sequences: bool = False,
     frames: int = 60,
     for_training: bool = False,
@@ -190,6 +191,7 @@ def synth(
         held_out: views of the first pose from yet other cameras, in the sub-folder held_out/.
         depth: also write 16-bit depth maps, depth/NAME.png (steps of 0.1 mm).
         maps: also write maps/NAME.exr: float32 colours, coverage, depth, positions in T-pose, the camera in the header.
+        scans: also write scan/: the first pose as a textured mesh, OBJ and GLB.
         sequences: the poses are frames of a walk, a turn or a reach, which is written as motion.npz.
         frames: length of that motion, 30 a second.
         for_training: short for 2 poses x 12 views at 256 pixels and no others, enough for `humangs train`.
@@ -206,7 +208,15 @@ def synth(
     if sequences and poses > frames:
         raise ValueError(f"--poses {poses}: a motion of --frames {frames} has no more of them")
     layout = Layout(
-        size, poses, views, close_views, held_out, frames=frames if sequences else 0, depth=depth, maps=maps
+        size,
+        poses,
+        views,
+        close_views,
+        held_out,
+        frames=frames if sequences else 0,
+        depth=depth,
+        maps=maps,
+        scan_texture=2048 if scans else 0,
     )
     if for_training:
         layout = Layout(256, poses=2, views=12)

@@ -137,8 +137,8 @@ def test_the_loader_shrinks_a_set_to_smaller_sizes(folder, body):
         find_people(folder)
 
 
-def test_sequences_are_written_with_their_motion(tmp_path, body):
-    layout = writer.Layout(SIZE, poses=3, views=1, frames=20)
+def test_sequences_are_written_with_their_motion_and_a_scan(tmp_path, body):
+    layout = writer.Layout(SIZE, poses=3, views=1, frames=20, scan_texture=128)
     (person,) = writer.write_set(tmp_path, 1, layout, "demo", 2, body=body, progress=False)
     capture, motion = load_capture(person, body=body), load_motion(person / "motion.npz")
     assert motion.rotations.shape == (20, 55, 3) and motion.fps == 30
@@ -146,6 +146,9 @@ def test_sequences_are_written_with_their_motion(tmp_path, body):
     for frame, of_motion in enumerate((0, 10, 19)):  # evenly spaced
         np.testing.assert_array_equal(capture.pose(frame).rotations, motion.rotations[of_motion])
         np.testing.assert_array_equal(capture.pose(frame).translation, motion.translations[of_motion])
+    scan = json.loads((person / "scan" / "scan.json").read_text())
+    np.testing.assert_allclose(scan["rotations"], capture.pose(0).rotations, atol=1e-6)
+    assert {"scan.obj", "scan.glb", "material.mtl"} <= {path.name for path in (person / "scan").iterdir()}
 
 
 def test_depths_that_do_not_fit_are_an_error(tmp_path):
@@ -211,8 +214,8 @@ def test_processes_write_the_same_files(tmp_path):
         (("--subjects", "3"), writer.Layout(512, 1, 60, 12), 0),
         (("--size", "128", "--poses", "4", "--sequences", "--frames", "30", "--depth", "--first", "7"),
          writer.Layout(128, 4, 60, 12, frames=30, depth=True), 7),
-        (("--views", "4", "--close-views", "0", "--held-out", "8", "--maps"),
-         writer.Layout(512, 1, 4, 0, 8, maps=True), 0),
+        (("--views", "4", "--close-views", "0", "--held-out", "8", "--maps", "--scans"),
+         writer.Layout(512, 1, 4, 0, 8, maps=True, scan_texture=2048), 0),
         (("--for-training",), writer.Layout(256, 2, 12), 0),
     ],
 )  # fmt: skip

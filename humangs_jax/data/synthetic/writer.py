@@ -4,6 +4,7 @@ out/manifest.json                    with what the set was made and who is finis
 out/SEED/                            a capture (docs/capture_format.md): views of one person in one or several poses
 out/SEED/held_out/                   a capture of its own with the views that reconstruction may not see
 out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
+out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see `scans`
 out/SEED/depth/NAME.png, maps/NAME.exr    where asked for, see `maps`; also in held_out/
 """
 
@@ -27,6 +28,7 @@ from humangs_jax.data.synthetic.manifest import begin_set, write_manifest
 from humangs_jax.data.synthetic.maps import render_maps, write_depth, write_maps
 from humangs_jax.data.synthetic.poses import sample_rotations
 from humangs_jax.data.synthetic.rendering import PosedSubject, pose_subject, render_view
+from humangs_jax.data.synthetic.scans import export_scan
 from humangs_jax.data.synthetic.seeds import SPLITS, seeds_of, split_of
 from humangs_jax.data.synthetic.sequences import sample_sequence
 from humangs_jax.data.synthetic.subject import SyntheticSubject, make_subject
@@ -52,7 +54,7 @@ class Layout:
     poses: how many; each is seen by `views` cameras of the published protocol and `close_views` nearer ones.
     held_out_views: cameras of the same pose, and of each of `novel_poses` others, in held_out/.
     frames: 0: poses are independent. Otherwise they are `poses` evenly spaced frames of a motion of so many at 30 a second.
-    depth, maps: files beside each picture.
+    depth, maps: files beside each picture. scan_texture: texels a side of the scan's texture, 0: no scan.
     """
 
     image_size: int = 512
@@ -64,6 +66,7 @@ class Layout:
     frames: int = 0
     depth: bool = False
     maps: bool = False
+    scan_texture: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -143,6 +146,9 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
             _write_views(temporary / HELD_OUT, subject, body, others, held_out, layout)
         if motion is not None:
             save_motion(temporary / "motion.npz", motion)
+        if layout.scan_texture:
+            pose = BodyPose(jnp.asarray(posed[0].rotations), jnp.asarray(posed[0].translation))
+            export_scan(subject, temporary / "scan", pose, lit=True, texture_size=layout.scan_texture)
 
     _atomically(Path(folder), write)
 
