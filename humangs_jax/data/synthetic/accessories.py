@@ -6,7 +6,7 @@ Swept tubes, sheets and boxes that follow one joint or the nearest skin.
 import numpy as np
 
 from humangs_jax.data.synthetic import hair, slices, tailoring
-from humangs_jax.data.synthetic.anatomy import Anatomy, smoothstep
+from humangs_jax.data.synthetic.anatomy import Anatomy
 from humangs_jax.data.synthetic.fabrics import Material, band, colour, mix
 from humangs_jax.data.synthetic.garments import nearest_weights, rest_height, smooth_weights
 from humangs_jax.data.synthetic.noise import ripples
@@ -104,7 +104,7 @@ def _placed(surface, template, girth):
 def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
     """A hood: over the head, or lying in folds around the neck and on the upper back."""
     if up:
-        return hair.falling_tube(rng, anatomy, 0.034, 0.1, HOOD_OPENING, wave=0.004, ends=0.1)
+        return hair.falling_tube(rng, anatomy, 0.034, 0.1, _hood_opening, wave=0.004, ends=0.1)
     ring, outwards = neck_ring(anatomy, -0.012)
     azimuth = np.arange(RING) * (2 * np.pi / RING)
     behind = 0.5 - 0.5 * np.cos(azimuth)  # 0 in front, 1 at the nape
@@ -122,9 +122,6 @@ def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
 def _hood_opening(sides, height):
     """Positive outside of an oval around the face."""
     return ((sides / 1.05) ** 2 + ((height - 0.31) / 0.096) ** 2 - 1) * 0.05
-
-
-HOOD_OPENING = _hood_opening
 
 
 def _veil_opening(sides, height):
@@ -348,18 +345,3 @@ def shoulder_bag(anatomy: Anatomy, size: float, side: float, ease: float) -> Sur
     reach = anatomy.hips_and_legs.radius(levels, np.full(7, angle)).mean() + ease + half[2] + 0.008
     center = np.asarray([reach * np.sin(angle), y, reach * np.cos(angle)])
     return _bag(anatomy, center, half, angle, np.flatnonzero(near))
-
-
-__all__ = [
-    "backpack",
-    "brim",
-    "build",
-    "glasses",
-    "headscarf",
-    "hood",
-    "necklace",
-    "peak",
-    "scarf",
-    "shoulder_bag",
-    "smoothstep",
-]

@@ -10,6 +10,8 @@ from humangs_jax.data.synthetic.haircuts import LONG_CUTS, Haircut
 from humangs_jax.data.synthetic.noise import Ripples, lattice
 
 EYE_X, EYE_Y, MOUTH_Y = 0.029, 0.330, 0.2629
+HAND_Y = 0.085
+"""Template height that parts the backs of the hands from the palms."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,10 +156,6 @@ def _hand(tones, result, x, y, z):
     tip = np.clip((x - 0.79) / 0.03, 0, 1)
     knuckle = np.exp(-(((x - 0.745) / 0.008) ** 2)) * (1 - palm)
     return mix(result, result * np.asarray([0.98, 0.82, 0.8]), np.clip(0.5 * tip + 0.5 * knuckle, 0, 1))
-
-
-HAND_Y = 0.085
-"""Template height that parts the backs of the hands from the palms."""
 
 
 def _face(tones, haircut, features, result, x, y, z, template, seed):

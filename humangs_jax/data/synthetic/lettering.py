@@ -103,6 +103,3 @@ def emblem(
         return 0.7 * (1 - np.abs(x) * 1.3 - np.abs(y))
     slant = x + 0.35 * y - 0.25 * np.sign(y)
     return np.minimum(0.28 - np.abs(slant), 1 - np.abs(y))  # bolt
-
-
-__all__ = ["ADVANCE", "EMBLEMS", "ROWS", "WORDS", "bitmap", "emblem", "random_text", "written"]

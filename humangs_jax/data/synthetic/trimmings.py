@@ -9,7 +9,7 @@ import numpy as np
 
 from humangs_jax.data.synthetic import lettering
 from humangs_jax.data.synthetic.anatomy import ARMHOLE
-from humangs_jax.data.synthetic.fabrics import Spots, accent, band, colour, mix, random_colour
+from humangs_jax.data.synthetic.fabrics import Spots, accent, band, colour, mix
 from humangs_jax.data.synthetic.noise import lattice
 
 Colouring = Callable[[Spots], np.ndarray]
@@ -299,9 +299,3 @@ def zipped_bag(rng: np.random.Generator, fabric: Colouring, base: np.ndarray) ->
         return mix(result, ink, band(np.abs(y - 0.72), -1, 0.025, 0.02) * (z > -0.2))
 
     return albedo
-
-
-__all__ = [
-    "banded", "below", "buckled", "buttoned", "darkened", "hemmed", "leather", "pocketed", "printed", "quilted", "random_colour",
-    "ribbed", "ribbed_shaft", "seamed", "side_striped", "zipped", "zipped_bag",
-]  # fmt: skip

@@ -436,6 +436,3 @@ def _shoulder_bag(rng, outfit, garment):
 def _accessory(rng, outfit, garment):
     for surface, material in accessories.build(rng, outfit.anatomy, garment, outfit.trunk):
         outfit.add(surface, material, layered=False)
-
-
-__all__ = ["Outfit", "Piece", "dress_up"]
