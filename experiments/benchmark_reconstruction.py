@@ -54,6 +54,8 @@ def main() -> None:
     prepare_process()
     result = benchmark(arguments)
     print(table(result))
+    if arguments.memory:
+        print(memory_table(result))
     if arguments.json:
         write_json(arguments.json, result)
 
@@ -224,18 +226,25 @@ def table(result: dict[str, Any]) -> str:
         "",
         markdown_table(header, rows),
         "",
-        f"matrix products {result['matmul_gflops']:.0f} GFLOP/s; published network {result['published_flops'] / 1e12:.3f} TFLOP, "
-        f"all tokens take {result['ratio_to_published_matmul']:.2f} times its time as plain products",
-        f"foreground share {result['foreground_share']:.3f}; speed-up {speed_up['measured']:.2f} measured, "
-        f"{speed_up['promised']:.2f} promised: {speed_up['fraction']:.2f} of it",
+        f"Matrix products {result['matmul_gflops']:.0f} GFLOP/s. Published network {result['published_flops'] / 1e12:.3f} TFLOP: "
+        f"all tokens take {result['ratio_to_published_matmul']:.2f} times as long as these as plain products.",
+        f"Foreground share {result['foreground_share']:.3f}: speed-up {speed_up['measured']:.2f} measured, "
+        f"{speed_up['promised']:.2f} promised by the operations, {speed_up['fraction']:.2f} of it.",
     ]
-    for name, (wall, cpu) in result["stages_ms"].items():
-        lines.append(f"{name}: {wall:.0f}, {cpu:.0f} ms")
-    for name, by_views in result["memory"].items():
-        if by_views:
-            cells = ", ".join(f"{views}: {cost['temporary_mb']:.0f}" for views, cost in by_views.items())
-            lines.append(f"memory at {result['memory_size']}, {name} tokens, MiB by views: {cells}")
+    stages = [f"{name} {wall:.0f} ({cpu:.0f})" for name, (wall, cpu) in result["stages_ms"].items()]
+    if stages:
+        lines += ["", f"Stages, wall (CPU) ms: {', '.join(stages)}."]
     return "\n".join(lines)
+
+
+def memory_table(result: dict[str, Any]) -> str:
+    """Memory and counted operations by number of views."""
+    views = list(result["memory"]["all"])
+    rows = []
+    for tokens, by_views in result["memory"].items():
+        for unit, key, scale, digits in (("MiB", "temporary_mb", 1, 0), ("TFLOP", "flops", 1e-12, 2)):
+            rows.append([f"{tokens} tokens, {unit}", *(f"{scale * by_views[v][key]:.{digits}f}" for v in views)])
+    return markdown_table([f"{result['preset']} at {result['memory_size']}", *(f"{v} views" for v in views)], rows)
 
 
 if __name__ == "__main__":

@@ -18,23 +18,11 @@ import benchmark_reconstruction
 import reconstruction_savings
 import reconstruction_scaling
 import transformer_compilation
-from report_tables import markdown_table, write_section
-
-
-def memory_table(result: dict[str, Any]) -> str:
-    """Memory and counted operations by number of views."""
-    views = list(result["memory"]["all"])
-    rows = []
-    for tokens, by_views in result["memory"].items():
-        for what, scale, digits in (("temporary_mb", 1, 0), ("flops", 1e-12, 2)):
-            name = {"temporary_mb": "MiB", "flops": "TFLOP"}[what]
-            rows.append([f"{tokens} tokens, {name}", *(f"{scale * by_views[v][what]:.{digits}f}" for v in views)])
-    return markdown_table([f"{result['preset']} at {result['memory_size']}", *(f"{v} views" for v in views)], rows)
-
+from report_tables import write_section
 
 TABLES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
     "benchmark": ("benchmark.json", benchmark_reconstruction.table),
-    "memory": ("benchmark.json", memory_table),
+    "memory": ("benchmark.json", benchmark_reconstruction.memory_table),
     "savings": ("savings.json", reconstruction_savings.table),
     "scaling": ("scaling.json", reconstruction_scaling.table),
     "attention": ("attention.json", benchmark_attention.table),

@@ -35,6 +35,7 @@ _PUBLIC = {
     "pose_body": "body.model",
     "rasterize_mesh": "rendering.mesh_rasterizer",
     "reconstruct": "avatar.reconstruct",
+    "reconstruct_batch": "avatar.reconstruct",
     "reconstruct_views": "avatar.reconstruct",
     "render": "rendering.splatting",
     "render_views": "rendering.splatting",

@@ -38,7 +38,7 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     if bucket > capture.view_count:
         views = pad_views(views, bucket)
     inputs = _prepare(body, views, config)
-    return _assemble_compiled(variables, fit_tokens(inputs, config), body, views, inputs)[0]
+    return _assemble_compiled(variables, fit_buffers(inputs, config), body, views, inputs)[0]
 
 
 def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
@@ -67,15 +67,15 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
         subjects.append(replace(views, betas=betas))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
     inputs = _prepare_batch(body, batch, config)
-    avatars, _ = _assemble_batch(variables, fit_tokens(inputs, config), body, batch, inputs)
+    avatars, _ = _assemble_batch(variables, fit_buffers(inputs, config), body, batch, inputs)
     return [jax.tree.map(lambda leaf, i=index: leaf[i], avatars) for index in range(len(captures))]
 
 
-def fit_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
-    """The configuration with room for the foreground tokens of some inputs, those of one subject or of a batch."""
-    if config.tokens == "all":
-        return config
-    return dataclasses.replace(config, token_capacity=round_up(int(_touched_patches(inputs, config))))
+def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
+    """The configuration with room for all that some inputs hold, those of one subject or of a batch."""
+    sampling = dataclasses.replace(config.sampling, vertex_capacity=None)  # a capacity pays in training only
+    capacity = 0 if config.tokens == "all" else round_up(int(_touched_patches(inputs, config)))
+    return dataclasses.replace(config, token_capacity=capacity, sampling=sampling)
 
 
 def reconstruct_views(

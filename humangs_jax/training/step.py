@@ -81,6 +81,7 @@ def subject_loss(
         **terms,
         "psnr": jnp.mean(jax.vmap(psnr)(drawn.rgb, images)),
         "dropped_tokens": outputs.dropped_tokens,
+        "dropped_reads": outputs.dropped_reads,
         "overflow": jnp.sum(drawn.overflow),
     }
     return loss, (batch_stats, metrics)
@@ -115,14 +116,14 @@ def batch_gradients(
         gradients, (losses, (batch_stats, metrics)) = jax.lax.scan(accumulate, zeros, (batch, keys))
         loss = jnp.mean(losses)
     batch_stats = jax.tree.map(lambda x: jnp.mean(x, axis=0), batch_stats)
-    counts = {name: jnp.sum(metrics.pop(name)) for name in ("dropped_tokens", "overflow")}
+    counts = {name: jnp.sum(metrics.pop(name)) for name in ("dropped_tokens", "dropped_reads", "overflow")}
     return loss, gradients, batch_stats, {name: jnp.mean(x) for name, x in metrics.items()} | counts
 
 
 @functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
 def train_step(state: TrainState, batch: Example, body: BodyModel, config: TrainConfig) -> tuple[TrainState, Metrics]:
     """The state after one more step, and metrics: loss and its terms, psnr, grad_norm, learning_rate, skipped (steps
-    so far), dropped_tokens and overflow (what did not fit its buffers in this step).
+    so far), dropped_tokens, dropped_reads and overflow (what did not fit its buffers in this step).
 
     Arguments: state is given away (donated). batch: an `Example` with a leading axis of subjects. body: decimated
     already. config: static.

@@ -46,6 +46,7 @@ def evaluate(
         "psnr_mask": jnp.mean(jax.vmap(masked_psnr)(shown, images, masks)),
         "ssim": jnp.mean(jax.vmap(similarity_map)(shown, images)),
         "dropped_tokens": outputs.dropped_tokens.astype(shown.dtype),
+        "dropped_reads": outputs.dropped_reads.astype(shown.dtype),
         "overflow": jnp.sum(drawn.overflow).astype(shown.dtype),
     }
 
