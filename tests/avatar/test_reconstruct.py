@@ -160,10 +160,8 @@ def capture_of(body, seed, views):
     )
 
 
-@pytest.mark.parametrize("tokens", ["foreground", "all"])
-def test_a_batch_of_people_with_different_numbers_of_views(body, network, tokens):
+def test_a_batch_of_people_with_different_numbers_of_views(body, network):
     variables, config = network
-    config = dataclasses.replace(config, tokens=tokens)
     captures = [capture_of(body, seed, views) for seed, views in enumerate((2, 1))]
     together = reconstruct_batch(variables, config, captures)
     for avatar, photos in zip(together, captures, strict=True):
