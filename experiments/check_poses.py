@@ -2,8 +2,9 @@
 
     python experiments/check_poses.py --json OUT [--poses 200] [--sequences 12] [--strips FOLDER]
 
-About 80 s of one CPU core. Expect: 0.85 % of the vertices inside another part, nearly all in creases of armpits and groin, 0.11 % of
-them without these parts; planted soles within 6 mm of the ground, which slide by 0.1 mm a frame in walks and less in the rest.
+About 80 s of one CPU core. Expect: 0.85 % of the vertices inside another part, nearly all in creases of armpits and
+groin, 0.11 % of them without these parts; planted soles within 6 mm of the ground, which slide by 0.1 mm a frame in walks
+and less in the rest.
 """
 
 import argparse

@@ -72,7 +72,7 @@ def compilation(transformer: Any, config: Any, tokens: int) -> dict[str, float]:
     variables = jax.eval_shape(module.init, jax.random.key(0), jnp.zeros((2, transformer.width)))
     x = jax.ShapeDtypeStruct((tokens, transformer.width), jnp.float32)
     forward = lambda variables, x: module.apply(variables, x)
-    loss = lambda variables, x: sum(jnp.sum(output**2) for output in forward(variables, x))
+    loss = lambda variables, x: sum(jnp.sum(jnp.square(output)) for output in forward(variables, x))
     result = {}
     for name, function in (("forward", forward), ("gradient", jax.grad(loss))):
         start = time.perf_counter()
