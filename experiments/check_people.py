@@ -287,6 +287,7 @@ def draw(file, people, seen):
         [np.rad2deg(seen["angles"][:, j]) for j in joints.values()], tick_labels=list(joints), showfliers=False
     )
     bent.set_ylabel("joint angle, degrees")
+    bent.tick_params(axis="x", labelrotation=45)
     figure.tight_layout()
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=70)

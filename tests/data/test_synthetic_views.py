@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.data.atomic import replace_folder
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.exr import read_exr
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling, find_people
@@ -54,7 +55,7 @@ def fast(monkeypatch, made=None):
             made.append(seed)
         if seed % 10 == 7:
             raise ValueError("a hole at the hem")
-        writer._atomically(folder, lambda f: (f.mkdir(), (f / "capture.json").write_text(str(seed))))
+        replace_folder(folder, lambda f: (f.mkdir(), (f / "capture.json").write_text(str(seed))))
 
     monkeypatch.setattr(writer, "write_person", write_person)
 

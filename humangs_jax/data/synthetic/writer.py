@@ -12,7 +12,7 @@ import dataclasses
 import os
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.data.atomic import replace_folder
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.data.synthetic.cameras import cameras_around, close_cameras, spread_azimuths
@@ -150,7 +151,7 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
             pose = BodyPose(jnp.asarray(posed[0].rotations), jnp.asarray(posed[0].translation))
             export_scan(subject, temporary / "scan", pose, lit=True, texture_size=layout.scan_texture)
 
-    _atomically(Path(folder), write)
+    replace_folder(folder, write)
 
 
 def write_subject(
@@ -345,17 +346,3 @@ def _remove_remains(out):
     for folder in out.glob(".[0-9]*.[0-9]*"):
         if folder.is_dir() and time.time() - folder.stat().st_mtime > STALE:
             shutil.rmtree(folder, ignore_errors=True)
-
-
-def _atomically(folder: Path, write: Callable[[Path], None]) -> None:
-    """Calls write(temporary folder) and renames it to `folder`."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}")
-    shutil.rmtree(temporary, ignore_errors=True)
-    try:
-        write(temporary)
-        if folder.is_dir():
-            shutil.rmtree(folder)
-        temporary.rename(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
