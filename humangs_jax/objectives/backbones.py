@@ -1,0 +1,193 @@
+"""The convolutional networks whose features losses compare, as tables of layers: VGG, AlexNet, SqueezeNet 1.1.
+
+A network is a tuple of slices, a slice a tuple of layers; the map after the last layer of each slice is a feature that is
+compared. Layers carry torchvision's numbers in its `features` list as names ("0", "3.squeeze"). Every convolution has a
+bias and is followed by a ReLU; a fire module is a 1x1 convolution whose output a 1x1 and a 3x3 convolution share.
+"""
+
+import functools
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.array_types import Array, Float
+from humangs_jax.pytree import pytree_dataclass
+
+
+@pytree_dataclass
+class Convolution:
+    """kernel (rows, columns, in, out) and bias of one convolution."""
+
+    kernel: Float[Array, "y x i o"]
+    bias: Float[Array, " o"]
+
+
+Weights = dict[str, Convolution]
+"""Convolutions by the name of their layer."""
+
+
+class Conv(NamedTuple):
+    """A convolution with as much zero padding on each side as `padding` says, and its ReLU."""
+
+    name: str
+    inputs: int
+    outputs: int
+    size: int = 3
+    stride: int = 1
+    padding: int = 1
+
+
+class Pool(NamedTuple):
+    """Largest or mean value of a window; without `ceil`, rows and columns that fill no window are left out."""
+
+    size: int = 3
+    stride: int = 2
+    average: bool = False
+    ceil: bool = False
+
+
+class Fire(NamedTuple):
+    """SqueezeNet's module: `outputs` is that of both expanding convolutions together."""
+
+    name: str
+    inputs: int
+    squeezed: int
+    outputs: int
+
+    @property
+    def squeeze(self) -> Conv:
+        """The convolution that comes first."""
+        return Conv(f"{self.name}.squeeze", self.inputs, self.squeezed, 1, 1, 0)
+
+    @property
+    def expand(self) -> tuple[Conv, Conv]:
+        """The two that look at its output."""
+        half = self.outputs // 2
+        return (
+            Conv(f"{self.name}.expand1x1", self.squeezed, half, 1, 1, 0),
+            Conv(f"{self.name}.expand3x3", self.squeezed, half),
+        )
+
+
+Layer = Conv | Pool | Fire
+Slices = tuple[tuple[Layer, ...], ...]
+
+
+def vgg(depths: tuple[int, ...], feature: tuple[int, ...], average: bool = False) -> Slices:
+    """A VGG whose block b has `depths[b]` convolutions, of which the one numbered `feature[b]` (from 1) is compared."""
+    slices, layers, index, inputs = [], [], 0, 3
+    for block, depth in enumerate(depths):
+        outputs = min(64 << block, 512)
+        for number in range(1, depth + 1):
+            layers.append(Conv(str(index), inputs, outputs))
+            index, inputs = index + 2, outputs  # its ReLU has a number too
+            if number == feature[block]:
+                slices.append(tuple(layers))
+                layers = []
+        layers.append(Pool(2, 2, average))
+        index += 1
+    return tuple(slices)  # what follows the last feature is not needed
+
+
+ALEXNET: Slices = (
+    (Conv("0", 3, 64, 11, 4, 2),),
+    (Pool(), Conv("3", 64, 192, 5, 1, 2)),
+    (Pool(), Conv("6", 192, 384)),
+    (Conv("8", 384, 256),),
+    (Conv("10", 256, 256),),
+)
+SQUEEZENET: Slices = (
+    (Conv("0", 3, 64, 3, 2, 0),),
+    (Pool(ceil=True), Fire("3", 64, 16, 128), Fire("4", 128, 16, 128)),
+    (Pool(ceil=True), Fire("6", 128, 32, 256), Fire("7", 256, 32, 256)),
+    (Pool(ceil=True), Fire("9", 256, 48, 384)),
+    (Fire("10", 384, 48, 384),),
+    (Fire("11", 384, 64, 512),),
+    (Fire("12", 512, 64, 512),),
+)
+VGG16 = vgg((2, 2, 3, 3, 3), (2, 2, 3, 3, 3))
+
+
+def convolutions(slices: Slices) -> Iterator[Conv]:
+    """All convolutions of a network, those of the fire modules among them."""
+    for layer in itertools.chain.from_iterable(slices):
+        if isinstance(layer, Fire):
+            yield layer.squeeze
+            yield from layer.expand
+        elif isinstance(layer, Conv):
+            yield layer
+
+
+def channels(slices: Slices) -> tuple[int, ...]:
+    """Of each compared feature map."""
+    return tuple([layer for layer in part if not isinstance(layer, Pool)][-1].outputs for part in slices)
+
+
+@functools.cache
+def smallest_side(slices: Slices) -> int:
+    """Pixels that an image must have per side for every layer to find a whole window."""
+
+    def fits(side: int) -> bool:
+        for layer in itertools.chain.from_iterable(slices):
+            if isinstance(layer, Fire):
+                continue
+            side += 2 * layer.padding if isinstance(layer, Conv) else 0
+            if side < layer.size:
+                return False
+            up = layer.stride - 1 if isinstance(layer, Pool) and layer.ceil else 0
+            side = (side - layer.size + up) // layer.stride + 1
+        return True
+
+    return next(side for side in itertools.count(1) if fits(side))
+
+
+def feature_maps(weights: Weights, slices: Slices, image: Float[Array, "h w 3"]) -> list[Float[Array, "y x c"]]:
+    """The compared maps of an image whose colours are scaled as the network expects them.
+
+    Computed in the dtype of the weights. Raises: ValueError for an image that is too small for the network.
+    """
+    height, width, _ = image.shape
+    if min(height, width) < (least := smallest_side(slices)):
+        raise ValueError(f"an image of {width} x {height} is too small for this network: {least} pixels a side needed")
+    maps, x = [], image.astype(weights["0"].kernel.dtype)
+    for part in slices:
+        for layer in part:
+            x = _apply(weights, layer, x)
+        maps.append(x)
+    return maps
+
+
+def _apply(weights, layer, x):
+    if isinstance(layer, Pool):
+        return _pool(layer, x)
+    if isinstance(layer, Fire):
+        x = _convolve(weights, layer.squeeze, x)
+        return jnp.concatenate([_convolve(weights, part, x) for part in layer.expand], axis=-1)
+    return _convolve(weights, layer, x)
+
+
+def _convolve(weights, layer, x):
+    convolution, padding = weights[layer.name], [(layer.padding, layer.padding)] * 2
+    y = jax.lax.conv_general_dilated(
+        x[None], convolution.kernel, (layer.stride,) * 2, padding, dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )
+    return jax.nn.relu(y[0] + convolution.bias)
+
+
+def _pool(layer, x):
+    # strided slices, one per place in the window: their gradient is cheaper than that of a windowed reduction, and the
+    # order in which equal maxima share a gradient does not matter behind a ReLU
+    if layer.ceil:
+        missing = [-(side - layer.size) % layer.stride for side in x.shape[:2]]
+        x = jnp.pad(x, [(0, missing[0]), (0, missing[1]), (0, 0)], constant_values=-jnp.inf)
+    rows, columns = ((side - layer.size) // layer.stride * layer.stride + 1 for side in x.shape[:2])
+    window = [
+        x[i : i + rows : layer.stride, j : j + columns : layer.stride]
+        for i, j in itertools.product(range(layer.size), repeat=2)
+    ]
+    if layer.average:
+        return sum(window[1:], window[0]) / len(window)
+    return functools.reduce(jnp.maximum, window)
