@@ -41,7 +41,9 @@ __all__ = [
     "Rendering",
     "SplatConfig",
     "default_pairs",
+    "draw_projected",
     "plan",
+    "project_gaussians",
     "render",
     "render_views",
     "seen_from",
@@ -172,11 +174,37 @@ def plan(
     return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
 
 
+def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> ProjectedGaussians:
+    """The first half of `render`: Gaussians on the image that `config` draws."""
+    return _project(*at_least_float32((gaussians, _drawn_camera(camera, config))), config)
+
+
+def draw_projected(
+    projected: ProjectedGaussians,
+    gaussians: Gaussians,
+    camera: Camera,
+    config: SplatConfig = DEFAULT_CONFIG,
+    background: Float[Array, "3"] | None = None,
+) -> Rendering:
+    """The second half of `render`, to look at what lies between them; for use inside transformations.
+
+    projected: of these Gaussians, camera and config; of the Gaussians only opacities and colours are read here.
+    """
+    background = _white(gaussians) if background is None else background
+    gaussians, camera, background = at_least_float32((gaussians, camera, background))
+    config = _with_default_buffers(gaussians, camera, config)
+    return _draw_projected(projected, gaussians, camera, background, config, None)
+
+
 def _render(gaussians: Gaussians, camera: Camera, background, config: SplatConfig, mesh: Mesh | None) -> Rendering:
+    projected = _project(gaussians, _drawn_camera(camera, config), config)
+    return _draw_projected(projected, gaussians, camera, background, config, mesh)
+
+
+def _draw_projected(projected, gaussians, camera, background, config: SplatConfig, mesh: Mesh | None) -> Rendering:
     if config.scale != 1:
-        return _render_resized(gaussians, camera, background, config, mesh)
+        return _draw_resized(projected, gaussians, camera, background, config, mesh)
     grid = _grid(camera, config)
-    projected = _project(gaussians, camera, config)
     if gaussians.means.shape[0] == 0:
         blank = jnp.zeros((grid.tiles, FEATURE_COUNT, grid.pixels), projected.x.dtype)
         visibility = jnp.zeros(0, blank.dtype) if config.visibility else None
@@ -268,9 +296,9 @@ def _draw_shared(mesh: Mesh):
     return draw
 
 
-def _render_resized(gaussians, camera, background, config, mesh) -> Rendering:
+def _draw_resized(projected, gaussians, camera, background, config, mesh) -> Rendering:
     small = dataclasses.replace(config, scale=1.0)
-    r = _render(gaussians, _drawn_camera(camera, config), background, small, mesh)
+    r = _draw_projected(projected, gaussians, _drawn_camera(camera, config), background, small, mesh)
     premultiplied = jnp.concatenate([r.rgb, r.alpha[..., None], (r.alpha * r.depth)[..., None]], axis=-1)
     image = _resampled(_resampled(premultiplied, camera.height, 0), camera.width, 1)
     alpha = image[..., 3]

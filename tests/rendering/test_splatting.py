@@ -15,7 +15,15 @@ from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.pytree import replace
 from humangs_jax.rendering.dense import render_dense
-from humangs_jax.rendering.splatting import SplatConfig, default_pairs, plan, render, render_views
+from humangs_jax.rendering.splatting import (
+    SplatConfig,
+    default_pairs,
+    draw_projected,
+    plan,
+    project_gaussians,
+    render,
+    render_views,
+)
 
 FLOAT64 = 1e-9
 """Relative to the largest entry; float64 rounding, grown by the 1 / (1 - alpha) <= 1000 of the gradient."""
@@ -284,6 +292,20 @@ def test_lowers_for_every_platform(gradient):
     function = jax.grad(loss) if gradient else lambda gaussians, view: render(gaussians, view, CHUNKS).rgb
     exported = jax.export.export(jax.jit(function), platforms=("cpu", "cuda", "tpu"))(gaussians, view)
     assert "callback" not in exported.mlir_module()
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_the_two_halves_are_the_whole(scale):
+    gaussians, view = random_gaussians(0, np.float32), camera(np.float32)
+    config = dataclasses.replace(CHUNKS, scale=scale)
+
+    @jax.jit
+    def halves(gaussians, view):
+        projected = project_gaussians(gaussians, view, config)
+        return draw_projected(projected, gaussians, view, config, background(np.float32))
+
+    whole = jax.jit(lambda g, c: render(g, c, config, background(np.float32)))(gaussians, view)
+    assert_close(halves(gaussians, view), whole, FLOAT32)
 
 
 def test_settings_are_checked():
