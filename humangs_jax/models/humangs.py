@@ -182,7 +182,7 @@ class Encoder(nn.Module):
     """Pixels of all views (v, h, w, 12: rgb, rays, canonical position) -> maps (v, h', w', d), global token."""
 
     config: HumanGSConfig
-    axis_name: str | None = None
+    axis_name: str | tuple[str, ...] | None = None
 
     @nn.compact
     def __call__(
@@ -293,7 +293,7 @@ def encode_with_statistics(
     inputs: HumanGSInputs,
     config: HumanGSConfig,
     train: bool = False,
-    axis_name: str | None = None,
+    axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[Encoding, Variables]:
     """`encode`, and the running batch statistics: updated ones if `train`, the given ones otherwise."""
     pixels = encoder_pixels(inputs, config)
@@ -414,7 +414,7 @@ def apply_humangs(
     inputs: HumanGSInputs,
     config: HumanGSConfig,
     train: bool = False,
-    axis_name: str | None = None,
+    axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[HumanGSOutputs, Variables]:
     """The whole network for one subject: outputs and batch statistics.
 

@@ -106,7 +106,7 @@ class Upsampler(nn.Module):
 
     config: UpsamplerConfig
     dtype: Any = None
-    axis_name: str | None = None
+    axis_name: str | tuple[str, ...] | None = None
 
     @nn.compact
     def __call__(
@@ -122,7 +122,8 @@ class Upsampler(nn.Module):
                 momentum=MOMENTUM,
                 use_fast_variance=False,
                 dtype=self.dtype,
-                axis_name=self.axis_name if train else None,
+                # several names are as good to it as one, whatever its annotation says
+                axis_name=self.axis_name if train else None,  # ty: ignore[invalid-argument-type]
                 name=name,
             )
             return jax.nn.leaky_relu(norm(x, mask=mask), SLOPE)

@@ -5,11 +5,7 @@ Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metada
 float32.
 """
 
-import dataclasses
-import json
 import os
-import types
-import typing
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
@@ -18,58 +14,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.configuration import config_from_json, config_to_json
 from humangs_jax.models.humangs import HumanGSConfig, Variables, init_humangs
 
 FORMAT = "humangs-weights"
 VERSION = "1"
 SHIPPED = "assets/weights.safetensors"
-
-
-def config_to_json(config: HumanGSConfig) -> str:
-    """Configuration as JSON, sub-configurations nested."""
-    return json.dumps(dataclasses.asdict(config))
-
-
-def config_from_json(text: str) -> HumanGSConfig:
-    """Inverse of `config_to_json`; fields that are absent take their defaults.
-
-    Raises: ValueError for a field that the configuration does not have or a value of another type, naming it.
-    """
-    try:
-        values = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise ValueError(f"configuration is no JSON: {error}") from error
-    return _build(HumanGSConfig, values, "config")
-
-
-def _build(cls: type, values: Any, path: str) -> Any:
-    """A (nested) configuration dataclass from plain JSON values, checked against its annotations."""
-    if not isinstance(values, dict):
-        raise ValueError(f"{path}: expected an object, got {values!r}")
-    annotations = typing.get_type_hints(cls)
-    if unknown := sorted(set(values) - set(annotations)):
-        raise ValueError(f"{path}.{unknown[0]}: {cls.__name__} has no such field")
-    arguments = {}
-    for name, value in values.items():
-        annotation = annotations[name]
-        if dataclasses.is_dataclass(annotation):
-            value = _build(annotation, value, f"{path}.{name}")
-        elif not _matches(value, annotation):
-            raise ValueError(f"{path}.{name}: {value!r} is no {annotation}")
-        arguments[name] = value
-    return cls(**arguments)
-
-
-def _matches(value: Any, annotation: Any) -> bool:
-    """Whether a JSON value fits one of the annotations that configurations use."""
-    origin = typing.get_origin(annotation)
-    if origin is Literal:
-        return value in typing.get_args(annotation)
-    if origin in (typing.Union, types.UnionType):
-        return any(_matches(value, option) for option in typing.get_args(annotation))
-    if annotation is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return type(value) is annotation
 
 
 def expected_variables(config: HumanGSConfig) -> Variables:
@@ -136,7 +86,7 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
         found = f"format {metadata.get('format')!r}, version {metadata.get('version')!r}"
         raise ValueError(f"{path}: expected header format {FORMAT!r}, version {VERSION!r}; found {found}")
     try:
-        config = config_from_json(metadata.get("config", ""))
+        config = config_from_json(HumanGSConfig, metadata.get("config", ""))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return variables_from_tensors(tensors, config, str(path)), config

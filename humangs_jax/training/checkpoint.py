@@ -1,5 +1,8 @@
 """Checkpoints of a run: the newest few and the best, each complete or not there, bit for bit what was saved.
 
+They are written while the run goes on, by all processes together, each what its devices hold; a run on other devices reads
+them as well.
+
 out/config.json          the configuration of the run
 out/checkpoints/STEP     Orbax checkpoints of the TrainState, with the score of their validation
 """
@@ -15,6 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from humangs_jax.configuration import config_from_json, config_to_json
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.state import TrainState
 
@@ -39,7 +43,7 @@ class Checkpoints:
         self._ocp = ocp
         kept = AnyPreservationPolicy([LatestN(keep), BestN(get_metric_fn=score, n=1)])
         options = ocp.CheckpointManagerOptions(
-            best_fn=score, preservation_policy=kept, enable_async_checkpointing=False, create=True
+            best_fn=score, preservation_policy=kept, enable_async_checkpointing=True, create=True
         )
         with _quiet():
             self._manager = ocp.CheckpointManager(Path(folder).resolve(), options=options)
@@ -60,13 +64,25 @@ class Checkpoints:
         return None if metrics is None or metrics["score"] == UNSCORED else metrics["score"]
 
     def save(self, state: TrainState, score: float | None = None) -> None:
-        """Write the state under its step; returns when it is on disk. A step that is there already is left as it is."""
+        """Write the state under its step, in the background: see `wait`. The state may be donated afterwards.
+
+        A step that is there already is left as it is.
+        """
         step = int(state.step)
         if step in self._manager.all_steps():
             return
+        if (
+            jax.default_backend() == "cpu"
+        ):  # where what is written would be the very memory that the next step overwrites
+            state = jax.tree.map(jnp.copy, state)
         metrics = {"score": UNSCORED if score is None else float(score)}
         with _quiet():
             self._manager.save(step, args=self._ocp.args.StandardSave(_as_dict(state)), metrics=metrics)
+
+    def wait(self) -> None:
+        """Return when all that was saved is on disk. Raises: what went wrong in the background."""
+        with _quiet():
+            self._manager.wait_until_finished()
 
     def restore(self, like: TrainState, step: int | None = None) -> TrainState:
         """The state of a step (None: the newest). `like`: a state of the same run, for structure, shapes and devices.
@@ -84,17 +100,18 @@ class Checkpoints:
         return TrainState(**jax.tree.map(_placed_as, restored, _as_dict(like)))
 
     def close(self) -> None:
-        """Release what Orbax holds."""
-        self._manager.close()
+        """Wait for what is being written, and release what Orbax holds."""
+        with _quiet():
+            self._manager.close()
 
 
-def save_config(out: str | Path, config: TrainConfig) -> None:
-    """Write out/config.json, or check the one that is there.
+def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> None:
+    """Write out/config.json, or check the one that is there. write: only check otherwise.
 
     Raises: ValueError, naming a field, if the folder belongs to a run of another configuration.
     """
     path = Path(out) / "config.json"
-    fields = json.loads(json.dumps(dataclasses.asdict(config)))
+    fields = json.loads(config_to_json(config))
     if path.is_file():
         earlier = _flat(json.loads(path.read_text()))
         for name, value in _flat(fields).items():
@@ -102,13 +119,28 @@ def save_config(out: str | Path, config: TrainConfig) -> None:
                 raise ValueError(
                     f"{path}: this run was started with {name} = {earlier[name]}, not {value}: use another --out"
                 )
+    if not write:
+        return
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     temporary.write_text(json.dumps(fields, indent=1))
     temporary.replace(path)
 
 
+def load_config(out: str | Path) -> TrainConfig:
+    """The configuration of the run in a folder. Raises: FileNotFoundError; ValueError, naming file and field."""
+    path = Path(out) / "config.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no run here")
+    try:
+        return config_from_json(TrainConfig, path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
 def _placed_as(value, like):
     """Through numpy: the buffers are XLA's own then, and may be donated. Uncommitted stays uncommitted: no recompiling."""
+    if not value.is_fully_addressable:
+        return value
     host = jax.device_get(value)
     return jax.device_put(host, like.sharding) if like.committed else jnp.asarray(host)
 

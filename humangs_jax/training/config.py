@@ -1,13 +1,13 @@
 """Everything that a training run depends on, composed of the configurations beside what they configure."""
 
 import dataclasses
-from typing import Literal
+import itertools
 
 from humangs_jax.data.loader import ViewSampling
 from humangs_jax.models import presets
 from humangs_jax.models.humangs import HumanGSConfig
 from humangs_jax.rendering.mesh_rasterizer import RasterConfig
-from humangs_jax.rendering.splatting import SplatConfig
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.training.optimizer import OptimizerConfig
 
 
@@ -16,7 +16,9 @@ class LossConfig:
     """Weights of the terms, each a mean over pixels or vertices and over the targets.
 
     squared: error of the colours. structural: structural dissimilarity at `structural_scales` sizes. silhouette:
-    squared error of the coverage. tightness: squared tight offsets, normalised units.
+    squared error of the coverage. tightness: squared tight offsets, normalised units. perceptual: difference of the
+    features of VGG-19, lpips: learned distance of features; both need networks that the user has, see
+    `objectives.loss_networks`, and are not computed where their weight is 0.
     random_background: share of the targets that are seen against one random colour instead of white, so that Gaussians
     as white as the background are told from none at all.
     """
@@ -26,17 +28,34 @@ class LossConfig:
     structural_scales: int = 3
     silhouette: float = 0.1
     tightness: float = 0.1
+    perceptual: float = 0.0
+    lpips: float = 0.0
     random_background: float = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """What changes at step `start` of a run and holds until the next stage; None: as the run's own configuration says."""
+
+    start: int
+    image_size: int | None = None
+    token_capacity: int | None = None
+    target_size: int | None = None
+    batch_size: int | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
     """One run. Photographs enter at `model.image_size` pixels, targets are learnt at `target_size`.
 
-    steps: of the whole run, which the learning rate ends with. batch_size: subjects per step. batching: subjects of a
-    batch one after the other ("loop", least memory, best on a CPU, statistics per subject) or all at once ("vmap",
-    statistics shared). ema_decay: of the averaged parameters, None for none.
+    steps: of the whole run, which the learning rate ends with. stages: in the order of their starts, for instance larger
+    photographs for the last steps; before the first the fields here hold, see `at`.
+    batch_size: subjects per step. microbatch_size: of those of a device, how many it works on at once, gradients
+    accumulating over the rest: 1 needs least memory and suits CPUs. The upsampler's batch statistics are of the subjects
+    that all devices work on at once. ema_decay: of the averaged parameters, None for none.
     log_every, validate_every, checkpoint_every: steps. keep_checkpoints: the newest so many, besides the best.
+
+    Raises: ValueError for stages that are not in order, or sizes that do not divide each other.
     """
 
     model: HumanGSConfig = dataclasses.field(default_factory=presets.small)
@@ -48,13 +67,50 @@ class TrainConfig:
     target_size: int = 128
     steps: int = 20_000
     batch_size: int = 1
-    batching: Literal["loop", "vmap"] = "loop"
+    microbatch_size: int = 1
+    stages: tuple[Stage, ...] = ()
     ema_decay: float | None = None
     seed: int = 0
     log_every: int = 20
     validate_every: int = 1000
     checkpoint_every: int = 1000
     keep_checkpoints: int = 2
+
+    def __post_init__(self):
+        counts = ("steps", "batch_size", "microbatch_size", "target_size", "log_every", "validate_every")
+        for name in (*counts, "checkpoint_every", "keep_checkpoints"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} {getattr(self, name)}: expected at least 1")
+        starts = [stage.start for stage in self.stages]
+        if starts and (starts[0] < 1 or starts != sorted(set(starts)) or starts[-1] >= self.steps):
+            raise ValueError(f"stages start at {starts}: expected ascending steps between 1 and {self.steps - 1}")
+        for start in starts:
+            self.at(start)
+
+    def at(self, step: int) -> "TrainConfig":
+        """The configuration in force at a step, without stages. Raises: ValueError if its sizes do not fit together."""
+        config = dataclasses.replace(self, stages=())
+        for stage in self.stages:
+            if stage.start <= step:
+                config = _changed(config, stage)
+        return config
+
+    def spans(self, start: int, stop: int) -> list[tuple[int, int]]:
+        """(first, end) of the runs of steps between two steps during which the configuration stays the same."""
+        inner = [stage.start for stage in self.stages if start < stage.start < stop]
+        edges = [start, *inner, stop]
+        return list(itertools.pairwise(edges)) if start < stop else []
+
+    def examples_before(self, step: int) -> int:
+        """Subjects that the steps before this one have taken, over all stages."""
+        return sum((end - first) * self.at(first).batch_size for first, end in self.spans(0, step))
+
+
+def _changed(config, stage):
+    model = {"image_size": stage.image_size, "token_capacity": stage.token_capacity}
+    own = {"target_size": stage.target_size, "batch_size": stage.batch_size}
+    given = lambda fields: {name: value for name, value in fields.items() if value is not None}
+    return dataclasses.replace(config, model=dataclasses.replace(config.model, **given(model)), **given(own))
 
 
 def small() -> TrainConfig:
@@ -67,6 +123,36 @@ def small() -> TrainConfig:
         ema_decay=0.998,
         validate_every=500,
         checkpoint_every=500,
+    )
+
+
+def published() -> TrainConfig:
+    """The release: 100,000 steps at 512 pixels, 4 input and 4 target views. Needs VGG-19 and LPIPS, see `LossConfig`.
+
+    The release has 2 subjects per device and does not say how many devices: 4 are taken here.
+    """
+    return TrainConfig(
+        model=presets.published(),
+        splat=SPLAT_PRESETS["inria"],
+        views=ViewSampling(target_count=4),
+        loss=LossConfig(structural=0.0, silhouette=0.0, perceptual=1.0, lpips=0.1, random_background=0.0),
+        target_size=512,
+        steps=100_000,
+        batch_size=8,
+    )
+
+
+def paper() -> TrainConfig:
+    """The paper: 60,000 steps at 256 pixels with 8 subjects, then 10,000 at 512 with 4. Needs VGG-19."""
+    model = presets.paper()
+    return dataclasses.replace(
+        published(),
+        model=dataclasses.replace(model, image_size=256),
+        splat=SplatConfig(),
+        loss=dataclasses.replace(published().loss, lpips=0.0),
+        target_size=256,
+        steps=70_000,
+        stages=(Stage(start=60_000, image_size=512, target_size=512, batch_size=4),),
     )
 
 
@@ -85,4 +171,16 @@ def tiny() -> TrainConfig:
     )
 
 
-PRESETS = {"small": small, "tiny": tiny}
+PRESETS = {"published": published, "paper": paper, "small": small, "tiny": tiny}
+
+
+def without_networks(config: TrainConfig) -> TrainConfig:
+    """The run without the losses that need other people's networks; structural dissimilarity takes their place.
+
+    Its weight becomes at least that of `LossConfig()`. A run without such losses stays as it is.
+    """
+    loss = config.loss
+    if loss.perceptual == 0 and loss.lpips == 0:
+        return config
+    structural = max(loss.structural, LossConfig().structural)
+    return dataclasses.replace(config, loss=dataclasses.replace(loss, perceptual=0.0, lpips=0.0, structural=structural))

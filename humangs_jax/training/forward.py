@@ -21,7 +21,7 @@ def reconstruct_example(
     inputs: SubjectViews,
     config: TrainConfig,
     train: bool = False,
-    axis_name: str | None = None,
+    axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[HumanGSOutputs, Variables]:
     """Canonical Gaussians of one subject and the batch statistics, see `apply_humangs`."""
     prepared = jax.lax.stop_gradient(prepare_inputs(body, inputs, config.model, config.raster))

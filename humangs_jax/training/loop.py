@@ -1,168 +1,184 @@
 """The training loop: the one place of this package's training with side effects.
 
 out/config.json, out/checkpoints/    see `checkpoint`; a run continues from the newest one by itself
-out/log.jsonl                        one line per `log_every` steps and per validation
+out/log.jsonl, out/tensorboard/      see `log`
 out/sheets/STEP.png                  what the network shows of people it was not trained on
 out/weights.safetensors              the newest weights (float16), averaged ones where `ema_decay` is set
 out/best.safetensors                 those of the best validation
+
+Of several processes all must see the same folder `out`; one of them writes all but the checkpoints.
 """
 
-import contextlib
-import json
-import logging
-import signal
-import threading
-import time
-from collections.abc import Generator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
+from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.loader import CaptureCache, ExampleSource
+from humangs_jax.data.loader import CaptureCache, Loader, Source, Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.models.humangs import Variables
 from humangs_jax.models.weights import save_weights
+from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training.checkpoint import Checkpoints, save_config
 from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.log import RunLog
+from humangs_jax.training.sharding import batch_sharding, place, replicated, state_shardings, training_mesh, whole
+from humangs_jax.training.sources import MakeSource, captured_people
 from humangs_jax.training.state import TrainState, init_state
-from humangs_jax.training.step import train_step
-from humangs_jax.training.validation import validate, validation_examples, write_sheet
-
-logger = logging.getLogger(__name__)
+from humangs_jax.training.step import NO_NETWORKS, train_step
+from humangs_jax.training.stopping import stop_requested
+from humangs_jax.training.validation import sheet, validate, validation_examples, write_sheet
 
 VALIDATED = 8
 """Subjects that a validation looks at."""
 SHOWN = 4
 """Subjects of those in the picture."""
+MANY_SKIPPED = 20
+"""Steps skipped one after the other that are worth a word."""
 
 
 def train(
     config: TrainConfig,
     body: BodyModel,
-    training: Sequence[str | Path],
+    training: Sequence[str | Path] | MakeSource,
     out: str | Path,
     *,
     validation: Sequence[str | Path] = (),
     variables: Variables | None = None,
+    networks: LossNetworks = NO_NETWORKS,
+    fsdp: int | None = None,
     stop_at: int | None = None,
     progress: bool = True,
 ) -> TrainState:
-    """Train until `config.steps`, from the newest checkpoint in `out` if there is one.
+    """Train until `config.steps`, from the newest checkpoint in `out` if there is one, on all devices of all processes.
 
     Arguments:
         body: the model that the captures' parameters belong to; made into the model's `gaussian_body` here.
-        training, validation: capture folders; no validation without the latter.
+        training: capture folders, or what makes another source of examples (`sources`).
+        validation: capture folders of other people; no validation without.
         variables: where to start a new run, for instance shipped weights; None for fresh ones.
+        networks: of the losses that need them.
+        fsdp: how many devices share one copy of the state, see `sharding.training_mesh`.
         stop_at: end after this step as if interrupted.
         progress: show a progress bar.
 
     Ctrl-C and SIGTERM finish the step, save and return; a second Ctrl-C interrupts at once.
-    Raises: ValueError if `out` belongs to a run of another configuration, or no capture can be used.
+    Raises: ValueError if `out` belongs to a run of another configuration, no capture can be used, or devices and batch do
+    not divide each other.
     """
-    out = Path(out)
+    out, leading = Path(out), jax.process_index() == 0
     (out / "sheets").mkdir(parents=True, exist_ok=True)
-    save_config(out, config)
+    save_config(out, config, write=leading)
+    make_source = captured_people(training, body) if isinstance(training, Sequence) else training
+    unseen = CaptureCache(validation, body) if validation else None
     body = gaussian_body(body, config.model)
-    size = config.model.image_size
-    source = ExampleSource(
-        CaptureCache(training, body), config.views, size, config.target_size, config.batch_size, config.seed
-    )
-    examples = validation_examples(CaptureCache(validation, body), config, VALIDATED) if validation else []
 
+    mesh = training_mesh(fsdp)
+    mesh = None if mesh.size == 1 else mesh
+    state, own_networks, own_body = init_state(config, variables), networks, body
+    if mesh is not None:
+        state = place(state, state_shardings(state, mesh))
+        body, networks = place((body, networks), replicated(mesh))
     checkpoints = Checkpoints(out / "checkpoints", config.keep_checkpoints)
-    state = init_state(config, variables)
     best = None
     if checkpoints.steps:
         state, best_step = checkpoints.restore(state), checkpoints.best_step
         best = None if best_step is None else checkpoints.score(best_step)
-    start, end = int(state.step), config.steps if stop_at is None else min(config.steps, stop_at)
+    begin, end = int(state.step), config.steps if stop_at is None else min(config.steps, stop_at)
 
-    log = _Log(out / "log.jsonl")
-    with _stop_on_signal() as stop, log, _bar(config.steps, start, progress) as bar:
-        batches, pending = source.batches(start, end), None
-        for step, batch in batches:
-            state, metrics = train_step(state, batch, body, config)
-            # one step may wait behind the one that runs: enough to keep a device busy, and a signal is obeyed soon
-            jax.block_until_ready(pending)
-            pending = metrics
-            done = step + 1
-            if done % config.log_every == 0 or done == end:
-                numbers = log.write_step(done, metrics, broken=len(source.cache.broken))
-                bar.set_postfix(loss=f"{numbers['loss']:.4f}", psnr=f"{numbers['psnr']:.2f}", refresh=False)
-            bar.update(1)
-            last, score = stop.is_set() or done == end, None
-            if examples and (done % config.validate_every == 0 or done == config.steps):
-                numbers, pictures = validate(state.variables, body, examples, config)
-                log.write({"step": done} | {f"val_{name}": value for name, value in numbers.items()})
-                write_sheet(out / "sheets" / f"{done:07d}.png", examples[:SHOWN], pictures[:SHOWN])
-                bar.write(f"step {done}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
-                score = numbers["psnr"]
-                if best is None or score > best:
+    waiting = Waiting()
+    with stop_requested() as stopping, RunLog(out, begin, config.steps, leading, progress) as log:
+        watch, stop = _Watch(log, state), False
+        for first, last in config.spans(begin, end):
+            part = config.at(first)
+            source = make_source(part)
+            examples = [] if unseen is None else validation_examples(unseen, part, VALIDATED)
+            batches = _loader(source, config, first, mesh).batches(first, last, waiting=waiting)
+            for step, batch in batches:
+                state, metrics = train_step(state, batch, body, part, networks, mesh)
+                watch(done := step + 1, metrics)
+                stop = stopping(done)
+                if done % config.log_every == 0 or done == end or stop:
+                    log.steps(done, jax.device_get(metrics), part.batch_size, waiting, len(source.broken))
+                log.bar.update(1)
+                validating = unseen is not None and (done % config.validate_every == 0 or done == config.steps)
+                if not (validating or stop or done == end or done % config.checkpoint_every == 0):
+                    continue
+                variables, score = state.variables if mesh is None else whole(state.variables, mesh), None
+                if validating:
+                    numbers, pictures = validate(variables, own_body, examples, part, own_networks)
+                    score = numbers["psnr"]
+                    if leading:
+                        _tell(log, out, done, numbers, sheet(examples[:SHOWN], pictures[:SHOWN]))
+                if leading:
+                    save_weights(out / "weights.safetensors", variables, part.model, "float16")
+                if score is not None and (best is None or score > best):
                     best = score
-                    save_weights(out / "best.safetensors", state.variables, config.model, "float16")
-            if last or score is not None or done % config.checkpoint_every == 0:
+                    if leading:
+                        save_weights(out / "best.safetensors", variables, part.model, "float16")
                 checkpoints.save(state, score)
-                save_weights(out / "weights.safetensors", state.variables, config.model, "float16")
-            if last:
-                batches.close()
+                if stop:
+                    break
+            batches.close()
+            if stop:
                 break
-    checkpoints.close()
+        watch.look()
+        checkpoints.close()
     return state
 
 
-class _Log:
-    """JSON lines, appended; times are measured between the lines of steps."""
-
-    def __init__(self, path):
-        self._path = path
-
-    def __enter__(self):
-        self._file = open(self._path, "a", buffering=1)
-        self._previous = None
-        return self
-
-    def __exit__(self, *_):
-        self._file.close()
-
-    def write(self, numbers):
-        self._file.write(json.dumps(numbers) + "\n")
-
-    def write_step(self, done, metrics, broken):
-        numbers = {"step": done} | {name: float(value) for name, value in jax.device_get(metrics).items()}
-        now = time.perf_counter()
-        if self._previous is not None:
-            steps, seconds = done - self._previous[0], now - self._previous[1]
-            numbers["seconds_per_step"] = seconds / max(steps, 1)
-        self._previous = (done, now)
-        if broken:
-            numbers["broken_folders"] = broken
-        self.write(numbers)
-        return numbers
+def _loader(source: Source, config: TrainConfig, first: int, mesh: Mesh | None) -> Loader:
+    """Batches from step `first` on, of the stage that holds there."""
+    part = config.at(first)
+    sharding = None if mesh is None else batch_sharding(mesh)
+    before = config.examples_before(first)
+    return Loader(source, part.batch_size, part.seed, sharding, first_step=first, first_example=before)
 
 
-def _bar(total, start, shown):
-    from tqdm import tqdm
+def _tell(log, out, done, numbers, picture):
+    """Of a validation."""
+    log.numbers(done, {f"val_{name}": value for name, value in numbers.items()}, "validation")
+    write_sheet(out / "sheets" / f"{done:07d}.png", picture)
+    log.picture(done, "validation/sheet", picture)
+    log.bar.write(f"step {done}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
 
-    return tqdm(total=total, initial=start, disable=not shown, unit="step", dynamic_ncols=True, smoothing=0.05)
 
+class _Watch:
+    """Looks at every step's numbers, one step late so that the device is never idle, and tells of steps that went wrong."""
 
-@contextlib.contextmanager
-def _stop_on_signal() -> Generator[threading.Event, None, None]:
-    """An event that SIGINT and SIGTERM set; the second SIGINT is a KeyboardInterrupt again."""
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():  # only the main thread may catch signals
-        yield stop
-        return
+    def __init__(self, log: RunLog, state: TrainState):
+        self._log, self._pending = log, None
+        self._skipped, self._nonfinite = int(state.opt_state.skipped), int(state.opt_state.nonfinite)
+        self._in_a_row = 0
 
-    def handle(number, _frame):
-        stop.set()
-        signal.signal(number, previous[number])
-        logger.warning("stopping after this step; what is done is saved")
+    def __call__(self, done, metrics):
+        # one step may wait behind the one that runs: enough to keep a device busy, and a signal is obeyed soon
+        self.look()
+        names = ("skipped", "nonfinite", "loss", "grad_norm")
+        self._pending = done, {name: metrics[name] for name in names}
 
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+    def look(self):
+        """At the step that waits."""
+        if self._pending is None:
+            return
+        done, metrics = self._pending
+        self._pending = None
+        numbers = {name: float(value) for name, value in jax.device_get(metrics).items()}
+        skipped, nonfinite = int(numbers["skipped"]), int(numbers["nonfinite"])
+        was_skipped, was_nonfinite = skipped > self._skipped, nonfinite > self._nonfinite
+        self._skipped, self._nonfinite = skipped, nonfinite
+        self._in_a_row = self._in_a_row + 1 if was_skipped else 0
+        if not (was_skipped or was_nonfinite):
+            return
+        told = f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}"
+        if was_skipped:
+            self._log.event(done, "skipped", f"skipped ({told}), {skipped} so far", **numbers)
+        else:
+            self._log.event(
+                done, "nonfinite", f"gradient entries that were not finite were replaced ({told})", **numbers
+            )
+        if self._in_a_row == MANY_SKIPPED:
+            advice = f"{MANY_SKIPPED} steps in a row were skipped: `humangs train --diagnose` names the first stage that fails"
+            self._log.event(done, "stuck", advice)

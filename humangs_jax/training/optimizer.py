@@ -2,7 +2,7 @@
 
 A gradient is made finite entry by entry first (NaN becomes 0, infinities +-1e-6). A step whose gradient norm exceeds
 `skip_norm`, or whose loss is not finite, changes nothing, neither parameters nor moments nor the schedule, and is
-counted.
+counted, and so is every step that had anything to make finite.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from humangs_jax.array_types import Array, Float, Int, PyTree, Scalar
+from humangs_jax.array_types import Array, Bool, Float, Int, PyTree, Scalar
 
 INFINITY_STAND_IN = 1e-6
 
@@ -34,9 +34,13 @@ class OptimizerConfig:
 
 
 class GuardState(NamedTuple):
-    """skipped: steps skipped so far. norm: gradient norm of the last step, before clipping. inner: what is guarded."""
+    """skipped: steps skipped so far. nonfinite: steps so far whose loss or gradient was not finite, skipped or not.
+
+    norm: gradient norm of the last step, made finite, before clipping. inner: what is guarded.
+    """
 
     skipped: Int[Array, ""]
+    nonfinite: Int[Array, ""]
     norm: Float[Array, ""]
     inner: PyTree
 
@@ -58,6 +62,11 @@ def finite_gradients(gradients: PyTree) -> PyTree:
     return jax.tree.map(lambda x: jnp.nan_to_num(x, nan=0.0, posinf=stand_in, neginf=-stand_in), gradients)
 
 
+def all_finite(tree: PyTree) -> Bool[Array, ""]:
+    """Whether every entry of every leaf is finite."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves(tree)]))
+
+
 def gradient_norm(gradients: PyTree) -> Scalar:
     """Euclidean norm over all entries of all leaves."""
     return jnp.sqrt(sum(jnp.sum(jnp.square(x)) for x in jax.tree.leaves(gradients)))
@@ -70,9 +79,12 @@ def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.Gradie
     """
 
     def init(params):
-        return GuardState(jnp.zeros((), jnp.int32), jnp.zeros(()), inner.init(params))
+        # two arrays: a state that is donated may not hold one buffer twice
+        counts = jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
+        return GuardState(*counts, jnp.zeros(()), inner.init(params))
 
     def update(gradients: PyTree, state: GuardState, params: PyTree, *, value: Scalar, **_):
+        finite = jnp.isfinite(value) & all_finite(gradients)
         gradients = finite_gradients(gradients)
         norm = gradient_norm(gradients)
         good = jnp.isfinite(value) & (norm <= skip_norm)
@@ -80,7 +92,7 @@ def guard(inner: optax.GradientTransformation, skip_norm: float) -> optax.Gradie
         keep = lambda new, old: jnp.where(good, new, old)
         updates = jax.tree.map(lambda x: keep(x, jnp.zeros_like(x)), updates)
         advanced = jax.tree.map(keep, advanced, state.inner)
-        return updates, GuardState(state.skipped + ~good, norm, advanced)
+        return updates, GuardState(state.skipped + ~good, state.nonfinite + ~finite, norm, advanced)
 
     # optax types the constructor's second argument as that of its base class, which knows no extra arguments
     return optax.GradientTransformationExtraArgs(init, update)  # ty: ignore[invalid-argument-type]

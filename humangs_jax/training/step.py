@@ -1,31 +1,41 @@
-"""One step of training: a pure function of state, batch and body."""
+"""One step of training: a pure function of state, batch and body, on one device or on a mesh of them."""
 
 import functools
-from typing import cast
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh, PartitionSpec
 
-from humangs_jax.array_types import Array, Float, Key, PyTree, Scalar
+from humangs_jax.array_types import Array, Float, Key, PyTree, Scalar, Shaped
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.models.humangs import HumanGSOutputs
+from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.losses import squared_error, tightness
+from humangs_jax.objectives.lpips import lpips
 from humangs_jax.objectives.metrics import psnr
+from humangs_jax.objectives.perceptual import perceptual_loss
 from humangs_jax.objectives.ssim import multiscale_structural_dissimilarity
 from humangs_jax.pytree import replace
-from humangs_jax.rendering.splatting import Rendering
+from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, Rendering
+from humangs_jax.training import sharding
 from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.forward import draw_targets, reconstruct_example
 from humangs_jax.training.optimizer import GuardState, learning_rate, make_optimizer
 from humangs_jax.training.state import TrainState
 
 SUBJECTS = "subjects"
-"""Name of the vmap axis over a batch, along which batch statistics are shared."""
+"""Name of the vmap axis over the subjects that a device works on at once, along which batch statistics are shared."""
+COUNTS = ("dropped_tokens", "dropped_reads", "overflow")
+"""Metrics that are sums over a batch; all others are means."""
+NO_NETWORKS = LossNetworks()
 
-Metrics = dict[str, Scalar]
+Metrics = dict[str, Shaped[Array, ""]]
+Gradients = tuple[Scalar, PyTree, PyTree, Metrics]
+"""Loss, gradients, updated batch statistics, metrics."""
 
 
 def random_backgrounds(key: Key, count: int, share: float) -> Float[Array, "v 3"]:
@@ -47,15 +57,37 @@ def loss_terms(
     images: Float[Array, "v h w 3"],
     targets: SubjectViews,
     config: LossConfig,
+    networks: LossNetworks = NO_NETWORKS,
 ) -> Metrics:
-    """The unweighted terms of `LossConfig` by name, for pictures drawn on the backgrounds of `images`."""
+    """The unweighted terms of `LossConfig` by name, for pictures drawn on the backgrounds of `images`.
+
+    Raises: ValueError if a term has a weight but its network is missing.
+    """
     dissimilarity = functools.partial(multiscale_structural_dissimilarity, scales=config.structural_scales)
-    return {
+    terms = {
         "squared": jnp.mean(squared_error(drawn.rgb, images)),
         "structural": jnp.mean(jax.vmap(dissimilarity)(drawn.rgb, images)),
         "silhouette": jnp.mean(squared_error(drawn.alpha, targets.masks)),
         "tightness": jnp.mean(tightness(outputs.tight_offsets)),
     }
+    if config.perceptual:
+        compare = functools.partial(perceptual_loss, _required(networks.perceptual, "perceptual", "VGG-19"))
+        terms["perceptual"] = jnp.mean(_each(compare, drawn.rgb, images))
+    if config.lpips:
+        compare = functools.partial(lpips, _required(networks.lpips, "lpips", "LPIPS"))
+        terms["lpips"] = jnp.mean(_each(compare, drawn.rgb, images))
+    return terms
+
+
+def _required(network, name, title):
+    if network is None:
+        raise ValueError(f"loss.{name} is not 0, but there is no {title}: pass its weights, or use `without_networks`")
+    return network
+
+
+def _each(compare, predicted, targets):
+    """One view after the other: the features of all at once would be the largest arrays of a step."""
+    return jax.lax.map(jax.checkpoint(lambda pair: compare(*pair)), (predicted, targets))
 
 
 def subject_loss(
@@ -65,7 +97,8 @@ def subject_loss(
     example: Example,
     key: Key,
     config: TrainConfig,
-    axis_name: str | None = None,
+    networks: LossNetworks = NO_NETWORKS,
+    axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[Scalar, tuple[PyTree, Metrics]]:
     """Loss of one subject, with the updated batch statistics and what is worth knowing."""
     variables = {"params": params, "batch_stats": batch_stats}
@@ -75,7 +108,7 @@ def subject_loss(
     backgrounds = backgrounds.astype(targets.images.dtype)
     images = change_background(targets, backgrounds)
     drawn = draw_targets(outputs, body, targets, backgrounds, config)
-    terms = loss_terms(drawn, outputs, images, targets, config.loss)
+    terms = loss_terms(drawn, outputs, images, targets, config.loss, networks)
     loss = sum(getattr(config.loss, name) * term for name, term in terms.items())
     metrics = {
         **terms,
@@ -87,50 +120,118 @@ def subject_loss(
     return loss, (batch_stats, metrics)
 
 
-def batch_gradients(
-    state: TrainState, body: BodyModel, batch: Example, keys: Array, config: TrainConfig
-) -> tuple[Scalar, PyTree, PyTree, Metrics]:
-    """(loss, gradients, batch_stats, metrics) of a batch: means over its subjects, but sums of what was dropped.
+def local_gradients(
+    params: PyTree,
+    batch_stats: PyTree,
+    body: BodyModel,
+    batch: Example,
+    keys: Array,
+    config: TrainConfig,
+    networks: LossNetworks = NO_NETWORKS,
+    axes: tuple[str, ...] = (),
+) -> Gradients:
+    """Of the subjects of one device: means over them, but sums of what was dropped. keys: one per subject.
 
-    keys: one per subject.
+    `config.microbatch_size` subjects are worked on at once, the gradients accumulate over the rest. axes: of the mesh,
+    along which batch statistics are shared too. Raises: ValueError if the subjects cannot be divided so.
     """
-    if config.batching == "vmap":
+    count, size = len(keys), config.microbatch_size
+    if count % size:
+        raise ValueError(f"{count} subjects per device cannot be divided into microbatches of {size}")
 
-        def batch_loss(params):
-            def one(example, key):
-                return subject_loss(params, state.batch_stats, body, example, key, config, SUBJECTS)
+    def microbatch_loss(params, batch, keys):
+        names = (SUBJECTS, *axes) if size > 1 else axes
+        one = lambda example, key: subject_loss(
+            params, batch_stats, body, example, key, config, networks, names or None
+        )
+        if size == 1:  # without vmap: a CPU runs the loops of a single subject faster
+            first = lambda tree: jax.tree.map(lambda x: x[0], tree)
+            loss, aux = one(first(batch), keys[0])
+            return loss, jax.tree.map(lambda x: x[None], (loss, aux))
+        losses, aux = jax.vmap(one, axis_name=SUBJECTS)(batch, keys)
+        return jnp.mean(losses), (losses, aux)
 
-            losses, aux = jax.vmap(one, axis_name=SUBJECTS)(batch, keys)
-            return jnp.mean(losses), aux
+    def accumulate(total, microbatch):
+        (_, aux), gradients = jax.value_and_grad(microbatch_loss, has_aux=True)(params, *microbatch)
+        return jax.tree.map(lambda a, x: a + x * (size / count), total, gradients), aux
 
-        (loss, (batch_stats, metrics)), gradients = jax.value_and_grad(batch_loss, has_aux=True)(state.params)
-    else:
-        value_and_gradient = jax.value_and_grad(subject_loss, has_aux=True)
-
-        def accumulate(total, arguments):
-            example, key = arguments
-            (loss, aux), gradients = value_and_gradient(state.params, state.batch_stats, body, example, key, config)
-            return jax.tree.map(lambda a, x: a + x / keys.shape[0], total, gradients), (loss, aux)
-
-        zeros = jax.tree.map(jnp.zeros_like, state.params)
-        gradients, (losses, (batch_stats, metrics)) = jax.lax.scan(accumulate, zeros, (batch, keys))
-        loss = jnp.mean(losses)
-    batch_stats = jax.tree.map(lambda x: jnp.mean(x, axis=0), batch_stats)
-    counts = {name: jnp.sum(metrics.pop(name)) for name in ("dropped_tokens", "dropped_reads", "overflow")}
-    return loss, gradients, batch_stats, {name: jnp.mean(x) for name, x in metrics.items()} | counts
+    microbatches = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), (batch, keys))
+    zeros = jax.tree.map(jnp.zeros_like, params)
+    gradients, (losses, (updated, metrics)) = jax.lax.scan(accumulate, zeros, microbatches)
+    average = lambda x: jnp.mean(x, axis=(0, 1))
+    totals = {name: jnp.sum(metrics.pop(name)) for name in COUNTS}
+    metrics = {name: average(x) for name, x in metrics.items()} | totals
+    return average(losses), gradients, jax.tree.map(average, updated), metrics
 
 
-@functools.partial(jax.jit, static_argnames="config", donate_argnames="state")
-def train_step(state: TrainState, batch: Example, body: BodyModel, config: TrainConfig) -> tuple[TrainState, Metrics]:
-    """The state after one more step, and metrics: loss and its terms, psnr, grad_norm, learning_rate, skipped (steps
-    so far), dropped_tokens, dropped_reads and overflow (what did not fit its buffers in this step).
+def batch_gradients(
+    params: PyTree,
+    batch_stats: PyTree,
+    body: BodyModel,
+    batch: Example,
+    keys: Array,
+    config: TrainConfig,
+    networks: LossNetworks = NO_NETWORKS,
+    mesh: Mesh | None = None,
+) -> Gradients:
+    """`local_gradients` of a whole batch: each device of a mesh takes its share of the subjects."""
+    if mesh is None:
+        return local_gradients(params, batch_stats, body, batch, keys, config, networks)
+    specs = sharding.partition(params, mesh)
+    everywhere, divided = PartitionSpec(), PartitionSpec(sharding.AXES)
+
+    def one_device(params, batch_stats, body, batch, keys, networks):
+        params = sharding.gather(params, specs)
+        loss, gradients, updated, metrics = local_gradients(
+            params, batch_stats, body, batch, keys, config, networks, sharding.AXES
+        )
+        reduce = {name: jax.lax.psum if name in COUNTS else jax.lax.pmean for name in metrics}
+        metrics = {name: reduce[name](x, sharding.AXES) for name, x in metrics.items()}
+        loss, updated = jax.lax.pmean((loss, updated), sharding.AXES)
+        return loss, sharding.mean_parts(gradients, specs, mesh), updated, metrics
+
+    return jax.shard_map(
+        one_device,
+        mesh=mesh,
+        in_specs=(specs, everywhere, everywhere, divided, divided, everywhere),
+        out_specs=(everywhere, specs, everywhere, everywhere),
+        # the renderer's loops start from constants, which the check would want marked as differing between devices
+        check_vma=False,
+    )(params, batch_stats, body, batch, keys, networks)
+
+
+def train_step(
+    state: TrainState,
+    batch: Example,
+    body: BodyModel,
+    config: TrainConfig,
+    networks: LossNetworks = NO_NETWORKS,
+    mesh: Mesh | None = None,
+) -> tuple[TrainState, Metrics]:
+    """The state after one more step, and metrics: loss and its terms, psnr, grad_norm, learning_rate, skipped and
+    nonfinite (steps so far), dropped_tokens, dropped_reads and overflow (what did not fit its buffers in this step).
 
     Arguments: state is given away (donated). batch: an `Example` with a leading axis of subjects. body: decimated
-    already. config: static.
+    already. config: static, of one stage. networks: of the losses that need them. mesh: static; where there is one, state,
+    batch, body and networks lie on it, see `sharding`.
     """
+    return jitted_train_step()(state, batch, body, networks, config=config, mesh=mesh)
+
+
+@functools.cache
+def jitted_train_step() -> Any:
+    """The jitted function behind `train_step`, called as f(state, batch, body, networks, config=, mesh=)."""
+    # chosen when first used: asking for the backend would start it
+    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    return jax.jit(_train_step, static_argnames=("config", "mesh"), donate_argnames="state", compiler_options=options)
+
+
+def _train_step(state, batch, body, networks, config, mesh):
     key = jax.random.fold_in(jax.random.key(config.seed), state.step)
     keys = jax.random.split(key, batch.inputs.betas.shape[0])
-    loss, gradients, batch_stats, metrics = batch_gradients(state, body, batch, keys, config)
+    loss, gradients, batch_stats, metrics = batch_gradients(
+        state.params, state.batch_stats, body, batch, keys, config, networks, mesh
+    )
     optimizer = make_optimizer(config.optimizer, config.steps)
     updates, opt_state = optimizer.update(gradients, state.opt_state, state.params, value=loss)
     opt_state = cast(GuardState, opt_state)
@@ -148,12 +249,16 @@ def train_step(state: TrainState, batch: Example, body: BodyModel, config: Train
         "grad_norm": opt_state.norm,
         "learning_rate": jnp.asarray(rate(state.step - state.opt_state.skipped)),
         "skipped": opt_state.skipped,
+        "nonfinite": opt_state.nonfinite,
     }
-    return replace(
+    state = replace(
         state,
         step=state.step + 1,
         params=params,
         batch_stats=jax.tree.map(lambda new, old: jnp.where(good, new, old), batch_stats, state.batch_stats),
         opt_state=opt_state,
         ema_params=ema_params,
-    ), metrics
+    )
+    if mesh is not None:
+        state = jax.lax.with_sharding_constraint(state, sharding.state_shardings(state, mesh))
+    return state, metrics

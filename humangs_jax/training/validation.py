@@ -1,4 +1,7 @@
-"""Validation: the same views of the same unseen people every time, with the running statistics, in numbers and a picture."""
+"""Validation: the same views of the same unseen people every time, with the running statistics, in numbers and a picture.
+
+Several processes share the people; every process ends up with the means over all of them.
+"""
 
 import dataclasses
 import functools
@@ -12,36 +15,51 @@ import numpy as np
 from humangs_jax.array_types import Array, Float
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.images import write_png
-from humangs_jax.data.loader import CaptureCache, Example, ExampleSource, ViewSampling
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, ViewSampling
 from humangs_jax.models.humangs import Variables
+from humangs_jax.objectives.loss_networks import LossNetworks
+from humangs_jax.objectives.lpips import lpips
 from humangs_jax.objectives.metrics import masked_psnr, psnr
 from humangs_jax.objectives.ssim import similarity_map
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.forward import predict
 
+NO_NETWORKS = LossNetworks()
+METRICS = ("psnr", "psnr_mask", "ssim", "dropped_tokens", "dropped_reads", "overflow")
+
 
 def validation_examples(cache: CaptureCache, config: TrainConfig, count: int) -> list[Example]:
-    """Examples of the first `count` subjects: inputs evenly spaced and of one pose, targets as large as the inputs."""
+    """This process's examples of the first `count` subjects: inputs evenly spaced and of one pose, as many as in the
+    middle one of the training's counts; targets as large as the inputs.
+    """
+    counts = sorted(config.views.input_counts)
     views = ViewSampling(
-        input_counts=config.views.input_counts[:1],
+        input_counts=(counts[len(counts) // 2],),
         target_count=config.views.target_count,
         jitter=0.0,
         scattered_share=0.0,
         mixed_pose_share=0.0,
     )
-    source = ExampleSource(cache, views, config.model.image_size, config.model.image_size, seed=0)
-    return [source.example_at(i, views.input_counts[0]) for i in range(min(count, len(cache)))]
+    source = CaptureSource(cache, views, config.model.image_size, config.model.image_size)
+    own = range(jax.process_index(), min(count, len(cache)), jax.process_count())
+    return [jax.tree.map(jnp.asarray, source.example(0, i, views.input_counts[0])) for i in own]
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def evaluate(
-    variables: Variables, body: BodyModel, example: Example, config: TrainConfig
+    variables: Variables,
+    body: BodyModel,
+    example: Example,
+    config: TrainConfig,
+    networks: LossNetworks = NO_NETWORKS,
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
-    """The pictures of one example's targets and their mean psnr, psnr_mask (both dB) and ssim."""
+    """The pictures of one example's targets and their mean psnr, psnr_mask (both dB), ssim, and lpips if its network is
+    there.
+    """
     drawn, outputs = predict(variables, body, example, config)
     images, masks = example.targets.images, example.targets.masks
     shown = jnp.clip(drawn.rgb, 0, 1)
-    return shown, {
+    metrics = {
         "psnr": jnp.mean(jax.vmap(psnr)(shown, images)),
         "psnr_mask": jnp.mean(jax.vmap(masked_psnr)(shown, images, masks)),
         "ssim": jnp.mean(jax.vmap(similarity_map)(shown, images)),
@@ -49,27 +67,52 @@ def evaluate(
         "dropped_reads": outputs.dropped_reads.astype(shown.dtype),
         "overflow": jnp.sum(drawn.overflow).astype(shown.dtype),
     }
+    if networks.lpips is not None:
+        compare = functools.partial(lpips, networks.lpips)
+        metrics["lpips"] = jnp.mean(jax.lax.map(lambda pair: compare(*pair), (shown, images)))
+    return shown, metrics
 
 
 def validate(
-    variables: Variables, body: BodyModel, examples: Sequence[Example], config: TrainConfig
+    variables: Variables,
+    body: BodyModel,
+    examples: Sequence[Example],
+    config: TrainConfig,
+    networks: LossNetworks = NO_NETWORKS,
 ) -> tuple[dict[str, float], list[np.ndarray]]:
-    """Means over the examples, and the pictures of each."""
+    """Means over the examples of all processes, and the pictures of this process's. All arguments are local arrays."""
     # buffers of another size than in training: as many pairs as the larger pictures may need
     config = dataclasses.replace(config, splat=dataclasses.replace(config.splat, max_pairs=None, max_rows=None))
     pictures, rows = [], []
     for example in examples:
-        shown, metrics = evaluate(variables, body, example, config)
+        shown, metrics = evaluate(variables, body, example, config, networks)
         pictures.append(np.asarray(shown))
         rows.append({name: float(value) for name, value in metrics.items()})
-    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}, pictures
+    names = METRICS if networks.lpips is None else (*METRICS, "lpips")
+    return _means(names, rows), pictures
 
 
-def write_sheet(path: str | Path, examples: Sequence[Example], pictures: Sequence[np.ndarray]) -> None:
-    """A PNG with a row per example: its inputs, then each target beside what the network shows of it."""
+def _means(names, rows):
+    """Over all processes, some of which may have no rows."""
+    own = np.asarray([[row[name] for name in names] for row in rows]).reshape(-1, len(names))
+    totals = np.append(own.sum(axis=0), len(own))
+    if jax.process_count() > 1:
+        from jax.experimental import multihost_utils
+
+        totals = multihost_utils.process_allgather(totals.astype(np.float32)).sum(axis=0)
+    return {name: float(total / totals[-1]) for name, total in zip(names, totals[:-1], strict=True)}
+
+
+def sheet(examples: Sequence[Example], pictures: Sequence[np.ndarray]) -> Float[np.ndarray, "h w 3"]:
+    """A row per example: its inputs, then each target beside what the network shows of it."""
     rows = []
     for example, shown in zip(examples, pictures, strict=True):
         targets = np.asarray(example.targets.images)
         pairs = [picture for pair in zip(targets, shown, strict=True) for picture in pair]
         rows.append(np.concatenate([*np.asarray(example.inputs.images), *pairs], axis=1))
-    write_png(Path(path), np.concatenate(rows))
+    return np.concatenate(rows)
+
+
+def write_sheet(path: str | Path, picture: Float[np.ndarray, "h w 3"]) -> None:
+    """The `sheet` as a PNG."""
+    write_png(Path(path), picture)

@@ -8,8 +8,9 @@ import pytest
 from network_cases import TINY, random_variables
 from safetensors.numpy import load_file, save_file
 
+from humangs_jax.configuration import config_from_json, config_to_json
 from humangs_jax.models import presets, weights
-from humangs_jax.models.weights import config_from_json, config_to_json, load_weights, save_weights
+from humangs_jax.models.weights import load_weights, save_weights
 
 VARIABLES = random_variables(TINY)
 TEXTURE = "params/encoder/tokenizer/texture"
@@ -109,5 +110,5 @@ def test_nothing_is_written_that_could_not_be_read(tmp_path):
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
 def test_configurations_survive_json(name):
     config = presets.PRESETS[name]()
-    assert config_from_json(config_to_json(config)) == config
-    assert config_from_json("{}") == type(config)()
+    assert config_from_json(type(config), config_to_json(config)) == config
+    assert config_from_json(type(config), "{}") == type(config)()

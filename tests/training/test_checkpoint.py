@@ -42,6 +42,7 @@ def test_a_restored_state_can_be_donated(checkpoints):
 def test_keeps_the_newest_and_the_best(tmp_path, checkpoints, same):
     for step, score in enumerate([20.0, 30.0, None, 25.0, None, 28.0]):
         checkpoints.save(state_at(step), score)
+    checkpoints.wait()
     assert checkpoints.steps == [1, 4, 5] and checkpoints.best_step == 1
     again = Checkpoints(tmp_path / "checkpoints", keep=2)
     assert again.steps == [1, 4, 5] and again.best_step == 1

@@ -10,6 +10,7 @@ import pytest
 from humangs_jax.data.loader import CaptureCache, ExampleSource
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.models.humangs import init_humangs
 from humangs_jax.pytree import replace
 from humangs_jax.training.config import tiny
 from humangs_jax.training.state import init_state
@@ -77,11 +78,13 @@ def test_a_fresh_state_has_the_shapes_of_a_given_one(variables):
 
 @pytest.mark.slow
 def test_a_batch_gives_the_mean_gradient_of_its_subjects(body, source, variables):
-    state = init_state(CONFIG, variables)
     keys = jax.random.split(jax.random.key(0), 2)
     batch = jax.tree.map(lambda *x: jnp.concatenate(x), source.batch_at(0), source.batch_at(1))
-    one = lambda i: batch_gradients(state, body, jax.tree.map(lambda x: x[i : i + 1], batch), keys[i : i + 1], CONFIG)
-    both = batch_gradients(state, body, batch, keys, CONFIG)
+    gradients = lambda batch, keys, config=CONFIG: batch_gradients(
+        variables["params"], variables["batch_stats"], body, batch, keys, config
+    )
+    one = lambda i: gradients(jax.tree.map(lambda x: x[i : i + 1], batch), keys[i : i + 1])
+    both = gradients(batch, keys)
     singles = [one(0), one(1)]
     for position in (0, 1, 2):  # loss, gradients, batch statistics
         mean = jax.tree.map(lambda a, b: (a + b) / 2, *(x[position] for x in singles))
@@ -89,11 +92,25 @@ def test_a_batch_gives_the_mean_gradient_of_its_subjects(body, source, variables
             lambda a, b: np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b) + 1e-9, both[position], mean
         )
         assert jax.tree.all(close)
-    together = dataclasses.replace(CONFIG, batching="vmap")
-    alone = batch_gradients(state, body, jax.tree.map(lambda x: x[:1], batch), keys[:1], together)
-    assert float(alone[0]) == pytest.approx(float(singles[0][0]), rel=FLOAT32)
-    norms = [np.sqrt(sum(float(jnp.vdot(x, x)) for x in jax.tree.leaves(g[1]))) for g in (alone, singles[0])]
-    assert norms[0] == pytest.approx(norms[1], rel=1e-3)
+    with pytest.raises(ValueError, match="2 subjects per device cannot be divided into microbatches of 3"):
+        gradients(batch, keys, dataclasses.replace(CONFIG, microbatch_size=3))
+
+
+@pytest.mark.slow
+def test_subjects_worked_on_at_once_or_one_after_the_other_give_the_same_gradient(body, source):
+    keys = jax.random.split(jax.random.key(0), 2)
+    batch = jax.tree.map(lambda *x: jnp.concatenate(x), source.batch_at(0), source.batch_at(1))
+    # without batch statistics, which are meant to differ
+    upsampler = dataclasses.replace(CONFIG.model.upsampler, enabled=False)
+    config = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, upsampler=upsampler))
+    variables = init_humangs(jax.random.key(0), config.model)
+    results = [
+        batch_gradients(variables["params"], {}, body, batch, keys, dataclasses.replace(config, microbatch_size=size))
+        for size in (1, 2)
+    ]
+    assert float(results[1][0]) == pytest.approx(float(results[0][0]), rel=FLOAT32)
+    for a, b in zip(*(jax.tree.leaves(result[1]) for result in results), strict=True):
+        assert np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b) + 1e-9
 
 
 def views_on_white(color, masks):

@@ -25,6 +25,7 @@ class Loader:
     batch_size: subjects of the global batch, over all processes. seed: of order and views.
     sharding: how a batch lies on the devices (only its first axis may be split); a process makes the rows that its own
         devices hold, so that replicas hold equal rows. None: everything on the default device.
+    first_step, first_example: where the numbering of examples starts: those of steps before had other batches.
     process_index, process_count: where `sharding` is None, the part of the batch to make: equal runs of rows.
     reader: "grain", "plain", or "auto": grain where it is installed. Batches are the same. threads: that make examples.
 
@@ -35,6 +36,8 @@ class Loader:
     batch_size: int = 1
     seed: int = 0
     sharding: jax.sharding.Sharding | None = None
+    first_step: int = 0
+    first_example: int = 0
     process_index: int = 0
     process_count: int = 1
     reader: Reader = "auto"
@@ -62,7 +65,8 @@ class Loader:
 
     def example_at(self, step: int, row: int) -> Example:
         """Row `row` of the global batch of a step."""
-        return self.source.example(self.seed, step * self.batch_size + row, self.input_count(step))
+        number = self.first_example + (step - self.first_step) * self.batch_size + row
+        return self.source.example(self.seed, number, self.input_count(step))
 
     def batch_at(self, step: int) -> Example:
         """The batch of a step on the devices: an `Example` with a leading batch axis on every leaf.

@@ -1,0 +1,131 @@
+"""Finds the stage of a training step in which numbers stopped being finite.
+
+    print(diagnose_step(state, batch, body, config))       # one step
+    print(diagnose_run("runs/small", load_body(), people)) # the first step of a run that failed
+
+For one process and device; needs the memory of a step that recomputes nothing. JAX_PLATFORMS=cpu has it where an
+accelerator has not.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.array_types import PyTree
+from humangs_jax.body.model import BodyModel
+from humangs_jax.data.loader import Example, Loader
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.models.humangs import Variables
+from humangs_jax.objectives.loss_networks import LossNetworks
+from humangs_jax.training.checkpoint import Checkpoints, load_config
+from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.diagnosis import Diagnosis, StageReport, leaves
+from humangs_jax.training.observed import observe_subject
+from humangs_jax.training.probes import Statistics, tree_statistics
+from humangs_jax.training.sources import MakeSource, captured_people
+from humangs_jax.training.state import TrainState, init_state
+from humangs_jax.training.step import NO_NETWORKS, train_step
+
+FAILED = ("skipped", "nonfinite")
+"""Events of a run's log that are worth a diagnosis."""
+
+
+def diagnose_step(
+    state: TrainState, batch: Example, body: BodyModel, config: TrainConfig, networks: LossNetworks = NO_NETWORKS
+) -> Diagnosis:
+    """Look at the step that `train_step` would make of these arguments (and which the state survives).
+
+    Subject by subject: where a microbatch shares its batch statistics, theirs are their own here.
+    """
+    config = config.at(int(state.step))
+    stored = [StageReport(name, leaves(numbers)) for name, numbers in jax.device_get(_stored(state)).items()]
+    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+    found = []
+    for subject, key in enumerate(jax.random.split(key, len(batch.inputs.betas))):
+        example = jax.tree.map(lambda x, i=subject: x[i], batch)
+        result = observe_subject(state.params, state.batch_stats, body, example, key, config, networks)
+        loss, stages = jax.device_get(result)
+        photographs = StageReport("batch", leaves(jax.device_get(_tree_statistics(example))))
+        diagnosis = Diagnosis(
+            step=int(state.step),
+            subject=subject,
+            loss=float(loss),
+            skip_norm=config.optimizer.skip_norm,
+            stored=(*stored, photographs),
+            stages=tuple(StageReport(x.name, *map(leaves, (x.values, x.cotangents, x.gradients))) for x in stages),
+        )
+        if diagnosis.fault is not None:
+            return diagnosis
+        found.append(diagnosis)
+    return max(found, key=lambda diagnosis: diagnosis.gradient_norm)
+
+
+def diagnose_run(
+    out: str | Path,
+    body: BodyModel,
+    training: Sequence[str | Path] | MakeSource,
+    *,
+    networks: LossNetworks = NO_NETWORKS,
+    variables: Variables | None = None,
+) -> Diagnosis:
+    """Repeat the first step of a run that its log calls skipped or not finite, from the newest checkpoint before it.
+
+    Without such a step: the one that would come next. body, training, networks, variables: as the run had them.
+    Batches are functions of seed and step, so that on the device that the run had the step is repeated bit for bit.
+    Raises: FileNotFoundError without a run in `out`.
+    """
+    config = load_config(out)
+    make_source = captured_people(training, body) if isinstance(training, Sequence) else training
+    body = gaussian_body(body, config.model)
+    checkpoints = Checkpoints(Path(out) / "checkpoints", config.keep_checkpoints)
+    failed = first_failed_step(Path(out) / "log.jsonl")
+    state = init_state(config, variables)
+    before = [step for step in checkpoints.steps if failed is None or step <= failed]
+    if before:
+        state = checkpoints.restore(state, before[-1])
+    checkpoints.close()
+    step = int(state.step)
+    for first, last in config.spans(step, step + 1 if failed is None else failed + 1):
+        part = config.at(first)
+        loader = Loader(
+            make_source(part),
+            part.batch_size,
+            part.seed,
+            first_step=first,
+            first_example=config.examples_before(first),
+        )
+        for step, batch in loader.batches(first, last):
+            if step + 1 < (last if failed is None else failed + 1):
+                state, _ = train_step(state, batch, body, part, networks)
+            else:
+                return diagnose_step(state, batch, body, config, networks)
+    raise AssertionError("the last of the steps is diagnosed")
+
+
+def first_failed_step(log: Path) -> int | None:
+    """Number of the first step that a log calls skipped or not finite, counted from 0; None if there is none."""
+    if not log.is_file():
+        return None
+    for line in log.read_text().splitlines():
+        record = json.loads(line)
+        if record.get("event") in FAILED:
+            return record["step"] - 1
+    return None
+
+
+@jax.jit
+def _tree_statistics(tree: PyTree) -> dict[str, Statistics]:
+    return tree_statistics(tree)
+
+
+def _stored(state: TrainState) -> dict[str, dict[str, Statistics]]:
+    parts = {
+        "parameters": state.params,
+        "batch statistics": state.batch_stats,
+        "optimizer": state.opt_state.inner,
+        "averaged parameters": state.ema_params,
+    }
+    return {name: _tree_statistics(tree) for name, tree in parts.items() if jax.tree.leaves(tree)}

@@ -1,0 +1,121 @@
+"""What a run tells of itself: JSON lines, the same numbers for TensorBoard, and a progress bar.
+
+out/log.jsonl       one object per line; {"step", "loss", ...} while training, {"step", "val_psnr", ...} from validations,
+                    {"step", "event", ...} where something happened
+out/tensorboard/    the numbers and the validation pictures, if tensorboardX is installed
+"""
+
+import json
+import math
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.data.loader import Waiting
+
+FLUSH_SECONDS = 10
+
+
+class RunLog:
+    """The records of a run that continues after `step`: what was recorded of later steps by a run that was killed goes.
+
+    recording: False in all processes but one; then nothing is written or shown.
+    """
+
+    def __init__(self, out: str | Path, step: int, total: int, recording: bool = True, progress: bool = True):
+        from tqdm import tqdm
+
+        self.bar = tqdm(
+            total=total,
+            initial=step,
+            disable=not (recording and progress),
+            unit="step",
+            dynamic_ncols=True,
+            smoothing=0.05,
+        )
+        self._recording = recording
+        self._lines = self._board = None
+        self._previous = (step, time.perf_counter(), 0.0)
+        if recording:
+            path = Path(out) / "log.jsonl"
+            forget_after(path, step)
+            self._lines = open(path, "a", buffering=1)  # noqa: SIM115 (closed in __exit__)
+            self._board = _tensorboard(Path(out) / "tensorboard", step)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.bar.close()
+        if self._lines is not None:
+            self._lines.close()
+        if self._board is not None:
+            self._board.close()
+
+    def steps(self, done: int, metrics: dict[str, Any], subjects: int, waiting: Waiting, broken: int) -> None:
+        """Numbers of the last step done. subjects: per step; seconds and samples a second are since the last line."""
+        numbers = {name: float(value) for name, value in metrics.items()}
+        before, began, waited = self._previous
+        now = time.perf_counter()
+        self._previous = (done, now, waiting.seconds)
+        if (count := done - before) > 0:
+            numbers["seconds_per_step"] = (now - began) / count
+            numbers["samples_per_second"] = count * subjects / (now - began)
+            numbers["data_seconds_per_step"] = (waiting.seconds - waited) / count
+        if broken:
+            numbers["broken_folders"] = broken
+        self.numbers(done, numbers, "train")
+        shown = {"loss": f"{numbers['loss']:.4f}", "psnr": f"{numbers['psnr']:.2f}"}
+        if "samples_per_second" in numbers:
+            shown["samples/s"] = f"{numbers['samples_per_second']:.2f}"
+        self.bar.set_postfix(shown, refresh=False)
+
+    def numbers(self, done: int, numbers: dict[str, float], group: str) -> None:
+        """Numbers after a step, as a line and as curves "group/name"."""
+        self._write({"step": done} | numbers)
+        if self._board is not None:
+            for name, value in numbers.items():
+                self._board.add_scalar(f"{group}/{name}", value, done)
+
+    def picture(self, done: int, name: str, picture: np.ndarray) -> None:
+        """An (h, w, 3) picture in [0, 1] for TensorBoard."""
+        if self._board is not None:
+            self._board.add_image(name, (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8), done, dataformats="HWC")
+
+    def event(self, done: int, event: str, message: str, **numbers: float) -> None:
+        """Something worth knowing, as a line and beside the progress bar."""
+        self._write({"step": done, "event": event} | numbers)
+        if self._recording:
+            self.bar.write(f"step {done}: {message}")
+
+    def _write(self, record):
+        if self._lines is not None:  # JSON has no NaN
+            finite = lambda x: x if not isinstance(x, float) or math.isfinite(x) else None
+            self._lines.write(json.dumps({name: finite(value) for name, value in record.items()}) + "\n")
+
+
+def forget_after(path: Path, step: int) -> None:
+    """Drop the lines of later steps, and a last line that was not written to its end; the file changes whole or not."""
+    if not path.is_file():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line)
+        except (json.JSONDecodeError, KeyError, TypeError):
+            continue
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text("".join(f"{line}\n" for line in kept))
+    temporary.replace(path)
+
+
+def _tensorboard(folder, step):
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:  # optional: the log has the same numbers
+        return None
+    return SummaryWriter(str(folder), purge_step=step + 1, flush_secs=FLUSH_SECONDS)

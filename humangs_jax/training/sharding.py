@@ -1,0 +1,112 @@
+"""How a run lies on many devices: batches are divided among all of them, the state among those along one axis of the mesh.
+
+Data parallelism over both axes of the mesh ("data", "fsdp"); parameters, moments and averages are divided along "fsdp" and
+equal along "data". A step gathers the parameters once, works on its subjects, and sends every device the sum of its own
+part of the gradient (ZeRO stage 3, Rajbhandari et al., 2020, https://arxiv.org/abs/1910.02054, with one gathering a step:
+the network is small beside what it computes).
+"""
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import jax
+import numpy as np
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+
+from humangs_jax.array_types import PyTree
+from humangs_jax.pytree import replace
+from humangs_jax.training.state import TrainState
+
+AXES = ("data", "fsdp")
+SMALLEST_DIVIDED = 1 << 10
+"""Elements of the smallest array that is worth dividing: below, the messages cost more than the memory."""
+
+T = TypeVar("T")
+
+
+def training_mesh(fsdp: int | None = None, devices: Sequence[jax.Device] | None = None) -> Mesh:
+    """All devices (of all processes) as a mesh of `AXES`. fsdp: devices that share one copy of the state; None: all.
+
+    Raises: ValueError if fsdp does not divide the number of devices.
+    """
+    devices = jax.devices() if devices is None else list(devices)
+    fsdp = len(devices) if fsdp is None else fsdp
+    if fsdp < 1 or len(devices) % fsdp:
+        raise ValueError(f"fsdp {fsdp} does not divide {len(devices)} devices")
+    # automatic axes: with explicit ones, the default of newer jax, every gather of a divided array is an error
+    return Mesh(np.asarray(devices).reshape(-1, fsdp), AXES, axis_types=(AxisType.Auto,) * 2)
+
+
+def divided_axis(shape: tuple[int, ...], parts: int) -> int | None:
+    """The axis of an array of the state along which it is divided: the longest that can be; None for none."""
+    if np.prod(shape) < SMALLEST_DIVIDED or parts == 1:
+        return None
+    axes = [axis for axis, length in enumerate(shape) if length % parts == 0]
+    return max(axes, key=lambda axis: shape[axis], default=None)
+
+
+def partition(tree: PyTree, mesh: Mesh) -> PyTree:
+    """PartitionSpec of every leaf of parameters, or of what has their shapes."""
+
+    def spec(leaf):
+        axis = divided_axis(leaf.shape, mesh.shape["fsdp"])
+        return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, "fsdp")
+
+    return jax.tree.map(spec, tree)
+
+
+def state_shardings(state: TrainState, mesh: Mesh) -> TrainState:
+    """NamedSharding of every leaf of a state; batch statistics are whole everywhere."""
+    named = lambda spec: NamedSharding(mesh, spec)
+    divided = replace(state, batch_stats={})
+    shardings = jax.tree.map(named, partition(divided, mesh))
+    return replace(shardings, batch_stats=jax.tree.map(lambda _: named(PartitionSpec()), state.batch_stats))
+
+
+def batch_sharding(mesh: Mesh) -> NamedSharding:
+    """Of a batch: its first axis is divided among all devices."""
+    return NamedSharding(mesh, PartitionSpec(AXES))
+
+
+def replicated(mesh: Mesh) -> NamedSharding:
+    """Of what every device has whole."""
+    return NamedSharding(mesh, PartitionSpec())
+
+
+def place(tree: T, shardings: PyTree) -> T:
+    """Equal host or local arrays of every process as global ones; `shardings`: a tree of them, or one for all leaves."""
+    if isinstance(shardings, NamedSharding):
+        shardings = jax.tree.map(lambda _: shardings, tree)
+
+    def put(leaf, sharding):
+        host = np.asarray(leaf)
+        return jax.make_array_from_callback(host.shape, sharding, lambda index: host[index])
+
+    return jax.tree.map(put, tree, shardings)
+
+
+def whole(tree: T, mesh: Mesh) -> T:
+    """Arrays of this process's default device equal to those that are divided among devices. All processes must call it."""
+    gathered = jax.jit(lambda x: x, out_shardings=replicated(mesh))(tree)
+    return jax.tree.map(lambda x: x.addressable_data(0), gathered)
+
+
+def gather(params: PyTree, specs: PyTree) -> PyTree:
+    """Inside `shard_map`: whole parameters from this device's parts."""
+
+    def one(part, spec):
+        return jax.lax.all_gather(part, "fsdp", axis=len(spec) - 1, tiled=True) if len(spec) else part
+
+    return jax.tree.map(one, params, specs)
+
+
+def mean_parts(gradients: PyTree, specs: PyTree, mesh: Mesh) -> PyTree:
+    """Inside `shard_map`: this device's parts of the mean over all devices of whole gradients."""
+
+    def one(gradient, spec):
+        if len(spec):
+            part = jax.lax.psum_scatter(gradient, "fsdp", scatter_dimension=len(spec) - 1, tiled=True)
+            return jax.lax.psum(part, "data") / mesh.size
+        return jax.lax.pmean(gradient, AXES)
+
+    return jax.tree.map(one, gradients, specs)

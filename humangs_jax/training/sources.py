@@ -1,0 +1,52 @@
+"""Where a run's examples come from: capture folders, people made on the fly, or both.
+
+A run asks for its source anew at every stage, whose picture sizes differ.
+"""
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import jax
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Mixture, Source
+from humangs_jax.data.synthetic.live import LiveConfig
+from humangs_jax.data.synthetic.live_bank import PeopleBank
+from humangs_jax.data.synthetic.live_source import live_source
+from humangs_jax.training.config import TrainConfig
+
+MakeSource = Callable[[TrainConfig], Source]
+"""Configuration of a stage -> examples of its sizes."""
+
+
+def captured_people(folders: Sequence[str | Path], body: BodyModel) -> MakeSource:
+    """Capture folders whose parameters belong to `body`; pictures that are decoded once serve all stages."""
+    cache = CaptureCache(folders, body)
+    return lambda config: CaptureSource(cache, config.views, config.model.image_size, config.target_size)
+
+
+def live_people(bank: PeopleBank) -> MakeSource:
+    """People of a bank, drawn anew for every step on the device that trains."""
+
+    def make(config: TrainConfig) -> Source:
+        views = config.views
+        live = LiveConfig(
+            target_views=views.target_count,
+            input_size=config.model.image_size,
+            target_size=config.target_size,
+            mixed_pose_share=views.mixed_pose_share,
+            jitter=views.jitter,
+            scattered_share=views.scattered_share,
+        )
+        if jax.default_backend() != "cpu":  # whole pictures, all views at once
+            most = max(views.input_counts) + views.target_count
+            live = dataclasses.replace(live, views_at_once=most, pixels_per_step=1 << 30)
+        return live_source(bank, live, views.input_counts, on_host=jax.device_count() > 1)
+
+    return make
+
+
+def mixed_people(parts: Sequence[MakeSource], weights: Sequence[float | int]) -> MakeSource:
+    """Several of these, each with its share of the examples, see `loader.Mixture`."""
+    return lambda config: Mixture(tuple(part(config) for part in parts), tuple(weights))
