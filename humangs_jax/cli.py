@@ -279,6 +279,7 @@ def train(
 def convert(
     checkpoint: Positional[Path],
     out: Path = Path("weights.safetensors"),
+    losses: Path | None = None,
     head_width: int | None = None,
     pool: Literal["all", "visible"] = "all",
     dtype: Literal["float32", "float16"] = "float32",
@@ -288,24 +289,39 @@ def convert(
     Sizes and parts of the network are read off the shapes; everything else is as in the preset `published`.
 
     Args:
-        checkpoint: zip-format .pt with a state dict under 'model', or that state dict as .safetensors.
+        checkpoint: .pt with a state dict under 'model', or that state dict as .safetensors.
         out: the weights file to write.
+        losses: also write the loss networks that the checkpoint carries (VGG-19, LPIPS), for training and evaluation.
         head_width: features per attention head, where no shape tells it (networks without q_norm and k_norm).
         pool: average a vertex's features over all views (as released) or over those that see it.
         dtype: to store; float16 halves the file.
     """
+    from safetensors.numpy import save_file
+
+    from humangs_jax.data.atomic import replace_file
     from humangs_jax.models.conversion import LOSS_PREFIX, describe, load_checkpoint
     from humangs_jax.models.weights import save_weights
+    from humangs_jax.objectives.loss_networks import collect_loss_networks
 
-    _require_parent(out)
-    _require_suffix(out, (".safetensors",))
-    if out.exists() and checkpoint.exists() and out.samefile(checkpoint):
-        raise ValueError(f"--out {out} is the checkpoint itself")
+    for option, path in (("--out", out), ("--losses", losses)):
+        if path is None:
+            continue
+        _require_parent(path, option)
+        _require_suffix(path, (".safetensors",), option)
+        if path.exists() and checkpoint.exists() and path.samefile(checkpoint):
+            raise ValueError(f"{option} {path} is the checkpoint itself")
+    if losses is not None and losses.resolve() == out.resolve():
+        raise ValueError(f"--losses {losses}: the same file as --out")
+    networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)
     converted = load_checkpoint(checkpoint, head_width)
     config = dataclasses.replace(converted.config, sampling=dataclasses.replace(converted.config.sampling, pool=pool))
     save_weights(out, converted.variables, config, dtype)
     print(f"{out}: {describe(converted)}")
-    print(f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*)")
+    if losses is None:
+        print(f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*); --losses keeps them")
+    else:
+        replace_file(losses, lambda path: save_file(networks, path))
+        print(f"{losses}: {' and '.join(names)}")
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
@@ -313,14 +329,14 @@ COMMANDS: dict[str, Callable[..., None]] = {
 }
 
 
-def _require_parent(path: Path) -> None:
+def _require_parent(path: Path, option: str = "--out") -> None:
     if not path.parent.is_dir():
-        raise FileNotFoundError(f"--out {path}: the folder {path.parent} does not exist")
+        raise FileNotFoundError(f"{option} {path}: the folder {path.parent} does not exist")
 
 
-def _require_suffix(path: Path, suffixes: tuple[str, ...]) -> None:
+def _require_suffix(path: Path, suffixes: tuple[str, ...], option: str = "--out") -> None:
     if path.suffix.lower() not in suffixes:
-        raise ValueError(f"--out {path}: expected a name ending in {' or '.join(suffixes)}")
+        raise ValueError(f"{option} {path}: expected a name ending in {' or '.join(suffixes)}")
 
 
 def main() -> None:

@@ -1,6 +1,6 @@
 """The authors' released checkpoint to our variables and back: names, layouts, and the configuration behind the shapes.
 
-Files are read by `models.torch_file` (`.pt`) or safetensors, without torch. Layouts: linear (out, in) -> (in, out); convolution
+Files are read by `models.tensor_file`, without torch. Layouts: linear (out, in) -> (in, out); convolution
 (out, in, kh, kw) -> (kh, kw, in, out); 1x1 convolution (out, in, 1, 1) -> (in, out); transposed convolution
 (in, out, kh, kw) -> (kh, kw, in, out), unflipped (see `upsampler.UpConvolution`).
 """
@@ -10,7 +10,6 @@ import functools
 import os
 import statistics
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +17,7 @@ import numpy as np
 from humangs_jax.models.attention import AttentionConfig
 from humangs_jax.models.humangs import HumanGSConfig, Variables
 from humangs_jax.models.presets import published
-from humangs_jax.models.torch_file import read_torch_file
+from humangs_jax.models.tensor_file import is_safetensors, read_tensors, safetensors_metadata
 from humangs_jax.models.transformer import TransformerConfig
 from humangs_jax.models.upsampler import UpsamplerConfig
 from humangs_jax.models.vertex_decoder import VertexDecoderConfig
@@ -150,25 +149,13 @@ def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
 
 
 def read_state_dict(path: str | os.PathLike) -> tuple[StateDict, int]:
-    """Tensors of a checkpoint (`.pt`, or `.safetensors` by its suffix), and how many of the loss networks were skipped.
+    """Tensors of a checkpoint in any format of `tensor_file`, and how many of the loss networks were skipped.
 
     Raises: OSError; ValueError if the file is damaged, is none, or holds anything but tensors.
     """
-    if Path(path).suffix.lower() != ".safetensors":
-        return read_torch_file(path, LOSS_PREFIX)
-    from safetensors import SafetensorError, safe_open
-
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"no such file: {path}")
-    try:
-        with safe_open(path, framework="numpy") as file:
-            if (file.metadata() or {}).get("format") == FORMAT:
-                raise ValueError(f"{path} is a weights file already: nothing to convert")
-            keys = list(file.keys())
-            wanted = [key for key in keys if not key.startswith(LOSS_PREFIX)]
-            return {key: file.get_tensor(key) for key in wanted}, len(keys) - len(wanted)
-    except (SafetensorError, TypeError) as error:
-        raise ValueError(f"{path} is no readable safetensors file: {error}") from error
+    if is_safetensors(path) and safetensors_metadata(path).get("format") == FORMAT:
+        raise ValueError(f"{path} is a weights file already: nothing to convert")
+    return read_tensors(path, lambda key: not key.startswith(LOSS_PREFIX))
 
 
 def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConfig:

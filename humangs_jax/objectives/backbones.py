@@ -78,7 +78,9 @@ Slices = tuple[tuple[Layer, ...], ...]
 
 def vgg(depths: tuple[int, ...], feature: tuple[int, ...], average: bool = False) -> Slices:
     """A VGG whose block b has `depths[b]` convolutions, of which the one numbered `feature[b]` (from 1) is compared."""
-    slices, layers, index, inputs = [], [], 0, 3
+    slices: list[tuple[Layer, ...]] = []
+    layers: list[Layer] = []
+    index, inputs = 0, 3
     for block, depth in enumerate(depths):
         outputs = min(64 << block, 512)
         for number in range(1, depth + 1):

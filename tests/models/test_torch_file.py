@@ -5,12 +5,29 @@ import pickle
 import subprocess
 import sys
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
-from torch_writer import FakeTensor, write_checkpoint
+from torch_writer import FakeTensor, pickled, write_checkpoint, write_stream
 
 from humangs_jax.models.torch_file import read_torch_file
+
+
+DATA = Path(__file__).parent / "data"
+FORMATS = pytest.mark.parametrize("write", [write_checkpoint, write_stream])
+
+
+@pytest.mark.parametrize("name", ["torch_zip.pth", "torch_stream.pt"])
+def test_files_that_torch_wrote(name):
+    """Of one state dict, plain and under "model" (write_torch_files.py, torch 2.15)."""
+    state, skipped = read_torch_file(DATA / name)
+    truth = dict(np.load(DATA / "torch_numbers.npz"))
+    assert skipped == 0 and list(state) == list(truth)
+    for key, numbers in truth.items():
+        assert state[key].dtype == numbers.dtype and np.array_equal(state[key], numbers), key
+    some, skipped = read_torch_file(DATA / name, lambda key: key.startswith("0."))
+    assert sorted(some) == ["0.bias", "0.weight"] and skipped == len(truth) - 2
 
 
 def write_pickle(path, data, **members):
@@ -22,7 +39,8 @@ def write_pickle(path, data, **members):
     return path
 
 
-def test_tensors_are_views_of_their_storages(tmp_path):
+@FORMATS
+def test_tensors_are_views_of_their_storages(write, tmp_path):
     numbers = np.arange(12, dtype=np.float32)
     halves = (np.asarray([1.0, -2.5, 0.1], np.float32).view(np.uint32) >> 16).astype(np.uint16)
     model = {
@@ -33,8 +51,8 @@ def test_tensors_are_views_of_their_storages(tmp_path):
         "loss_computer.vgg": FakeTensor(numbers),
     }
     content = {"model": collections.OrderedDict(model), "optimizer": {"state": FakeTensor(numbers)}, "step": 3}
-    path = write_checkpoint(tmp_path / "a.pt", content)
-    state, skipped = read_torch_file(path, "loss_computer.")
+    path = write(tmp_path / "a.pt", content)
+    state, skipped = read_torch_file(path, lambda key: not key.startswith("loss_computer."))
     assert skipped == 1 and set(state) == set(model) - {"loss_computer.vgg"}
     assert np.array_equal(state["turned"], [[2, 6, 10], [3, 7, 11]])
     assert state["scalar"].shape == () and state["scalar"] == 7 and state["empty"].shape == (0, 3)
@@ -78,12 +96,13 @@ CALLS = {
 
 @pytest.mark.parametrize("name", CALLS)
 @pytest.mark.parametrize("place", ["model", "optimizer"])
-def test_no_code_of_a_file_runs(name, place, tmp_path, monkeypatch):
+@FORMATS
+def test_no_code_of_a_file_runs(write, name, place, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     content = {"model": {"w": FakeTensor(np.ones(3, np.float32))}, "optimizer": {}}
     content[place]["evil"] = CALLS[name]
     with pytest.raises(ValueError, match=rf"a\.pt: refused to load [\w.]*{name}: no part of a state dict"):
-        read_torch_file(write_checkpoint(tmp_path / "a.pt", content))
+        read_torch_file(write(tmp_path / "a.pt", content))
     assert os.listdir(tmp_path) == ["a.pt"]
 
 
@@ -115,6 +134,9 @@ BOMB = (1 << 40, 2)
         ({"weights": {}}, "under 'model'"),
         ([1, 2], "under 'model'"),
         ({"model": [3]}, "under 'model'"),
+        ({}, "expected a state dict"),
+        ({"epoch": 3}, "expected a state dict"),
+        ({"w": FakeTensor(np.zeros(4, np.float32)), "epoch": 3}, r"state_dict\['epoch'\] is no tensor but int"),
         ({"model": {"w": 3}}, r"model\['w'\] is no tensor but int"),
         ({"model": {3: 3}}, "no string"),
         ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=(5,))}}, "w: shape .* does not fit"),
@@ -126,14 +148,16 @@ BOMB = (1 << 40, 2)
         ({"model": {"w": FakeTensor(np.zeros(4, np.float32), shape=("a",), strides=(1,))}}, "no counts"),
     ],
 )
-def test_damaged_checkpoints_are_clear_errors(tmp_path, content, message):
-    path = write_checkpoint(tmp_path / "a.pt", content)
+@FORMATS
+def test_damaged_checkpoints_are_clear_errors(write, tmp_path, content, message):
+    path = write(tmp_path / "a.pt", content)
     with pytest.raises(ValueError, match=message):
         read_torch_file(path)
 
 
-def test_every_truncation_is_a_clear_error(tmp_path):
-    path = write_checkpoint(tmp_path / "a.pt", {"model": {"w": FakeTensor(np.arange(40, dtype=np.float32))}})
+@FORMATS
+def test_every_truncation_is_a_clear_error(write, tmp_path):
+    path = write(tmp_path / "a.pt", {"model": {"w": FakeTensor(np.arange(40, dtype=np.float32))}})
     whole = path.read_bytes()
     for length in range(0, len(whole), 7):
         path.write_bytes(whole[:length])
@@ -141,20 +165,30 @@ def test_every_truncation_is_a_clear_error(tmp_path):
             read_torch_file(path)
 
 
-def test_every_damaged_byte_is_noticed_or_harmless(tmp_path):
-    numbers = np.arange(40, dtype=np.float32)
-    path = write_checkpoint(tmp_path / "a.pt", {"model": {"w": FakeTensor(numbers)}})
-    whole = path.read_bytes()
-    noticed = 0
+def damaged(path):
+    """State dicts of a file with one byte changed, where reading it raises no error, and how often it does."""
+    whole, states, noticed = path.read_bytes(), [], 0
     for position in range(0, len(whole), 3):
         path.write_bytes(whole[:position] + bytes([whole[position] ^ 0x5A]) + whole[position + 1 :])
         try:
-            state, _ = read_torch_file(path)
+            states.append(read_torch_file(path)[0])
         except ValueError:
             noticed += 1
-        else:
-            assert np.array_equal(state["w"], numbers)  # a time stamp, an unused field
-    assert noticed > len(whole) / 6
+    return states, noticed, len(whole)
+
+
+def test_every_damaged_byte_is_noticed_or_harmless(tmp_path):
+    numbers = np.arange(40, dtype=np.float32)
+    path = write_checkpoint(tmp_path / "a.pt", {"model": {"w": FakeTensor(numbers)}})
+    states, noticed, size = damaged(path)
+    assert all(np.array_equal(state["w"], numbers) for state in states)  # a time stamp, an unused field
+    assert noticed > size / 6
+
+
+def test_damage_to_the_older_format_raises_nothing_else(tmp_path):
+    """It has no checksums: numbers, names and shapes may change, but a damaged structure is a ValueError."""
+    path = write_stream(tmp_path / "a.pt", {"model": {"w": FakeTensor(np.arange(40, dtype=np.float32))}})
+    assert damaged(path)[1] > 0
 
 
 def test_files_that_are_no_checkpoints(tmp_path):
@@ -162,7 +196,7 @@ def test_files_that_are_no_checkpoints(tmp_path):
     with pytest.raises(FileNotFoundError):
         read_torch_file(other)
     other.write_bytes(b"legacy")
-    with pytest.raises(ValueError, match="no zip-format checkpoint"):
+    with pytest.raises(ValueError, match="neither of the formats"):
         read_torch_file(other)
     with zipfile.ZipFile(other, "w") as archive:
         archive.writestr("archive/readme", "")
@@ -176,6 +210,46 @@ def test_files_that_are_no_checkpoints(tmp_path):
     bomb = {"model": {"w": FakeTensor(np.zeros(10**6, np.float32))}}
     with pytest.raises(ValueError, match="unpack to more than"):
         read_torch_file(write_checkpoint(other, bomb, compression=zipfile.ZIP_DEFLATED))
+
+
+def test_streams_that_are_no_checkpoints(tmp_path):
+    path, content = tmp_path / "a.pt", {"model": {"w": FakeTensor(np.ones(3, np.float32))}}
+    for changes, message in [
+        ({"magic": 7}, "neither of the formats"),
+        ({"version": 1000}, "version 1000"),
+        ({"little": False}, "little-endian"),
+        ({"count": lambda size: size + 1}, "storage 0 of 4 numbers does not fit the file"),
+        ({"count": lambda size: 1 << 62}, "does not fit the file"),
+        ({"count": lambda size: -1}, "does not fit the file"),
+        ({"count": lambda size: size - 1}, "w: shape .* does not fit storage 0"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            read_torch_file(write_stream(path, content, **changes))
+    path.write_bytes(pickle.dumps({"w": 3}))
+    with pytest.raises(ValueError, match="a pickle, but neither of the formats"):
+        read_torch_file(path)
+
+
+def test_parts_of_storages_in_old_streams(tmp_path):
+    """Before torch 0.4 a storage could be a part of another one."""
+    numbers = np.arange(9, dtype=np.float32)
+    tensor = FakeTensor(numbers, shape=(2, 2), strides=(2, 1), offset=1, part=("1", 3, 5))
+    state, _ = read_torch_file(write_stream(tmp_path / "a.pt", {"w": tensor}))
+    assert np.array_equal(state["w"], [[4, 5], [6, 7]])
+    for part in (("1", -3, 5), ("1", "3", 5), (3, 5), 3):
+        bad = FakeTensor(numbers, part=part)
+        with pytest.raises(ValueError, match="whose place is no count"):
+            read_torch_file(write_stream(tmp_path / "a.pt", {"w": bad}))
+    beyond = FakeTensor(numbers, shape=(2,), strides=(1,), part=("1", 8, 2))
+    with pytest.raises(ValueError, match="does not fit storage"):
+        read_torch_file(write_stream(tmp_path / "a.pt", {"w": beyond}))
+
+
+def test_a_storage_of_two_types_is_refused(tmp_path):
+    data, _ = pickled({"a": FakeTensor(np.ones(2, np.float32)), "b": FakeTensor(np.ones(2), "DoubleStorage")})
+    data = data.replace(b"X\x01\x00\x00\x001", b"X\x01\x00\x00\x000")
+    with pytest.raises(ValueError, match="storage 0 is of two types"):
+        read_torch_file(write_pickle(tmp_path / "a.pt", data))
 
 
 def test_a_missing_storage_is_named(tmp_path):
