@@ -26,8 +26,8 @@ logger = logging.getLogger(__name__)
 
 UNSCORED = -1e9
 """Score of a checkpoint that was saved before any validation: worse than every other."""
-ADJUSTABLE = ("log_every", "validate_every", "checkpoint_every", "keep_checkpoints")
-"""What may change in the middle of a run without changing its numbers."""
+ADJUSTABLE = ("log_every", "validate_every", "checkpoint_every", "keep_checkpoints", "microbatch_size")
+"""What may change in the middle of a run without changing its numbers (but for shared batch statistics)."""
 
 
 class Checkpoints:

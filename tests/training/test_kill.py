@@ -1,0 +1,62 @@
+"""Killed at any moment, a run loses the steps since its last checkpoint and nothing else."""
+
+import random
+import subprocess
+import time
+
+import pytest
+from safetensors.numpy import load_file
+from training_runs import losses, worker
+
+WAIT_SECONDS = 300
+
+
+def finished_checkpoints(out):
+    return sorted(int(path.name) for path in (out / "checkpoints").glob("*") if path.name.isdigit())
+
+
+def kill_in_a_checkpoint_write(arguments, out, moment):
+    """Start a run, wait until a checkpoint is being written, wait a moment more, kill; the newest checkpoint there was."""
+    process = subprocess.Popen([*worker(), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    deadline = time.monotonic() + WAIT_SECONDS
+    try:
+        known = finished_checkpoints(out)
+        # not the first write: some steps should come through
+        while not any(".orbax-checkpoint-tmp" in path.name for path in (out / "checkpoints").glob("*")) or (
+            finished_checkpoints(out)[-1:] == known[-1:]
+        ):
+            assert process.poll() is None, process.stdout.read()
+            assert time.monotonic() < deadline, "no checkpoint was written"
+            time.sleep(0.001)
+        time.sleep(moment)
+        newest = finished_checkpoints(out)[-1]
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+    return newest
+
+
+def survive(kills, tmp_path, captures):
+    """Kill a run so many times, then let it end; compare with one that was never killed."""
+    options = ["--no-validation", "--batch", "1", "--cache", str(tmp_path / "compiled")]
+    killed, whole, generator = tmp_path / "killed", tmp_path / "whole", random.Random(0)
+    folder = str(captures[0].parent)
+    done = 0
+    for _ in range(kills):
+        newest = kill_in_a_checkpoint_write([str(killed), folder, *options], killed, generator.uniform(0, 0.05))
+        assert newest > done, "a checkpoint was lost"
+        done = newest
+    end = done + 3
+    for out in (killed, whole):
+        subprocess.run([*worker(), str(out), folder, *options, "--stop-at", str(end)], check=True, timeout=WAIT_SECONDS)
+    curve = losses(killed)
+    assert list(curve) == list(range(1, end + 1)) and curve == losses(whole)
+    weights = load_file(whole / "weights.safetensors")
+    assert all((tensor == weights[name]).all() for name, tensor in load_file(killed / "weights.safetensors").items())
+    assert not list((killed / "checkpoints").glob("*tmp*"))
+
+
+@pytest.mark.slow
+def test_kill_in_a_checkpoint_write_fifty_times(tmp_path, captures):
+    survive(50, tmp_path, captures)

@@ -1,0 +1,81 @@
+"""A body of 64 vertices, made-up captures of it, and what runs on them: enough to train on in seconds."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.data.capture import capture_from_arrays, save_capture
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+
+SIDES, RINGS, SIZE, VIEWS, POSES = 8, 8, 32, 6, 2
+
+
+def tube():
+    """An upright tube of 1.6 m that bends in the middle, with one shape direction: its girth."""
+    height = np.repeat(np.linspace(-0.8, 0.8, RINGS), SIDES)
+    angle = np.tile(np.arange(SIDES) * 2 * np.pi / SIDES, RINGS)
+    around = np.stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)], axis=-1)
+    template = 0.25 * around + height[:, None] * [0, 1, 0]
+    ring, side = np.divmod(np.arange((RINGS - 1) * SIDES), SIDES)
+    a, b = ring * SIDES + side, ring * SIDES + (side + 1) % SIDES
+    faces = np.concatenate([np.stack([a, b, a + SIDES], -1), np.stack([b, b + SIDES, a + SIDES], -1)])
+    upper = np.clip(0.5 + 2 * height, 0, 1)
+    regressor = np.stack([height < -0.7, np.abs(height) < 0.2]).astype(float)
+    return BodyModel(
+        template=jnp.asarray(template, jnp.float32),
+        shape_directions=jnp.asarray(0.05 * around[..., None], jnp.float32),
+        pose_directions=None,
+        joint_regressor=jnp.asarray(regressor / regressor.sum(axis=1, keepdims=True), jnp.float32),
+        skinning_weights=jnp.asarray(np.stack([1 - upper, upper], -1), jnp.float32),
+        faces=jnp.asarray(faces),
+        parents=(-1, 0),
+        joint_names=("foot", "middle"),
+        shape_names=("girth",),
+        name="tube",
+    )
+
+
+def photograph(points, colors, camera):
+    """Points painted far to near into an image on white, with its mask; numpy, so that nothing needs compiling."""
+    K, cam_from_world = np.asarray(camera.K), np.asarray(camera.cam_from_world)
+    seen = points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
+    order = np.argsort(-seen[:, 2])
+    x, y = (np.floor(seen[:, :2] / seen[:, 2:] @ K[:2, :2].T + K[:2, 2]).astype(int)[order]).T
+    inside = (x >= 0) & (x < SIZE) & (y >= 0) & (y < SIZE)
+    image, mask = np.ones((SIZE, SIZE, 3)), np.zeros((SIZE, SIZE))
+    image[y[inside], x[inside]] = colors[order][inside]
+    mask[y[inside], x[inside]] = 1
+    return image, mask
+
+
+def write_subject(path, body, seed):
+    generator = np.random.default_rng(seed)
+    betas = generator.normal(size=1).astype(np.float32)
+    rest = shape_body(body, jnp.asarray(betas))
+    rotations = 0.3 * generator.normal(size=(POSES, 2, 3)).astype(np.float32)
+    K = intrinsics_from_fov(0.8, SIZE, SIZE)
+    cameras = orbit(jnp.zeros(3), 2.6, jnp.arange(VIEWS) * 2 * jnp.pi / VIEWS + 0.1 * seed, 0.1, K, SIZE, SIZE)
+    weights = generator.dirichlet([1, 1, 1], 40)
+    corner_colors = generator.random((len(body.template), 3))
+    faces = np.asarray(body.faces)
+    fill = lambda values: np.einsum("wk,fkc->wfc", weights, values[faces]).reshape(-1, 3)
+    images, masks, frames = [], [], []
+    for view in range(VIEWS):
+        frames.append(view % POSES)
+        posed = pose_body(body, rest, BodyPose(jnp.asarray(rotations[frames[-1]]), jnp.zeros(3)))
+        image, mask = photograph(fill(np.asarray(posed.vertices)), fill(corner_colors), cameras[view])
+        images.append(image)
+        masks.append(mask)
+    capture = capture_from_arrays(
+        np.stack(images),
+        np.asarray(K),
+        np.asarray(cameras.cam_from_world),
+        rotations,
+        np.zeros((POSES, 3)),
+        betas=betas,
+        masks=np.stack(masks),
+        frames=frames,
+        background="white",
+        body=body,
+    )
+    save_capture(path, capture)
