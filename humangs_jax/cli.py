@@ -243,37 +243,73 @@ def check(capture: Positional[Path], out: Path = Path("check.png")) -> None:
 
 
 def train(
-    data: Positional[Path],
+    data: Positional[Path | None] = None,
     out: Path = Path("runs/train"),
+    config: str = "small",
+    live: int = 0,
     validation: Path | None = None,
     steps: int | None = None,
     init_weights: Path | None = None,
+    vgg19: Path | None = None,
+    lpips_backbone: Path | None = None,
+    lpips_heads: Path | None = None,
+    lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg",
+    fsdp: int | None = None,
+    distributed: bool = False,
+    coordinator: str | None = None,
+    processes: int | None = None,
+    process: int | None = None,
+    diagnose: bool = False,
 ) -> None:
-    """Train the small network on capture folders (`humangs synth --for-training`). Continues a run that is in --out.
+    """Train a network on capture folders (`humangs synth --for-training`), on all devices. Continues a run that is in --out.
 
     Args:
         data: folder of capture folders.
-        out: checkpoints, log, validation pictures and weights.safetensors.
+        out: checkpoints, log, TensorBoard curves, validation pictures and weights.safetensors.
+        config: small, paper, published or tiny, or a JSON file of settings like the config.json of a run.
+        live: also (or without DATA only) train on so many synthetic people who are drawn anew for every step.
         validation: folder of capture folders of other people, looked at now and then.
-        steps: length of the run; the preset's if not given. All settings: experiments/train_small.py --help.
-        init_weights: start from these weights instead of fresh ones.
+        steps: length of the run; that of the configuration if not given.
+        init_weights: start from these weights, and their network, instead of fresh ones.
+        vgg19: weights of VGG-19 for the perceptual loss (docs/loss_networks.md); without, it is left out.
+        lpips_backbone: weights of the network under LPIPS, for the loss and for validation; without, LPIPS is missing.
+        lpips_heads: the linear heads of LPIPS, where the backbone's file does not have them.
+        lpips_net: which network LPIPS is on.
+        fsdp: how many devices share one copy of parameters and moments; all if not given.
+        distributed: this is one of several processes (docs/scaling.md), as SLURM or a TPU pod tells, or as follows.
+        coordinator: HOST:PORT of process 0.
+        processes: how many there are.
+        process: which this is.
+        diagnose: train nothing, but repeat the first step of the run that failed (or the next one) and name the first stage
+            whose numbers are not finite.
     """
+    from humangs_jax.training.processes import join_processes
+
+    if distributed or coordinator is not None:
+        join_processes(coordinator, processes, process)
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import find_people
     from humangs_jax.models.weights import load_weights
-    from humangs_jax.training.config import small
+    from humangs_jax.objectives.loss_networks import load_loss_networks
+    from humangs_jax.training.diagnose import diagnose_run
+    from humangs_jax.training.launch import fitting_losses, read_config, training_people
     from humangs_jax.training.loop import train as run
 
-    config = small()
+    networks = load_loss_networks(vgg19, lpips_backbone, lpips_heads, lpips_net)
+    settings = fitting_losses(read_config(config), networks)
     if steps is not None:
-        config = dataclasses.replace(config, steps=steps)
-    people = find_people(data)
-    others = find_people(validation, None) if validation is not None else ()
+        settings = dataclasses.replace(settings, steps=steps)
     variables = None
     if init_weights is not None:
         variables, model = load_weights(init_weights)
-        config = dataclasses.replace(config, model=model)
-    run(config, load_body(), people, out, validation=others, variables=variables)
+        settings = dataclasses.replace(settings, model=model)
+    body = load_body()
+    people = training_people(data, live, out, body)
+    if diagnose:
+        print(diagnose_run(out, body, people, networks=networks, variables=variables))
+        return
+    others = find_people(validation, None) if validation is not None else ()
+    run(settings, body, people, out, validation=others, variables=variables, networks=networks, fsdp=fsdp)
 
 
 def convert(

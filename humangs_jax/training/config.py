@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from collections.abc import Collection
 
 from humangs_jax.data.loader import ViewSampling
 from humangs_jax.models import presets
@@ -174,13 +175,11 @@ def tiny() -> TrainConfig:
 PRESETS = {"published": published, "paper": paper, "small": small, "tiny": tiny}
 
 
-def without_networks(config: TrainConfig) -> TrainConfig:
-    """The run without the losses that need other people's networks; structural dissimilarity takes their place.
+def without_losses(config: TrainConfig, names: Collection[str]) -> TrainConfig:
+    """The run without some of the losses that need networks; structural dissimilarity takes their place.
 
-    Its weight becomes at least that of `LossConfig()`. A run without such losses stays as it is.
+    Its weight becomes at least that of `LossConfig()`.
     """
-    loss = config.loss
-    if loss.perceptual == 0 and loss.lpips == 0:
-        return config
-    structural = max(loss.structural, LossConfig().structural)
-    return dataclasses.replace(config, loss=dataclasses.replace(loss, perceptual=0.0, lpips=0.0, structural=structural))
+    structural = max(config.loss.structural, LossConfig().structural)
+    loss = dataclasses.replace(config.loss, **dict.fromkeys(names, 0.0), structural=structural)
+    return dataclasses.replace(config, loss=loss)

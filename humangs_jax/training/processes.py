@@ -1,7 +1,5 @@
 """Several processes that train together, each with its own devices: jax's distributed runtime, nothing else."""
 
-import os
-
 import jax
 
 
@@ -17,6 +15,5 @@ def join_processes(
     given = (coordinator, process_count, process_index)
     if None in given and any(value is not None for value in given):
         raise ValueError("several processes: give coordinator, number of processes and process index, or none of them")
-    if "cpu" in os.environ.get("JAX_PLATFORMS", jax.config.jax_platforms or "cpu"):
-        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")  # CPUs have no others; no matter elsewhere
     jax.distributed.initialize(coordinator, process_count, process_index)

@@ -81,7 +81,7 @@ def loss_terms(
 
 def _required(network, name, title):
     if network is None:
-        raise ValueError(f"loss.{name} is not 0, but there is no {title}: pass its weights, or use `without_networks`")
+        raise ValueError(f"loss.{name} is not 0, but there is no {title}: pass its weights, or use `without_losses`")
     return network
 
 

@@ -12,8 +12,9 @@ import pytest
 from humangs_jax.models.weights import load_weights
 from humangs_jax.training import loop
 from humangs_jax.training.checkpoint import Checkpoints
-from humangs_jax.training.config import tiny
+from humangs_jax.training.config import Stage, tiny
 from humangs_jax.training.loop import train
+from humangs_jax.training.sources import captured_people
 
 CONFIG = tiny()
 
@@ -98,3 +99,35 @@ def test_a_broken_folder_is_named_and_logged(body, captures, variables, tmp_path
         train(CONFIG, body, folders, out, variables=variables, stop_at=2, progress=False)
     assert str(broken) in caplog.text
     assert lines(tmp_path / "out")[-1]["broken_folders"] == 1
+
+
+def test_a_run_on_people_of_any_source_asks_for_it_with_its_configuration(
+    body, captures, variables, tmp_path, whole, same
+):
+    asked = []
+
+    def make(config):
+        asked.append(config)
+        return captured_people(captures[:2], body)(config)
+
+    state = train(CONFIG, body, make, tmp_path, variables=variables, stop_at=4, progress=False)
+    assert asked == [CONFIG] and same(state.params, whole[0].params)
+
+
+@pytest.mark.slow
+def test_resume_in_a_later_stage_with_changing_numbers_of_views(body, captures, variables, tmp_path, same):
+    config = dataclasses.replace(
+        CONFIG,
+        views=dataclasses.replace(CONFIG.views, input_counts=(1, 2, 3)),
+        ema_decay=0.9,
+        steps=6,
+        stages=(Stage(2, image_size=16, target_size=8, batch_size=2, token_capacity=12),),
+    )
+    options = {"validation": captures[2:], "variables": variables, "progress": False}
+    whole = train(config, body, captures[:2], tmp_path / "whole", **options)
+    for stop in (1, 3, 4, 6):
+        resumed = train(config, body, captures[:2], tmp_path / "parts", stop_at=stop, **options)
+    assert same(resumed, whole)
+    losses = [[line["loss"] for line in lines(tmp_path / name) if "loss" in line] for name in ("whole", "parts")]
+    assert losses[0] == losses[1] and len(losses[0]) == 6
+    assert load_weights(tmp_path / "whole" / "weights.safetensors")[1].image_size == 16

@@ -1,0 +1,103 @@
+"""The log: what a killed run wrote too much goes, what went wrong is told, TensorBoard reads the same numbers."""
+
+import json
+import struct
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.data.loader import Waiting
+from humangs_jax.training.log import RunLog, forget_after
+from humangs_jax.training.loop import MANY_SKIPPED, _Watch
+from humangs_jax.training.optimizer import GuardState
+from humangs_jax.training.state import TrainState
+
+
+def read(path):
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def tensorboard_events(folder):
+    """Events of all files, by the format of TFRecord: length, checksum, message, checksum."""
+    from tensorboardX.proto.event_pb2 import Event
+
+    events = []
+    for path in sorted(folder.glob("events.out.tfevents.*")):
+        data = path.read_bytes()
+        while data:
+            (length,) = struct.unpack("<Q", data[:8])
+            events.append(Event.FromString(data[12 : 12 + length]))
+            data = data[16 + length :]
+    return events
+
+
+def test_lines_of_later_steps_and_half_written_ones_go(tmp_path):
+    path = tmp_path / "log.jsonl"
+    whole = [
+        {"step": 1, "loss": 0.5},
+        {"step": 2, "loss": 0.4},
+        {"step": 2, "val_psnr": 20.0},
+        {"step": 3, "loss": 0.3},
+    ]
+    path.write_text("".join(json.dumps(line) + "\n" for line in whole) + '{"step": 2, "lo')
+    forget_after(path, 2)
+    assert read(path) == whole[:3]
+    assert [p.name for p in tmp_path.iterdir()] == ["log.jsonl"]
+    forget_after(tmp_path / "none.jsonl", 2)
+
+
+def test_tensorboard_reads_the_numbers_and_the_pictures(tmp_path):
+    waiting = Waiting()
+    with RunLog(tmp_path, 0, 10, progress=False) as log:
+        waiting.add(0.5)
+        log.steps(4, {"loss": jnp.asarray(0.25), "psnr": jnp.asarray(21.0)}, subjects=2, waiting=waiting, broken=1)
+        log.numbers(4, {"val_psnr": 19.0}, "validation")
+        log.picture(4, "validation/sheet", np.random.default_rng(0).random((8, 16, 3)))
+    training, validation = read(tmp_path / "log.jsonl")
+    assert np.isclose(training["samples_per_second"] * training["seconds_per_step"], 2.0)
+    assert training["data_seconds_per_step"] == 0.5 / 4 and training["broken_folders"] == 1
+    assert validation == {"step": 4, "val_psnr": 19.0}
+    values = {v.tag: (e.step, v) for e in tensorboard_events(tmp_path / "tensorboard") for v in e.summary.value}
+    for name, value in training.items():
+        if name != "step":
+            step, found = values[f"train/{name}"]
+            assert step == 4 and np.isclose(found.simple_value, value)
+    assert np.isclose(values["validation/val_psnr"][1].simple_value, 19.0)
+    assert values["validation/sheet"][1].image.width == 16
+
+
+def test_numbers_that_are_not_finite_are_no_json(tmp_path):
+    with RunLog(tmp_path, 0, 10, progress=False) as log:
+        log.event(3, "skipped", "skipped", loss=float("nan"), grad_norm=2.0)
+    assert (tmp_path / "log.jsonl").read_text() == '{"step": 3, "event": "skipped", "loss": null, "grad_norm": 2.0}\n'
+
+
+def test_a_process_that_does_not_record_writes_nothing(tmp_path):
+    with RunLog(tmp_path, 0, 10, recording=False) as log:
+        log.steps(1, {"loss": jnp.ones(()), "psnr": jnp.ones(())}, 1, Waiting(), 0)
+        log.event(1, "skipped", "skipped")
+        log.picture(1, "sheet", np.zeros((2, 2, 3)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_steps_that_went_wrong_are_told_by_number(tmp_path, capsys):
+    guard = GuardState(jnp.asarray(2), jnp.asarray(2), jnp.zeros(()), ())
+    state = TrainState(jnp.asarray(0), {}, {}, guard, None)
+    metrics = lambda skipped, nonfinite: {
+        "skipped": jnp.asarray(skipped),
+        "nonfinite": jnp.asarray(nonfinite),
+        "loss": jnp.asarray(jnp.nan if skipped > 2 else 1.0),
+        "grad_norm": jnp.asarray(1.0),
+    }
+    with RunLog(tmp_path, 0, 100, progress=False) as log:
+        watch = _Watch(log, state)
+        watch(1, metrics(2, 2))
+        watch(2, metrics(2, 3))
+        for i in range(MANY_SKIPPED):
+            watch(3 + i, metrics(3 + i, 4 + i))
+        watch.look()
+        watch.look()
+    events = [(line["step"], line["event"]) for line in read(tmp_path / "log.jsonl")]
+    skipped = [(3 + i, "skipped") for i in range(MANY_SKIPPED)]
+    assert events == [(2, "nonfinite"), *skipped, (2 + MANY_SKIPPED, "stuck")]
+    assert "--diagnose" in capsys.readouterr().out
