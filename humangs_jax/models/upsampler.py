@@ -17,6 +17,7 @@ import jax.numpy as jnp
 from flax.linen.dtypes import promote_dtype
 
 from humangs_jax.array_types import Array, Bool, Float
+from humangs_jax.models.convolution import Convolution
 from humangs_jax.sampling.neighborhoods import KERNEL
 
 SLOPE = 0.2
@@ -129,7 +130,7 @@ class Upsampler(nn.Module):
             return jax.nn.leaky_relu(norm(x, mask=mask), SLOPE)
 
         def convolution(features, name):
-            return nn.Conv(features, (3, 3), dtype=self.dtype, kernel_init=KAIMING, name=name)
+            return Convolution(features, KAIMING, self.dtype, name=name)
 
         projected = [
             nn.Dense(hidden, dtype=self.dtype, kernel_init=KAIMING, name=f"project_{i}")(x) for i, x in enumerate(maps)
