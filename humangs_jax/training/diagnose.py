@@ -12,9 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 
-from humangs_jax.array_types import PyTree
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import Example, Loader
 from humangs_jax.data.views import gaussian_body
@@ -24,7 +22,6 @@ from humangs_jax.training.checkpoint import Checkpoints, load_config
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.diagnosis import Diagnosis, StageReport, leaves
 from humangs_jax.training.observed import observe_subject
-from humangs_jax.training.probes import Statistics, tree_statistics
 from humangs_jax.training.sources import MakeSource, captured_people
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import NO_NETWORKS, train_step
@@ -41,20 +38,24 @@ def diagnose_step(
     Subject by subject: where a microbatch shares its batch statistics, theirs are their own here.
     """
     config = config.at(int(state.step))
-    stored = [StageReport(name, leaves(numbers)) for name, numbers in jax.device_get(_stored(state)).items()]
-    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
+    parts = {
+        "parameters": state.params,
+        "batch statistics": state.batch_stats,
+        "optimizer": state.opt_state.inner,
+        "averaged parameters": state.ema_params,
+    }
+    stored = [StageReport(name, leaves(tree)) for name, tree in parts.items() if jax.tree.leaves(tree)]
+    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step), len(batch.inputs.betas))
     found = []
-    for subject, key in enumerate(jax.random.split(key, len(batch.inputs.betas))):
+    for subject, key in enumerate(keys):
         example = jax.tree.map(lambda x, i=subject: x[i], batch)
-        result = observe_subject(state.params, state.batch_stats, body, example, key, config, networks)
-        loss, stages = jax.device_get(result)
-        photographs = StageReport("batch", leaves(jax.device_get(_tree_statistics(example))))
+        loss, stages = observe_subject(state.params, state.batch_stats, body, example, key, config, networks)
         diagnosis = Diagnosis(
             step=int(state.step),
             subject=subject,
             loss=float(loss),
             skip_norm=config.optimizer.skip_norm,
-            stored=(*stored, photographs),
+            stored=(*stored, StageReport("batch", leaves(example))),
             stages=tuple(StageReport(x.name, *map(leaves, (x.values, x.cotangents, x.gradients))) for x in stages),
         )
         if diagnosis.fault is not None:
@@ -114,18 +115,3 @@ def first_failed_step(log: Path) -> int | None:
         if record.get("event") in FAILED:
             return record["step"] - 1
     return None
-
-
-@jax.jit
-def _tree_statistics(tree: PyTree) -> dict[str, Statistics]:
-    return tree_statistics(tree)
-
-
-def _stored(state: TrainState) -> dict[str, dict[str, Statistics]]:
-    parts = {
-        "parameters": state.params,
-        "batch statistics": state.batch_stats,
-        "optimizer": state.opt_state.inner,
-        "averaged parameters": state.ema_params,
-    }
-    return {name: _tree_statistics(tree) for name, tree in parts.items() if jax.tree.leaves(tree)}

@@ -2,12 +2,13 @@
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Literal
 
 import numpy as np
 
-from humangs_jax.training.probes import Statistics
+from humangs_jax.array_types import PyTree
+from humangs_jax.training.probes import inexact_leaves
 
 AXES = {
     "images": "view row column",
@@ -42,7 +43,9 @@ Direction = Literal["stored", "forward", "backward"]
 
 @dataclasses.dataclass(frozen=True)
 class Leaf:
-    """`Statistics` of one array on the host; of the finite entries smallest to norm."""
+    """Numbers of one array. bad: entries that are not finite, the first of them at index `first`. Of the finite entries:
+    smallest and largest (+-inf without any), the mean of their magnitudes, their Euclidean norm.
+    """
 
     name: str
     bad: int
@@ -51,6 +54,22 @@ class Leaf:
     largest: float
     mean: float
     norm: float
+
+    @classmethod
+    def of(cls, name: str, array: np.ndarray) -> "Leaf":
+        """The numbers of an array."""
+        wrong = ~np.isfinite(array.astype(np.promote_types(array.dtype, np.float32), copy=False))
+        bad = int(np.count_nonzero(wrong))
+        finite = (array[~wrong] if bad else array.reshape(-1)).astype(np.float64)
+        return cls(
+            name=name,
+            bad=bad,
+            first=tuple(int(i) for i in np.unravel_index(int(np.argmax(wrong)), array.shape)) if bad else (),
+            smallest=float(np.min(finite, initial=np.inf)),
+            largest=float(np.max(finite, initial=-np.inf)),
+            mean=float(np.mean(np.abs(finite))) if finite.size else 0.0,
+            norm=float(np.linalg.norm(finite)),
+        )
 
     @property
     def magnitude(self) -> float:
@@ -159,24 +178,15 @@ class Diagnosis:
         )
 
     def __str__(self) -> str:
-        title = f"step {self.step}, subject {self.subject}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g}"
+        title = (
+            f"step {self.step}, subject {self.subject}: loss {self.loss:.6g}, gradient norm {self.gradient_norm:.4g}"
+        )
         return "\n".join([title, self.verdict, "", *_table((*self.stored, *self.stages))])
 
 
-def leaves(numbers: Mapping[str, Statistics]) -> tuple[Leaf, ...]:
-    """Statistics that were fetched from the device."""
-    return tuple(
-        Leaf(
-            name=name,
-            bad=int(x.bad),
-            first=tuple(int(i) for i in np.asarray(x.first)),
-            smallest=float(x.smallest),
-            largest=float(x.largest),
-            mean=float(x.mean),
-            norm=float(x.norm),
-        )
-        for name, x in numbers.items()
-    )
+def leaves(tree: PyTree) -> tuple[Leaf, ...]:
+    """Of all arrays of a tree that could be NaN."""
+    return tuple(Leaf.of(name, np.asarray(leaf)) for name, leaf in inexact_leaves(tree))
 
 
 def _bad(found: Sequence[Leaf]) -> Iterator[Leaf]:

@@ -10,7 +10,6 @@ from typing import Any
 
 import flax.linen as nn
 import jax
-import jax.numpy as jnp
 
 from humangs_jax.array_types import Array, Key, PyTree, Scalar
 from humangs_jax.body.model import BodyModel, shape_body
@@ -34,20 +33,20 @@ from humangs_jax.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.rendering.gaussians import Gaussians, skin_gaussians
 from humangs_jax.rendering.splatting import Rendering, draw_projected, project_gaussians
 from humangs_jax.training.config import TrainConfig
-from humangs_jax.training.probes import Recorder, Statistics, tree_statistics
+from humangs_jax.training.probes import Named, Recorder, inexact_leaves
 from humangs_jax.training.step import change_background, loss_terms, random_backgrounds
 
 
 @pytree_dataclass
 class ObservedStage:
-    """Statistics, by name of the array: of what a stage gives, of the gradients that it sends back to what it is given,
-    and of the gradients of its parameters.
+    """values: what a stage gives. cotangents: the gradients that it sends back to what it is given. gradients: of its
+    parameters.
     """
 
     name: str = static_field()
-    values: dict[str, Statistics]
-    cotangents: dict[str, Statistics]
-    gradients: dict[str, Statistics]
+    values: Named
+    cotangents: Named
+    gradients: Named
 
 
 @functools.partial(jax.jit, static_argnames="config")
@@ -62,7 +61,8 @@ def observe_subject(
 ) -> tuple[Scalar, list[ObservedStage]]:
     """The loss, as `subject_loss`, and all stages in the order of the forward pass.
 
-    Blocks are neither looped over nor recomputed, so that each can be watched: this needs more memory than a step.
+    Blocks are neither looped over nor recomputed, so that each can be watched, and all that was seen is kept: this needs
+    more memory than a step.
     """
     transformer = dataclasses.replace(config.model.transformer, scan=False, remat=False)
     config = dataclasses.replace(config, model=dataclasses.replace(config.model, transformer=transformer))
@@ -75,9 +75,9 @@ def observe_subject(
     jax.eval_shape(lambda params: loss(params, None, dry)[0], params)
     differentiated = jax.value_and_grad(lambda *trees: loss(*trees, None), argnums=(0, 1), has_aux=True)
     (value, given), (gradients, cotangents) = differentiated(params, dry.probes())
-    own: dict[str, dict[str, Statistics]] = {}
-    for name, numbers in tree_statistics(gradients).items():
-        own.setdefault(parameter_stage(name), {})[name] = numbers
+    own: dict[str, Named] = {}
+    for name, gradient in inexact_leaves(gradients):
+        own.setdefault(parameter_stage(name), {})[name] = gradient
     stages = [ObservedStage(name, given[name], cotangents.get(name, {}), own.get(name, {})) for name in dry.given]
     return value, stages
 
@@ -101,7 +101,8 @@ def _observed_loss(params, batch_stats, body, example, key, config, networks, re
     """`step.subject_loss`."""
     model, variables = config.model, {"params": params, "batch_stats": batch_stats}
     inputs = jax.lax.stop_gradient(prepare_inputs(body, example.inputs, model, config.raster))
-    recorder.give("position maps", inputs)
+    computed = ("posed_vertices", "canonical_vertices", "position_maps", "depth_maps")
+    recorder.give("position maps", {name: getattr(inputs, name) for name in computed})
     with nn.intercept_methods(functools.partial(_watch, recorder)):
         encoding, updated = encode_with_statistics(variables, inputs, model, train=True)
     recorder.give("maps", encoding)

@@ -1,0 +1,310 @@
+"""Diagnosis of a step: its numbers are the step's, and what is planted in one place is named there and nowhere else."""
+
+import dataclasses
+import functools
+import inspect
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.data.loader import CaptureCache, CaptureSource, ExampleSource
+from humangs_jax.models.humangs import init_humangs
+from humangs_jax.models.presets import PRESETS
+from humangs_jax.models.transformer import Block
+from humangs_jax.models.upsampler import UpsamplerConfig
+from humangs_jax.pytree import replace
+from humangs_jax.training import diagnose, observed
+from humangs_jax.training.config import tiny
+from humangs_jax.training.diagnose import diagnose_run, diagnose_step, first_failed_step
+from humangs_jax.training.diagnosis import Diagnosis, Fault, Leaf, StageReport
+from humangs_jax.training.loop import train
+from humangs_jax.training.probes import Recorder, inexact_leaves
+from humangs_jax.training.state import init_state
+from humangs_jax.training.step import train_step
+
+FLOAT32 = 1e-4
+"""Relative: the stages are fused otherwise than in the step."""
+CONFIG = tiny()
+
+
+@pytest.fixture(scope="module")
+def batch(body, captures):
+    size = CONFIG.model.image_size
+    source = ExampleSource(CaptureCache(captures, body), CONFIG.views, size, CONFIG.target_size, CONFIG.batch_size)
+    return source.batch_at(0)
+
+
+def with_leaf(tree, path, change):
+    """The tree with the leaf of this path changed."""
+    names = dict(inexact_leaves(tree))
+    assert path in names, sorted(names)
+    named = lambda p: jax.tree_util.keystr(p, simple=True, separator=".")
+    return jax.tree_util.tree_map_with_path(lambda p, x: change(x) if named(p) == path else x, tree)
+
+
+def planted(value, *index):
+    return lambda x: x.at[tuple(index) or (0,) * x.ndim].set(value)
+
+
+def test_the_numbers_are_those_of_the_step(body, batch, variables):
+    diagnosis = diagnose_step(init_state(CONFIG, variables), batch, body, CONFIG)
+    _, metrics = train_step(init_state(CONFIG, variables), batch, body, CONFIG)
+    assert diagnosis.loss == pytest.approx(float(metrics["loss"]), rel=FLOAT32)
+    assert diagnosis.gradient_norm == pytest.approx(float(metrics["grad_norm"]), rel=FLOAT32)
+    assert diagnosis.fault is None and diagnosis.verdict.startswith("all finite; gradient norm")
+    named = {leaf.name for stage in diagnosis.stages for leaf in stage.gradients}
+    assert named == {name for name, _ in inexact_leaves(variables["params"])}
+    lines = str(diagnosis).splitlines()
+    assert len({len(line) for line in lines[-2:]}) == 1 and lines[-1].startswith("loss ")
+    spike = dataclasses.replace(diagnosis, skip_norm=1e-9)
+    assert "of its square is of stage 'raw heads'" in spike.verdict  # at the start its last layer has nearly all
+
+
+IN_BATCH = {
+    "photograph": ("inputs.images", (0, 1, 3, 4, 2), "view 1, row 3, column 4 [2]", "pixels"),
+    "target": ("targets.images", (0, 0, 5, 6, 0), "view 0, row 5, column 6 [0]", "loss: squared"),
+    "mask": ("targets.masks", (0, 1, 2, 3), "view 1, row 2, column 3", "loss: silhouette"),
+    "shape": ("inputs.betas", (0, 0), "[0]", "position maps"),
+    "pose": ("inputs.rotations", (0, 1, 1, 2), "view 1, joint 1 [2]", "position maps"),
+    "input camera": ("inputs.cameras.cam_from_world", (0, 1, 0, 3), "view 1 [0, 3]", "pixels"),
+    "target pose": ("targets.rotations", (0, 1, 0, 0), "view 1, joint 0 [0]", "posed Gaussians"),
+    "target camera": ("targets.cameras.K", (0, 1, 0, 0), "view 1 [0, 0]", "projected splats"),
+}
+
+
+@pytest.mark.parametrize("what", IN_BATCH)
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_bad_number_in_the_batch_is_named_and_where_it_enters(body, batch, variables, what, value):
+    path, index, place, stage = IN_BATCH[what]
+    if value == np.inf and "camera" in what:
+        pytest.skip("an infinite camera may show nothing at all, which is finite")
+    diagnosis = diagnose_step(
+        init_state(CONFIG, variables), with_leaf(batch, path, planted(value, *index)), body, CONFIG
+    )
+    stored, computed = diagnosis.faults
+    assert (stored.direction, stored.stage, stored.leaf.name, stored.leaf.bad) == ("stored", "batch", path, 1)
+    assert stored.leaf.first == index[1:] and stored.place == place and place in str(diagnosis)
+    assert (computed.direction, computed.stage) == ("forward", stage)
+
+
+IN_PARAMETERS = {
+    "encoder.tokenizer.linear.kernel": "tokens",
+    "encoder.transformer.input_norm.scale": "input norm",
+    "encoder.transformer.block_0.norm1.scale": "block 0",
+    "encoder.transformer.block_2.mlp_in.kernel": "block 2",
+    "encoder.transformer.norm.bias": "final norm",
+    "encoder.upsampler.up1.kernel": "maps",
+    "readout.kernel": "vertex features",
+    "decoder.trunk_1.kernel": "raw heads",
+    "decoder.geometry_out.bias": "raw heads",
+}
+
+
+@pytest.mark.parametrize("path", IN_PARAMETERS)
+def test_a_bad_parameter_is_named_and_the_stage_that_uses_it(body, batch, variables, path):
+    state = init_state(CONFIG, variables)
+    state = replace(state, params=with_leaf(state.params, path, planted(np.nan)))
+    stored, computed = diagnose_step(state, batch, body, CONFIG).faults
+    assert (stored.direction, stored.stage, stored.leaf.name) == ("stored", "parameters", path)
+    assert stored.leaf.bad == 1 and not any(stored.leaf.first)
+    assert (computed.direction, computed.stage) == ("forward", IN_PARAMETERS[path])
+
+
+EXPLODING = {
+    "block 1": ["encoder.transformer.block_1.mlp_in.kernel", "encoder.transformer.block_1.mlp_out.kernel"],
+    "raw heads": ["decoder.trunk_0.kernel", "decoder.trunk_1.kernel"],
+}
+
+
+@pytest.mark.parametrize("stage", EXPLODING)
+def test_a_stage_that_overflows_from_finite_parameters_is_named(body, batch, variables, stage):
+    state = init_state(CONFIG, variables)
+    for path in EXPLODING[stage]:
+        state = replace(state, params=with_leaf(state.params, path, lambda x: 1e25 * x))
+    (fault,) = diagnose_step(state, batch, body, CONFIG).faults
+    assert (fault.direction, fault.stage) == ("forward", stage)
+
+
+def test_moments_and_averages_are_looked_at(body, batch, variables):
+    config = dataclasses.replace(CONFIG, ema_decay=0.9)
+    state = init_state(config, variables)
+    assert state.ema_params is not None
+    moments = state.opt_state.inner
+    for path in [path for path, _ in inexact_leaves(moments) if path.endswith("decoder.trunk_0.kernel")]:
+        moments = with_leaf(moments, path, planted(np.inf))
+    averages = with_leaf(state.ema_params, "decoder.trunk_0.bias", planted(np.nan, 3))
+    state = replace(state, opt_state=state.opt_state._replace(inner=moments), ema_params=averages)
+    faults = diagnose_step(state, batch, body, CONFIG).faults
+    assert [fault.stage for fault in faults] == ["optimizer", "optimizer", "averaged parameters"]
+    assert "averaged parameters: decoder.trunk_0.bias, 1 entries, first at [3]" in str(faults[-1])
+
+
+def test_every_parameter_of_every_preset_has_a_stage():
+    for preset in PRESETS.values():
+        variables = jax.eval_shape(lambda preset=preset: init_humangs(jax.random.key(0), preset()))
+        names = {observed.parameter_stage(name) for name, _ in inexact_leaves(variables["params"])}
+        assert {"tokens", "block 0", "final norm", "raw heads"} <= names
+
+
+@jax.custom_vjp
+def nan_gradient(x):
+    return x
+
+
+nan_gradient.defvjp(lambda x: (x, None), lambda _, g: (g.at[(-1,) * g.ndim].set(jnp.nan),))
+
+
+def test_probes_tell_the_users_of_an_array_apart():
+    def loss(x, probes=None):
+        recorder = Recorder(probes)
+        a = recorder.give("a", jnp.sin(recorder.take("a", x)))
+        b = recorder.give("b", nan_gradient(recorder.take("b", {"in": a})["in"]))
+        c = recorder.give("c", 2 * recorder.take("c", {"in": a, "number": jnp.arange(3)})["in"])
+        return jnp.sum(b * c), recorder
+
+    x = jnp.asarray([0.1, 0.2, 0.3])
+    dry = loss(x)[1]
+    value, probes = loss(x)[0], dry.probes()
+    gradients = jax.grad(lambda probes: loss(x, probes)[0])(probes)
+    assert float(loss(x, probes)[0]) == float(value) and list(dry.given) == ["a", "b", "c"]
+    assert np.isfinite(gradients["c"]["in"]).all() and list(gradients["c"]) == ["in"]
+    np.testing.assert_array_equal(np.isnan(gradients["b"]["in"]), [False, False, True])
+    np.testing.assert_array_equal(np.isnan(gradients["a"][""]), [False, False, True])
+
+
+def number(name, bad=0):
+    return Leaf(name, bad, (1, 2), -1.0, 1.0, 0.5, 1.0)
+
+
+def test_going_back_the_last_stage_with_good_gradients_behind_it_is_blamed():
+    stages = [
+        StageReport("tokens", (number("out"),), (), (number("encoder.tokenizer.linear.kernel", 4),)),
+        StageReport("block 0", (number("out"),), (number("in", 3),), (number("kernel", 9),)),
+        StageReport("block 1", (number("out"),), (number("in"),), (number("kernel", 2),)),
+        StageReport("loss", (number(""),), (number("term"),), ()),
+    ]
+    diagnosis = Diagnosis(step=7, subject=0, loss=1.0, skip_norm=100.0, stored=(), stages=tuple(stages))
+    assert diagnosis.fault == Fault("backward", "block 1", stages[2].gradients[0])
+    worse = [*stages[:3], dataclasses.replace(stages[3], values=(number("", 1),))]
+    assert dataclasses.replace(diagnosis, stages=tuple(worse)).fault == Fault("forward", "loss", number("", 1))
+
+
+def test_numbers_of_arrays():
+    leaf = Leaf.of("x", np.asarray([[3.0, np.inf], [np.nan, -4.0]], np.float32))
+    assert leaf == Leaf("x", 2, (0, 1), -4.0, 3.0, 3.5, 5.0) and leaf.magnitude == 4
+    assert Leaf.of("x", np.zeros((0, 3))).magnitude == 0 and Leaf.of("x", np.asarray(np.nan)).first == ()
+    half = Leaf.of("x", np.asarray(jnp.asarray([1e30, jnp.nan], jnp.bfloat16)))
+    assert half.bad == 1 and half.norm == pytest.approx(1e30, rel=1e-2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Spoilt:
+    """A source of which one example is not finite."""
+
+    source: CaptureSource
+    at: int
+
+    def __getattr__(self, name):
+        return getattr(self.source, name)
+
+    def __len__(self):
+        return len(self.source)
+
+    def example(self, seed, index, input_count):
+        example = self.source.example(seed, index, input_count)
+        if index == self.at:
+            example = jax.tree.map(np.array, example)
+            example.targets.images[0, 1, 2, 0] = np.nan  # no background that the network skips
+        return example
+
+
+def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, tmp_path):
+    def source(at):
+        make = lambda config: CaptureSource(cache, config.views, config.model.image_size, config.target_size)
+        return lambda config: Spoilt(make(config), at)
+
+    cache = CaptureCache(captures, body)
+    train(CONFIG, body, source(3), tmp_path, variables=variables, stop_at=5, progress=False)
+    diagnosis = diagnose_run(tmp_path, body, source(3), variables=variables)
+    assert diagnosis.step == 3 and first_failed_step(tmp_path / "log.jsonl") == 3
+    assert diagnosis.fault is not None and diagnosis.fault.leaf.name == "targets.images"
+    (tmp_path / "log.jsonl").write_text("")
+    assert (healthy := diagnose_run(tmp_path, body, source(99))).step == 5 and healthy.fault is None
+
+
+def fresh(monkeypatch):
+    """`observe_subject` traced anew, after something was exchanged; quick to compile."""
+    options = {"xla_backend_optimization_level": 0}
+    function = functools.partial(
+        inspect.unwrap(observed.observe_subject)
+    )  # another one, or it would come from the cache
+    traced = jax.jit(function, static_argnames="config", compiler_options=options)
+    monkeypatch.setattr(diagnose, "observe_subject", traced)
+
+
+def spoil_vertex_features(monkeypatch):
+    def spoilt(*arguments):
+        features = original(*arguments)
+        return replace(features, local=nan_gradient(features.local))
+
+    original = observed.sample_vertices
+    monkeypatch.setattr(observed, "sample_vertices", spoilt)
+
+
+def spoil_block(monkeypatch):
+    def spoilt(block, *arguments):
+        x = original(block, *arguments)
+        return nan_gradient(x) if block.name == "block_1" else x
+
+    original = Block.__call__
+    monkeypatch.setattr(Block, "__call__", spoilt)
+
+
+def spoil_pictures(monkeypatch):
+    def spoilt(*arguments):
+        drawn = original(*arguments)
+        return replace(drawn, rgb=nan_gradient(drawn.rgb))
+
+    original = observed.draw_projected
+    monkeypatch.setattr(observed, "draw_projected", spoilt)
+
+
+SPOILT = {"vertex features": spoil_vertex_features, "block 1": spoil_block, "pictures": spoil_pictures}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", SPOILT)
+def test_a_stage_whose_gradient_alone_is_bad_is_named(monkeypatch, body, batch, variables, stage):
+    SPOILT[stage](monkeypatch)
+    fresh(monkeypatch)
+    (fault,) = diagnose_step(init_state(CONFIG, variables), batch, body, CONFIG).faults
+    assert (fault.direction, fault.stage) == ("backward", stage)
+
+
+@pytest.mark.slow
+def test_an_infinite_weight_of_a_loss_is_named(body, batch, variables):
+    config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, silhouette=np.inf))
+    (fault,) = diagnose_step(init_state(config, variables), batch, body, config).faults
+    assert (fault.direction, fault.stage, fault.leaf.name) == ("forward", "loss", "")
+
+
+@pytest.mark.slow
+def test_networks_of_other_parts_have_the_same_stages(monkeypatch, body, batch):
+    """Blocks in a loop and recomputed, all patches, no upsampler, corrected skinning weights, rotated quaternions."""
+    model = dataclasses.replace(
+        CONFIG.model,
+        tokens="all",
+        skinning="rotation",
+        transformer=dataclasses.replace(CONFIG.model.transformer, scan=True, remat=True),
+        upsampler=UpsamplerConfig(enabled=False),
+        decoder=dataclasses.replace(CONFIG.model.decoder, skinning_joints=2),
+    )
+    config = dataclasses.replace(CONFIG, model=model)
+    fresh(monkeypatch)
+    whole = diagnose_step(init_state(config), batch, body, config)
+    _, metrics = train_step(init_state(config), batch, body, config)
+    assert whole.fault is None and {"block 3", "maps", "loss"} <= {stage.name for stage in whole.stages}
+    assert whole.loss == pytest.approx(float(metrics["loss"]), rel=FLOAT32)
+    assert whole.gradient_norm == pytest.approx(float(metrics["grad_norm"]), rel=1e-3)  # without the compiler's fusions
