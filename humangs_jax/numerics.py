@@ -28,6 +28,11 @@ def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
+def absolute(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """|x| with zero gradient at 0, where that of `jnp.abs` is 1: an L1 of images would push where they agree."""
+    return x * jax.lax.stop_gradient(jnp.sign(x))
+
+
 def safe_norm(x: Float[Array, "*b d"]) -> Float[Array, "*b"]:
     """Euclidean norm over the last axis; zero gradient at the zero vector.
 

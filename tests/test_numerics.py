@@ -42,6 +42,12 @@ def test_values_and_gradients_are_finite_at_zero(f):
     assert np.isfinite(value) and np.isfinite(gradient).all()
 
 
+def test_absolute_has_no_slope_at_zero():
+    x = jnp.asarray([-2.0, 0.0, 3.0])
+    assert np.array_equal(numerics.absolute(x), [2, 0, 3])
+    assert np.array_equal(jax.grad(lambda x: numerics.absolute(x).sum())(x), [-1, 0, 1])
+
+
 def test_zero_has_the_stated_value():
     assert (numerics.safe_normalize(jnp.zeros(3), jnp.asarray([0.0, 1, 0])) == jnp.asarray([0.0, 1, 0])).all()
     assert numerics.safe_divide(jnp.ones(1), jnp.zeros(1))[0] == 0

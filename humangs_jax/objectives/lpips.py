@@ -34,17 +34,21 @@ def _unit(x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:
     return x / (safe_sqrt(jnp.sum(jnp.square(x), axis=-1, keepdims=True)) + EPSILON)
 
 
+def lpips_distances(
+    weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
+) -> Float[Array, " _"]:
+    """The distance at each depth of the backbone: five for vgg and alex, seven for squeeze. See `lpips`."""
+    images = at_least_float32((predicted, target))
+    shift, scale = (jnp.asarray(x, images[0].dtype) for x in (SHIFT, SCALE))
+    slices = BACKBONES[weights.net]
+    maps = [feature_maps(weights.backbone, slices, (2 * image - 1 - shift) / scale) for image in images]
+    pairs = zip(weights.heads, *map(at_least_float32, maps), strict=True)
+    return jnp.stack([jnp.mean(jnp.sum(head * jnp.square(_unit(x) - _unit(y)), axis=-1)) for head, x, y in pairs])
+
+
 def lpips(weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Scalar:
     """The distance of two images in [0, 1]; 0 for equal ones.
 
     Raises: ValueError for images that are too small (16 pixels a side for vgg, 31 for alex, 25 for squeeze).
     """
-    images = at_least_float32((predicted, target))
-    shift, scale = (jnp.asarray(x, images[0].dtype) for x in (SHIFT, SCALE))
-    slices = BACKBONES[weights.net]
-    maps = [feature_maps(weights.backbone, slices, (2 * image - 1 - shift) / scale) for image in images]
-    distances = [
-        jnp.mean(jnp.sum(head * jnp.square(_unit(x) - _unit(y)), axis=-1))
-        for head, x, y in zip(weights.heads, *map(at_least_float32, maps), strict=True)
-    ]
-    return jnp.sum(jnp.stack(distances))
+    return jnp.sum(lpips_distances(weights, predicted, target))

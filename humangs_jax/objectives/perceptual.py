@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.array_types import Array, Float, Scalar
-from humangs_jax.numerics import at_least_float32
+from humangs_jax.numerics import absolute, at_least_float32
 from humangs_jax.objectives.backbones import Weights, feature_maps, vgg
 from humangs_jax.pytree import pytree_dataclass
 
@@ -35,7 +35,7 @@ def perceptual_errors(vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Floa
     images = [255 * image for image in at_least_float32((predicted, target))]
     mean = jnp.asarray(MEAN_COLOR, images[0].dtype)
     pairs = zip(*([image, *feature_maps(vgg.weights, VGG19, image - mean)] for image in images), strict=True)
-    return jnp.stack([jnp.mean(jnp.abs(x - y)) for x, y in map(at_least_float32, pairs)])
+    return jnp.stack([jnp.mean(absolute(x - y)) for x, y in map(at_least_float32, pairs)])
 
 
 def perceptual_loss(vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Scalar:
