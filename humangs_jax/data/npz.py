@@ -1,8 +1,13 @@
 """npz archives from strangers: read without pickle, file handles closed, every kind of damage one exception."""
 
+import threading
 from pathlib import Path
 
 import numpy as np
+
+_ONE_AT_A_TIME = threading.Lock()
+"""numpy reads the header of an array through Python's syntax trees, and CPython 3.11 counts the depth of these for all
+threads together: two at once are rarely, but then "AST constructor recursion depth mismatch" (python/cpython#106905)."""
 
 
 def read_npz(path: str | Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
@@ -19,7 +24,8 @@ def read_npz(path: str | Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
             with archive:
                 for name in archive.files:
                     try:
-                        arrays[name] = archive[name]
+                        with _ONE_AT_A_TIME:
+                            arrays[name] = archive[name]
                     except ValueError as error:
                         if "pickle" not in str(error):
                             raise
