@@ -73,9 +73,9 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
             f"tensor '{before}{missing[0]}' of {network} is missing ({len(missing)} of {len(expected)}){hint}"
         )
     for other, names in groups.items():
-        if expected.keys() <= names.keys() and not all(
-            np.array_equal(tensors[names[name]], tensors[found[name]]) for name in expected
-        ):
+        if names is found or not expected.keys() <= names.keys():
+            continue
+        if not all(np.array_equal(tensors[names[name]], tensors[found[name]]) for name in expected):
             raise ValueError(f"two networks that may be {network} in it, under {before!r} and {other!r}")
     return {name: _check(tensors, found[name], shape, network) for name, shape in expected.items()}
 

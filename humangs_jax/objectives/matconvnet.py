@@ -25,19 +25,21 @@ def read_matconvnet(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """
     from scipy.io import loadmat
 
-    try:
-        cells = loadmat(path, variable_names=["layers"])["layers"].ravel()
-        tensors = {}
-        for index, layer in enumerate(cell.ravel()[0] for cell in cells):
-            if layer["type"].item() != "conv":
-                continue
-            new = "weights" in layer.dtype.names
-            kernel, bias = layer["weights"].ravel() if new else (layer["filters"], layer["biases"])
-            tensors[f"{index}.weight"], tensors[f"{index}.bias"] = kernel.transpose(3, 2, 0, 1), bias.ravel()
-    except NotImplementedError as error:
-        raise ValueError(f"{path}: MATLAB files of version 7.3 are not supported: {error}") from error
-    except OSError:
-        raise
-    except Exception as error:  # a damaged or another file raises nearly anything
-        raise ValueError(f"{path} is no network of MatConvNet: {error!r}") from error
+    with open(path, "rb") as file:
+        try:
+            return _tensors(loadmat(file, variable_names=["layers"])["layers"])
+        except NotImplementedError as error:
+            raise ValueError(f"{path}: MATLAB files of version 7.3 are not supported: {error}") from error
+        except Exception as error:  # a damaged file, or another one, raises nearly anything
+            raise ValueError(f"{path} is no network of MatConvNet: {error!r}") from error
+
+
+def _tensors(cells: np.ndarray) -> dict[str, np.ndarray]:
+    tensors = {}
+    for index, layer in enumerate(cell.ravel()[0] for cell in cells.ravel()):
+        if layer["type"].item() != "conv":
+            continue
+        new = "weights" in layer.dtype.names
+        kernel, bias = layer["weights"].ravel() if new else (layer["filters"], layer["biases"])
+        tensors[f"{index}.weight"], tensors[f"{index}.bias"] = kernel.transpose(3, 2, 0, 1), bias.ravel()
     return tensors

@@ -1,5 +1,6 @@
 import dataclasses
 import os
+import re
 import sys
 
 import jax
@@ -24,6 +25,8 @@ from humangs_jax.models.conversion import (
 from humangs_jax.models.presets import published
 from humangs_jax.models.transformer import TransformerConfig
 from humangs_jax.models.weights import load_weights
+from humangs_jax.objectives.layer_names import expected_tensors
+from humangs_jax.objectives.loss_networks import load_lpips
 
 VARIANTS = [
     Options(),
@@ -251,3 +254,49 @@ def test_the_command_converts(tmp_path, monkeypatch, capsys):
     code, _, error = convert(monkeypatch, capsys, weights, "--out", weights)
     assert code == 2 and "the checkpoint itself" in error
     assert sorted(os.listdir(tmp_path)) == ["a.pt", "w.safetensors"]
+
+
+def loss_networks():
+    """LPIPS squeeze as the released checkpoint would carry it, its heads twice."""
+    draw = np.random.default_rng(0)
+    layers = expected_tensors("SqueezeNet 1.1").items()
+    state = {f"net.slice1.{key}": draw.normal(size=shape).astype(np.float32) for key, shape in layers}
+    for i, count in enumerate((64, 128, 256, 384, 384, 512, 512)):
+        state[f"lin{i}.model.1.weight"] = state[f"lins.{i}.model.1.weight"] = np.ones((1, count, 1, 1), np.float32)
+    return {f"loss_computer.lpips_loss_module.{key}": x for key, x in state.items()}
+
+
+def test_the_command_keeps_the_loss_networks(tmp_path, monkeypatch, capsys):
+    losses, weights, networks = tmp_path / "losses.safetensors", tmp_path / "w.safetensors", loss_networks()
+    path = write(tmp_path, oracle.random_state(Options()) | networks)
+    code, out, error = convert(monkeypatch, capsys, path, "--out", weights, "--losses", losses)
+    assert code == 0 and f"{losses}: LPIPS squeeze" in out and "skipped" not in out, error
+    assert sorted(os.listdir(tmp_path)) == ["a.pt", "losses.safetensors", "w.safetensors"]
+    kernel = load_lpips("squeeze", losses).backbone["3.squeeze"].kernel
+    expected = networks["loss_computer.lpips_loss_module.net.slice1.3.squeeze.weight"]
+    assert np.array_equal(kernel, expected.transpose(2, 3, 1, 0))
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("w.safetensors", "the same file as --out"),
+        ("losses.pt", "--losses .*losses.pt: expected a name ending in .safetensors"),
+        ("nowhere/losses.safetensors", "--losses .*: the folder .* does not exist"),
+        ("losses.safetensors", "a.pt: no loss networks"),
+    ],
+)
+def test_losses_that_cannot_be_kept(name, message, tmp_path, monkeypatch, capsys):
+    path = write(tmp_path, oracle.random_state(Options()))
+    arguments = ("--out", tmp_path / "w.safetensors", "--losses", tmp_path / name)
+    code, out, error = convert(monkeypatch, capsys, path, *arguments)
+    assert code == 2 and out == "" and error.count("\n") == 1 and re.search(message, error)
+    assert os.listdir(tmp_path) == ["a.pt"]
+
+
+def test_parts_of_loss_networks_are_refused(tmp_path, monkeypatch, capsys):
+    """The golden checkpoint carries four stubs of tensors."""
+    arguments = ("--out", tmp_path / "w.safetensors", "--losses", tmp_path / "losses.safetensors")
+    code, _, error = convert(monkeypatch, capsys, CHECKPOINT, *arguments)
+    assert code == 2 and "perceptual_loss_module.vgg.features.0.bias' of VGG-19 is missing" in error
+    assert os.listdir(tmp_path) == []

@@ -1,0 +1,223 @@
+"""Loss networks out of the files that hold them. Weights are made up; data/torch_heads.pth was written by torch."""
+
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from loss_cases import BACKBONES, made_up_heads, made_up_state
+from safetensors.numpy import save_file
+from scipy.io import savemat
+
+from humangs_jax.objectives.layer_names import expected_tensors, find_layers
+from humangs_jax.objectives.loss_networks import (
+    LossNetworks,
+    collect_loss_networks,
+    load_loss_networks,
+    load_lpips,
+    load_vgg19,
+)
+
+HEADS = Path(__file__).parent / "data" / "torch_heads.pth"
+NETWORKS = {"vgg19": "VGG-19", "vgg": "VGG-16", "alex": "AlexNet", "squeeze": "SqueezeNet 1.1"}
+
+
+def state(name, rename=lambda key: key, dtype="float16"):
+    return {rename(key): x.astype(dtype) for key, x in made_up_state(name).items()}
+
+
+def heads(net, rename="lin{}.model.1.weight"):
+    return {rename.format(i): x.astype(np.float32) for i, x in enumerate(made_up_heads(net))}
+
+
+def slices(net, form):
+    """The lpips package sorts layers into slices: net.slice1.0.weight."""
+    firsts = {"squeeze": (0, 2, 5, 8, 10, 11, 12), "alex": (0, 2, 5, 8, 10)}[net]
+    return lambda key: form.format(sum(first <= int(key.split(".")[0]) for first in firsts), key)
+
+
+def write(folder, tensors, name="a.safetensors"):
+    save_file({key: np.ascontiguousarray(x) for key, x in tensors.items()}, folder / name)
+    return folder / name
+
+
+def check_weights(weights, name, dtype="float16"):
+    for layer, *_ in BACKBONES[name]:
+        expected = made_up_state(name)[f"{layer}.weight"].astype(dtype).astype(np.float32)
+        assert np.array_equal(weights[layer].kernel, expected.transpose(2, 3, 1, 0))
+        assert np.array_equal(weights[layer].bias, made_up_state(name)[f"{layer}.bias"].astype(dtype))
+    assert len(weights) == len(BACKBONES[name])
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_expected_tensors(name):
+    assert expected_tensors(NETWORKS[name]) == {key: x.shape for key, x in made_up_state(name).items()}
+
+
+FORMS = {
+    "torchvision": lambda key: f"features.{key}",
+    "its features": lambda key: key,
+    "inside a model": lambda key: f"loss.vgg.features.{key}",
+    "data parallel": lambda key: f"module.features.{key}",
+    "lpips": slices("squeeze", "net.slice{}.{}"),
+    "lpips inside a model": slices("squeeze", "loss_computer.lpips_loss_module.net.slice{}.{}"),
+    "lists of slices": slices("squeeze", "net.slices.{}.{}"),
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_names_in_the_wild(form, tmp_path):
+    others = {"classifier.0.weight": np.zeros((2, 2), np.float32), "scaling_layer.shift": np.zeros(3, np.float32)}
+    path = write(tmp_path, state("squeeze", FORMS[form]) | heads("squeeze") | others)
+    networks = load_lpips("squeeze", path)
+    check_weights(networks.backbone, "squeeze")
+    assert networks.net == "squeeze"
+    for ours, expected in zip(networks.heads, made_up_heads("squeeze"), strict=True):
+        assert np.array_equal(ours, expected[0, :, 0, 0].astype(np.float32))
+
+
+@pytest.mark.parametrize("rename", ["lins.{}.model.1.weight", "loss.lin{}.model.0.weight", "lpips.lin{}.1.weight"])
+def test_names_of_heads(rename, tmp_path):
+    backbone = write(tmp_path, state("squeeze"))
+    path = write(tmp_path, heads("squeeze", rename) | {"extra": np.zeros(2, np.float32)}, "heads")
+    assert len(load_lpips("squeeze", backbone, path).heads) == 7
+
+
+def test_heads_that_torch_wrote_in_the_older_format(tmp_path):
+    networks = load_lpips("squeeze", write(tmp_path, state("squeeze")), HEADS)
+    for ours, expected in zip(networks.heads, made_up_heads("squeeze"), strict=True):
+        assert np.array_equal(ours, expected[0, :, 0, 0].astype(np.float32))
+
+
+def cell(*items):
+    array = np.empty((1, len(items)), object)
+    array[0, :] = items
+    return array
+
+
+def matconvnet(path, old):
+    """MatConvNet's file of a VGG-19, cut behind the layers that are looked at."""
+    layers, tensors = [], state("vgg19", dtype="float32")
+    for index in range(32):
+        if f"{index}.weight" not in tensors:
+            layers.append({"name": "x", "type": "pool" if index in (4, 9, 18, 27) else "relu"})
+            continue
+        kernel, bias = tensors[f"{index}.weight"].transpose(2, 3, 1, 0), tensors[f"{index}.bias"][None]
+        numbers = {"filters": kernel, "biases": bias} if old else {"weights": cell(kernel, bias)}
+        layers.append({"name": "x", "type": "conv", **numbers, "stride": np.ones((1, 2))})
+    savemat(path, {"layers": cell(*layers), "meta": {"normalization": 3}})
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_vgg19_of_matconvnet(old, tmp_path):
+    matconvnet(tmp_path / "a.bin", old)
+    check_weights(load_vgg19(tmp_path / "a.bin").weights, "vgg19", "float32")
+
+
+def test_other_matlab_files(tmp_path):
+    for content in ({"x": np.zeros(3)}, {"layers": np.zeros(3)}, {"layers": cell({"name": "x"})}):
+        savemat(tmp_path / "a.mat", content)
+        with pytest.raises(ValueError, match=r"a\.mat is no network of MatConvNet"):
+            load_vgg19(tmp_path / "a.mat")
+    savemat(tmp_path / "a.mat", {"layers": cell({"type": "relu"})})
+    with pytest.raises(ValueError, match=r"a\.mat: no tensor has a name like"):
+        load_vgg19(tmp_path / "a.mat")
+    (tmp_path / "a.mat").write_bytes((tmp_path / "a.mat").read_bytes()[:150])
+    with pytest.raises(ValueError, match=r"a\.mat is no network"):
+        load_vgg19(tmp_path / "a.mat")
+    (tmp_path / "a.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400))
+    with pytest.raises(ValueError, match=r"a\.mat: MATLAB files of version 7\.3 are not supported"):
+        load_vgg19(tmp_path / "a.mat")
+
+
+def alter(tensors, key, change):
+    return tensors | {key: change(tensors[key])}
+
+
+def without(tensors, key):
+    return {other: x for other, x in tensors.items() if other != key}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda x: {}, "no tensor has a name like 'features.0.weight': no SqueezeNet 1.1 in it"),
+        (lambda x: without(x, "features.6.squeeze.bias"), r"'features.6.squeeze.bias' of .* is missing \(1 of 50\)"),
+        (lambda x: alter(x, "features.0.weight", lambda w: w[:, :2]), r"'features.0.weight' has shape \(64, 2, 3, 3\)"),
+        (lambda x: alter(x, "features.0.bias", lambda w: w * np.nan), "'features.0.bias' holds numbers that are not"),
+        (lambda x: x | {f"other.{key}": w + 1 for key, w in x.items()}, "two networks that may be SqueezeNet 1.1"),
+        (lambda x: without(x, "lin3.model.1.weight"), r"heads \[0, 1, 2, 4, 5, 6\] of LPIPS; squeeze has 7"),
+        (lambda x: alter(x, "lin3.model.1.weight", lambda w: w[:, 1:]), r"'lin3.model.1.weight' has shape \(1, 383"),
+        (lambda x: {key: w for key, w in x.items() if "lin" not in key}, "no heads of LPIPS in it"),
+    ],
+)
+def test_what_is_wrong_is_named(change, message, tmp_path):
+    path = write(tmp_path, change(state("squeeze", lambda key: f"features.{key}") | heads("squeeze")))
+    with pytest.raises(ValueError, match=rf"a\.safetensors: .*{message}"):
+        load_lpips("squeeze", path)
+
+
+def test_twice_the_same_network_is_no_problem():
+    tensors = state("squeeze")
+    assert (
+        find_layers(tensors | {f"copy.{key}": x for key, x in tensors.items()}, "SqueezeNet 1.1").keys()
+        == tensors.keys()
+    )
+
+
+def test_another_network_is_recognised():
+    shapes = {f"features.{key}": np.zeros(shape) for key, shape in expected_tensors("VGG-16").items()}
+    with pytest.raises(ValueError, match=r"'features.16.weight' of VGG-19 is missing .*; it looks like VGG-16"):
+        find_layers(shapes, "VGG-19")
+
+
+def test_what_is_not_given_is_not_there(tmp_path):
+    assert jax.tree.leaves(load_loss_networks()) == [] and load_loss_networks().lpips is None
+    backbone = write(tmp_path, state("squeeze"))
+    networks = load_loss_networks(lpips_backbone=backbone, lpips_heads=HEADS, lpips_net="squeeze")
+    assert isinstance(networks, LossNetworks) and networks.perceptual is None and networks.lpips.net == "squeeze"
+    with pytest.raises(ValueError, match=r"torch_heads\.pth: heads of LPIPS, but no file for its backbone"):
+        load_loss_networks(lpips_heads=HEADS)
+    with pytest.raises(ValueError, match="no net 'resnet', only vgg, alex, squeeze"):
+        load_lpips("resnet", backbone)
+    with pytest.raises(FileNotFoundError):
+        load_loss_networks(vgg19=tmp_path / "nowhere.mat")
+
+
+def released(net="squeeze"):
+    """The loss networks among the tensors of a released checkpoint, blocks and lists of heads twice as there."""
+    root, blocks = "loss_computer.", (4, 9, 14, 23, 32)
+    perceptual, first = {}, 0
+    for block, end in enumerate(blocks):
+        for key, x in state("vgg19").items():
+            index, field = key.split(".")
+            if first <= int(index) < end:
+                perceptual[f"perceptual_loss_module.blocks.{block}.{int(index) - first}.{field}"] = x
+                perceptual[f"perceptual_loss_module.vgg.features.{key}"] = x
+        first = end
+    lpips = state(net, lambda key: f"lpips_loss_module.{slices(net, 'net.slice{}.{}')(key)}")
+    for form in ("lpips_loss_module.lin{}.model.1.weight", "lpips_loss_module.lins.{}.model.1.weight"):
+        lpips |= heads(net, form)
+    return {root + key: x for key, x in (perceptual | lpips).items()} | {"norm.weight": np.zeros(3, np.float32)}
+
+
+def test_the_loss_networks_of_a_released_checkpoint(tmp_path):
+    found, names = collect_loss_networks(write(tmp_path, released()))
+    assert names == ["VGG-19", "LPIPS squeeze"]
+    path = write(tmp_path, found, "losses.safetensors")
+    networks = load_loss_networks(path, path, lpips_net="squeeze")
+    check_weights(networks.perceptual.weights, "vgg19")
+    check_weights(networks.lpips.backbone, "squeeze")
+    assert len(networks.lpips.heads) == 7
+
+
+def test_checkpoints_with_fewer(tmp_path):
+    only = lambda word: {key: x for key, x in released("alex").items() if word in key}
+    assert collect_loss_networks(write(tmp_path, only("lpips_loss_module")))[1] == ["LPIPS alex"]
+    for tensors, message in [
+        (only("norm"), r"a\.safetensors: no loss networks"),
+        (without(only("lpips_loss"), "loss_computer.lpips_loss_module.net.slice3.6.bias"), "net.6.bias' of AlexNet is"),
+        (only(".blocks."), r"'loss_computer.perceptual_loss_module.blocks.\d.\d+.weight' of VGG-19 is missing"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            collect_loss_networks(write(tmp_path, tensors))
