@@ -1,0 +1,186 @@
+"""What no run should die of: nothing to see, one view, one Gaussian per vertex, Gaussians far away, bad photos, wild rates."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.data.loader import CaptureCache, ExampleSource
+from humangs_jax.pytree import replace
+from humangs_jax.training.config import tiny
+from humangs_jax.training.state import init_state
+from humangs_jax.training.step import train_step
+
+CONFIG = tiny()
+OUTSIDE = 100.0
+"""Metres that take any subject out of any picture."""
+
+
+def batch_of(body, captures, config, step=0):
+    size = config.model.image_size
+    source = ExampleSource(CaptureCache(captures, body), config.views, size, config.target_size, config.batch_size)
+    return source.batch_at(step)
+
+
+@pytest.fixture(scope="module")
+def batch(body, captures):
+    return batch_of(body, captures, CONFIG)
+
+
+def finite(tree):
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
+
+
+def step_without_harm(state, batch, body, config=CONFIG):
+    """The state and metrics after one more step that had nothing to repair or to skip."""
+    before = int(state.opt_state.skipped)
+    state, metrics = train_step(state, batch, body, config)
+    metrics = {name: float(value) for name, value in metrics.items()}
+    assert finite(metrics) and metrics["nonfinite"] == 0 and metrics["skipped"] == before, metrics
+    assert finite((state.params, state.opt_state, state.batch_stats))
+    return state, metrics
+
+
+def without_person(views, which):
+    """Views (leading axis of subjects) of which some show background alone: nobody in the photo, the body beside it."""
+    cameras = views.cameras
+    return replace(
+        views,
+        images=views.images.at[:, which].set(1.0),
+        masks=views.masks.at[:, which].set(0.0),
+        cameras=replace(cameras, cam_from_world=cameras.cam_from_world.at[:, which, 0, 3].add(OUTSIDE)),
+    )
+
+
+NOTHING_TO_SEE = {
+    "one input": lambda batch: replace(batch, inputs=without_person(batch.inputs, slice(1, 2))),
+    "one target": lambda batch: replace(batch, targets=without_person(batch.targets, slice(1, 2))),
+    "all inputs": lambda batch: replace(batch, inputs=without_person(batch.inputs, slice(None))),
+    "all targets": lambda batch: replace(batch, targets=without_person(batch.targets, slice(None))),
+    "everything": lambda batch: replace(
+        batch,
+        inputs=without_person(batch.inputs, slice(None)),
+        targets=without_person(batch.targets, slice(None)),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", NOTHING_TO_SEE)
+def test_views_of_background_alone(body, batch, variables, what):
+    _, metrics = step_without_harm(init_state(CONFIG, variables), NOTHING_TO_SEE[what](batch), body)
+    if what in ("all targets", "everything"):
+        assert metrics["squared"] < 1e-9 and metrics["silhouette"] < 1e-9  # background is drawn as it was photographed
+
+
+def moved(views, offset):
+    """The subject moved, and not the cameras."""
+    return replace(views, translations=views.translations + jnp.asarray(offset))
+
+
+@pytest.mark.parametrize("offset", [(OUTSIDE, 0, 0), (0, 0, OUTSIDE), (0, -OUTSIDE, 0), (0, 0, 1e6)], ids=str)
+def test_a_subject_outside_of_the_frame_or_behind_the_camera(body, batch, variables, offset):
+    """The photos show a person where the poses say that there is none."""
+    away = replace(batch, inputs=moved(batch.inputs, offset), targets=moved(batch.targets, offset))
+    step_without_harm(init_state(CONFIG, variables), away, body)
+
+
+def test_a_camera_inside_of_the_body(body, batch, variables):
+    inside = batch.targets.cameras.cam_from_world.at[:, :, :3, 3].set(0.0)
+    targets = replace(batch.targets, cameras=replace(batch.targets.cameras, cam_from_world=inside))
+    step_without_harm(init_state(CONFIG, variables), replace(batch, targets=targets), body)
+
+
+def test_black_photos_and_masks_that_cover_all(body, batch, variables):
+    full = lambda views: replace(views, images=jnp.zeros_like(views.images), masks=jnp.ones_like(views.masks))
+    step_without_harm(init_state(CONFIG, variables), replace(batch, inputs=full(batch.inputs)), body)
+    step_without_harm(init_state(CONFIG, variables), replace(batch, targets=full(batch.targets)), body)
+
+
+@pytest.mark.parametrize("views", ["inputs", "targets"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e30])
+def test_a_bad_photo_costs_its_step_and_the_run_goes_on(body, batch, variables, views, value, same):
+    """A pixel of the person, so that the network sees it."""
+    row, column = np.argwhere(np.asarray(getattr(batch, views).masks[0, 0]) > 0.9)[0]
+    shown = getattr(batch, views)
+    bad = replace(batch, **{views: replace(shown, images=shown.images.at[0, 0, row, column].set(value))})
+    before = init_state(CONFIG, variables)
+    state, metrics = train_step(init_state(CONFIG, variables), bad, body, CONFIG)
+    assert finite(state.params) and finite(state.batch_stats) and finite(state.opt_state.inner)
+    if not np.isfinite(value):
+        assert int(metrics["skipped"]) == int(metrics["nonfinite"]) == 1
+        assert same(state.params, before.params) and same(state.opt_state.inner, before.opt_state.inner)
+    skipped = int(metrics["skipped"])
+    state, metrics = train_step(state, batch, body, CONFIG)
+    assert int(state.step) == 2 and int(metrics["skipped"]) == skipped and np.isfinite(float(metrics["loss"]))
+    assert not same(state.params, before.params)
+
+
+def with_geometry(state, free_offset=0.0, log_scale=None):
+    """A state whose free Gaussians start at an offset from their vertex, and all of them at a scale (its softplus)."""
+    bias = state.params["decoder"]["geometry_out"]["bias"]
+    rows = bias.reshape(-1, 10)
+    rows = rows.at[1:, :3].set(free_offset)
+    if log_scale is not None:
+        rows = rows.at[:, 7:].set(log_scale)
+    params = jax.tree.map(lambda x: x, state.params)
+    params["decoder"]["geometry_out"]["bias"] = rows.reshape(-1)
+    return replace(state, params=params)
+
+
+@pytest.mark.parametrize("log_scale", [-1e4, -100.0, 10.0, 1e4, 1e30])
+def test_gaussians_of_no_size_and_of_any(body, batch, variables, log_scale):
+    step_without_harm(with_geometry(init_state(CONFIG, variables), log_scale=log_scale), batch, body)
+
+
+def decoder_of(**changes):
+    return dataclasses.replace(
+        CONFIG, model=dataclasses.replace(CONFIG.model, decoder=dataclasses.replace(CONFIG.model.decoder, **changes))
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("tight", "free"), [(1, 0), (0, 1)], ids=["tight", "free"])
+def test_one_gaussian_per_vertex(body, batch, tight, free):
+    config = decoder_of(tight=tight, free=free)
+    state = init_state(config)
+    for _ in range(3):
+        state, _ = step_without_harm(state, batch, body, config)
+
+
+@pytest.mark.slow
+def test_one_view(body, captures):
+    views = dataclasses.replace(CONFIG.views, input_counts=(1,), target_count=1)
+    config = dataclasses.replace(CONFIG, views=views)
+    state = init_state(config)
+    for step in range(3):
+        state, _ = step_without_harm(state, batch_of(body, captures, config, step), body, config)
+    nobody = NOTHING_TO_SEE["all inputs"](batch_of(body, captures, config))
+    step_without_harm(state, nobody, body, config)
+
+
+@pytest.mark.slow
+def test_hundreds_of_free_gaussians_per_vertex_far_away(body, batch):
+    """Without a bound on offsets; near, in the distance, beyond float32's squares, and back."""
+    config = decoder_of(tight=1, free=200, offset_scale=None)
+    for offset in (0.0, 10.0, 1e4, 1e12, 1e25):
+        state = with_geometry(init_state(config), free_offset=offset)
+        _, metrics = train_step(state, batch, body, config)
+        assert finite(metrics) and int(metrics["nonfinite"]) == 0, (offset, metrics)
+        assert int(metrics["overflow"]) == 0
+
+
+@pytest.mark.slow
+def test_a_hundred_times_the_learning_rate(body, captures):
+    rate = 100 * CONFIG.optimizer.learning_rate
+    config = dataclasses.replace(CONFIG, optimizer=dataclasses.replace(CONFIG.optimizer, learning_rate=rate))
+    state, skipped = init_state(config), 0
+    batches = [batch_of(body, captures, config, step) for step in range(3)]
+    for step in range(CONFIG.steps):
+        state, metrics = train_step(state, batches[step % 3], body, config)
+        assert np.isfinite(float(metrics["grad_norm"]))
+        assert 0 <= int(metrics["skipped"]) - skipped <= 1
+        skipped = int(metrics["skipped"])
+    assert int(state.step) == CONFIG.steps and finite((state.params, state.opt_state, state.batch_stats))
+    assert np.isfinite(float(metrics["loss"]))
