@@ -1,0 +1,108 @@
+"""The benchmark and the cost page of training: help without JAX, traffic between devices counted, pages from numbers."""
+
+import importlib
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+EXPERIMENTS = REPOSITORY / "experiments"
+SCRIPTS = ("benchmark_training", "training_cost")
+
+PROGRAM = """HloModule step, is_scheduled=true
+
+%body (state: (s32[], f32[64,8])) -> (s32[], f32[64,8]) {
+  %state = (s32[], f32[64,8]{1,0}) parameter(0)
+  %i = s32[] get-tuple-element((s32[], f32[64,8]) %state), index=0
+  %one = s32[] constant(1)
+  %next = s32[] add(s32[] %i, s32[] %one)
+  %x = f32[64,8]{1,0} get-tuple-element((s32[], f32[64,8]) %state), index=1
+  %sum = f32[64,8]{1,0} all-reduce(f32[64,8]{1,0} %x), replica_groups={{0,1,2,3}}, to_apply=%add
+  ROOT %out = (s32[], f32[64,8]{1,0}) tuple(s32[] %next, f32[64,8]{1,0} %sum)
+}
+
+%condition (state: (s32[], f32[64,8])) -> pred[] {
+  %state = (s32[], f32[64,8]{1,0}) parameter(0)
+  %i = s32[] get-tuple-element((s32[], f32[64,8]) %state), index=0
+  %limit = s32[] constant(5)
+  ROOT %less = pred[] compare(s32[] %i, s32[] %limit), direction=LT
+}
+
+%add (a: f32[], b: f32[]) -> f32[] {
+  %a = f32[] parameter(0)
+  %b = f32[] parameter(1)
+  ROOT %c = f32[] add(f32[] %a, f32[] %b)
+}
+
+ENTRY %main (part: f32[16,8]) -> f32[16,8] {
+  %part = f32[16,8]{1,0} parameter(0)
+  %whole = f32[64,8]{1,0} all-gather(f32[16,8]{1,0} %part), replica_groups=[2,4]<=[8], dimensions={0}
+  %zero = s32[] constant(0)
+  %start = (s32[], f32[64,8]{1,0}) tuple(s32[] %zero, f32[64,8]{1,0} %whole)
+  %loop = (s32[], f32[64,8]{1,0}) while((s32[], f32[64,8]) %start), condition=%condition, body=%body
+  %result = f32[64,8]{1,0} get-tuple-element((s32[], f32[64,8]) %loop), index=1
+  ROOT %mine = f32[16,8]{1,0} reduce-scatter(f32[64,8]{1,0} %result), replica_groups=[2,4]<=[8], dimensions={0}, to_apply=%add
+}
+"""
+WHOLE = 4 * 64 * 8
+"""Bytes of the array that is gathered from four devices."""
+
+
+@pytest.fixture
+def collectives(monkeypatch):
+    monkeypatch.syspath_prepend(EXPERIMENTS)
+    return importlib.import_module("hlo_collectives")
+
+
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_help_imports_no_jax(script, tmp_path):
+    code = f"import sys, runpy; sys.argv = ['{script}.py', '--help']; sys.path.insert(0, {str(EXPERIMENTS)!r})\n"
+    code += f"try: runpy.run_path({str(EXPERIMENTS / script)!r} + '.py', run_name='__main__')\n"
+    code += "except SystemExit: pass\nassert 'jax' not in sys.modules"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert result.returncode == 0 and "usage:" in result.stdout, result.stderr
+
+
+def test_traffic_between_devices(collectives):
+    counted = collectives.collectives(PROGRAM, 8)
+    assert counted.calls == {"all-gather": 1, "all-reduce": 5, "reduce-scatter": 1}
+    assert counted.array_bytes == {"all-gather": WHOLE, "all-reduce": 5 * WHOLE, "reduce-scatter": WHOLE}
+    sent = {"all-gather": WHOLE * 3 // 4, "all-reduce": 5 * 2 * WHOLE * 3 // 4, "reduce-scatter": WHOLE * 3 // 4}
+    assert counted.sent_bytes == sent and counted.unknown_trips == 0
+
+
+def test_asynchronous_traffic_counts_once(collectives):
+    gather = "%whole = f32[64,8]{1,0} all-gather(f32[16,8]{1,0} %part)"
+    started = "%s = (f32[16,8]{1,0}, f32[64,8]{1,0}) all-gather-start(f32[16,8]{1,0} %part)"
+    text = PROGRAM.replace(gather, started).replace(
+        "  %zero = s32[]", "  %whole = f32[64,8]{1,0} all-gather-done((f32[16,8], f32[64,8]) %s)\n  %zero = s32[]"
+    )
+    assert text.count("all-gather") == 2
+    assert collectives.collectives(text, 8) == collectives.collectives(PROGRAM, 8)
+
+
+def test_groups_of_devices(collectives):
+    assert collectives.group_size("replica_groups={{0,2,4,6},{1,3,5,7}}, x", 8) == 4
+    assert collectives.group_size("replica_groups=[2,128]<=[256]", 256) == 128
+    assert collectives.group_size("replica_groups={}", 256) == 256
+
+
+@pytest.mark.slow
+def test_the_page_is_made_of_what_the_benchmark_writes(tmp_path):
+    numbers, page = tmp_path / "numbers.json", tmp_path / "page.md"
+    command = [sys.executable, str(EXPERIMENTS / "benchmark_training.py"), "--json", str(numbers)]
+    options = ["--only", "tiny 32", "--repeats", "1", "--stages", "--variants"]
+    subprocess.run([*command, *options], check=True, cwd=tmp_path)
+    (row,) = json.loads(numbers.read_text()).values()
+    assert row["flops"] > 0 and 0 < row["share_of_floor"] < 1 and row["losses"]["skipped"] == 0
+    assert row["losses"]["overflow"] == 0 and not row["uncounted"]
+    base, looped = (row["variants"][name] for name in ("as it is", "blocks recomputed, in a loop"))
+    assert base["flops"] == row["flops"] < looped["flops"]
+    assert all(cpu > 0 for _, cpu in row["stages"].values())
+
+    page.write_text((REPOSITORY / "docs" / "performance_training.md").read_text())
+    subprocess.run([*command, "--page", str(page)], check=True, cwd=tmp_path)
+    assert "tiny 32, 2 + 2 views" in page.read_text()
