@@ -27,7 +27,7 @@ from humangs_jax.training.log import RunLog
 from humangs_jax.training.sharding import batch_sharding, place, replicated, state_shardings, training_mesh, whole
 from humangs_jax.training.sources import MakeSource, captured_people
 from humangs_jax.training.state import TrainState, init_state
-from humangs_jax.training.step import NO_NETWORKS, train_step
+from humangs_jax.training.step import NO_NETWORKS, jitted_train_step, train_step
 from humangs_jax.training.stopping import stop_requested
 from humangs_jax.training.validation import sheet, validate, validation_examples, write_sheet
 
@@ -65,8 +65,8 @@ def train(
         progress: show a progress bar.
 
     Ctrl-C and SIGTERM finish the step, save and return; a second Ctrl-C interrupts at once.
-    Raises: ValueError if `out` belongs to a run of another configuration, no capture can be used, or devices and batch do
-    not divide each other.
+    Raises: ValueError if `out` belongs to a run of another configuration, no capture can be used, devices and batch do not
+    divide each other, or the sizes of a later stage do not fit.
     """
     out, leading = Path(out), jax.process_index() == 0
     (out / "sheets").mkdir(parents=True, exist_ok=True)
@@ -87,6 +87,9 @@ def train(
         state, best_step = checkpoints.restore(state), checkpoints.best_step
         best = None if best_step is None else checkpoints.score(best_step)
     begin, end = int(state.step), config.steps if stop_at is None else min(config.steps, stop_at)
+
+    for first, _ in config.spans(begin, end)[1:]:
+        _rehearse(make_source, config, first, state, body, networks, mesh)
 
     waiting = Waiting()
     with stop_requested() as stopping, RunLog(out, begin, config.steps, leading, progress) as log:
@@ -135,6 +138,13 @@ def _loader(source: Source, config: TrainConfig, first: int, mesh: Mesh | None) 
     sharding = None if mesh is None else batch_sharding(mesh)
     before = config.examples_before(first)
     return Loader(source, part.batch_size, part.seed, sharding, first_step=first, first_example=before)
+
+
+def _rehearse(make_source, config, step, state, body, networks, mesh):
+    """Trace a step of a later stage: sizes that do not fit are told before the run, not in the middle of it."""
+    part = config.at(step)
+    batch = _loader(make_source(part), config, step, mesh).batch_at(step)
+    jitted_train_step().eval_shape(state, batch, body, networks, config=part, mesh=mesh)
 
 
 def _tell(log, out, done, numbers, picture):

@@ -114,6 +114,13 @@ def test_a_run_on_people_of_any_source_asks_for_it_with_its_configuration(
     assert asked == [CONFIG] and same(state.params, whole[0].params)
 
 
+def test_sizes_of_a_later_stage_are_tried_before_the_run(body, captures, variables, tmp_path):
+    config = dataclasses.replace(CONFIG, stages=(Stage(50, target_size=8),))
+    with pytest.raises(ValueError, match="8 x 8 has no 11 x 11 window"):
+        train(config, body, captures[:2], tmp_path, variables=variables, progress=False)
+    assert not (tmp_path / "log.jsonl").exists()
+
+
 @pytest.mark.slow
 def test_resume_in_a_later_stage_with_changing_numbers_of_views(body, captures, variables, tmp_path, same):
     config = dataclasses.replace(
@@ -121,7 +128,7 @@ def test_resume_in_a_later_stage_with_changing_numbers_of_views(body, captures, 
         views=dataclasses.replace(CONFIG.views, input_counts=(1, 2, 3)),
         ema_decay=0.9,
         steps=6,
-        stages=(Stage(2, image_size=16, target_size=8, batch_size=2, token_capacity=12),),
+        stages=(Stage(2, image_size=16, target_size=32, batch_size=2, token_capacity=12),),
     )
     options = {"validation": captures[2:], "variables": variables, "progress": False}
     whole = train(config, body, captures[:2], tmp_path / "whole", **options)
