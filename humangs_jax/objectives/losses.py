@@ -14,5 +14,6 @@ def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:
     """How far the tight Gaussians stray from their vertex: squared norm of the offset, averaged over the k of a vertex.
 
     Offsets are in normalised units (body height 1.8), so the weight of this term does not depend on the subject's size.
+    Without tight Gaussians (k = 0) it is 0.
     """
-    return jnp.mean(jnp.sum(jnp.square(tight_offsets), axis=-1), axis=-1)
+    return jnp.sum(jnp.square(tight_offsets), axis=(-2, -1)) / max(1, tight_offsets.shape[-2])

@@ -48,3 +48,7 @@ def test_ssim_of_the_clipped_prediction():
     target = np.random.default_rng(0).random((16, 16, 3))
     target[0] = 1.0
     assert ssim(np.where(target == 1.0, 3.0, target), target) == 1.0
+
+
+def test_without_tight_gaussians_there_is_no_tightness():
+    np.testing.assert_array_equal(tightness(jnp.zeros((4, 0, 3))), np.zeros(4))
