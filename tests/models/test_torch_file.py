@@ -13,7 +13,6 @@ from torch_writer import FakeTensor, pickled, write_checkpoint, write_stream
 
 from humangs_jax.models.torch_file import read_torch_file
 
-
 DATA = Path(__file__).parent / "data"
 FORMATS = pytest.mark.parametrize("write", [write_checkpoint, write_stream])
 
