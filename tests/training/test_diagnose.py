@@ -206,8 +206,13 @@ class Spoilt:
     source: CaptureSource
     at: int
 
-    def __getattr__(self, name):
-        return getattr(self.source, name)
+    @property
+    def input_counts(self):
+        return self.source.input_counts
+
+    @property
+    def broken(self):
+        return self.source.broken
 
     def __len__(self):
         return len(self.source)
