@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.array_types import Array, Float, Key
+from humangs_jax.models.convolution import convolve
 from humangs_jax.pytree import pytree_dataclass
 
 
@@ -184,11 +185,12 @@ def _apply(weights, layer, x):
 
 
 def _convolve(weights, layer, x):
-    convolution, padding = weights[layer.name], [(layer.padding, layer.padding)] * 2
-    y = jax.lax.conv_general_dilated(
-        x[None], convolution.kernel, (layer.stride,) * 2, padding, dimension_numbers=("NHWC", "HWIO", "NHWC")
-    )
-    return jax.nn.relu(y[0] + convolution.bias)
+    kernel, bias = weights[layer.name].kernel, weights[layer.name].bias
+    if (layer.size, layer.stride, layer.padding) == (3, 1, 1):
+        return jax.nn.relu(convolve(x[None], kernel)[0] + bias)
+    stride, padding = (layer.stride,) * 2, [(layer.padding, layer.padding)] * 2
+    y = jax.lax.conv_general_dilated(x[None], kernel, stride, padding, dimension_numbers=("NHWC", "HWIO", "NHWC"))
+    return jax.nn.relu(y[0] + bias)
 
 
 def _pool(layer, x):
