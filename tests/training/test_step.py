@@ -11,10 +11,20 @@ from humangs_jax.data.loader import CaptureCache, ExampleSource
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.models.humangs import init_humangs
+from humangs_jax.objectives.backbones import VGG16, channels, random_weights
+from humangs_jax.objectives.loss_networks import LossNetworks
+from humangs_jax.objectives.lpips import Lpips
+from humangs_jax.objectives.perceptual import VGG19, Vgg19
 from humangs_jax.pytree import replace
 from humangs_jax.training.config import tiny
 from humangs_jax.training.state import init_state
-from humangs_jax.training.step import batch_gradients, change_background, random_backgrounds, train_step
+from humangs_jax.training.step import (
+    batch_gradients,
+    change_background,
+    jitted_train_step,
+    random_backgrounds,
+    train_step,
+)
 
 FLOAT32 = 1e-5
 CONFIG = tiny()
@@ -111,6 +121,38 @@ def test_subjects_worked_on_at_once_or_one_after_the_other_give_the_same_gradien
     assert float(results[1][0]) == pytest.approx(float(results[0][0]), rel=FLOAT32)
     for a, b in zip(*(jax.tree.leaves(result[1]) for result in results), strict=True):
         assert np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b) + 1e-9
+
+
+WITH_NETWORKS = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25))
+
+
+@pytest.mark.parametrize(("name", "title"), [("perceptual", "VGG-19"), ("lpips", "LPIPS")])
+def test_a_loss_without_its_network_is_an_error_not_a_number(body, source, variables, name, title):
+    loss = dataclasses.replace(CONFIG.loss, **{name: 1.0})
+    step = jitted_train_step()
+    with pytest.raises(ValueError, match=f"loss.{name} is not 0, but there is no {title}"):
+        config = dataclasses.replace(CONFIG, loss=loss)
+        state = init_state(CONFIG, variables)
+        step.eval_shape(state, source.batch_at(0), body, LossNetworks(), config=config, mesh=None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
+def test_losses_of_networks_are_part_of_the_loss(body, source, variables, dtype):
+    keys = jax.random.split(jax.random.key(0))
+    heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))
+    networks = LossNetworks(Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg"))
+    config = dataclasses.replace(WITH_NETWORKS, model=dataclasses.replace(CONFIG.model, dtype=dtype))
+    state, metrics = train_step(init_state(config, variables), source.batch_at(0), body, config, networks)
+    weights = dataclasses.asdict(config.loss)
+    names = ("squared", "structural", "silhouette", "tightness", "perceptual", "lpips")
+    assert float(metrics["loss"]) == pytest.approx(sum(weights[x] * float(metrics[x]) for x in names), rel=FLOAT32)
+    assert float(metrics["perceptual"]) > 0 and float(metrics["lpips"]) > 0
+    assert int(state.opt_state.skipped) == int(state.opt_state.nonfinite) == 0
+    first = float(metrics["perceptual"])
+    for _ in range(20):
+        state, metrics = train_step(state, source.batch_at(0), body, config, networks)
+    assert float(metrics["perceptual"]) < first
 
 
 def views_on_white(color, masks):
