@@ -1,24 +1,27 @@
 """What a step of training costs on a mesh of many chips, counted from the program that XLA compiles for them.
 
-    python experiments/training_cost.py --libtpu SITE_PACKAGES --json OUT
+    python experiments/training_cost.py --json OUT
+    python experiments/training_cost.py --json OUT --compile --libtpu SITE_PACKAGES
 
-Compiles the divided training step for a topology of TPUs, without the chips and without running anything, and counts
-what one chip does in one step: operations, memory traffic, memory, what it sends to others. `--libtpu` is the folder into
+Counts what one chip does in one step, without the chips and without running anything: operations and what it sends to
+others from the program as JAX hands it to XLA (as the step is written: XLA removes next to nothing of either), memory
+traffic and memory from what XLA compiles for a topology of TPUs, with `--compile`. `--libtpu` is the folder into
 which `pip install --target` put the package libtpu, where it is not installed. `--chips v5e:16x16 --fsdp 256` describes the
 mesh, `--sizes 256 512` the stages, `--per-chip` the subjects of each chip. Weights of the loss networks are made up.
-Each program compiles for minutes. Numbers and what follows from them: docs/scaling.md, made by `--page`.
+Without `--compile` a minute each. Numbers and what follows from them: docs/scaling.md, made by `--page`.
 """
 
 import argparse
 import dataclasses
 import json
+import math
 import os
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
-from compiled_costs import compiled_costs
+from compiled_costs import compiled_costs, program_costs
 from hlo_collectives import collectives
 from report_tables import markdown_table, write_json, write_section
 
@@ -44,7 +47,8 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--targets", type=int, default=4)
     parser.add_argument("--per-chip", type=int, default=1, help="subjects of a chip in a step")
-    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=["recomputed"])
+    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
+    parser.add_argument("--compile", action="store_true", help="also compile: many minutes each")
     parser.add_argument("--libtpu", type=Path, help="folder with the package libtpu")
     parser.add_argument("--json", type=Path, help="add the numbers to this file")
     parser.add_argument(
@@ -55,6 +59,8 @@ def main() -> None:
         write_section(arguments.page, "cost", table(json.loads(arguments.json.read_text())))
         return
     result = json.loads(arguments.json.read_text()) if arguments.json and arguments.json.exists() else {}
+    if arguments.compile != (arguments.libtpu is not None):
+        parser.error("--compile and --libtpu belong together")
     devices = topology(arguments.chips, arguments.libtpu)
     for size in arguments.sizes:
         for variant in arguments.variants:
@@ -67,7 +73,9 @@ def main() -> None:
 
 
 def topology(name: str, libtpu: Path | None) -> Any:
-    """Descriptions of the chips of a TPU topology."""
+    """Descriptions of the chips of a TPU topology, to compile for; virtual devices, to count for, without `libtpu`."""
+    chips = math.prod(int(side) for side in name.split(":")[-1].split("x"))
+    os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={chips}"
     os.environ.setdefault("TPU_SKIP_MDS_QUERY", "1")  # nobody to ask about the machine: there is none
     os.environ.setdefault("TPU_LOG_DIR", "disabled")
     if libtpu is not None:
@@ -77,6 +85,8 @@ def topology(name: str, libtpu: Path | None) -> Any:
 
     jax.config.update("jax_platforms", "cpu")
     jax.config.update("jax_enable_compilation_cache", False)
+    if libtpu is None:
+        return jax.devices()
     from jax.experimental import topologies
 
     return topologies.get_topology_desc(name, "tpu").devices
@@ -101,31 +111,48 @@ def compilation(arguments: argparse.Namespace, devices: Any, size: int, variant:
     # without the compiler options of the CPU that this runs on
     step = jax.jit(jitted_train_step().__wrapped__, static_argnames=("config", "mesh"), donate_argnames="state")
     start = time.perf_counter()
-    lowered = step.lower(state, batch, everywhere(body), everywhere(networks), config=config, mesh=mesh)
-    traced = time.perf_counter()
+    traced = step.trace(state, batch, everywhere(body), everywhere(networks), config=config, mesh=mesh)
+    lowered = traced.lower(lowering_platforms=("tpu",))
     facts = {
         "chips": mesh.size,
         "subjects": config.batch_size,
         "parameters": sum(x.size for x in jax.tree.leaves(state.params)),
         "state_bytes": sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state)),
         "batch_bytes": sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(batch)),
-        "trace_s": traced - start,
+        "trace_s": time.perf_counter() - start,
+    } | handed_over(lowered, mesh.size)
+    return facts | (compiled(lowered) if arguments.compile else {})
+
+
+def handed_over(lowered: Any, chips: int) -> dict[str, Any]:
+    """Of the program before XLA's optimisations."""
+    text = lowered.compiler_ir("hlo").as_hlo_module().to_string()
+    costs = program_costs(text)
+    return {
+        "flops": costs.matrix_flops,
+        "convolution_flops": costs.convolution_flops,
+        "unknown_trips": costs.unknown_trips,
+        "collectives": dataclasses.asdict(collectives(text, chips)),
     }
+
+
+def compiled(lowered: Any) -> dict[str, Any]:
+    """Of the program that XLA makes; or why it refuses, for instance for want of memory."""
+    import jax
+
+    start = time.perf_counter(), time.process_time()
     try:
         program = lowered.compile()
     except jax.errors.JaxRuntimeError as error:
-        return facts | {"refused": str(error).splitlines()[0][:300]}
-    costs, text = compiled_costs(program), program.as_text() or ""
-    sent = collectives(text, mesh.size)
-    return facts | {
-        "compile_s": time.perf_counter() - traced,
-        "flops": costs.matrix_flops,
+        return {"refused": str(error).splitlines()[0][:300]}
+    costs = compiled_costs(program)
+    return {
+        "compile_s": time.perf_counter() - start[0],
+        "compile_cpu_s": time.process_time() - start[1],
+        "compiled_flops": costs.matrix_flops,
         "bytes": costs.bytes_accessed,
         "temporary_bytes": costs.temporary_bytes,
         "argument_bytes": costs.argument_bytes,
-        "unknown_trips": costs.unknown_trips,
-        "uncounted": list(costs.uncounted),
-        "collectives": dataclasses.asdict(sent),
         "jax": jax.__version__,
     }
 
@@ -165,23 +192,19 @@ def abstract_arguments(config: Any) -> tuple[Any, Any, Any, Any]:
 
 def table(result: dict[str, Any]) -> str:
     """One line per program."""
-    header = [
-        "one chip, one step",
-        "compile s",
-        "TFLOP",
-        "GB memory traffic",
-        "MiB temporaries",
-        "MiB arguments",
-        "MB sent",
-    ]
+    header = ["one chip, one step", "TFLOP", "of them convolutions", "messages", "MB sent", "state, MB", "batch, MB"]
+    header += ["compile, CPU s", "GB memory traffic", "GB needed"]
     rows = []
     for name, row in result.items():
-        if "refused" in row:
-            rows.append([name, "refused", *["-"] * 5])
-            continue
+        messages = sum(row["collectives"]["calls"].values())
         sent = sum(row["collectives"]["sent_bytes"].values())
-        cells = [row["flops"] / 1e12, row["bytes"] / 1e9, row["temporary_bytes"] / 2**20, row["argument_bytes"] / 2**20]
-        rows.append([name, f"{row['compile_s']:.0f}", *(f"{x:.1f}" for x in cells), f"{sent / 1e6:.0f}"])
+        mega = [sent / 1e6, row["state_bytes"] / row["chips"] / 1e6, row["batch_bytes"] / row["chips"] / 1e6]
+        share = row["convolution_flops"] / row["flops"]
+        cells = [name, f"{row['flops'] / 1e12:.2f}", f"{share:.0%}", messages, *(f"{x:.1f}" for x in mega)]
+        if "bytes" in row:
+            needed = row["temporary_bytes"] + row["argument_bytes"]
+            cells += [f"{row['compile_cpu_s']:.0f}", f"{row['bytes'] / 1e9:.0f}", f"{needed / 1e9:.1f}"]
+        rows.append([*cells, *["refused" if "refused" in row else "-"] * (len(header) - len(cells))])
     return markdown_table(header, rows)
 
 
