@@ -14,7 +14,7 @@ from pathlib import Path
 import jax
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.loader import Example, Loader
+from humangs_jax.data.loader import Example
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.models.humangs import Variables
 from humangs_jax.objectives.loss_networks import LossNetworks
@@ -22,7 +22,7 @@ from humangs_jax.training.checkpoint import Checkpoints, load_config
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.diagnosis import Diagnosis, StageReport, leaves
 from humangs_jax.training.observed import observe_subject
-from humangs_jax.training.sources import MakeSource, captured_people
+from humangs_jax.training.sources import MakeSource, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import NO_NETWORKS, train_step
 
@@ -43,6 +43,7 @@ def diagnose_step(
         "batch statistics": state.batch_stats,
         "optimizer": state.opt_state.inner,
         "averaged parameters": state.ema_params,
+        "loss networks": networks,
     }
     stored = [StageReport(name, leaves(tree)) for name, tree in parts.items() if jax.tree.leaves(tree)]
     keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step), len(batch.inputs.betas))
@@ -90,14 +91,7 @@ def diagnose_run(
     checkpoints.close()
     step = int(state.step)
     for first, last in config.spans(step, step + 1 if failed is None else failed + 1):
-        part = config.at(first)
-        loader = Loader(
-            make_source(part),
-            part.batch_size,
-            part.seed,
-            first_step=first,
-            first_example=config.examples_before(first),
-        )
+        part, loader = config.at(first), stage_loader(make_source, config, first)
         for step, batch in loader.batches(first, last):
             if step + 1 < (last if failed is None else failed + 1):
                 state, _ = train_step(state, batch, body, part, networks)

@@ -115,7 +115,7 @@ class Fault:
         """The first index in words, as: view 1, row 4, column 7 [2]."""
         last_part = self.leaf.name.rsplit(".", 1)[-1]
         stage = self.stage.split(" ")[0] if self.stage.startswith("block ") else self.stage
-        axes = "" if self.stage in ("parameters", "optimizer") else AXES.get(last_part, AXES.get(stage, ""))
+        axes = AXES.get(last_part, AXES.get(stage, ""))
         names = axes.split()[: len(self.leaf.first)]
         words = ", ".join(f"{name} {index}" for name, index in zip(names, self.leaf.first, strict=False))
         rest = list(self.leaf.first[len(names) :])

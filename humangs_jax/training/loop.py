@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import jax
-from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.loader import CaptureCache, Loader, Source, Waiting
+from humangs_jax.data.loader import CaptureCache, Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.models.humangs import Variables
 from humangs_jax.models.weights import save_weights
@@ -24,8 +23,8 @@ from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training.checkpoint import Checkpoints, save_config
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.log import RunLog
-from humangs_jax.training.sharding import batch_sharding, place, replicated, state_shardings, training_mesh, whole
-from humangs_jax.training.sources import MakeSource, captured_people
+from humangs_jax.training.sharding import place, replicated, state_shardings, training_mesh, whole
+from humangs_jax.training.sources import MakeSource, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import NO_NETWORKS, jitted_train_step, train_step
 from humangs_jax.training.stopping import stop_requested
@@ -96,15 +95,15 @@ def train(
         watch, stop = _Watch(log, state), False
         for first, last in config.spans(begin, end):
             part = config.at(first)
-            source = make_source(part)
+            loader = stage_loader(make_source, config, first, mesh)
             examples = [] if unseen is None else validation_examples(unseen, part, VALIDATED)
-            batches = _loader(source, config, first, mesh).batches(first, last, waiting=waiting)
+            batches = loader.batches(first, last, waiting=waiting)
             for step, batch in batches:
                 state, metrics = train_step(state, batch, body, part, networks, mesh)
                 watch(done := step + 1, metrics)
                 stop = stopping(done)
                 if done % config.log_every == 0 or done == end or stop:
-                    log.steps(done, jax.device_get(metrics), part.batch_size, waiting, len(source.broken))
+                    log.steps(done, jax.device_get(metrics), part.batch_size, waiting, len(loader.source.broken))
                 log.bar.update(1)
                 validating = unseen is not None and (done % config.validate_every == 0 or done == config.steps)
                 if not (validating or stop or done == end or done % config.checkpoint_every == 0):
@@ -132,19 +131,10 @@ def train(
     return state
 
 
-def _loader(source: Source, config: TrainConfig, first: int, mesh: Mesh | None) -> Loader:
-    """Batches from step `first` on, of the stage that holds there."""
-    part = config.at(first)
-    sharding = None if mesh is None else batch_sharding(mesh)
-    before = config.examples_before(first)
-    return Loader(source, part.batch_size, part.seed, sharding, first_step=first, first_example=before)
-
-
 def _rehearse(make_source, config, step, state, body, networks, mesh):
     """Trace a step of a later stage: sizes that do not fit are told before the run, not in the middle of it."""
-    part = config.at(step)
-    batch = _loader(make_source(part), config, step, mesh).batch_at(step)
-    jitted_train_step().eval_shape(state, batch, body, networks, config=part, mesh=mesh)
+    batch = stage_loader(make_source, config, step, mesh).batch_at(step)
+    jitted_train_step().eval_shape(state, batch, body, networks, config=config.at(step), mesh=mesh)
 
 
 def _tell(log, out, done, numbers, picture):

@@ -8,16 +8,26 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
+from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Mixture, Source
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture, Source
 from humangs_jax.data.synthetic.live import LiveConfig
 from humangs_jax.data.synthetic.live_bank import PeopleBank
 from humangs_jax.data.synthetic.live_source import live_source
 from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.sharding import batch_sharding
 
 MakeSource = Callable[[TrainConfig], Source]
 """Configuration of a stage -> examples of its sizes."""
+
+
+def stage_loader(make_source: MakeSource, config: TrainConfig, step: int, mesh: Mesh | None = None) -> Loader:
+    """Batches from a step on, until the end of the stage that holds there."""
+    part = config.at(step)
+    sharding = None if mesh is None else batch_sharding(mesh)
+    before = config.examples_before(step)
+    return Loader(make_source(part), part.batch_size, part.seed, sharding, first_step=step, first_example=before)
 
 
 def captured_people(folders: Sequence[str | Path], body: BodyModel) -> MakeSource:
