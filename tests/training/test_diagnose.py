@@ -14,6 +14,10 @@ from humangs_jax.models.humangs import init_humangs
 from humangs_jax.models.presets import PRESETS
 from humangs_jax.models.transformer import Block
 from humangs_jax.models.upsampler import UpsamplerConfig
+from humangs_jax.objectives.backbones import VGG16, channels, random_weights
+from humangs_jax.objectives.loss_networks import LossNetworks
+from humangs_jax.objectives.lpips import Lpips
+from humangs_jax.objectives.perceptual import VGG19, Vgg19
 from humangs_jax.pytree import replace
 from humangs_jax.training import diagnose, observed
 from humangs_jax.training.config import tiny
@@ -26,6 +30,8 @@ from humangs_jax.training.step import train_step
 
 FLOAT32 = 1e-4
 """Relative: the stages are fused otherwise than in the step."""
+BFLOAT16 = 2e-2
+"""Relative, likewise."""
 CONFIG = tiny()
 
 
@@ -293,6 +299,27 @@ def test_an_infinite_weight_of_a_loss_is_named(body, batch, variables):
     config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, silhouette=np.inf))
     (fault,) = diagnose_step(init_state(config, variables), batch, body, config).faults
     assert (fault.direction, fault.stage, fault.leaf.name) == ("forward", "loss", "")
+
+
+@pytest.mark.slow
+def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(monkeypatch, body, batch, variables):
+    keys = jax.random.split(jax.random.key(0))
+    heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))
+    networks = LossNetworks(Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg"))
+    loss = dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25)
+    config = dataclasses.replace(CONFIG, loss=loss, model=dataclasses.replace(CONFIG.model, dtype="bfloat16"))
+    fresh(monkeypatch)
+    whole = diagnose_step(init_state(config, variables), batch, body, config, networks)
+    _, metrics = train_step(init_state(config, variables), batch, body, config, networks)
+    assert whole.fault is None and whole.loss == pytest.approx(float(metrics["loss"]), rel=BFLOAT16)
+    stages = {stage.name: stage for stage in whole.stages}
+    for name in ("perceptual", "lpips"):
+        assert stages[f"loss: {name}"].values[0].mean == pytest.approx(float(metrics[name]), rel=BFLOAT16)
+    head = networks.lpips.heads[2].at[5].set(jnp.nan)
+    networks = replace(networks, lpips=replace(networks.lpips, heads=(*heads[:2], head, *heads[3:])))
+    stored, computed = diagnose_step(init_state(config, variables), batch, body, config, networks).faults
+    assert (stored.stage, stored.leaf.name, stored.place) == ("loss networks", "lpips.heads.2", "[5]")
+    assert (computed.direction, computed.stage) == ("forward", "loss: lpips")
 
 
 @pytest.mark.slow
