@@ -80,12 +80,13 @@ IN_BATCH = {
 }
 
 
-@pytest.mark.parametrize("what", IN_BATCH)
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+PLANTED = [(what, np.nan) for what in IN_BATCH] + [(what, np.inf) for what in IN_BATCH if "camera" not in what]
+"""An infinite camera may show nothing at all, which is finite."""
+
+
+@pytest.mark.parametrize(("what", "value"), PLANTED)
 def test_a_bad_number_in_the_batch_is_named_and_where_it_enters(body, batch, variables, what, value):
     path, index, place, stage = IN_BATCH[what]
-    if value == np.inf and "camera" in what:
-        pytest.skip("an infinite camera may show nothing at all, which is finite")
     diagnosis = diagnose_step(
         init_state(CONFIG, variables), with_leaf(batch, path, planted(value, *index)), body, CONFIG
     )
