@@ -78,7 +78,7 @@ class Case:
 
     def __init__(self, preset: str, size: int, views: int, targets: int, dtype: str, batch: int = 1):
         import jax
-        from training_cases import random_networks, settings, with_model
+        from training_setups import random_networks, settings, with_model
 
         from humangs_jax.body.library import load_body
 
@@ -91,7 +91,7 @@ class Case:
     def prepare(self, folder: Path) -> "Case":
         """Makes the person, reads the batch, draws the weights."""
         import jax
-        from training_cases import written_subject
+        from training_setups import written_subject
 
         from humangs_jax.data.loader import Loader
         from humangs_jax.data.views import gaussian_body
@@ -115,7 +115,7 @@ class Case:
     def fit(self) -> None:
         """Room for the foreground tokens of this person, as a run would have."""
         import jax
-        from training_cases import with_model
+        from training_setups import with_model
 
         from humangs_jax.data.views import prepare_inputs
 
@@ -347,7 +347,7 @@ def upsampler(model: Any) -> Any:
 def variant_numbers(case: Case, arguments: argparse.Namespace) -> Iterator[tuple[str, dict[str, float]]]:
     """Of the step with one thing changed, in turns with the step as it is."""
     import jax
-    from training_cases import with_model
+    from training_setups import with_model
 
     from humangs_jax.models import convolution
 

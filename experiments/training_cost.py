@@ -159,7 +159,7 @@ def compiled(lowered: Any) -> dict[str, Any]:
 
 def configured(arguments: argparse.Namespace, size: int, variant: str, chips: int) -> Any:
     """The settings of a stage."""
-    from training_cases import settings, with_model
+    from training_setups import settings, with_model
 
     batch = arguments.per_chip * chips
     config = settings(arguments.preset, size, arguments.views, arguments.targets, batch)
@@ -177,7 +177,7 @@ def configured(arguments: argparse.Namespace, size: int, variant: str, chips: in
 def abstract_arguments(config: Any) -> tuple[Any, Any, Any, Any]:
     """Shapes of state, batch, body and loss networks."""
     import jax
-    from training_cases import abstract_batch, random_networks
+    from training_setups import abstract_batch, random_networks
 
     from humangs_jax.body.library import load_body
     from humangs_jax.data.views import gaussian_body
