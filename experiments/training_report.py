@@ -4,8 +4,8 @@
 
 makes 64 synthetic people of the training seeds and 8 of the validation seeds in runs/report, trains the preset `small` for 500
 steps and writes docs/training_run.md with its pictures in docs/images. Ctrl-C saves; the same command goes on where it
-stopped, and run again after the end it writes the page anew. On 2 CPU cores about 4 minutes for the people and 15 to 25
-for the run; expected: 18 to 22 dB on the validation people, no step skipped. Needs matplotlib (the `notebooks` extra).
+stopped, and run again after the end it writes the page anew. On 2 CPU cores about 5 minutes for the people and 15 for the
+run; expected: 22 dB on the validation people, no step skipped. Needs matplotlib (the `notebooks` extra).
 
 `--config tiny --people 3 --validation 2 --steps 10` tries all of it in two minutes.
 """
@@ -70,13 +70,15 @@ def train(arguments: argparse.Namespace) -> bool:
     began = time.perf_counter()
     for folder, count, split in ((people, arguments.people, "train"), (others, arguments.validation, "validation")):
         write_set(folder, count, Layout(SIZE, POSES, VIEWS), split, workers=cores)
-    facts["people_s"] = facts.get("people_s", 0.0) + time.perf_counter() - began
+    if (seconds := time.perf_counter() - began) > 1:  # or they were there already
+        facts["people_s"] = facts.get("people_s", 0.0) + seconds
     facts |= {name: getattr(arguments, name) for name in ("config", "people", "validation")}
     facts |= {"machine": machine(), "sessions": facts.get("sessions", 0) + 1}
     write_json(arguments.out / "report.json", facts)
 
     state = run(config, load_body(), find_people(people), arguments.out, validation=find_people(others, None))
     facts["peak_mb"] = max(facts.get("peak_mb", 0.0), peak_rss_mb())
+    facts["load"] = os.getloadavg()[2]  # of the last quarter of an hour
     write_json(arguments.out / "report.json", facts)
     return int(state.step) == config.steps
 
@@ -263,9 +265,11 @@ def facts_of_run(lines: Sequence[dict[str, Any]], facts: dict[str, Any], config:
     step_s, data_s = (median(values) for values in (zip(*plain, strict=True) if plain else ((), ())))
     machine, last = facts["machine"], steps[-1]
     dropped = {name: max(line[name] for line in steps) for name in ("dropped_tokens", "dropped_reads", "overflow")}
+    made = f" in {facts['people_s'] / 60:.1f} min" if "people_s" in facts else ""
+    cores = f"{machine['cores']} cores of {machine['architecture']} (load average {facts['load']:.1f})"
     rows = {
-        "machine": f"{machine['cores']} cores of {machine['architecture']}, {machine['device']}, JAX {machine['jax']}",
-        "people made": f"{facts['people'] + facts['validation']} in {facts['people_s'] / 60:.1f} min",
+        "machine": f"{cores}, {machine['device']}, JAX {machine['jax']}",
+        "people made": f"{facts['people'] + facts['validation']}{made}",
         "a step": f"{step_s:.2f} s, {config['batch_size'] / step_s:.2f} subjects a second (median)",
         "of that, waiting for data": f"{data_s * 1e3:.0f} ms, {data_s / step_s:.1%}",
         "all steps with compilation, validations and checkpoints": f"{total / 60:.1f} min in {facts['sessions']} session(s)",

@@ -33,7 +33,7 @@ def run(report, tmp_path):
     (folder / "sheets").mkdir(parents=True)
     config = report.reported(dataclasses.replace(tiny(), ema_decay=0.5), STEPS)
     (folder / "config.json").write_text(config_to_json(config))
-    facts = {"config": "tiny", "people": 3, "validation": 2, "people_s": 90.0, "peak_mb": 2048.0}
+    facts = {"config": "tiny", "people": 3, "validation": 2, "people_s": 90.0, "peak_mb": 2048.0, "load": 1.5}
     (folder / "report.json").write_text(json.dumps(facts | {"machine": MACHINE, "sessions": 2}))
     lines, rng = [], np.random.default_rng(0)
     counts = {"dropped_tokens": 0, "dropped_reads": 0, "overflow": 0, "skipped": 1, "nonfinite": 1}
