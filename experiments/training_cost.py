@@ -193,7 +193,8 @@ def abstract_arguments(config: Any) -> tuple[Any, Any, Any, Any]:
 def table(result: dict[str, Any]) -> str:
     """One line per program."""
     header = ["one chip, one step", "TFLOP", "of them convolutions", "messages", "MB sent", "state, MB", "batch, MB"]
-    header += ["compile, CPU s", "GB memory traffic", "GB needed"]
+    if any("bytes" in row or "refused" in row for row in result.values()):
+        header += ["compile, CPU s", "GB memory traffic", "GB needed"]
     rows = []
     for name, row in result.items():
         messages = sum(row["collectives"]["calls"].values())
