@@ -1,6 +1,6 @@
 """Writes data/torch_*: one state dict in both formats of `torch.save`, and its numbers as npz. Needs torch; tests do not.
 
-    python tests/models/write_torch_files.py
+python tests/models/write_torch_files.py
 """
 
 from pathlib import Path
