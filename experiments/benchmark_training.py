@@ -50,7 +50,9 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3, help="timed rounds")
     parser.add_argument("--warm-up", type=int, default=1, help="rounds before these")
     parser.add_argument("--stages", action="store_true", help="also time parts of the step")
-    parser.add_argument("--variants", action="store_true", help="also time the step with one thing changed at a time")
+    parser.add_argument(
+        "--variants", nargs="*", help="also time the step with one thing changed at a time (all, or these)"
+    )
     parser.add_argument("--json", type=Path, help="add the numbers to this file")
     parser.add_argument("--page", type=Path, help="write the tables into this page from --json; nothing is run")
     arguments = parser.parse_args()
@@ -190,7 +192,7 @@ def benchmark(case: Case, arguments: argparse.Namespace) -> Iterator[dict[str, A
         yield step_numbers(case, arguments)
         if arguments.stages:
             yield {"stages": stage_numbers(case, arguments)}
-        if arguments.variants:
+        if arguments.variants is not None:
             done = {}
             for name, numbers in variant_numbers(case, arguments):
                 yield {"variants": done | {name: numbers}}
@@ -353,7 +355,8 @@ def variant_numbers(case: Case, arguments: argparse.Namespace) -> Iterator[tuple
 
     from humangs_jax.models import convolution
 
-    for name, (fields, options, plain) in variants(case).items():
+    asked = arguments.variants or list(variants(case))
+    for name, (fields, options, plain) in ((name, variants(case)[name]) for name in asked):
         changed = object.__new__(Case)
         changed.__dict__.update(case.__dict__)
         changed.config = with_model(case.config, **fields)

@@ -94,12 +94,11 @@ def test_groups_of_devices(collectives):
 def test_the_page_is_made_of_what_the_benchmark_writes(tmp_path):
     numbers, page = tmp_path / "numbers.json", tmp_path / "page.md"
     command = [sys.executable, str(EXPERIMENTS / "benchmark_training.py"), "--json", str(numbers)]
-    options = ["--only", "tiny 32", "--repeats", "1", "--stages", "--variants"]
+    options = ["--only", "tiny 32", "--repeats", "1", "--stages", "--variants", "XLA's default compiler options"]
     subprocess.run([*command, *options], check=True, cwd=tmp_path)
     (row,) = json.loads(numbers.read_text()).values()
     assert row["flops"] > 0 and 0 < row["share_of_floor"] < 1 and row["losses"]["skipped"] == 0
     assert row["losses"]["overflow"] == 0 and not row["uncounted"]
-    assert row["flops"] < row["variants"]["blocks recomputed, in a loop"]["flops"]
     assert row["flops"] == row["variants"]["XLA's default compiler options"]["flops"]
     assert all(cpu > 0 for _, cpu in row["stages"].values())
 
