@@ -54,6 +54,7 @@ def planted(value, *index):
     return lambda x: x.at[tuple(index) or (0,) * x.ndim].set(value)
 
 
+@pytest.mark.slow
 def test_the_numbers_are_those_of_the_step(body, batch, variables):
     diagnosis = diagnose_step(init_state(CONFIG, variables), batch, body, CONFIG)
     _, metrics = train_step(init_state(CONFIG, variables), batch, body, CONFIG)
@@ -232,6 +233,7 @@ class Spoilt:
         return example
 
 
+@pytest.mark.slow
 def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, tmp_path):
     def source(at):
         make = lambda config: CaptureSource(cache, config.views, config.model.image_size, config.target_size)
