@@ -6,6 +6,7 @@ part of the gradient (ZeRO stage 3, Rajbhandari et al., 2020, https://arxiv.org/
 the network is small beside what it computes).
 """
 
+import functools
 from collections.abc import Sequence
 from typing import TypeVar
 
@@ -87,8 +88,12 @@ def place(tree: T, shardings: PyTree) -> T:
 
 def whole(tree: T, mesh: Mesh) -> T:
     """Arrays of this process's default device equal to those that are divided among devices. All processes must call it."""
-    gathered = jax.jit(lambda x: x, out_shardings=replicated(mesh))(tree)
-    return jax.tree.map(lambda x: x.addressable_data(0), gathered)
+    return jax.tree.map(lambda x: x.addressable_data(0), _replicate(mesh)(tree))
+
+
+@functools.cache
+def _replicate(mesh):
+    return jax.jit(lambda tree: tree, out_shardings=replicated(mesh))
 
 
 def gather(params: PyTree, specs: PyTree) -> PyTree:
