@@ -116,6 +116,7 @@ def test_photos_of_any_size_become_squares_with_cameras_that_follow(body):
     np.testing.assert_allclose(after, (np.asarray(before) + np.asarray([6, 0])) * SIZE / 48, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_token_capacity_follows_the_photos(body, network):
     variables, config = network
     photos = capture(body, SIZE, SIZE, views=4)  # full masks: 4 x 16 patches, more than the configuration's 48

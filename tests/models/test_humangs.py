@@ -228,6 +228,7 @@ def test_padding_views_change_nothing(config, train):
     assert not close(outputs, apply(replace(padded(inputs, 3), view_count=jnp.asarray(3)))[0], 1e-3)
 
 
+@pytest.mark.slow
 def test_subjects_with_different_numbers_of_views_share_a_batch():
     subjects = [random_inputs(seed, views) for seed, views in enumerate((1, 3, 2))]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(padded(x, 3) for x in subjects))

@@ -94,6 +94,7 @@ def test_gradients_have_no_signed_bias():
         assert abs(np.mean(found - exact)) < BIAS * np.mean(np.abs(exact)), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ordinary: nothing special", "order: coincident depths"])
 def test_decisions_are_the_same_without_jit(name):
     """Operation by operation, in one program, and in one that XLA compiles with other options."""

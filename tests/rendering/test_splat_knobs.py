@@ -218,6 +218,7 @@ print("shared")
 """
 
 
+@pytest.mark.slow
 def test_devices_share_an_image():
     """Devices of a CPU must be asked for before JAX starts: hence a process of its own."""
     here = str(Path(__file__).parent)
