@@ -4,6 +4,7 @@ import dataclasses
 import json
 import types
 import typing
+from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 T = TypeVar("T")
@@ -24,6 +25,14 @@ def config_from_json(cls: type[T], text: str) -> T:
     except json.JSONDecodeError as error:
         raise ValueError(f"configuration is no JSON: {error}") from error
     return _build(cls, values, "config")
+
+
+def config_from_file(cls: type[T], path: Path) -> T:
+    """`config_from_json` of a file. Raises: OSError; ValueError, naming file and field."""
+    try:
+        return config_from_json(cls, path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
 
 
 def _build(annotation: Any, value: Any, path: str) -> Any:

@@ -18,7 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.configuration import config_from_json, config_to_json
+from humangs_jax.configuration import config_from_file, config_to_json
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.state import TrainState
 
@@ -31,9 +31,12 @@ ADJUSTABLE = ("log_every", "validate_every", "checkpoint_every", "keep_checkpoin
 
 
 class Checkpoints:
-    """The checkpoints in a folder. `keep`: how many of the newest stay, besides the one of the highest score."""
+    """The checkpoints in a folder. `keep`: how many of the newest stay, besides the one of the highest score.
 
-    def __init__(self, folder: str | Path, keep: int = 2):
+    read_only: nothing is written, deleted or tidied up.
+    """
+
+    def __init__(self, folder: str | Path, keep: int = 2, read_only: bool = False):
         import orbax.checkpoint as ocp
         from orbax.checkpoint.checkpoint_managers import AnyPreservationPolicy, BestN, LatestN
 
@@ -43,7 +46,11 @@ class Checkpoints:
         self._ocp = ocp
         kept = AnyPreservationPolicy([LatestN(keep), BestN(get_metric_fn=score, n=1)])
         options = ocp.CheckpointManagerOptions(
-            best_fn=score, preservation_policy=kept, enable_async_checkpointing=True, create=True
+            best_fn=score,
+            preservation_policy=kept,
+            enable_async_checkpointing=True,
+            create=not read_only,
+            read_only=read_only,
         )
         with _quiet():
             self._manager = ocp.CheckpointManager(Path(folder).resolve(), options=options)
@@ -131,10 +138,7 @@ def load_config(out: str | Path) -> TrainConfig:
     path = Path(out) / "config.json"
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no run here")
-    try:
-        return config_from_json(TrainConfig, path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return config_from_file(TrainConfig, path)
 
 
 def _placed_as(value, like):

@@ -24,7 +24,7 @@ from humangs_jax.training.diagnosis import Diagnosis, StageReport, leaves
 from humangs_jax.training.observed import observe_subject
 from humangs_jax.training.sources import MakeSource, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
-from humangs_jax.training.step import NO_NETWORKS, train_step
+from humangs_jax.training.step import NO_NETWORKS, subject_keys, train_step
 
 FAILED = ("skipped", "nonfinite")
 """Events of a run's log that are worth a diagnosis."""
@@ -46,7 +46,7 @@ def diagnose_step(
         "loss networks": networks,
     }
     stored = [StageReport(name, leaves(tree)) for name, tree in parts.items() if jax.tree.leaves(tree)]
-    keys = jax.random.split(jax.random.fold_in(jax.random.key(config.seed), state.step), len(batch.inputs.betas))
+    keys = subject_keys(config.seed, state.step, len(batch.inputs.betas))
     found = []
     for subject, key in enumerate(keys):
         example = jax.tree.map(lambda x, i=subject: x[i], batch)
@@ -82,7 +82,7 @@ def diagnose_run(
     config = load_config(out)
     make_source = captured_people(training, body) if isinstance(training, Sequence) else training
     body = gaussian_body(body, config.model)
-    checkpoints = Checkpoints(Path(out) / "checkpoints", config.keep_checkpoints)
+    checkpoints = Checkpoints(Path(out) / "checkpoints", read_only=True)  # the run may still be writing
     failed = first_failed_step(Path(out) / "log.jsonl")
     state = init_state(config, variables)
     before = [step for step in checkpoints.steps if failed is None or step <= failed]

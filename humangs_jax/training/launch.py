@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.configuration import config_from_json
+from humangs_jax.configuration import config_from_file
 from humangs_jax.data.loader import find_people
 from humangs_jax.data.synthetic.live_bank import build_bank, load_bank, save_bank
 from humangs_jax.data.synthetic.seeds import SPLITS
@@ -28,10 +28,7 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
     path = Path(preset_or_path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: neither a file nor one of the presets {', '.join(PRESETS)}")
-    try:
-        return config_from_json(TrainConfig, path.read_text())
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return config_from_file(TrainConfig, path)
 
 
 def training_people(data: Path | None, live: int, out: Path, body: BodyModel) -> MakeSource:
@@ -43,24 +40,26 @@ def training_people(data: Path | None, live: int, out: Path, body: BodyModel) ->
     if data is not None:
         parts.append(captured_people(find_people(data), body))
     if live:
-        parts.append(live_people(load_bank(_bank(live, out, body))))
+        parts.append(live_people(_bank(live, out, body)))
     if not parts:
         raise ValueError("nobody to train on: name a folder of captures, or give --live a number of people")
     return parts[0] if len(parts) == 1 else mixed_people(parts, [1] * len(parts))
 
 
 def _bank(people, out, body):
-    path = out / "people.npz"
+    """The bank in out/people.npz, which one process makes unless it is there."""
+    path, seeds, bank = out / "people.npz", SPLITS["train"][:people], None
     if jax.process_index() == 0:
-        seeds = SPLITS["train"][:people]
-        if not (path.is_file() and load_bank(path).seeds.tolist() == list(seeds)):
+        bank = load_bank(path) if path.is_file() else None
+        if bank is None or bank.seeds.tolist() != list(seeds):
             out.mkdir(parents=True, exist_ok=True)
-            save_bank(path, build_bank(seeds, body, "train", processes=os.cpu_count() or 1, progress=True))
+            bank = build_bank(seeds, body, "train", processes=os.cpu_count() or 1, progress=True)
+            save_bank(path, bank)
     if jax.process_count() > 1:
         from jax.experimental import multihost_utils
 
         multihost_utils.sync_global_devices("people")
-    return path
+    return load_bank(path) if bank is None else bank
 
 
 def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:

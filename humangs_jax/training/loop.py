@@ -29,13 +29,12 @@ from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import NO_NETWORKS, jitted_train_step, train_step
 from humangs_jax.training.stopping import stop_requested
 from humangs_jax.training.validation import sheet, validate, validation_examples, write_sheet
+from humangs_jax.training.watch import Watch
 
 VALIDATED = 8
 """Subjects that a validation looks at."""
 SHOWN = 4
 """Subjects of those in the picture."""
-MANY_SKIPPED = 20
-"""Steps skipped one after the other that are worth a word."""
 
 
 def train(
@@ -92,7 +91,7 @@ def train(
 
     waiting = Waiting()
     with stop_requested() as stopping, RunLog(out, begin, config.steps, leading, progress) as log:
-        watch, stop = _Watch(log, state), False
+        watch, stop = Watch(log, state), False
         for first, last in config.spans(begin, end):
             part = config.at(first)
             loader = stage_loader(make_source, config, first, mesh)
@@ -143,42 +142,3 @@ def _tell(log, out, done, numbers, picture):
     write_sheet(out / "sheets" / f"{done:07d}.png", picture)
     log.picture(done, "validation/sheet", picture)
     log.bar.write(f"step {done}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
-
-
-class _Watch:
-    """Looks at every step's numbers, one step late so that the device is never idle, and tells of steps that went wrong."""
-
-    def __init__(self, log: RunLog, state: TrainState):
-        self._log, self._pending = log, None
-        self._skipped, self._nonfinite = int(state.opt_state.skipped), int(state.opt_state.nonfinite)
-        self._in_a_row = 0
-
-    def __call__(self, done, metrics):
-        # one step may wait behind the one that runs: enough to keep a device busy, and a signal is obeyed soon
-        self.look()
-        names = ("skipped", "nonfinite", "loss", "grad_norm")
-        self._pending = done, {name: metrics[name] for name in names}
-
-    def look(self):
-        """At the step that waits."""
-        if self._pending is None:
-            return
-        done, metrics = self._pending
-        self._pending = None
-        numbers = {name: float(value) for name, value in jax.device_get(metrics).items()}
-        skipped, nonfinite = int(numbers["skipped"]), int(numbers["nonfinite"])
-        was_skipped, was_nonfinite = skipped > self._skipped, nonfinite > self._nonfinite
-        self._skipped, self._nonfinite = skipped, nonfinite
-        self._in_a_row = self._in_a_row + 1 if was_skipped else 0
-        if not (was_skipped or was_nonfinite):
-            return
-        told = f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}"
-        if was_skipped:
-            self._log.event(done, "skipped", f"skipped ({told}), {skipped} so far", **numbers)
-        else:
-            self._log.event(
-                done, "nonfinite", f"gradient entries that were not finite were replaced ({told})", **numbers
-            )
-        if self._in_a_row == MANY_SKIPPED:
-            advice = f"{MANY_SKIPPED} steps in a row were skipped: `humangs train --diagnose` names the first stage that fails"
-            self._log.event(done, "stuck", advice)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh, PartitionSpec
 
-from humangs_jax.array_types import Array, Float, Key, PyTree, Scalar, Shaped
+from humangs_jax.array_types import Array, Float, Int, Key, PyTree, Scalar, Shaped
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
@@ -88,6 +88,11 @@ def _required(network, name, title):
 def _each(compare, predicted, targets):
     """One view after the other: the features of all at once would be the largest arrays of a step."""
     return jax.lax.map(jax.checkpoint(lambda pair: compare(*pair)), (predicted, targets))
+
+
+def subject_keys(seed: int, step: Int[Array, ""], count: int) -> Array:
+    """One key per subject of a step."""
+    return jax.random.split(jax.random.fold_in(jax.random.key(seed), step), count)
 
 
 def subject_loss(
@@ -227,8 +232,7 @@ def jitted_train_step() -> Any:
 
 
 def _train_step(state, batch, body, networks, config, mesh):
-    key = jax.random.fold_in(jax.random.key(config.seed), state.step)
-    keys = jax.random.split(key, batch.inputs.betas.shape[0])
+    keys = subject_keys(config.seed, state.step, batch.inputs.betas.shape[0])
     loss, gradients, batch_stats, metrics = batch_gradients(
         state.params, state.batch_stats, body, batch, keys, config, networks, mesh
     )

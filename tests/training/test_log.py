@@ -8,9 +8,9 @@ import numpy as np
 
 from humangs_jax.data.loader import Waiting
 from humangs_jax.training.log import RunLog, forget_after
-from humangs_jax.training.loop import MANY_SKIPPED, _Watch
 from humangs_jax.training.optimizer import GuardState
 from humangs_jax.training.state import TrainState
+from humangs_jax.training.watch import MANY_SKIPPED, Watch
 
 
 def read(path):
@@ -90,7 +90,7 @@ def test_steps_that_went_wrong_are_told_by_number(tmp_path, capsys):
         "grad_norm": jnp.asarray(1.0),
     }
     with RunLog(tmp_path, 0, 100, progress=False) as log:
-        watch = _Watch(log, state)
+        watch = Watch(log, state)
         watch(1, metrics(2, 2))
         watch(2, metrics(2, 3))
         for i in range(MANY_SKIPPED):
