@@ -1,4 +1,4 @@
-"""The benchmark and the cost page of training: help without JAX, traffic between devices counted, pages from numbers."""
+"""The benchmarks and the cost page of training: traffic between devices counted, pages from what the scripts measure."""
 
 import importlib
 import json
@@ -51,9 +51,27 @@ WHOLE = 4 * 64 * 8
 
 
 @pytest.fixture
-def collectives(monkeypatch):
+def experiment(monkeypatch):
+    """A module of experiments/ by name."""
     monkeypatch.syspath_prepend(EXPERIMENTS)
-    return importlib.import_module("hlo_collectives")
+    return importlib.import_module
+
+
+@pytest.fixture
+def collectives(experiment):
+    return experiment("hlo_collectives")
+
+
+@pytest.fixture
+def page(tmp_path):
+    """A copy of a page to write into."""
+
+    def copied(name):
+        path = tmp_path / name
+        path.write_text((REPOSITORY / "docs" / name).read_text())
+        return path
+
+    return copied
 
 
 def test_traffic_between_devices(collectives):
@@ -80,9 +98,34 @@ def test_groups_of_devices(collectives):
     assert collectives.group_size("replica_groups={}", 256) == 256
 
 
+def test_convolutions_are_timed_in_a_loop_and_out_of_it(experiment, page):
+    script, path = experiment("benchmark_convolution"), page("performance_training.md")
+    result = json.loads(json.dumps(script.benchmark([(2, 4, 5, 3, 6)], repeats=1)))
+    (row,) = result["maps"]
+    assert all(row["cpu_ms"][way] > 0 for way in script.WAYS)
+    experiment("report_tables").write_section(path, "convolution", script.table(result))
+    assert "| 2 x 4 x 5 x 3 -> 6 |" in path.read_text()
+
+
+def test_checkpoints_are_saved_restored_and_weighed(experiment, page, tmp_path):
+    script, path = experiment("benchmark_checkpoints"), page("scaling.md")
+    result = json.loads(json.dumps(script.measure("tiny", tmp_path / "checkpoints", repeats=1)))
+    numbers = 3 * result["parameters"]  # parameters and two moments
+    assert result["state_bytes"] >= 4 * numbers and result["disk_bytes"] > 0.8 * result["state_bytes"]
+    times = result["ms"]
+    assert all(wall > 0 for wall, _ in times.values()) and times["save"][0] < times["to disk"][0]
+    experiment("report_tables").write_section(path, "checkpoints", script.table([result]))
+    assert "| tiny |" in path.read_text()
+
+
+def test_an_unknown_preset_is_named(experiment, tmp_path):
+    with pytest.raises(SystemExit, match=r"--presets huge: expected one of published, .*tiny"):
+        experiment("benchmark_checkpoints").measure("huge", tmp_path, repeats=1)
+
+
 @pytest.mark.slow
-def test_the_page_is_made_of_what_the_benchmark_writes(tmp_path):
-    numbers, page = tmp_path / "numbers.json", tmp_path / "page.md"
+def test_the_page_is_made_of_what_the_benchmark_writes(tmp_path, page):
+    numbers, path = tmp_path / "numbers.json", page("performance_training.md")
     command = [sys.executable, str(EXPERIMENTS / "benchmark_training.py"), "--json", str(numbers)]
     options = ["--only", "tiny 32", "--repeats", "1", "--stages", "--variants", "XLA's default compiler options"]
     subprocess.run([*command, *options], check=True, cwd=tmp_path)
@@ -92,6 +135,5 @@ def test_the_page_is_made_of_what_the_benchmark_writes(tmp_path):
     assert row["flops"] == row["variants"]["XLA's default compiler options"]["flops"]
     assert all(cpu > 0 for _, cpu in row["stages"].values())
 
-    page.write_text((REPOSITORY / "docs" / "performance_training.md").read_text())
-    subprocess.run([*command, "--page", str(page)], check=True, cwd=tmp_path)
-    assert "tiny 32, 2 + 2 views" in page.read_text()
+    subprocess.run([*command, "--page", str(path)], check=True, cwd=tmp_path)
+    assert "tiny 32, 2 + 2 views" in path.read_text()
