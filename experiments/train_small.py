@@ -1,26 +1,26 @@
 """Train the network that comes with the package on synthetic people, from nothing or from the shipped weights.
 
     python experiments/train_small.py --out runs/small
+    python experiments/train_small.py --out runs/more --init-weights shipped
 
-Makes the people first (`--subjects` of the training seeds, and a few of the validation seeds to look at) unless `--people`
-and `--validation` name folders of captures. Continues the run in `--out` if there is one; Ctrl-C saves. Every setting
-of `TrainConfig` is an option: `--steps 4000 --optimizer.learning-rate 2e-4`.
+The run is experiments/configs/small.json; every setting of it is an option: `--steps 4000 --optimizer.learning-rate 2e-4`.
+Makes the people first: `--live` of the training seeds that are drawn anew for every step, `--subjects` that are written as
+captures, and a few of the validation seeds to look at. Continues the run in `--out` if there is one; Ctrl-C saves.
 
-On 2 CPU cores: 3 s per subject to make them, then 0.9 s per step on an otherwise quiet machine. The shipped weights had two
-runs of 994 and 2,000 steps with the settings in docs/training.md (22.7 dB on the validation views at 256 x 256 after 250
-steps, 24.7 after 750, 26.7 at the end); the preset here is one longer run with the same losses and views.
+On 2 CPU cores: 1 s a live person, 5 s a written one, then about 1.2 s a step on an otherwise quiet machine. How the shipped
+weights came about is in humangs_jax/assets/weights.md.
 """
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 
 from humangs_jax.allocator import keep_freed_memory
-from humangs_jax.training.config import TrainConfig, small
+from humangs_jax.configuration import config_from_file
+from humangs_jax.training.config import TrainConfig
 
-SMALL = small()
+SMALL = config_from_file(TrainConfig, Path(__file__).resolve().parent / "configs" / "small.json")
 VALIDATION_SUBJECTS = 8
 
 
@@ -28,18 +28,21 @@ def main(
     out: Path,
     people: Path | None = None,
     validation: Path | None = None,
-    subjects: int = 600,
+    subjects: int = 64,
+    live: int = 320,
     init_weights: Path | Literal["shipped"] | None = None,
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = SMALL,
 ) -> None:
-    """Train on synthetic people.
+    """Train on synthetic people, written and live ones by halves.
 
     Args:
         out: checkpoints, log, pictures and weights of the run.
         people: folder of capture folders to train on; made in out/people if not given.
         validation: folder of captures of other people, looked at now and then; made in out/validation if not given.
-        subjects: how many people to make.
-        init_weights: start from these weights (and their network) instead of fresh ones; "shipped": the package's own.
+        subjects: how many people to write; 0 for live ones alone.
+        live: how many live people; kept in out/people.npz. 0 for written ones alone.
+        init_weights: start from these weights instead of fresh ones, as far as their network is the one of `config`;
+            "shipped": the package's own.
         config: the run.
     """
     import logging
@@ -47,21 +50,23 @@ def main(
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import find_captures
     from humangs_jax.data.synthetic import SPLITS, synthesize
-    from humangs_jax.models.weights import load_weights
+    from humangs_jax.models.weights import fit_variables, load_weights
+    from humangs_jax.training.launch import training_people
     from humangs_jax.training.loop import train
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
-    variables = None
+    body, variables = load_body(), None
     if init_weights is not None:
-        variables, model = load_weights(None if init_weights == "shipped" else init_weights)
-        config = dataclasses.replace(config, model=model)
-    if people is None:
+        variables, _ = load_weights(None if init_weights == "shipped" else init_weights)
+        variables = fit_variables(variables, config.model)
+    if people is None and subjects:
         people = out / "people"
         synthesize(people, subjects, SPLITS["train"].start)
     if validation is None:
         validation = out / "validation"
         synthesize(validation, VALIDATION_SUBJECTS, SPLITS["validation"].start)
-    train(config, load_body(), find_captures(people), out, validation=find_captures(validation), variables=variables)
+    training = training_people(people, live, out, body)
+    train(config, body, training, out, validation=find_captures(validation), variables=variables)
 
 
 if __name__ == "__main__":

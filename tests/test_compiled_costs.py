@@ -219,6 +219,8 @@ def empty_inputs(views, size, vertices=20):
         position_maps=jnp.zeros((views, size, size, 3)),
         depth_maps=jnp.zeros((views, size, size)),
         foreground=jnp.zeros((views, size, size), bool),
+        posed_normals=jnp.zeros((views, vertices, 3)),
+        canonical_normals=jnp.zeros((vertices, 3)),
     )
 
 

@@ -13,7 +13,7 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.models.humangs import HumanGSConfig, HumanGSInputs, subject_unit
 from humangs_jax.pytree import pytree_dataclass, replace
 from humangs_jax.rendering.mesh_rasterizer import RasterConfig
-from humangs_jax.rendering.position_map import gouraud_position_map, plain_position_map
+from humangs_jax.rendering.position_map import gouraud_position_map, plain_position_map, vertex_normals
 
 MASK_THRESHOLD = 0.5
 """A pixel belongs to the person when its mask is above this."""
@@ -80,6 +80,8 @@ def prepare_inputs(
         vertices, camera = arguments
         return draw(vertices / unit, canonical, body.faces, camera, raster or RasterConfig())
 
+    normals = lambda vertices: vertex_normals(vertices, body.faces)
+
     # one view after the other: a vmapped rasterizer would make every view pay for the fullest one
     position_maps, depth_maps = jax.lax.map(rasterize_view, (posed, cameras))
     return HumanGSInputs(
@@ -91,6 +93,8 @@ def prepare_inputs(
         depth_maps=depth_maps,
         foreground=(views.masks > MASK_THRESHOLD) | (depth_maps >= 0),
         view_count=views.view_count,
+        posed_normals=jax.vmap(normals)(posed) if config.sampling.shells else None,
+        canonical_normals=normals(rest.vertices) if config.decoder.frame == "normal" else None,
     )
 
 

@@ -26,6 +26,7 @@ from humangs_jax.models.tokenizer import Packing, Tokenizer, TokenSelection, pac
 from humangs_jax.models.transformer import INIT_STD, Transformer, TransformerConfig
 from humangs_jax.models.upsampler import Readout, Upsampler, UpsamplerConfig
 from humangs_jax.models.vertex_decoder import (
+    SHELL_WIDTH,
     RawGaussians,
     VertexDecoder,
     VertexDecoderConfig,
@@ -46,6 +47,7 @@ from humangs_jax.sampling.pixel_aligned import (
     sum_over_views,
     visible_vertices,
 )
+from humangs_jax.sampling.shells import Shells, sample_shells
 from humangs_jax.sampling.triplane import TriplaneConfig
 
 TARGET_HEIGHT = 1.8
@@ -101,6 +103,8 @@ class HumanGSConfig:
             raise ValueError(f"layers must be even and at least 4, to have quarters; got {transformer.layers}")
         if decoder.residual_color and not self.sampling.sample_rgb:
             raise ValueError("decoder.residual_color needs sampling.sample_rgb: there is no photo colour to correct")
+        if self.sampling.shells and decoder.frame != "normal":
+            raise ValueError('sampling.shells lie along the normals: they need decoder.frame = "normal"')
         if decoder.gaussians_per_vertex < 1:
             raise ValueError("decoder: tight + free must be at least 1")
 
@@ -119,7 +123,14 @@ class HumanGSConfig:
         """Numbers that enter the decoder per vertex."""
         width = self.transformer.width
         local = self.upsampler.out if self.upsampler.enabled else width
-        return local + width * self.transformer.class_token + ENCODED_POSITION + 4 * self.sampling.sample_rgb
+        return (
+            local
+            + width * self.transformer.class_token
+            + ENCODED_POSITION
+            + 4 * self.sampling.sample_rgb
+            + SHELL_WIDTH * len(self.sampling.shells)
+            + 3 * (self.decoder.frame == "normal")
+        )
 
 
 @pytree_dataclass
@@ -130,7 +141,8 @@ class HumanGSInputs:
     the body in the pose of each photo. canonical_vertices: (n, 3) metric, T-pose. position_maps: (v, h, w, 3) canonical
     position of each pixel, normalised units, 1 on background. depth_maps: (v, h, w) rasterized z, normalised units, -1
     on background. foreground: (v, h, w) pixels of the person (used by `tokens = "foreground"`). view_count: views beyond
-    the first so many are padding, whatever they show, and change nothing; None: none is.
+    the first so many are padding, whatever they show, and change nothing; None: none is. posed_normals: (v, n, 3)
+    unit, used with `sampling.shells`. canonical_normals: (n, 3) unit, used with `decoder.frame = "normal"`.
     """
 
     images: Float[Array, "v h w 3"]
@@ -141,6 +153,8 @@ class HumanGSInputs:
     depth_maps: Float[Array, "v h w"]
     foreground: Bool[Array, "v h w"]
     view_count: Int[Array, ""] | None = None
+    posed_normals: Float[Array, "v n 3"] | None = None
+    canonical_normals: Float[Array, "n 3"] | None = None
 
     @property
     def present(self) -> Bool[Array, " v"]:
@@ -238,7 +252,9 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     encoder_key, decoder_key = jax.random.split(key)
     pixels = jnp.zeros((1, 2 * config.patch_size, 2 * config.patch_size, 12))
     encoder = Encoder(config).init(encoder_key, pixels)
-    decoder = VertexDecoder(config.decoder).init(decoder_key, jnp.zeros((1, config.decoder_width)))
+    decoder = VertexDecoder(config.decoder, len(config.sampling.shells)).init(
+        decoder_key, jnp.zeros((1, config.decoder_width))
+    )
     params = {"encoder": encoder["params"], "decoder": decoder["params"]}
     if config.upsampler.enabled:
         neighborhoods = jnp.zeros((1, KERNEL**2 * config.readout.channels))
@@ -328,6 +344,8 @@ def sample_vertices(
 ) -> VertexFeatures:
     """Feature maps (and photographs, if configured) at the projections of the posed vertices, pooled over views."""
     sampling = config.sampling
+    if config.decoder.frame == "normal" and inputs.canonical_normals is None:
+        raise ValueError('decoder.frame "normal" needs canonical_normals of the inputs, see `prepare_inputs`')
     pixels, visible = project_and_test(inputs, config)
     weights = _view_weights(visible, inputs, config).astype(pixels.dtype)
     size = (inputs.cameras.width, inputs.cameras.height)
@@ -338,13 +356,36 @@ def sample_vertices(
     if config.upsampler.enabled:
         local = config.readout.apply({"params": variables["params"]["readout"]}, *local)
     features = VertexFeatures(
-        cast(Array, local), encoding.global_token, dropped_reads=dropped_reads(weights, sampling.vertex_capacity)
+        cast(Array, local),
+        encoding.global_token,
+        normals=inputs.canonical_normals if config.decoder.frame == "normal" else None,
+        dropped_reads=dropped_reads(weights, sampling.vertex_capacity),
     )
+    if sampling.shells:
+        features = replace(features, shells=read_shells(inputs, config))
     if not sampling.sample_rgb:
         return features
     fraction = jnp.sum(visible, axis=0) / jnp.sum(inputs.present)
     colors = photo_colors(inputs.images, pixels, visible, sampling.convention)
     return replace(features, photo_colors=colors, visible_fraction=fraction.astype(pixels.dtype))
+
+
+def read_shells(inputs: HumanGSInputs, config: HumanGSConfig) -> Shells:
+    """The photographs at points off the surface. Raises ValueError if the inputs have no normals."""
+    if inputs.posed_normals is None:
+        raise ValueError("sampling.shells needs posed_normals of the inputs, see `prepare_inputs`")
+    unit = subject_unit(inputs.canonical_vertices)
+    return sample_shells(
+        inputs.images,
+        inputs.foreground,
+        inputs.depth_maps,
+        inputs.cameras.in_units(unit),
+        inputs.posed_vertices / unit,
+        inputs.posed_normals,
+        config.sampling.shells,
+        inputs.present,
+        config.sampling.convention,
+    )
 
 
 def project_and_test(inputs: HumanGSInputs, config: HumanGSConfig) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
@@ -382,7 +423,7 @@ def decode_heads(
     """The first half of `decode`: heads before their activations."""
     entering = decoder_input(features, canonical_vertices / subject_unit(canonical_vertices))
     own = {"params": variables["params"]["decoder"]}
-    return cast(RawGaussians, VertexDecoder(config.decoder).apply(own, entering))
+    return cast(RawGaussians, VertexDecoder(config.decoder, len(config.sampling.shells)).apply(own, entering))
 
 
 def assemble(
@@ -391,7 +432,7 @@ def assemble(
     """The second half of `decode`: activations, and lengths in metres."""
     unit = subject_unit(canonical_vertices)
     canonical = canonical_vertices / unit
-    at_vertices = activate(raw, config.decoder, features.photo_colors)
+    at_vertices = activate(raw, config.decoder, features)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     gaussians = Gaussians(
         means=flat(canonical[:, None] + at_vertices.offsets) * unit,

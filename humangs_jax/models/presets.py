@@ -10,6 +10,9 @@ from humangs_jax.models.vertex_decoder import VertexDecoderConfig
 from humangs_jax.sampling.pixel_aligned import PixelAlignedConfig
 from humangs_jax.sampling.triplane import TriplaneConfig
 
+SHELLS = (0.0, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18)
+"""From the skin to the hems of the widest clothes, normalised units."""
+
 
 def published() -> HumanGSConfig:
     """The authors' release, 99 M parameters, with its quirks."""
@@ -33,15 +36,21 @@ def small() -> HumanGSConfig:
     return HumanGSConfig(
         image_size=256,
         tokens="foreground",
-        token_capacity=896,
+        token_capacity=1344,
         body_vertices=4000,
         longest_edge=0.03,
         texture=TriplaneConfig(resolution=64, channels=8),
         transformer=TransformerConfig(width=256, layers=6),
         upsampler=UpsamplerConfig(enabled=False),  # left out for its cost on a CPU, see docs/training.md
-        sampling=PixelAlignedConfig(pool="visible", convention="half_pixel", sample_rgb=True),
+        sampling=PixelAlignedConfig(pool="visible", convention="half_pixel", sample_rgb=True, shells=SHELLS),
         decoder=VertexDecoderConfig(
-            hidden=256, tight=1, free=2, offset_scale=0.25, initial_log_scale=-4.6, residual_color=True
+            hidden=256,
+            tight=1,
+            free=2,
+            offset_scale=0.25,
+            initial_log_scale=-4.6,
+            frame="normal",
+            residual_color=True,
         ),
     )
 

@@ -92,6 +92,26 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
     return variables_from_tensors(tensors, config, str(path)), config
 
 
+def fit_variables(variables: Variables, config: HumanGSConfig) -> Variables:
+    """Variables for a network that differs a little, to train on: tensors keep what both networks have of them.
+
+    Along an axis that is longer now, or of tensors that are new, the rest is as initialised, but new inputs of a layer start
+    unheard (0).
+    """
+    old = flatten_variables(variables)
+
+    def fit(path, new):
+        key = "/".join(str(entry.key) for entry in path)
+        if key not in old:
+            return new
+        kept = tuple(slice(min(sizes)) for sizes in zip(new.shape, old[key].shape, strict=True))
+        if new.ndim == 2 and new.shape[0] > old[key].shape[0]:  # a layer's kernel: (inputs, outputs)
+            new = new.at[old[key].shape[0] :].set(0)
+        return new.at[kept].set(old[key][kept])
+
+    return jax.tree_util.tree_map_with_path(fit, init_humangs(jax.random.key(0), config))
+
+
 def variables_from_tensors(tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str) -> Variables:
     """Float32 variables from flat tensors keyed by path; ValueError naming the key unless they are exactly those."""
     expected = expected_variables(config)

@@ -33,12 +33,15 @@ class PixelAlignedConfig:
     convention: "half_pixel" is correct, "mixed" is the published one (see `sampling.bilinear`).
     sample_rgb: also read the photo colour at each vertex, averaged over the views that see it, and their fraction.
     vertex_capacity: vertices that a view is read for at most, None for all: views cost nothing where they see nothing.
+    shells: distances along the vertex normals, normalised units, at which the photographs are looked up too, see
+    `sampling.shells`; none: that is left out.
     """
 
     pool: Literal["visible", "all"] = "visible"
     convention: Convention = "half_pixel"
     sample_rgb: bool = False
     vertex_capacity: int | None = None
+    shells: tuple[float, ...] = ()
 
 
 def project_vertices(camera: Camera, vertices: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:

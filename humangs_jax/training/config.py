@@ -117,10 +117,11 @@ def _changed(config, stage):
 def small() -> TrainConfig:
     """The shipped weights: some hours on a CPU of two cores."""
     return TrainConfig(
-        views=ViewSampling(target_count=2, mixed_pose_share=0.2),
-        optimizer=OptimizerConfig(warmup_steps=200),
+        views=ViewSampling(input_counts=(1, 2, 4, 4, 4, 6), target_count=3, mixed_pose_share=0.2),
+        loss=LossConfig(silhouette=0.3),
+        optimizer=OptimizerConfig(learning_rate=5e-4, warmup_steps=100),
         target_size=256,
-        steps=8000,
+        steps=4000,
         ema_decay=0.998,
         validate_every=500,
         checkpoint_every=500,

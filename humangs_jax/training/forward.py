@@ -1,5 +1,7 @@
 """From an example to pictures: photographs -> canonical Gaussians -> posed as each target -> drawn."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 
@@ -8,7 +10,7 @@ from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews, prepare_inputs
-from humangs_jax.models.humangs import HumanGSOutputs, Variables, apply_humangs
+from humangs_jax.models.humangs import HumanGSConfig, HumanGSOutputs, Variables, apply_humangs
 from humangs_jax.models.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.gaussians import skin_gaussians
 from humangs_jax.rendering.splatting import Rendering, render
@@ -24,8 +26,20 @@ def reconstruct_example(
     axis_name: str | tuple[str, ...] | None = None,
 ) -> tuple[HumanGSOutputs, Variables]:
     """Canonical Gaussians of one subject and the batch statistics, see `apply_humangs`."""
-    prepared = jax.lax.stop_gradient(prepare_inputs(body, inputs, config.model, config.raster))
-    return apply_humangs(variables, prepared, config.model, train, axis_name)
+    model = token_share(config, len(inputs.images))
+    prepared = jax.lax.stop_gradient(prepare_inputs(body, inputs, model, config.raster))
+    return apply_humangs(variables, prepared, model, train, axis_name)
+
+
+def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
+    """The network with the token capacity of a step of so many photographs.
+
+    `model.token_capacity` is for the most of `views.input_counts`; fewer have their share, and a view's share more, as one
+    photograph may show more of a person than the others.
+    """
+    most = max(config.views.input_counts)
+    capacity = -(-config.model.token_capacity * (views + 1) // (most + 1))
+    return config.model if views >= most else dataclasses.replace(config.model, token_capacity=capacity)
 
 
 def draw_targets(

@@ -33,6 +33,7 @@ from humangs_jax.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.rendering.gaussians import Gaussians, skin_gaussians
 from humangs_jax.rendering.splatting import Rendering, draw_projected, project_gaussians
 from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.forward import token_share
 from humangs_jax.training.probes import Named, Recorder, inexact_leaves
 from humangs_jax.training.step import change_background, loss_terms, random_backgrounds
 
@@ -99,7 +100,7 @@ def _transformer_stage(module_name):
 
 def _observed_loss(params, batch_stats, body, example, key, config, networks, recorder):
     """`step.subject_loss`."""
-    model, variables = config.model, {"params": params, "batch_stats": batch_stats}
+    model, variables = token_share(config, len(example.inputs.images)), {"params": params, "batch_stats": batch_stats}
     inputs = jax.lax.stop_gradient(prepare_inputs(body, example.inputs, model, config.raster))
     computed = ("posed_vertices", "canonical_vertices", "position_maps", "depth_maps")
     recorder.give("position maps", {name: getattr(inputs, name) for name in computed})

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture, Source
-from humangs_jax.data.synthetic.live import LiveConfig
+from humangs_jax.data.synthetic.live import DEFAULT_CONFIG, LiveConfig
 from humangs_jax.data.synthetic.live_bank import PeopleBank
 from humangs_jax.data.synthetic.live_source import live_source
 from humangs_jax.training.config import TrainConfig
@@ -36,12 +36,13 @@ def captured_people(folders: Sequence[str | Path], body: BodyModel) -> MakeSourc
     return lambda config: CaptureSource(cache, config.views, config.model.image_size, config.target_size)
 
 
-def live_people(bank: PeopleBank) -> MakeSource:
-    """People of a bank, drawn anew for every step on the device that trains."""
+def live_people(bank: PeopleBank, settings: LiveConfig = DEFAULT_CONFIG) -> MakeSource:
+    """People of a bank, drawn anew for every step on the device that trains; sizes and views are those of the run."""
 
     def make(config: TrainConfig) -> Source:
         views = config.views
-        live = LiveConfig(
+        live = dataclasses.replace(
+            settings,
             target_views=views.target_count,
             input_size=config.model.image_size,
             target_size=config.target_size,

@@ -38,6 +38,21 @@ def test_matrices_are_rotations_and_convert_back(seed, batch):
     assert close(back * jnp.sign(jnp.sum(back * q, -1, keepdims=True)), q)
 
 
+@given(seeds, batches, st.sampled_from(["any", "same", "opposite", "almost opposite"]))
+def test_between_turns_one_direction_into_the_other_the_short_way(seed, batch, case):
+    a, b = (unit(seed + i, batch)[..., :3] for i in range(2))
+    a, b = (x / jnp.linalg.norm(x, axis=-1, keepdims=True) for x in (a, b))
+    b = {"any": b, "same": a, "opposite": -a, "almost opposite": -a + 0.01 * b}[case]
+    b = b / jnp.linalg.norm(b, axis=-1, keepdims=True)
+    q = quaternion.between(a, b)
+    turned = jnp.einsum("...ij,...j->...i", quaternion.to_matrix(q), a)
+    assert close(turned, b, atol=1e-4 if case == "almost opposite" else 1e-5)  # 1 + a.b cancels there
+    assert close(jnp.linalg.norm(q, axis=-1), jnp.ones(batch))
+    assert np.all(q[..., 0] >= 0)  # at most half a turn
+    if case == "same":
+        assert close(q, jnp.broadcast_to(jnp.asarray(quaternion.IDENTITY), q.shape), atol=1e-5)
+
+
 @pytest.mark.parametrize("axis", range(3))
 def test_half_turns_convert_back(axis):
     q = jnp.zeros(4).at[axis + 1].set(1.0)

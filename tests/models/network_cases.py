@@ -22,6 +22,8 @@ def random_inputs(seed=0, views=2, vertices=20, size=32):
     K = intrinsics_from_fov(0.8, size, size)
     azimuths = jnp.linspace(0.0, 5.0, views)
     canonical = uniform(-0.8, 0.8, vertices, 3)
+    directions = np.random.default_rng([seed, 1]).normal(size=(views + 1, vertices, 3))
+    normals = jnp.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True), jnp.float32)
     return HumanGSInputs(
         images=uniform(0, 1, views, size, size, 3),
         cameras=orbit(jnp.zeros(3), 3.0, azimuths, 0.1, K, size, size),
@@ -30,6 +32,8 @@ def random_inputs(seed=0, views=2, vertices=20, size=32):
         position_maps=uniform(-1, 1, views, size, size, 3),
         depth_maps=jnp.full((views, size, size), 5.0),
         foreground=jnp.ones((views, size, size), bool),
+        posed_normals=normals[1:],
+        canonical_normals=normals[0],
     )
 
 

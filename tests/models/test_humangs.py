@@ -21,7 +21,7 @@ from humangs_jax.models.humangs import (
     subject_unit,
 )
 from humangs_jax.models.transformer import Block
-from humangs_jax.models.vertex_decoder import VertexDecoder
+from humangs_jax.models.vertex_decoder import SHELL_WIDTH, VertexDecoder
 from humangs_jax.models.weights import expected_variables
 from humangs_jax.pytree import replace
 
@@ -29,6 +29,9 @@ FLOAT32_TOLERANCE = 1e-5
 """The same sums in another order: a few layers of float32 roundings on numbers of order one."""
 BFLOAT16_TOLERANCE = 0.05
 """bfloat16 has 8 bits (0.4 %); some twenty roundings in a row on numbers of order one."""
+
+
+PER_VIEW = ("images", "posed_vertices", "posed_normals", "position_maps", "depth_maps")
 
 
 @functools.partial(jax.jit, static_argnames=("config",))
@@ -101,7 +104,7 @@ def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
     assert (encoding.global_token is not None) == class_token
     kernel = variables["params"]["decoder"]["trunk_0"]["kernel"]
     local = TINY.upsampler.out if class_token else TINY.transformer.width
-    assert kernel.shape[0] == local + TINY.transformer.width * class_token + 39 + 4 * sample_rgb
+    assert kernel.shape[0] == local + TINY.transformer.width * class_token + 39 + 4 * sample_rgb + 3 + 7 * SHELL_WIDTH
 
 
 # values
@@ -110,11 +113,16 @@ def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
 def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
     inputs = random_inputs()
     inputs = replace(inputs, images=jnp.full_like(inputs.images, 0.7))
-    decoder = jax.jit(VertexDecoder(TINY.decoder).init)(jax.random.key(0), jnp.zeros((1, TINY.decoder_width)))
-    variables = variables_of(TINY)
+    plain = dataclasses.replace(
+        TINY,
+        sampling=dataclasses.replace(TINY.sampling, shells=()),
+        decoder=dataclasses.replace(TINY.decoder, frame="canonical"),
+    )
+    decoder = jax.jit(VertexDecoder(plain.decoder).init)(jax.random.key(0), jnp.zeros((1, plain.decoder_width)))
+    variables = variables_of(plain)
     variables = {**variables, "params": {**variables["params"], "decoder": decoder["params"]}}
-    fresh = run(variables, inputs, TINY)[1].gaussians
-    unit, k = subject_unit(inputs.canonical_vertices), TINY.decoder.gaussians_per_vertex
+    fresh = run(variables, inputs, plain)[1].gaussians
+    unit, k = subject_unit(inputs.canonical_vertices), plain.decoder.gaussians_per_vertex
     assert np.abs(fresh.means - jnp.repeat(inputs.canonical_vertices, k, axis=0)).max() < 0.02
     assert np.allclose(fresh.scales, 0.01 * unit, rtol=0.1)  # softplus(-4.6) = 1.0 cm
     assert np.allclose(fresh.opacities, jax.nn.sigmoid(-1.0), atol=0.01) and np.allclose(fresh.colors, 0.7, atol=0.01)
@@ -130,7 +138,7 @@ def test_deeper_blocks_begin_smaller():
 def test_the_order_of_the_views_does_not_matter():
     """Maps are permuted with the views, everything pooled stays."""
     inputs, order = random_inputs(), jnp.asarray([1, 0])
-    per_view = {name: getattr(inputs, name) for name in ("images", "posed_vertices", "position_maps", "depth_maps")}
+    per_view = {name: getattr(inputs, name) for name in PER_VIEW}
     permuted = replace(
         inputs,
         cameras=jax.tree.map(lambda x: x[order], inputs.cameras),
@@ -205,6 +213,7 @@ def padded(inputs, views):
         images=extend(inputs.images, 0.9),
         cameras=jax.tree.map(lambda x: extend(x, x[-1]), inputs.cameras),
         posed_vertices=extend(inputs.posed_vertices, 0.1),
+        posed_normals=extend(inputs.posed_normals, 0.5),
         position_maps=extend(inputs.position_maps, 0.2),
         depth_maps=extend(inputs.depth_maps, 9.0),
         foreground=extend(inputs.foreground, True),
@@ -299,6 +308,7 @@ def test_a_vmap_over_subjects_is_a_loop():
     [
         ({"image_size": 100}, "no multiple of patch_size"),
         ({"transformer": presets.TransformerConfig(width=100)}, "head_width"),
+        ({"sampling": dataclasses.replace(TINY.sampling, shells=(0.0, 0.1))}, "along the normals"),
         ({"transformer": presets.TransformerConfig(layers=3)}, "layers"),
         ({"decoder": presets.VertexDecoderConfig(residual_color=True)}, "sample_rgb"),
         ({"decoder": presets.VertexDecoderConfig(tight=0, free=0)}, "tight"),
@@ -317,3 +327,10 @@ def test_images_must_be_those_of_the_cameras():
     odd = random_inputs(size=36)
     with pytest.raises(ValueError, match="36 x 36 cannot be cut"):
         apply(odd)
+
+
+@pytest.mark.parametrize("missing", ["posed_normals", "canonical_normals"])
+def test_shells_need_normals(missing):
+    inputs = replace(random_inputs(), **{missing: None})
+    with pytest.raises(ValueError, match=missing):
+        jax.eval_shape(lambda v: run(v, inputs, TINY), expected_variables(TINY))

@@ -5,12 +5,13 @@ import os
 import jax
 import numpy as np
 import pytest
-from network_cases import TINY, random_variables
+from network_cases import TINY, random_inputs, random_variables
 from safetensors.numpy import load_file, save_file
 
 from humangs_jax.configuration import config_from_json, config_to_json
 from humangs_jax.models import presets, weights
-from humangs_jax.models.weights import load_weights, save_weights
+from humangs_jax.models.humangs import apply_humangs
+from humangs_jax.models.weights import fit_variables, load_weights, save_weights
 
 VARIABLES = random_variables(TINY)
 TEXTURE = "params/encoder/tokenizer/texture"
@@ -112,3 +113,21 @@ def test_configurations_survive_json(name):
     config = presets.PRESETS[name]()
     assert config_from_json(type(config), config_to_json(config)) == config
     assert config_from_json(type(config), "{}") == type(config)()
+
+
+def test_a_network_that_grows_shows_the_same_until_it_learns():
+    """Shells and a Gaussian more per vertex: what the smaller network made of the photographs is still there."""
+    small = dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, shells=()))
+    variables = random_variables(small, 3)
+    grown = dataclasses.replace(TINY, decoder=dataclasses.replace(TINY.decoder, free=TINY.decoder.free + 1))
+    inputs = random_inputs()
+    before, _ = apply_humangs(variables, inputs, small)
+    after, _ = apply_humangs(fit_variables(variables, grown), inputs, grown)
+    k, more = small.decoder.gaussians_per_vertex, grown.decoder.gaussians_per_vertex
+    own = np.asarray(after.gaussians.opacities).reshape(-1, more)[:, :k]
+    assert np.allclose(own, np.asarray(before.gaussians.opacities).reshape(-1, k), atol=1e-6)
+
+
+def test_fitting_to_the_same_network_changes_nothing():
+    same = fit_variables(VARIABLES, TINY)
+    assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (same, VARIABLES)), strict=True))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.data.loader import CaptureCache, ExampleSource
+from humangs_jax.data.loader import CaptureCache, ExampleSource, ViewSampling
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.models.humangs import init_humangs
@@ -17,6 +17,7 @@ from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.objectives.perceptual import VGG19, Vgg19
 from humangs_jax.pytree import replace
 from humangs_jax.training.config import tiny
+from humangs_jax.training.forward import token_share
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import (
     batch_gradients,
@@ -174,3 +175,10 @@ def test_the_share_of_random_backgrounds_is_kept():
     white = np.asarray(jax.vmap(lambda key: jnp.all(random_backgrounds(key, 3, 0.25) == 1, axis=-1))(keys))
     assert 0.68 < white.mean() < 0.82  # 600 draws of probability 0.75: four standard deviations
     assert bool(jnp.all(random_backgrounds(keys[0], 3, 0.0) == 1))
+
+
+@pytest.mark.parametrize(("views", "capacity"), [(6, 70), (4, 50), (1, 20)])
+def test_fewer_photographs_have_their_share_of_the_token_capacity(views, capacity):
+    config = dataclasses.replace(tiny(), views=ViewSampling(input_counts=(1, 4, 6)))
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, token_capacity=70))
+    assert token_share(config, views).token_capacity == capacity
