@@ -110,8 +110,7 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     if arguments.json:
         write_json(arguments.json, report)
     if arguments.pictures:
-        if not drawn:  # all were scored by an earlier run, which kept no pictures
-            add(seeds[0])
+        add(seeds[0])  # whoever was scored last
         write_bodies(arguments.pictures, drawn, [0, arguments.held_out] if arguments.poses else [0])
     return report
 

@@ -24,11 +24,10 @@ POSE_FEATURES = 9 * (len(JOINT_NAMES) - 1)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BodyCase:
-    """A body, and the one on whose vertices the Gaussians hang. as_weights_want: that is `gaussian_body` of it."""
+    """A body, and the one on whose vertices the Gaussians hang."""
 
     body: BodyModel
     carrier: BodyModel
-    as_weights_want: bool
 
 
 def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
@@ -37,14 +36,14 @@ def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
     Decimated bodies are there as they are and, where the weights want long edges split, with these split.
     """
     wanted = {"default": body, "SMPL-X format": smplx_body(body)}
-    cases = {name: BodyCase(model, gaussian_body(model, config), True) for name, model in wanted.items()}
+    cases = {name: BodyCase(model, gaussian_body(model, config)) for name, model in wanted.items()}
     for name, divisor in FRACTIONS.items():
         small = decimate(body, len(body.template) // divisor)
-        cases[name] = BodyCase(small, small, False)
+        cases[name] = BodyCase(small, small)
     if config.longest_edge is not None:
         for name in FRACTIONS:
             small = cases[name].body
-            cases[f"{name}, edges split"] = BodyCase(small, gaussian_body(small, config), True)
+            cases[f"{name}, edges split"] = BodyCase(small, gaussian_body(small, config))
     return cases
 
 

@@ -82,4 +82,5 @@ def settings_of(arguments: argparse.Namespace, digest: str, tokens: str, lpips: 
         "ring": RING,
         "generator": GENERATOR_VERSION,
         "lpips_net": arguments.lpips_net if lpips else None,
+        "lpips_weights": file_digest(arguments.lpips_backbone) if lpips else None,
     }

@@ -70,6 +70,7 @@ def kept_rows(path: Path | None, settings: dict[str, Any], cells: str) -> dict[i
     if not isinstance(report, dict):
         raise ValueError(f"{path}: expected the JSON of an earlier evaluation, or no file")
     if report.get("settings") != settings:
+        print(f"{path}: made with other settings (weights, people or sizes), so it is replaced")
         return {}
     return {person["seed"]: person[cells] for person in report["subjects"] + report["others"]}
 

@@ -1,10 +1,11 @@
-"""What matters when training: short runs that differ in one setting each, from the same start, compared on the same people.
+"""What matters: short runs from the same start that differ in little, compared on the same people.
 
     python experiments/train_pilots.py --bank runs/people.npz --people people --validation unseen --out runs/pilots
     python experiments/train_pilots.py ... --only "as it is" "rate 1e-3" --steps 150
 
-Every run is whole: its learning rate ends at 0. The table is written to docs/training.md, the numbers to OUT/pilots.json; runs
-that are in there are not repeated. About 5 CPU minutes a run of 150 steps.
+Of how the network is trained, from weights that know their way already (`--start`), or with `--fresh` of the network
+itself, from nothing. Every run is whole: its learning rate ends at 0. The table is written to docs/training.md, the numbers to
+OUT/pilots.json; runs that are in there are not repeated. About 3 CPU minutes a run of 60 steps.
 """
 
 import argparse
@@ -39,35 +40,23 @@ def main() -> None:
     run(arguments, parser)
 
 
-def variants(base, model):
-    """Name -> (configuration, settings of the live people)."""
+def training_variants(base):
+    """Name -> (configuration, settings of the live people): of how the network is trained, from weights."""
     replace = dataclasses.replace
+    model = base.model
     view = lambda **changes: replace(base, views=replace(base.views, **changes))
     loss = lambda **changes: replace(base, loss=replace(base.loss, **changes))
     rate = lambda x: replace(base, optimizer=replace(base.optimizer, learning_rate=x))
     k = lambda free: replace(base, model=replace(model, decoder=replace(model.decoder, free=free)))
-    bare = replace(base, model=replace(model, sampling=replace(model.sampling, shells=())))
-    published = replace(bare, model=replace(bare.model, decoder=replace(model.decoder, frame="canonical")))
-    body = lambda vertices, edge, free: replace(
-        base,
-        model=replace(model, body_vertices=vertices, longest_edge=edge, decoder=replace(model.decoder, free=free)),
-    )
+    counts = view(input_counts=(1, 2, 4, 4, 6))
     return {
         FIRST: (base, {}),
-        "no shells": (bare, {}),
-        "no shells, Gaussians in the canonical frame": (published, {}),
-        "edges to 2 cm, K = 2": (body(6000, 0.02, 1), {}),
+        "another seed": (replace(base, seed=1), {}),
         "rate 1e-3": (rate(1e-3), {}),
         "rate 2e-4": (rate(2e-4), {}),
         "2 subjects a step, half of the steps": (replace(base, batch_size=2, steps=base.steps // 2), {}),
         "2 targets": (view(target_count=2), {}),
-        "1, 2, 4, 4 or 6 inputs": (
-            replace(
-                view(input_counts=(1, 2, 4, 4, 6)),
-                model=replace(model, token_capacity=model.token_capacity * 7 // 5),
-            ),
-            {},
-        ),
+        "1, 2, 4, 4 or 6 inputs": (replace(counts, model=replace(model, token_capacity=TOKENS * 7 // 5)), {}),
         "squared error alone": (loss(structural=0.0), {}),
         "structural 0.5": (loss(structural=0.5), {}),
         "silhouette 0.5": (loss(silhouette=0.5), {}),
@@ -80,8 +69,23 @@ def variants(base, model):
     }
 
 
+def network_variants(base):
+    """Name -> (configuration, settings of the live people): of the network, from nothing."""
+    replace, model = dataclasses.replace, base.model
+    bare = replace(model, sampling=replace(model.sampling, shells=()))
+    fine = replace(model, body_vertices=6000, longest_edge=0.02, decoder=replace(model.decoder, free=1))
+    networks = {
+        FIRST: model,
+        "no shells": bare,
+        "no shells, Gaussians in the canonical frame": replace(bare, decoder=replace(model.decoder, frame="canonical")),
+        "edges to 2 cm, K = 2": fine,
+    }
+    return {name: (replace(base, model=network), {}) for name, network in networks.items()}
+
+
 def run(arguments, parser) -> None:
     """Make the runs that are missing, then write the table."""
+    from evaluation_results import file_digest
     from report_tables import write_json
 
     from humangs_jax.configuration import config_to_json
@@ -101,25 +105,38 @@ def run(arguments, parser) -> None:
         validate_every=arguments.steps,
         checkpoint_every=arguments.steps,
     )
-    if arguments.fresh:
-        variables = {"params": {}, "batch_stats": {}}
-    runs = variants(base, base.model)
-    if unknown := set(arguments.only or ()) - set(runs):
+    runs = network_variants(base) if arguments.fresh else training_variants(base)
+    names = arguments.only or list(runs)
+    if unknown := set(names) - set(runs):
         parser.error(f"--only {sorted(unknown)}: expected names of {', '.join(runs)}")
+    start = None if arguments.fresh else file_digest(arguments.start) if arguments.start else "shipped"
+    settings = {"steps": arguments.steps, "start": start, "bank": file_digest(arguments.bank)}
     path = arguments.out / "pilots.json"
-    for name in arguments.only or runs:
-        rows = json.loads(path.read_text()) if path.is_file() else {}
-        if name in rows:
+    if FIRST not in {*names, *kept(path, settings, parser)}:
+        parser.error(f"--only: the others are compared with {FIRST!r}, which is not in {path}")
+    for name in names:
+        if name in kept(path, settings, parser):
             continue
         config, live = runs[name]
-        row = pilot(arguments, config, live, variables, name.replace(" ", "_").replace(",", ""))
-        rows = json.loads(path.read_text()) if path.is_file() else {}  # another process may have added to it
-        rows[name] = row | {"steps": config.steps, "config": json.loads(config_to_json(config)), "live": live}
-        write_json(path, rows)
-    write_table(arguments.docs, json.loads(path.read_text()), f"{MARK}, fresh" if arguments.fresh else MARK)
+        started = None if arguments.fresh else (variables, model)
+        row = pilot(arguments, config, live, started, name.replace(" ", "_").replace(",", ""))
+        row |= {"steps": config.steps, "config": json.loads(config_to_json(config)), "live": live}
+        rows = kept(path, settings, parser) | {name: row}  # another process may have added to it
+        write_json(path, {"settings": settings, "runs": rows})
+    write_table(arguments.docs, kept(path, settings, parser), f"{MARK}, fresh" if arguments.fresh else MARK)
 
 
-def pilot(arguments, config, live, variables, name) -> dict:
+def kept(path, settings, parser):
+    """The runs in a file, none if there is no file; ends with a message if they had other settings."""
+    if not path.is_file():
+        return {}
+    report = json.loads(path.read_text())
+    if report["settings"] != settings:
+        parser.error(f"{path} has runs of other settings, {report['settings']}: give another --out")
+    return report["runs"]
+
+
+def pilot(arguments, config, live, started, name) -> dict:
     """One run: scores on the validation people with 4 inputs and 6 targets each, and CPU seconds."""
     import jax
 
@@ -138,8 +155,10 @@ def pilot(arguments, config, live, variables, name) -> dict:
         captured_people(find_captures(arguments.people), body),
         live_people(load_bank(arguments.bank), LiveConfig(**live)),
     ]
-    started = fit_variables(variables, config.model)
-    state = train(config, body, mixed_people(people, [1, 1]), arguments.out / name, variables=started, progress=False)
+    variables = None if started is None else fit_variables(*started, config.model)
+    state = train(config, body, mixed_people(people, [1, 1]), arguments.out / name, variables=variables, progress=False)
+    if int(state.step) < config.steps:
+        raise SystemExit(f"interrupted at step {int(state.step)} of {name!r}; the same command goes on there")
     seconds = time.process_time() - begin
     # compared alike, whatever the run saw
     views = dataclasses.replace(config.views, input_counts=(4,), target_count=6)

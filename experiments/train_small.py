@@ -30,7 +30,7 @@ def main(
     validation: Path | None = None,
     subjects: int = 64,
     live: int = 320,
-    init_weights: Path | Literal["shipped"] | None = None,
+    init_weights: Literal["shipped"] | Path | None = None,  # the word first: tyro takes the first type that fits
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = SMALL,
 ) -> None:
     """Train on synthetic people, written and live ones by halves.
@@ -41,8 +41,8 @@ def main(
         validation: folder of captures of other people, looked at now and then; made in out/validation if not given.
         subjects: how many people to write; 0 for live ones alone.
         live: how many live people; kept in out/people.npz. 0 for written ones alone.
-        init_weights: start from these weights instead of fresh ones, as far as their network is the one of `config`;
-            "shipped": the package's own.
+        init_weights: start from these weights instead of fresh ones, see `fit_variables` for how much their network may
+            differ from that of `config`; "shipped": the package's own.
         config: the run.
     """
     import logging
@@ -57,8 +57,8 @@ def main(
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     body, variables = load_body(), None
     if init_weights is not None:
-        variables, _ = load_weights(None if init_weights == "shipped" else init_weights)
-        variables = fit_variables(variables, config.model)
+        variables, model = load_weights(None if init_weights == "shipped" else init_weights)
+        variables = fit_variables(variables, model, config.model)
     if people is None and subjects:
         people = out / "people"
         synthesize(people, subjects, SPLITS["train"].start)

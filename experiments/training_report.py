@@ -133,7 +133,7 @@ def draw_progress(sheets: Path, steps: Sequence[int], config: dict[str, Any], pa
     import numpy as np
 
     pictures = [read_picture(sheets, step) for step in steps]
-    inputs = config["views"]["input_counts"][0]
+    inputs = validated_count(config)
     targets = config["views"]["target_count"]
     side = pictures[0].shape[1] // (inputs + 2 * targets)
     column = lambda picture, i: picture[:, i * side : (i + 1) * side]
@@ -149,6 +149,12 @@ def draw_progress(sheets: Path, steps: Sequence[int], config: dict[str, Any], pa
     figure.tight_layout(pad=0.2)
     figure.savefig(path, dpi=130, pil_kwargs={"quality": 85})
     plt.close(figure)
+
+
+def validated_count(config: dict[str, Any]) -> int:
+    """Photos of a validation, see `validation.validation_examples`."""
+    counts = sorted(config["views"]["input_counts"])
+    return counts[len(counts) // 2]
 
 
 def draw_sheet(sheets: Path, step: int, path: Path) -> None:
@@ -174,6 +180,7 @@ def page_text(
 ) -> str:
     """The page in Markdown. pictures: links by the end of their names."""
     views, optimizer, size = config["views"], config["optimizer"], config["model"]["image_size"]
+    counts = " or ".join(str(count) for count in sorted(set(views["input_counts"])))
     other = ("structural_scales", "random_background")
     terms = [f"{value:g} {name}" for name, value in config["loss"].items() if value and name not in other]
     parts = [
@@ -183,7 +190,7 @@ def page_text(
         paragraph(
             f"The preset `{facts['config']}` from fresh weights: {facts['people']} synthetic people to learn from, {POSES} poses",
             f"x {VIEWS} views each, and {facts['validation']} of the validation seeds to look at. A step takes",
-            f"{config['batch_size']} of them: {views['input_counts'][0]} photos of {size} pixels go in, {views['target_count']}",
+            f"{config['batch_size']} of them: {counts} photos of {size} pixels go in, {views['target_count']}",
             f"other views of {config['target_size']} pixels are compared. Loss: {' + '.join(terms)}. Peak learning rate",
             f"{optimizer['learning_rate']:g} after {optimizer['warmup_steps']} steps of warm-up, then a cosine to",
             f"0{average_text(config)}. So short a run shows that training works and what it costs; the shipped weights had a",

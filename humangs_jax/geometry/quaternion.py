@@ -13,7 +13,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 SMALL_ANGLE_SQUARED = 1e-4
 """Below this the Taylor series of sin(t)/t and (1-cos t)/t^2, cut after t^4, are exact to float32 rounding (t^6/5040 < 2e-16)."""
 
-OPPOSITE = 1e-6
+OPPOSITE = 1e-12
 """Unit vectors whose product is less than this above -1 count as opposite: their cross product is rounding."""
 
 
@@ -39,7 +39,7 @@ def multiply(p: Float[Array, "*#b 4"], q: Float[Array, "*#b 4"]) -> Float[Array,
 
 def between(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"]) -> Float[Array, "*b 4"]:
     """The shortest rotation from one unit vector to another; half a turn across `a` where they are opposite."""
-    real = 1 + jnp.sum(a * b, axis=-1, keepdims=True)
+    real = jnp.sum(jnp.square(a + b), axis=-1, keepdims=True) / 2  # 1 + a.b without cancellation
     across = jnp.cross(a, jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(a), axis=-1)])
     opposite = real < OPPOSITE
     imaginary = jnp.where(opposite, across, jnp.cross(a, b))

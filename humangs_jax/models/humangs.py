@@ -64,7 +64,8 @@ class HumanGSConfig:
 
     image_size: side of the photographs, pixels (recorded: the network takes any multiple of the patch size).
     patch_size: side of a token's patch, pixels. tokens: "all" patches, or those that the "foreground" touches, packed
-    into `token_capacity` slots over all views, 0 for room for all patches. position_map, skinning, rendering: how the
+    into `token_capacity` slots over all views (in training: over the most that a step may show, see
+    `training.forward.token_share`), 0 for room for all patches. position_map, skinning, rendering: how the
     position map that comes in was shaded, and how the Gaussians are to be skinned and drawn (recorded). body_vertices,
     longest_edge: vertex count to decimate bodies to, and metres to split their edges to afterwards, None for neither
     (recorded). ray_origins: the release divides camera centres by s and the ray origins taken from them once more, so
@@ -342,7 +343,10 @@ def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -
 def sample_vertices(
     variables: Variables, encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig
 ) -> VertexFeatures:
-    """Feature maps (and photographs, if configured) at the projections of the posed vertices, pooled over views."""
+    """Feature maps (and photographs, if configured) at the projections of the posed vertices, pooled over views.
+
+    Raises: ValueError if the configuration needs normals that the inputs lack.
+    """
     sampling = config.sampling
     if config.decoder.frame == "normal" and inputs.canonical_normals is None:
         raise ValueError('decoder.frame "normal" needs canonical_normals of the inputs, see `prepare_inputs`')
@@ -461,7 +465,7 @@ def apply_humangs(
 
     train: normalise by this subject's statistics and return updated running ones. Under a vmap over subjects give the
     vmap's `axis_name` to share the statistics over the batch; without it each subject has its own, to be averaged.
-    Raises: see `encode`.
+    Raises: see `encode` and `sample_vertices`.
     """
     encoding, batch_stats = encode_with_statistics(variables, inputs, config, train, axis_name)
     features = sample_vertices(variables, encoding, inputs, config)

@@ -48,7 +48,7 @@ def small() -> HumanGSConfig:
             tight=1,
             free=2,
             offset_scale=0.25,
-            initial_log_scale=-4.6,
+            initial_log_scale=-4.8,
             frame="normal",
             residual_color=True,
         ),

@@ -31,7 +31,7 @@ WEIGHT_EPSILON = 1e-9
 THINNER = 1.2
 """Less in the bias of the scale along the normal: a third of the thickness, so that outlines are sharp."""
 OBLIQUE = (0.36, 0.48, 0.8)
-"""No axis of a body: where its normals are opposite, in few places, the frames turn quickly from vertex to vertex."""
+"""A unit vector, no axis of a body: where normals are opposite, in few places, frames turn quickly between vertices."""
 SHELL_WIDTH = 6
 """Numbers that enter per shell: colour, seen, inside, hull."""
 INITIAL_SHELL = 4.0
@@ -43,10 +43,10 @@ class VertexDecoderConfig:
     """hidden: width. tight, free: Gaussians per vertex of the two kinds, K = tight + free.
 
     skinning_joints: joints of the head that corrects skinning weights, None without it. offset_scale: offsets are
-    bounded to it by tanh (normalised units), None leaves them unbounded as published. initial_log_scale: initial bias
-    of the scales, before the softplus. frame: axes of offsets and rotations, "canonical" those of the canonical body
-    (published), "normal" ones whose z is the vertex's normal, along which Gaussians start `THINNER`. residual_color:
-    colours are predicted relative to the photo colour.
+    bounded to it by tanh (normalised units; what shells add is not), None leaves them unbounded as published.
+    initial_log_scale: initial bias of the scales, before the softplus. frame: axes of offsets and rotations, "canonical"
+    those of the canonical body (published), "normal" ones whose z is the vertex's normal, along which Gaussians start
+    `THINNER`. residual_color: colours are predicted relative to the photo colour.
     """
 
     hidden: int = 256
@@ -118,7 +118,8 @@ def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
 
 
 def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> Float[Array, "n c"]:
-    """Local feature, global token, positional encoding, photo colour as 2 rgb - 1, visible fraction, shells, as
+    """Local feature, global token, positional encoding, photo colour as 2 rgb - 1, visible fraction, normal,
+    shells, as
     configured.
     """
     vertices = canonical.shape[0]
@@ -138,7 +139,7 @@ def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> F
 
 def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
     """Rotations that take z to each normal, smooth in the normal but for the direction opposite to `OBLIQUE`."""
-    oblique = jnp.asarray(OBLIQUE, normals.dtype) / float(np.linalg.norm(OBLIQUE))
+    oblique = jnp.asarray(OBLIQUE, normals.dtype)
     upright = quaternion.between(jnp.asarray([0.0, 0.0, 1.0], normals.dtype), oblique)
     return quaternion.multiply(quaternion.between(oblique, normals), upright)
 

@@ -20,6 +20,7 @@ from humangs_jax.models.humangs import HumanGSConfig, Variables, init_humangs
 FORMAT = "humangs-weights"
 VERSION = "1"
 SHIPPED = "assets/weights.safetensors"
+HEADS = "params/decoder/"
 
 
 def expected_variables(config: HumanGSConfig) -> Variables:
@@ -92,24 +93,40 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
     return variables_from_tensors(tensors, config, str(path)), config
 
 
-def fit_variables(variables: Variables, config: HumanGSConfig) -> Variables:
-    """Variables for a network that differs a little, to train on: tensors keep what both networks have of them.
+def fit_variables(variables: Variables, old: HumanGSConfig, new: HumanGSConfig) -> Variables:
+    """Variables of the network `old` for the network `new`, to train on.
 
-    Along an axis that is longer now, or of tensors that are new, the rest is as initialised, but new inputs of a layer start
-    unheard (0).
+    `new` may have shells where `old` has none, another number of free Gaussians and other settings without tensors. What is
+    new starts as initialised, but unheard where it enters a layer (0). With another `decoder.frame` offsets and rotations
+    start anew: theirs are of other axes. Raises: ValueError naming the tensor, or the shells, if more differs.
     """
-    old = flatten_variables(variables)
+    if old.sampling.shells not in ((), new.sampling.shells):
+        raise ValueError(f"shells {old.sampling.shells}: those of trained weights cannot become {new.sampling.shells}")
+    ours = flatten_variables(variables)
+    fresh = flatten_variables(init_humangs(jax.random.key(0), new))
+    anew = {f"{HEADS}shells_{name}/{kind}" for name in ("hidden", "out") for kind in ("kernel", "bias")} - set(ours)
+    if unknown := sorted((set(ours) - set(fresh)) | (set(fresh) - set(ours) - anew)):
+        raise ValueError(f"tensor {unknown[0]!r} is in one of the two networks alone")
+    if old.decoder.frame != new.decoder.frame:
+        anew |= {key for key in ours if key.startswith(f"{HEADS}geometry_out")}
 
-    def fit(path, new):
-        key = "/".join(str(entry.key) for entry in path)
-        if key not in old:
-            return new
-        kept = tuple(slice(min(sizes)) for sizes in zip(new.shape, old[key].shape, strict=True))
-        if new.ndim == 2 and new.shape[0] > old[key].shape[0]:  # a layer's kernel: (inputs, outputs)
-            new = new.at[old[key].shape[0] :].set(0)
-        return new.at[kept].set(old[key][kept])
+    def fit(key, leaf):
+        if key in anew:
+            return leaf
+        if key == f"{HEADS}trunk_0/kernel" and old.decoder_width <= new.decoder_width:
+            rows = len(ours[key])  # shells and normals enter last
+            leaf = leaf.at[rows:].set(0).at[:rows].set(ours[key])
+        elif key.startswith(HEADS) and key.split("/")[-2].endswith("_out"):
+            both = min(leaf.shape[-1], ours[key].shape[-1])  # Gaussians come one after the other
+            leaf = leaf.at[..., :both].set(ours[key][..., :both])
+        elif leaf.shape != ours[key].shape:
+            raise ValueError(f"tensor {key!r} has shape {ours[key].shape}, the other network wants {leaf.shape}")
+        else:
+            leaf = ours[key]
+        return leaf
 
-    return jax.tree_util.tree_map_with_path(fit, init_humangs(jax.random.key(0), config))
+    structure = jax.tree.structure(expected_variables(new))
+    return jax.tree.unflatten(structure, [fit(key, leaf) for key, leaf in fresh.items()])
 
 
 def variables_from_tensors(tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str) -> Variables:

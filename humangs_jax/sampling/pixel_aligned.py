@@ -4,6 +4,8 @@ Lengths are normalised units throughout (see `models.humangs`): cameras, vertice
 """
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -33,7 +35,7 @@ class PixelAlignedConfig:
     convention: "half_pixel" is correct, "mixed" is the published one (see `sampling.bilinear`).
     sample_rgb: also read the photo colour at each vertex, averaged over the views that see it, and their fraction.
     vertex_capacity: vertices that a view is read for at most, None for all: views cost nothing where they see nothing.
-    shells: distances along the vertex normals, normalised units, at which the photographs are looked up too, see
+    shells: ascending distances along the vertex normals, normalised units, at which the photographs are looked up too, see
     `sampling.shells`; none: that is left out.
     """
 
@@ -42,6 +44,12 @@ class PixelAlignedConfig:
     sample_rgb: bool = False
     vertex_capacity: int | None = None
     shells: tuple[float, ...] = ()
+
+    def __post_init__(self):
+        """Raises ValueError for distances that are no ascending list."""
+        ascending = all(a < b for a, b in itertools.pairwise(self.shells))
+        if not (ascending and all(0 <= x < math.inf for x in self.shells)):
+            raise ValueError(f"shells {self.shells}: expected ascending distances, finite and at least 0")
 
 
 def project_vertices(camera: Camera, vertices: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:

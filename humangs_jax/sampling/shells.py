@@ -1,7 +1,7 @@
 """Points off the body's surface, looked up in all photographs: where loose clothes and hair are, and their colour.
 
-Each vertex has one point at every distance of a list along its posed normal. A point that some photograph shows in front
-of the background alone belongs to nobody; those that all photographs show before the person are in the visual hull
+Each vertex has one point at every distance of a list along its posed normal. A point that some photograph shows before
+the background alone belongs to nobody; those that all photographs show before the person are in the visual hull
 (Laurentini 1994). Lengths are normalised units, as in `pixel_aligned`.
 """
 
@@ -16,6 +16,8 @@ from humangs_jax.sampling.pixel_aligned import DEPTH_TOLERANCE, UNSEEN_COLOR, pr
 
 WEIGHT_EPSILON = 1e-6
 """Views count by how much the surface faces them; a point with less than this in all is unseen."""
+SQUARED_DISTANCE_EPSILON = 1e-6
+"""Least squared distance between a camera and a point."""
 
 
 @pytree_dataclass
@@ -48,7 +50,8 @@ def sample_shells(
 ) -> Shells:
     """Look the points at `distances` from the posed vertices up in every view that is `present`.
 
-    depth_maps: rasterized z of the body, -1 on background. cameras, vertices: normalised units.
+    images: in [0, 1]. foreground: pixels of the person or the body. depth_maps: rasterized z of the body, -1 on background.
+    cameras, vertices: normalised units. normals: unit, of the posed body. distances: ascending, normalised units.
     """
     steps = jnp.asarray(distances, vertices.dtype)
     count = vertices.shape[1]
@@ -58,19 +61,20 @@ def sample_shells(
         points = (vertices[:, None] + steps[:, None] * normals[:, None]).reshape(-1, 3)
         pixels, depths = project_vertices(camera, points)
         indices = texel_indices(pixels, size, size, convention)
-        read = sample_bilinear(jnp.concatenate([image, mask[..., None].astype(image.dtype)], axis=-1), indices)
+        mask = mask[..., None].astype(image.dtype)  # the background's colour is nobody's
+        read = sample_bilinear(jnp.concatenate([image * mask, mask], axis=-1), indices)
         surface = sample_nearest(depth_map, indices)
         framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (depths > 0)
         visible = framed & ((surface < 0) | (depths < surface + DEPTH_TOLERANCE))
         towards = camera.center - points
-        distance = jnp.sqrt(jnp.maximum(jnp.sum(towards**2, axis=-1), WEIGHT_EPSILON))
+        distance = jnp.sqrt(jnp.maximum(jnp.sum(towards**2, axis=-1), SQUARED_DISTANCE_EPSILON))
         facing = jnp.sum(towards * jnp.repeat(normals, len(distances), axis=0), axis=-1) / distance
-        weight = jnp.where(visible, jnp.maximum(facing, 0), 0) * read[:, 3]  # the background's colour is nobody's
+        weight = jnp.where(visible, jnp.maximum(facing, 0), 0)
         return read[:, :3], read[:, 3], weight, framed
 
     colors, masks, weights, framed = jax.vmap(view)(images, foreground, depth_maps, cameras, vertices, normals)
     framed, weights = framed & present[:, None], weights * present[:, None]
-    total = jnp.sum(weights, axis=0)
+    total = jnp.sum(weights * masks, axis=0)
     mean = jnp.einsum("vpc,vp->pc", colors, weights) / jnp.maximum(total, WEIGHT_EPSILON)[:, None]
     known = jnp.sum(framed, axis=0)
     inside = jnp.where(known > 0, jnp.sum(masks * framed, axis=0) / jnp.maximum(known, 1), 1)

@@ -124,7 +124,7 @@ def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
     fresh = run(variables, inputs, plain)[1].gaussians
     unit, k = subject_unit(inputs.canonical_vertices), plain.decoder.gaussians_per_vertex
     assert np.abs(fresh.means - jnp.repeat(inputs.canonical_vertices, k, axis=0)).max() < 0.02
-    assert np.allclose(fresh.scales, 0.01 * unit, rtol=0.1)  # softplus(-4.6) = 1.0 cm
+    assert np.allclose(fresh.scales, 0.0082 * unit, rtol=0.1)  # softplus(-4.8) = 8.2 mm
     assert np.allclose(fresh.opacities, jax.nn.sigmoid(-1.0), atol=0.01) and np.allclose(fresh.colors, 0.7, atol=0.01)
     assert np.allclose(jnp.abs(fresh.quats[:, 0]), 1, atol=0.01)
 

@@ -115,19 +115,52 @@ def test_configurations_survive_json(name):
     assert config_from_json(type(config), "{}") == type(config)()
 
 
-def test_a_network_that_grows_shows_the_same_until_it_learns():
-    """Shells and a Gaussian more per vertex: what the smaller network made of the photographs is still there."""
-    small = dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, shells=()))
-    variables = random_variables(small, 3)
-    grown = dataclasses.replace(TINY, decoder=dataclasses.replace(TINY.decoder, free=TINY.decoder.free + 1))
-    inputs = random_inputs()
-    before, _ = apply_humangs(variables, inputs, small)
-    after, _ = apply_humangs(fit_variables(variables, grown), inputs, grown)
-    k, more = small.decoder.gaussians_per_vertex, grown.decoder.gaussians_per_vertex
-    own = np.asarray(after.gaussians.opacities).reshape(-1, more)[:, :k]
-    assert np.allclose(own, np.asarray(before.gaussians.opacities).reshape(-1, k), atol=1e-6)
+def grown(**decoder):
+    """TINY without shells and in the canonical frame, and a network with shells and another number of Gaussians."""
+    plain = dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, shells=()))
+    plain = dataclasses.replace(plain, decoder=dataclasses.replace(plain.decoder, frame="canonical"))
+    return plain, dataclasses.replace(TINY, decoder=dataclasses.replace(TINY.decoder, **decoder))
+
+
+@pytest.mark.parametrize("more", [-1, 0, 2])
+def test_a_network_that_grows_keeps_the_opacities_and_colours_it_has_learnt(more):
+    old, new = grown(free=TINY.decoder.free + more)
+    variables, inputs = random_variables(old, 3), random_inputs()
+    before, _ = apply_humangs(variables, inputs, old)
+    after, _ = apply_humangs(fit_variables(variables, old, new), inputs, new)
+    per_vertex = lambda outputs, config: np.asarray(outputs.gaussians.opacities).reshape(
+        -1, config.decoder.gaussians_per_vertex
+    )
+    a, b = per_vertex(before, old), per_vertex(after, new)
+    both = min(a.shape[1], b.shape[1])
+    assert np.allclose(a[:, :both], b[:, :both], atol=1e-6)
+
+
+def test_geometry_starts_anew_in_another_frame_alone():
+    old, new = grown()
+    variables = random_variables(old, 3)
+    geometry = lambda tree: np.asarray(tree["params"]["decoder"]["geometry_out"]["kernel"])
+    assert np.abs(geometry(fit_variables(variables, old, new))).max() < 0.01 < np.abs(geometry(variables)).max()
+    frame = dataclasses.replace(old, decoder=dataclasses.replace(old.decoder, frame="normal"))
+    assert np.array_equal(
+        geometry(fit_variables(random_variables(frame), frame, new)), geometry(random_variables(frame))
+    )
 
 
 def test_fitting_to_the_same_network_changes_nothing():
-    same = fit_variables(VARIABLES, TINY)
+    same = fit_variables(VARIABLES, TINY, TINY)
     assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (same, VARIABLES)), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sampling": dataclasses.replace(TINY.sampling, shells=(0.0, 0.2))}, "shells"),
+        ({"decoder": dataclasses.replace(TINY.decoder, hidden=24)}, "trunk_0"),
+        ({"transformer": dataclasses.replace(TINY.transformer, layers=6)}, "block_4"),
+        ({"texture": dataclasses.replace(TINY.texture, resolution=4)}, "texture"),
+    ],
+)
+def test_networks_that_differ_more_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        fit_variables(VARIABLES, TINY, dataclasses.replace(TINY, **changes))
