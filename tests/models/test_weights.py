@@ -156,7 +156,7 @@ def test_fitting_to_the_same_network_changes_nothing():
     ("changes", "message"),
     [
         ({"sampling": dataclasses.replace(TINY.sampling, shells=(0.0, 0.2))}, "shells"),
-        ({"decoder": dataclasses.replace(TINY.decoder, hidden=24)}, "trunk_0"),
+        ({"decoder": dataclasses.replace(TINY.decoder, hidden=24)}, "decoder/"),
         ({"transformer": dataclasses.replace(TINY.transformer, layers=6)}, "block_4"),
         ({"texture": dataclasses.replace(TINY.texture, resolution=4)}, "texture"),
     ],
