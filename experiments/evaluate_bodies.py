@@ -25,7 +25,7 @@ from typing import Any
 from evaluation_options import COUNTS, add_people_options, check_people_options, load_lpips, load_network, settings_of
 from evaluation_results import TASKS, Row, cell, finished, kept_rows, mean_scores
 from evaluation_tables import SHOWN, TASK_NAMES, about, printed_table
-from report_tables import markdown_table, write_json, write_section
+from report_tables import around_section, markdown_table, write_json, write_section
 
 PAINTED = "painted default body"
 """Cell of a row that holds the scores of the baseline."""
@@ -43,6 +43,8 @@ def main() -> None:
     check_people_options(parser, arguments)
     lpips = load_lpips(parser, arguments)
     try:
+        if arguments.docs:
+            around_section(arguments.docs, "bodies")
         report = evaluate(arguments, lpips)
     except (ValueError, OSError) as error:
         parser.error(str(error))

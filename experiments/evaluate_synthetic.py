@@ -30,7 +30,7 @@ from typing import Any
 from evaluation_options import COUNTS, add_people_options, check_people_options, load_lpips, load_network, settings_of
 from evaluation_results import COLUMNS, extremes, headline, kept_rows, table_row, views_report
 from evaluation_tables import printed_table, views_section
-from report_tables import write_json, write_section
+from report_tables import around_section, write_json, write_section
 
 
 def main() -> None:
@@ -47,6 +47,8 @@ def main() -> None:
     arguments.views = sorted(set(arguments.views))
     lpips = load_lpips(parser, arguments)
     try:
+        if arguments.docs:
+            around_section(arguments.docs, "views")
         report = evaluate(arguments, lpips)
     except (ValueError, OSError) as error:
         parser.error(str(error))

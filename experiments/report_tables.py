@@ -28,11 +28,20 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]]) -> s
 def write_section(page: Path, name: str, text: str) -> None:
     """Replaces what stands in a Markdown page between `<!-- name -->` and `<!-- end name -->`.
 
-    Raises: ValueError if the page lacks the markers.
+    Raises: see `around_section`.
+    """
+    before, after = around_section(page, name)
+    write_text(page, f"{before}\n{text.strip()}\n{after}")
+
+
+def around_section(page: Path, name: str) -> tuple[str, str]:
+    """What stands before and after a section, with its markers: for long work to ask before it begins, too.
+
+    Raises: FileNotFoundError; ValueError if the page lacks the markers.
     """
     first, last = f"<!-- {name} -->", f"<!-- end {name} -->"
     old = page.read_text()
     if old.count(first) != 1 or old.count(last) != 1:
         raise ValueError(f"{page}: needs the markers {first} and {last} once each")
     before, rest = old.split(first)
-    write_text(page, f"{before}{first}\n{text.strip()}\n{last}{rest.split(last)[1]}")
+    return before + first, last + rest.split(last)[1]

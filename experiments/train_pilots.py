@@ -86,7 +86,7 @@ def network_variants(base):
 def run(arguments, parser) -> None:
     """Make the runs that are missing, then write the table."""
     from evaluation_results import file_digest
-    from report_tables import write_json
+    from report_tables import around_section, write_json
 
     from humangs_jax.configuration import config_to_json
     from humangs_jax.models.weights import load_weights
@@ -111,7 +111,11 @@ def run(arguments, parser) -> None:
         parser.error(f"--only {sorted(unknown)}: expected names of {', '.join(runs)}")
     start = None if arguments.fresh else file_digest(arguments.start) if arguments.start else "shipped"
     settings = {"steps": arguments.steps, "start": start, "bank": file_digest(arguments.bank)}
-    path = arguments.out / "pilots.json"
+    path, mark = arguments.out / "pilots.json", f"{MARK}, fresh" if arguments.fresh else MARK
+    try:
+        around_section(arguments.docs, mark)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
     if FIRST not in {*names, *kept(path, settings, parser)}:
         parser.error(f"--only: the others are compared with {FIRST!r}, which is not in {path}")
     for name in names:
@@ -123,7 +127,7 @@ def run(arguments, parser) -> None:
         row |= {"steps": config.steps, "config": json.loads(config_to_json(config)), "live": live}
         rows = kept(path, settings, parser) | {name: row}  # another process may have added to it
         write_json(path, {"settings": settings, "runs": rows})
-    write_table(arguments.docs, kept(path, settings, parser), f"{MARK}, fresh" if arguments.fresh else MARK)
+    write_table(arguments.docs, kept(path, settings, parser), mark)
 
 
 def kept(path, settings, parser):
