@@ -118,9 +118,8 @@ def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
 
 
 def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> Float[Array, "n c"]:
-    """Local feature, global token, positional encoding, photo colour as 2 rgb - 1, visible fraction, normal,
-    shells, as
-    configured.
+    """What is configured of: local feature, global token, encoded position, photo colour as 2 rgb - 1, visible fraction,
+    normal, shells; in this order.
     """
     vertices = canonical.shape[0]
     parts = [features.local]

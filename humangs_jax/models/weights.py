@@ -98,8 +98,12 @@ def fit_variables(variables: Variables, old: HumanGSConfig, new: HumanGSConfig) 
 
     `new` may have shells where `old` has none, another number of free Gaussians and other settings without tensors. What is
     new starts as initialised, but unheard where it enters a layer (0). With another `decoder.frame` offsets and rotations
-    start anew: theirs are of other axes. Raises: ValueError naming the tensor, or the shells, if more differs.
+    start anew: theirs are of other axes. Raises: ValueError naming the setting or the tensor if more differs.
     """
+    for part, name in (("sampling", "sample_rgb"), ("decoder", "tight")):  # either shifts what tensors hold
+        was, wanted = (getattr(getattr(config, part), name) for config in (old, new))
+        if was != wanted:
+            raise ValueError(f"{part}.{name} {was}: that of trained weights cannot become {wanted}")
     if old.sampling.shells not in ((), new.sampling.shells):
         raise ValueError(f"shells {old.sampling.shells}: those of trained weights cannot become {new.sampling.shells}")
     ours = flatten_variables(variables)

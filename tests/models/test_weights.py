@@ -14,6 +14,7 @@ from humangs_jax.models.humangs import apply_humangs
 from humangs_jax.models.weights import fit_variables, load_weights, save_weights
 
 VARIABLES = random_variables(TINY)
+NO_RGB = dataclasses.replace(TINY.sampling, sample_rgb=False)
 TEXTURE = "params/encoder/tokenizer/texture"
 
 
@@ -156,6 +157,8 @@ def test_fitting_to_the_same_network_changes_nothing():
     ("changes", "message"),
     [
         ({"sampling": dataclasses.replace(TINY.sampling, shells=(0.0, 0.2))}, "shells"),
+        ({"decoder": dataclasses.replace(TINY.decoder, tight=2)}, "decoder.tight 1"),
+        ({"decoder": dataclasses.replace(TINY.decoder, residual_color=False), "sampling": NO_RGB}, "sample_rgb True"),
         ({"decoder": dataclasses.replace(TINY.decoder, hidden=24)}, "decoder/"),
         ({"transformer": dataclasses.replace(TINY.transformer, layers=6)}, "block_4"),
         ({"texture": dataclasses.replace(TINY.texture, resolution=4)}, "texture"),
