@@ -12,17 +12,21 @@ ATOL = 5e-6  # float32, chains of 4 joints, lengths of about 1
 joint_transforms = jax.jit(skinning.joint_transforms, static_argnums=1)
 
 
-def test_levels_hold_every_joint_once_and_parents_first():
-    levels = skinning.joint_levels(PARENTS)
-    assert sorted(int(j) for level in levels for j in level) == list(range(len(PARENTS)))
-    depth = {int(j): i for i, level in enumerate(levels) for j in level}
-    assert all(depth[j] == depth[p] + 1 for j, p in enumerate(PARENTS) if p >= 0)
+def test_ancestors_are_one_two_four_joints_up_and_end_beyond_the_root():
+    count = len(PARENTS)
+    above = lambda j, steps: (
+        j if j == count or not steps else above(PARENTS[j] if PARENTS[j] >= 0 else count, steps - 1)
+    )
+    rounds = skinning.ancestors(PARENTS)
+    for i, up in enumerate(rounds):
+        assert list(up) == [above(j, 2**i) for j in range(count)]
+    assert all(above(j, 2 ** len(rounds)) == count for j in range(count))
 
 
-@pytest.mark.parametrize("parents", [(0, 0), (-1, -1), (-1, 2, 1), (-1, 7), (1, 2, 0)])
+@pytest.mark.parametrize("parents", [(0, 0), (-1, -1), (-1, 2, 1), (-1, 7), (-1, -2), (1, 2, 0)])
 def test_what_is_no_tree_is_refused(parents):
     with pytest.raises(ValueError, match="root"):
-        skinning.joint_levels(parents)
+        skinning.ancestors(parents)
 
 
 @pytest.mark.parametrize("seed", range(3))
