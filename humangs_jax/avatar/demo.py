@@ -23,8 +23,9 @@ from humangs_jax.avatar.frames import capture_renderings, motion_frames, write_r
 from humangs_jax.avatar.pictures import contact_sheet, side_by_side
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.video import write_video
-from humangs_jax.data.capture import DEMO_CAPTURE, load_capture
+from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
+from humangs_jax.data.photographs import DEMO_CAPTURE
 from humangs_jax.models.weights import load_weights
 
 VERSIONS = ("humangs_jax", "jax", "jaxlib", "flax", "numpy")

@@ -14,7 +14,6 @@ import os
 import shutil
 import uuid
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -39,18 +38,13 @@ from humangs_jax.data.capture_reading import (
     DEFAULT_BODY,
     FORMAT,
     VERSION,
-    names_from_paths,
     on_white_background,
     read_description,
     read_parameters,
-    read_view,
-    view_frame,
 )
 from humangs_jax.data.images import write_png
+from humangs_jax.data.photographs import Photographs, capture_folder, read_photographs
 from humangs_jax.geometry.camera import Camera, stack_cameras
-
-DEMO_CAPTURE = "demo_capture"
-"""Name of the capture of a synthetic person that comes with the package."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -158,7 +152,8 @@ def capture_from_arrays(
         raise CaptureError(source, "background", f"expected one of {', '.join(BACKGROUNDS)}, got {background!r}")
     if masks is not None and background == "photo":
         images = on_white_background(images, masks)
-    return _assemble(images, masks, cameras, frames, body, betas, rotations, translations, names, body_file)
+    photographs = Photographs(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names)
+    return _assemble(photographs, body, betas, rotations, translations, body_file)
 
 
 def load_capture(
@@ -174,53 +169,17 @@ def load_capture(
 
     Raises: CaptureError, one line naming file and field.
     """
-    chosen = views
-    folder = Path(path)
-    if not folder.exists() and folder.parts[:1] == (DEMO_CAPTURE,):
-        folder = Path(str(resources.files("humangs_jax"))) / "assets" / folder
-    file = folder / "capture.json"
-    description = read_description(file)
+    folder = capture_folder(path)
+    description = read_description(folder / "capture.json")
     parameter_file = folder / description["body"]
     body_file, betas, rotations, translations = read_parameters(parameter_file)
     if body is None:
         body = _load_model(parameter_file, body_file, folder)
     betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
-
-    views = description["views"]
-    if chosen is not None:
-        views = [views[i] for i in chosen]
-    with_mask = ["mask" in view for view in views]
-    if any(with_mask) and not all(with_mask):
-        raise CaptureError(
-            file, f"views[{with_mask.index(False)}].mask", "missing, but other views have one: give all or none"
-        )
-    frames = [view_frame(view, len(rotations), file, f"views[{i}].frame") for i, view in enumerate(views)]
-    matrices = [
-        [
-            numbers(view[key], file, f"views[{i}].{key}", shape)
-            for key, shape in (("K", (3, 3)), ("cam_from_world", (4, 4)))
-        ]
-        for i, view in enumerate(views)
-    ]
-    on_white = description.get("background", "photo") == "white"
-    images, masks = zip(*[read_view(folder, view, on_white) for view in views], strict=True)
-    height, width = images[0].shape[:2]
-    for view, image, mask in zip(views, images, masks, strict=True):
-        if image.shape != images[0].shape:
-            size = f"{image.shape[1]} x {image.shape[0]}"
-            raise CaptureError(
-                folder / view["image"], "size", f"{size}, but the first view has {width} x {height}: expected one size"
-            )
-        if (mask is None) != (masks[0] is None):
-            raise CaptureError(folder / view["image"], "alpha", "expected an alpha channel in all images or in none")
-    cameras = [checked_camera(*matrices[i], width, height, file, f"views[{i}]") for i in range(len(views))]
-    stacked_masks = None if masks[0] is None else np.stack(masks)
-    names = names_from_paths([view["image"] for view in views])
+    photographs = read_photographs(folder, description, views, len(rotations))
     if body_file != DEFAULT_BODY:
         body_file = str(folder / body_file)
-    return _assemble(
-        np.stack(images), stacked_masks, cameras, frames, body, betas, rotations, translations, names, body_file
-    )
+    return _assemble(photographs, body, betas, rotations, translations, body_file)
 
 
 def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False) -> None:
@@ -260,16 +219,12 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _assemble(images, masks, cameras, frames, body, betas, rotations, translations, names, body_file):
+def _assemble(photographs, body, betas, rotations, translations, body_file):
     return Capture(
-        images=images,
-        masks=masks,
-        cameras=stack_cameras(cameras),
-        frames=np.asarray(frames, np.int32),
+        **vars(photographs),
         body=body,
         betas=betas,
         poses=jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray(translations)),
-        names=names,
         body_file=str(body_file),
     )
 
@@ -308,14 +263,18 @@ def _write_folder(folder, capture, target):
         views.append(view)
     background = "photo" if capture.masks is None else "white"
     description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": background, "views": views}
+    np.savez(folder / "body.npz", **parameter_arrays(capture, target))  # ty: ignore[invalid-argument-type]
+    (folder / "capture.json").write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+
+
+def parameter_arrays(capture: Capture, folder: Path) -> dict[str, np.ndarray]:
+    """What body.npz of a capture in `folder` holds; the model file is named relative to it."""
     body_file = capture.body_file
     if body_file != DEFAULT_BODY:
-        body_file = Path(os.path.relpath(Path(body_file).resolve(), target)).as_posix()
-    np.savez(
-        folder / "body.npz",
-        body=np.asarray(body_file),
-        betas=np.asarray(capture.betas),
-        rotations=np.asarray(capture.poses.rotations),
-        translations=np.asarray(capture.poses.translation),
-    )
-    (folder / "capture.json").write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+        body_file = Path(os.path.relpath(Path(body_file).resolve(), folder.resolve())).as_posix()
+    return {
+        "body": np.asarray(body_file),
+        "betas": np.asarray(capture.betas),
+        "rotations": np.asarray(capture.poses.rotations),
+        "translations": np.asarray(capture.poses.translation),
+    }

@@ -74,7 +74,7 @@ def read_parameters(file: Path) -> tuple[str, np.ndarray, np.ndarray, np.ndarray
     try:
         values, pickled = read_npz(file)
     except FileNotFoundError:
-        raise CaptureError(file, "", "no such file (capture.json: body names it)") from None
+        raise CaptureError(file, "", "no such file (capture.json: body names it); `humangs fit` makes one") from None
     except OSError as error:
         raise CaptureError(file, "", error.strerror or error) from error
     if pickled:
