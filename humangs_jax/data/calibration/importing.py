@@ -1,0 +1,246 @@
+"""`import_cameras`: photos and the calibration that another tool made of their cameras -> a capture folder without body.
+
+docs/cameras.md tells the formats and their conventions. Photos are copied as they are, or undistorted where the lens
+asks for it; capture.json names body.npz, which `humangs fit` makes.
+"""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+from humangs_jax.data.atomic import replace_folder
+from humangs_jax.data.calibration.calibration import (
+    PIXEL_CENTERS,
+    ROTATION_TO_Y_UP,
+    CalibratedCamera,
+    Calibration,
+    in_capture_convention,
+)
+from humangs_jax.data.calibration.checks import Checks, check_calibration
+from humangs_jax.data.calibration.detection import read_calibration
+from humangs_jax.data.calibration.distortion import undistort
+from humangs_jax.data.calibration.photos import Photo, find_photo, find_photos, photo_size
+from humangs_jax.data.capture_checks import CaptureError, check_names, checked_camera
+from humangs_jax.data.capture_reading import FORMAT, VERSION, names_from_paths
+from humangs_jax.data.images import read_grey, read_image, write_png
+
+NO_COMMON_FRAME = "no two cameras have a photo of the same frame: photos of one moment must have the same file name"
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportReport:
+    """What was imported and how it was understood; as a string, the lines that a user should read."""
+
+    out: Path
+    format: str
+    source: Path
+    cameras: int
+    frames: int
+    views: int
+    width: int
+    height: int
+    scale: float
+    up: str
+    pixel_centers: str
+    convention: str
+    undistorted: int
+    checks: Checks
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What looks wrong."""
+        return self.checks.warnings
+
+    def __str__(self) -> str:
+        count = lambda n, noun: f"{n} {noun}{'' if n == 1 else 's'}"
+        photos, frames, cameras = count(self.views, "photo"), count(self.frames, "frame"), count(self.cameras, "camera")
+        centers = "whole numbers (0.5 added to cx and cy)" if self.pixel_centers == "integer" else "+0.5"
+        lines = [
+            f"{self.out}: {photos} of {self.width} x {self.height} pixels: {cameras}, {frames}",
+            f"read as: {self.format} ({self.source}): {self.convention}; {self.up} up; "
+            f"{self.scale:g} m per unit; pixel centres at {centers}",
+        ]
+        if self.undistorted:
+            lines.append(f"lens distortion removed from {count(self.undistorted, 'photo')}")
+        if self.checks.reprojection is not None:
+            error, points = self.checks.reprojection, count(self.checks.observations, "observation")
+            lines.append(f"mean reprojection error: {error:.3g} px ({points})")
+        if self.checks.distance is not None:
+            lines.append(f"the cameras stand {self.checks.distance:.3g} m from where they look")
+        return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
+
+
+def import_cameras(
+    source: str | Path,
+    images: str | Path,
+    out: str | Path,
+    *,
+    masks: str | Path | None = None,
+    scale: float | None = None,
+    up: str | None = None,
+    pixel_centers: str | None = None,
+    overwrite: bool = False,
+) -> ImportReport:
+    """Write a capture folder (all of it or nothing) of photos and their calibration; body.npz is still to be made.
+
+    Arguments:
+        source: file or folder of any format in docs/cameras.md; which one is seen from what is in it.
+        images: folder of the photos. masks: folder of their masks, named alike.
+        out: the capture folder. With `overwrite` a capture that is there is replaced as a whole.
+        scale: metres per unit of the source; 1 if None.
+        up: the axis of the source's world that points up, "+y", "-z", ...; None: the format's.
+        pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0), "half": (0.5, 0.5);
+            None: as the format says.
+
+    Raises: ValueError for an option, CaptureError (one line: file, field, what was expected) for everything else.
+    """
+    source, images, out = Path(source), Path(images), Path(out)
+    masks = None if masks is None else Path(masks)
+    scale = 1.0 if scale is None else scale
+    _check_options(scale, up, pixel_centers)
+    _check_folders(source, images, masks, out, overwrite)
+    calibration = read_calibration(source, lambda name: _size_by_name(images, name, source))
+    up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
+    photos = find_photos(calibration, images, masks)
+    calibration = _with_photo_sizes(calibration, photos)
+    converted = in_capture_convention(calibration, scale, up, pixel_centers)
+    for camera in converted.cameras:
+        checked_camera(camera.K, camera.cam_from_world, *_size(camera), calibration.file, camera.name)
+    checks = check_calibration(calibration, converted, up)
+    frames = 1 + max(photo.frame for photo in photos)
+    if len(converted.cameras) > 1 and frames == len(photos) > 1:
+        checks = dataclasses.replace(checks, warnings=(*checks.warnings, NO_COMMON_FRAME))
+    names = names_from_paths([photo.key + ".png" for photo in photos])
+    check_names(names, len(photos), images)
+    replace_folder(out.resolve(), lambda folder: _write(folder, converted, photos, names))
+    return ImportReport(
+        out=out,
+        format=calibration.format,
+        source=calibration.file,
+        cameras=len(converted.cameras),
+        frames=frames,
+        views=len(photos),
+        width=_size(converted.cameras[0])[0],
+        height=_size(converted.cameras[0])[1],
+        scale=scale,
+        up=up,
+        pixel_centers=pixel_centers,
+        convention=calibration.convention,
+        undistorted=sum(converted.cameras[photo.camera].distortion is not None for photo in photos),
+        checks=checks,
+    )
+
+
+def _check_options(scale, up, pixel_centers):
+    if not 0 < scale < float("inf"):
+        raise ValueError(f"--scale {scale:g}: expected metres per unit of the source, more than 0")
+    if up is not None and up not in ROTATION_TO_Y_UP:
+        raise ValueError(f"--up {up}: expected one of {', '.join(ROTATION_TO_Y_UP)}")
+    if pixel_centers is not None and pixel_centers not in PIXEL_CENTERS:
+        raise ValueError(f"--pixel-centers {pixel_centers}: expected {' or '.join(PIXEL_CENTERS)}")
+
+
+def _check_folders(source, images, masks, out, overwrite):
+    for folder in (images, masks):
+        if folder is not None and not folder.is_dir():
+            raise CaptureError(folder, "", "no such folder")
+    if out.exists() and not out.is_dir():
+        raise CaptureError(out, "", "is a file: expected a folder name")
+    if not out.is_dir() or not any(out.iterdir()):
+        return
+    if not overwrite:
+        raise CaptureError(out, "", "the folder is not empty: choose another one or ask to overwrite it")
+    if not (out / "capture.json").is_file():
+        raise CaptureError(out, "", "the folder holds no capture.json: refusing to overwrite what is no capture")
+    for path in (source, images, masks):
+        if path is not None and path.resolve().is_relative_to(out.resolve()):
+            raise CaptureError(path, "", f"lies in {out}, which would be overwritten: expected another place")
+
+
+def _size_by_name(images, name, source):
+    photo = find_photo(images, name)
+    if photo is None:
+        raise CaptureError(source, name, f"no such photo (PNG or JPEG) in {images}")
+    return photo_size(photo)
+
+
+def _size(camera):
+    assert camera.width is not None and camera.height is not None  # _with_photo_sizes has been here
+    return camera.width, camera.height
+
+
+def _with_photo_sizes(calibration: Calibration, photos: tuple[Photo, ...]) -> Calibration:
+    """The calibration with all sizes known. Raises: CaptureError unless photos and masks have its size, and one size."""
+    cameras: list[CalibratedCamera] = list(calibration.cameras)
+    first = photo_size(photos[0].image)
+    for photo in photos:
+        camera, size = cameras[photo.camera], photo_size(photo.image)
+        if camera.width is not None and size != (camera.width, camera.height):
+            _refuse_size(photo.image, size, f"was calibrated with {camera.width} x {camera.height}: expected the same")
+        if size != first:
+            _refuse_size(
+                photo.image, size, f"but {photos[0].image.name} has {first[0]} x {first[1]}: expected one size"
+            )
+        if photo.mask is not None and (mask := photo_size(photo.mask)) != size:
+            _refuse_size(photo.mask, mask, f"but its photo has {size[0]} x {size[1]}: expected the same")
+        cameras[photo.camera] = dataclasses.replace(camera, width=size[0], height=size[1])
+    return dataclasses.replace(calibration, cameras=tuple(cameras))
+
+
+def _refuse_size(file, size, problem):
+    raise CaptureError(file, "size", f"{size[0]} x {size[1]}, {problem}")
+
+
+# Writing -------------------------------------------------------------------------------------------------------------
+
+
+def _write(folder: Path, calibration: Calibration, photos: tuple[Photo, ...], names: tuple[str, ...]) -> None:
+    (folder / "images").mkdir(parents=True)
+    if photos[0].mask is not None:
+        (folder / "masks").mkdir()
+    as_they_are = all(camera.distortion is None for camera in calibration.cameras)
+    views = []
+    for photo, name in zip(photos, names, strict=True):
+        camera = calibration.cameras[photo.camera]
+        files = _copy(folder, photo, name) if as_they_are else _undistort(folder, photo, name, camera)
+        matrices = {"K": camera.K.tolist(), "cam_from_world": camera.cam_from_world.tolist()}
+        views.append({**files, "frame": photo.frame, **matrices})
+    description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "views": views}
+    (folder / "capture.json").write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+
+
+def _copy(folder, photo, name):
+    """The files as they are; their paths for capture.json."""
+    files = {"image": f"images/{name}{photo.image.suffix}"}
+    shutil.copyfile(photo.image, folder / files["image"])
+    if photo.mask is not None:
+        files["mask"] = f"masks/{name}{photo.mask.suffix}"
+        shutil.copyfile(photo.mask, folder / files["mask"])
+    return files
+
+
+def _undistort(folder, photo, name, camera):
+    """Photo and mask (its alpha, if that is all there is) as a pinhole sees them; what it does not see is white and no person."""
+    image, mask = _read(read_image, photo.image)
+    if photo.mask is not None:
+        mask = _read(read_grey, photo.mask)
+    if camera.distortion is not None:
+        image = undistort(image, camera.K, camera.distortion, fill=1.0)
+        mask = None if mask is None else undistort(mask, camera.K, camera.distortion, fill=0.0)
+    files = {"image": f"images/{name}.png"}
+    write_png(folder / files["image"], image)
+    if mask is not None:
+        files["mask"] = f"masks/{name}.png"
+        (folder / "masks").mkdir(exist_ok=True)
+        write_png(folder / files["mask"], mask)
+    return files
+
+
+def _read(reader, file):
+    try:
+        return reader(file)
+    except OSError as error:
+        raise CaptureError(file, "", f"not a readable image: {error.strerror or error}") from error
+    except ValueError as error:
+        raise CaptureError(file, "", error) from error

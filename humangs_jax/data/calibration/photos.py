@@ -1,0 +1,140 @@
+"""Which photo belongs to which camera and to which moment, by the names of files."""
+
+import dataclasses
+import os
+from collections.abc import Iterable
+from pathlib import Path, PurePosixPath
+
+from humangs_jax.data.calibration.calibration import Calibration
+from humangs_jax.data.capture_checks import CaptureError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+"""Of the photos that a capture may have."""
+LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
+
+
+@dataclasses.dataclass(frozen=True)
+class Photo:
+    """A photo on disk: its camera and its frame (both counted from 0), and its mask or None.
+
+    key: path relative to the folder of photos with slashes and without suffix.
+    """
+
+    image: Path
+    mask: Path | None
+    camera: int
+    frame: int
+    key: str
+
+
+def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> tuple[Photo, ...]:
+    """The photos of a calibration, frame after frame.
+
+    Raises: CaptureError if an image of the calibration, or all of a camera, or a mask, is not there.
+    """
+    if calibration.per_image:
+        names = [camera.name for camera in calibration.cameras]
+        found = _of_images(images, names, calibration.file)
+    else:
+        found = _of_cameras(calibration, images)
+    photos = []
+    for camera, frame, image in found:
+        key = image.relative_to(images).with_suffix("").as_posix()
+        photos.append(Photo(image, None if masks is None else _mask(masks, images, image), camera, frame, key))
+    return tuple(photos)
+
+
+def find_photo(folder: Path, name: str) -> Path | None:
+    """The photo of a path that may lack its suffix, have another one, or begin with folders that `folder` stands for."""
+    parts = PurePosixPath(name.replace("\\", "/")).parts
+    parts = [part for part in parts if part not in (".", "..", "/")]
+    found = (_any_suffix(folder.joinpath(*parts[start:])) for start in range(len(parts)))
+    return next((photo for photo in found if photo is not None), None)
+
+
+def _any_suffix(path):
+    """The file, or the one of that name with another suffix of photos, or with one more."""
+    stems = [path.name, path.stem] if path.suffix in SUFFIXES else [path.name]
+    candidates = [path] if path.suffix in SUFFIXES else []
+    candidates += [path.with_name(stem + suffix) for stem in stems for suffix in SUFFIXES]
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def photo_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels, of the file's head alone. Raises: CaptureError if it is no image."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow's ways to say "broken"
+        raise CaptureError(path, "", f"not a readable image: {error}") from error
+
+
+def _of_images(images, names, file):
+    """(camera, frame 0, photo) where each image has a camera of its own."""
+    photos: dict[Path, str] = {}
+    for name in names:
+        photo = find_photo(images, name)
+        if photo is None:
+            raise CaptureError(file, name, f"no such photo (PNG or JPEG) in {images}")
+        if photo in photos:
+            raise CaptureError(file, name, f"{photo} is the photo of {photos[photo]} already: expected one for each")
+        photos[photo] = name
+    return [(i, 0, photo) for i, photo in enumerate(photos)]
+
+
+def _mask(masks, images, image):
+    """Where the photo's path has it in the other folder (COLMAP: with one more suffix); AvatarReX: in mask/pha beside it.
+
+    AvatarReX has photos and masks in one folder, so that the photo itself can be what is found first.
+    """
+    path = image.relative_to(images)
+    for place in (path, path.parent / "mask" / "pha" / path.name):
+        if (mask := _any_suffix(masks / place)) is not None and not mask.samefile(image):
+            return mask
+    raise CaptureError(masks / path, "", "no mask (PNG or JPEG): expected one for each photo, named like it")
+
+
+def _of_cameras(calibration, images):
+    """(camera, frame, photo) where each camera took one photo or several."""
+    names = [camera.name for camera in calibration.cameras]
+    layouts = (_folders_of_cameras(images, names), _folders_of_frames(images, names), _single_photos(images, names))
+    frames_of = next((layout for layout in layouts if any(layout)), None)
+    if frames_of is None:
+        shown = ", ".join(names[:3]) + (", ..." if len(names) > 3 else "")
+        raise CaptureError(images, "", f"no photo of the cameras {shown}: expected {LAYOUTS}")
+    for name, photos in zip(names, frames_of, strict=True):
+        if not photos:
+            raise CaptureError(calibration.file, name, f"no photo of this camera in {images}: expected {LAYOUTS}")
+    frames = {frame: i for i, frame in enumerate(_in_order({f for photos in frames_of for f in photos}))}
+    found = [(i, frames[f], photo) for i, photos in enumerate(frames_of) for f, photo in photos.items()]
+    return sorted(found, key=lambda entry: (entry[1], entry[0]))
+
+
+def _folders_of_cameras(images, names):
+    """Of each camera, frame name -> photo."""
+    return [{p.stem: p for p in _photos_in(images / name)} for name in names]
+
+
+def _folders_of_frames(images, names):
+    folders = [entry for entry in images.iterdir() if entry.is_dir()]
+    of_frame = {folder.name: {p.stem: p for p in _photos_in(folder)} for folder in folders}
+    return [{frame: photos[name] for frame, photos in of_frame.items() if name in photos} for name in names]
+
+
+def _single_photos(images, names):
+    photos = {p.stem: p for p in _photos_in(images)}
+    return [{"": photos[name]} if name in photos else {} for name in names]
+
+
+def _photos_in(folder):
+    if not folder.is_dir():
+        return []
+    return [Path(entry.path) for entry in os.scandir(folder) if Path(entry.name).suffix in SUFFIXES and entry.is_file()]
+
+
+def _in_order(names: Iterable[str]) -> list[str]:
+    """By number where all are numbers (10 after 9), else by letter."""
+    names = list(names)
+    return sorted(names, key=lambda name: (int(name), name)) if all(n.isdecimal() for n in names) else sorted(names)
