@@ -1,0 +1,1 @@
+"""2D keypoints of photographs, read from the files that detectors write."""

@@ -1,0 +1,90 @@
+"""The keypoint sets that detectors are trained on, in one vocabulary.
+
+The names, for `side` left or right (the person's own):
+
+nose, `side`_eye, _ear, _shoulder, _elbow, _wrist, _hip, _knee, _ankle, _big_toe, _small_toe, _heel; neck and mid_hip (the
+    middle of the shoulders and of the hips, OpenPose only)
+face_0 to face_67: 300-W's landmarks; 0 is the jaw under the person's right ear
+`side`_hand_root; `side`_thumb_, index_, middle_, ring_, pinky_ with 1, 2, 3, tip: 1 is nearest to the palm
+
+A point has the same name in every set that has it, though annotators of different sets do not mean quite the same by "hip".
+
+Sources: COCO's person_keypoints annotations; jin-s13/COCO-WholeBody's data format; OpenPose's "Demo - Output" page.
+"""
+
+import dataclasses
+
+SIDES = ("left", "right")
+FINGERS = ("thumb", "index", "middle", "ring", "pinky")
+FINGER_JOINTS = ("1", "2", "3", "tip")
+FACE_POINTS = 68
+
+_FOOT = ("big_toe", "small_toe", "heel")
+_FEET = tuple(f"{side}_{part}" for side in SIDES for part in _FOOT)
+_PAIRS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+_COCO = ("nose", *(f"{side}_{part}" for part in _PAIRS for side in SIDES))
+_BODY_25 = (
+    *("nose", "neck"),
+    *(f"{side}_{part}" for side in ("right", "left") for part in ("shoulder", "elbow", "wrist")),
+    "mid_hip",
+    *(f"{side}_{part}" for side in ("right", "left") for part in ("hip", "knee", "ankle")),
+    *("right_eye", "left_eye", "right_ear", "left_ear"),
+    *_FEET,
+)
+_FACE_SUMS = ((0, 17, 16), (17, 27, 43), (31, 36, 66), (48, 55, 102), (55, 60, 114), (60, 65, 124), (65, 68, 132))
+"""(first, end, sum): landmarks i and sum - i are mirror images: jaw, brows, nostrils, upper and lower lip, outside and
+inside."""
+_FACE_EYES = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
+
+
+@dataclasses.dataclass(frozen=True)
+class KeypointSet:
+    """The points of a detector: their names in its order, and for each the index of its mirror image.
+
+    A point in the middle of the body is its own mirror image.
+    """
+
+    name: str
+    names: tuple[str, ...]
+    mirror: tuple[int, ...]
+
+
+def hand_names(side: str) -> tuple[str, ...]:
+    """The 21 points of one hand, in the order of OpenPose and COCO-WholeBody."""
+    return (f"{side}_hand_root", *(f"{side}_{finger}_{joint}" for finger in FINGERS for joint in FINGER_JOINTS))
+
+
+def mirrored_name(name: str) -> str:
+    """The point that a mirror puts in the place of `name`."""
+    kind, _, rest = name.partition("_")
+    if kind == "face":
+        return f"face_{_mirrored_face(int(rest))}"
+    other = {"left": "right", "right": "left"}
+    return f"{other[kind]}_{rest}" if kind in other else name
+
+
+def _mirrored_face(i: int) -> int:
+    for first, end, total in _FACE_SUMS:
+        if first <= i < end:
+            return total - i
+    return (_FACE_EYES | {b: a for a, b in _FACE_EYES.items()}).get(i, i)
+
+
+def _keypoint_set(name: str, names: tuple[str, ...]) -> KeypointSet:
+    return KeypointSet(name, names, tuple(names.index(mirrored_name(each)) for each in names))
+
+
+COCO_17 = _keypoint_set("coco17", _COCO)
+"""COCO's 17 body points."""
+
+COCO_WHOLEBODY_133 = _keypoint_set(
+    "wholebody133",
+    (*_COCO, *_FEET, *(f"face_{i}" for i in range(FACE_POINTS)), *hand_names("left"), *hand_names("right")),
+)
+"""COCO-WholeBody: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the left and 21 of the right hand."""
+
+OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
+"""OpenPose's BODY_25 with its left and right hand. Its 70 points of the face are read over: they are not in this set."""
+
+KEYPOINT_SETS = {each.name: each for each in (COCO_17, COCO_WHOLEBODY_133, OPENPOSE_67)}
+"""The sets by name, as our npz files name them."""

@@ -1,0 +1,236 @@
+"""Each format as its tool writes it, from known points, read back exactly."""
+
+import json
+
+import numpy as np
+import pytest
+
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.keypoints.reading import read_keypoints
+from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, OPENPOSE_67
+from humangs_jax.data.keypoints.storage import save_keypoints
+
+NAMES, SIZE = ("front", "back", "left"), (320, 240)
+CAMERA_NAMES = ("images_cam0_000000", "images_cam0_000001", "images_cam1_000000", "images_cam1_000001")
+
+
+def known(count, views=3, seed=0):
+    """(v, k, 3): pixels in eighths and confidences in sixteenths, which float32 and JSON keep exactly."""
+    rng = np.random.default_rng(seed)
+    points = rng.integers(8, 8 * 200, (views, count, 2)) / 8
+    return np.concatenate([points, rng.integers(1, 17, (views, count, 1)) / 16], axis=-1)
+
+
+def write(path, content):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content))
+    return path
+
+
+def read(path, names=NAMES, **options):
+    return read_keypoints(path, names, *SIZE, **options)
+
+
+def check(keypoints, values, keypoint_set, missing=()):
+    """The tools' first pixel has its centre at 0, ours at 0.5."""
+    assert keypoints.set is keypoint_set
+    np.testing.assert_array_equal(keypoints.points, values[..., :2] + 0.5)
+    np.testing.assert_array_equal(keypoints.confidences, values[..., 2])
+    assert keypoints.points.dtype == keypoints.confidences.dtype == np.float32
+    assert (keypoints.missing, keypoints.not_finite, keypoints.far_outside) == (tuple(missing), 0, 0)
+
+
+def flat(values):
+    return values.reshape(-1).tolist()
+
+
+# OpenPose ------------------------------------------------------------------------------------------------------------
+
+
+def openpose_person(values, hands=True, face=False):
+    person = {"person_id": [-1], "pose_keypoints_2d": flat(values[:25]), "face_keypoints_2d": [1.0] * 210 * face}
+    person |= {"hand_left_keypoints_2d": flat(values[25:46]) if hands else []}
+    return person | {"hand_right_keypoints_2d": flat(values[46:]) if hands else [], "pose_keypoints_3d": []}
+
+
+def openpose(*people):
+    return {"version": 1.3, "people": list(people)}
+
+
+@pytest.mark.parametrize("face", [False, True])
+def test_openpose_folder(tmp_path, face):
+    values = known(67)
+    for name, each in zip(NAMES, values, strict=True):
+        write(tmp_path / f"{name}_keypoints.json", openpose(openpose_person(each, face=face)))
+    check(read(tmp_path), values, OPENPOSE_67)
+
+
+def test_openpose_without_hands(tmp_path):
+    values = known(67)
+    people = [openpose_person(each, hands=False) for each in values]
+    del people[1]["hand_left_keypoints_2d"], people[1]["hand_right_keypoints_2d"]  # older versions
+    for name, person in zip(NAMES, people, strict=True):
+        write(tmp_path / f"{name}_keypoints.json", openpose(person))
+    values[:, 25:] = 0
+    check(read(tmp_path), values, OPENPOSE_67)
+
+
+def test_openpose_of_several_videos_and_of_one_image(tmp_path):
+    values = known(67, 4)
+    for i in range(4):
+        write(tmp_path / f"cam{i // 2}_{i % 2:012d}_keypoints.json", openpose(openpose_person(values[i])))
+    check(read(tmp_path, CAMERA_NAMES), values, OPENPOSE_67)
+    one = write(tmp_path / "one" / "front_keypoints.json", openpose(openpose_person(values[0])))
+    check(read(one, ("front",)), values[:1], OPENPOSE_67)
+
+
+def test_openpose_in_a_folder_per_camera(tmp_path):
+    values = known(67, 4)
+    for i in range(4):
+        write(tmp_path / f"cam{i // 2}" / f"{i % 2:06d}_keypoints.json", openpose(openpose_person(values[i])))
+    check(read(tmp_path, CAMERA_NAMES), values, OPENPOSE_67)
+
+
+def test_openpose_finds_nobody_in_a_view(tmp_path):
+    values = known(67)
+    for name, each in zip(NAMES, values, strict=True):
+        people = [] if name == "back" else [openpose_person(each)]
+        write(tmp_path / f"{name}_keypoints.json", openpose(*people))
+    keypoints = read(tmp_path)
+    assert keypoints.missing == ("back",) and not keypoints.confidences[1].any()
+    np.testing.assert_array_equal(keypoints.points[[0, 2]], values[[0, 2], :, :2] + 0.5)
+
+
+# MMPose --------------------------------------------------------------------------------------------------------------
+
+
+def instances(values):
+    return [{"keypoints": values[:, :2].tolist(), "keypoint_scores": values[:, 2].tolist(), "bbox": [[0, 0, 9, 9]]}]
+
+
+@pytest.mark.parametrize("keypoint_set", [COCO_17, COCO_WHOLEBODY_133])
+@pytest.mark.parametrize("demo", [False, True])
+def test_mmpose_images(tmp_path, keypoint_set, demo):
+    values = known(len(keypoint_set.names))
+    for name, each in zip(NAMES, values, strict=True):
+        if demo:
+            content = {"meta_info": {"dataset_name": "coco"}, "instance_info": instances(each)}
+            write(tmp_path / f"results_{name}.json", content)
+        else:
+            write(tmp_path / f"{name}.json", instances(each))
+    check(read(tmp_path), values, keypoint_set)
+
+
+@pytest.mark.parametrize("first, demo", [(0, False), (1, True)])
+def test_mmpose_video(tmp_path, first, demo):
+    values = known(17)
+    frames = [{"frame_id": i, "instances": instances(each)} for i, each in enumerate(values, first)]
+    content = {"meta_info": {}, "instance_info": frames} if demo else frames
+    check(read(write(tmp_path / "walk.json", content), ("f_0000", "f_0001", "f_0002")), values, COCO_17)
+
+
+def test_mmpose_videos_of_two_cameras(tmp_path):
+    values = known(133, 4)
+    for camera in (0, 1):
+        frames = [{"frame_id": i, "instances": instances(values[2 * camera + i])} for i in (0, 1)]
+        write(tmp_path / f"cam{camera}.json", frames)
+    check(read(tmp_path, CAMERA_NAMES), values, COCO_WHOLEBODY_133)
+
+
+def test_mmpose_image_without_people(tmp_path):
+    values = known(17)
+    for name, each in zip(NAMES, values, strict=True):
+        write(tmp_path / f"{name}.json", [] if name == "left" else instances(each))
+    assert read(tmp_path).missing == ("left",)
+
+
+# COCO ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("keypoint_set", [COCO_17, COCO_WHOLEBODY_133])
+@pytest.mark.parametrize("key", ["image_id", "file_name"])
+def test_coco_results_and_alphapose_by_name(tmp_path, keypoint_set, key):
+    values = known(len(keypoint_set.names))
+    entries = [
+        {"image_id": 7, key: f"{name}.jpg", "category_id": 1, "keypoints": flat(each), "score": 2.9}
+        for name, each in reversed(list(zip(NAMES, values, strict=True)))
+    ]
+    file = write(tmp_path / "out" / "alphapose-results.json", entries)
+    check(read(file), values, keypoint_set)
+    check(read(file.parent), values, keypoint_set)  # a folder of one file
+
+
+def test_coco_results_by_number(tmp_path):
+    values = known(17)
+    entries = [
+        {"image_id": i, "keypoints": flat(each), "score": 0.9} for i, each in zip((7, 9, 4), values, strict=True)
+    ]
+    check(read(write(tmp_path / "r.json", entries), ("000007", "000009", "a_04")), values, COCO_17)
+
+
+def parts(values):
+    names = ("keypoints", "foot_kpts", "face_kpts", "lefthand_kpts", "righthand_kpts")
+    return {k: flat(v) for k, v in zip(names, np.split(values, [17, 23, 91, 112]), strict=True)}
+
+
+def test_whole_body_results_in_parts(tmp_path):
+    values = known(133)
+    entries = [{"image_id": name, **parts(each)} for name, each in zip(NAMES, values, strict=True)]
+    del entries[1]["face_kpts"]
+    values[1, 23:91] = 0
+    check(read(write(tmp_path / "r.json", entries)), values, COCO_WHOLEBODY_133)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_annotations_tell_visibility(tmp_path, whole):
+    values = known(133 if whole else 17)
+    values[..., 2] = np.arange(values.shape[1]) % 3  # 0 not labelled, 1 hidden, 2 visible
+    images = [{"id": 5 + i, "file_name": f"{n}.png", "width": 320, "height": 240} for i, n in enumerate(NAMES)]
+    entries = [
+        {"id": i, "image_id": 5 + i, "iscrowd": 0, **(parts(each) if whole else {"keypoints": flat(each)})}
+        for i, each in enumerate(values)
+    ]
+    entries += [{"id": 8, "image_id": 5, "iscrowd": 1, "keypoints": [9.0, 9.0, 2.0] * 17}, {"id": 9, "image_id": 5}]
+    values[..., 2] /= 2  # hidden is half sure
+    file = write(tmp_path / "person_keypoints.json", {"images": images, "annotations": entries})
+    check(read(file), values, COCO_WHOLEBODY_133 if whole else COCO_17)
+
+
+def test_fractional_visibilities_are_reliable(tmp_path):
+    values = known(17, 1)
+    values[..., 2] = 0.25
+    content = {
+        "images": [{"id": 1, "width": 0, "height": 0}],
+        "annotations": [{"image_id": 1, "keypoints": flat(values)}],
+    }
+    keypoints = read(write(tmp_path / "a.json", content), ("1",))
+    np.testing.assert_array_equal(keypoints.confidences, 1)
+
+
+# Ours ----------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("keypoint_set", KEYPOINT_SETS.values(), ids=lambda each: each.name)
+def test_our_own_file_round_trips_exactly(tmp_path, keypoint_set):
+    rng = np.random.default_rng(1)
+    shape = (3, len(keypoint_set.names))
+    points = rng.uniform(-40, 300, (*shape, 2)).astype(np.float32)
+    confidences = rng.uniform(size=shape).astype(np.float32)
+    confidences[1] = 0
+    saved = Keypoints(points, confidences, keypoint_set, missing=("back",))
+    save_keypoints(tmp_path / "k.npz", saved, NAMES)
+    back = read(tmp_path / "k.npz")
+    np.testing.assert_array_equal(back.points, points)
+    np.testing.assert_array_equal(back.confidences, confidences)
+    assert (back.set, back.missing, back.not_finite, back.far_outside) == (keypoint_set, ("back",), 0, 0)
+    assert [file.name for file in tmp_path.iterdir()] == ["k.npz"]  # nothing aside is left
+    swapped = read(tmp_path / "k.npz", ("left", "front"))
+    np.testing.assert_array_equal(swapped.points, points[[2, 0]])
+
+
+def test_saving_checks_its_arguments(tmp_path):
+    keypoints = Keypoints(np.zeros((2, 17, 2), np.float32), np.zeros((2, 17), np.float32), COCO_17)
+    with pytest.raises(ValueError, match=r"k\.json: expected a name ending in \.npz"):
+        save_keypoints(tmp_path / "k.json", keypoints, NAMES[:2])
+    with pytest.raises(ValueError, match="names: expected one for each of 2 views, got 3"):
+        save_keypoints(tmp_path / "k.npz", keypoints, NAMES)
