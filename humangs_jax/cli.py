@@ -8,11 +8,15 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import tyro
 
 from humangs_jax.allocator import keep_freed_memory
+
+if TYPE_CHECKING:
+    from humangs_jax.data.capture import Capture
+    from humangs_jax.data.keypoints.keypoints import Keypoints
 
 Positional = tyro.conf.Positional
 
@@ -226,20 +230,123 @@ def synth(
     print(f"{out}: {len(folders)} people")
 
 
-def check(capture: Positional[Path], out: Path = Path("check.png")) -> None:
+def check(capture: Positional[Path], out: Path = Path("check.png"), keypoints: Path | None = None) -> None:
     """Draw the posed body over each photo of a capture: wrong pose or camera conventions show at a glance.
+
+    A capture that `humangs fit` made also shows its keypoints, how far off the body is, and what the views do not determine.
 
     Args:
         capture: folder with capture.json.
-        out: the contact sheet to write.
+        out: the contact sheet to write; of the keypoints, NAME_fit.png beside it.
+        keypoints: look at these keypoints instead of those that were fitted.
     """
     from humangs_jax.avatar.check import check_capture
     from humangs_jax.data.capture import load_capture
+    from humangs_jax.data.photographs import capture_folder
+    from humangs_jax.fitting.fit_record import FIT_FILE, read_fit_record
 
     photos = load_capture(capture)
     _require_parent(out)
-    report = check_capture(photos, out)
-    print(report)
+    record_file = capture_folder(capture) / FIT_FILE
+    record = read_fit_record(record_file) if record_file.exists() and keypoints is None else None
+    found = _read_keypoints(keypoints, photos) if keypoints is not None else None
+    print(check_capture(photos, out))
+    if record is not None or found is not None:
+        from humangs_jax.fitting.examination import examine_record
+        from humangs_jax.fitting.fit_pictures import fit_sheet
+
+        examination, found = examine_record(photos, record, found)
+        sheet = out.with_name(f"{out.stem}_fit{out.suffix}")
+        fit_sheet(photos, found, examination, sheet)
+        print(f"\n{examination}\n{sheet}: the keypoints over the photos")
+
+
+def fit(
+    capture: Positional[Path | None] = None,
+    keypoints: Path | None = None,
+    scan: Path | None = None,
+    joints: Path | None = None,
+    bare: bool = False,
+    refine: bool = False,
+    photometric: bool = False,
+    body: Path | None = None,
+    person: int | None = None,
+    smoothness: float = 0.0,
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Find the body of one's own photos: from keypoints of a detector, or inside of a scan; or refine what is there.
+
+    humangs fit CAPTURE --keypoints FILE: shape and poses from photos with cameras (humangs import cameras) and 2D keypoints.
+    humangs fit CAPTURE --refine: polish cameras and poses of a capture against its masks. humangs fit --scan MESH --out FOLDER.
+
+    Args:
+        capture: folder with capture.json; its body.npz need not exist.
+        keypoints: of OpenPose, COCO, COCO-WholeBody, MMPose or AlphaPose, a file or folder (docs/fitting.md).
+        scan: a mesh with a person in it, of any scale and orientation.
+        joints: 3D landmarks of the scan by name (.json or .npz); without, the pose is searched.
+        bare: the scan wears no clothes.
+        refine: polish cameras and poses; with --keypoints, against these too. Never worse than the start.
+        photometric: also compare photos and renderings of a reconstruction while refining.
+        body: model file (SMPL-X .npz or .pkl); the shipped body if not given.
+        person: which person of the keypoint file, from 0, where it has several in a view.
+        smoothness: metres per frame squared that joints accelerate by, for sequences (0.005 at 30 frames a second); 0: frames are
+            fitted one by one.
+        out: folder for the result; the capture folder itself if not given.
+        overwrite: replace what is there.
+    """
+    from humangs_jax.fitting.commands import fit_from_keypoints, fit_from_scan, refine_in_place
+
+    if (capture is None) == (scan is None):
+        raise ValueError("give either a CAPTURE folder or --scan MESH")
+    if scan is not None:
+        if wrong := [n for n, given in (("--refine", refine), ("--person", person is not None)) if given]:
+            raise ValueError(f"{wrong[0]} is for captures, not for --scan")
+        fit_from_scan(scan, out, body=body, joints=joints, keypoints=keypoints, bare=bare, overwrite=overwrite)
+        return
+    if wrong := [name for name, given in (("--joints", joints is not None), ("--bare", bare)) if given]:
+        raise ValueError(f"{wrong[0]} is for --scan, not for captures")
+    if photometric and not refine:
+        raise ValueError("--photometric is a way to refine: add --refine")
+    if refine:
+        refine_in_place(capture, out, keypoints=keypoints, person=person, photometric=photometric, overwrite=overwrite)
+        return
+    if keypoints is None:
+        raise ValueError("--keypoints FILE is missing (or --refine, to polish the body that a capture has)")
+    if not smoothness >= 0:
+        raise ValueError(f"--smoothness {smoothness}: expected at least 0")
+    fit_from_keypoints(capture, keypoints, out, body=body, person=person, smoothness=smoothness, overwrite=overwrite)
+
+
+def import_cameras(
+    what: Positional[Literal["cameras"]],
+    source: Positional[Path],
+    images: Path,
+    out: Path,
+    masks: Path | None = None,
+    scale: float | None = None,
+    up: str | None = None,
+    pixel_centers: Literal["integer", "half"] | None = None,
+    overwrite: bool = False,
+) -> None:
+    """Make a capture folder from calibrated cameras: COLMAP text, OpenCV YAML or JSON, calibration_full.json, transforms.json.
+
+    Then `humangs fit` finds the body. Conventions of every format: docs/cameras.md.
+
+    Args:
+        what: "cameras".
+        source: file or folder with the calibration; its format is detected.
+        images: folder of the photos.
+        out: the capture folder to write.
+        masks: folder of masks, named like the photos.
+        scale: metres per unit of the source.
+        up: axis of the source's world that points up, like --up=+z or --up=-y.
+        pixel_centers: where the source has the centre of the first pixel: at 0 (integer) or 0.5 (half).
+        overwrite: replace the capture folder.
+    """
+    from humangs_jax.data.calibration.importing import import_cameras as run
+
+    print(run(source, images, out, masks=masks, scale=scale, up=up, pixel_centers=pixel_centers, overwrite=overwrite))
 
 
 def train(
@@ -361,8 +468,16 @@ def convert(
 
 
 COMMANDS: dict[str, Callable[..., None]] = {
-    f.__name__: f for f in (demo, reconstruct, animate, render, export, synth, check, train, convert)
+    "import": import_cameras,
+    **{f.__name__: f for f in (fit, check, demo, reconstruct, animate, render, export, synth, train, convert)},
 }
+
+
+def _read_keypoints(path: Path, photos: "Capture") -> "Keypoints":
+    from humangs_jax.data.keypoints.reading import read_keypoints
+
+    height, width = photos.images.shape[1:3]
+    return read_keypoints(path, photos.names, width, height)
 
 
 def _require_parent(path: Path, option: str = "--out") -> None:

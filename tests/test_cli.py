@@ -10,7 +10,7 @@ import pytest
 from humangs_jax import cli
 from humangs_jax.data.capture import load_capture, save_capture
 
-COMMANDS = ("demo", "reconstruct", "animate", "render", "export", "synth", "check", "train", "convert")
+COMMANDS = ("import", "fit", "check", "demo", "reconstruct", "animate", "render", "export", "synth", "train", "convert")
 
 
 @pytest.fixture(scope="module")
@@ -129,3 +129,45 @@ def test_from_photos_to_pictures(folder, tmp_path, monkeypatch, capsys):
     assert Path("views/views.exr").stat().st_size > 1000
     assert len(plyfile.PlyData.read("avatar.ply")["vertex"].data) > 10_000
     assert iio.imread("check.png").std() > 10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "give either a CAPTURE folder or --scan MESH"),
+        (["FOLDER", "--scan", "scan.obj"], "give either a CAPTURE folder or --scan MESH"),
+        (["FOLDER"], "--keypoints FILE is missing"),
+        (["FOLDER", "--keypoints", "k.json"], "body.npz exists: --overwrite replaces it"),
+        (["FOLDER", "--photometric"], "--photometric is a way to refine: add --refine"),
+        (["FOLDER", "--bare"], "--bare is for --scan"),
+        (["FOLDER", "--keypoints", "k.json", "--out", "new"], "k.json"),
+        (
+            ["FOLDER", "--keypoints", "k.json", "--smoothness", "-1", "--out", "new"],
+            "--smoothness -1.0: expected at least 0",
+        ),
+        (["--scan", "scan.obj", "--refine"], "--refine is for captures"),
+        (["--scan", "scan.obj"], "--out FOLDER is missing"),
+    ],
+)
+def test_fit_says_what_is_missing(folder, tmp_path, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    arguments = [folder if argument == "FOLDER" else argument for argument in arguments]
+    code, _, err = run(monkeypatch, capsys, "fit", *arguments)
+    assert code == 2 and message in err and err.count("\n") == 1
+    assert not any(tmp_path.iterdir())
+
+
+def test_import_of_what_is_no_calibration_is_one_line(folder, tmp_path, monkeypatch, capsys):
+    code, _, err = run(
+        monkeypatch,
+        capsys,
+        "import",
+        "cameras",
+        tmp_path / "none",
+        "--images",
+        folder / "images",
+        "--out",
+        tmp_path / "new",
+    )
+    assert code == 2 and "none" in err and err.count("\n") == 1
+    assert not (tmp_path / "new").exists()

@@ -124,3 +124,11 @@ def from_axis_angle(axis_angle: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
     squared = jnp.sum(jnp.square(half), axis=-1)
     sine, cosine = _sine_and_cosine_ratios(squared)
     return jnp.concatenate([(1 - squared * cosine)[..., None], half * sine[..., None]], axis=-1)
+
+
+def to_axis_angle(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
+    """The rotation vector, no longer than pi, of a unit quaternion. Not meant to be differentiated at the zero rotation."""
+    q = jnp.where(q[..., :1] < 0, -q, q)
+    sine = jnp.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * jnp.arctan2(sine, q[..., :1])
+    return q[..., 1:] * jnp.where(sine > 0, angle / jnp.where(sine > 0, sine, 1.0), 2.0)

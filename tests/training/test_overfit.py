@@ -2,7 +2,7 @@
 
 A synthetic person of the package, four photographs of 128 x 128, which are inputs and targets alike. The network is
 small, has its upsampler, and starts from nothing. With edges of 3 cm, K = 1 has 6,792 Gaussians for the 10,917 pixels of
-the person, and ended at 34.5 dB after 250 steps; so its body has edges of 2 cm. Measured: docs/performance_training.md.
+the person; so its body has edges of 2 cm.
 """
 
 import dataclasses

@@ -1,0 +1,217 @@
+"""Where on a body the landmarks are that people and detectors mark in photographs: `landmark_model(body, names)`.
+
+A landmark is a weighted mean of joints, or a vertex that a rule finds on the body's own template, so that any body whose joints
+have SMPL-X's names has them. Sides are the person's. By name:
+
+    {side}_shoulder, elbow, wrist, hip, knee, ankle    the joint
+    {side}_hand_root                                   the wrist
+    {side}_FINGER_1, 2, 3                              joints FINGER1, 2, 3: knuckles from the palm outwards
+    {side}_FINGER_tip                                  vertex of the last segment farthest along it
+    neck                                               middle of the shoulders (as OpenPose has it)
+    mid_hip                                            middle of the hips
+    {side}_eye                                         the joint: centre of the eyeball, a centimetre behind the pupil
+    nose, face_30                                      foremost vertex of the head between jaw and eyes
+    face_8                                             chin: lowest vertex of the front of the head's midline
+    face_27                                            root of the nose: vertex of the midline at the height of the eyes
+    {side}_ear                                         outermost vertex of the head at the height of the ears
+    {side}_big_toe, small_toe, heel                    vertices of the foot farthest forward and inward, forward and outward, back
+
+Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres): fits give them less weight. The
+other 65 points of the face are not on this list: they follow expressions, which bodies without a face rig do not have.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.array_types import Array, Float
+from humangs_jax.body import skinning
+from humangs_jax.body.joints import FINGERS
+from humangs_jax.body.model import BodyModel, BodyPose, pose_features
+from humangs_jax.pytree import pytree_dataclass, static_field
+
+SIDES = {"left": 1.0, "right": -1.0}
+"""And the sign of x that is outwards in T-pose."""
+MEMBER = 0.5
+"""A vertex belongs to the segment whose joints have at least this share of its weight."""
+CARRIES = 0.1
+"""A joint moves a point that has at least this share of its weight from it."""
+MIDLINE = 0.006
+"""Half-width of the middle of the face, metres."""
+
+
+@pytree_dataclass
+class LandmarkModel:
+    """What of a body its landmarks depend on: k landmarks from j joints and p points of the surface.
+
+    joints, joint_directions: (j, 3) rest joints of the mean shape and (j, 3, s) their change, metres. points: (p, 3) at rest.
+    point_directions: (p, 3, s). pose_directions: (p, 3, q) or None. point_weights: (p, j) of the skinning.
+    regressor: (k, j + p) landmarks from posed joints and points; rows sum to 1, or are 0 where the body lacks a landmark.
+    Static: names; known, which of them the body has; parents, joint_names; movers, the joints whose turning moves a landmark.
+    """
+
+    joints: Float[Array, "j 3"]
+    joint_directions: Float[Array, "j 3 s"]
+    points: Float[Array, "p 3"]
+    point_directions: Float[Array, "p 3 s"]
+    pose_directions: Float[Array, "p 3 q"] | None
+    point_weights: Float[Array, "p j"]
+    regressor: Float[Array, "k jp"]
+    names: tuple[str, ...] = static_field(default=())
+    known: tuple[bool, ...] = static_field(default=())
+    parents: tuple[int, ...] = static_field(default=())
+    joint_names: tuple[str, ...] = static_field(default=())
+    movers: tuple[int, ...] = static_field(default=())
+
+
+def landmark_model(body: BodyModel, names: tuple[str, ...]) -> LandmarkModel:
+    """The landmarks of a body by name; those that it does not have get rows of zeros.
+
+    Raises: ValueError if it has none of them, which is so when its joints have other names than SMPL-X's.
+    """
+    finder = _Finder(body)
+    sources = [finder.find(name) for name in names]
+    if not any(sources):
+        raise ValueError(
+            f"body '{body.name}' has none of these landmarks: are its joints named like SMPL-X's (left_hip, ...)? They are "
+            f"{', '.join(body.joint_names[:4]) or 'not named'}"
+        )
+    vertices = sorted({source for found in sources for source in found if source >= 0})
+    joints = len(body.parents)
+    regressor = np.zeros((len(names), joints + len(vertices)), np.float32)
+    for row, found in zip(regressor, sources, strict=True):
+        for source in found:
+            row[joints + vertices.index(source) if source >= 0 else -1 - source] += 1 / len(found)
+    chosen = np.asarray(vertices, np.int32)
+    product = lambda x: jnp.einsum("jn,n...->j...", body.joint_regressor, x, precision=skinning.EXACT)
+    return LandmarkModel(
+        joints=product(body.template),
+        joint_directions=product(body.shape_directions),
+        points=body.template[chosen],
+        point_directions=body.shape_directions[chosen],
+        pose_directions=None if body.pose_directions is None else body.pose_directions[chosen],
+        point_weights=body.skinning_weights[chosen],
+        regressor=jnp.asarray(regressor),
+        names=names,
+        known=tuple(bool(found) for found in sources),
+        parents=body.parents,
+        joint_names=body.joint_names,
+        movers=_movers(body.parents, regressor[:, :joints].any(0), np.asarray(body.skinning_weights)[chosen]),
+    )
+
+
+def pose_landmarks(
+    model: LandmarkModel, betas: Float[Array, " s_used"], pose: BodyPose
+) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
+    """Landmarks and joints of a person in a pose, metres. Landmarks that the body lacks are at the origin."""
+    s = betas.shape[0]
+    shaped = lambda mean, directions: (
+        mean + jnp.einsum("nas,s->na", directions[..., :s], betas, precision=skinning.EXACT)
+    )
+    rest, points = shaped(model.joints, model.joint_directions), shaped(model.points, model.point_directions)
+    if model.pose_directions is not None:
+        features = pose_features(pose.rotations)
+        points = points + jnp.einsum("paq,q->pa", model.pose_directions, features, precision=skinning.EXACT)
+    transforms = skinning.joint_transforms(rest, model.parents, pose.rotations, pose.translation)
+    joints = skinning.apply_transforms(transforms, rest)
+    posed = skinning.apply_transforms(skinning.blend_transforms(model.point_weights, transforms), points)
+    return jnp.matmul(model.regressor, jnp.concatenate([joints, posed]), precision=skinning.EXACT), joints
+
+
+def _movers(parents, joints_used, point_weights):
+    """Joints above the used joints, and those that move a used point (p, j): turning a joint does not move itself."""
+    moving = point_weights.max(axis=0, initial=0.0) > CARRIES
+    for j in np.flatnonzero(joints_used | moving):
+        while (j := parents[j]) >= 0:
+            moving[j] = True
+    return tuple(int(j) for j in np.flatnonzero(moving))
+
+
+class _Finder:
+    """Sources of landmarks on one body: vertices as they are, joints as -1 - joint."""
+
+    def __init__(self, body: BodyModel) -> None:
+        self.template = np.asarray(body.template, np.float64)
+        self.weights = np.asarray(body.skinning_weights)
+        self.joints = np.asarray(body.joint_regressor, np.float64) @ self.template
+        self.index = {name: j for j, name in enumerate(body.joint_names)}
+
+    def find(self, name: str) -> list[int]:
+        """The sources whose mean is the landmark; none if the body lacks it."""
+        try:
+            return self._find(name)
+        except (KeyError, _NoVertex):
+            return []
+
+    def _find(self, name):
+        joint = lambda x: -1 - self.index[x]
+        middles = {"neck": "shoulder", "mid_hip": "hip"}
+        if name in middles:
+            return [joint(f"{side}_{middles[name]}") for side in SIDES]
+        if name in ("nose", "face_30"):
+            return [self._nose()]
+        if name == "face_8":
+            return [self._on_midline(lambda p: -p[:, 1], highest=self.joints[self.index["jaw"], 1])]
+        if name == "face_27":
+            height = self._eyes()[1]
+            return [self._on_midline(lambda p: -np.abs(p[:, 1] - height) + p[:, 2])]
+        side, _, part = name.partition("_")
+        if side not in SIDES:
+            raise KeyError(name)
+        if part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle", "eye"):
+            return [joint(name)]
+        if part == "hand_root":
+            return [joint(f"{side}_wrist")]
+        if part == "ear":
+            return [self._ear(SIDES[side])]
+        if part in ("big_toe", "small_toe", "heel"):
+            return [self._foot(side, part)]
+        finger, _, knuckle = part.partition("_")
+        if finger not in FINGERS:
+            raise KeyError(name)
+        if knuckle == "tip":
+            return [self._finger_tip(f"{side}_{finger}")]
+        return [joint(f"{side}_{finger}{int(knuckle)}")]
+
+    def _segment(self, *joints):
+        """Vertices that belong to some joints together; joints that the body lacks are left out."""
+        owned = self.weights[:, [self.index[name] for name in joints if name in self.index]].sum(1)
+        return np.flatnonzero(owned > MEMBER)
+
+    def _best(self, vertices, score):
+        if not len(vertices):
+            raise _NoVertex
+        return int(vertices[np.argmax(score(self.template[vertices]))])
+
+    def _eyes(self):
+        return self.joints[[self.index["left_eye"], self.index["right_eye"]]].mean(0)
+
+    def _nose(self):
+        head = self._segment("head", "jaw")
+        height, low, high = self.template[head, 1], self.joints[self.index["jaw"], 1], self._eyes()[1]
+        return self._best(head[(height > low) & (height < high)], lambda p: p[:, 2])
+
+    def _on_midline(self, score, highest=np.inf):
+        """The best vertex of the front of the face's middle."""
+        head = self._segment("head", "jaw")
+        p = self.template[head]
+        front = p[:, 2] > 0.5 * (self._eyes()[2] + p[:, 2].max()) - 0.02
+        return self._best(head[front & (np.abs(p[:, 0]) < MIDLINE) & (p[:, 1] < highest)], score)
+
+    def _ear(self, sign):
+        head, eyes = self._segment("head", "jaw"), self._eyes()[1]
+        height = self.template[head, 1]
+        return self._best(head[(height > eyes - 0.06) & (height < eyes + 0.03)], lambda p: sign * p[:, 0])
+
+    def _foot(self, side, part):
+        directions = {"big_toe": (-0.3, 1.0), "small_toe": (1.0, 1.0), "heel": (0.0, -1.0)}
+        outward, forward = directions[part]
+        foot = self._segment(f"{side}_ankle", f"{side}_foot")
+        return self._best(foot, lambda p: outward * SIDES[side] * p[:, 0] + forward * p[:, 2])
+
+    def _finger_tip(self, finger):
+        along = self.joints[self.index[f"{finger}3"]] - self.joints[self.index[f"{finger}2"]]
+        return self._best(self._segment(f"{finger}3"), lambda p: p @ along)
+
+
+class _NoVertex(Exception):
+    """A body without a vertex where a rule looks."""

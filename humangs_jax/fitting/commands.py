@@ -1,0 +1,102 @@
+"""What `humangs fit` does: read, fit, say how good it is, write. Everything is checked before the work, and written after it."""
+
+import dataclasses
+from pathlib import Path
+
+from humangs_jax.body.library import load_body
+from humangs_jax.data.capture import Capture, load_capture
+from humangs_jax.data.capture_reading import DEFAULT_BODY
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.keypoints.reading import read_keypoints
+from humangs_jax.data.photographs import Photographs, load_photographs
+from humangs_jax.fitting.fit_capture import check_place, fit_photographs, write_fitted
+from humangs_jax.fitting.landmark_fit import FitConfig
+
+NAMED = 5
+"""So many views are listed by name, no more."""
+
+
+def fit_from_keypoints(
+    capture: Path,
+    keypoints: Path,
+    out: Path | None,
+    *,
+    body: Path | None,
+    person: int | None,
+    smoothness: float,
+    overwrite: bool,
+) -> None:
+    """`humangs fit CAPTURE --keypoints FILE`. Raises: ValueError or OSError, one line, with nothing written."""
+    from humangs_jax.fitting.examination import examine
+
+    target = check_place(capture, out, overwrite)
+    photographs = load_photographs(capture)
+    found = _keypoints(keypoints, photographs, person)
+    model = load_body(body)
+    body_file = DEFAULT_BODY if body is None else str(body)
+    config = dataclasses.replace(FitConfig(), smoothness=smoothness)
+    fitted = fit_photographs(photographs, found, model, body_file=body_file, config=config)
+    record = fitted.record
+    examination = examine(fitted.capture, found, deviations=record.deviations, determined=record.determined)
+    write_fitted(capture, target, fitted.capture, record)
+    print(fitted.convergence())
+    print(f"\n{examination}")
+    for warning in (*_reading_warnings(found), *fitted.warnings):
+        print(f"warning: {warning}")
+    print(f"{target}: body.npz and fit.npz; `humangs check {target}` shows them")
+
+
+def refine_in_place(
+    capture: Path, out: Path | None, *, keypoints: Path | None, person: int | None, photometric: bool, overwrite: bool
+) -> None:
+    """`humangs fit CAPTURE --refine`. Raises: ValueError or OSError, one line, with nothing written."""
+    from humangs_jax.fitting.refine import refine_capture
+
+    target = check_place(capture, out, overwrite)
+    start = load_capture(capture)
+    found = None if keypoints is None else _keypoints(keypoints, start, person)
+    refinement = refine_capture(start, keypoints=found, photometric=photometric)
+    print(refinement)
+    if refinement.kept == "start":
+        print("nothing was written: the capture is as good as it gets here")
+        return
+    write_fitted(capture, target, refinement.capture, None)
+    print(f"{target}: refined cameras and body; `humangs check {target}` shows them")
+
+
+def fit_from_scan(
+    scan: Path,
+    out: Path | None,
+    *,
+    body: Path | None,
+    joints: Path | None,
+    keypoints: Path | None,
+    bare: bool,
+    overwrite: bool,
+) -> None:
+    """`humangs fit --scan MESH`. Raises: ValueError or OSError, one line, with nothing written."""
+    if out is None:
+        raise ValueError("--out FOLDER is missing: where the body of the scan goes")
+    if out.exists() and (out.is_file() or any(out.iterdir())) and not overwrite:
+        raise ValueError(f"--out {out}: exists and is not empty; --overwrite replaces it")
+    from humangs_jax.fitting.scan_fit import fit_scan, save_scan_fit
+
+    fitted = fit_scan(scan, body=load_body(body), joints=joints, clothed=not bare)
+    save_scan_fit(out, fitted)
+    print(fitted)
+
+
+def _keypoints(path: Path, views: Photographs | Capture, person: int | None) -> Keypoints:
+    height, width = views.images.shape[1:3]
+    return read_keypoints(path, views.names, width, height, person=person)
+
+
+def _reading_warnings(found):
+    """What was odd about a file of keypoints that could be read."""
+    if found.missing:
+        names = ", ".join(found.missing[:NAMED]) + (" ..." if len(found.missing) > NAMED else "")
+        yield f"no keypoints of {len(found.missing)} views: {names}"
+    if found.not_finite:
+        yield f"{found.not_finite} keypoints were no numbers and are left out"
+    if found.far_outside:
+        yield f"{found.far_outside} keypoints lie far outside of their photo and are left out: of photos of another size?"

@@ -1,0 +1,100 @@
+"""Points in space from their pictures in several views: plain, by least squares, or robustly, from the pair most agree with.
+
+A pixel is a ray; a point is sought whose squared distances to the rays, weighted, are least (3 x 3 equations). Weighting by
+the focal length over the distance makes them squares of pixels (Hartley and Zisserman, Multiple View Geometry, 12.2).
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.array_types import Array, Float
+from humangs_jax.fitting.observations import Observations
+from humangs_jax.numerics import safe_normalize
+
+RIDGE = 1e-6
+"""Of the weights: rays that are parallel leave the distance open, and the point near the cameras."""
+REWEIGHTED = 3
+"""Rounds of weighting the rays by the distance of the last point."""
+MARGIN = 6.0
+"""Views within so many standard deviations of the noise agree with a point."""
+
+
+def triangulate(
+    observations: Observations, weights: Float[Array, "c k"] | None = None
+) -> tuple[Float[Array, "k 3"], Float[Array, " k"]]:
+    """Least squares over all views: points (k, 3) in metres and how many views see each (k,).
+
+    Arguments: weights: of the views of each point; the confidences if not given.
+    """
+    weights = observations.confidences if weights is None else weights
+    origins, directions = _rays(observations)
+    focal = observations.K[:, 0, 0]
+    points = _nearest(origins, directions, weights)
+    for _ in range(REWEIGHTED):
+        distance = jnp.sum(directions * (points - origins[:, None]), axis=-1)
+        points = _nearest(
+            origins, directions, weights * jnp.square(focal[:, None] / jnp.maximum(jnp.abs(distance), 0.1))
+        )
+    return points, jnp.sum(weights > 0, axis=0).astype(jnp.float32)
+
+
+def triangulate_robustly(
+    observations: Observations,
+) -> tuple[Float[Array, "k 3"], Float[Array, " k"], Float[Array, "c k"]]:
+    """Points (k, 3), how many views agree with each (k,), and those views' weights (c, k).
+
+    Every pair of views proposes a point; the proposal that the views agree with most is improved from those views alone. A
+    point that fewer than two views agree with has weights of 0.
+    """
+    views = observations.points.shape[0]
+    if views < 2:
+        k = observations.points.shape[1]
+        return jnp.zeros((k, 3)), jnp.zeros(k), jnp.zeros_like(observations.confidences)
+    pairs = np.stack(np.triu_indices(views, 1), axis=1)
+    chosen = np.zeros((len(pairs), views, 1), np.float32)
+    chosen[np.arange(len(pairs))[:, None], pairs] = 1
+    propose = lambda pair: triangulate(observations, observations.confidences * pair)[0]
+    proposals = jax.vmap(propose)(jnp.asarray(chosen))
+    errors = jax.vmap(lambda points: reprojection_errors(observations, points))(proposals)
+    limit = MARGIN * observations.noise
+    agreement = observations.confidences * jnp.maximum(1 - jnp.square(errors / limit), 0.0)
+    best = jnp.argmax(jnp.sum(agreement, axis=1), axis=0)
+    weights = jax.vmap(lambda a, i: a[i], in_axes=(-1, 0), out_axes=-1)(agreement, best)
+    agreeing = jnp.sum(weights > 0, axis=0)
+    weights = jnp.where(agreeing >= 2, weights, 0.0)
+    points, count = triangulate(observations, weights)
+    return points, count, weights
+
+
+def reprojection_errors(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
+    """Distance in pixels between points as the views would show them and the detections; huge behind a camera."""
+    seen = (
+        points @ jnp.swapaxes(observations.cam_from_world[:, :3, :3], -1, -2)
+        + observations.cam_from_world[:, None, :3, 3]
+    )
+    depth = seen[..., 2]
+    before = depth > 0.01
+    focal = jnp.stack([observations.K[:, 0, 0], observations.K[:, 1, 1]], axis=-1)[:, None]
+    pixels = seen[..., :2] / jnp.where(before, depth, 1.0)[..., None] * focal + observations.K[:, None, :2, 2]
+    return jnp.where(before, jnp.linalg.norm(pixels - observations.points, axis=-1), 1e6)
+
+
+def _rays(observations):
+    """Camera centres (c, 3) and unit directions (c, k, 3) of the detections in the world."""
+    rotation, translation = observations.cam_from_world[:, :3, :3], observations.cam_from_world[:, :3, 3]
+    focal = jnp.stack([observations.K[:, 0, 0], observations.K[:, 1, 1]], axis=-1)[:, None]
+    xy = (observations.points - observations.K[:, None, :2, 2]) / focal
+    local = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
+    directions = safe_normalize(jnp.einsum("cba,ckb->cka", rotation, local), jnp.asarray([0.0, 0.0, 1.0]))
+    return -jnp.einsum("cba,cb->ca", rotation, translation), directions
+
+
+def _nearest(origins, directions, weights):
+    """The points (k, 3) nearest to weighted rays."""
+    center = jnp.mean(origins, axis=0)  # far from the world's origin nothing is lost to rounding
+    across = jnp.eye(3) - directions[..., :, None] * directions[..., None, :]
+    scale = weights / jnp.maximum(jnp.sum(weights, axis=0), 1e-12)
+    matrix = jnp.einsum("ck,ckab->kab", scale, across) + RIDGE * jnp.eye(3)
+    vector = jnp.einsum("ck,ckab,cb->ka", scale, across, origins - center)
+    return jnp.linalg.solve(matrix, vector[..., None])[..., 0] + center

@@ -1,0 +1,145 @@
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from fit_people import NAMES_WITHIN_LIMITS, default_body, observe
+
+from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
+from humangs_jax.data.photographs import load_photographs
+from humangs_jax.fitting.fit_capture import check_place, fit_photographs, write_fitted
+from humangs_jax.fitting.fit_record import read_fit_record
+from humangs_jax.pytree import replace
+
+SIZE = 16
+MOMENTS = NAMES_WITHIN_LIMITS
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A capture folder without body.npz; five moments, four views each, in no order."""
+    joints, _, seen = observe(MOMENTS, noise=2.0)
+    order = np.random.default_rng(0).permutation(len(MOMENTS) * 4)
+    frames, views = order // 4, order % 4
+    path = tmp_path_factory.mktemp("photos") / "me"
+    K, pose = np.asarray(seen.K)[frames, views], np.asarray(seen.cam_from_world)[frames, views]
+    images = np.full((len(order), SIZE, SIZE, 3), 0.5, np.float32)
+    rest = np.zeros((len(MOMENTS), 55, 3)), np.zeros((len(MOMENTS), 3))
+    save_capture(
+        path, capture_from_arrays(images, K, pose, *rest, frames=[int(f) for f in frames], body=default_body())
+    )
+    (path / "body.npz").unlink()
+    points, confidences = (np.asarray(x)[frames, views] for x in (seen.points, seen.confidences))
+    return path, Keypoints(points, confidences, COCO_WHOLEBODY_133), joints
+
+
+@pytest.fixture(scope="module")
+def fitted(folder):
+    return fit_photographs(load_photographs(folder[0]), folder[1], default_body())
+
+
+def test_views_are_sorted_by_their_moments(folder, fitted):
+    errors = 1000 * np.linalg.norm(np.asarray(fitted.fit.joints) - folder[2], axis=-1)
+    assert errors.mean() < 10
+    assert fitted.capture.frame_count == len(MOMENTS) and fitted.warnings == ()
+    table = fitted.convergence().splitlines()
+    assert [row.split()[0] for row in table[1:]] == ["rigid", "points", "body", "hands", "person"]
+
+
+def test_written_in_place_and_read_again(folder, fitted, tmp_path):
+    path = copied(folder[0], tmp_path)
+    described = (path / "capture.json").read_text()
+    with pytest.raises(CaptureError, match="humangs fit"):
+        load_capture(path)
+    write_fitted(path, check_place(path, None, overwrite=False), fitted.capture, fitted.record)
+    again = load_capture(path)
+    np.testing.assert_array_equal(again.poses.rotations, fitted.capture.poses.rotations)
+    np.testing.assert_array_equal(again.betas, fitted.capture.betas)
+    assert json.loads((path / "capture.json").read_text()) == json.loads(described)
+    record = read_fit_record(path / "fit.npz")
+    np.testing.assert_array_equal(record.keypoints.points, folder[1].points)
+    np.testing.assert_allclose(record.deviations, fitted.record.deviations, rtol=1e-6)
+    assert record.names == again.names
+    with pytest.raises(ValueError, match=r"body\.npz exists: --overwrite"):
+        check_place(path, None, overwrite=False)
+    check_place(path, None, overwrite=True)
+
+
+def test_written_elsewhere_with_its_pictures_and_new_cameras(folder, fitted, tmp_path):
+    moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
+    capture = dataclasses.replace(fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved))
+    target = check_place(folder[0], tmp_path / "out", overwrite=False)
+    write_fitted(folder[0], target, capture, None)
+    again = load_capture(target)
+    np.testing.assert_array_equal(again.cameras.cam_from_world, moved)
+    np.testing.assert_array_equal(again.images, load_photographs(folder[0]).images)
+    assert not (target / "fit.npz").exists() and not (folder[0] / "body.npz").exists()
+    with pytest.raises(ValueError, match="not empty; --overwrite"):
+        check_place(folder[0], target, overwrite=False)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "diary.txt").write_text("mine")
+    with pytest.raises(ValueError, match="no capture"):
+        check_place(folder[0], tmp_path / "other", overwrite=True)
+
+
+def test_moments_that_views_hardly_show_are_named(folder):
+    points, confidences = folder[1].points, folder[1].confidences.copy()
+    frames = load_photographs(folder[0]).frames
+    confidences[frames == 1] = 0
+    first, *others = np.flatnonzero(frames == 3)
+    confidences[others] = 0
+    found = fit_photographs(load_photographs(folder[0]), Keypoints(points, confidences, folder[1].set), default_body())
+    assert len(found.warnings) == 2
+    assert found.warnings[0].startswith("moment 1: 0 keypoints are seen")
+    assert found.warnings[1].startswith("moment 3: seen by one view")
+    assert first >= 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p, c: (p, 0 * c), "no view has a keypoint"),
+        (lambda p, c: (p[:3], c[:3]), "keypoints of 3 views, but there are 20 photographs"),
+    ],
+)
+def test_what_cannot_be_fitted_is_one_error(folder, change, message):
+    keypoints = Keypoints(*change(folder[1].points, folder[1].confidences), folder[1].set)
+    with pytest.raises(ValueError, match=message):
+        fit_photographs(load_photographs(folder[0]), keypoints, default_body())
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"set": np.asarray("mine")}, "set: expected one of coco17"),
+        ({"points": np.zeros((2, 3))}, "points: expected shape"),
+        ({"confidences": np.full((20, 133), np.nan)}, "confidences: expected finite"),
+        ({"noise": np.zeros(2)}, "noise: expected"),
+        ({"determined": None}, "determined: missing"),
+        ({"names": np.asarray([{}], object)}, "names: expected plain arrays"),
+    ],
+)
+def test_a_damaged_record_is_one_error(folder, fitted, tmp_path, change, message):
+    path = copied(folder[0], tmp_path)
+    write_fitted(path, path, fitted.capture, fitted.record)
+    with np.load(path / "fit.npz") as file:
+        arrays = {**file, **change}
+    np.savez(path / "fit.npz", **{name: value for name, value in arrays.items() if value is not None})
+    with pytest.raises(CaptureError, match=message):
+        read_fit_record(path / "fit.npz")
+
+
+def test_a_body_whose_root_is_not_first_is_refused(folder):
+    body = default_body()
+    strange = replace(body, parents=(1, -1, *body.parents[2:]))
+    with pytest.raises(ValueError, match="root to be its first joint, got joint 1"):
+        fit_photographs(load_photographs(folder[0]), folder[1], strange)
+
+
+def copied(folder, tmp_path):
+    import shutil
+
+    return shutil.copytree(folder, tmp_path / "me")

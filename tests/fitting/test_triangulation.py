@@ -1,0 +1,75 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fit_people import model_of, observe
+
+from humangs_jax.fitting.triangulation import reprojection_errors, triangulate, triangulate_robustly
+from humangs_jax.pytree import replace
+
+EXACT = 2e-4  # metres: float32 pixels of 512 at 3 metres
+KNOWN = np.asarray(model_of().known)
+
+plain, robust = (jax.jit(jax.vmap(f)) for f in (triangulate, triangulate_robustly))
+
+
+def scene(**changes):
+    joints, _, seen = observe(["standing", "crouching"], **changes)
+    return joints, seen
+
+
+def truth(joints):
+    """The landmarks that are joints: both knees and wrists, by name."""
+    names = ("left_knee", "right_knee", "left_wrist", "right_wrist")
+    rows = [model_of().names.index(name) for name in names]
+    return rows, joints[:, [model_of().joint_names.index(name) for name in names]]
+
+
+@pytest.mark.parametrize("method", [plain, robust], ids=["plain", "robust"])
+@pytest.mark.parametrize("views", [2, 5])
+def test_exact_points_are_found(method, views):
+    joints, seen = scene(views=views)
+    points, counts = method(seen)[:2]
+    rows, expected = truth(joints)
+    np.testing.assert_allclose(np.asarray(points)[:, rows], expected, atol=EXACT)
+    assert (np.asarray(counts)[:, KNOWN] == views).all()
+    assert (np.asarray(counts)[:, ~KNOWN] == 0).all()
+
+
+def test_a_wrong_view_is_left_out():
+    joints, seen = scene(views=4)
+    off = replace(seen, points=seen.points.at[:, 2].add(80.0))
+    rows, expected = truth(joints)
+    error = lambda found: np.linalg.norm(np.asarray(found[0])[:, rows] - expected, axis=-1).max()
+    assert error(robust(off)) < EXACT < 0.05 < error(plain(off))
+    weights = np.asarray(robust(off)[2])
+    assert (weights[:, 2][:, KNOWN] == 0).all() and (weights[:, [0, 1, 3]][:, :, KNOWN] > 0).all()
+
+
+def test_what_no_two_views_agree_on_is_unknown():
+    _, seen = scene(views=2)
+    apart = replace(seen, points=seen.points.at[:, 0, :, 1].add(120.0))
+    _, counts, weights = robust(apart)
+    assert (np.asarray(counts)[:, KNOWN] == 0).mean() > 0.8  # some agree by chance, far away
+    assert np.isfinite(weights).all()
+
+
+def test_one_view_has_no_points_in_space():
+    _, seen = scene(views=1)
+    points, counts, _ = robust(seen)
+    assert not np.asarray(counts).any() and np.isfinite(points).all()
+
+
+def test_parallel_rays_stay_finite():
+    _, seen = scene(views=2)
+    same = jax.tree.map(lambda leaf: leaf.at[:, 1].set(leaf[:, 0]) if leaf.ndim > 1 else leaf, seen)
+    assert np.isfinite(plain(same)[0]).all() and np.isfinite(robust(same)[0]).all()
+
+
+def test_a_point_behind_a_camera_is_no_match():
+    _, seen = scene(views=2)
+    one = jax.tree.map(lambda leaf: leaf[0], seen)
+    rotation, translation = np.asarray(one.cam_from_world[0, :3, :3]), np.asarray(one.cam_from_world[0, :3, 3])
+    behind = -rotation.T @ translation - 3 * rotation[2]
+    errors = reprojection_errors(one, jnp.asarray(np.broadcast_to(behind, (133, 3)), jnp.float32))
+    assert (np.asarray(errors)[0] > 1e5).all()
