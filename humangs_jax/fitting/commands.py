@@ -37,7 +37,8 @@ def fit_from_keypoints(
     config = dataclasses.replace(FitConfig(), smoothness=smoothness)
     fitted = fit_photographs(photographs, found, model, body_file=body_file, config=config)
     record = fitted.record
-    examination = examine(fitted.capture, found, deviations=record.deviations, determined=record.determined)
+    known = {name: getattr(record, name) for name in ("deviations", "determined", "noise")}
+    examination = examine(fitted.capture, found, **known, mirrored=fitted.mirrored)
     write_fitted(capture, target, fitted.capture, record)
     print(fitted.convergence())
     print(f"\n{examination}")

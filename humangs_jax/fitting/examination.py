@@ -20,7 +20,7 @@ from humangs_jax.fitting.fit_record import FitRecord
 from humangs_jax.fitting.landmark_fit import NOISE_RANGE, RAYLEIGH_MEDIAN
 from humangs_jax.fitting.objective import keypoint_errors, landmark_certainty
 from humangs_jax.fitting.observations import group_by_moment
-from humangs_jax.fitting.swaps import Swap, find_swaps
+from humangs_jax.fitting.swaps import Swap, find_exchanged_hands, find_swaps
 
 OUTLIER = 5.0
 """Standard deviations of the noise beyond which a keypoint is an outlier; as many as the last stage of a fit cuts it off at."""
@@ -114,6 +114,7 @@ def examine(
     violations = limit_violations(capture.body.joint_names, poses)
     known = [None if values is None else values[: len(views)] for values in (deviations, determined)]
     swaps = (*mirrored, *find_swaps(observations, keypoints.set, views, capture.names))
+    swaps += find_exchanged_hands(keypoints, capture.names)
     return Examination(
         views=fits,
         moments=moments,

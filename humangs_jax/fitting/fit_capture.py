@@ -18,16 +18,18 @@ from humangs_jax.data.photographs import Photographs, capture_folder
 from humangs_jax.fitting.fit_record import FIT_FILE, FitRecord, write_fit_record
 from humangs_jax.fitting.landmark_fit import STAGES, FitConfig, LandmarkFit, fit_landmarks
 from humangs_jax.fitting.observations import group_by_moment
+from humangs_jax.fitting.swaps import Swap, find_mirrored
 from humangs_jax.fitting.uncertainty import fit_uncertainty
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FittedCapture:
-    """A fit in memory: the capture with its body, what to keep beside it, and what the solver did."""
+    """A fit in memory: the capture with its body, what to keep beside it, what the solver did, and what seems wrong."""
 
     capture: Capture
     record: FitRecord
     fit: LandmarkFit
+    mirrored: tuple[Swap, ...]
     warnings: tuple[str, ...]
 
     def convergence(self) -> str:
@@ -83,7 +85,8 @@ def fit_photographs(
         found.determined,
         found.shape_covariance,
     )
-    return FittedCapture(capture, record, fit, _blind_moments(seen))
+    mirrored = find_mirrored(model, observations, keypoints.set, fit, config)
+    return FittedCapture(capture, record, fit, mirrored, _blind_moments(seen))
 
 
 FEW = 6

@@ -81,7 +81,8 @@ IN_BATCH = {
 }
 
 
-PLANTED = [(what, np.nan) for what in IN_BATCH] + [(what, np.inf) for what in IN_BATCH if "camera" not in what]
+PLANTED = [(what, np.nan) for what in IN_BATCH]
+PLANTED += [pytest.param(what, np.inf, marks=pytest.mark.slow) for what in IN_BATCH if "camera" not in what]
 """An infinite camera may show nothing at all, which is finite."""
 
 

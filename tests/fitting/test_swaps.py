@@ -1,0 +1,178 @@
+import dataclasses
+import types
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from seen_people import person
+
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, hand_names
+from humangs_jax.data.photographs import Photographs
+from humangs_jax.fitting import swaps as module
+from humangs_jax.fitting.landmark_fit import FitConfig
+from humangs_jax.fitting.observations import group_by_moment
+from humangs_jax.fitting.swaps import find_exchanged_hands, find_mirrored, find_swaps
+
+MIRROR = list(COCO_17.mirror)
+
+
+def seen(capture, keypoints):
+    photographs = Photographs(capture.images, None, capture.cameras, capture.frames, capture.names)
+    return (*group_by_moment(photographs, keypoints)[:1], keypoints.set, group_by_moment(photographs, keypoints)[1])
+
+
+def found(capture, keypoints):
+    return find_swaps(*seen(capture, keypoints), capture.names)
+
+
+def changed(keypoints, order=None, flipped=()):
+    """Keypoints of views in another order, those of some mirrored."""
+    order = np.arange(len(keypoints.points)) if order is None else np.asarray(order)
+    points, confidences = keypoints.points[order].copy(), keypoints.confidences[order].copy()
+    for view in flipped:
+        points[view], confidences[view] = points[view][MIRROR], confidences[view][MIRROR]
+    return Keypoints(points, confidences, keypoints.set)
+
+
+@pytest.mark.parametrize("views", [2, 3, 4, 8])
+def test_nothing_is_found_where_nothing_is_wrong(views):
+    for seed in range(4):
+        assert found(*person(seed, 4, views, outliers=0.2)) == ()
+
+
+@pytest.mark.parametrize("views", [3, 4, 8])
+@pytest.mark.parametrize("outliers", [0.0, 0.1])
+def test_sides_of_single_views(views, outliers):
+    capture, keypoints = person(10, 4, views, outliers=outliers)
+    swapped = [1, views, 3 * views + 2]  # in moments 0, 1 and 3
+    swaps = found(capture, changed(keypoints, flipped=swapped))
+    assert {(swap.kind, swap.views, swap.instead) for swap in swaps} == {
+        ("sides", (capture.names[view],), ()) for view in swapped
+    }
+    assert all(0.3 < swap.gain < 1.1 for swap in swaps)
+    assert "view m1v0: left and right of the keypoints seem exchanged" in [str(swap) for swap in swaps]
+
+
+def test_of_two_views_either_may_be_the_wrong_one():
+    capture, keypoints = person(11, 4, 2)
+    swaps = found(capture, changed(keypoints, flipped=[0, 5]))
+    assert {frozenset((*swap.views, *swap.instead)) for swap in swaps} == {
+        frozenset(("m0v0", "m0v1")),
+        frozenset(("m2v0", "m2v1")),
+    }
+    assert "instead)" in str(swaps[0])
+
+
+def test_of_four_views_two_and_two():
+    capture, keypoints = person(12, 4, 4)
+    swaps = found(capture, changed(keypoints, flipped=[0, 3]))
+    assert len(swaps) == 2
+    assert {name for swap in swaps for name in (*swap.views, *swap.instead)} == {"m0v0", "m0v1", "m0v2", "m0v3"}
+    assert {frozenset(swap.views) for swap in swaps} in (
+        {frozenset(("m0v0",)), frozenset(("m0v3",))},
+        {frozenset(("m0v1",)), frozenset(("m0v2",))},
+    )
+
+
+@pytest.mark.parametrize("views", [3, 4, 8])
+def test_cameras_of_two_views(views):
+    capture, keypoints = person(13, 4, views, outliers=0.1)
+    order = np.arange(4 * views)
+    order[[0, 2]] = [2, 0]
+    (swap,) = found(capture, changed(keypoints, order))
+    assert (swap.kind, swap.views, swap.instead, swap.moments) == ("cameras", ("m0v0", "m0v2"), (), 1)
+    assert str(swap) == "the cameras (or the photos) of views m0v0 and m0v2 seem exchanged"
+
+
+def test_evenly_spaced_cameras_have_two_explanations():
+    """Half a turn of all cameras makes one exchange of opposite ones the other."""
+    capture, keypoints = person(13, 4, 4, even=True)
+    order = np.arange(16)
+    order[[0, 2]] = [2, 0]
+    (swap,) = found(capture, changed(keypoints, order))
+    assert {" and ".join(swap.views), *swap.instead} == {"m0v0 and m0v2", "m0v1 and m0v3"}
+    assert str(swap).endswith("instead)")
+
+
+def test_cameras_of_two_views_cannot_be_told_from_two():
+    capture, keypoints = person(14, 4, 2)
+    assert all(swap.kind != "cameras" for swap in found(capture, changed(keypoints, [1, 0, 2, 3, 4, 5, 6, 7])))
+
+
+def test_cameras_that_stand_still_are_reported_once():
+    capture, keypoints = person(15, 4, 4, still=True, outliers=0.1)
+    order = (np.arange(16).reshape(4, 4)[:, [0, 3, 2, 1]]).ravel()
+    (swap,) = found(capture, changed(keypoints, order))
+    assert (swap.kind, swap.views, swap.moments) == ("cameras", ("m0v1", "m0v3"), 4)
+    assert str(swap).endswith("seem exchanged, as in 4 moments")
+
+
+def test_photos_of_one_moment_are_exchanged_under_cameras_that_stand_still():
+    capture, keypoints = person(16, 4, 4, still=True)
+    order = np.arange(16)
+    order[[5, 6]] = [6, 5]
+    (swap,) = found(capture, changed(keypoints, order))
+    assert (swap.kind, swap.views, swap.moments) == ("cameras", ("m1v1", "m1v2"), 1)
+
+
+def test_both_at_once():
+    capture, keypoints = person(17, 4, 8)
+    order = np.arange(32)
+    order[[8, 12]] = [12, 8]
+    swaps = found(capture, changed(keypoints, order, flipped=[1, 10]))
+    assert {(swap.kind, swap.views) for swap in swaps} == {
+        ("cameras", ("m1v0", "m1v4")),
+        ("sides", ("m0v1",)),
+        ("sides", ("m1v2",)),
+    }
+
+
+def test_one_view_and_views_that_are_missing():
+    capture, keypoints = person(18, 4, 3)
+    alone = capture.select([0, 3, 6, 9])
+    assert found(alone, changed(keypoints, [0, 3, 6, 9], flipped=[1])) == ()
+    some = [0, 1, 2, 4, 5, 6, 7, 8, 9]  # moment 1 has two views, moment 3 has one
+    swaps = found(capture.select(some), changed(changed(keypoints, flipped=[8]), some))
+    assert [swap.views for swap in swaps] == [("m2v2",)]
+    blind = dataclasses.replace(keypoints, confidences=np.zeros_like(keypoints.confidences))
+    assert found(capture, blind) == ()
+
+
+@pytest.mark.parametrize(
+    "given, other, share", [(10.0, 5.0, 0.5), (10.0, 7.0, None), (1000.0, 900.0, 0.1), (1000.0, 950.0, None)]
+)
+def test_mirrored_people(monkeypatch, given, other, share):
+    """By what a fit to the mirrored keypoints costs; that it finds the people themselves is measured, not tested here."""
+    fit = lambda cost: types.SimpleNamespace(outcomes={"hands": types.SimpleNamespace(after=jnp.full(4, cost / 4))})
+    capture, keypoints = person(19, 4, 2)
+    observations, kind, _ = seen(capture, keypoints)
+    asked = []
+    monkeypatch.setattr(module, "fit_landmarks", lambda model, seen, config: asked.append(seen) or fit(other))
+    swaps = _unchecked(find_mirrored)(None, observations, kind, fit(given), FitConfig())
+    np.testing.assert_array_equal(asked[0].points, np.asarray(observations.points)[:, :, MIRROR])
+    assert len(swaps) == (share is not None)
+    for swap in swaps:
+        assert swap.kind == "all sides" and swap.gain == pytest.approx(share, abs=1e-6)
+        assert "in all views" in str(swap)
+
+
+def _unchecked(function):
+    """Without the check of types, which the stand-in of a fit would fail."""
+    return getattr(function, "__wrapped__", function)
+
+
+def test_hands_at_each_others_wrists():
+    _, keypoints = person(0, 2, 4, kind=COCO_WHOLEBODY_133)
+    names = tuple(f"view{i}" for i in range(8))
+    assert find_exchanged_hands(keypoints, names) == ()
+    hands = [
+        i for i, name in enumerate(COCO_WHOLEBODY_133.names) if name in (*hand_names("left"), *hand_names("right"))
+    ]
+    points = keypoints.points.copy()
+    points[3, hands] = points[3, np.asarray(COCO_WHOLEBODY_133.mirror)[hands]]
+    found = find_exchanged_hands(dataclasses.replace(keypoints, points=points), names)
+    assert [str(swap) for swap in found] == [
+        "view view3: the keypoints of the hands seem exchanged: each lies at the other wrist"
+    ]
+    assert find_exchanged_hands(person(0, 1, 2)[1], names) == ()
