@@ -74,9 +74,9 @@ def run(arguments) -> None:
 
 def write(path: Path, results: dict) -> None:
     """Whole or not at all."""
-    from humangs_jax.data.atomic import replace_file
+    from report_tables import write_json
 
-    replace_file(path, lambda temporary: temporary.write_text(json.dumps(results, indent=1) + "\n"))
+    write_json(path, results)
     short = {name: value for name, value in results.items() if not isinstance(value, dict | list)}
     print(json.dumps(short), flush=True)
 

@@ -111,7 +111,9 @@ def fit_photos(photos, body, seed, arguments):
     model = landmark_model(body, kind.names)
     landmarks, joints = pose_landmarks(model, photos.betas, photos.pose(0))
     K, pose = np.asarray(photos.cameras.K)[None], np.asarray(photos.cameras.cam_from_world)[None]
-    case = FitCase(photos.betas, None, None, np.asarray(joints)[None], np.asarray(landmarks)[None], K, pose)
+    rotations, translations = np.asarray(photos.poses.rotations), np.asarray(photos.poses.translation)
+    truth = (np.asarray(x)[None] for x in (joints, landmarks))
+    case = FitCase(photos.betas, rotations, translations, *truth, K, pose)
     points = detect(case, seed, arguments.noise_px * SIZE / 512, arguments.outliers, 100 * SIZE / 512)[0]
     confidences = np.broadcast_to(np.asarray(model.known, np.float32), points.shape[:-1])
     keypoints = Keypoints(points.astype(np.float32), confidences, kind)

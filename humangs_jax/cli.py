@@ -266,6 +266,8 @@ def fit(
     keypoints: Path | None = None,
     scan: Path | None = None,
     joints: Path | None = None,
+    views: Path | None = None,
+    height: float | None = None,
     bare: bool = False,
     refine: bool = False,
     photometric: bool = False,
@@ -284,7 +286,9 @@ def fit(
         capture: folder with capture.json; its body.npz need not exist.
         keypoints: of OpenPose, COCO, COCO-WholeBody, MMPose or AlphaPose, a file or folder (docs/fitting.md).
         scan: a mesh with a person in it, of any scale and orientation.
-        joints: 3D landmarks of the scan by name (.json or .npz); without, the pose is searched.
+        joints: 3D landmarks of the scan by name (.json or .npz); without these and --views, the pose is searched.
+        views: folder of pictures of the scan, which are drawn there; then, with --keypoints, those that the keypoints are of.
+        height: of the person in the scan without shoes, metres, which gives the scan its unit.
         bare: the scan wears no clothes.
         refine: polish cameras and poses; with --keypoints, against these too. Never worse than the start.
         photometric: also compare photos and renderings of a reconstruction while refining.
@@ -297,14 +301,18 @@ def fit(
     """
     from humangs_jax.fitting.commands import fit_from_keypoints, fit_from_scan, refine_in_place
 
-    if (capture is None) == (scan is None):
-        raise ValueError("give either a CAPTURE folder or --scan MESH")
     if scan is not None:
-        if wrong := [n for n, given in (("--refine", refine), ("--person", person is not None)) if given]:
-            raise ValueError(f"{wrong[0]} is for captures, not for --scan")
-        fit_from_scan(scan, out, body=body, joints=joints, keypoints=keypoints, bare=bare, overwrite=overwrite)
+        if capture is not None:
+            raise ValueError("give either a CAPTURE folder or --scan MESH, not both")
+        if refine or photometric or smoothness:
+            raise ValueError("--refine, --photometric and --smoothness are for captures, not for --scan")
+        given = {"joints": joints, "views": views, "keypoints": keypoints, "person": person, "height": height}
+        fit_from_scan(scan, out, body=body, bare=bare, overwrite=overwrite, **given)
         return
-    if wrong := [name for name, given in (("--joints", joints is not None), ("--bare", bare)) if given]:
+    if capture is None:
+        raise ValueError("give either a CAPTURE folder or --scan MESH")
+    scans_only = {"--joints": joints, "--views": views, "--height": height, "--bare": bare or None}
+    if wrong := [option for option, value in scans_only.items() if value is not None]:
         raise ValueError(f"{wrong[0]} is for --scan, not for captures")
     if photometric and not refine:
         raise ValueError("--photometric is a way to refine: add --refine")

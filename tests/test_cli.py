@@ -145,8 +145,12 @@ def test_from_photos_to_pictures(folder, tmp_path, monkeypatch, capsys):
             ["FOLDER", "--keypoints", "k.json", "--smoothness", "-1", "--out", "new"],
             "--smoothness -1.0: expected at least 0",
         ),
-        (["--scan", "scan.obj", "--refine"], "--refine is for captures"),
+        (["--scan", "scan.obj", "--refine"], "are for captures, not for --scan"),
         (["--scan", "scan.obj"], "--out FOLDER is missing"),
+        (["--scan", "scan.obj", "--out", "new"], "scan.obj"),
+        (["--scan", "scan.obj", "--views", "v"], "scan.obj"),
+        (["--scan", "scan.obj", "--keypoints", "k.json", "--out", "new"], "needs --views FOLDER"),
+        (["--scan", "scan.obj", "--joints", "j.json", "--views", "v"], "--joints and --views: give one"),
     ],
 )
 def test_fit_says_what_is_missing(folder, tmp_path, monkeypatch, capsys, arguments, message):

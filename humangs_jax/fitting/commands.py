@@ -1,6 +1,7 @@
 """What `humangs fit` does: read, fit, say how good it is, write. Everything is checked before the work, and written after it."""
 
 import dataclasses
+import os
 from pathlib import Path
 
 from humangs_jax.body.library import load_body
@@ -71,20 +72,43 @@ def fit_from_scan(
     *,
     body: Path | None,
     joints: Path | None,
+    views: Path | None,
     keypoints: Path | None,
+    person: int | None,
+    height: float | None,
     bare: bool,
     overwrite: bool,
 ) -> None:
     """`humangs fit --scan MESH`. Raises: ValueError or OSError, one line, with nothing written."""
+    if joints is not None and views is not None:
+        raise ValueError("--joints and --views: give one of them, both say where the joints are")
+    if keypoints is not None and views is None:
+        raise ValueError("--keypoints of a scan needs --views FOLDER, the pictures that they are of")
+    from humangs_jax.fitting.scan_files import save_scan_fit
+    from humangs_jax.fitting.scan_fit import fit_scan
+    from humangs_jax.fitting.scan_joints import read_joints
+    from humangs_jax.fitting.scan_views import joints_from_views, render_scan_views
+
+    if views is not None and keypoints is None:
+        render_scan_views(scan, views)
+        print(
+            f"{views}: pictures of the scan; find keypoints in {views / 'images'}, then add --keypoints FILE --out FOLDER"
+        )
+        return
     if out is None:
         raise ValueError("--out FOLDER is missing: where the body of the scan goes")
     if out.exists() and (out.is_file() or any(out.iterdir())) and not overwrite:
         raise ValueError(f"--out {out}: exists and is not empty; --overwrite replaces it")
-    from humangs_jax.fitting.scan_fit import fit_scan, save_scan_fit
-
-    fitted = fit_scan(scan, body=load_body(body), joints=joints, clothed=not bare)
-    save_scan_fit(out, fitted)
+    known = None
+    if joints is not None:
+        known = read_joints(joints)
+    elif views is not None and keypoints is not None:
+        known = joints_from_views(views, _keypoints(keypoints, load_photographs(views), person))
+    fitted = fit_scan(scan, body=load_body(body), joints=known, clothed=not bare, height=height)
+    body_file = DEFAULT_BODY if body is None else os.path.relpath(body.resolve(), out.resolve())
+    save_scan_fit(out, fitted, body_file, overwrite=overwrite)
     print(fitted)
+    print(f"{out}: body.npz, scan_fit.json and body_in_scan.ply")
 
 
 def _keypoints(path: Path, views: Photographs | Capture, person: int | None) -> Keypoints:

@@ -146,7 +146,7 @@ def write_fitted(source: str | Path, target: str | Path, capture: Capture, recor
         else:
             write_fit_record(target / FIT_FILE, record)
         replace_file(target / name, lambda path: np.savez(path, **arrays))  # ty: ignore[invalid-argument-type]
-        replace_file(target / "capture.json", lambda path: path.write_text(described, encoding="utf-8"))
+        replace_file(target / "capture.json", lambda path: _write_text(path, described))
         return
 
     def write(folder: Path):
@@ -159,6 +159,10 @@ def write_fitted(source: str | Path, target: str | Path, capture: Capture, recor
             write_fit_record(folder / FIT_FILE, record)
 
     replace_folder(target, write)
+
+
+def _write_text(path, text):
+    path.write_text(text, encoding="utf-8")
 
 
 def _with_cameras(description, capture):

@@ -36,7 +36,7 @@ _FINGER = Range((0.0, 0.0, -0.35), (0.1, 0.1, 0.5), (-0.4, -0.4, -1.9), (0.4, 0.
 _KNUCKLE = Range((0.0, 0.0, -0.3), (0.15, 0.2, 0.5), (-0.5, -0.6, -1.8), (0.5, 0.6, 0.6))
 
 RANGES = {
-    "pelvis": Range((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (-FREE,) * 3, (FREE,) * 3),
+    "pelvis": Range((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (-FREE, -FREE, -FREE), (FREE, FREE, FREE)),
     "spine1": _SPINE,
     "spine2": _SPINE,
     "spine3": _SPINE,
@@ -71,7 +71,7 @@ class PosePrior:
 
 def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
     """The prior of a body. Joints of other names than SMPL-X's rest at 0 with a spread of 0.3 rad, free of limits."""
-    unknown = Range((0.0, 0.0, 0.0), (0.3,) * 3, (-FREE,) * 3, (FREE,) * 3)
+    unknown = Range((0.0, 0.0, 0.0), (0.3, 0.3, 0.3), (-FREE, -FREE, -FREE), (FREE, FREE, FREE))
     rows = [_range_of(name, unknown) for name in joint_names]
     return PosePrior(*(np.stack([row[i] for row in rows]).astype(np.float32) for i in range(4)))
 

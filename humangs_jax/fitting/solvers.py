@@ -22,7 +22,7 @@ class Outcome:
 
 def half_squares(tree: PyTree) -> Float[Array, ""]:
     """Half the square sum of all leaves."""
-    return 0.5 * sum(jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree))
+    return sum((0.5 * jnp.sum(jnp.square(leaf)) for leaf in jax.tree.leaves(tree)), jnp.zeros(()))
 
 
 def minimise(

@@ -44,10 +44,9 @@ MIRRORED_SHARE, MIRRORED_GAIN = 0.6, 60.0
 class Swap:
     """One exchange that explains what does not agree; `str()` is a sentence about it.
 
-    kind: "sides", "cameras", "all sides" or "hands". views: names of those concerned. instead: of those that would explain it as well, of
-    cameras pairs ("a and b").
-    gain: how much more the views agree without it, as a share of what is attainable; of "all sides": by which share the cost
-    of the fit falls. moments: of cameras, in how many; the views are those of the first.
+    kind: "sides", "cameras", "all sides" or "hands". views: names of those concerned. instead: of those that would explain it as
+    well, of cameras pairs ("a and b"). gain: how much more the views agree without it, as a share of what is attainable; of "all
+    sides": by which share the cost of the fit falls. moments: of cameras, in how many; the views are those of the first.
     """
 
     kind: str
