@@ -1,0 +1,135 @@
+"""Pictures of a scan for a keypoint detector, and what the detector saw in them back as joints of the scan.
+
+render_scan_views("scan.obj", "views")          a capture folder without a body; run a detector on views/images
+joints = joints_from_views("views", keypoints)  then fit_scan("scan.obj", joints=joints, ...)
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.array_types import Float
+from humangs_jax.data.atomic import replace_folder
+from humangs_jax.data.capture_reading import FORMAT, VERSION
+from humangs_jax.data.images import write_png
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.photographs import load_photographs
+from humangs_jax.fitting.observations import group_by_moment
+from humangs_jax.fitting.scan_joints import SCAN_LANDMARKS
+from humangs_jax.fitting.scan_reading import read_mesh
+from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.triangulation import triangulate_robustly
+from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
+from humangs_jax.rendering.mesh_rasterizer import interpolate, rasterize_mesh
+
+SCAN_FILE = "scan.json"
+"""In the folder, beside capture.json: where the scan is in the world of the pictures."""
+HEIGHT = 1.7
+"""Metres: the scan's longest side in that world; any number would do."""
+DISTANCE, FIELD_OF_VIEW = 4.0, np.radians(36.0)
+"""Of the cameras: metres, and vertical."""
+AXES = {f"{sign}{axis}": (s, i) for s, sign in ((1, "+"), (-1, "-")) for i, axis in enumerate("xyz")}
+
+
+def render_scan_views(
+    mesh_path: str | Path, out: str | Path, views: int = 8, size: int = 512, up: str | None = None
+) -> Path:
+    """Write pictures of a scan from all around as a capture folder without a body.
+
+    Arguments: up: which axis of the file is up for the person, "+y", "-z", ...; None: the positive one along which the scan is
+    longest. Detectors know people who stand: look at the pictures.
+    Raises: ValueError for a mesh that cannot be used (see `read_mesh`), an unknown axis, or a folder that is not empty.
+    """
+    out = Path(out)
+    if out.is_dir() and any(out.iterdir()):
+        raise ValueError(f"{out}: the folder is not empty: expected a new one")
+    mesh = read_mesh(mesh_path)
+    vertices = np.asarray(mesh.vertices, np.float64)
+    align = _into_world(vertices[np.unique(mesh.faces)], up)
+    angles = jnp.arange(views) * (2 * jnp.pi / views)
+    K = intrinsics_from_fov(FIELD_OF_VIEW, size, size)
+    cameras = orbit(jnp.zeros(3), DISTANCE, angles, 0.1, K, size, size)
+    drawn = _draw(align(vertices), np.asarray(mesh.faces), _colors(mesh), cameras, views)
+    replace_folder(out, lambda folder: _write(folder, drawn, cameras, align))
+    return out
+
+
+def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Float[np.ndarray, "3"]]:
+    """Landmarks by name, in the scan's coordinates, that two views or more agree on.
+
+    Arguments: keypoints: of the pictures that `render_scan_views` wrote to the folder.
+    Raises: ValueError if the folder is not one of these, or fewer than three landmarks can be told.
+    """
+    folder = Path(folder)
+    try:
+        matrix = np.asarray(json.loads((folder / SCAN_FILE).read_text())["world_from_scan"], np.float64)
+    except (OSError, ValueError, KeyError) as error:
+        raise ValueError(f"{folder / SCAN_FILE}: expected what render_scan_views writes: {error}") from error
+    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
+    align = Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
+    observations, _ = group_by_moment(load_photographs(folder), keypoints)
+    moment = type(observations)(*(getattr(observations, name)[0] for name in vars(observations)))
+    points, counts, _ = triangulate_robustly(moment)
+    points = align.inverse()(np.asarray(points, np.float64))
+    names = keypoints.set.names
+    found = {name: points[i] for i, name in enumerate(names) if counts[i] >= 2 and name in SCAN_LANDMARKS}
+    if len(found) < 3:
+        raise ValueError(f"{folder}: views agree on {len(found)} landmarks only: expected at least three")
+    return found
+
+
+def _into_world(vertices, up):
+    """The similarity that stands a scan upright around the origin."""
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    if up is not None and up not in AXES:
+        raise ValueError(f"--up {up}: expected one of {', '.join(AXES)}")
+    sign, axis = AXES[up] if up else (1, int((high - low).argmax()))
+    above = sign * np.eye(3)[axis]
+    forward = np.eye(3)[2 if axis == 1 else (0 if axis == 2 else 1)]
+    rotation = np.stack([np.cross(above, forward), above, forward])
+    scale = HEIGHT / float((high - low).max())
+    return Similarity(scale, rotation, -scale * rotation @ (low + high) / 2)
+
+
+def _colors(mesh: Any) -> Float[np.ndarray, "n 3"]:
+    """(n, 3) colours of the vertices in [0, 1]: painted, from the texture, or grey."""
+    colors = getattr(mesh.visual.to_color() if mesh.visual.kind == "texture" else mesh.visual, "vertex_colors", None)
+    if colors is None or np.shape(colors)[:1] != (len(mesh.vertices),):
+        return np.full((len(mesh.vertices), 3), 0.6)
+    return np.asarray(colors, np.float64)[:, :3] / 255
+
+
+def _draw(vertices, faces, colors, cameras: Camera, views):
+    """Images (h, w, 3) on white, shaded by a light at the camera, and masks (h, w)."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    normals = np.cross(b - a, c - a)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    number = lambda x: jnp.asarray(x, jnp.float32)
+    for view in range(views):
+        camera = cameras[view]
+        fragments = rasterize_mesh(number(vertices), jnp.asarray(faces, jnp.int32), camera)
+        painted = np.asarray(interpolate(fragments, jnp.asarray(faces, jnp.int32), number(colors), jnp.ones(3)))
+        face = np.asarray(fragments.face_ids)
+        facing = np.abs(normals @ np.asarray(camera.cam_from_world)[2, :3])
+        shade = np.where(face >= 0, 0.45 + 0.55 * facing[np.maximum(face, 0)], 1.0)
+        yield painted * shade[..., None], (face >= 0).astype(np.float32)
+
+
+def _write(folder, drawn, cameras, align):
+    for name in ("images", "masks"):
+        (folder / name).mkdir(parents=True)
+    listed = []
+    for view, (image, mask) in enumerate(drawn):
+        files = {kind: f"{kind}s/{view:03d}.png" for kind in ("image", "mask")}
+        write_png(folder / files["image"], image)
+        write_png(folder / files["mask"], mask)
+        matrices = {
+            key: np.asarray(getattr(cameras, key)[view], np.float64).tolist() for key in ("K", "cam_from_world")
+        }
+        listed.append({**files, "frame": 0, **matrices})
+    description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": "white", "views": listed}
+    (folder / "capture.json").write_text(json.dumps(description, indent=2) + "\n")
+    (folder / SCAN_FILE).write_text(json.dumps({"world_from_scan": align.matrix().tolist()}) + "\n")

@@ -1,0 +1,117 @@
+"""Outlines of a body against masks: which point belongs to which line, and how far off it is.
+
+Like edge trackers (Harris and Stennett 1990, "RAPiD"): each point of the body's outline looks along its normal for the
+nearest place where the mask ends, and each point of the mask's outline for the nearest point of the body's that faces the
+same way. Both give one equation n . x = n . q: x, a point of the body in the picture, may slide along the mask's outline.
+
+A person wears clothes: the body may end inside of the mask (hair, cloth), but not outside. So distances outwards count in
+full, and inwards less and less the larger they are.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.fitting.objective import robust
+from humangs_jax.fitting.outlines import Outline, inside_picture
+from humangs_jax.pytree import pytree_dataclass
+from humangs_jax.sampling.bilinear import sample_bilinear
+
+LOOKS = 129
+"""Places at which a line is looked at: half a pixel apart at first, less later."""
+FACING = 0.5
+"""Cosine: points of two outlines belong together if their normals are no further apart than this (60 degrees)."""
+
+
+@pytree_dataclass
+class Matches:
+    """Equations of one view: points[i] of the body's outline shall lie on the line normals[i] . x = offsets[i].
+
+    points: (e,) indices. normals: (e, 2) unit, outwards. offsets: (e,) pixels. weights: (e,) 0: no equation.
+    """
+
+    points: Int[Array, " e"]
+    normals: Float[Array, "e 2"]
+    offsets: Float[Array, " e"]
+    weights: Float[Array, " e"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MaskView:
+    """A mask (h, w) with its outline."""
+
+    mask: Float[np.ndarray, "h w"]
+    outline: Outline
+
+
+def match(body: Outline, view: MaskView, reach: float, count: int) -> Matches:
+    """At most 2 `count` equations, filled up with ones of weight 0. reach: pixels, how far points look."""
+    own = _ends_of_mask(body, view.mask, reach)
+    other = _nearest(body, view.outline, reach)
+    rows = [np.concatenate(pair) for pair in zip(own, other, strict=True)]
+    missing = 2 * count - len(rows[0])
+    points, normals, offsets = (np.pad(x, ((0, missing),) + ((0, 0),) * (x.ndim - 1)) for x in rows)
+    weights = np.arange(2 * count) < len(rows[0])
+    to = lambda x: jnp.asarray(x, jnp.float32)
+    return Matches(jnp.asarray(points, jnp.int32), to(normals), to(offsets), to(weights))
+
+
+def _ends_of_mask(body, mask, reach):
+    """For points of the body, along their normals: where the mask goes from inside to outside."""
+    steps = np.linspace(-reach, reach, LOOKS)
+    places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
+    covered = np.asarray(_coverage(mask, places))
+    seen = inside_picture(places, mask.shape)
+    ends = (covered[:, :-1] >= 0.5) & (covered[:, 1:] < 0.5) & seen[:, :-1] & seen[:, 1:]
+    nearest = np.argmin(np.where(ends, np.abs(steps[:-1]), np.inf), axis=1)
+    rows = np.arange(len(nearest))
+    inner, outer = covered[rows, nearest], covered[rows, nearest + 1]
+    found = ends[rows, nearest]
+    along = steps[nearest] + (steps[1] - steps[0]) * (inner - 0.5) / np.where(found, inner - outer, 1.0)
+    offsets = np.sum(body.normals * body.positions, axis=-1) + along
+    return np.flatnonzero(found), body.normals[found], offsets[found]
+
+
+@jax.jit
+def _coverage(mask, places):
+    return sample_bilinear(mask[..., None], places - 0.5)[..., 0]
+
+
+def _nearest(body, mask, reach):
+    """For points of the mask: the nearest of the body that faces the same way."""
+    if not len(body.positions) or not len(mask.positions):
+        return np.zeros(0, int), np.zeros((0, 2)), np.zeros(0)
+    distances = np.linalg.norm(mask.positions[:, None] - body.positions, axis=-1)
+    distances = np.where(mask.normals @ body.normals.T > FACING, distances, np.inf)
+    nearest = np.argmin(distances, axis=1)
+    found = distances[np.arange(len(nearest)), nearest] < reach
+    return nearest[found], mask.normals[found], np.sum(mask.normals * mask.positions, axis=-1)[found]
+
+
+def distances(matches: Matches, pixels: Float[Array, "p 2"]) -> Float[Array, " e"]:
+    """How far points of the body are outside of their lines, pixels; negative inside."""
+    return jnp.sum(matches.normals * pixels[matches.points], axis=-1) - matches.offsets
+
+
+def silhouette_residuals(
+    matches: Matches,
+    pixels: Float[Array, "p 2"],
+    clothes: Float[Array, " p"],
+    noise: Float[Array, ""],
+    cuts: tuple[Float[Array, ""], Float[Array, ""]],
+    independent: float,
+) -> Float[Array, " e"]:
+    """In standard deviations.
+
+    Arguments: clothes: pixels by which the mask reaches beyond the body. noise: of an outline, pixels. cuts: pixels outwards
+    and inwards at which the loss flattens. independent: how many independent equations all of a view count for; neighbours on
+    an outline err together.
+    """
+    off = distances(matches, pixels) + clothes[matches.points]
+    cut = jnp.where(off > 0, *cuts)
+    share = independent / jnp.maximum(jnp.sum(matches.weights), 1.0)
+    bounded = jax.vmap(robust)((off / noise)[:, None], cut / noise)[:, 0]
+    return jnp.sqrt(matches.weights * jnp.minimum(share, 1.0)) * bounded

@@ -1,0 +1,200 @@
+"""Refinement from end to end on small pictures of the bare body, and what it says of starts that it cannot help."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.landmarks import landmark_model, pose_landmarks
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.keypoints.sets import COCO_17
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.fitting.photometric import Likeness, PhotometricConfig, _draw, by_colors
+from humangs_jax.fitting.refine import RefineConfig, refine_capture
+from humangs_jax.fitting.refine_rounds import RoundConfig
+from humangs_jax.geometry import quaternion, transform
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
+from humangs_jax.pytree import replace
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
+from humangs_jax.rendering.splat_config import SplatConfig
+from tests.fitting.fit_people import default_body, rotations_of
+
+SIZE, VIEWS = 192, 3
+CONFIG = RefineConfig(RoundConfig(rounds=6, points=120))
+
+
+@functools.cache
+def truth():
+    """A person who stands, with masks of the bare body."""
+    body = default_body()
+    rotations, translation = jnp.asarray(rotations_of("standing")), jnp.asarray([0.0, 0.4, 0.0])
+    pose = BodyPose(rotations, translation)
+    K = intrinsics_from_fov(0.9, SIZE, SIZE)
+    cameras = orbit(translation, 2.6, jnp.asarray([0.2, 2.2, 4.4]), 0.1, K, SIZE, SIZE)
+    vertices = jax.jit(lambda: pose_body(body, shape_body(body, jnp.zeros(3)), pose).vertices)()
+    large = [
+        rasterize_mesh(vertices, body.faces, cameras[i].resized(2 * SIZE, 2 * SIZE)).face_ids for i in range(VIEWS)
+    ]
+    masks = np.stack([(np.asarray(ids) >= 0).reshape(SIZE, 2, SIZE, 2).mean((1, 3)) for ids in large]).astype(
+        np.float32
+    )
+    images = np.repeat(1 - masks[..., None], 3, axis=-1)
+    poses = jax.tree.map(lambda leaf: leaf[None], pose)
+    names = ("front", "left", "right")
+    return Capture(images, masks, cameras, np.zeros(VIEWS, np.int32), body, np.zeros(3, np.float32), poses, names)
+
+
+def turned(capture, degrees, axis=(0, 1, 0)):
+    turn = quaternion.matrix_from_axis_angle(jnp.radians(degrees) * jnp.asarray(axis, jnp.float32))
+    matrices = transform.make(turn, jnp.zeros(3)) @ capture.cameras.cam_from_world
+    return dataclasses.replace(capture, cameras=replace(capture.cameras, cam_from_world=matrices))
+
+
+@functools.cache
+def disturbed():
+    """Focal lengths 5 % too long, cameras turned by 2 degrees, body joints bent by 3."""
+    rng = np.random.default_rng(1)
+    axes = rng.normal(size=(VIEWS + 22, 3))
+    axes = jnp.asarray(axes / np.linalg.norm(axes, axis=1, keepdims=True), jnp.float32)
+    turns = transform.make(quaternion.matrix_from_axis_angle(jnp.radians(2.0) * axes[:VIEWS]), jnp.zeros(3))
+    capture = truth()
+    K = capture.cameras.K * jnp.asarray([[1.05, 1, 1], [1, 1.05, 1], [1, 1, 1]])
+    rotations = capture.poses.rotations.at[0, :22].add(jnp.radians(3.0) * axes[VIEWS:])
+    cameras = replace(capture.cameras, K=K, cam_from_world=turns @ capture.cameras.cam_from_world)
+    return dataclasses.replace(capture, cameras=cameras, poses=replace(capture.poses, rotations=rotations))
+
+
+@jax.jit
+def _joints(body, betas, pose):
+    return pose_body(body, shape_body(body, betas), pose).joints
+
+
+def aligned_error(capture):
+    """Mean distance of body joints from the truth after the best rigid motion, metres."""
+    a, b = (np.asarray(_joints(c.body, jnp.asarray(c.betas), c.pose(0)))[:22] for c in (capture, truth()))
+    a, b = a - a.mean(0), b - b.mean(0)
+    u, _, vt = np.linalg.svd(b.T @ a)
+    return np.linalg.norm(a @ ((u * [1, 1, np.linalg.det(u @ vt)]) @ vt).T - b, axis=-1).mean()
+
+
+def keypoints(confidence=1.0):
+    """Where the true landmarks are."""
+    model, capture = landmark_model(default_body(), COCO_17.names), truth()
+    landmarks, _ = pose_landmarks(model, jnp.zeros(3), capture.pose(0))
+    points = np.stack([project(capture.cameras[i], landmarks)[0] for i in range(VIEWS)])
+    return Keypoints(points.astype(np.float32), np.full(points.shape[:2], confidence, np.float32), COCO_17)
+
+
+def test_silhouettes_mend_cameras_focal_length_and_pose():
+    refined = refine_capture(disturbed(), config=CONFIG)
+    assert refined.kept == "refined" and refined.before["silhouette_iou"] < 0.75
+    assert refined.after["silhouette_iou"] > 0.95
+    assert aligned_error(refined.capture) < 0.5 * aligned_error(disturbed())
+    focal = np.asarray(refined.capture.cameras.K[:, 0, 0] / truth().cameras.K[:, 0, 0])
+    np.testing.assert_allclose(focal, 1.0, atol=0.025)
+    assert refined.moved.turn == pytest.approx(2.0, abs=0.5)
+    before = {name: pair[0] for name, pair in refined.views.items()}
+    assert np.mean(list(before.values())) == pytest.approx(refined.before["silhouette_iou"])
+    text = str(refined)
+    assert "kept: refined" in text and "focal length x 0.9" in text and "front" in text
+
+
+def test_keypoints_alone_mend_them_too_and_with_masks_both_errors_fall():
+    alone = refine_capture(dataclasses.replace(disturbed(), masks=None), keypoints=keypoints(), config=CONFIG)
+    assert alone.kept == "refined" and "silhouette_iou" not in alone.after
+    assert alone.after["keypoint_error_px"] < 0.2 * alone.before["keypoint_error_px"]
+    assert aligned_error(alone.capture) < 0.6 * aligned_error(disturbed())
+    assert "no mask" in str(alone)
+    both = refine_capture(disturbed(), keypoints=keypoints(), config=CONFIG)
+    assert both.after["silhouette_iou"] > 0.95 and both.after["keypoint_error_px"] < 1.0
+
+
+def test_a_start_that_is_right_stays():
+    refined = refine_capture(truth(), config=CONFIG)
+    assert refined.kept == "start" and refined.capture is truth()
+    assert refined.before == refined.after
+    assert "no improvement" in str(refined) and "moved:" not in str(refined)
+
+
+def test_a_single_view_with_a_mask_is_enough_and_the_others_stay():
+    masks = np.zeros_like(truth().masks)
+    masks[0] = truth().masks[0]
+    refined = refine_capture(dataclasses.replace(disturbed(), masks=masks), config=CONFIG)
+    assert refined.kept == "refined" and refined.after["silhouette_iou"] > 0.92
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
+
+
+def test_a_view_with_an_empty_mask_takes_no_part():
+    masks = np.array(truth().masks)
+    masks[1] = 0
+    refined = refine_capture(dataclasses.replace(disturbed(), masks=masks), config=CONFIG)
+    assert refined.kept == "refined" and np.isnan(refined.views["left"]).all()
+    assert refined.after["silhouette_iou"] > 0.93
+    moved = refined.capture.cameras.cam_from_world - disturbed().cameras.cam_from_world
+    assert np.abs(moved[1]).max() < 1e-4 < np.abs(moved[0]).max(), "nothing is known of its camera"
+
+
+def test_cameras_that_look_the_other_way_are_told_and_left():
+    away = turned(truth(), 180.0)
+    refined = refine_capture(away, config=CONFIG)
+    assert refined.kept == "start" and refined.capture is away
+    assert refined.after["silhouette_iou"] == 0
+    assert "the start was too far off" in str(refined)
+
+
+@pytest.mark.slow  # compiles once more
+def test_one_view_is_refined_by_its_outline():
+    refined = refine_capture(disturbed().select([0]), config=CONFIG)
+    assert refined.kept == "refined" and refined.after["silhouette_iou"] > 0.92
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
+
+
+@pytest.mark.parametrize("masks", [None, np.zeros((VIEWS, SIZE, SIZE), np.float32)])
+def test_nothing_to_refine_by_is_an_error(masks):
+    blind = dataclasses.replace(truth(), masks=masks)
+    with pytest.raises(CaptureError, match="masks: none shows anybody, and there are no keypoints"):
+        refine_capture(blind)
+    with pytest.raises(CaptureError, match="no keypoints"):
+        refine_capture(blind, keypoints=keypoints(confidence=0.0))
+    with pytest.raises(CaptureError, match="expected with colours"):
+        refine_capture(blind, keypoints=keypoints(), photometric=True)
+
+
+def test_keypoints_of_other_views_are_an_error():
+    with pytest.raises(ValueError, match="of 3 views, but the capture has 2"):
+        refine_capture(truth().select([0, 1]), keypoints=keypoints())
+
+
+@pytest.mark.slow  # compiles the renderer and its gradient
+def test_colours_alone_turn_cameras_and_poses_back():
+    """A painted body of Gaussians, photographed by the renderer: what is off comes back through its gradient."""
+    size, capture = 48, truth()
+    body = decimate(default_body(), 600)
+    rest, count = shape_body(body, jnp.zeros(3)), len(body.template)
+    rng = np.random.default_rng(0)
+    colors = 0.5 + 0.5 * jnp.sin(rest.vertices @ jnp.asarray(rng.normal(0, 12, (3, 3)), jnp.float32))
+    identity = jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (count, 1))
+    gaussians = Gaussians(rest.vertices, identity, jnp.full((count, 3), 0.02), jnp.full(count, 0.9), colors)
+    avatar = Avatar(
+        gaussians, body.skinning_weights, rest.vertices, rest.joints, body.faces, body.parents, body.joint_names
+    )
+    small = dataclasses.replace(capture, cameras=capture.cameras.resized(size, size))
+    config = SplatConfig(max_pairs=1 << 14)
+    per_view = lambda c: (jnp.repeat(c.poses.rotations, VIEWS, 0), jnp.repeat(c.poses.translation, VIEWS, 0))
+    images = _draw(avatar, *per_view(small), small.cameras, config)
+    start = turned(small, 1.0)
+    views = SubjectViews(images, jnp.ones((VIEWS, size, size)), start.cameras, *per_view(start), jnp.zeros(3))
+    likeness = Likeness(avatar, views, 0.0, 0.05, config)
+    moved, outcome = by_colors(likeness, start, PhotometricConfig(steps=30, independent=1000.0), RoundConfig())
+    assert float(outcome.after) < 0.2 * float(outcome.before)
+    off = lambda c: float(jnp.mean(jnp.square(_draw(avatar, *per_view(c), c.cameras, config) - images)))
+    assert off(moved) < 0.2 * off(start)
