@@ -80,9 +80,9 @@ def fit_one(seed, kind, body, arguments):
     """Scores of one scan, and what a picture of it needs."""
     import jax.numpy as jnp
 
-    from humangs_jax.fitting.scan_fit import fit_scan_points
-    from humangs_jax.fitting.scan_reading import sample_scan
-    from humangs_jax.fitting.scan_result import body_in_scan
+    from humangs_jax.fitting.scans.fit import fit_scan_points
+    from humangs_jax.fitting.scans.reading import sample_scan
+    from humangs_jax.fitting.scans.result import body_in_scan
 
     true, landmarks, vertices, faces = person(seed, kind, body)
     place, rng = random_place(seed), np.random.default_rng([seed, JOINT_STREAM])
@@ -124,7 +124,7 @@ def person(seed, kind, body):
 
 def random_place(seed):
     """A random similarity: any rotation, scale 0.1 to 100 by its logarithm, centre up to ten metres off before the scaling."""
-    from humangs_jax.fitting.similarity import Similarity
+    from humangs_jax.fitting.scans.similarity import Similarity
 
     rng = np.random.default_rng([seed, PLACE_STREAM])
     w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)

@@ -52,7 +52,7 @@ def refine_in_place(
     capture: Path, out: Path | None, *, keypoints: Path | None, person: int | None, photometric: bool, overwrite: bool
 ) -> None:
     """`humangs fit CAPTURE --refine`. Raises: ValueError or OSError, one line, with nothing written."""
-    from humangs_jax.fitting.refine import refine_capture
+    from humangs_jax.fitting.refinement.refine import refine_capture
 
     target = check_place(capture, out, overwrite)
     start = load_capture(capture)
@@ -84,10 +84,10 @@ def fit_from_scan(
         raise ValueError("--joints and --views: give one of them, both say where the joints are")
     if keypoints is not None and views is None:
         raise ValueError("--keypoints of a scan needs --views FOLDER, the pictures that they are of")
-    from humangs_jax.fitting.scan_files import save_scan_fit
-    from humangs_jax.fitting.scan_fit import fit_scan
-    from humangs_jax.fitting.scan_joints import read_joints
-    from humangs_jax.fitting.scan_views import joints_from_views, render_scan_views
+    from humangs_jax.fitting.scans.files import save_scan_fit
+    from humangs_jax.fitting.scans.fit import fit_scan
+    from humangs_jax.fitting.scans.joints import read_joints
+    from humangs_jax.fitting.scans.views import joints_from_views, render_scan_views
 
     if views is not None and keypoints is None:
         render_scan_views(scan, views)

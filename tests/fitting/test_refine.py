@@ -17,9 +17,9 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.views import SubjectViews
-from humangs_jax.fitting.photometric import Likeness, PhotometricConfig, _draw, by_colors
-from humangs_jax.fitting.refine import RefineConfig, refine_capture
-from humangs_jax.fitting.refine_rounds import RoundConfig
+from humangs_jax.fitting.refinement.photometric import Likeness, PhotometricConfig, _draw, by_colors
+from humangs_jax.fitting.refinement.refine import RefineConfig, refine_capture
+from humangs_jax.fitting.refinement.rounds import RoundConfig
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
 from humangs_jax.pytree import replace

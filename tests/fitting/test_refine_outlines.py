@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from humangs_jax.fitting.outlines import BodyPicture, body_outline, body_picture, mask_outline, mesh_edges
-from humangs_jax.fitting.silhouettes import MaskView, distances, match, silhouette_residuals
+from humangs_jax.fitting.refinement.outlines import BodyPicture, body_outline, body_picture, mask_outline, mesh_edges
+from humangs_jax.fitting.refinement.silhouettes import MaskView, distances, match, silhouette_residuals
 from humangs_jax.geometry.camera import Camera
 
 SIZE, FOCAL, DISTANCE, RADIUS = 128, 160.0, 3.0, 0.8

@@ -11,8 +11,8 @@ from humangs_jax.body import skinning
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import Capture
-from humangs_jax.fitting.refine_rounds import RoundConfig, moved_capture, start_of
-from humangs_jax.fitting.refine_unknowns import (
+from humangs_jax.fitting.refinement.rounds import RoundConfig, moved_capture, start_of
+from humangs_jax.fitting.refinement.unknowns import (
     Spreads,
     moved_cameras,
     moved_poses,

@@ -11,16 +11,16 @@ from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.npz import read_npz
-from humangs_jax.fitting.body_surface import body_surface, vertex_normals
 from humangs_jax.fitting.pose_prior import pose_prior
-from humangs_jax.fitting.scan_config import ScanFitConfig
-from humangs_jax.fitting.scan_files import save_scan_fit
-from humangs_jax.fitting.scan_fit import fit_scan
-from humangs_jax.fitting.scan_joints import checked_joints, read_joints
-from humangs_jax.fitting.scan_reading import sample_scan
-from humangs_jax.fitting.scan_result import body_in_scan
-from humangs_jax.fitting.scan_start import Start, facing_back, search_starts
-from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.scans.body_surface import body_surface, vertex_normals
+from humangs_jax.fitting.scans.config import ScanFitConfig
+from humangs_jax.fitting.scans.files import save_scan_fit
+from humangs_jax.fitting.scans.fit import fit_scan
+from humangs_jax.fitting.scans.joints import checked_joints, read_joints
+from humangs_jax.fitting.scans.reading import sample_scan
+from humangs_jax.fitting.scans.result import body_in_scan
+from humangs_jax.fitting.scans.similarity import Similarity
+from humangs_jax.fitting.scans.start import Start, facing_back, search_starts
 
 LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 NAMES = ("nose", "left_ear", "right_ear", *(f"{side}_{part}" for part in LIMBS for side in ("left", "right")))

@@ -7,10 +7,10 @@ import pytest
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.fitting.body_surface import body_surface, pose_points, pose_surface
-from humangs_jax.fitting.scan_config import ScanFitConfig
-from humangs_jax.fitting.scan_objective import Given, Matches, Tolerances, one_sided, scan_problem, scan_residuals
-from humangs_jax.fitting.scan_search import start_state
+from humangs_jax.fitting.scans.body_surface import body_surface, pose_points, pose_surface
+from humangs_jax.fitting.scans.config import ScanFitConfig
+from humangs_jax.fitting.scans.objective import Given, Matches, Tolerances, one_sided, scan_problem, scan_residuals
+from humangs_jax.fitting.scans.search import start_state
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,7 @@
 Of a pair, d = n . (scan point - body vertex) is the distance by which the scan is outside of the skin, n the normal of the
 surface that was searched for the partner. On a bare person d is noise on both sides. Clothes are outside: d > 0 is usual and
 counts lightly; d < 0 says that the body pokes out of its clothes, and counts fully. Hands are usually bare, so that
-they count fully on both sides. Pairs that are far apart fade out by their weights, which `scan_rounds` sets anew in every round.
+they count fully on both sides. Pairs that are far apart fade out by their weights, which `rounds` sets anew in every round.
 """
 
 import jax.numpy as jnp
@@ -12,9 +12,9 @@ import numpy as np
 from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.body.model import BodyPose
 from humangs_jax.fitting.body_state import BodyState, pose_of
-from humangs_jax.fitting.body_surface import BodySurface, pose_points
 from humangs_jax.fitting.objective import LIMIT_STIFFNESS, robust
 from humangs_jax.fitting.pose_prior import PosePrior, pose_prior
+from humangs_jax.fitting.scans.body_surface import BodySurface, pose_points
 from humangs_jax.pytree import pytree_dataclass, static_field
 
 SIZE = 0.05

@@ -18,9 +18,9 @@ from humangs_jax.data.images import write_png
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photographs import load_photographs
 from humangs_jax.fitting.observations import group_by_moment
-from humangs_jax.fitting.scan_joints import SCAN_LANDMARKS
-from humangs_jax.fitting.scan_reading import read_mesh
-from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.scans.joints import SCAN_LANDMARKS
+from humangs_jax.fitting.scans.reading import read_mesh
+from humangs_jax.fitting.scans.similarity import Similarity
 from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.rendering.mesh_rasterizer import interpolate, rasterize_mesh

@@ -1,7 +1,7 @@
 """The equations of refinement, and their solution while what belongs together is held fixed.
 
 Residuals, in standard deviations: outlines of every view (`silhouettes`), keypoints where there are any (`objective`), and
-the prior (`refine_unknowns`). Half their square sum is the negative log posterior.
+the prior (`unknowns`). Half their square sum is the negative log posterior.
 """
 
 import functools
@@ -18,9 +18,10 @@ from humangs_jax.body.landmarks import LandmarkModel
 from humangs_jax.body.model import BodyModel, pose_features
 from humangs_jax.fitting.objective import Problem, keypoint_residuals
 from humangs_jax.fitting.observations import Observations
-from humangs_jax.fitting.outlines import Outline
 from humangs_jax.fitting.pose_prior import pose_prior
-from humangs_jax.fitting.refine_unknowns import (
+from humangs_jax.fitting.refinement.outlines import Outline
+from humangs_jax.fitting.refinement.silhouettes import Matches, silhouette_residuals
+from humangs_jax.fitting.refinement.unknowns import (
     Spreads,
     Start,
     Unknowns,
@@ -30,7 +31,6 @@ from humangs_jax.fitting.refine_unknowns import (
     root_turns,
     thickness,
 )
-from humangs_jax.fitting.silhouettes import Matches, silhouette_residuals
 from humangs_jax.fitting.solvers import Outcome, least_squares, minimise
 from humangs_jax.pytree import pytree_dataclass, replace
 

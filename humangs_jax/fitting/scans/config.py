@@ -2,7 +2,7 @@
 
 import dataclasses
 
-from humangs_jax.fitting.scan_rounds import Round
+from humangs_jax.fitting.scans.rounds import Round
 
 
 @dataclasses.dataclass(frozen=True)

@@ -15,10 +15,11 @@ from humangs_jax.body.skinning import EXACT
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.fitting.observations import Observations, expected_noise
-from humangs_jax.fitting.outlines import BodyPicture, body_outline, body_picture, mask_outline, mesh_edges
-from humangs_jax.fitting.refine_equations import Evidence, solve, surface_points
-from humangs_jax.fitting.refine_score import Score, keypoint_distances, overlap, posed_vertices, score_of
-from humangs_jax.fitting.refine_unknowns import (
+from humangs_jax.fitting.refinement.equations import Evidence, solve, surface_points
+from humangs_jax.fitting.refinement.outlines import BodyPicture, body_outline, body_picture, mask_outline, mesh_edges
+from humangs_jax.fitting.refinement.score import Score, keypoint_distances, overlap, posed_vertices, score_of
+from humangs_jax.fitting.refinement.silhouettes import MaskView, distances, match
+from humangs_jax.fitting.refinement.unknowns import (
     Spreads,
     Start,
     Unknowns,
@@ -30,7 +31,6 @@ from humangs_jax.fitting.refine_unknowns import (
     same_focals,
     segments,
 )
-from humangs_jax.fitting.silhouettes import MaskView, distances, match
 from humangs_jax.fitting.solvers import Outcome
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.pytree import replace

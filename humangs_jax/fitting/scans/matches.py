@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.array_types import Float
-from humangs_jax.fitting.body_surface import pose_surface
-from humangs_jax.fitting.scan_objective import Matches, ScanProblem, ScanState, Tolerances, scale_of
-from humangs_jax.fitting.scan_reading import Scan
-from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.scans.body_surface import pose_surface
+from humangs_jax.fitting.scans.objective import Matches, ScanProblem, ScanState, Tolerances, scale_of
+from humangs_jax.fitting.scans.reading import Scan
+from humangs_jax.fitting.scans.similarity import Similarity
 
 LIKE = 0.3
 """Cosine between normals below which two points are no pair."""

@@ -20,8 +20,8 @@ from humangs_jax.body.skinning import EXACT, blend_transforms, joint_transforms
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import MASK_THRESHOLD, SubjectViews, standardize
 from humangs_jax.fitting.objective import robust
-from humangs_jax.fitting.refine_rounds import DEVIATION, RoundConfig, moved_capture, start_of
-from humangs_jax.fitting.refine_unknowns import moved_cameras, moved_poses, nothing_moved, root_turns
+from humangs_jax.fitting.refinement.rounds import DEVIATION, RoundConfig, moved_capture, start_of
+from humangs_jax.fitting.refinement.unknowns import moved_cameras, moved_poses, nothing_moved, root_turns
 from humangs_jax.fitting.solvers import Outcome, minimise
 from humangs_jax.models.humangs import HumanGSConfig
 from humangs_jax.objectives.metrics import decibels

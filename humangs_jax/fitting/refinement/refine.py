@@ -1,6 +1,6 @@
 """Cameras and poses polished against silhouettes, keypoints and photographs: never worse than where they started.
 
-Silhouettes and keypoints first (`refine_rounds`), then, if asked for, the photographs' colours (`photometric`). Each stage is
+Silhouettes and keypoints first (`rounds`), then, if asked for, the photographs' colours (`photometric`). Each stage is
 kept only if its score is better than before it.
 """
 
@@ -12,9 +12,9 @@ import numpy as np
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.fitting.photometric import PhotometricConfig, by_colors, likeness
-from humangs_jax.fitting.refine_report import Refinement, how_far
-from humangs_jax.fitting.refine_rounds import RoundConfig, Scene
+from humangs_jax.fitting.refinement.photometric import PhotometricConfig, by_colors, likeness
+from humangs_jax.fitting.refinement.report import Refinement, how_far
+from humangs_jax.fitting.refinement.rounds import RoundConfig, Scene
 
 LEAST_GAIN = 0.2
 """Share of the loss that has to go for a change to be kept. Bodies in clothes fit masks a little better where they are wrong: of

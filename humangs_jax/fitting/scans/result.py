@@ -8,7 +8,7 @@ import numpy as np
 
 from humangs_jax.array_types import Array, Float
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
-from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.scans.similarity import Similarity
 
 LITTLE = 0.6
 """Of the scan: if less is near the body, the fit is in doubt. Wide skirts and long hair leave 0.7."""

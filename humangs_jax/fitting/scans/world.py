@@ -7,8 +7,8 @@ import numpy as np
 
 from humangs_jax.array_types import Array, Float
 from humangs_jax.body.model import BodyModel, BodyPose, shape_body
-from humangs_jax.fitting.scan_reading import Scan
-from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.scans.reading import Scan
+from humangs_jax.fitting.scans.similarity import Similarity
 from humangs_jax.geometry import quaternion
 
 UPRIGHT = np.cos(np.radians(25.0))

@@ -11,11 +11,11 @@ import numpy as np
 
 from humangs_jax.array_types import Float
 from humangs_jax.body.model import BodyPose
-from humangs_jax.fitting.body_surface import BodySurface, pose_surface
 from humangs_jax.fitting.pose_prior import MIRROR, pose_prior
 from humangs_jax.fitting.rigid import cube_rotations, trunk_weights
-from humangs_jax.fitting.scan_reading import Scan, directions_around
-from humangs_jax.fitting.similarity import Similarity, align_robustly
+from humangs_jax.fitting.scans.body_surface import BodySurface, pose_surface
+from humangs_jax.fitting.scans.reading import Scan, directions_around
+from humangs_jax.fitting.scans.similarity import Similarity, align_robustly
 from humangs_jax.geometry import quaternion
 
 STANCES = {

@@ -16,7 +16,7 @@ import numpy as np
 
 from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.fitting.objective import robust
-from humangs_jax.fitting.outlines import Outline, inside_picture
+from humangs_jax.fitting.refinement.outlines import Outline, inside_picture
 from humangs_jax.pytree import pytree_dataclass
 from humangs_jax.sampling.bilinear import sample_bilinear
 

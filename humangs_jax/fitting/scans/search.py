@@ -15,14 +15,14 @@ from humangs_jax.array_types import Array, Float
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.model import BodyPose
 from humangs_jax.fitting.body_state import state_of
-from humangs_jax.fitting.body_surface import pose_points
-from humangs_jax.fitting.scan_config import COARSE, COARSE_NORMAL, LOOSE, ScanFitConfig
-from humangs_jax.fitting.scan_matches import Target
-from humangs_jax.fitting.scan_objective import Given, ScanProblem, ScanState, Tolerances, scale_of, scan_problem
-from humangs_jax.fitting.scan_reading import Scan
-from humangs_jax.fitting.scan_rounds import leftover, run_rounds
-from humangs_jax.fitting.scan_start import Start, facing_back, search_starts
-from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.scans.body_surface import pose_points
+from humangs_jax.fitting.scans.config import COARSE, COARSE_NORMAL, LOOSE, ScanFitConfig
+from humangs_jax.fitting.scans.matches import Target
+from humangs_jax.fitting.scans.objective import Given, ScanProblem, ScanState, Tolerances, scale_of, scan_problem
+from humangs_jax.fitting.scans.reading import Scan
+from humangs_jax.fitting.scans.rounds import leftover, run_rounds
+from humangs_jax.fitting.scans.similarity import Similarity
+from humangs_jax.fitting.scans.start import Start, facing_back, search_starts
 
 
 def start_state(problem: ScanProblem, rotations: Float[np.ndarray, "j 3"], config: ScanFitConfig) -> ScanState:

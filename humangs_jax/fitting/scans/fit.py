@@ -1,6 +1,6 @@
 """A body inside a scan: `fit_scan(mesh file, body=...)`.
 
-start   where, how large and in which stance: from given landmarks, or by a search over turns and stances (see `scan_start`)
+start   where, how large and in which stance: from given landmarks, or by a search over turns and stances (see `start`)
 coarse  without landmarks: few points and the body's joints, from several starts; the best by what is left goes on
 fine    all joints and the shape, many points, pairs found anew in every round
 
@@ -16,8 +16,8 @@ import numpy as np
 
 from humangs_jax.array_types import Float
 from humangs_jax.body.model import BodyModel, BodyPose
-from humangs_jax.fitting.body_surface import body_surface
-from humangs_jax.fitting.scan_config import (
+from humangs_jax.fitting.scans.body_surface import body_surface
+from humangs_jax.fitting.scans.config import (
     CLOSER,
     DEFAULT_CONFIG,
     FINE,
@@ -28,15 +28,15 @@ from humangs_jax.fitting.scan_config import (
     SETTLED,
     ScanFitConfig,
 )
-from humangs_jax.fitting.scan_joints import SCAN_LANDMARKS, checked_joints
-from humangs_jax.fitting.scan_matches import Target
-from humangs_jax.fitting.scan_objective import Given, Matches, Tolerances, scale_of, scan_problem
-from humangs_jax.fitting.scan_reading import Scan, read_scan
-from humangs_jax.fitting.scan_result import ScanFit
-from humangs_jax.fitting.scan_rounds import improve, run_rounds
-from humangs_jax.fitting.scan_search import landmarks_and_joints, search, start_state
-from humangs_jax.fitting.scan_start import start_from_landmarks
-from humangs_jax.fitting.scan_world import Placement, place_upright
+from humangs_jax.fitting.scans.joints import SCAN_LANDMARKS, checked_joints
+from humangs_jax.fitting.scans.matches import Target
+from humangs_jax.fitting.scans.objective import Given, Matches, Tolerances, scale_of, scan_problem
+from humangs_jax.fitting.scans.reading import Scan, read_scan
+from humangs_jax.fitting.scans.result import ScanFit
+from humangs_jax.fitting.scans.rounds import improve, run_rounds
+from humangs_jax.fitting.scans.search import landmarks_and_joints, search, start_state
+from humangs_jax.fitting.scans.start import start_from_landmarks
+from humangs_jax.fitting.scans.world import Placement, place_upright
 
 
 def fit_scan(
