@@ -1,21 +1,24 @@
 """How much refinement mends cameras and poses that are a little off, on synthetic people of unseen seeds.
 
-python experiments/evaluate_refine.py --subjects 4 --views 6 --json refine.json [--docs docs/fitting_refinement.md]
-[--pictures P.png]
+    python experiments/evaluate_refine.py --subjects 4 --views 6 --json refine.json [--docs docs/fitting_refinement.md]
 
 The start: all focal lengths off by 5 %, every camera turned by 2 degrees about a random axis through its centre, every joint
-(the root and the fingers, too) by 3 degrees about a random axis; true shape. Photos of 512 px. What it is refined by:
+(the root and the fingers, too) by 3 degrees about a random axis; true shape. --exact starts at the truth instead, which should
+stay. Photos of 512 px. What it is refined by:
 
-bare               masks of the body alone clothed            masks of the dressed person with hair, as photographs have them
-keypoints          COCO's 17, normal errors of --noise-px, no masks clothed+keypoints  both clothed+photos     dressed masks,
-then the colours of the photographs
+    bare               masks of the body alone
+    clothed            masks of the dressed person with hair, as photographs have them
+    keypoints          COCO's 17, normal errors of --noise-px, no masks
+    clothed+keypoints  both
+    clothed+photos     dressed masks, then the colours of the photographs
 
 --json writes {"cases": {case: means}, "subjects": [{"seed", "cases": {case: row}}], "settings"} after every person. A row has
 `iou_before`, `iou_after` (body against the masks of the case), `bare_iou_before`, `bare_iou_after` (against the true body),
 `joints_before_mm`, `joints_after_mm` (mean over the body's 22 joints, in the world), `aligned_before_mm`, `aligned_after_mm`
 (after the best rigid motion, since cameras and person moved together look the same), `focal_before_percent`,
-`focal_after_percent`, `seconds`, `refined` (1: kept), and with photos `psnr_before`, `psnr_after` of the
-reconstructed avatar, dB. About 15 s a case and person on a core, and two minutes of compiling.
+`focal_after_percent`, `seconds`, `refined` (1: kept), and with photos `psnr_before`, `psnr_after` of the reconstructed avatar,
+dB. --pictures writes the body over the photos, before and after. About 10 s of CPU time a case and person, 25 s with photos,
+and two minutes of compiling.
 """
 
 import argparse

@@ -9,7 +9,8 @@ body: a scan has no metric, so that neither has the error one of its own. Two di
 vertices from the true surface. A fit has succeeded if its vertices are within 50 mm on average.
 
 --json writes {"bare" and "clothed": {"mean_vertex_mm", "mean_surface_mm", "worst_surface_mm", "success", "seconds_per_scan"},
-"settings", "subjects": [...]} after every person. About 25 s a person on two CPU cores, 80 s without joints.
+"settings", "subjects": [...]} after every person. On two free CPU
+cores about 3 s a scan and 20 s to compile, without joints four times as long.
 """
 
 import argparse

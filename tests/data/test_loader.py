@@ -222,7 +222,7 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder,
             read.append(arguments)
         return capture_reading.read_view(*arguments)
 
-    monkeypatch.setattr("humangs_jax.data.capture.read_view", reading)
+    monkeypatch.setattr("humangs_jax.data.photographs.read_view", reading)
     examples = lambda cache: [
         ExampleSource(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(s) for s in range(6)
     ]
@@ -260,7 +260,7 @@ def test_a_picture_that_only_decoding_finds_broken_costs_its_examples_alone(fold
             raise OSError("003.png: bad bytes with a right checksum")
         return capture_reading.read_view(path, view, on_white)
 
-    monkeypatch.setattr("humangs_jax.data.capture.read_view", reading)
+    monkeypatch.setattr("humangs_jax.data.photographs.read_view", reading)
     new = lambda: ExampleSource(CaptureCache(folders, small_body()), SAMPLING, SIZE, SIZE)
     whole = new()
     examples = [whole.example_at(i, 2) for i in range(40)]
@@ -273,7 +273,7 @@ def test_a_picture_that_only_decoding_finds_broken_costs_its_examples_alone(fold
 
 
 def test_outlines_find_every_fault_without_decoding(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("humangs_jax.data.capture.read_view", None)
+    monkeypatch.setattr("humangs_jax.data.photographs.read_view", None)
     whole = read_outline(folder / "s1", small_body())
     assert whole.images.shape == (0, SIZE, SIZE, 3) and whole.frames.tolist() == [0, 1, 0, 1, 0, 1]
 
