@@ -64,6 +64,7 @@ def test_vmap_over_subjects_is_a_loop(body, network):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4), one, alone)
 
 
+@pytest.mark.slow
 def test_reconstruct_and_render_lower_for_every_platform(body, network):
     variables, config = network
 
@@ -171,6 +172,7 @@ def test_a_batch_of_people_with_different_numbers_of_views(body, network):
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=VMAP_TOLERANCE, rtol=1e-4), avatar, alone)
 
 
+@pytest.mark.slow
 def test_programs_are_compiled_once_per_bucket(body, network):
     variables, config = network
     config = dataclasses.replace(config, tokens="all")

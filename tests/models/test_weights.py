@@ -123,7 +123,8 @@ def grown(**decoder):
     return plain, dataclasses.replace(TINY, decoder=dataclasses.replace(TINY.decoder, **decoder))
 
 
-@pytest.mark.parametrize("more", [pytest.param(-1, marks=pytest.mark.slow), pytest.param(0, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [-1, 0, 2])
 def test_a_network_that_grows_keeps_the_opacities_and_colours_it_has_learnt(more):
     old, new = grown(free=TINY.decoder.free + more)
     variables, inputs = random_variables(old, 3), random_inputs()

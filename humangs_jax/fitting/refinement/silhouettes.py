@@ -93,7 +93,8 @@ def _nearest(body, mask, reach):
 
 def distances(matches: Matches, pixels: Float[Array, "p 2"]) -> Float[Array, " e"]:
     """How far points of the body are outside of their lines, pixels; negative inside."""
-    return jnp.sum(matches.normals * pixels[matches.points], axis=-1) - matches.offsets
+    along = matches.normals * pixels[matches.points]
+    return along[:, 0] + along[:, 1] - matches.offsets  # not `jnp.sum`: see `scans.objective.scan_residuals`
 
 
 def silhouette_residuals(
