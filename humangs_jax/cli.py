@@ -8,15 +8,11 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import tyro
 
 from humangs_jax.allocator import keep_freed_memory
-
-if TYPE_CHECKING:
-    from humangs_jax.data.capture import Capture
-    from humangs_jax.data.keypoints.keypoints import Keypoints
 
 Positional = tyro.conf.Positional
 
@@ -230,7 +226,12 @@ def synth(
     print(f"{out}: {len(folders)} people")
 
 
-def check(capture: Positional[Path], out: Path = Path("check.png"), keypoints: Path | None = None) -> None:
+def check(
+    capture: Positional[Path],
+    out: Path = Path("check.png"),
+    keypoints: Path | None = None,
+    person: int | None = None,
+) -> None:
     """Draw the posed body over each photo of a capture: wrong pose or camera conventions show at a glance.
 
     A capture that `humangs fit` made also shows its keypoints, how far off the body is, and what the views do not determine.
@@ -239,6 +240,7 @@ def check(capture: Positional[Path], out: Path = Path("check.png"), keypoints: P
         capture: folder with capture.json.
         out: the contact sheet to write; of the keypoints, NAME_fit.png beside it.
         keypoints: look at these keypoints instead of those that were fitted.
+        person: which person of the keypoint file, from 0, where it has several in a view.
     """
     from humangs_jax.avatar.check import check_capture
     from humangs_jax.data.capture import load_capture
@@ -248,8 +250,13 @@ def check(capture: Positional[Path], out: Path = Path("check.png"), keypoints: P
     photos = load_capture(capture)
     _require_parent(out)
     record_file = capture_folder(capture) / FIT_FILE
-    record = read_fit_record(record_file) if record_file.exists() and keypoints is None else None
-    found = _read_keypoints(keypoints, photos) if keypoints is not None else None
+    record, found = None, None
+    if keypoints is not None:
+        from humangs_jax.fitting.commands import read_keypoints_of
+
+        found = read_keypoints_of(photos, keypoints, person)
+    elif record_file.exists():
+        record = read_fit_record(record_file)
     print(check_capture(photos, out))
     if record is not None or found is not None:
         from humangs_jax.fitting.examination import examine_record
@@ -317,6 +324,8 @@ def fit(
     if photometric and not refine:
         raise ValueError("--photometric is a way to refine: add --refine")
     if refine:
+        if body is not None or smoothness:
+            raise ValueError("--body and --smoothness are for --keypoints; --refine keeps the capture's body")
         refine_in_place(capture, out, keypoints=keypoints, person=person, photometric=photometric, overwrite=overwrite)
         return
     if keypoints is None:
@@ -479,13 +488,6 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "import": import_cameras,
     **{f.__name__: f for f in (fit, check, demo, reconstruct, animate, render, export, synth, train, convert)},
 }
-
-
-def _read_keypoints(path: Path, photos: "Capture") -> "Keypoints":
-    from humangs_jax.data.keypoints.reading import read_keypoints
-
-    height, width = photos.images.shape[1:3]
-    return read_keypoints(path, photos.names, width, height)
 
 
 def _require_parent(path: Path, option: str = "--out") -> None:

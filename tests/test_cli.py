@@ -140,6 +140,7 @@ def test_from_photos_to_pictures(folder, tmp_path, monkeypatch, capsys):
         (["FOLDER", "--keypoints", "k.json"], "body.npz exists: --overwrite replaces it"),
         (["FOLDER", "--photometric"], "--photometric is a way to refine: add --refine"),
         (["FOLDER", "--bare"], "--bare is for --scan"),
+        (["FOLDER", "--refine", "--smoothness", "0.1"], "--body and --smoothness are for --keypoints"),
         (["FOLDER", "--keypoints", "k.json", "--out", "new"], "k.json"),
         (
             ["FOLDER", "--keypoints", "k.json", "--smoothness", "-1", "--out", "new"],

@@ -27,6 +27,7 @@ from humangs_jax.array_types import Array, Float
 from humangs_jax.body import skinning
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, pose_features
+from humangs_jax.body.surface_points import SurfacePoints, pose_points, shaped
 from humangs_jax.pytree import pytree_dataclass, static_field
 
 SIDES = {"left": 1.0, "right": -1.0}
@@ -43,18 +44,14 @@ MIDLINE = 0.006
 class LandmarkModel:
     """What of a body its landmarks depend on: k landmarks from j joints and p points of the surface.
 
-    joints, joint_directions: (j, 3) rest joints of the mean shape and (j, 3, s) their change, metres. points: (p, 3) at rest.
-    point_directions: (p, 3, s). pose_directions: (p, 3, q) or None. point_weights: (p, j) of the skinning.
+    joints, joint_directions: (j, 3) rest joints of the mean shape and (j, 3, s) their change, metres. points: p of the surface.
     regressor: (k, j + p) landmarks from posed joints and points; rows sum to 1, or are 0 where the body lacks a landmark.
     Static: names; known, which of them the body has; parents, joint_names; movers, the joints whose turning moves a landmark.
     """
 
     joints: Float[Array, "j 3"]
     joint_directions: Float[Array, "j 3 s"]
-    points: Float[Array, "p 3"]
-    point_directions: Float[Array, "p 3 s"]
-    pose_directions: Float[Array, "p 3 q"] | None
-    point_weights: Float[Array, "p j"]
+    points: SurfacePoints
     regressor: Float[Array, "k jp"]
     names: tuple[str, ...] = static_field(default=())
     known: tuple[bool, ...] = static_field(default=())
@@ -86,10 +83,12 @@ def landmark_model(body: BodyModel, names: tuple[str, ...]) -> LandmarkModel:
     return LandmarkModel(
         joints=product(body.template),
         joint_directions=product(body.shape_directions),
-        points=body.template[chosen],
-        point_directions=body.shape_directions[chosen],
-        pose_directions=None if body.pose_directions is None else body.pose_directions[chosen],
-        point_weights=body.skinning_weights[chosen],
+        points=SurfacePoints(
+            body.template[chosen],
+            body.shape_directions[chosen],
+            None if body.pose_directions is None else body.pose_directions[chosen],
+            body.skinning_weights[chosen],
+        ),
         regressor=jnp.asarray(regressor),
         names=names,
         known=tuple(bool(found) for found in sources),
@@ -103,18 +102,25 @@ def pose_landmarks(
     model: LandmarkModel, betas: Float[Array, " s_used"], pose: BodyPose
 ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
     """Landmarks and joints of a person in a pose, metres. Landmarks that the body lacks are at the origin."""
-    s = betas.shape[0]
-    shaped = lambda mean, directions: (
-        mean + jnp.einsum("nas,s->na", directions[..., :s], betas, precision=skinning.EXACT)
-    )
-    rest, points = shaped(model.joints, model.joint_directions), shaped(model.points, model.point_directions)
-    if model.pose_directions is not None:
-        features = pose_features(pose.rotations)
-        points = points + jnp.einsum("paq,q->pa", model.pose_directions, features, precision=skinning.EXACT)
+    transforms, joints = pose_joints(model, betas, pose)
+    posed = pose_points(model.points, betas, pose_features(pose.rotations), transforms)
+    return landmarks_from(model, joints, posed), joints
+
+
+def pose_joints(
+    model: LandmarkModel, betas: Float[Array, " s_used"], pose: BodyPose
+) -> tuple[Float[Array, "j 4 4"], Float[Array, "j 3"]]:
+    """Transforms of the joints from rest, and where the joints are, metres."""
+    rest = shaped(model.joints, model.joint_directions, betas)
     transforms = skinning.joint_transforms(rest, model.parents, pose.rotations, pose.translation)
-    joints = skinning.apply_transforms(transforms, rest)
-    posed = skinning.apply_transforms(skinning.blend_transforms(model.point_weights, transforms), points)
-    return jnp.matmul(model.regressor, jnp.concatenate([joints, posed]), precision=skinning.EXACT), joints
+    return transforms, skinning.apply_transforms(transforms, rest)
+
+
+def landmarks_from(
+    model: LandmarkModel, joints: Float[Array, "j 3"], points: Float[Array, "p 3"]
+) -> Float[Array, "k 3"]:
+    """Landmarks from posed joints and points."""
+    return jnp.matmul(model.regressor, jnp.concatenate([joints, points]), precision=skinning.EXACT)
 
 
 def _movers(parents, joints_used, point_weights):

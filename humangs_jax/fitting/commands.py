@@ -32,7 +32,7 @@ def fit_from_keypoints(
 
     target = check_place(capture, out, overwrite)
     photographs = load_photographs(capture)
-    found = _keypoints(keypoints, photographs, person)
+    found = read_keypoints_of(photographs, keypoints, person)
     model = load_body(body)
     body_file = DEFAULT_BODY if body is None else str(body)
     config = dataclasses.replace(FitConfig(), smoothness=smoothness)
@@ -56,7 +56,7 @@ def refine_in_place(
 
     target = check_place(capture, out, overwrite)
     start = load_capture(capture)
-    found = None if keypoints is None else _keypoints(keypoints, start, person)
+    found = None if keypoints is None else read_keypoints_of(start, keypoints, person)
     refinement = refine_capture(start, keypoints=found, photometric=photometric)
     print(refinement)
     if refinement.kept == "start":
@@ -84,7 +84,7 @@ def fit_from_scan(
         raise ValueError("--joints and --views: give one of them, both say where the joints are")
     if keypoints is not None and views is None:
         raise ValueError("--keypoints of a scan needs --views FOLDER, the pictures that they are of")
-    from humangs_jax.fitting.scans.files import save_scan_fit
+    from humangs_jax.fitting.scans.files import check_folder, save_scan_fit
     from humangs_jax.fitting.scans.fit import fit_scan
     from humangs_jax.fitting.scans.joints import read_joints
     from humangs_jax.fitting.scans.views import joints_from_views, render_scan_views
@@ -97,13 +97,12 @@ def fit_from_scan(
         return
     if out is None:
         raise ValueError("--out FOLDER is missing: where the body of the scan goes")
-    if out.exists() and (out.is_file() or any(out.iterdir())) and not overwrite:
-        raise ValueError(f"--out {out}: exists and is not empty; --overwrite replaces it")
+    check_folder(out, overwrite)
     known = None
     if joints is not None:
         known = read_joints(joints)
     elif views is not None and keypoints is not None:
-        known = joints_from_views(views, _keypoints(keypoints, load_photographs(views), person))
+        known = joints_from_views(views, read_keypoints_of(load_photographs(views), keypoints, person))
     fitted = fit_scan(scan, body=load_body(body), joints=known, clothed=not bare, height=height)
     body_file = DEFAULT_BODY if body is None else os.path.relpath(body.resolve(), out.resolve())
     save_scan_fit(out, fitted, body_file, overwrite=overwrite)
@@ -111,7 +110,8 @@ def fit_from_scan(
     print(f"{out}: body.npz, scan_fit.json and body_in_scan.ply")
 
 
-def _keypoints(path: Path, views: Photographs | Capture, person: int | None) -> Keypoints:
+def read_keypoints_of(views: Photographs | Capture, path: Path, person: int | None) -> Keypoints:
+    """Keypoints of the views of a capture. Raises: see `read_keypoints`."""
     height, width = views.images.shape[1:3]
     return read_keypoints(path, views.names, width, height, person=person)
 

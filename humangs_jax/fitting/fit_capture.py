@@ -126,6 +126,8 @@ def check_place(source: str | Path, out: str | Path | None, overwrite: bool) -> 
         raise ValueError(f"--out {target}: exists and is not empty; --overwrite replaces it")
     elif overwrite and target.is_dir() and any(target.iterdir()) and not (target / "capture.json").is_file():
         raise ValueError(f"--out {target}: holds no capture.json: refusing to overwrite what is no capture")
+    if target.resolve() in source.resolve().parents:
+        raise ValueError(f"--out {target}: {source} lies inside of it, and would be lost")
     return target
 
 

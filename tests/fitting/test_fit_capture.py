@@ -83,6 +83,10 @@ def test_written_elsewhere_with_its_pictures_and_new_cameras(folder, fitted, tmp
     (tmp_path / "other" / "diary.txt").write_text("mine")
     with pytest.raises(ValueError, match="no capture"):
         check_place(folder[0], tmp_path / "other", overwrite=True)
+    inside = target / "held_out"
+    write_fitted(folder[0], inside, capture, None)
+    with pytest.raises(ValueError, match="lies inside of it"):
+        check_place(inside, target, overwrite=True)
 
 
 def test_moments_that_views_hardly_show_are_named(folder):

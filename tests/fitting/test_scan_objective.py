@@ -7,7 +7,7 @@ import pytest
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.fitting.scans.body_surface import body_surface, pose_points, pose_surface
+from humangs_jax.fitting.scans.body_surface import body_surface, pose_surface, pose_vertices
 from humangs_jax.fitting.scans.config import ScanFitConfig
 from humangs_jax.fitting.scans.objective import Given, Matches, Tolerances, one_sided, scan_problem, scan_residuals
 from humangs_jax.fitting.scans.search import start_state
@@ -49,7 +49,7 @@ def test_the_surface_is_the_bodys(body):
     betas = jnp.asarray(rng.normal(size=22), jnp.float32)
     true = pose_body(body, shape_body(body, betas), pose)
     vertices, normals = pose_surface(surface, betas, pose)
-    some, _, joints = pose_points(surface, jnp.asarray([5, 2]), betas, pose)
+    some, _, joints = pose_vertices(surface, jnp.asarray([5, 2]), betas, pose)
     np.testing.assert_allclose(vertices, true.vertices, atol=1e-5)
     np.testing.assert_allclose(some, true.vertices[jnp.asarray([5, 2])], atol=1e-5)
     np.testing.assert_allclose(joints, true.joints, atol=1e-5)
@@ -58,7 +58,7 @@ def test_the_surface_is_the_bodys(body):
 
 def test_hands_are_what_is_not_covered(problem):
     surface, names = problem.surface, problem.surface.landmarks.joint_names
-    owner = np.asarray(names)[np.asarray(surface.weights).argmax(1)]
+    owner = np.asarray(names)[np.asarray(surface.points.weights).argmax(1)]
     covered = np.asarray(surface.covered)
     assert covered[owner == "left_index3"].max() < 0.1
     assert covered[owner == "left_knee"].min() > 0.99

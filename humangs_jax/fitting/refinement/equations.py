@@ -16,6 +16,7 @@ from humangs_jax.array_types import Array, Float
 from humangs_jax.body import skinning
 from humangs_jax.body.landmarks import LandmarkModel
 from humangs_jax.body.model import BodyModel, pose_features
+from humangs_jax.body.surface_points import SurfacePoints, pose_points
 from humangs_jax.fitting.objective import Problem, keypoint_residuals
 from humangs_jax.fitting.observations import Observations
 from humangs_jax.fitting.pose_prior import pose_prior
@@ -44,18 +45,6 @@ BARE = 5.0
 """Clothes are not thinner than nothing: so much less likely than thick ones."""
 NEAR = 0.05
 """Metres: points nearer to a camera, or behind it, are taken to be so far."""
-
-
-@pytree_dataclass
-class SurfacePoints:
-    """p points of a body's surface, one batch a view. rest: (p, 3). directions: (p, 3, s). corrections: (p, 3, q) of the pose, or
-    None. weights: (p, j) of the skinning.
-    """
-
-    rest: Float[Array, "p 3"]
-    directions: Float[Array, "p 3 s"]
-    corrections: Float[Array, "p 3 q"] | None
-    weights: Float[Array, "p j"]
 
 
 @pytree_dataclass
@@ -111,7 +100,7 @@ def evidence_residuals(
     features = jax.vmap(pose_features)(poses.rotations)
 
     def seen_points(points, frame, matrix):
-        posed = _posed(points, betas, features[frame], transforms[frame])
+        posed = pose_points(points, betas, features[frame], transforms[frame])
         return jnp.matmul(posed, matrix[:3, :3].T, precision=skinning.EXACT) + matrix[:3, 3]
 
     def silhouette(points, matches, frame, own_K, matrix):
@@ -124,7 +113,7 @@ def evidence_residuals(
     parts = {"silhouettes": jax.vmap(silhouette)(evidence.points, evidence.matches, start.frame, K, cam_from_world)}
     if model is not None and evidence.keypoints is not None:
         problem, sources = Problem(model, pose_prior(model.joint_names), np.zeros(0, int)), _sources(model, start)
-        landmarks = jax.vmap(lambda f, t: jnp.matmul(model.regressor, _posed(sources, betas, f, t)))(
+        landmarks = jax.vmap(lambda f, t: jnp.matmul(model.regressor, pose_points(sources, betas, f, t)))(
             features, transforms
         )
         seen = replace(evidence.keypoints, K=K[:, None], cam_from_world=cam_from_world[:, None])
@@ -133,25 +122,15 @@ def evidence_residuals(
     return parts
 
 
-def _posed(points, betas, features, transforms):
-    """(p, 3) in the world."""
-    shaped = points.rest + jnp.einsum("pas,s->pa", points.directions, betas, precision=skinning.EXACT)
-    if points.corrections is not None:
-        shaped = shaped + jnp.einsum("paq,q->pa", points.corrections, features, precision=skinning.EXACT)
-    return skinning.apply_transforms(skinning.blend_transforms(points.weights, transforms), shaped)
-
-
 def _sources(model, start):
     """What landmarks are means of, as points of a surface: the joints, each moved by itself alone, and vertices."""
     joints, coefficients = len(start.parents), len(start.betas)
-    corrections = None
-    if model.pose_directions is not None:
-        corrections = jnp.pad(model.pose_directions, ((joints, 0), (0, 0), (0, 0)))
+    points, pad = model.points, ((joints, 0), (0, 0), (0, 0))
     return SurfacePoints(
-        jnp.concatenate([model.joints, model.points]),
-        jnp.concatenate([model.joint_directions, model.point_directions])[..., :coefficients],
-        corrections,
-        jnp.concatenate([jnp.eye(joints), model.point_weights]),
+        jnp.concatenate([model.joints, points.rest]),
+        jnp.concatenate([model.joint_directions, points.directions])[..., :coefficients],
+        None if points.corrections is None else jnp.pad(points.corrections, pad),
+        jnp.concatenate([jnp.eye(joints), points.weights]),
     )
 
 

@@ -16,12 +16,22 @@ BODY_FILE, REPORT_FILE, MESH_FILE = "body.npz", "scan_fit.json", "body_in_scan.p
 def save_scan_fit(folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BODY, *, overwrite: bool = False) -> None:
     """Write body.npz (as in captures), scan_fit.json and body_in_scan.ply; all or nothing.
 
-    Arguments: body_file: what body.npz calls the model. Raises: ValueError if the folder is not empty and not to be overwritten.
+    Arguments: body_file: what body.npz calls the model. Raises: see `check_folder`.
     """
-    folder = Path(folder)
-    if folder.is_dir() and any(folder.iterdir()) and not overwrite:
-        raise ValueError(f"{folder}: the folder is not empty: choose another one or ask to overwrite it")
+    check_folder(Path(folder), overwrite)
     replace_folder(folder, lambda temporary: _write(temporary, fit, body_file))
+
+
+def check_folder(folder: Path, overwrite: bool) -> None:
+    """Raises: ValueError if it is a file, not empty and not to be overwritten, or holds something else than a fit to a scan."""
+    if folder.is_file():
+        raise ValueError(f"{folder}: is a file: expected a folder")
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not overwrite:
+        raise ValueError(f"{folder}: the folder is not empty: choose another one or ask to overwrite it")
+    if not (folder / REPORT_FILE).is_file():
+        raise ValueError(f"{folder}: holds no {REPORT_FILE}: refusing to overwrite what is no fit to a scan")
 
 
 def _write(folder: Path, fit: ScanFit, body_file: str) -> None:

@@ -113,7 +113,7 @@ def _given(align, points, known, height, config):
 
 def _resting_landmarks(problem):
     rotations = jnp.asarray(problem.prior.usual)
-    betas = jnp.zeros(problem.surface.point_directions.shape[-1])
+    betas = jnp.zeros(problem.surface.points.directions.shape[-1])
     return np.asarray(landmarks_and_joints(problem, betas, BodyPose(rotations, jnp.zeros(3)))[0], np.float64)
 
 

@@ -14,7 +14,7 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.fitting.body_state import BodyState, pose_of
 from humangs_jax.fitting.objective import LIMIT_STIFFNESS, robust
 from humangs_jax.fitting.pose_prior import PosePrior, pose_prior
-from humangs_jax.fitting.scans.body_surface import BodySurface, pose_points
+from humangs_jax.fitting.scans.body_surface import BodySurface, pose_vertices
 from humangs_jax.pytree import pytree_dataclass, static_field
 
 SIZE = 0.05
@@ -97,7 +97,7 @@ def scan_problem(surface: BodySurface, names: tuple[str, ...]) -> ScanProblem:
     """With those joints free that have these names."""
     model = surface.landmarks
     joints = tuple(j for j, name in enumerate(model.joint_names) if j > 0 and name in names)
-    height = np.asarray(surface.points)[:, 1]
+    height = np.asarray(surface.points.rest)[:, 1]
     return ScanProblem(surface, joints, (int(height.argmax()), int(height.argmin())))
 
 
@@ -112,10 +112,9 @@ def scan_residuals(
     """All residuals by what they are of."""
     rows, joints, body = matches.rows, np.asarray(problem.joints), state.body
     prior, pose = problem.prior, problem.pose(state)
-    vertices, landmarks, _ = pose_points(problem.surface, rows, body.betas, pose)
-    apart = matches.points - vertices / scale_of(
-        state
-    )  # in the scan's frame: in metres, a smaller scan would be nearer
+    vertices, landmarks, _ = pose_vertices(problem.surface, rows, body.betas, pose)
+    # in the scan's frame: in metres, a smaller scan would be nearer
+    apart = matches.points - vertices / scale_of(state)
     # Term by term: of `jnp.sum(normals * apart, axis=-1)` XLA's CPU compiler (jaxlib 0.10.2) makes wrong Jacobians under jacfwd
     along = matches.normals * apart
     away = along[:, 0] + along[:, 1] + along[:, 2]
@@ -143,5 +142,6 @@ def one_sided(away: Float[Array, " r"], outside: Float[Array, " r"], inside: Flo
 
 def _stature(problem, betas):
     top, bottom = problem.ends
-    height = lambda i: problem.surface.points[i, 1] + problem.surface.point_directions[i, 1, : betas.shape[0]] @ betas
+    points = problem.surface.points
+    height = lambda i: points.rest[i, 1] + points.directions[i, 1, : betas.shape[0]] @ betas
     return height(top) - height(bottom)

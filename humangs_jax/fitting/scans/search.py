@@ -15,7 +15,7 @@ from humangs_jax.array_types import Array, Float
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.model import BodyPose
 from humangs_jax.fitting.body_state import state_of
-from humangs_jax.fitting.scans.body_surface import pose_points
+from humangs_jax.fitting.scans.body_surface import pose_vertices
 from humangs_jax.fitting.scans.config import COARSE, COARSE_NORMAL, LOOSE, ScanFitConfig
 from humangs_jax.fitting.scans.matches import Target
 from humangs_jax.fitting.scans.objective import Given, ScanProblem, ScanState, Tolerances, scale_of, scan_problem
@@ -27,7 +27,7 @@ from humangs_jax.fitting.scans.start import Start, facing_back, search_starts
 
 def start_state(problem: ScanProblem, rotations: Float[np.ndarray, "j 3"], config: ScanFitConfig) -> ScanState:
     """The mean body in a pose, at the origin of the frame."""
-    betas = jnp.zeros(min(problem.surface.point_directions.shape[-1], config.shapes))
+    betas = jnp.zeros(min(problem.surface.points.directions.shape[-1], config.shapes))
     pose = BodyPose(jnp.asarray(rotations, jnp.float32), jnp.zeros(3))
     return ScanState(state_of(problem.prior, np.asarray(problem.joints), betas, pose), jnp.zeros(()))
 
@@ -37,7 +37,7 @@ def landmarks_and_joints(
     problem: ScanProblem, betas: Float[Array, " s"], pose: BodyPose
 ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
     """Of a body in a pose, metres."""
-    return pose_points(problem.surface, jnp.zeros(1, jnp.int32), betas, pose)[1:]
+    return pose_vertices(problem.surface, jnp.zeros(1, jnp.int32), betas, pose)[1:]
 
 
 def search(

@@ -106,7 +106,7 @@ def search_starts(surface: BodySurface, scan: Scan, kept: int) -> list[Start]:
 
 def _stance_points(surface, stance):
     """Evenly spread points of a resting body in a stance about their centre and over their size; centre and size, metres."""
-    betas = jnp.zeros(surface.point_directions.shape[-1])
+    betas = jnp.zeros(surface.points.directions.shape[-1])
     posed = pose_surface(surface, betas, BodyPose(jnp.asarray(stance, jnp.float32), jnp.zeros(3)))
     vertices, faces = np.asarray(posed[0], np.float64), np.asarray(surface.faces)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
