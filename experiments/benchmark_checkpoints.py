@@ -49,7 +49,7 @@ def measure(preset: str, folder: Path, repeats: int) -> dict[str, Any]:
     import jax.numpy as jnp
     import numpy as np
 
-    from humangs_jax.pytree import replace
+    from humangs_jax.core.pytree import replace
     from humangs_jax.training.checkpoint import Checkpoints
     from humangs_jax.training.config import PRESETS
 

@@ -4,7 +4,7 @@
 
 A round gives the result, and the gradients of the map and of the kernel. Alone it is a program by itself; in a loop it is the
 body of a loop over ROUNDS maps, as a training step is one over its microbatches, and the time is divided by ROUNDS. "ours" is
-`humangs_jax/models/convolution.py`. CPU time of all threads, float32, the three in turns. It runs on the CPU whatever else is
+`humangs_jax/network/convolution.py`. CPU time of all threads, float32, the three in turns. It runs on the CPU whatever else is
 there: elsewhere both are the same program. Two minutes on one core, nearly all of them in the loop as XLA differentiates it.
 """
 
@@ -62,7 +62,7 @@ def measure(shape: tuple[int, int, int, int, int], repeats: int) -> dict[str, fl
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.models.convolution import KERNEL, LAYOUT, convolve
+    from humangs_jax.network.convolution import KERNEL, LAYOUT, convolve
 
     views, height, width, channels, features = shape
     plain = lambda x, kernel: jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=LAYOUT)

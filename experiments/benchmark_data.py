@@ -49,7 +49,7 @@ def rates(spent: dict[str, float], subjects: int, views: int) -> dict[str, float
 
 def measure_synth(out: Path, size: int, subjects: int, body: Any) -> dict[str, float]:
     """Write people; one more before, which compiles."""
-    from humangs_jax.data.synthetic.writer import Layout, write_set
+    from humangs_jax.people.writer import Layout, write_set
 
     layout = Layout(size, poses=POSES, views=VIEWS)
     write_set(out, 1, layout, "train", 0, body=body, progress=False)
@@ -59,7 +59,8 @@ def measure_synth(out: Path, size: int, subjects: int, body: Any) -> dict[str, f
 
 def measure_read(out: Path, size: int, examples: int, body: Any) -> dict[str, dict[str, float]]:
     """Examples of written people through the loader: from disk every time, and from memory."""
-    from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling, find_people
+    from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
+    from humangs_jax.people.written import find_people
 
     sampling = ViewSampling(input_counts=(INPUTS,), target_count=TARGETS)
     results = {}
@@ -76,9 +77,9 @@ def measure_live(size: int, people: int, examples: int, body: Any) -> dict[str, 
     """Build a bank, compile, draw examples one by one."""
     import jax
 
-    from humangs_jax.data.synthetic.live import LiveConfig
-    from humangs_jax.data.synthetic.live_bank import build_bank
-    from humangs_jax.data.synthetic.live_source import jitted_example
+    from humangs_jax.people.live import LiveConfig
+    from humangs_jax.people.live_bank import build_bank
+    from humangs_jax.people.live_source import jitted_example
 
     texture = 1024 if size > 256 else 512
     build_bank([0, 1], body, "train", texture_size=texture)
@@ -103,12 +104,13 @@ def measure_training(folder: Path, body: Any) -> dict[str, Any]:
 
     import jax
 
-    from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling, Waiting, find_people
-    from humangs_jax.data.synthetic.live import LiveConfig
-    from humangs_jax.data.synthetic.live_bank import build_bank
-    from humangs_jax.data.synthetic.live_source import live_source
-    from humangs_jax.data.synthetic.writer import Layout, write_set
+    from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling, Waiting
     from humangs_jax.data.views import gaussian_body
+    from humangs_jax.people.live import LiveConfig
+    from humangs_jax.people.live_bank import build_bank
+    from humangs_jax.people.live_source import live_source
+    from humangs_jax.people.writer import Layout, write_set
+    from humangs_jax.people.written import find_people
     from humangs_jax.training.config import small
     from humangs_jax.training.state import init_state
     from humangs_jax.training.step import train_step

@@ -122,7 +122,7 @@ def configured(preset: str, dtype: str, size: int) -> Any:
     """A preset for photos of that size, in the dtype that suits the machine."""
     import jax
 
-    from humangs_jax.models.presets import PRESETS
+    from humangs_jax.network.presets import PRESETS
 
     if preset not in PRESETS:
         raise SystemExit(f"--preset {preset}: expected one of {', '.join(PRESETS)}")
@@ -133,7 +133,7 @@ def configured(preset: str, dtype: str, size: int) -> Any:
 
 def reconstruction(variables: Any, inputs: Any, config: Any) -> tuple[Any, dict[str, Any]]:
     """(the network as one program, what it costs by count)."""
-    from humangs_jax.models.humangs import apply_humangs
+    from humangs_jax.network.humangs import apply_humangs
 
     program, seconds = compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)
     costs = compiled_costs(program)
@@ -151,7 +151,7 @@ def stages(variables: Any, inputs: Any, config: Any) -> dict[str, Any]:
     """The three public stages, each compiled by itself."""
     import jax
 
-    from humangs_jax.models.humangs import decode, encode, sample_vertices
+    from humangs_jax.network.humangs import decode, encode, sample_vertices
 
     encoding = encode(variables, inputs, config)
     features = sample_vertices(variables, encoding, inputs, config)
@@ -165,7 +165,7 @@ def stages(variables: Any, inputs: Any, config: Any) -> dict[str, Any]:
 
 def whole_network_flops(variables: Any, inputs: Any, config: Any) -> int:
     """Operations of the network whose last convolution is evaluated at every pixel and not where vertices read it."""
-    from humangs_jax.models.humangs import apply_humangs
+    from humangs_jax.network.humangs import apply_humangs
 
     program, _ = compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)
     here = compiled_costs(program).matrix_flops
@@ -181,8 +181,8 @@ def memory(config: Any, views: int, size: int) -> dict[str, float]:
     """MiB that a program for so many photos of that size needs besides its arguments and results; its operations."""
     import jax
 
-    from humangs_jax.models.humangs import apply_humangs
-    from humangs_jax.models.weights import expected_variables
+    from humangs_jax.network.humangs import apply_humangs
+    from humangs_jax.network.weights import expected_variables
 
     subject = benchmark_inputs(dataclasses.replace(config, tokens="all"), views, size)
     if config.tokens == "foreground":

@@ -122,10 +122,10 @@ def planned(
 ) -> Any:
     """A preset with some fields replaced, and buffers that fit the scene."""
     from humangs_jax.rendering.splat_config import SPLAT_PRESETS
-    from humangs_jax.rendering.splatting import plan
+    from humangs_jax.rendering.splatting import plan_buffers
 
     config = dataclasses.replace(SPLAT_PRESETS[preset], **fields)
-    return plan(scene.gaussians(dtype), scene.camera(dtype), config, margin, mesh)
+    return plan_buffers(scene.gaussians(dtype), scene.camera(dtype), config, margin, mesh)
 
 
 def compiled(

@@ -14,13 +14,13 @@ ASSETS = Path(__file__).parents[1] / "humangs_jax" / "assets"
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seed", type=int, default=3_000_003, help="of the demo range, see data/synthetic/seeds.py")
+    parser.add_argument("--seed", type=int, default=3_000_003, help="of the demo range, see people/seeds.py")
     parser.add_argument("--out", type=Path, default=ASSETS / "demo_capture", help="folder to write")
     arguments = parser.parse_args()
 
     from humangs_jax.body.library import load_body
-    from humangs_jax.data.synthetic.seeds import split_of
-    from humangs_jax.data.synthetic.writer import write_subject
+    from humangs_jax.people.seeds import split_of
+    from humangs_jax.people.writer import write_subject
 
     if split_of(arguments.seed) != "demo":
         parser.error(f"--seed {arguments.seed} belongs to the {split_of(arguments.seed)} people")

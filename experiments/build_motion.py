@@ -191,7 +191,7 @@ def draw(motion, folder: Path) -> None:
     import jax.numpy as jnp
     import numpy as np
 
-    from humangs_jax.avatar.check import draw_body
+    from humangs_jax.apps.check import draw_body
     from humangs_jax.avatar.pictures import contact_sheet
     from humangs_jax.avatar.video import write_video
     from humangs_jax.body.library import load_body

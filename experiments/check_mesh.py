@@ -28,8 +28,8 @@ def compare(arrays: Path) -> list[tuple[float, ...]]:
     import numpy as np
 
     from humangs_jax.geometry.camera import Camera
-    from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
-    from humangs_jax.rendering.position_map import gouraud_position_map, plain_position_map
+    from humangs_jax.rendering.mesh.position_map import gouraud_position_map, plain_position_map
+    from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
     with np.load(arrays, allow_pickle=False) as file:
         expected = dict(file)

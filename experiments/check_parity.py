@@ -177,9 +177,9 @@ def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
     import jax.numpy as jnp
     import numpy as np
 
+    from humangs_jax.core.pytree import replace
     from humangs_jax.geometry.camera import Camera
-    from humangs_jax.models.humangs import HumanGSInputs
-    from humangs_jax.pytree import replace
+    from humangs_jax.network.humangs import HumanGSInputs
 
     own = lambda name: jnp.asarray(arrays[name][index], dtype)
     images = jnp.moveaxis(own("in_image"), 1, -1)
@@ -210,8 +210,8 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
     import jax.numpy as jnp
 
     from humangs_jax.geometry import quaternion
-    from humangs_jax.models.stages import network_stages
-    from humangs_jax.models.vertex_decoder import corrected_skinning_weights
+    from humangs_jax.network.stages import network_stages
+    from humangs_jax.network.vertex_decoder import corrected_skinning_weights
     from humangs_jax.rendering.gaussians import skin_gaussians
 
     channels_first = lambda x: jnp.moveaxis(x, -1, 1)
@@ -305,7 +305,7 @@ def run_checkpoint(checkpoint: Path, arrays: Path, config: Path, dtype: str) -> 
     import jax.numpy as jnp
     import numpy as np
 
-    from humangs_jax.models.conversion import load_checkpoint
+    from humangs_jax.network.conversion import load_checkpoint
 
     release, expected = read_release_config(config), load_arrays(arrays)
     converted = load_checkpoint(checkpoint, head_width=_head_width(release))

@@ -66,7 +66,7 @@ def describe_all(body, arguments):
     """Counts and spreads over descriptions."""
     import numpy as np
 
-    from humangs_jax.data.synthetic.person import describe
+    from humangs_jax.people.person import describe
 
     people = [describe(arguments.first + i, body) for i in range(arguments.described)]
     kinds = collections.Counter(g.kind for p in people for g in p.garments)
@@ -110,9 +110,9 @@ def look_at_all(body, arguments):
     """Faults, foreground shares, colours and angles of built people; and a row of faults for every pose."""
     import numpy as np
 
-    from humangs_jax.data.synthetic import cameras, rendering
-    from humangs_jax.data.synthetic.subject import make_subject
-    from humangs_jax.data.synthetic.writer import sample_pose
+    from humangs_jax.people import cameras, rendering
+    from humangs_jax.people.subject import make_subject
+    from humangs_jax.people.writer import sample_pose
 
     rows, colours, angles, shares = [], np.zeros((12, 4, 4)), [], []
     for i in range(arguments.subjects):
@@ -157,8 +157,8 @@ def count_faults(body, posed, camera):
     import numpy as np
 
     from humangs_jax.body.model import BodyPose, pose_body, shape_body
-    from humangs_jax.data.synthetic.rendering import _padded
-    from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
+    from humangs_jax.people.rendering import _padded
+    from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
     subject = posed.subject
     faces, materials = subject.surface.faces, subject.face_materials
@@ -249,7 +249,7 @@ def draw(file, people, seen):
     import matplotlib.pyplot as plt
     import numpy as np
 
-    from humangs_jax.data.synthetic import poses
+    from humangs_jax.people import poses
 
     figure = plt.figure(figsize=(17, 9.5))
     grid = figure.add_gridspec(2, 5)

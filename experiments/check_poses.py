@@ -29,10 +29,10 @@ def main() -> None:
     import numpy as np
 
     from humangs_jax.body.library import load_body
-    from humangs_jax.data.synthetic.kinematics import Build
-    from humangs_jax.data.synthetic.overlap import OverlapMeter
-    from humangs_jax.data.synthetic.poses import sample_rotations
-    from humangs_jax.data.synthetic.sequences import KINDS, sample_sequence
+    from humangs_jax.people.kinematics import Build
+    from humangs_jax.people.overlap import OverlapMeter
+    from humangs_jax.people.poses import sample_rotations
+    from humangs_jax.people.sequences import KINDS, sample_sequence
 
     body = load_body()
     joints = np.asarray(body.joint_regressor @ body.template, float)
@@ -78,7 +78,7 @@ def limits(poses) -> dict:
     """Spread of the joints' angles (degrees), and the largest share of a limit that is used."""
     import numpy as np
 
-    from humangs_jax.data.synthetic.kinematics import LIMITS
+    from humangs_jax.people.kinematics import LIMITS
 
     angles = np.linalg.norm(np.stack(poses), axis=-1)
     used = {joint: angles[:, joint].max() / limit for joint, limit in LIMITS.items()}
@@ -132,10 +132,10 @@ def draw_strips(body, poses, sequences, folder: Path) -> None:
     import numpy as np
 
     from humangs_jax.body.model import BodyPose, pose_body, shape_body
-    from humangs_jax.data.images import write_png
     from humangs_jax.geometry.camera import intrinsics_from_fov, look_at
-    from humangs_jax.rendering.mesh_rasterizer import interpolate, rasterize_mesh
-    from humangs_jax.rendering.position_map import vertex_normals
+    from humangs_jax.io.images import write_png
+    from humangs_jax.rendering.mesh.position_map import vertex_normals
+    from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
     size, rest = 160, shape_body(body, jnp.zeros(0))
     pose = jax.jit(lambda r, t: pose_body(body, rest, BodyPose(r, t)).vertices)
@@ -150,7 +150,9 @@ def draw_strips(body, poses, sequences, folder: Path) -> None:
         light = jnp.asarray([0.3, 0.8, 0.5]) / jnp.linalg.norm(jnp.asarray([0.3, 0.8, 0.5]))
         bright = 0.35 + 0.6 * jnp.clip(vertex_normals(vertices, body.faces) @ light, 0, 1)
         grey = jnp.repeat(bright[:, None], 3, axis=1)
-        return np.asarray(interpolate(rasterize_mesh(vertices, body.faces, camera), body.faces, grey, jnp.ones(3)))
+        return np.asarray(
+            interpolate_attributes(rasterize_mesh(vertices, body.faces, camera), body.faces, grey, jnp.ones(3))
+        )
 
     pictures = [draw(r, np.zeros(3), 0.6 if i % 2 else -0.5, True) for i, r in enumerate(poses[:40])]
     rows = [np.concatenate(pictures[i : i + 10], 1) for i in range(0, len(pictures) // 10 * 10, 10)]

@@ -77,7 +77,7 @@ def all_around(body, arguments):
 
 def close_ups(body, arguments):
     """A row of heads, a row of the same heads from the side, a row of hands."""
-    from humangs_jax.data.synthetic import poses
+    from humangs_jax.people import poses
 
     rows = [[], [], []]
     for seed in _seeds(arguments, arguments.close_ups, offset=200):
@@ -99,9 +99,9 @@ def sequences(body, arguments):
     """One row a sequence, eight frames over two and a half seconds, the camera beside the walker; two sequences side by side."""
     import numpy as np
 
-    from humangs_jax.data.synthetic.rendering import pose_subject
-    from humangs_jax.data.synthetic.subject import make_subject
-    from humangs_jax.data.synthetic.writer import sample_motion
+    from humangs_jax.people.rendering import pose_subject
+    from humangs_jax.people.subject import make_subject
+    from humangs_jax.people.writer import sample_motion
 
     rows = []
     for seed in _seeds(arguments, arguments.sequences, offset=300):
@@ -119,20 +119,20 @@ def sequences(body, arguments):
 
 def poses_world(subject, rotations):
     """(3, 3) rotation of the pelvis."""
-    from humangs_jax.data.synthetic import poses
+    from humangs_jax.people import poses
 
     return poses.joint_positions(subject.build, rotations.astype(float))[0][poses.PELVIS]
 
 
 def _seeds(arguments, count, offset=0):
-    from humangs_jax.data.synthetic.seeds import DEMO
+    from humangs_jax.people.seeds import DEMO
 
     return [DEMO[arguments.first + offset + i] for i in range(count)]
 
 
 def _person(seed, body, pose=0):
-    from humangs_jax.data.synthetic.subject import make_subject
-    from humangs_jax.data.synthetic.writer import sample_pose
+    from humangs_jax.people.subject import make_subject
+    from humangs_jax.people.writer import sample_pose
 
     return sample_pose(make_subject(seed, body), pose)
 
@@ -158,7 +158,7 @@ def _whole(posed, azimuth, size, scale):
     """The whole person, feet near the lower edge; all people at one scale, 2.3 metres to the picture's height."""
     import numpy as np
 
-    from humangs_jax.data.synthetic.rendering import render_view
+    from humangs_jax.people.rendering import render_view
 
     low, high = posed.vertices.min(0), posed.vertices.max(0)
     reach = max(2.25, 1.1 * (high[1] - low[1]))
@@ -171,7 +171,7 @@ def _near(posed, target, reach, azimuth, elevation, scale):
     """A close-up of `reach` metres around a point, from a metre away."""
     import numpy as np
 
-    from humangs_jax.data.synthetic.rendering import render_view
+    from humangs_jax.people.rendering import render_view
 
     fov = 2 * np.arctan(reach / 1.2)
     return render_view(posed, _camera(target, 1.2, azimuth, elevation, fov, CLOSE_SIZE, scale))[0]

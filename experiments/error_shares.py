@@ -46,7 +46,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, float]:
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import CaptureCache, ViewSampling, find_captures
     from humangs_jax.data.views import gaussian_body
-    from humangs_jax.models.weights import load_weights
+    from humangs_jax.network.weights import load_weights
     from humangs_jax.training.config import TrainConfig
     from humangs_jax.training.forward import predict
     from humangs_jax.training.validation import validation_examples

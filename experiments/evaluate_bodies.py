@@ -63,7 +63,7 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     from humangs_jax.avatar.evaluate import draw_painted_body, painted_body
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.body.library import load_body
-    from humangs_jax.data.synthetic.seeds import seeds_of
+    from humangs_jax.people.seeds import seeds_of
 
     seeds = seeds_of(arguments.split, arguments.first, arguments.subjects)
     body, (variables, config, digest) = load_body(), load_network(arguments)

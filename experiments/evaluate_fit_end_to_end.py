@@ -31,7 +31,7 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.people < 1:
         parser.error(f"--people {arguments.people}: expected at least 1")
-    from humangs_jax.allocator import keep_freed_memory
+    from humangs_jax.core.allocator import keep_freed_memory
 
     keep_freed_memory()
     run(arguments)
@@ -44,7 +44,7 @@ def run(arguments) -> None:
     from tqdm import tqdm
 
     from humangs_jax.body.library import load_body
-    from humangs_jax.models.weights import load_weights
+    from humangs_jax.network.weights import load_weights
 
     body, (variables, config) = load_body(), load_weights()
     rows = []

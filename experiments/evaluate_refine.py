@@ -63,7 +63,7 @@ def main() -> None:
 def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     """Refine every person in every case, and write what was asked for."""
     from humangs_jax.body.library import load_body
-    from humangs_jax.data.synthetic.seeds import seeds_of
+    from humangs_jax.people.seeds import seeds_of
 
     body, subjects = load_body(), []
     names = ("split", "first", "views", "size", "noise_px", "exact")
@@ -131,7 +131,7 @@ def draw(path: Path, start: Any, refined: Any) -> None:
     import jax.numpy as jnp
     import numpy as np
 
-    from humangs_jax.avatar.check import draw_body
+    from humangs_jax.apps.check import draw_body
     from humangs_jax.avatar.pictures import contact_sheet
 
     path.parent.mkdir(parents=True, exist_ok=True)

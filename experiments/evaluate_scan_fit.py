@@ -56,7 +56,7 @@ def main() -> None:
 def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     """Fit every scan; the report."""
     from humangs_jax.body.library import load_body
-    from humangs_jax.data.synthetic.seeds import seeds_of
+    from humangs_jax.people.seeds import seeds_of
 
     body, rows, drawn = load_body(), [], []
     settings = {"split": arguments.split, "first": arguments.first, "noise_mm": arguments.noise_mm}
@@ -109,8 +109,8 @@ def person(seed, kind, body):
 
     from humangs_jax.body.landmarks import landmark_model, pose_landmarks
     from humangs_jax.body.model import BodyPose, pose_body, shape_body
-    from humangs_jax.data.synthetic.poses import sample_rotations
-    from humangs_jax.data.synthetic.subject import make_subject
+    from humangs_jax.people.poses import sample_rotations
+    from humangs_jax.people.subject import make_subject
 
     subject = make_subject(seed, body)
     rotations = sample_rotations(np.random.default_rng([seed, POSE_STREAM]), subject.build).astype(np.float32)
@@ -176,7 +176,7 @@ def summary(rows):
 
 def draw_extremes(path, drawn, kinds):
     """Best and worst scan of each kind: from two sides, the scan grey, the fitted body over it in red."""
-    from humangs_jax.data.images import write_png
+    from humangs_jax.io.images import write_png
 
     rows = []
     for kind in kinds:
@@ -212,7 +212,7 @@ def shaded(vertices, faces, camera):
     """Brightness (h, w) and where there is something (h, w)."""
     import jax.numpy as jnp
 
-    from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
+    from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
     faces = np.asarray(faces)
     a, b, c = (vertices[faces[:, i]] for i in range(3))

@@ -3,7 +3,7 @@
     python experiments/evaluate_synthetic.py --subjects 32 --views 1 2 4 6 --json evaluation.json
         [--pictures sheet.png] [--plot views.png] [--docs docs/evaluation.md]
 
-Subjects are drawn from the test seeds (`humangs_jax.data.synthetic.seeds`), which training never sees; choices are made
+Subjects are drawn from the test seeds (`humangs_jax.people.seeds`), which training never sees; choices are made
 on `--split validation`. A person is made once, photographed from evenly spaced places (`evaluation_subjects.py`), reconstructed
 from every number of photos asked for, and always compared with the same held-out views: "novel" ones in the pose of the photos,
 and "animation" ones in unseen poses. The baseline is the body mesh, each vertex painted with the mean photo colour over the
@@ -65,7 +65,7 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     from tqdm import tqdm
 
     from humangs_jax.body.library import load_body
-    from humangs_jax.data.synthetic.seeds import seeds_of
+    from humangs_jax.people.seeds import seeds_of
 
     seeds = seeds_of(arguments.split, arguments.first, arguments.subjects)
     body, (variables, config, digest) = load_body(), load_network(arguments)

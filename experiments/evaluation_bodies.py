@@ -12,9 +12,9 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.body.smplx import EXPRESSION_COLUMNS, SHAPE_COLUMNS
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.models.humangs import HumanGSConfig
-from humangs_jax.pytree import replace
+from humangs_jax.network.humangs import HumanGSConfig
 
 SMPLX_SEED_VERTICES = 3493
 """Vertices of the decimated body that the made-up one grows from: with a vertex for each of its faces about SMPL-X's 10,475."""

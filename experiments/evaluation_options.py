@@ -56,7 +56,7 @@ def load_lpips(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -
 
 def load_network(arguments: argparse.Namespace) -> tuple[Any, Any, str]:
     """Variables, configuration, and SHA-256 of the weights file."""
-    from humangs_jax.models.weights import SHIPPED, load_weights
+    from humangs_jax.network.weights import SHIPPED, load_weights
 
     with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:
         path = arguments.weights or shipped
@@ -69,7 +69,7 @@ def settings_of(arguments: argparse.Namespace, digest: str, tokens: str, lpips: 
     """What the rows of a person depend on; rows of other settings are not taken for theirs."""
     from evaluation_subjects import RING
 
-    from humangs_jax.data.synthetic.seeds import GENERATOR_VERSION
+    from humangs_jax.people.seeds import GENERATOR_VERSION
 
     return {
         "weights": digest,

@@ -11,7 +11,7 @@ from evaluation_tables import TASK_NAMES
 
 from humangs_jax.avatar.pictures import GAP, tile, write_texts
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.images import to_uint8, write_png
+from humangs_jax.io.images import to_uint8, write_png
 
 TRIPLE = ("truth", "ours", "painted body")
 CROP = 0.75

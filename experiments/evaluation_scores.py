@@ -12,7 +12,7 @@ from humangs_jax.avatar.evaluate import draw_painted_body, painted_body, score
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.data.capture import Capture
-from humangs_jax.models.humangs import HumanGSConfig, Variables
+from humangs_jax.network.humangs import HumanGSConfig, Variables
 from humangs_jax.objectives.lpips import Lpips
 
 MeanLpips = Callable[[np.ndarray, np.ndarray], float | None]

@@ -2,7 +2,7 @@
 
 The ring has `RING` cameras of the published protocol around the person, evenly spaced but for the generator's jitter, number 0
 the most frontal one. Any number of photographs is every n-th camera of the ring, so that one person is photographed once for
-all of them. Held-out cameras and unseen poses are those of `humangs_jax.data.synthetic.writer.write_subject` for the same seed,
+all of them. Held-out cameras and unseen poses are those of `humangs_jax.people.writer.write_subject` for the same seed,
 and pictures have 8 bits as they would have on disk.
 """
 
@@ -15,13 +15,13 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.images import to_uint8
-from humangs_jax.data.synthetic.cameras import cameras_around, spread_azimuths
-from humangs_jax.data.synthetic.rendering import PosedSubject
-from humangs_jax.data.synthetic.subject import make_subject
-from humangs_jax.data.synthetic.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capture_views, sample_pose
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
+from humangs_jax.io.images import to_uint8
+from humangs_jax.people.cameras import cameras_around, spread_azimuths
+from humangs_jax.people.rendering import PosedSubject
+from humangs_jax.people.subject import make_subject
+from humangs_jax.people.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capture_views, sample_pose
 
 RING = 12
 """Cameras that photographs are taken from; numbers of photographs divide it."""

@@ -29,9 +29,9 @@ def make_case(seed, body, model, frames, views, size=512) -> FitCase:
 
     from humangs_jax.body.landmarks import pose_landmarks
     from humangs_jax.body.model import BodyPose
-    from humangs_jax.data.synthetic.cameras import cameras_around, spread_azimuths
-    from humangs_jax.data.synthetic.poses import sample_rotations
-    from humangs_jax.data.synthetic.subject import make_subject
+    from humangs_jax.people.cameras import cameras_around, spread_azimuths
+    from humangs_jax.people.poses import sample_rotations
+    from humangs_jax.people.subject import make_subject
 
     subject = make_subject(seed, body)
     rotations, translations, extrinsics, intrinsics = [], [], [], []

@@ -146,7 +146,7 @@ def _demo_scene(size: int) -> Scene:
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.data.capture import load_capture
     from humangs_jax.data.photographs import DEMO_CAPTURE
-    from humangs_jax.models.weights import load_weights
+    from humangs_jax.network.weights import load_weights
 
     capture = load_capture(DEMO_CAPTURE)
     avatar = reconstruct(*load_weights(), capture)

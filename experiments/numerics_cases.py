@@ -20,8 +20,8 @@ import numpy as np
 
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.constants import ALPHA_MIN, NEAR
-from humangs_jax.rendering.dense import render_dense
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.reference import render_dense
 from humangs_jax.rendering.splatting import render
 
 WIDTH, HEIGHT, COUNT = 24, 16, 32

@@ -28,7 +28,7 @@ def demo_avatar() -> tuple[Any, Any]:
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.data.capture import load_capture
     from humangs_jax.data.photographs import DEMO_CAPTURE
-    from humangs_jax.models.weights import load_weights
+    from humangs_jax.network.weights import load_weights
 
     capture = load_capture(DEMO_CAPTURE)
     return reconstruct(*load_weights(), capture), capture
@@ -41,9 +41,9 @@ def benchmark_views(views: int, size: int) -> tuple[Any, Any]:
     from humangs_jax.avatar.animate import animate
     from humangs_jax.avatar.frames import draw_gaussians
     from humangs_jax.body.model import pose_body, shape_body
-    from humangs_jax.data.synthetic.cameras import VERTICAL_FOV, bounding_sphere
     from humangs_jax.data.views import SubjectViews
     from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+    from humangs_jax.people.cameras import VERTICAL_FOV, bounding_sphere
 
     avatar, capture = demo_avatar()
     pose, body = capture.pose(0), capture.body
@@ -82,8 +82,8 @@ def foreground(inputs: Any, config: Any) -> tuple[Any, int, float]:
     """(configuration for foreground tokens with room for these photos, tokens that the person touches, their share)."""
     import jax
 
-    from humangs_jax.capacity import round_up
-    from humangs_jax.models.humangs import touched_patches
+    from humangs_jax.core.buffers import round_up
+    from humangs_jax.network.humangs import touched_patches
 
     touched = int(jax.jit(touched_patches, static_argnames="config")(inputs, config))
     patches = int(np.prod(inputs.images.shape[:3])) // config.patch_size**2
@@ -99,7 +99,7 @@ def random_variables(config: Any, seed: int = 0) -> Any:
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.models.weights import expected_variables
+    from humangs_jax.network.weights import expected_variables
 
     rng = np.random.default_rng(seed)
 

@@ -49,8 +49,8 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """Everything that the JSON holds."""
     import jax
 
-    from humangs_jax.models.humangs import read_vertices
-    from humangs_jax.models.weights import load_weights
+    from humangs_jax.network.humangs import read_vertices
+    from humangs_jax.network.weights import load_weights
 
     config = configured(arguments.preset, arguments.dtype, arguments.size)
     variables = None
@@ -108,7 +108,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def network(variables: Any, inputs: Any, config: Any) -> Any:
     """The package's."""
-    from humangs_jax.models.humangs import apply_humangs
+    from humangs_jax.network.humangs import apply_humangs
 
     return apply_humangs(variables, inputs, config)[0].gaussians
 
@@ -117,10 +117,10 @@ def everywhere(variables: Any, inputs: Any, config: Any) -> Any:
     """The package's, with its last convolution evaluated at every pixel and then sampled."""
     import jax.numpy as jnp
 
-    from humangs_jax.models.humangs import assemble, decode_heads, encode, project_and_test, sample_vertices
-    from humangs_jax.pytree import replace
-    from humangs_jax.sampling.bilinear import sample_bilinear, texel_indices
-    from humangs_jax.sampling.pixel_aligned import COUNT_EPSILON, sum_over_views
+    from humangs_jax.core.pytree import replace
+    from humangs_jax.network.bilinear import sample_bilinear, texel_indices
+    from humangs_jax.network.humangs import assemble, decode_heads, encode, project_and_test, sample_vertices
+    from humangs_jax.network.pixel_aligned import COUNT_EPSILON, sum_over_views
 
     encoding = encode(variables, inputs, config)
     features = sample_vertices(variables, encoding, inputs, config)

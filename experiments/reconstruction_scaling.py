@@ -84,14 +84,14 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def network(variables: Any, inputs: Any, config: Any) -> Any:
     """The compiled network."""
-    from humangs_jax.models.humangs import apply_humangs
+    from humangs_jax.network.humangs import apply_humangs
 
     return compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)[0]
 
 
 def shapes_of(config: Any) -> Any:
     """Variables that are only compiled for."""
-    from humangs_jax.models.weights import expected_variables
+    from humangs_jax.network.weights import expected_variables
 
     return expected_variables(config)
 

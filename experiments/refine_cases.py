@@ -20,10 +20,10 @@ class Errors:
 
 def true_captures(seed: int, body: Any, views: int, size: int = 512) -> tuple[Any, Any]:
     """The person of a test seed in a random pose from cameras all around, with true parameters: (in clothes, the bare body)."""
-    from humangs_jax.data.synthetic.cameras import cameras_around, spread_azimuths
-    from humangs_jax.data.synthetic.poses import sample_rotations
-    from humangs_jax.data.synthetic.subject import make_subject
-    from humangs_jax.data.synthetic.writer import View, capture_views, stand
+    from humangs_jax.people.cameras import cameras_around, spread_azimuths
+    from humangs_jax.people.poses import sample_rotations
+    from humangs_jax.people.subject import make_subject
+    from humangs_jax.people.writer import View, capture_views, stand
 
     subject = make_subject(seed, body)
     posed = stand(subject, sample_rotations(np.random.default_rng([seed, POSE_STREAM]), subject.build))
@@ -38,7 +38,7 @@ def bare_masks(capture: Any) -> np.ndarray:
     import jax.numpy as jnp
 
     from humangs_jax.fitting.refinement.score import posed_vertices
-    from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
+    from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
     vertices = posed_vertices(capture.body, jnp.asarray(capture.betas), capture.poses)
     height, width = capture.images.shape[1:3]
@@ -56,8 +56,8 @@ def disturbed(capture: Any, seed: int, errors: Errors = Errors()) -> Any:
     """
     import jax.numpy as jnp
 
+    from humangs_jax.core.pytree import replace
     from humangs_jax.geometry import quaternion, transform
-    from humangs_jax.pytree import replace
 
     rng = np.random.default_rng([seed, ERROR_STREAM])
     about = lambda count, degrees: jnp.asarray(np.radians(degrees) * _directions(rng, count), jnp.float32)

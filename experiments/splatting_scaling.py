@@ -63,12 +63,12 @@ def main() -> None:
 
 def measure(scene: Scene, repeats: int) -> dict[str, Any]:
     """{"series": {panel: [{"size", "forward_ms", ..., "temporary_mb"}]}, "slopes": {panel: {direction: slope}}}."""
-    from humangs_jax.rendering.splatting import plan
+    from humangs_jax.rendering.splatting import plan_buffers
 
     series: dict[str, list[dict[str, Any]]] = {}
 
     def one(panel: str, size: float, scene: Scene) -> None:
-        config = plan(scene.gaussians(), scene.camera(), margin=1.0)
+        config = plan_buffers(scene.gaussians(), scene.camera(), margin=1.0)
         programs, facts = compiled(scene, make_target(scene.size), config)
         _append(series, panel, size, programs, facts, repeats)
 
@@ -102,10 +102,10 @@ def compiled_views(scene: Scene, views: int, at_once: bool) -> tuple[dict[str, C
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, plan, render, render_views
+    from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, plan_buffers, render, render_views
 
     gaussians, cameras = scene.gaussians(), orbiting(scene, VIEW_ANGLE * np.arange(views))
-    config, black = plan(gaussians, cameras, margin=1.0), jnp.zeros(3)
+    config, black = plan_buffers(gaussians, cameras, margin=1.0), jnp.zeros(3)
     goal = jnp.asarray(make_target(scene.size))
 
     def forward(gaussians):

@@ -45,9 +45,9 @@ def main() -> None:
 
 def measure(scene: Scene, repeats: int) -> dict[str, Any]:
     """{"scene", "size", "cpu_ms": {stage: number}}."""
-    from humangs_jax.rendering.splatting import plan
+    from humangs_jax.rendering.splatting import plan_buffers
 
-    config = plan(scene.gaussians(), scene.camera(), margin=1.0)
+    config = plan_buffers(scene.gaussians(), scene.camera(), margin=1.0)
     runs = stages(scene, config) | compiled(scene, make_target(scene.size), config)[0]
     times = {name: float(cpu) for name, (_, cpu) in medians(runs, repeats).items()}
     return {"scene": scene.kind, "size": scene.size, "cpu_ms": times}
@@ -58,9 +58,10 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.rendering import binning, fat_chunks, small_blocks
+    from humangs_jax.rendering import binning
     from humangs_jax.rendering.compositing import pack_splats
     from humangs_jax.rendering.projection import project, squared_reach
+    from humangs_jax.rendering.schedules import fat_chunks, small_blocks
     from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
     from humangs_jax.rendering.tiling import TileGrid, image_to_tiles, sort_into_tiles, tiles_to_image
 

@@ -10,7 +10,7 @@ the relative L2 error, the worst of the five parameters'. Knobs that only say in
 block, chunks) are measured too: their error is rounding. Dropping the hidden: the Gaussians that weigh less than a
 threshold on every pixel from all of 24 cameras around are left out (of gradients, they count as 0).
 
-About 8 minutes for a scene of 52,375 Gaussians at 512; `--only extent scale` measures some knobs. Expected: the preset
+About 8 minutes for a scene of 52,375 Gaussians at 512; `--only radius_sigma scale` measures some knobs. Expected: the preset
 near_exact above 50 dB at 0.8 of the time, fast at about 40 dB and 0.6 of it (docs/performance.md).
 """
 
@@ -34,14 +34,14 @@ KNOBS: dict[str, tuple[Any, ...]] = {
     "block": (16, 64),
     "chunk": (4, 16),
     "chunk_backward": (4, 16),
-    "products": ("bfloat16",),
+    "matmul_precision": ("bfloat16",),
     "alpha_min": (1 / 192, 1 / 128, 1 / 64, 1 / 32, 1 / 16),
     "transmittance_stop": (1e-3, 1e-2, 3e-2, 1e-1),
-    "extent": (3.33, 3.0, 2.5, 2.0, 1.5),
+    "radius_sigma": (3.33, 3.0, 2.5, 2.0, 1.5),
     "opacity_min": (0.05, 0.1, 0.2, 0.4),
     "scale": (0.75, 0.5, 0.25),
 }
-SCHEDULE = ("tile_size", "block", "chunk", "chunk_backward", "products")
+SCHEDULE = ("tile_size", "block", "chunk", "chunk_backward", "matmul_precision")
 """Knobs of the exact image: not drawn in the picture."""
 
 HIDDEN = (1 / 255, 0.01, 0.03, 0.1)
@@ -53,17 +53,17 @@ VIEWS = 24
 COMBINED: tuple[dict[str, Any], ...] = (
     {"alpha_min": 1 / 128, "transmittance_stop": 1e-3},
     {"alpha_min": 1 / 32, "transmittance_stop": 1e-2},
-    {"extent": 2.75, "transmittance_stop": 1e-3},
-    {"extent": 2.25, "transmittance_stop": 1e-3},
-    {"extent": 2.0, "transmittance_stop": 3e-3},
-    {"extent": 1.5, "transmittance_stop": 3e-3},
-    {"extent": 1.25, "transmittance_stop": 1e-2},
-    {"extent": 2.0, "alpha_min": 1 / 64, "transmittance_stop": 3e-3},
-    {"extent": 1.75, "transmittance_stop": 3e-3, "scale": 0.5},
-    {"hidden": 0.01, "extent": 2.75, "transmittance_stop": 1e-3},
-    {"hidden": 0.03, "extent": 2.5, "transmittance_stop": 1e-3},
-    {"hidden": 0.03, "extent": 2.0, "transmittance_stop": 3e-3},
-    {"hidden": 0.1, "extent": 1.75, "transmittance_stop": 3e-3},
+    {"radius_sigma": 2.75, "transmittance_stop": 1e-3},
+    {"radius_sigma": 2.25, "transmittance_stop": 1e-3},
+    {"radius_sigma": 2.0, "transmittance_stop": 3e-3},
+    {"radius_sigma": 1.5, "transmittance_stop": 3e-3},
+    {"radius_sigma": 1.25, "transmittance_stop": 1e-2},
+    {"radius_sigma": 2.0, "alpha_min": 1 / 64, "transmittance_stop": 3e-3},
+    {"radius_sigma": 1.75, "transmittance_stop": 3e-3, "scale": 0.5},
+    {"hidden": 0.01, "radius_sigma": 2.75, "transmittance_stop": 1e-3},
+    {"hidden": 0.03, "radius_sigma": 2.5, "transmittance_stop": 1e-3},
+    {"hidden": 0.03, "radius_sigma": 2.0, "transmittance_stop": 3e-3},
+    {"hidden": 0.1, "radius_sigma": 1.75, "transmittance_stop": 3e-3},
 )
 """Several knobs at once; "hidden" as in `HIDDEN`."""
 
@@ -152,10 +152,10 @@ def measure(scene: Scene, repeats: int, only: Sequence[str] | None = None) -> di
     import jax
 
     from humangs_jax.rendering.splat_config import DEFAULT_CONFIG
-    from humangs_jax.rendering.splatting import plan
+    from humangs_jax.rendering.splatting import plan_buffers
 
     target = make_target(scene.size)
-    fitted = lambda scene, config, dtype: plan(scene.gaussians(dtype), scene.camera(dtype), config, 1.0)
+    fitted = lambda scene, config, dtype: plan_buffers(scene.gaussians(dtype), scene.camera(dtype), config, 1.0)
     with jax.enable_x64(True):
         config = fitted(scene, DEFAULT_CONFIG, np.float64)
         truth = outputs(compiled(scene, target, config, np.float64)[0], None)

@@ -75,7 +75,7 @@ def main() -> None:
 def count(scene: Scene) -> dict[str, Any]:
     """All numbers of one scene: {"needed", "done": {idea: {tile size: pixel-Gaussian pairs}}, ...}."""
     from humangs_jax.rendering.splat_config import SplatConfig
-    from humangs_jax.rendering.splatting import plan
+    from humangs_jax.rendering.splatting import plan_buffers
 
     config = SplatConfig()
     projected, reach = projected_splats(scene, config)
@@ -98,7 +98,7 @@ def count(scene: Scene) -> dict[str, Any]:
             needed, visible, counts, rows = drawn.contributing.sum(), drawn.visible.sum(), lists.counts, lists.rows
     for name, of_size in pairs.items():
         done[name] = {size: number * size**2 for size, number in of_size.items()}
-    planned = plan(scene.gaussians(), scene.camera())
+    planned = plan_buffers(scene.gaussians(), scene.camera())
     return {
         "scene": scene.kind,
         "size": scene.size,
@@ -148,14 +148,14 @@ def projected_splats(scene: Scene, config: Any, dtype: type = np.float32) -> tup
     @jax.jit
     def run(gaussians, camera):
         projected = project(
-            gaussians, camera, config.near, config.dilation, config.jacobian_margin, config.normalize_quats
+            gaussians, camera, config.near, config.eps2d, config.jacobian_margin, config.normalize_quats
         )
         return projected, squared_reach(gaussians.opacities, config.alpha_min)
 
     projected, reach = run(scene.gaussians(dtype), scene.camera(dtype))
     reach = np.where(projected.visible, reach, 0)
-    if config.extent is not None:
-        reach = np.minimum(reach, config.extent**2)
+    if config.radius_sigma is not None:
+        reach = np.minimum(reach, config.radius_sigma**2)
     return projected, np.where(scene.opacities >= config.opacity_min, reach, 0)
 
 
@@ -197,7 +197,7 @@ def make_lists(scene: Scene, config: Any, tile_size: int, dtype: type = np.float
     def sort_by_depth(projected, reach):
         order = binning.depth_order(jnp.where(projected.visible, projected.depth, jnp.inf))
         if config.square:
-            footprints = binning.square_footprints(projected, reach, config.extent)
+            footprints = binning.square_footprints(projected, reach, config.radius_sigma)
         else:
             footprints = binning.footprints(projected, reach)
         footprints = jax.tree.map(lambda plane: plane[order], footprints)

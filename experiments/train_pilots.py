@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", help="names of the runs to make; all if not given")
     parser.add_argument("--docs", type=Path, default=DOCS, help="page with the table")
     arguments = parser.parse_args()
-    from humangs_jax.allocator import keep_freed_memory
+    from humangs_jax.core.allocator import keep_freed_memory
 
     keep_freed_memory()
     run(arguments, parser)
@@ -88,8 +88,8 @@ def run(arguments, parser) -> None:
     from evaluation_results import file_digest
     from report_tables import around_section, write_json
 
-    from humangs_jax.configuration import config_to_json
-    from humangs_jax.models.weights import load_weights
+    from humangs_jax.core.configuration import config_to_json
+    from humangs_jax.network.weights import load_weights
     from humangs_jax.training.config import LossConfig, small
     from humangs_jax.training.optimizer import OptimizerConfig
 
@@ -146,10 +146,10 @@ def pilot(arguments, config, live, started, name) -> dict:
 
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import CaptureCache, find_captures
-    from humangs_jax.data.synthetic.live import LiveConfig
-    from humangs_jax.data.synthetic.live_bank import load_bank
     from humangs_jax.data.views import gaussian_body
-    from humangs_jax.models.weights import fit_variables
+    from humangs_jax.network.weights import fit_variables
+    from humangs_jax.people.live import LiveConfig
+    from humangs_jax.people.live_bank import load_bank
     from humangs_jax.training.loop import train
     from humangs_jax.training.sources import captured_people, live_people, mixed_people
     from humangs_jax.training.validation import validate, validation_examples

@@ -16,8 +16,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from humangs_jax.allocator import keep_freed_memory
-from humangs_jax.configuration import config_from_file
+from humangs_jax.core.allocator import keep_freed_memory
+from humangs_jax.core.configuration import config_from_file
 from humangs_jax.training.config import TrainConfig
 
 SMALL = config_from_file(TrainConfig, Path(__file__).resolve().parent / "configs" / "small.json")
@@ -49,8 +49,8 @@ def main(
 
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import find_captures
-    from humangs_jax.data.synthetic import SPLITS, synthesize
-    from humangs_jax.models.weights import fit_variables, load_weights
+    from humangs_jax.network.weights import fit_variables, load_weights
+    from humangs_jax.people import SPLITS, synthesize
     from humangs_jax.training.launch import training_people
     from humangs_jax.training.loop import train
 

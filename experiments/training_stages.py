@@ -31,9 +31,9 @@ def stages(case: Case) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
     import jax.numpy as jnp
     import optax
 
+    from humangs_jax.core.pytree import replace
     from humangs_jax.data.views import prepare_inputs
-    from humangs_jax.models.humangs import decode, encode_with_statistics, sample_vertices
-    from humangs_jax.pytree import replace
+    from humangs_jax.network.humangs import decode, encode_with_statistics, sample_vertices
     from humangs_jax.training.forward import draw_targets, white_backgrounds
     from humangs_jax.training.optimizer import make_optimizer
     from humangs_jax.training.step import loss_terms

@@ -29,7 +29,7 @@ def variants(case: Case) -> dict[str, tuple[dict[str, Any], dict[str, Any] | Non
 
 def upsampler(model: Any) -> Any:
     """One in proportion to the network."""
-    from humangs_jax.models.upsampler import UpsamplerConfig
+    from humangs_jax.network.upsampler import UpsamplerConfig
 
     width = model.transformer.width
     return UpsamplerConfig(hidden=width // 3, out=width)
@@ -42,7 +42,7 @@ def variant_numbers(
     import jax
     from training_setups import with_model
 
-    from humangs_jax.models import convolution
+    from humangs_jax.network import convolution
 
     for name in asked or list(variants(case)):
         fields, options, plain = variants(case)[name]

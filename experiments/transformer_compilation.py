@@ -66,7 +66,7 @@ def compilation(transformer: Any, config: Any, tokens: int) -> dict[str, float]:
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.models.transformer import Transformer
+    from humangs_jax.network.transformer import Transformer
 
     module = Transformer(transformer, config.compute_dtype)
     variables = jax.eval_shape(module.init, jax.random.key(0), jnp.zeros((2, transformer.width)))

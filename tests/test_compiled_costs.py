@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import pytest
 
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.models.humangs import HumanGSInputs, encode
-from humangs_jax.models.presets import tiny
-from humangs_jax.models.weights import expected_variables
+from humangs_jax.network.humangs import HumanGSInputs, encode
+from humangs_jax.network.presets import tiny
+from humangs_jax.network.weights import expected_variables
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SMALL_EXTRAS = 1.02  # of loop counters, indices and the like beside the arrays that a test counts

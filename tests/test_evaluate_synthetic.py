@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.models.presets import tiny
-from humangs_jax.models.weights import expected_variables, save_weights
+from humangs_jax.network.presets import tiny
+from humangs_jax.network.weights import expected_variables, save_weights
 from humangs_jax.objectives.backbones import channels, random_weights
 from humangs_jax.objectives.lpips import BACKBONES, Lpips, lpips
 

@@ -12,8 +12,8 @@ from humangs_jax.body.decimation import decimate
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.models.presets import tiny
-from humangs_jax.pytree import replace
+from humangs_jax.core.pytree import replace
+from humangs_jax.network.presets import tiny
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 

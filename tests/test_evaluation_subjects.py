@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from humangs_jax.body.library import load_body
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.synthetic.seeds import DEMO
-from humangs_jax.data.synthetic.writer import write_subject
-from humangs_jax.pytree import replace
+from humangs_jax.people.seeds import DEMO
+from humangs_jax.people.writer import write_subject
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 SIZE = 48

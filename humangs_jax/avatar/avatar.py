@@ -9,8 +9,8 @@ from typing import Literal
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float, Int
-from humangs_jax.pytree import pytree_dataclass, static_field
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.rendering.gaussians import Gaussians
 
 FORMAT = "humangs-avatar"

@@ -6,17 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.objectives import metrics
-from humangs_jax.rendering.mesh_rasterizer import interpolate, rasterize_mesh
-from humangs_jax.sampling.pixel_aligned import (
+from humangs_jax.network.pixel_aligned import (
     photo_colors,
     project_vertices,
     visible_vertices,
 )
+from humangs_jax.objectives import metrics
+from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,7 +68,7 @@ def draw_painted_body(colors: Float[Array, "n 3"], views: Capture) -> Float[np.n
 
     def draw(frame: int, camera: Camera):
         fragments = rasterize_mesh(_posed_vertices(views, rest, frame), body.faces, camera)
-        return np.asarray(interpolate(fragments, body.faces, colors, jnp.ones(3)))
+        return np.asarray(interpolate_attributes(fragments, body.faces, colors, jnp.ones(3)))
 
     return np.stack([draw(int(frame), views.cameras[i]) for i, frame in enumerate(views.frames)])
 

@@ -8,16 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyPose, RestBody
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import BufferOverflowError, Rendering, plan, render
+from humangs_jax.rendering.splatting import BufferOverflowError, Rendering, plan_buffers, render
 
 VERTICAL_FOV = np.pi / 6
 """Narrow enough that a person keeps natural proportions."""
@@ -51,11 +51,11 @@ def draw_gaussians(
     """
     config = None
     for frame, camera in zip(gaussians, cameras, strict=True):
-        config = config or plan(frame, camera, how)
+        config = config or plan_buffers(frame, camera, how)
         try:
             rendering = render(frame, camera, config, background)
         except BufferOverflowError:
-            config = plan(frame, camera, how)
+            config = plan_buffers(frame, camera, how)
             rendering = render(frame, camera, config, background)
         yield rendering
 
@@ -127,7 +127,7 @@ def capture_renderings(
 
 def write_renderings(out: str | os.PathLike, cameras: Camera, renderings: list[Rendering], exr: bool = False) -> int:
     """Write view_000.png ... into a folder, and views.exr if asked. Returns the number of views."""
-    from humangs_jax.data.images import write_png
+    from humangs_jax.io.images import write_png
 
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -140,7 +140,7 @@ def write_renderings(out: str | os.PathLike, cameras: Camera, renderings: list[R
 
 def write_renderings_exr(path: str | os.PathLike, cameras: Camera, renderings: list[Rendering]) -> None:
     """Float32 RGBA as rendered, Z in metres and the camera's matrices, one part per view."""
-    from humangs_jax.data.exr import ExrView, write_exr
+    from humangs_jax.io.exr import ExrView, write_exr
 
     write_exr(
         Path(path),

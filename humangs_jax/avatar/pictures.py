@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.array_types import Float
-from humangs_jax.data.images import to_uint8, write_png
+from humangs_jax.core.array_types import Float
+from humangs_jax.io.images import to_uint8, write_png
 
 GAP = 4
 """Pixels of white between tiles."""

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.array_types import Float
-from humangs_jax.data.images import to_uint8
+from humangs_jax.core.array_types import Float
+from humangs_jax.io.images import to_uint8
 
 CONSTANT_RATE_FACTOR = 17
 """x264's quality; 18 counts as visually lossless."""

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.pytree import replace
+from humangs_jax.core.pytree import replace
 
 FLATNESS = 100.0
 """1 mm off the surface costs as much as 1 cm of edge."""

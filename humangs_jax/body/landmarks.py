@@ -23,12 +23,12 @@ other 65 points of the face are not on this list: they follow expressions, which
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body import skinning
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, pose_features
 from humangs_jax.body.surface_points import SurfacePoints, pose_points, shaped
-from humangs_jax.pytree import pytree_dataclass, static_field
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass, static_field
 
 SIDES = {"left": 1.0, "right": -1.0}
 """And the sign of x that is outwards in T-pose."""

@@ -10,10 +10,10 @@ package another (`humangs_jax.body.library.load_body`).
 
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.body import skinning
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.geometry import quaternion
-from humangs_jax.pytree import pytree_dataclass, static_field
 
 
 @pytree_dataclass

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.geometry import quaternion, transform
 
 EXACT = jax.lax.Precision.HIGHEST

@@ -16,11 +16,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyModel, BodyPose
-from humangs_jax.body.restricted_pickle import as_array, read_pickle
-from humangs_jax.pytree import pytree_dataclass
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.io.restricted_pickle import as_array, read_pickle
 
 SHAPE_COLUMNS, EXPRESSION_COLUMNS = 300, 100
 """Of `shapedirs` in current files; older ones have 10 + 10."""

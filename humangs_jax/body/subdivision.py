@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.pytree import replace
+from humangs_jax.core.pytree import replace
 
 FINEST = 64
 """Edges are made at most this many times shorter: finer asks for billions of faces, and is a length in another unit."""

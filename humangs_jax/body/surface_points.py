@@ -2,9 +2,9 @@
 
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body import skinning
-from humangs_jax.pytree import pytree_dataclass
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass
 
 
 @pytree_dataclass

@@ -21,8 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Float, Int
 from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import (
     CaptureError,
     body_parameters,
@@ -42,9 +42,9 @@ from humangs_jax.data.capture_reading import (
     read_description,
     read_parameters,
 )
-from humangs_jax.data.images import write_png
 from humangs_jax.data.photographs import Photographs, capture_folder, read_photographs
 from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.io.images import write_png
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.array_types import Float
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.camera import Camera
 
 COLOUR_SLACK = 1e-3

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.array_types import Float
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, checked_frame
-from humangs_jax.data.images import read_grey, read_image
-from humangs_jax.data.npz import read_npz
+from humangs_jax.io.images import read_grey, read_image
+from humangs_jax.io.npz import read_npz
 
 FORMAT = "humangs-capture"
 VERSION = 1

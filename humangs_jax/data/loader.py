@@ -16,20 +16,17 @@ from humangs_jax.data.loading.examples import (
     shrink,
     subject_views,
 )
-from humangs_jax.data.loading.generated import GeneratedSource
 from humangs_jax.data.loading.mixture import Mixture
 from humangs_jax.data.loading.order import subject_order
 from humangs_jax.data.loading.prefetch import Waiting
 from humangs_jax.data.loading.reading import has_grain
 from humangs_jax.data.loading.source import Source
-from humangs_jax.data.loading.written import find_people
 
 __all__ = [
     "CaptureCache",
     "CaptureSource",
     "Example",
     "ExampleSource",
-    "GeneratedSource",
     "Loader",
     "Mixture",
     "Source",
@@ -38,7 +35,6 @@ __all__ = [
     "Waiting",
     "draw_views",
     "find_captures",
-    "find_people",
     "has_grain",
     "nearest_view",
     "shrink",

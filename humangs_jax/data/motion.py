@@ -27,15 +27,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body import skinning
 from humangs_jax.body.joints import BODY_NAMES, JOINT_NAMES
 from humangs_jax.body.model import BodyPose, RestBody
-from humangs_jax.body.restricted_pickle import as_array, read_pickle
 from humangs_jax.body.smplx import HandBasis
-from humangs_jax.data.npz import read_npz
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.pytree import pytree_dataclass, replace, static_field
+from humangs_jax.io.npz import read_npz
+from humangs_jax.io.restricted_pickle import as_array, read_pickle
 
 WALK = "walk.npz"
 BODY_NUMBERS = 3 * len(BODY_NAMES)  # 66

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.array_types import Float, Int
+from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, numbers
 from humangs_jax.data.capture_reading import names_from_paths, read_description, read_view, view_frame
 from humangs_jax.geometry.camera import Camera, stack_cameras

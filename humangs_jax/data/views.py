@@ -4,16 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.body.subdivision import split_long_edges
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.models.humangs import HumanGSConfig, HumanGSInputs, subject_unit
-from humangs_jax.pytree import pytree_dataclass, replace
-from humangs_jax.rendering.mesh_rasterizer import RasterConfig
-from humangs_jax.rendering.position_map import gouraud_position_map, plain_position_map, vertex_normals
+from humangs_jax.network.humangs import HumanGSConfig, HumanGSInputs, subject_unit
+from humangs_jax.rendering.mesh.position_map import gouraud_position_map, plain_position_map, vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
 MASK_THRESHOLD = 0.5
 """A pixel belongs to the person when its mask is above this."""

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Bool, Float, Int
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.fitting.observations import Observations
 from humangs_jax.fitting.triangulation import MARGIN, reprojection_errors, triangulate_robustly
-from humangs_jax.pytree import pytree_dataclass, replace
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

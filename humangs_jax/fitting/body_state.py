@@ -6,10 +6,10 @@ Optimisers take steps of one length in all directions: a shape coefficient, a te
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.fitting.pose_prior import PosePrior
-from humangs_jax.pytree import pytree_dataclass
 
 METRE = 0.1
 """A step of 1 in the translation, metres."""

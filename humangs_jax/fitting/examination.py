@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Bool, Float
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photographs import Photographs

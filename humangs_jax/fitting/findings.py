@@ -5,9 +5,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from humangs_jax.array_types import Bool, Float
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.fitting.pose_prior import pose_prior, violations
 from humangs_jax.fitting.swaps import Swap
 

@@ -9,7 +9,6 @@ import numpy as np
 
 from humangs_jax.body.landmarks import landmark_model
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.atomic import replace_file, replace_folder
 from humangs_jax.data.capture import Capture, parameter_arrays
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.capture_reading import DEFAULT_BODY, read_description
@@ -20,6 +19,7 @@ from humangs_jax.fitting.landmark_fit import STAGES, FitConfig, LandmarkFit, fit
 from humangs_jax.fitting.observations import group_by_moment
 from humangs_jax.fitting.swaps import Swap, find_mirrored
 from humangs_jax.fitting.uncertainty import fit_uncertainty
+from humangs_jax.io.atomic import replace_file, replace_folder
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.array_types import Float
-from humangs_jax.data.atomic import replace_file
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, numbers
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
-from humangs_jax.data.npz import read_npz
+from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.npz import read_npz
 
 FIT_FILE = "fit.npz"
 KEYS = ("set", "names", "points", "confidences", "noise", "deviations", "determined", "shape_covariance")

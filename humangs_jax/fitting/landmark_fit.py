@@ -16,10 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
 from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.fitting.body_state import BodyState, pose_of, state_of
 from humangs_jax.fitting.objective import Problem, Targets, keypoint_errors, residuals
 from humangs_jax.fitting.observations import Observations
@@ -27,7 +28,6 @@ from humangs_jax.fitting.pose_prior import pose_prior
 from humangs_jax.fitting.rigid import rigid_starts, trunk_weights
 from humangs_jax.fitting.solvers import Outcome, minimise
 from humangs_jax.fitting.triangulation import triangulate_robustly
-from humangs_jax.pytree import pytree_dataclass, replace
 
 STAGES = ("rigid", "points", "body", "hands")
 

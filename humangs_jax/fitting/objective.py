@@ -9,12 +9,12 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Bool, Float
 from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
+from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.fitting.body_state import BodyState, pose_of
 from humangs_jax.fitting.observations import Observations
 from humangs_jax.fitting.pose_prior import PosePrior
-from humangs_jax.pytree import pytree_dataclass
 
 NEAR = 0.05
 """Metres: points nearer to a camera, or behind it, are taken to be so far."""

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photographs import Photographs
-from humangs_jax.pytree import pytree_dataclass
 
 
 @pytree_dataclass

@@ -10,8 +10,8 @@ import dataclasses
 
 import numpy as np
 
-from humangs_jax.array_types import Float
 from humangs_jax.body.joints import FINGERS
+from humangs_jax.core.array_types import Float
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
 """The rotation vector of the mirrored rotation."""

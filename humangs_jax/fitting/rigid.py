@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body.landmarks import pose_landmarks
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import replace
 from humangs_jax.fitting.body_state import HEADING, METRE, BodyState, pose_of
 from humangs_jax.fitting.objective import Problem, keypoint_residuals
 from humangs_jax.fitting.observations import Observations
 from humangs_jax.geometry import quaternion
-from humangs_jax.pytree import replace
 
 TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")
 """Landmarks that hardly depend on the pose."""

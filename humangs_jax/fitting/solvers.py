@@ -6,8 +6,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Bool, Float, Int, PyTree
-from humangs_jax.pytree import pytree_dataclass
+from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree
+from humangs_jax.core.pytree import pytree_dataclass
 
 
 @pytree_dataclass

@@ -16,8 +16,8 @@ import itertools
 import jax
 import numpy as np
 
-from humangs_jax.array_types import Bool, Float, Int
 from humangs_jax.body.landmarks import LandmarkModel
+from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import KeypointSet
 from humangs_jax.fitting.agreement import Order, agreement, arranged, attainable

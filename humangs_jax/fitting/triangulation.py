@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.fitting.observations import Observations
-from humangs_jax.numerics import safe_normalize
 
 RIDGE = 1e-6
 """Of the weights: rays that are parallel leave the distance open, and the point near the cameras."""

@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Float
 from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
+from humangs_jax.core.array_types import Float
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.fitting.body_state import HEADING, BodyState, pose_of, state_of
 from humangs_jax.fitting.landmark_fit import FitConfig, LandmarkFit, fit_problem
 from humangs_jax.fitting.objective import residuals
 from humangs_jax.fitting.observations import Observations
-from humangs_jax.pytree import pytree_dataclass, replace
 
 UNSEEN = 1e-8
 """Information about place and heading that nobody has: a kilometre, and any direction."""

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float, Matrix3, Matrix4, Vector3
+from humangs_jax.core.array_types import Array, Float, Matrix3, Matrix4, Vector3
+from humangs_jax.core.numerics import safe_normalize
+from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
-from humangs_jax.numerics import safe_normalize
-from humangs_jax.pytree import pytree_dataclass, replace, static_field
 
 RIGID_TOLERANCE = 1e-3
 """Calibrations are stored with few digits: R R^T may be this far from the identity before a camera is refused."""

@@ -6,8 +6,8 @@ Quaternions q and -q are the same rotation.
 
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float
-from humangs_jax.numerics import safe_normalize
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.numerics import safe_normalize
 
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
 SMALL_ANGLE_SQUARED = 1e-4

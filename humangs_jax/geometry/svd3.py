@@ -6,7 +6,7 @@ itself, never on its Gram matrix, keeps small singular values accurate (Demmel &
 
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Float
 
 SWEEPS = 6
 """Cyclic Jacobi converges quadratically; 3x3 matrices reach float64 rounding after five sweeps (tests), float32 after four."""

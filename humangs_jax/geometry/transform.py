@@ -6,7 +6,7 @@ Products ask for full precision: accelerators otherwise round float32 factors to
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Float
 
 EXACT = jax.lax.Precision.HIGHEST
 

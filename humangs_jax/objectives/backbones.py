@@ -13,9 +13,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float, Key
-from humangs_jax.models.convolution import convolve
-from humangs_jax.pytree import pytree_dataclass
+from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.network.convolution import convolve
 
 
 @pytree_dataclass

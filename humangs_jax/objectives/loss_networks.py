@@ -10,8 +10,10 @@ from collections.abc import Generator
 
 import jax.numpy as jnp
 
-from humangs_jax.models.conversion import LOSS_PREFIX
-from humangs_jax.models.tensor_file import read_tensors
+from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.io.matconvnet import is_matlab_file, read_matconvnet
+from humangs_jax.io.tensor_file import read_tensors
+from humangs_jax.network.conversion import LOSS_PREFIX
 from humangs_jax.objectives.backbones import Convolution, Weights, convolutions
 from humangs_jax.objectives.layer_names import (
     LPIPS_NETWORKS,
@@ -23,9 +25,7 @@ from humangs_jax.objectives.layer_names import (
     is_layer,
 )
 from humangs_jax.objectives.lpips import Lpips
-from humangs_jax.objectives.matconvnet import is_matlab_file, read_matconvnet
 from humangs_jax.objectives.perceptual import Vgg19
-from humangs_jax.pytree import pytree_dataclass
 
 PERCEPTUAL_MODULE = "perceptual_loss_module."
 LPIPS_MODULE = "lpips_loss_module."

@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Float
 
 
 def squared_error(predicted: Float[Array, "*b"], target: Float[Array, "*b"]) -> Float[Array, "*b"]:

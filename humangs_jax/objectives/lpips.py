@@ -8,10 +8,10 @@ with `jax.vmap`.
 
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float, Scalar
-from humangs_jax.numerics import at_least_float32, safe_sqrt
+from humangs_jax.core.array_types import Array, Float, Scalar
+from humangs_jax.core.numerics import at_least_float32, safe_sqrt
+from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.objectives.backbones import ALEXNET, SQUEEZENET, VGG16, Slices, Weights, feature_maps
-from humangs_jax.pytree import pytree_dataclass, static_field
 
 BACKBONES: dict[str, Slices] = {"vgg": VGG16, "alex": ALEXNET, "squeeze": SQUEEZENET}
 SHIFT = (-0.030, -0.088, -0.188)

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float, Scalar
-from humangs_jax.numerics import safe_divide
+from humangs_jax.core.array_types import Array, Float, Scalar
+from humangs_jax.core.numerics import safe_divide
 from humangs_jax.objectives.ssim import SIGMA, WINDOW
 
 LARGEST_PSNR = 100.0

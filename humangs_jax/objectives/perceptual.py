@@ -8,10 +8,10 @@ features are those after the second ReLU of each block. Losses are for ONE image
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float, Scalar
-from humangs_jax.numerics import absolute, at_least_float32
+from humangs_jax.core.array_types import Array, Float, Scalar
+from humangs_jax.core.numerics import absolute, at_least_float32
+from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.objectives.backbones import Weights, feature_maps, vgg
-from humangs_jax.pytree import pytree_dataclass
 
 VGG19 = vgg((2, 2, 4, 4, 4), (2, 2, 2, 2, 2), average=True)
 MEAN_COLOR = (123.68, 116.779, 103.939)

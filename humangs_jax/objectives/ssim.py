@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float, Scalar
+from humangs_jax.core.array_types import Array, Float, Scalar
 
 WINDOW = 11
 SIGMA = 1.5

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import lax
 
-from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.rendering.projection import ProjectedGaussians
 from humangs_jax.rendering.tiling import SUM_LIMIT, TileGrid, bits_for, expand, sort_keys, take
 
@@ -148,12 +148,12 @@ def footprints(projected: ProjectedGaussians, reach: Float[Array, " g"]) -> Foot
     return Footprints(p.x, p.y, p.xx, p.xy, p.yy, p.determinant, reach)
 
 
-def square_footprints(projected: ProjectedGaussians, reach: Float[Array, " g"], extent: float) -> Squares:
-    """Squares of `extent` times the larger standard deviation, rounded up to pixels, where reach is positive."""
+def square_footprints(projected: ProjectedGaussians, reach: Float[Array, " g"], radius_sigma: float) -> Squares:
+    """Squares of `radius_sigma` times the larger standard deviation, rounded up to pixels, where reach is positive."""
     p = lax.stop_gradient(projected)
     middle = 0.5 * (p.xx + p.yy)
     largest = middle + jnp.sqrt(jnp.maximum(middle * middle - p.determinant, INRIA_LEAST_SPREAD))
-    radius = jnp.where(p.visible & (reach > 0), jnp.ceil(extent * jnp.sqrt(largest)), 0.0)
+    radius = jnp.where(p.visible & (reach > 0), jnp.ceil(radius_sigma * jnp.sqrt(largest)), 0.0)
     return Squares(p.x, p.y, radius)
 
 

@@ -31,11 +31,11 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from humangs_jax.array_types import Array, Float
-from humangs_jax.rendering import fat_chunks, small_blocks
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.rendering.projection import ProjectedGaussians
+from humangs_jax.rendering.schedules import fat_chunks, small_blocks
+from humangs_jax.rendering.schedules.splat_rows import R00, R01, R11
 from humangs_jax.rendering.splat_config import SplatConfig
-from humangs_jax.rendering.splat_rows import R00, R01, R11
 from humangs_jax.rendering.tiling import TileGrid, TileLists
 
 

@@ -10,7 +10,7 @@ NEAR = 0.01
 
 INRIA_NEAR = 0.2
 
-DILATION = 0.3
+EPS2D = 0.3
 """Pixels^2 added to both variances of the image: a low-pass of about one pixel, without which a Gaussian thinner than a
 pixel falls between pixel centres. The same in INRIA and gsplat; opacity is not compensated for it (gsplat
 "classic")."""
@@ -31,7 +31,7 @@ INRIA_JACOBIAN_MARGIN = 0.3
 beyond the image's border: it bounds the footprints of Gaussians beside a near camera, at the price of a wrong shape
 there."""
 
-INRIA_EXTENT = 3.0
+INRIA_RADIUS_SIGMA = 3.0
 """Standard deviations after which INRIA cuts a square around a splat (gsplat: 3.33); visible for opaque splats."""
 
 LARGEST_FOOTPRINT = 1e9

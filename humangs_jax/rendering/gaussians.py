@@ -8,10 +8,10 @@ from typing import Literal
 
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.svd3 import left_singular_vectors
-from humangs_jax.pytree import pytree_dataclass, replace
 
 
 @pytree_dataclass

@@ -4,11 +4,11 @@ With p = (X, Y, Z) the mean in the camera's frame, fx, fy, cx, cy of K and W the
 
     mean2d = (fx X/Z + cx, fy Y/Z + cy)
     J      = [[fx/Z, 0, -fx X/Z^2], [0, fy/Z, -fy Y/Z^2]]             the projection's derivative at p
-    cov2d  = M M^T + dilation I,   M = J W A R diag(s)                (2, 3), A R diag(s) the factor of the covariance
+    cov2d  = M M^T + eps2d I,   M = J W A R diag(s)                (2, 3), A R diag(s) the factor of the covariance
 
 Everything is kept as planes of g numbers rather than as (g, 2, 2) arrays: XLA then fuses the projection, and its
 gradient, into a few loops. Its determinant is not taken from the entries of cov2d, where float32 cancels for needles,
-but as a sum of squares: |m0 x m1|^2 + dilation (|m0|^2 + |m1|^2) + dilation^2 for the rows m0, m1 of M. What is drawn is
+but as a sum of squares: |m0 x m1|^2 + eps2d (|m0|^2 + |m1|^2) + eps2d^2 for the rows m0, m1 of M. What is drawn is
 the upper triangular r with r^T r = cov2d^-1 / 2, whose gradient is written by hand for the same reason.
 
 Gaussians that are not drawn (centre nearer than `near` or behind, footprint beyond `LARGEST_FOOTPRINT`) have finite
@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from humangs_jax.array_types import Array, Bool, Float
+from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering import constants
@@ -54,13 +54,13 @@ def project(
     gaussians: Gaussians,
     camera: Camera,
     near: float = constants.NEAR,
-    dilation: float = constants.DILATION,
+    eps2d: float = constants.EPS2D,
     jacobian_margin: float | None = None,
     normalize_quats: bool = True,
 ) -> ProjectedGaussians:
     """Projects every Gaussian.
 
-    near: metres. dilation: pixels^2. jacobian_margin: None for the exact Jacobian; a number clamps where it is
+    near: metres. eps2d: pixels^2. jacobian_margin: None for the exact Jacobian; a number clamps where it is
     evaluated to that fraction of the half field of view beyond the border (`INRIA_JACOBIAN_MARGIN`).
     normalize_quats: False takes the quaternions as they are.
     """
@@ -86,8 +86,8 @@ def project(
 
     small = _all([jnp.abs(entry) < constants.LARGEST_FOOTPRINT for row in m for entry in row])
     m0, m1 = ([jnp.where(small, entry, 0.0) for entry in row] for row in m)
-    xx, xy, yy, determinant = _covariance(m0, m1, dilation)
-    r00, r01, r11 = _conic_factor(m0, m1, dilation)
+    xx, xy, yy, determinant = _covariance(m0, m1, eps2d)
+    r00, r01, r11 = _conic_factor(m0, m1, eps2d)
     return ProjectedGaussians(
         x=fx * u + cx,
         y=fy * v + cy,
@@ -110,12 +110,12 @@ def squared_reach(opacities: Float[Array, " g"], alpha_min: float = constants.AL
     return jnp.where(seen, 2 * jnp.log(jnp.where(seen, opacities, 1.0) / alpha_min), 0.0)
 
 
-def _covariance(m0, m1, dilation):
+def _covariance(m0, m1, eps2d):
     """xx, xy, yy and determinant of cov2d from the rows of M."""
     xx, xy, yy = _dot(m0, m0), _dot(m0, m1), _dot(m1, m1)
     normal = [_cross(m0, m1, 1, 2), _cross(m0, m1, 2, 0), _cross(m0, m1, 0, 1)]
-    determinant = _dot(normal, normal) + dilation * (xx + yy) + dilation * dilation
-    return xx + dilation, xy, yy + dilation, determinant
+    determinant = _dot(normal, normal) + eps2d * (xx + yy) + eps2d * eps2d
+    return xx + eps2d, xy, yy + eps2d, determinant
 
 
 def _cross(m0, m1, j, i):
@@ -124,7 +124,7 @@ def _cross(m0, m1, j, i):
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
-def _conic_factor(m0, m1, dilation):
+def _conic_factor(m0, m1, eps2d):
     """Upper triangular r with r^T r = cov2d^-1 / 2: r00, r01, r11. Where cov2d is singular, some finite numbers.
 
     Gradient. With k the symmetric matrix of k00 = r00 g00 + r01 g01, k01 = r11 g01, k11 = r11 g11 (g: the cotangents),
@@ -134,25 +134,25 @@ def _conic_factor(m0, m1, dilation):
     For a needle of length l and width w, in pixels, the entries of r are of the order of 1 / w, but r's product with
     its long axis is of the order of 1. In
 
-        (r M)_0j = r00 / yy (sum_i m1_i (m_j x m_i) + dilation m0_j),     (r M)_1j = r11 m1_j
+        (r M)_0j = r00 / yy (sum_i m1_i (m_j x m_i) + eps2d m0_j),     (r M)_1j = r11 m1_j
 
     what would cancel, m_j x m_j, is not there. Autodiff sums two terms that cancel, through yy and through the
     determinant; that is ten times less accurate, and once the determinant passes 2e19 pixels^4 (7e4 pixels square: the
     square of the determinant overflows) one of them is lost and the gradient along the long axis is as large as across.
     """
-    _, xy, yy, determinant = _covariance(m0, m1, dilation)
+    _, xy, yy, determinant = _covariance(m0, m1, eps2d)
     regular = determinant > 0
     yy, determinant = jnp.where(regular, yy, 1.0), jnp.where(regular, determinant, 1.0)
     r00 = lax.rsqrt(2 * (determinant / yy))
     return r00, -r00 * (xy / yy), lax.rsqrt(2 * yy)
 
 
-def _conic_factor_fwd(m0, m1, dilation):
-    r = _conic_factor(m0, m1, dilation)
+def _conic_factor_fwd(m0, m1, eps2d):
+    r = _conic_factor(m0, m1, eps2d)
     return r, (m0, m1, r)
 
 
-def _conic_factor_bwd(dilation, saved, cotangents):
+def _conic_factor_bwd(eps2d, saved, cotangents):
     m0, m1, (r00, r01, r11) = saved
     g00, g01, g11 = cotangents
     k00, k01, k11 = r00 * g00 + r01 * g01, r11 * g01, r11 * g11
@@ -160,7 +160,7 @@ def _conic_factor_bwd(dilation, saved, cotangents):
     d0, d1 = [], []
     for j in range(3):
         across = sum(m1[i] * _cross(m0, m1, j, i) for i in range(3) if i != j)
-        n0, n1 = ratio * (across + dilation * m0[j]), r11 * m1[j]
+        n0, n1 = ratio * (across + eps2d * m0[j]), r11 * m1[j]
         t0, t1 = k00 * n0 + k01 * n1, k01 * n0 + k11 * n1
         d0.append(-2 * (r00 * t0))
         d1.append(-2 * (r01 * t0 + r11 * t1))

@@ -10,7 +10,7 @@ class SplatConfig:
     """What is drawn, in which buffers, on which schedule. docs/performance.md has what each knob costs and gains.
 
     What is drawn (see `constants` for reasons and for the numbers of other rasterizers):
-        near: metres; nearer Gaussians are not drawn. dilation: pixels^2 added to the projected variances.
+        near: metres; nearer Gaussians are not drawn. eps2d: pixels^2 added to the projected variances.
         alpha_min: alphas below are skipped. alpha_max: alphas are clamped to it.
         transmittance_stop: a pixel ends before its transmittance would fall to this.
         jacobian_margin: None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat.
@@ -18,9 +18,9 @@ class SplatConfig:
         opacity_min: fainter Gaussians are not drawn at all.
 
     Where footprints end. A splat is drawn on whole tiles, all that its footprint meets.
-        extent: standard deviations; None: only where alpha falls below alpha_min, so that nothing is lost. Less draws
+        radius_sigma: standard deviations; None: only where alpha falls below alpha_min, so that nothing is lost. Less draws
         faster, and cuts splats off at the borders of tiles: then the image depends on tile_size.
-        square: INRIA's footprint: the square around the splat whose half side is `extent` times the larger standard
+        square: INRIA's footprint: the square around the splat whose half side is `radius_sigma` times the larger standard
         deviation, rounded up to pixels, at tiles as INRIA counts them.
 
     What is computed:
@@ -30,24 +30,24 @@ class SplatConfig:
     Buffers: capacities for (splat, tile) pairs, `max_pairs`, and for (splat, row of tiles) pairs, `max_rows`.
         None: an eager call measures its need. A traced call (under jit, grad or vmap) cannot, and takes
         `splatting.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and
-        `splatting.plan` measures a capacity for such calls. `max_rows` None: as many as pairs, always enough in
+        `splatting.plan_buffers` measures a capacity for such calls. `max_rows` None: as many as pairs, always enough in
         practice; smaller is a little faster.
 
     Schedule: changes the time, not the image (but for rounding).
         tile_size: pixels. block: tiles that are composited together. chunk, chunk_backward: splats of a list taken at
         once (block and chunks: on CPUs only).
-        products: "bfloat16" rounds the factors of the gradient's sums over pixels to 8 bits.
+        matmul_precision: "bfloat16" rounds the factors of the gradient's sums over pixels to 8 bits.
     """
 
     near: float = constants.NEAR
-    dilation: float = constants.DILATION
+    eps2d: float = constants.EPS2D
     alpha_min: float = constants.ALPHA_MIN
     alpha_max: float = constants.ALPHA_MAX
     transmittance_stop: float = constants.TRANSMITTANCE_STOP
     jacobian_margin: float | None = None
     normalize_quats: bool = True
     opacity_min: float = 0.0
-    extent: float | None = None
+    radius_sigma: float | None = None
     square: bool = False
     scale: float = 1.0
     visibility: bool = False
@@ -57,7 +57,7 @@ class SplatConfig:
     block: int = 32
     chunk: int = 8
     chunk_backward: int = 8
-    products: str = "float32"
+    matmul_precision: str = "float32"
 
     def __post_init__(self):
         positive = ("alpha_min", "scale", "tile_size", "block", "chunk", "chunk_backward")
@@ -65,32 +65,34 @@ class SplatConfig:
             raise ValueError(f"SplatConfig: {', '.join(wrong)} must be positive")
         if not self.alpha_min < self.alpha_max < 1:
             raise ValueError(f"SplatConfig: need alpha_min < alpha_max < 1, got {self.alpha_min}, {self.alpha_max}")
-        if not (self.near >= 0 and self.dilation >= 0 and 0 <= self.transmittance_stop < 1):
-            raise ValueError("SplatConfig: near and dilation must not be negative, transmittance_stop in [0, 1)")
+        if not (self.near >= 0 and self.eps2d >= 0 and 0 <= self.transmittance_stop < 1):
+            raise ValueError("SplatConfig: near and eps2d must not be negative, transmittance_stop in [0, 1)")
         if any(size is not None and size < 1 for size in (self.max_pairs, self.max_rows)):
             raise ValueError("SplatConfig: max_pairs and max_rows must be at least 1")
-        if self.extent is not None and not self.extent > 0:
-            raise ValueError(f"SplatConfig: extent must be positive or None, got {self.extent}")
-        if self.square and self.extent is None:
-            raise ValueError("SplatConfig: a square footprint needs an extent")
-        if self.products not in PRODUCTS:
-            raise ValueError(f"SplatConfig: products must be one of {PRODUCTS}, got {self.products!r}")
+        if self.radius_sigma is not None and not self.radius_sigma > 0:
+            raise ValueError(f"SplatConfig: radius_sigma must be positive or None, got {self.radius_sigma}")
+        if self.square and self.radius_sigma is None:
+            raise ValueError("SplatConfig: a square footprint needs an radius_sigma")
+        if self.matmul_precision not in MATMUL_PRECISIONS:
+            raise ValueError(
+                f"SplatConfig: matmul_precision must be one of {MATMUL_PRECISIONS}, got {self.matmul_precision!r}"
+            )
 
 
-PRODUCTS = ("float32", "bfloat16")
+MATMUL_PRECISIONS = ("float32", "bfloat16")
 
 DEFAULT_CONFIG = SplatConfig()
 
 SPLAT_PRESETS = {
     "exact": DEFAULT_CONFIG,
-    "near_exact": SplatConfig(extent=2.5, transmittance_stop=1e-3),
-    "fast": SplatConfig(extent=1.75, transmittance_stop=3e-3),
+    "near_exact": SplatConfig(radius_sigma=2.5, transmittance_stop=1e-3),
+    "fast": SplatConfig(radius_sigma=1.75, transmittance_stop=3e-3),
     "inria": SplatConfig(
         near=constants.INRIA_NEAR,
         alpha_max=constants.INRIA_ALPHA_MAX,
         jacobian_margin=constants.INRIA_JACOBIAN_MARGIN,
         normalize_quats=False,
-        extent=constants.INRIA_EXTENT,
+        radius_sigma=constants.INRIA_RADIUS_SIGMA,
         square=True,
         tile_size=constants.INRIA_TILE_SIZE,
     ),

@@ -1,7 +1,7 @@
 """Differentiable 3D Gaussian splatting in plain JAX, for CPU, GPU and TPU, under `jit`, `vmap` and `grad`.
 
     rendering = render(gaussians, camera)                # eager: the buffers are sized to the scene
-    config = plan(gaussians, cameras)                    # for calls inside jit, vmap, grad: sized once
+    config = plan_buffers(gaussians, cameras)                    # for calls inside jit, vmap, grad: sized once
     loss = lambda gaussians: jnp.mean((render(gaussians, camera, config).rgb - photo) ** 2)
 
 Projection, depth order, (tile, splat) pairs, lists by tile, compositing: each has its module. `dense` draws the same
@@ -23,17 +23,17 @@ from jax.core import Tracer
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
-from humangs_jax.array_types import Array, Bool, Float, Int
-from humangs_jax.capacity import round_up
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.buffers import round_up
+from humangs_jax.core.numerics import at_least_float32, safe_divide
+from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.numerics import at_least_float32, safe_divide
-from humangs_jax.pytree import pytree_dataclass
 from humangs_jax.rendering import binning, constants
 from humangs_jax.rendering.compositing import composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import ProjectedGaussians, project, squared_reach
+from humangs_jax.rendering.schedules.splat_rows import FEATURE_COUNT
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
-from humangs_jax.rendering.splat_rows import FEATURE_COUNT
 from humangs_jax.rendering.tiling import TileGrid, sort_into_tiles, take, tiles_to_image
 
 __all__ = [
@@ -42,7 +42,7 @@ __all__ = [
     "SplatConfig",
     "default_pairs",
     "draw_projected",
-    "plan",
+    "plan_buffers",
     "project_gaussians",
     "render",
     "render_views",
@@ -105,7 +105,7 @@ def render(
     if _is_traced(gaussians, camera, background):
         gaussians = jax.tree.map(lambda leaf: _once_per_image(leaf, camera), gaussians)
         return _render(gaussians, camera, background, _with_default_buffers(gaussians, camera, config), mesh)
-    fitted = plan(gaussians, camera, config, margin=1.0, mesh=mesh) if config.max_pairs is None else config
+    fitted = plan_buffers(gaussians, camera, config, margin=1.0, mesh=mesh) if config.max_pairs is None else config
     rendering = _jitted(_render, 3, 4)(gaussians, camera, background, fitted, mesh)
     _check_overflow(rendering, gaussians, camera, fitted, mesh)
     return rendering
@@ -132,7 +132,7 @@ def render_views(
     if _is_traced(gaussians, cameras, background):
         fitted = _with_default_buffers(gaussians, cameras, config)
         return _render_views(gaussians, cameras, background, fitted, batch_size, mesh)
-    fitted = plan(gaussians, cameras, config, margin=1.0, mesh=mesh) if config.max_pairs is None else config
+    fitted = plan_buffers(gaussians, cameras, config, margin=1.0, mesh=mesh) if config.max_pairs is None else config
     renderings = _jitted(_render_views, 3, 4, 5)(gaussians, cameras, background, fitted, batch_size, mesh)
     _check_overflow(renderings, gaussians, cameras, fitted, mesh)
     return renderings
@@ -156,7 +156,7 @@ def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
     return max(1, min(g * tiles, PAIRS_PER_GAUSSIAN * g + PAIRS_PER_TILE * tiles))
 
 
-def plan(
+def plan_buffers(
     gaussians: Gaussians,
     cameras: Camera,
     config: SplatConfig = DEFAULT_CONFIG,
@@ -362,7 +362,7 @@ def _jitted(function, *static):
 
 def _project(gaussians, camera, config) -> ProjectedGaussians:
     return project(
-        gaussians, camera, config.near, config.dilation, config.jacobian_margin, normalize_quats=config.normalize_quats
+        gaussians, camera, config.near, config.eps2d, config.jacobian_margin, normalize_quats=config.normalize_quats
     )
 
 
@@ -370,8 +370,10 @@ def _footprints(projected, gaussians, config) -> binning.Footprints | binning.Sq
     reach = squared_reach(gaussians.opacities, config.alpha_min)
     reach = jnp.where(gaussians.opacities >= config.opacity_min, reach, 0.0)
     if config.square:
-        return binning.square_footprints(projected, reach, config.extent)
-    return binning.footprints(projected, reach if config.extent is None else jnp.minimum(reach, config.extent**2))
+        return binning.square_footprints(projected, reach, config.radius_sigma)
+    return binning.footprints(
+        projected, reach if config.radius_sigma is None else jnp.minimum(reach, config.radius_sigma**2)
+    )
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))

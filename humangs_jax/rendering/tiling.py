@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from humangs_jax.array_types import Array, Float, Int, Shaped, UInt
+from humangs_jax.core.array_types import Array, Float, Int, Shaped, UInt
 
 SUM_LIMIT = 1 << 30
 """Running sums stop here instead of wrapping past 2^31: far above any buffer, so a sum there only says "too many"."""

@@ -18,7 +18,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.configuration import config_from_file, config_to_json
+from humangs_jax.core.configuration import config_from_file, config_to_json
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.state import TrainState
 

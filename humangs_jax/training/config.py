@@ -5,9 +5,9 @@ import itertools
 from collections.abc import Collection
 
 from humangs_jax.data.loader import ViewSampling
-from humangs_jax.models import presets
-from humangs_jax.models.humangs import HumanGSConfig
-from humangs_jax.rendering.mesh_rasterizer import RasterConfig
+from humangs_jax.network import presets
+from humangs_jax.network.humangs import HumanGSConfig
+from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.training.optimizer import OptimizerConfig
 

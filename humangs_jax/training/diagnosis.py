@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from humangs_jax.array_types import PyTree
+from humangs_jax.core.array_types import PyTree
 from humangs_jax.training.probes import inexact_leaves
 
 AXES = {

@@ -5,13 +5,13 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews, prepare_inputs
-from humangs_jax.models.humangs import HumanGSConfig, HumanGSOutputs, Variables, apply_humangs
-from humangs_jax.models.vertex_decoder import corrected_skinning_weights
+from humangs_jax.network.humangs import HumanGSConfig, HumanGSOutputs, Variables, apply_humangs
+from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.gaussians import skin_gaussians
 from humangs_jax.rendering.splatting import Rendering, render
 from humangs_jax.training.config import TrainConfig

@@ -11,12 +11,13 @@ from typing import Any
 import flax.linen as nn
 import jax
 
-from humangs_jax.array_types import Array, Key, PyTree, Scalar
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
+from humangs_jax.core.array_types import Array, Key, PyTree, Scalar
+from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews, prepare_inputs
-from humangs_jax.models.humangs import (
+from humangs_jax.network.humangs import (
     Encoder,
     HumanGSOutputs,
     assemble,
@@ -24,12 +25,11 @@ from humangs_jax.models.humangs import (
     encode_with_statistics,
     sample_vertices,
 )
-from humangs_jax.models.tokenizer import Tokenizer
-from humangs_jax.models.transformer import Block, Transformer
-from humangs_jax.models.upsampler import Upsampler
-from humangs_jax.models.vertex_decoder import corrected_skinning_weights
+from humangs_jax.network.tokenizer import Tokenizer
+from humangs_jax.network.transformer import Block, Transformer
+from humangs_jax.network.upsampler import Upsampler
+from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.objectives.loss_networks import LossNetworks
-from humangs_jax.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.rendering.gaussians import Gaussians, skin_gaussians
 from humangs_jax.rendering.splatting import Rendering, draw_projected, project_gaussians
 from humangs_jax.training.config import TrainConfig

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from humangs_jax.array_types import Array, Bool, Float, Int, PyTree, Scalar
+from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree, Scalar
 
 INFINITY_STAND_IN = 1e-6
 

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.array_types import Array, Float, PyTree
+from humangs_jax.core.array_types import Array, Float, PyTree
 
 T = TypeVar("T")
 

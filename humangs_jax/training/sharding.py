@@ -14,8 +14,8 @@ import jax
 import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
-from humangs_jax.array_types import PyTree
-from humangs_jax.pytree import replace
+from humangs_jax.core.array_types import PyTree
+from humangs_jax.core.pytree import replace
 from humangs_jax.training.state import TrainState
 
 AXES = ("data", "fsdp")

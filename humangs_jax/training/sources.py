@@ -12,9 +12,9 @@ from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture, Source
-from humangs_jax.data.synthetic.live import DEFAULT_CONFIG, LiveConfig
-from humangs_jax.data.synthetic.live_bank import PeopleBank
-from humangs_jax.data.synthetic.live_source import live_source
+from humangs_jax.people.live import DEFAULT_CONFIG, LiveConfig
+from humangs_jax.people.live_bank import PeopleBank
+from humangs_jax.people.live_source import live_source
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.sharding import batch_sharding
 

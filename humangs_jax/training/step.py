@@ -8,18 +8,18 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh, PartitionSpec
 
-from humangs_jax.array_types import Array, Float, Int, Key, PyTree, Scalar, Shaped
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import Array, Float, Int, Key, PyTree, Scalar, Shaped
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
-from humangs_jax.models.humangs import HumanGSOutputs
+from humangs_jax.network.humangs import HumanGSOutputs
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.losses import squared_error, tightness
 from humangs_jax.objectives.lpips import lpips
 from humangs_jax.objectives.metrics import psnr
 from humangs_jax.objectives.perceptual import perceptual_loss
 from humangs_jax.objectives.ssim import multiscale_structural_dissimilarity
-from humangs_jax.pytree import replace
 from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, Rendering
 from humangs_jax.training import sharding
 from humangs_jax.training.config import LossConfig, TrainConfig

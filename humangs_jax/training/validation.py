@@ -12,11 +12,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.images import write_png
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, ViewSampling
-from humangs_jax.models.humangs import Variables
+from humangs_jax.io.images import write_png
+from humangs_jax.network.humangs import Variables
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import lpips
 from humangs_jax.objectives.metrics import masked_psnr, psnr

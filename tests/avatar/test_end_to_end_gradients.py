@@ -20,12 +20,12 @@ import pytest
 
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.models.humangs import apply_humangs
-from humangs_jax.models.presets import tiny
-from humangs_jax.models.weights import expected_variables
-from humangs_jax.pytree import replace
+from humangs_jax.network.humangs import apply_humangs
+from humangs_jax.network.presets import tiny
+from humangs_jax.network.weights import expected_variables
 from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.forward import draw_targets, white_backgrounds
 from humangs_jax.training.step import loss_terms

@@ -23,8 +23,8 @@ def blobs(count=80):
 
 def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
     plans, gaussians = [], blobs()
-    real = frames.plan
-    monkeypatch.setattr(frames, "plan", lambda *arguments: plans.append(1) or real(*arguments))
+    real = frames.plan_buffers
+    monkeypatch.setattr(frames, "plan_buffers", lambda *arguments: plans.append(1) or real(*arguments))
     focal = [5.0, 5.2, 150.0, 6.0]  # the third one comes close
     cameras = [Camera(jnp.asarray([[f, 0, 36], [0, f, 36], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64) for f in focal]
     drawn = list(frames.draw_gaussians(iter([gaussians] * 4), iter(cameras)))

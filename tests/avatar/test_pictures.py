@@ -10,7 +10,7 @@ from humangs_jax.avatar.pictures import (
     tile,
     write_texts,
 )
-from humangs_jax.data.images import read_image, to_uint8, write_png
+from humangs_jax.io.images import read_image, to_uint8, write_png
 
 LEVEL = 0.5 / 255 + 1e-6
 

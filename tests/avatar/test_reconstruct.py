@@ -12,8 +12,8 @@ from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.views import SubjectViews, pad_views, standardize
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.models.humangs import init_humangs
-from humangs_jax.models.presets import tiny
+from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.presets import tiny
 from humangs_jax.rendering.splatting import SplatConfig, render
 
 SIZE = 32

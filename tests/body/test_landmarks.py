@@ -10,8 +10,8 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, OPENPOSE_67, mirrored_name
-from humangs_jax.pytree import replace
 
 ATOL = 2e-6  # metres, float32
 SYMMETRY = 0.004  # metres: the shipped body's feet are not quite mirror images

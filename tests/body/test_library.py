@@ -14,7 +14,7 @@ from humangs_jax.body import storage
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.pytree import replace
+from humangs_jax.core.pytree import replace
 
 MEGABYTE = 1e6
 SYMMETRY = 1e-3  # metres: MakeHuman's targets are written with 0.1 mm and differ between the sides by a few

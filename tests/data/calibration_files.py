@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from humangs_jax.data.images import write_png
+from humangs_jax.io.images import write_png
 
 WIDTH, HEIGHT, VIEWS = 64, 48, 4
 TARGET = np.asarray([0.1, 0.9, -0.2])

@@ -11,7 +11,7 @@ from humangs_jax.data.calibration.distortion import distort, undistort
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.capture_reading import read_description, read_view
-from humangs_jax.data.images import read_grey, read_image
+from humangs_jax.io.images import read_grey, read_image
 from tests.data import calibration_files as written
 
 NAMES = ("a", "b", "c", "d")

@@ -12,8 +12,8 @@ import pytest
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import CaptureError, capture_from_arrays, load_capture, save_capture
-from humangs_jax.data.images import read_image, write_png
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.io.images import read_image, write_png
 
 HEIGHT, WIDTH, VIEWS, FRAMES, JOINTS = 12, 10, 3, 2, 5
 HALF_LEVEL = 0.5 / 255 + 1e-6

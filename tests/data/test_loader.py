@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data import capture_reading
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
-from humangs_jax.data.images import write_png
 from humangs_jax.data.loader import (
     CaptureCache,
     ExampleSource,
@@ -30,6 +29,7 @@ from humangs_jax.data.loader import (
 )
 from humangs_jax.data.loading.outlines import read_outline
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.io.images import write_png
 
 FLOAT32 = 1e-6
 SIZE, VIEWS, POSES = 16, 6, 2

@@ -6,6 +6,7 @@ import pytest
 from seen_people import NOISE, body, person
 
 from humangs_jax.body.joints import JOINT_NAMES
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.fitting.examination import ROWS, examine, examine_record
@@ -13,7 +14,6 @@ from humangs_jax.fitting.findings import NAMED, UNDECIDED, UNSURE, ViewFit, list
 from humangs_jax.fitting.fit_record import FitRecord
 from humangs_jax.fitting.swaps import Swap
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.pytree import replace
 
 MOMENTS, VIEWS = 4, 4
 NOSE, LEFT_WRIST = COCO_17.names.index("nose"), COCO_17.names.index("left_wrist")

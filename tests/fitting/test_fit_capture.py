@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from fit_people import NAMES_WITHIN_LIMITS, default_body, observe
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -12,7 +13,6 @@ from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
 from humangs_jax.data.photographs import load_photographs
 from humangs_jax.fitting.fit_capture import check_place, fit_photographs, write_fitted
 from humangs_jax.fitting.fit_record import read_fit_record
-from humangs_jax.pytree import replace
 
 SIZE = 16
 MOMENTS = NAMES_WITHIN_LIMITS

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from seen_people import person
 
-from humangs_jax.avatar.check import LEFT, RIGHT
+from humangs_jax.apps import fit_pictures as module
+from humangs_jax.apps.check import LEFT, RIGHT
+from humangs_jax.apps.fit_pictures import fit_sheet, plot_over_time
 from humangs_jax.avatar.pictures import GAP
-from humangs_jax.data.images import read_image
 from humangs_jax.data.keypoints.sets import COCO_17
-from humangs_jax.fitting import fit_pictures as module
 from humangs_jax.fitting.examination import examine
 from humangs_jax.fitting.findings import ViewFit
-from humangs_jax.fitting.fit_pictures import fit_sheet, plot_over_time
+from humangs_jax.io.images import read_image
 
 SIDE = 128
 LEFT_WRIST, RIGHT_WRIST = (COCO_17.names.index(f"{side}_wrist") for side in ("left", "right"))

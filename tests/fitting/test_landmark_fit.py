@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from fit_people import POSES, model_of, observe
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.fitting.landmark_fit import STAGES, FitConfig, fit_landmarks
 from humangs_jax.fitting.pose_prior import pose_prior, violations
 from humangs_jax.fitting.uncertainty import fit_uncertainty
-from humangs_jax.pytree import replace
 
 CONFIG = FitConfig()
 NAMES = list(POSES)

@@ -12,6 +12,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
@@ -22,9 +23,8 @@ from humangs_jax.fitting.refinement.refine import RefineConfig, refine_capture
 from humangs_jax.fitting.refinement.rounds import RoundConfig
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
-from humangs_jax.pytree import replace
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from humangs_jax.rendering.splat_config import SplatConfig
 from tests.fitting.fit_people import default_body, rotations_of
 

@@ -10,6 +10,7 @@ import pytest
 from humangs_jax.body import skinning
 from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.fitting.refinement.rounds import RoundConfig, moved_capture, start_of
 from humangs_jax.fitting.refinement.unknowns import (
@@ -24,7 +25,6 @@ from humangs_jax.fitting.refinement.unknowns import (
     segments,
 )
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.pytree import replace
 from tests.fitting.fit_people import default_body
 
 SPREADS = Spreads()

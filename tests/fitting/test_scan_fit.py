@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.data.npz import read_npz
 from humangs_jax.fitting.pose_prior import pose_prior
 from humangs_jax.fitting.scans.body_surface import body_surface, vertex_normals
 from humangs_jax.fitting.scans.config import ScanFitConfig
@@ -21,6 +20,7 @@ from humangs_jax.fitting.scans.reading import sample_scan
 from humangs_jax.fitting.scans.result import body_in_scan
 from humangs_jax.fitting.scans.similarity import Similarity
 from humangs_jax.fitting.scans.start import Start, facing_back, search_starts
+from humangs_jax.io.npz import read_npz
 
 LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 NAMES = ("nose", "left_ear", "right_ear", *(f"{side}_{part}" for part in LIMBS for side in ("left", "right")))

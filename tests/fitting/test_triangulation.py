@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from fit_people import model_of, observe
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.fitting.triangulation import reprojection_errors, triangulate, triangulate_robustly
-from humangs_jax.pytree import replace
 
 EXACT = 2e-4  # metres: float32 pixels of 512 at 3 metres
 KNOWN = np.asarray(model_of().known)

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.rendering.dense import render_dense
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.reference import render_dense
 from humangs_jax.rendering.splat_config import SplatConfig
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"

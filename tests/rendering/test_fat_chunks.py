@@ -12,7 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from splat_scenes import camera, random_gaussians
 
-from humangs_jax.rendering import binning, compositing, fat_chunks, small_blocks
+from humangs_jax.rendering import binning, compositing
+from humangs_jax.rendering.schedules import fat_chunks, small_blocks
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import _footprints, _project
 from humangs_jax.rendering.tiling import TileGrid, TileLists, sort_into_tiles

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
-from humangs_jax.rendering.mesh_rasterizer import Fragments, RasterConfig, interpolate, rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import Fragments, RasterConfig, interpolate_attributes, rasterize_mesh
 
 PIXEL_ERROR = 1e-4
 """Float32 positions of pixels: coordinates of tens of pixels are rounded to 4e-6, after a few operations each."""
@@ -325,7 +325,7 @@ def test_images_of_one_pixel_and_meshes_of_nothing():
     assert draw(vertices, SQUARE_FACES, shifted).face_ids == 0
     empty = rasterize_mesh(vertices, jnp.zeros((0, 3), jnp.int32), flat_camera())
     assert (np.asarray(empty.face_ids) == -1).all() and (np.asarray(empty.depth) == -1).all()
-    image = interpolate(empty, jnp.zeros((0, 3), jnp.int32), vertices, jnp.asarray([1.0, 2.0, 3.0]))
+    image = interpolate_attributes(empty, jnp.zeros((0, 3), jnp.int32), vertices, jnp.asarray([1.0, 2.0, 3.0]))
     np.testing.assert_array_equal(image, np.broadcast_to([1.0, 2.0, 3.0], (HEIGHT, WIDTH, 3)))
 
 
@@ -351,7 +351,9 @@ def test_interpolation_of_positions_is_the_seen_point():
     camera = some_camera(2)
     fragments = draw(vertices, faces, camera)
     background = jnp.asarray([5.0, 6.0, 7.0])
-    points = np.asarray(interpolate(fragments, jnp.asarray(faces), jnp.asarray(vertices), background), np.float64)
+    points = np.asarray(
+        interpolate_attributes(fragments, jnp.asarray(faces), jnp.asarray(vertices), background), np.float64
+    )
     covered = np.asarray(fragments.face_ids) >= 0
     np.testing.assert_array_equal(points[~covered], np.broadcast_to(background, points[~covered].shape))
     transform, K = np.asarray(camera.cam_from_world, np.float64), np.asarray(camera.K, np.float64)
@@ -364,7 +366,9 @@ def test_interpolation_of_positions_is_the_seen_point():
 def test_corner_attributes_have_their_own_numbering():
     fragments = draw(SQUARE, SQUARE_FACES, flat_camera())
     attributes = jnp.asarray([[1.0], [2.0]])
-    image = np.asarray(interpolate(fragments, jnp.asarray([[0, 0, 0], [1, 1, 1]]), attributes, jnp.zeros(1)))[..., 0]
+    image = np.asarray(
+        interpolate_attributes(fragments, jnp.asarray([[0, 0, 0], [1, 1, 1]]), attributes, jnp.zeros(1))
+    )[..., 0]
     np.testing.assert_allclose(image, np.asarray(fragments.face_ids) + 1, atol=1e-6)
 
 
@@ -374,7 +378,7 @@ def test_gradients_reach_attributes_and_nothing_else():
 
     def total(vertices, attributes):
         fragments = rasterize_mesh(vertices, faces, camera, SMALL_STEPS)
-        image = interpolate(fragments, faces, attributes, jnp.zeros(1))
+        image = interpolate_attributes(fragments, faces, attributes, jnp.zeros(1))
         return jnp.sum(image) + jnp.sum(jnp.where(fragments.depth > 0, fragments.depth, 0))
 
     to_vertices, to_attributes = jax.grad(total, (0, 1))(vertices, jnp.ones((4, 1)))

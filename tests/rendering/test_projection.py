@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from splat_scenes import camera, few, random_gaussians
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import camera as pinhole
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.pytree import replace
 from humangs_jax.rendering import constants, projection
 from humangs_jax.rendering.gaussians import Gaussians, covariances
 from humangs_jax.rendering.projection import squared_reach
 
-project = jax.jit(projection.project, static_argnames=("near", "dilation", "jacobian_margin"))
+project = jax.jit(projection.project, static_argnames=("near", "eps2d", "jacobian_margin"))
 
 FLOAT64 = 1e-9
 """float64 rounding, grown by 1/z^2 near the camera."""

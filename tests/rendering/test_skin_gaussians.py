@@ -3,8 +3,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.pytree import replace
 from humangs_jax.rendering.gaussians import Gaussians, covariances, skin_gaussians
 
 RTOL = 1e-10

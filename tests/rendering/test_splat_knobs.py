@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.pytree import replace
 from humangs_jax.rendering import binning
-from humangs_jax.rendering.dense import render_dense
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import project, squared_reach
+from humangs_jax.rendering.reference import render_dense
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import plan, render, seen_from
+from humangs_jax.rendering.splatting import plan_buffers, render, seen_from
 
 FLOAT64 = 1e-9
 """float64 rounding, relative to the largest entry."""
@@ -98,12 +98,15 @@ def test_extent_cuts_whole_tiles_only():
         gaussians = replace(random_gaussians(6), opacities=jnp.full(COUNT, 0.9))
         view = camera(width=96, height=64)
         exact = render(gaussians, view, SMALL)
-        wide = render(gaussians, view, knobs(extent=10.0))
+        wide = render(gaussians, view, knobs(radius_sigma=10.0))
         np.testing.assert_array_equal(wide.rgb, exact.rgb)
-        narrow = render(gaussians, view, knobs(extent=2.0))
+        narrow = render(gaussians, view, knobs(radius_sigma=2.0))
         # at most the alpha of one splat beyond two deviations: no pixel here loses more
         assert 1e-3 < np.abs(narrow.rgb - exact.rgb).max() < 0.9 * np.exp(-2)
-        assert plan(gaussians, view, knobs(extent=2.0)).max_pairs < plan(gaussians, view, SMALL).max_pairs
+        assert (
+            plan_buffers(gaussians, view, knobs(radius_sigma=2.0)).max_pairs
+            < plan_buffers(gaussians, view, SMALL).max_pairs
+        )
 
 
 def test_scale_draws_the_smaller_image():
@@ -117,7 +120,9 @@ def test_scale_draws_the_smaller_image():
         seen = np.asarray(ours.alpha) > 0
         low, high = half.depth[half.alpha > 0].min(), half.depth.max()
         assert (ours.depth[seen] >= low - FLOAT64).all() and (ours.depth[seen] <= high + FLOAT64).all()
-        assert plan(gaussians, view, knobs(scale=0.5)).max_pairs <= plan(gaussians, view, SMALL).max_pairs
+        assert (
+            plan_buffers(gaussians, view, knobs(scale=0.5)).max_pairs <= plan_buffers(gaussians, view, SMALL).max_pairs
+        )
 
 
 def test_narrow_products_round_only_gradients():
@@ -128,7 +133,7 @@ def test_narrow_products_round_only_gradients():
         loss = lambda g: jnp.sum(jnp.square(render(g, view, config).rgb - 0.3))
         return render(gaussians, view, config).rgb, jax.jit(jax.grad(loss))(gaussians)
 
-    (exact, gradient), (image, rounded) = run(SMALL), run(knobs(products="bfloat16"))
+    (exact, gradient), (image, rounded) = run(SMALL), run(knobs(matmul_precision="bfloat16"))
     np.testing.assert_array_equal(image, exact)
     for a, b in zip(jax.tree.leaves(rounded), jax.tree.leaves(gradient), strict=True):
         error = np.linalg.norm(a - b) / np.linalg.norm(b)
@@ -147,10 +152,10 @@ def test_presets_draw_nearly_the_same(name, most):
 def test_one_plan_serves_an_animation():
     gaussians, view = random_gaussians(10, np.float32), camera(np.float32)
     drawn = jax.jit(lambda *arguments: render(*arguments), static_argnums=2)  # with a cache of its own
-    config = plan(gaussians, view, SMALL)
+    config = plan_buffers(gaussians, view, SMALL)
     for step in range(4):
         moved = replace(gaussians, means=gaussians.means + 0.02 * step)
-        assert plan(moved, view, SMALL) == config
+        assert plan_buffers(moved, view, SMALL) == config
         assert drawn(moved, view, config).overflow == 0
     assert drawn._cache_size() == 1
 
@@ -184,7 +189,7 @@ import jax.numpy as jnp
 import numpy as np
 from splat_scenes import camera, random_gaussians
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.rendering.splatting import SplatConfig, plan, render, render_views
+from humangs_jax.rendering.splatting import SplatConfig, plan_buffers, render, render_views
 
 gaussians, view = random_gaussians(1), camera(width=37, height=45)
 config = SplatConfig(block=4, chunk=4, chunk_backward=4, visibility=True)
@@ -200,11 +205,11 @@ def close(a, b):
 
 alone = render(gaussians, view, config)
 arguments = gaussians, view.K, jnp.asarray([0.1, 0.5, 0.9])
-expected = jax.jit(jax.grad(loss), static_argnums=(1, 2))(arguments, plan(gaussians, view, config), None)
+expected = jax.jit(jax.grad(loss), static_argnums=(1, 2))(arguments, plan_buffers(gaussians, view, config), None)
 mesh = jax.make_mesh((3,), ("rows",))
 close(render(gaussians, view, config, mesh=mesh), alone)
-planned = plan(gaussians, view, config, mesh=mesh)
-assert planned.max_pairs < plan(gaussians, view, config).max_pairs
+planned = plan_buffers(gaussians, view, config, mesh=mesh)
+assert planned.max_pairs < plan_buffers(gaussians, view, config).max_pairs
 close(jax.jit(jax.grad(loss), static_argnums=(1, 2))(arguments, planned, mesh), expected)
 try:
     render(gaussians, view, dataclasses.replace(planned, max_pairs=10), mesh=mesh)
@@ -233,7 +238,7 @@ def test_a_mesh_of_two_axes_is_refused():
 
 
 def test_settings_are_checked():
-    for wrong in ({"extent": 0.0}, {"square": True}, {"scale": 0.0}, {"products": "float8"}):
+    for wrong in ({"radius_sigma": 0.0}, {"square": True}, {"scale": 0.0}, {"matmul_precision": "float8"}):
         with pytest.raises(ValueError, match="SplatConfig"):
             SplatConfig(**wrong)
 
@@ -242,5 +247,5 @@ def test_cameras_of_a_batch_are_planned_together():
     gaussians = random_gaussians(2, np.float32)
     near = camera(np.float32)
     far = Camera(near.K, near.cam_from_world.at[2, 3].add(3.0), WIDTH, HEIGHT)
-    both = plan(gaussians, stack_cameras([near, far]), SMALL)
-    assert both == max((plan(gaussians, c, SMALL) for c in (near, far)), key=lambda c: c.max_pairs)
+    both = plan_buffers(gaussians, stack_cameras([near, far]), SMALL)
+    assert both == max((plan_buffers(gaussians, c, SMALL) for c in (near, far)), key=lambda c: c.max_pairs)

@@ -12,14 +12,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.pytree import replace
-from humangs_jax.rendering.dense import render_dense
+from humangs_jax.rendering.reference import render_dense
 from humangs_jax.rendering.splatting import (
     SplatConfig,
     default_pairs,
     draw_projected,
-    plan,
+    plan_buffers,
     project_gaussians,
     render,
     render_views,
@@ -135,7 +135,7 @@ def test_the_schedule_does_not_change_the_image(config):
 
 def test_every_knob_means_the_same_as_in_dense():
     config = dataclasses.replace(
-        CHUNKS, near=2.5, dilation=0.1, alpha_min=0.05, alpha_max=0.8, transmittance_stop=0.02, jacobian_margin=0.0
+        CHUNKS, near=2.5, eps2d=0.1, alpha_min=0.05, alpha_max=0.8, transmittance_stop=0.02, jacobian_margin=0.0
     )
     with jax.enable_x64(True):
         gaussians = random_gaussians(6)
@@ -235,7 +235,7 @@ def test_overflow_is_counted_under_jit_and_refused_eagerly():
 
 def test_fitted_buffers_hold_every_view():
     gaussians, cameras = random_gaussians(2, np.float32), views()
-    config = plan(gaussians, cameras, CHUNKS, margin=1.0)
+    config = plan_buffers(gaussians, cameras, CHUNKS, margin=1.0)
     most = max(needed(gaussians, cameras[i]) for i in range(3))
     assert most <= config.max_pairs < 1.5 * most
     assert default_pairs(COUNT, WIDTH, HEIGHT) == COUNT * 6  # never more than every Gaussian in every tile

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from humangs_jax.geometry.camera import Camera, orbit
-from humangs_jax.rendering.texturing import render_textured_mesh, sample_texture
+from humangs_jax.rendering.mesh.texturing import render_textured_mesh, sample_texture
 
 ROUNDING = 2e-6
 """Texel positions of up to 16 texels in float32, times colour steps of up to 1."""

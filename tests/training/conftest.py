@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from training_cases import tube, write_subject
 
-from humangs_jax.models.humangs import init_humangs
+from humangs_jax.network.humangs import init_humangs
 from humangs_jax.training.config import tiny
 
 

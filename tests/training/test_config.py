@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from humangs_jax.configuration import config_from_file, config_from_json, config_to_json
+from humangs_jax.core.configuration import config_from_file, config_from_json, config_to_json
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training import config
 from humangs_jax.training.config import Stage, TrainConfig, small, tiny

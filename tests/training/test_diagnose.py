@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, CaptureSource, ExampleSource
-from humangs_jax.models.humangs import init_humangs
-from humangs_jax.models.presets import PRESETS
-from humangs_jax.models.transformer import Block
-from humangs_jax.models.upsampler import UpsamplerConfig
+from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.presets import PRESETS
+from humangs_jax.network.transformer import Block
+from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.objectives.backbones import VGG16, channels, random_weights
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.objectives.perceptual import VGG19, Vgg19
-from humangs_jax.pytree import replace
 from humangs_jax.training import diagnose, observed
 from humangs_jax.training.config import tiny
 from humangs_jax.training.diagnose import diagnose_run, diagnose_step, first_failed_step

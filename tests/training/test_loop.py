@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 
-from humangs_jax.models.weights import load_weights
+from humangs_jax.network.weights import load_weights
 from humangs_jax.training import loop
 from humangs_jax.training.checkpoint import Checkpoints
 from humangs_jax.training.config import Stage, tiny

@@ -15,11 +15,11 @@ import pytest
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loader import Example
-from humangs_jax.data.synthetic import write_subject
 from humangs_jax.data.views import gaussian_body, standardize
-from humangs_jax.models import presets
-from humangs_jax.models.transformer import TransformerConfig
-from humangs_jax.models.upsampler import UpsamplerConfig
+from humangs_jax.network import presets
+from humangs_jax.network.transformer import TransformerConfig
+from humangs_jax.network.upsampler import UpsamplerConfig
+from humangs_jax.people import write_subject
 from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.optimizer import OptimizerConfig
 from humangs_jax.training.state import init_state

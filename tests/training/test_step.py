@@ -7,15 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, ExampleSource, ViewSampling
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.models.humangs import init_humangs
+from humangs_jax.network.humangs import init_humangs
 from humangs_jax.objectives.backbones import VGG16, channels, random_weights
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.objectives.perceptual import VGG19, Vgg19
-from humangs_jax.pytree import replace
 from humangs_jax.training.config import tiny
 from humangs_jax.training.forward import token_share
 from humangs_jax.training.state import init_state

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from humangs_jax.configuration import config_to_json
-from humangs_jax.data.images import write_png
+from humangs_jax.core.configuration import config_to_json
+from humangs_jax.io.images import write_png
 from humangs_jax.training.config import tiny
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"

@@ -14,7 +14,7 @@ import jax
 def configuration(checkpoint_every=1, batch_size=4, at_once=1, learning_rate=1e-4):
     """`tiny`, with a batch for several devices, and no upsampler: what stands before a batch norm has no gradient but
     rounding errors, which Adam makes large."""
-    from humangs_jax.models.upsampler import UpsamplerConfig
+    from humangs_jax.network.upsampler import UpsamplerConfig
     from humangs_jax.training.config import tiny
 
     config = tiny()

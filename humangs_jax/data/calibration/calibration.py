@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.array_types import Float, Int
+from humangs_jax.core.array_types import Float, Int
 
 ROUNDED_ROTATION = 5e-3
 """R R^T of matrices written with three decimals (EasyMocap) is so far from 1; such are replaced by the nearest rotation."""

@@ -8,7 +8,7 @@ import dataclasses
 
 import numpy as np
 
-from humangs_jax.array_types import Float
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.calibration.calibration import (
     CONVENTIONS,
     OPENGL_FROM_OPENCV,

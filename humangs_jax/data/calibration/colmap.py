@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.array_types import Float
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration, Observations
 from humangs_jax.data.calibration.distortion import UNDISTORT_BEFORE, brown_conrady
 from humangs_jax.data.calibration.values import floats, image_size, intrinsics, pose_matrix, read_text

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.array_types import Float
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.calibration.values import floats
 from humangs_jax.data.capture_checks import CaptureError, numbers
 

@@ -9,7 +9,6 @@ import json
 import shutil
 from pathlib import Path
 
-from humangs_jax.data.atomic import replace_folder
 from humangs_jax.data.calibration.calibration import (
     PIXEL_CENTERS,
     ROTATION_TO_Y_UP,
@@ -23,7 +22,8 @@ from humangs_jax.data.calibration.distortion import undistort
 from humangs_jax.data.calibration.photos import Photo, find_photo, find_photos, photo_size
 from humangs_jax.data.capture_checks import CaptureError, check_names, checked_camera
 from humangs_jax.data.capture_reading import FORMAT, VERSION, names_from_paths
-from humangs_jax.data.images import read_grey, read_image, write_png
+from humangs_jax.io.atomic import replace_folder
+from humangs_jax.io.images import read_grey, read_image, write_png
 
 NO_COMMON_FRAME = "no two cameras have a photo of the same frame: photos of one moment must have the same file name"
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.array_types import Float
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KeypointSet
 

@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from humangs_jax.array_types import Float
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.keypoints.sets import KeypointSet
 
 

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.data.atomic import replace_file
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.detections import DetectedImage, Detections, floats
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
-from humangs_jax.data.npz import read_npz
+from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.npz import read_npz
 
 _KEYS = ("points", "confidences", "set", "names")
 

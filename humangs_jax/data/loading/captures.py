@@ -10,10 +10,10 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.images import to_uint8
 from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_views, shrink, subject_views
 from humangs_jax.data.loading.order import subject_order, view_generator
 from humangs_jax.data.loading.outlines import read_outline
+from humangs_jax.io.images import to_uint8
 
 logger = logging.getLogger("humangs_jax.data.loader")
 

@@ -6,10 +6,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from humangs_jax.array_types import Float, Int, UInt8
+from humangs_jax.core.array_types import Float, Int, UInt8
+from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.pytree import pytree_dataclass
 
 
 @dataclasses.dataclass(frozen=True)

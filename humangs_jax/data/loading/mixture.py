@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from humangs_jax.array_types import Int
+from humangs_jax.core.array_types import Int
 from humangs_jax.data.loading.examples import Example
 from humangs_jax.data.loading.order import block_counts, source_at
 from humangs_jax.data.loading.source import Source

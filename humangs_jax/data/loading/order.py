@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from humangs_jax.array_types import Int
+from humangs_jax.core.array_types import Int
 
 ORDER_STREAM, VIEW_STREAM, BATCH_STREAM, MIX_STREAM, SUBJECT_STREAM = range(5)
 """First entry of the seeds: what a generator is for, so that no two purposes share random numbers."""

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body import skinning
 from humangs_jax.body.landmarks import LandmarkModel
 from humangs_jax.body.model import BodyModel, pose_features
 from humangs_jax.body.surface_points import SurfacePoints, pose_points
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.fitting.objective import Problem, keypoint_residuals
 from humangs_jax.fitting.observations import Observations
 from humangs_jax.fitting.pose_prior import pose_prior
@@ -33,7 +34,6 @@ from humangs_jax.fitting.refinement.unknowns import (
     thickness,
 )
 from humangs_jax.fitting.solvers import Outcome, least_squares, minimise
-from humangs_jax.pytree import pytree_dataclass, replace
 
 DENSE = 400
 """Unknowns above which L-BFGS takes the place of least squares, whose matrix of derivatives grows with rows times columns."""

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Bool, Float, Int
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.rendering.mesh_rasterizer import rasterize_mesh
-from humangs_jax.rendering.position_map import vertex_normals
+from humangs_jax.rendering.mesh.position_map import vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 PROBE = 1.5
 """Pixels outside of an outline at which there must be no body."""

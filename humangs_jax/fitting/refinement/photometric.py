@@ -13,22 +13,22 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import PyTree
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.skinning import EXACT, blend_transforms, joint_transforms
+from humangs_jax.core.array_types import PyTree
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import MASK_THRESHOLD, SubjectViews, standardize
 from humangs_jax.fitting.objective import robust
 from humangs_jax.fitting.refinement.rounds import DEVIATION, RoundConfig, moved_capture, start_of
 from humangs_jax.fitting.refinement.unknowns import moved_cameras, moved_poses, nothing_moved, root_turns
 from humangs_jax.fitting.solvers import Outcome, minimise
-from humangs_jax.models.humangs import HumanGSConfig
+from humangs_jax.network.humangs import HumanGSConfig
 from humangs_jax.objectives.metrics import decibels
-from humangs_jax.pytree import replace
 from humangs_jax.rendering.gaussians import Gaussians, skin_gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import plan, render
+from humangs_jax.rendering.splatting import plan_buffers, render
 
 MOVING = ("turns", "shifts", "zooms", "headings", "places", "bends")
 """Unknowns that photographs move; the avatar's shape is its own."""
@@ -92,7 +92,9 @@ def by_colors(
 def _roomy(avatar, views):
     """Buffers for the most demanding view, and for what people may move."""
     needs = [
-        plan(_skinned(avatar, rotations, translation), views.cameras[i], SPLAT_PRESETS[avatar.rendering], margin=ROOM)
+        plan_buffers(
+            _skinned(avatar, rotations, translation), views.cameras[i], SPLAT_PRESETS[avatar.rendering], margin=ROOM
+        )
         for i, (rotations, translation) in enumerate(zip(views.rotations, views.translations, strict=True))
     ]
     most = lambda name: max(getattr(config, name) for config in needs)

@@ -88,7 +88,7 @@ def _by_colors(scene, capture, score, before, config):
     """The stage of colours: the better capture, its score, PSNR of the start's avatar and of the better one's, the outcome, a
     line.
     """
-    from humangs_jax.models.weights import load_weights
+    from humangs_jax.network.weights import load_weights
 
     look = functools.partial(likeness, *load_weights())
     now = look(capture)

@@ -12,6 +12,7 @@ import numpy as np
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import landmark_model
 from humangs_jax.body.skinning import EXACT
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.fitting.observations import Observations, expected_noise
@@ -33,7 +34,6 @@ from humangs_jax.fitting.refinement.unknowns import (
 )
 from humangs_jax.fitting.solvers import Outcome
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.pytree import replace
 
 DEVIATION = 1.4826
 """Standard deviations of a normal distribution in its median absolute deviation."""

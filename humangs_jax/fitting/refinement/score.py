@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Bool, Float
 from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.geometry.camera import project

@@ -14,11 +14,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.fitting.objective import robust
 from humangs_jax.fitting.refinement.outlines import Outline, inside_picture
-from humangs_jax.pytree import pytree_dataclass
-from humangs_jax.sampling.bilinear import sample_bilinear
+from humangs_jax.network.bilinear import sample_bilinear
 
 LOOKS = 129
 """Places at which a line is looked at: half a pixel apart at first, less later."""

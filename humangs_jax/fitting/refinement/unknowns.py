@@ -10,12 +10,12 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.body import skinning
 from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.pytree import pytree_dataclass, replace, static_field
 
 SAME = 1e-4
 """Relative difference of focal lengths, and radians and metres of cameras, below which two are the same."""

@@ -4,14 +4,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints
 from humangs_jax.body.model import BodyModel, BodyPose, pose_features
 from humangs_jax.body.surface_points import SurfacePoints, pose_points
-from humangs_jax.pytree import pytree_dataclass
-from humangs_jax.rendering.position_map import vertex_normals
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.rendering.mesh.position_map import vertex_normals
 
 VERTICES = 7000
 """Evenly spread, of which nearly all can be seen from outside: 1.6 cm apart."""

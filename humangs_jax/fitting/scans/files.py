@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.data.atomic import replace_folder
 from humangs_jax.data.capture_reading import DEFAULT_BODY
 from humangs_jax.fitting.scans.result import ScanFit, body_in_scan
+from humangs_jax.io.atomic import replace_folder
 
 BODY_FILE, REPORT_FILE, MESH_FILE = "body.npz", "scan_fit.json", "body_in_scan.ply"
 """Of a result: the body in our world, as captures have it; how it lies in the scan; its mesh in the scan's coordinates."""

@@ -14,8 +14,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Float
 from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.core.array_types import Float
 from humangs_jax.fitting.scans.body_surface import body_surface
 from humangs_jax.fitting.scans.config import (
     CLOSER,

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.array_types import Float
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.keypoints.sets import FINGER_JOINTS, FINGERS
-from humangs_jax.data.npz import read_npz
+from humangs_jax.io.npz import read_npz
 
 SIDES = ("left", "right")
 PARTS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "big_toe", "small_toe", "heel")

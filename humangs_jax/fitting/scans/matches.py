@@ -7,7 +7,7 @@ with the waist behind it. Pairs that are far apart, or do not look the same way,
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Float
+from humangs_jax.core.array_types import Float
 from humangs_jax.fitting.scans.body_surface import pose_surface
 from humangs_jax.fitting.scans.objective import Matches, ScanProblem, ScanState, Tolerances, scale_of
 from humangs_jax.fitting.scans.reading import Scan

@@ -9,13 +9,13 @@ they count fully on both sides. Pairs that are far apart fade out by their weigh
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float, Int
 from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.fitting.body_state import BodyState, pose_of
 from humangs_jax.fitting.objective import LIMIT_STIFFNESS, robust
 from humangs_jax.fitting.pose_prior import PosePrior, pose_prior
 from humangs_jax.fitting.scans.body_surface import BodySurface, pose_vertices
-from humangs_jax.pytree import pytree_dataclass, static_field
 
 SIZE = 0.05
 """A step of 1 in the logarithm of the scan's scale."""

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.array_types import Bool, Float
+from humangs_jax.core.array_types import Bool, Float
 
 VIEWS = 48
 """Directions that a point may be seen from."""

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.fitting.scans.similarity import Similarity
 
 LITTLE = 0.6

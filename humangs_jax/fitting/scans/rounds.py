@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from humangs_jax.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.fitting.scans.matches import Target
 from humangs_jax.fitting.scans.objective import Given, Matches, ScanProblem, ScanState, Tolerances, scan_residuals
 from humangs_jax.fitting.solvers import Outcome, half_squares, least_squares

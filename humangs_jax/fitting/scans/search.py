@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.fitting.body_state import state_of
 from humangs_jax.fitting.scans.body_surface import pose_vertices
 from humangs_jax.fitting.scans.config import COARSE, COARSE_NORMAL, LOOSE, ScanFitConfig

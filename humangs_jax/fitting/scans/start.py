@@ -9,8 +9,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Float
 from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Float
 from humangs_jax.fitting.pose_prior import MIRROR, pose_prior
 from humangs_jax.fitting.rigid import cube_rotations, trunk_weights
 from humangs_jax.fitting.scans.body_surface import BodySurface, pose_surface

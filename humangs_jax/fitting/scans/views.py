@@ -11,10 +11,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Float
-from humangs_jax.data.atomic import replace_folder
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_reading import FORMAT, VERSION
-from humangs_jax.data.images import write_png
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photographs import load_photographs
 from humangs_jax.fitting.observations import group_by_moment
@@ -23,7 +21,9 @@ from humangs_jax.fitting.scans.reading import read_mesh
 from humangs_jax.fitting.scans.similarity import Similarity
 from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
-from humangs_jax.rendering.mesh_rasterizer import interpolate, rasterize_mesh
+from humangs_jax.io.atomic import replace_folder
+from humangs_jax.io.images import write_png
+from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 SCAN_FILE = "scan.json"
 """In the folder, beside capture.json: where the scan is in the world of the pictures."""
@@ -111,7 +111,9 @@ def _draw(vertices, faces, colors, cameras: Camera, views):
     for view in range(views):
         camera = cameras[view]
         fragments = rasterize_mesh(number(vertices), jnp.asarray(faces, jnp.int32), camera)
-        painted = np.asarray(interpolate(fragments, jnp.asarray(faces, jnp.int32), number(colors), jnp.ones(3)))
+        painted = np.asarray(
+            interpolate_attributes(fragments, jnp.asarray(faces, jnp.int32), number(colors), jnp.ones(3))
+        )
         face = np.asarray(fragments.face_ids)
         facing = np.abs(normals @ np.asarray(camera.cam_from_world)[2, :3])
         shade = np.where(face >= 0, 0.45 + 0.55 * facing[np.maximum(face, 0)], 1.0)

@@ -5,8 +5,8 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.array_types import Array, Float
 from humangs_jax.body.model import BodyModel, BodyPose, shape_body
+from humangs_jax.core.array_types import Array, Float
 from humangs_jax.fitting.scans.reading import Scan
 from humangs_jax.fitting.scans.similarity import Similarity
 from humangs_jax.geometry import quaternion

@@ -1,0 +1,275 @@
+"""Looking at a capture before using it: the posed body over each photo, and numbers that tell what is wrong.
+
+Blue is the person's left side, red the right, the green line the outline of the body; what was photographed and what the
+parameters say should lie on each other. Most captures that fail are of a wrong convention, so that a view in which the body
+is not where the mask is, is tried again with the usual mistakes undone, and the one that helps is named.
+"""
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.avatar.pictures import contact_sheet
+from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.data.capture import Capture
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.mesh.position_map import vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
+
+LONGEST_SIDE = 512
+"""Larger photos are shrunk to this for the check, pixels."""
+LEAST_IOU = 0.5
+"""Clothes and hair cover about a fifth of a silhouette that the body does not; half means another pose or camera."""
+SURELY_IOU = 0.6
+LEAST_INSIDE, SURELY_INSIDE = 0.5, 0.9
+"""Share of the vertices in the frame: below the first it is a warning, the second is asked of an explanation."""
+LEAST_HEIGHT = 0.05
+"""Share of the image's height: a body smaller than this has its lengths in another unit."""
+LEFT, RIGHT, MIDDLE = (0.15, 0.45, 1.0), (1.0, 0.35, 0.15), (0.85, 0.85, 0.85)
+OUTLINE = (0.1, 0.85, 0.2)
+AMBIENT = 0.35
+OPACITY = 0.55
+
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""Points of a y-up world -> points of a z-up world."""
+
+
+def _moved(offset):
+    return np.block([[np.eye(3), np.reshape(offset, (3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
+
+
+MISTAKES = {
+    "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m, t: np.linalg.inv(m),
+    "the camera looks along -z with y up (OpenGL, Blender, NeRF): negate rows 2 and 3 of cam_from_world": (
+        lambda m, t: _FLIP @ m
+    ),
+    "the matrix is camera to world in OpenGL's convention (NeRF, Blender): invert it, then negate rows 2 and 3": (
+        lambda m, t: _FLIP @ np.linalg.inv(m)
+    ),
+    "the camera's translation is in millimetres": lambda m, t: np.block([[m[:3, :3], m[:3, 3:] / 1000], [m[3:]]]),
+    "the body's translation is in millimetres": lambda m, t: m @ _moved(t / 1000 - t),
+    "the cameras stand in a world with z up: multiply cam_from_world by (x, y, z) -> (x, -z, y) from the right": (
+        lambda m, t: m @ _FROM_Y_UP
+    ),
+}
+"""What people give, and the cam_from_world that undoes it, from theirs and the body's translation."""
+
+
+@pytree_dataclass
+class BodyPicture:
+    """The posed body as one camera sees it.
+
+    shaded: (h, w, 3) lit from the camera, black outside. covered: (h, w). inside, before: shares of the vertices that fall
+    into the image, and that lie before the camera. height: of the body in the image, share of the image's.
+    """
+
+    shaded: Float[Array, "h w 3"]
+    covered: Bool[Array, "h w"]
+    inside: Float[Array, ""]
+    before: Float[Array, ""]
+    height: Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewCheck:
+    """What is known of one view. iou: of body and mask, None without masks. inside: share of the vertices in the image."""
+
+    name: str
+    iou: float | None
+    inside: float
+    warnings: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckReport:
+    """One row per view; `str(report)` is the table that the command line prints."""
+
+    views: tuple[ViewCheck, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether no view has a warning."""
+        return not any(view.warnings for view in self.views)
+
+    def __str__(self) -> str:
+        """A table, then the warnings."""
+        width = max(4, *(len(view.name) for view in self.views))
+        lines = [f"{'view':<{width}}  silhouette IoU  body in frame"]
+        for view in self.views:
+            iou = "no mask" if view.iou is None else f"{view.iou:.3f}"
+            lines.append(f"{view.name:<{width}}  {iou:>14}  {view.inside:>12.0%}{'  !' if view.warnings else ''}")
+        lines += [f"warning: {view.name}: {warning}" for view in self.views for warning in view.warnings]
+        if self.ok:
+            lines.append(
+                "no warnings; look at the picture all the same: left and right cannot be told from silhouettes"
+            )
+        return "\n".join(lines)
+
+
+def check_capture(capture: Capture, out: str | Path) -> CheckReport:
+    """Draw the posed body over every photo, write the sheet as a PNG, and report how well they agree.
+
+    Raises: OSError if the picture cannot be written.
+    """
+    cameras, images, masks = _shrunk(capture)
+    vertices = _posed_frames(capture)
+    tints = side_tints(capture.body)
+    pictures, views = [], []
+    for i, name in enumerate(capture.names):
+        posed = vertices[int(capture.frames[i])]
+        picture = _picture(posed, capture.body.faces, tints, cameras[i])
+        mask = None if masks is None else masks[i] > 0.5
+        view = _judge(name, picture, mask)
+        if view.warnings:
+            translation = np.asarray(capture.poses.translation[int(capture.frames[i])], float)
+            draw = functools.partial(_picture, posed, capture.body.faces, tints)
+            cause = _mistake_in_picture(picture, mask) or _mistake_in_space(draw, cameras[i], translation, mask)
+            explained = f"it would fit if {cause}"
+            view = dataclasses.replace(view, warnings=view.warnings + ((explained,) if cause else ()))
+        pictures.append(overlay(images[i], picture))
+        views.append(view)
+    contact_sheet(np.stack(pictures), out, labels=[_label(view) for view in views])
+    return CheckReport(tuple(views))
+
+
+def draw_body(
+    body: BodyModel, betas: Float[Array, " s"], pose: BodyPose, camera: Camera, photo: Float[np.ndarray, "h w 3"]
+) -> tuple[Float[np.ndarray, "h w 3"], BodyPicture]:
+    """The posed body over a photo of one camera, and the body's picture alone."""
+    picture = _picture(_pose(body, betas, pose), body.faces, side_tints(body), camera)
+    return overlay(photo, picture), picture
+
+
+def overlay(photo: Float[np.ndarray, "h w 3"], picture: BodyPicture) -> Float[np.ndarray, "h w 3"]:
+    """Half-transparent body over a photo, with its outline."""
+    covered = np.asarray(picture.covered)
+    blended = photo + OPACITY * covered[..., None] * (np.asarray(picture.shaded) - photo)
+    return np.where(_outline(covered)[..., None], np.asarray(OUTLINE), blended)
+
+
+def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
+    """Colours of the vertices: left, right, or between, by the names of the joints that move them, else by x in T-pose."""
+    weights = np.asarray(body.skinning_weights)
+    left, right = (
+        weights @ np.array([name.startswith(side) for name in body.joint_names]) for side in ("left", "right")
+    )
+    if not (left.any() and right.any()):
+        left, right = (np.asarray(body.template)[:, 0] * sign > 0 for sign in (1, -1))
+    left, right = left.astype(np.float32)[:, None], right.astype(np.float32)[:, None]
+    colors = np.asarray([LEFT, RIGHT, MIDDLE], np.float32)
+    tints = left * colors[0] + right * colors[1] + (1 - left - right) * colors[2]
+    return tints.astype(np.float32)
+
+
+@jax.jit
+def _pose(body, betas, pose):
+    return pose_body(body, shape_body(body, betas), pose).vertices
+
+
+@jax.jit
+def _picture(vertices, faces, tints, camera) -> BodyPicture:
+    points = vertices @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    before = points[:, 2] > 0
+    xy = points[:, :2] / jnp.where(before, points[:, 2], 1.0)[:, None] * jnp.diagonal(camera.K)[:2] + camera.K[:2, 2]
+    inside = before & (xy >= 0).all(-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
+    y = jnp.where(before, xy[:, 1], 0.0)
+    rays = points / jnp.linalg.norm(points, axis=-1, keepdims=True)
+    normals = vertex_normals(vertices, faces) @ camera.cam_from_world[:3, :3].T
+    light = AMBIENT + (1 - AMBIENT) * jnp.abs(jnp.sum(normals * rays, axis=-1, keepdims=True))
+    fragments = rasterize_mesh(vertices, faces, camera)
+    return BodyPicture(
+        shaded=interpolate_attributes(fragments, faces, tints * light, jnp.zeros(3)),
+        covered=fragments.face_ids >= 0,
+        inside=inside.mean(dtype=jnp.float32),
+        before=before.mean(dtype=jnp.float32),
+        height=(y.max() - y.min()) / camera.height,
+    )
+
+
+def _posed_frames(capture):
+    """Vertices of the frames that views show, by frame."""
+    shown = sorted({int(frame) for frame in capture.frames})
+    return {frame: _pose(capture.body, jnp.asarray(capture.betas), capture.pose(frame)) for frame in shown}
+
+
+def _shrunk(capture):
+    """Cameras, photos and masks with the longest side of at most `LONGEST_SIDE`."""
+    height, width = capture.images.shape[1:3]
+    share = LONGEST_SIDE / max(height, width)
+    if share >= 1:
+        return capture.cameras, capture.images, capture.masks
+    from PIL import Image
+
+    size = (max(1, round(width * share)), max(1, round(height * share)))
+    shrink = lambda channel: np.asarray(Image.fromarray(channel).resize(size, Image.Resampling.BOX))
+    images = np.stack([np.stack([shrink(x[..., c]) for c in range(3)], axis=-1) for x in capture.images])
+    masks = None if capture.masks is None else np.stack([shrink(x) for x in capture.masks])
+    return capture.cameras.resized(*size), images, masks
+
+
+def _iou(picture, mask):
+    covered = np.asarray(picture.covered)
+    union = (covered | mask).sum()
+    return float((covered & mask).sum() / union) if union else 0.0
+
+
+def _judge(name, picture, mask) -> ViewCheck:
+    inside, before, height = float(picture.inside), float(picture.before), float(picture.height)
+    iou = None if mask is None else _iou(picture, mask)
+    warnings = []
+    if before == 0:
+        warnings.append("the body is behind the camera")
+    elif before < 1:
+        warnings.append(f"{1 - before:.0%} of the body is behind the camera")
+    elif inside < LEAST_INSIDE:
+        warnings.append(f"{1 - inside:.0%} of the body is outside the frame")
+    elif height < LEAST_HEIGHT:
+        warnings.append(f"the body is {height:.1%} of the image's height: are all lengths in metres?")
+    if mask is not None and not mask.any():
+        warnings.append("the mask is empty")
+    elif iou is not None and iou < LEAST_IOU:
+        warnings.append(f"body and mask do not agree (IoU {iou:.2f})")
+    return ViewCheck(name, iou, inside, tuple(warnings))
+
+
+def _mistake_in_picture(picture, mask):
+    """An inverted mask, or a mirrored photo."""
+    if mask is None or not mask.any():
+        return None
+    covered = np.asarray(picture.covered)
+    tried = {"the mask is inverted": (covered, ~mask), "the photo is mirrored": (covered[:, ::-1], mask)}
+    shares = {mistake: (a & b).sum() / max((a | b).sum(), 1) for mistake, (a, b) in tried.items()}
+    best = max(shares, key=lambda mistake: shares[mistake])
+    return best if shares[best] > SURELY_IOU else None
+
+
+def _mistake_in_space(draw, camera, translation, mask):
+    """The usual mistake that, undone, puts the body where the mask is; without a mask the only one that puts it in frame."""
+    fitting: dict[str, float] = {}
+    for mistake, undo in MISTAKES.items():
+        matrix = jnp.asarray(undo(np.asarray(camera.cam_from_world, float), translation), camera.K.dtype)
+        view = _judge("", draw(replace(camera, cam_from_world=matrix)), mask)
+        if not view.warnings and view.inside > SURELY_INSIDE:
+            fitting[mistake] = view.iou or 0.0
+    if mask is None:
+        return next(iter(fitting)) if len(fitting) == 1 else None
+    return max(fitting, key=lambda mistake: fitting[mistake]) if fitting else None
+
+
+def _outline(covered):
+    """Pixels of the body beside pixels outside it."""
+    padded = np.pad(covered, 1, mode="edge")
+    neighbours = (padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:])
+    return covered & ~np.logical_and.reduce(neighbours)
+
+
+def _label(view: ViewCheck) -> str:
+    iou = "" if view.iou is None else f"  IoU {view.iou:.2f}"
+    return f"{'! ' if view.warnings else ''}{view.name}{iou}"

@@ -1,0 +1,64 @@
+"""Every gradient-safety trick of the package, in one tested place.
+
+The double-where rule: a `jnp.where` that selects a finite value still back-propagates NaN from the branch it rejects, so the
+rejected branch must be evaluated at a harmless argument first. All functions here obey it.
+"""
+
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.core.array_types import Array, Float, PyTree
+
+
+def at_least_float32(tree: PyTree) -> PyTree:
+    """The tree with its bfloat16 and float16 arrays in float32; wider ones as they are. Gradients return narrow."""
+    widen = lambda a: a.astype(dtype) if (dtype := jnp.promote_types(a.dtype, jnp.float32)) != a.dtype else a
+    return jax.tree.map(widen, tree)
+
+
+def safe_divide(numerator: Float[Array, "*#n"], denominator: Float[Array, "*#n"]) -> Float[Array, "*n"]:
+    """numerator / denominator, and 0 with zero gradient where the denominator is 0."""
+    zero = denominator == 0
+    return jnp.where(zero, 0.0, numerator / jnp.where(zero, 1.0, denominator))
+
+
+def safe_sqrt(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """sqrt(max(x, 0)) with zero gradient where x <= 0, where the true one is infinite or undefined."""
+    positive = x > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def absolute(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """|x| with zero gradient at 0, where that of `jnp.abs` is 1: an L1 of images would push where they agree."""
+    return x * jax.lax.stop_gradient(jnp.sign(x))
+
+
+def safe_norm(x: Float[Array, "*b d"]) -> Float[Array, "*b"]:
+    """Euclidean norm over the last axis; zero gradient at the zero vector.
+
+    Scaled by the largest magnitude first, so that neither squares overflow nor small vectors underflow.
+    """
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
+    scale = jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1.0)
+    return safe_sqrt(jnp.sum(jnp.square(x / scale), axis=-1)) * scale[..., 0]
+
+
+def safe_normalize(x: Float[Array, "*b d"], fallback: Float[Array, " d"]) -> Float[Array, "*b d"]:
+    """x / |x|, and `fallback` with zero gradient where |x| is 0."""
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
+    zero = ~(largest > 0)
+    y = jnp.where(zero, fallback.astype(x.dtype), x / jnp.where(zero, 1.0, largest))
+    unit = y * jax.lax.rsqrt(jnp.sum(jnp.square(y), axis=-1, keepdims=True))
+    return jnp.where(zero, fallback.astype(x.dtype), unit)
+
+
+def inverse_sigmoid(p: Float[Array, "*n"], margin: float = 1e-6) -> Float[Array, "*n"]:
+    """log(p / (1 - p)) with p clamped to [margin, 1 - margin]."""
+    p = jnp.clip(p, margin, 1 - margin)
+    return jnp.log(p) - jnp.log1p(-p)
+
+
+def inverse_softplus(y: Float[Array, "*n"], smallest: float = 1e-12) -> Float[Array, "*n"]:
+    """x with softplus(x) = y for y > 0: y + log(-expm1(-y))."""
+    y = jnp.maximum(y, smallest)
+    return y + jnp.log(-jnp.expm1(-y))

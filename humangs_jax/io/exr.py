@@ -1,0 +1,155 @@
+"""Rendered views as OpenEXR files: float32, lossless ZIP, cameras in the header; several views are parts of one file.
+
+Channels R, G, B, A and Z (depth along the optical axis, metres, 0 where nothing was hit), and whatever others are given
+under their own names (`position.X`). Header of each part: `K` (3x3, pixels) and `cam_from_world` (4x4, OpenCV, metres),
+float32, exact. Colours are linear and stored as given; compositing programs expect them premultiplied, that is rendered
+onto black.
+"""
+
+import dataclasses
+import os
+import uuid
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.geometry.camera import Camera
+
+RGBA = ("R", "G", "B", "A")
+DEPTH = "Z"
+STANDARD_ATTRIBUTES = {"name", "type", "compression", "owner", "view", "comments"}
+"""Header strings with a meaning of their own in OpenEXR: neither written nor returned as ours."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class ExrView:
+    """One rendered view.
+
+    rgba: (h, w, 4) linear colours and coverage. depth: (h, w) metres, or None.
+    K, cam_from_world: (3, 3) pixels and (4, 4) metres of its camera, both or neither.
+    name: of the part; unique in a file. channels: further (h, w) images by name. attributes: strings for the header.
+    """
+
+    rgba: Float[np.ndarray, "h w 4"]
+    depth: Float[np.ndarray, "h w"] | None = None
+    K: Float[np.ndarray, "3 3"] | None = None
+    cam_from_world: Float[np.ndarray, "4 4"] | None = None
+    name: str = ""
+    channels: Mapping[str, Float[np.ndarray, "h w"]] = dataclasses.field(default_factory=dict)
+    attributes: Mapping[str, str] = dataclasses.field(default_factory=dict)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera that the header tells. Raises: ValueError if it tells none, or what is no camera."""
+        if self.K is None or self.cam_from_world is None:
+            raise ValueError(f"view {self.name!r}: no camera: expected K and cam_from_world")
+        return Camera.from_opencv(self.K, self.cam_from_world, self.rgba.shape[1], self.rgba.shape[0])
+
+
+def write_exr(path: str | Path, views: ExrView | Sequence[ExrView]) -> None:
+    """Write one view, or several as parts of one file (all of one size); the file appears whole or not at all.
+
+    Everything is stored as float32. Unnamed views are called view000, view001, ...
+
+    Raises: ValueError naming the view and what does not fit; OSError if the file cannot be written.
+    """
+    import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
+
+    views = [views] if isinstance(views, ExrView) else list(views)
+    if not views:
+        raise ValueError("views: expected at least one, got none")
+    names = [view.name or f"view{i:03d}" for i, view in enumerate(views)]
+    if len(set(names)) < len(names):
+        raise ValueError(f"views: expected different names, got {names}")
+    if len({view.rgba.shape for view in views}) > 1:  # parts of a file share one display window
+        raise ValueError(f"views: expected one image size, got {sorted({view.rgba.shape[:2] for view in views})}")
+    parts = [_to_part(view, name) for view, name in zip(views, names, strict=True)]
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent}: no such folder")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
+    try:
+        with OpenEXR.File(parts) as file:
+            file.write(str(temporary))
+        os.replace(temporary, path)
+    except RuntimeError as error:
+        raise OSError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_exr(path: str | Path) -> list[ExrView]:
+    """The views of a file, one per part; half floats become float32. A part without alpha is opaque, grey is repeated.
+
+    Raises: FileNotFoundError; OSError if it is no OpenEXR file or a damaged one; ValueError naming the part that has no
+    colours or whose K or cam_from_world is no matrix.
+    """
+    import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
+
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    if not OpenEXR.isOpenExrFile(str(path)):  # asked first: the reader prints to stderr before it raises
+        raise OSError(f"{path}: not an OpenEXR file")
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            count = len(file.parts)
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            if len(file.parts) < count:  # the binding drops parts that it cannot decode, with no more than a print
+                raise OSError(f"{path}: damaged: {count - len(file.parts)} of {count} parts cannot be decoded")
+            return [_from_part(part, path) for part in file.parts]
+    except RuntimeError as error:
+        raise OSError(f"{path}: not a readable OpenEXR file: {' '.join(str(error).split())}") from error
+
+
+def _to_part(view, name):
+    import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
+
+    height, width = view.rgba.shape[:2]
+    channels = {channel: view.rgba[..., i] for i, channel in enumerate(RGBA)}
+    if view.depth is not None:
+        channels[DEPTH] = view.depth
+    for channel, image in view.channels.items():
+        if channel in channels:
+            raise ValueError(f"view {name!r}: channels: {channel} is there already")
+        channels[channel] = image
+    # OpenEXR writes strided arrays wrongly in silence and refuses every type but its own
+    channels = {channel: np.ascontiguousarray(image, np.float32) for channel, image in channels.items()}
+    for channel, image in channels.items():
+        if image.shape != (height, width):
+            raise ValueError(f"view {name!r}: channel {channel}: expected shape {(height, width)}, got {image.shape}")
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    for key, value in view.attributes.items():
+        if key in STANDARD_ATTRIBUTES:
+            raise ValueError(f"view {name!r}: attributes: {key} has a meaning of its own in OpenEXR")
+        header[key] = str(value)
+    if (view.K is None) != (view.cam_from_world is None):
+        raise ValueError(f"view {name!r}: expected both K and cam_from_world, or neither")
+    if view.K is not None:
+        header["K"] = np.ascontiguousarray(view.K, np.float32)
+        header["cam_from_world"] = np.ascontiguousarray(view.cam_from_world, np.float32)
+    return OpenEXR.Part(header, channels, name)
+
+
+def _from_part(part, path):
+    images = {name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()}
+    grey = images.pop("Y", None)
+    colours = [colour for channel in RGBA[:3] if (colour := images.pop(channel, grey)) is not None]
+    if len(colours) < 3:
+        raise ValueError(f"{path}: part {part.name()!r}: expected channels R, G, B, got {sorted(part.channels)}")
+    alpha = images.pop("A", np.ones_like(colours[0]))
+    depth = images.pop(DEPTH, None)
+    matrices = [_matrix(part, key, size, path) for key, size in (("K", 3), ("cam_from_world", 4))]
+    attributes = {k: v for k, v in part.header.items() if isinstance(v, str) and k not in STANDARD_ATTRIBUTES}
+    return ExrView(np.stack([*colours, alpha], axis=-1), depth, *matrices, part.name(), images, attributes)
+
+
+def _matrix(part, key, size, path):
+    if key not in part.header:
+        return None
+    matrix = np.asarray(part.header[key])
+    if matrix.shape != (size, size):
+        raise ValueError(f"{path}: part {part.name()!r}: {key}: expected a {size} x {size} matrix, got {matrix.shape}")
+    return matrix.astype(np.float32)

@@ -1,0 +1,68 @@
+"""Sampling of grids at fractional positions, zeros outside.
+
+Positions are texel indices (x, y): (0, 0) is the CENTRE of the first texel, x runs along the width. Two conventions
+lead there from pixels u in [0, W] (pixel centres at +0.5) of an image that a w-texel grid covers:
+
+- half-pixel (correct): texels are areas, index = u * w / W - 0.5;
+- mixed (published): u / W * 2 - 1 treats pixels as areas, then `align_corners=True` treats texels as points,
+  index = u / W * (w - 1). The two differ by up to half a texel, zero in the middle.
+"""
+
+from typing import Literal
+
+import jax.numpy as jnp
+
+from humangs_jax.core.array_types import Array, Float
+
+Convention = Literal["half_pixel", "mixed"]
+
+
+def texel_indices(
+    pixels: Float[Array, "*p 2"], image_size: tuple[int, int], grid_size: tuple[int, int], convention: Convention
+) -> Float[Array, "*p 2"]:
+    """Positions in pixels of an image -> texel indices of a grid that covers it; sizes are (width, height)."""
+    image, grid = jnp.asarray(image_size, pixels.dtype), jnp.asarray(grid_size, pixels.dtype)
+    if convention == "half_pixel":
+        return pixels * (grid / image) - 0.5
+    return pixels / image * (grid - 1)
+
+
+def sample_bilinear(
+    grid: Float[Array, "h w c"], indices: Float[Array, "*p 2"], origin: float = 0.0
+) -> Float[Array, "*p c"]:
+    """Bilinear interpolation between texel centres; texels outside of the grid count as zeros.
+
+    origin: the texel index, in both axes, that `indices` are relative to; counted from the middle, float32 positions
+    keep more digits of their fractions. Positions that are outside by a texel or more, infinite or NaN give zero with
+    zero gradient.
+    """
+    height, width, channels = grid.shape
+    size = jnp.asarray([width, height], indices.dtype)
+    absolute = indices + origin
+    inside = jnp.all((absolute > -1) & (absolute < size), axis=-1, keepdims=True)
+    corner = jnp.floor(jnp.where(inside, absolute, -1.0))  # outside: weight one on a texel that does not exist
+    fraction = jnp.where(inside, indices, corner - origin) - (corner - origin)
+    x0, y0 = jnp.moveaxis(corner.astype(jnp.int32), -1, 0)
+    rows = grid.reshape(height * width, channels)
+
+    total = jnp.zeros((), jnp.result_type(grid, indices))
+    for dy in (0, 1):
+        for dx in (0, 1):
+            x, y = x0 + dx, y0 + dy
+            exists = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            weight = (fraction[..., 0] if dx else 1 - fraction[..., 0]) * (
+                fraction[..., 1] if dy else 1 - fraction[..., 1]
+            )
+            texel = rows.at[jnp.where(exists, y * width + x, 0)].get(mode="promise_in_bounds")
+            total = total + jnp.where(exists, weight, 0.0)[..., None] * texel
+    return total
+
+
+def sample_nearest(grid: Float[Array, "h w"], indices: Float[Array, "*p 2"]) -> Float[Array, "*p"]:
+    """The texel nearest to each position, halves to the even index; zero outside of the grid."""
+    height, width = grid.shape
+    nearest = jnp.round(indices)
+    size = jnp.asarray([width, height], indices.dtype)
+    inside = jnp.all((nearest >= 0) & (nearest < size), axis=-1)
+    x, y = jnp.moveaxis(jnp.where(inside[..., None], nearest, 0.0).astype(jnp.int32), -1, 0)
+    return jnp.where(inside, grid[y, x], 0.0)

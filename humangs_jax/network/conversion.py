@@ -1,0 +1,295 @@
+"""The authors' released checkpoint to our variables and back: names, layouts, and the configuration behind the shapes.
+
+Files are read by `io.tensor_file`, without torch. Layouts: linear (out, in) -> (in, out); convolution
+(out, in, kh, kw) -> (kh, kw, in, out); 1x1 convolution (out, in, 1, 1) -> (in, out); transposed convolution
+(in, out, kh, kw) -> (kh, kw, in, out), unflipped (see `upsampler.UpConvolution`).
+"""
+
+import dataclasses
+import functools
+import os
+import statistics
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from humangs_jax.io.tensor_file import is_safetensors, read_tensors, safetensors_metadata
+from humangs_jax.network.attention import AttentionConfig
+from humangs_jax.network.humangs import HumanGSConfig, Variables
+from humangs_jax.network.presets import published
+from humangs_jax.network.transformer import TransformerConfig
+from humangs_jax.network.triplane import TriplaneConfig
+from humangs_jax.network.upsampler import UpsamplerConfig
+from humangs_jax.network.vertex_decoder import VertexDecoderConfig
+from humangs_jax.network.weights import FORMAT, expected_variables, flatten_variables, variables_from_tensors
+
+LOSS_PREFIX = "loss_computer."
+"""The release saves its frozen loss networks along; they are no part of the network."""
+SKINNING_WEIGHTS = "tpose_lbs_weights"
+"""(n, j) of the body that the network was trained with; carried along, the network has no use for them."""
+UNSUPPORTED = "target_pose_tokenizer.1.weight"
+"""Marks a variant of the network (canonical target maps) that does not exist here."""
+COUNTER = "num_batches_tracked"
+"""Of every batch norm; means nothing here."""
+PIXEL_CHANNELS = 9
+"""rgb and ray, beside the pose features."""
+
+StateDict = dict[str, np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Converted:
+    """Variables and their configuration; skinning_weights: (n, j) of the body that the checkpoint was made for.
+
+    skipped: how many tensors of the frozen loss networks were left out.
+    """
+
+    variables: Variables
+    config: HumanGSConfig
+    skinning_weights: np.ndarray
+    skipped: int
+
+
+class Layout(NamedTuple):
+    """How a tensor lies in the release and here; the two undo each other."""
+
+    from_release: Callable[[np.ndarray], np.ndarray]
+    to_release: Callable[[np.ndarray], np.ndarray]
+
+
+SAME = Layout(lambda x: x, lambda x: x)
+LINEAR = Layout(lambda x: x.T, lambda x: x.T)
+CONVOLUTION = Layout(lambda x: x.transpose(2, 3, 1, 0), lambda x: x.transpose(3, 2, 0, 1))
+POINTWISE = Layout(lambda x: x[:, :, 0, 0].T, lambda x: x.T[:, :, None, None])
+TRANSPOSED_CONVOLUTION = Layout(lambda x: x.transpose(2, 3, 0, 1), lambda x: x.transpose(2, 3, 0, 1))
+CLASS_TOKEN = Layout(lambda x: x[0], lambda x: x[None])
+
+SINGLE_TENSORS = {
+    "params/encoder/tokenizer/texture": ("neural_texture", SAME),
+    "params/encoder/class_token": ("cls_token", CLASS_TOKEN),
+}
+MODULES = {  # our module: the release's, and the layout of its weight
+    "encoder/tokenizer/linear": ("image_tokenizer.1", LINEAR),
+    "encoder/transformer/input_norm": ("transformer_input_layernorm", SAME),
+    "encoder/transformer/norm": ("norm", SAME),
+    **{f"encoder/upsampler/project_{i}": (f"upsampler.proj.{i}", POINTWISE) for i in range(4)},
+    "encoder/upsampler/fuse": ("upsampler.fuse.0", CONVOLUTION),
+    "encoder/upsampler/fuse_norm": ("upsampler.fuse.1", SAME),
+    "encoder/upsampler/up1": ("upsampler.up1.0", TRANSPOSED_CONVOLUTION),
+    "encoder/upsampler/up1_norm": ("upsampler.up1.1", SAME),
+    "encoder/upsampler/conv1": ("upsampler.up1.3", CONVOLUTION),
+    "encoder/upsampler/conv1_norm": ("upsampler.up1.4", SAME),
+    "encoder/upsampler/up2": ("upsampler.up2.0", TRANSPOSED_CONVOLUTION),
+    "encoder/upsampler/up2_norm": ("upsampler.up2.1", SAME),
+    "readout": ("upsampler.up2.3", CONVOLUTION),
+    "decoder/trunk_0": ("vertex_decoder.trunk.0", LINEAR),
+    "decoder/trunk_1": ("vertex_decoder.trunk.2", LINEAR),
+    "decoder/geometry_hidden": ("vertex_decoder.geo_head.0", LINEAR),
+    "decoder/geometry_out": ("vertex_decoder.geo_head.2", LINEAR),
+    "decoder/appearance_hidden": ("vertex_decoder.app_head.0", LINEAR),
+    "decoder/appearance_out": ("vertex_decoder.app_head.2", LINEAR),
+    "decoder/skinning_hidden": ("vertex_decoder.lbs_head.0", LINEAR),
+    "decoder/skinning_out": ("vertex_decoder.lbs_head.2", LINEAR),
+}
+BLOCKS = "encoder/transformer/block_"
+BLOCK_MODULES = {
+    "norm1": ("norm1", SAME),
+    "attention/qkv": ("attn.to_qkv", LINEAR),
+    "attention/q_norm": ("attn.q_norm", SAME),
+    "attention/k_norm": ("attn.k_norm", SAME),
+    "attention/out": ("attn.fc", LINEAR),
+    "norm2": ("norm2", SAME),
+    "mlp_in": ("mlp.mlp.0", LINEAR),
+    "mlp_out": ("mlp.mlp.2", LINEAR),
+}
+FIELDS = {"kernel": "weight", "scale": "weight", "bias": "bias", "mean": "running_mean", "var": "running_var"}
+
+
+def release_name(path: str) -> tuple[str, Layout]:
+    """What the release calls one of our variables ("params/encoder/..."), and how it lies there.
+
+    Raises: KeyError if the release has no such thing.
+    """
+    if path in SINGLE_TENSORS:
+        return SINGLE_TENSORS[path]
+    module, _, field = path.partition("/")[2].rpartition("/")
+    if module.startswith(BLOCKS):
+        index, _, inner = module.removeprefix(BLOCKS).partition("/")
+        name, layout = BLOCK_MODULES[inner]
+        name = f"transformer_blocks.{index}.{name}"
+    else:
+        name, layout = MODULES[module]
+    return f"{name}.{FIELDS[field]}", layout if field == "kernel" else SAME
+
+
+def to_release(variables: Variables) -> StateDict:
+    """Variables as the state dict that the release would have of them (without the body's skinning weights).
+
+    Raises: KeyError for a part of a network that the release does not have.
+    """
+    state = {}
+    for path, value in flatten_variables(variables).items():
+        key, layout = release_name(path)
+        state[key] = layout.to_release(np.asarray(value))
+        if key.endswith("running_var"):
+            state[f"{key.removesuffix('running_var')}{COUNTER}"] = np.zeros((), np.int64)
+    return state
+
+
+def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
+    """Shapes of the state dict that the release has for a configuration, without the body's skinning weights."""
+    shapes = {}
+    for path, leaf in flatten_variables(expected_variables(config)).items():
+        key, layout = release_name(path)
+        shapes[key] = layout.to_release(np.broadcast_to(np.float32(0), leaf.shape)).shape
+        if key.endswith("running_var"):
+            shapes[f"{key.removesuffix('running_var')}{COUNTER}"] = ()
+    return shapes
+
+
+def read_state_dict(path: str | os.PathLike) -> tuple[StateDict, int]:
+    """Tensors of a checkpoint in any format of `tensor_file`, and how many of the loss networks were skipped.
+
+    Raises: OSError; ValueError if the file is damaged, is none, or holds anything but tensors.
+    """
+    if is_safetensors(path) and safetensors_metadata(path).get("format") == FORMAT:
+        raise ValueError(f"{path} is a weights file already: nothing to convert")
+    return read_tensors(path, lambda key: not key.startswith(LOSS_PREFIX))
+
+
+def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConfig:
+    """The configuration whose sizes are those of the tensors; what shapes do not tell is taken from `presets.published`.
+
+    head_width: of a network without normalised queries and keys, where no shape tells it. Of the Gaussians of a vertex
+    one counts as tight. Raises: ValueError for a variant that is not supported, or if a tensor that tells a size is
+    missing or has another number of axes.
+    """
+    if UNSUPPORTED in state:
+        raise ValueError(f"tensor {UNSUPPORTED!r}: the variant with canonical target maps is not supported")
+
+    shape = functools.partial(_shape, state)
+    has = lambda prefix: any(key.startswith(prefix) for key in state)
+    base = published()
+    resolution, channels = shape("neural_texture", 4)[2:]
+    token_width, patch_numbers = shape("image_tokenizer.1.weight", 2)
+    width = statistics.mode([token_width, *shape("transformer_input_layernorm.weight", 1), *shape("norm.weight", 1)])
+    per_pixel = PIXEL_CHANNELS + 3 * channels
+    patch = max(1, round((patch_numbers / per_pixel) ** 0.5))
+    if patch * patch * per_pixel != patch_numbers:
+        raise ValueError(
+            f"tensor 'image_tokenizer.1.weight' has {patch_numbers} inputs: no square patch of {per_pixel} channels"
+        )
+    upsampler = dataclasses.replace(base.upsampler, enabled=False)
+    if has("upsampler."):
+        upsampler = UpsamplerConfig(
+            hidden=shape("upsampler.proj.0.weight", 4)[0], out=shape("upsampler.up2.3.weight", 4)[0]
+        )
+    gaussians = max(1, shape("vertex_decoder.geo_head.2.weight", 2)[0] // 10)
+    joints = None
+    if has("vertex_decoder.lbs_head."):
+        joints = shape("vertex_decoder.lbs_head.2.weight", 2)[0] // gaussians
+    return dataclasses.replace(
+        base,
+        image_size=patch * max(1, base.image_size // patch),
+        patch_size=patch,
+        texture=TriplaneConfig(resolution, channels),
+        transformer=TransformerConfig(
+            width=width,
+            layers=_count_layers(state),
+            mlp_ratio=max(1, shape("transformer_blocks.0.mlp.mlp.0.weight", 2)[0] // width),
+            class_token="cls_token" in state,
+            attention=_infer_attention(state, head_width),
+        ),
+        upsampler=upsampler,
+        decoder=VertexDecoderConfig(
+            hidden=shape("vertex_decoder.trunk.0.weight", 2)[0], tight=1, free=gaussians - 1, skinning_joints=joints
+        ),
+    )
+
+
+def _shape(state: StateDict, key: str, axes: int) -> tuple[int, ...]:
+    if key not in state:
+        raise ValueError(f"tensor {key!r} is missing")
+    if state[key].ndim != axes or 0 in state[key].shape:
+        raise ValueError(f"tensor {key!r} has shape {state[key].shape}, expected {axes} axes")
+    return state[key].shape
+
+
+def _count_layers(state: StateDict) -> int:
+    indices = {key.split(".")[1] for key in state if key.startswith("transformer_blocks.")}
+    for index in range(len(indices)):
+        if str(index) not in indices:
+            raise ValueError(f"tensor 'transformer_blocks.{index}.norm1.weight' is missing")
+    return len(indices)
+
+
+def _infer_attention(state: StateDict, head_width: int | None) -> AttentionConfig:
+    """The width of a head is that of its norms, where there are any."""
+    if not any(key.endswith((".attn.q_norm.weight", ".attn.k_norm.weight")) for key in state):
+        if head_width is None:
+            raise ValueError("no tensor 'transformer_blocks.0.attn.q_norm.weight' tells the width of a head: give it")
+        if head_width < 1:
+            raise ValueError(f"the width of a head must be at least 1, got {head_width}")
+        return AttentionConfig(head_width=head_width, qk_norm=False)
+    (found,) = _shape(state, "transformer_blocks.0.attn.q_norm.weight", 1)
+    if head_width not in (None, found):
+        raise ValueError(f"tensor 'transformer_blocks.0.attn.q_norm.weight' says heads of {found}, not {head_width}")
+    return AttentionConfig(head_width=found)
+
+
+def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
+    """Raises ValueError, in the release's names, unless the tensors are exactly those expected, and finite."""
+    if missing := sorted(set(expected) - set(state)):
+        raise ValueError(f"tensor {missing[0]!r} is missing ({len(missing)} in all)")
+    if unknown := sorted(set(state) - set(expected)):
+        raise ValueError(f"tensor {unknown[0]!r} is no part of the published network ({len(unknown)} such in all)")
+    if wrong := [key for key, shape in expected.items() if state[key].shape != shape]:
+        found, wanted = state[wrong[0]].shape, expected[wrong[0]]
+        raise ValueError(
+            f"tensor {wrong[0]!r} has shape {found}; to fit the others it should have {wanted} ({len(wrong)} such in all)"
+        )
+    if bad := [key for key, value in state.items() if not np.isfinite(value.astype(np.float64)).all()]:
+        raise ValueError(f"tensor {bad[0]!r} holds numbers that are not finite ({len(bad)} such in all)")
+
+
+def load_checkpoint(path: str | os.PathLike, head_width: int | None = None) -> Converted:
+    """A released checkpoint as float32 variables, with the configuration that its shapes tell.
+
+    head_width: see `infer_config`. Raises: OSError; ValueError naming file and tensor if the file cannot be read or
+    asks for more than tensors, or if a tensor of the network is missing, unknown, of the wrong shape or not finite.
+    """
+    state, skipped = read_state_dict(path)
+    try:
+        config = infer_config(state, head_width)
+        vertices, joints = _shape(state, SKINNING_WEIGHTS, 2)
+        skinning_shape = (vertices, config.decoder.skinning_joints or joints)
+        _check(state, expected_shapes(config) | {SKINNING_WEIGHTS: skinning_shape})
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    tensors = {}
+    for ours in flatten_variables(expected_variables(config)):
+        key, layout = release_name(ours)
+        tensors[ours] = layout.from_release(state[key])
+    return Converted(variables_from_tensors(tensors, config, str(path)), config, state[SKINNING_WEIGHTS], skipped)
+
+
+def describe(converted: Converted) -> str:
+    """The network in one line."""
+    config, leaves = converted.config, flatten_variables(converted.variables["params"]).values()
+    transformer, decoder = config.transformer, config.decoder
+    parts = [
+        f"{sum(x.size for x in leaves):,} parameters",
+        f"width {transformer.width}",
+        f"{transformer.layers} layers of {transformer.width // transformer.attention.head_width} heads",
+        f"patches of {config.patch_size}",
+        f"texture {config.texture.resolution} x {config.texture.channels}",
+        f"{decoder.gaussians_per_vertex} Gaussians a vertex",
+    ]
+    optional = {
+        "class token": transformer.class_token,
+        "normalised queries and keys": transformer.attention.qk_norm,
+        "upsampler": config.upsampler.enabled,
+        "skinning head": decoder.skinning_joints is not None,
+    }
+    return ", ".join(parts + [name if there else f"no {name}" for name, there in optional.items()])

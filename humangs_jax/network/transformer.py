@@ -1,0 +1,109 @@
+"""Pre-norm transformer over all tokens of all views; position is in the tokens themselves (rays and pose features).
+
+    x += attention(norm1(x));  x += mlp(norm2(x))
+
+LayerNorms of the blocks have a weight and no bias, the final one has both (eps 1e-5). Norms and softmax run in float32
+at least, and so does the residual stream; products run in `dtype`.
+"""
+
+import dataclasses
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax.ad_checkpoint import checkpoint_name
+
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.network.attention import NORM_EPSILON, PRODUCT, Attention, AttentionConfig
+
+INIT_STD = 0.02
+_POLICIES = {"full": None, "dots": jax.checkpoint_policies.save_only_these_names(PRODUCT)}
+
+
+@dataclasses.dataclass(frozen=True)
+class TransformerConfig:
+    """width: features per token. layers: blocks, a multiple of 4. mlp_ratio: hidden width of the MLP over the width.
+
+    class_token: a learned global token in front of all others. remat: recompute blocks in the backward pass instead of
+    keeping what they computed; remat_policy: all of a block ("full"), or all but what attention and products with weights
+    gave ("dots"). On a CPU only a `scan` recomputes: XLA merges what is computed twice outside of loops.
+    scan: run one compiled block in a loop: its parameters are copied side by side in every call (12 layers of 768: 340
+    MB), but a TPU program of 12 layers compiles in 5 s instead of 22 (with gradients 8 instead of 26; H100: 3 instead
+    of 8; on a CPU it saves nothing).
+    """
+
+    width: int = 768
+    layers: int = 12
+    mlp_ratio: int = 4
+    class_token: bool = True
+    remat: bool = False
+    remat_policy: Literal["full", "dots"] = "full"
+    scan: bool = False
+    attention: AttentionConfig = dataclasses.field(default_factory=AttentionConfig)
+
+
+def layer_norm(dtype: Any, name: str, use_bias: bool = False) -> nn.LayerNorm:
+    """The LayerNorm of the published network; the two-pass variance does not cancel."""
+    return nn.LayerNorm(epsilon=NORM_EPSILON, use_bias=use_bias, use_fast_variance=False, dtype=dtype, name=name)
+
+
+class Block(nn.Module):
+    """One pre-norm block; tokens (l, d) -> (l, d)."""
+
+    config: TransformerConfig
+    index: int
+    dtype: Any = None
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> Float[Array, "l d"]:
+        config = self.config
+        init = nn.initializers.normal(INIT_STD / (2 * (self.index + 1)) ** 0.5)
+        dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=self.dtype, kernel_init=init, name=name)
+        normed = layer_norm(self.dtype, "norm1")(x)
+        x = x + Attention(config.attention, init, self.dtype, name="attention")(normed, count)
+        hidden = dense(config.mlp_ratio * config.width, "mlp_in")(layer_norm(self.dtype, "norm2")(x))
+        hidden = checkpoint_name(hidden, PRODUCT)
+        return x + dense(config.width, "mlp_out")(jax.nn.gelu(hidden, approximate=False))
+
+
+class Transformer(nn.Module):
+    """Tokens (l, d) -> outputs after layers L/4, L/2, 3L/4 (raw) and L (after the final norm), each (l, d)."""
+
+    config: TransformerConfig
+    dtype: Any = None
+
+    @nn.compact
+    def __call__(self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> list[Float[Array, "l d"]]:
+        config = self.config
+        x = layer_norm(self.dtype, "input_norm")(tokens)
+        x = x.astype(jnp.promote_types(x.dtype, jnp.float32))
+        quarters = (config.layers // 4, config.layers // 2, 3 * config.layers // 4)
+        if config.scan and not self.is_initializing():
+            x, collected = self._scan_blocks(x, count, quarters)
+        else:
+            collected = []
+            block_class = nn.remat(Block, policy=_POLICIES[config.remat_policy]) if config.remat else Block
+            for index in range(config.layers):
+                x = block_class(config, index, self.dtype, name=f"block_{index}")(x, count)
+                if index + 1 in quarters:
+                    collected.append(x)
+        return [*collected, layer_norm(self.dtype, "norm", use_bias=True)(x)]
+
+    def _scan_blocks(self, x, count, quarters):
+        """The blocks as one loop over their stacked parameters: (output, outputs at the quarters)."""
+        config, block = self.config, Block(self.config, 0, self.dtype, parent=None)
+        blocks = [self.variables["params"][f"block_{index}"] for index in range(config.layers)]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *blocks)
+        slots = [quarters.index(i + 1) if i + 1 in quarters else len(quarters) for i in range(config.layers)]
+
+        def step(carry, layer):
+            x, kept = carry
+            params, slot = layer
+            x = block.apply({"params": params}, x, count)
+            return (x, kept.at[slot].set(x, mode="drop")), None
+
+        kept = jnp.zeros((len(quarters), *x.shape), x.dtype)
+        body = jax.checkpoint(step, policy=_POLICIES[config.remat_policy]) if config.remat else step
+        (x, kept), _ = jax.lax.scan(body, (x, kept), (stacked, jnp.asarray(slots)))
+        return x, list(kept)

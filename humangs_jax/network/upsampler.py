@@ -1,0 +1,141 @@
+"""Feature aggregation: token maps of several depths fused and upsampled four times.
+
+With hidden width H: each map 1x1 -> H, concatenated, 3x3 -> 2H, norm, LeakyReLU; then twice a 4x4 transposed
+convolution of stride 2 (2H -> H, H -> H/2), norm, LeakyReLU, and a 3x3 convolution (-> H, norm, LeakyReLU; -> out,
+bare). Maps are (v, h, w, c).
+
+The last convolution is half of that arithmetic, and only body vertices read what it computes, from positions between
+its pixels. So it is a module of its own, `Readout`, that is applied to what the vertices have read of its input.
+"""
+
+import dataclasses
+from typing import Any, Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax.linen.dtypes import promote_dtype
+
+from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.network.convolution import Convolution
+from humangs_jax.network.neighborhoods import KERNEL
+
+SLOPE = 0.2
+MOMENTUM = 0.9
+"""Of the running statistics; torch calls it 0.1, and takes the unbiased variance: larger by one part in v * h * w."""
+KAIMING = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
+KAIMING_TRANSPOSED = nn.initializers.variance_scaling(2.0, "fan_in", "normal")
+"""torch counts the fan-out of a transposed convolution over its input channels."""
+
+
+@dataclasses.dataclass(frozen=True)
+class UpsamplerConfig:
+    """enabled: off, the map is the final token map itself (ablation). hidden, out: widths, see the module.
+
+    features: "intermediate" aggregates four depths, "final" upsamples the last one only (ablation).
+    """
+
+    enabled: bool = True
+    hidden: int = 256
+    out: int = 768
+    features: Literal["intermediate", "final"] = "intermediate"
+
+
+class UpConvolution(nn.Module):
+    """4x4 transposed convolution, stride 2, padding 1: (v, h, w, c) -> (v, 2h, 2w, features).
+
+    An output row 2i needs input rows i - 1, i under kernel rows 3, 1, and row 2i + 1 needs rows i, i + 1 under 2, 0;
+    columns likewise. So one matrix product of all 2x2 neighbourhoods to 4 * features channels, interleaved, does it: as
+    a dilated convolution (or a 2x2 one) its backward pass on a CPU is twenty times slower. The kernel (4, 4, c,
+    features) is stored unflipped: input pixel (i, j) adds kernel[a, b] to output pixel (2i + a - 1, 2j + b - 1).
+    """
+
+    features: int
+    dtype: Any = None
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v h w c"]) -> Float[Array, "v 2*h 2*w features"]:
+        views, height, width, channels = x.shape
+        kernel = self.param("kernel", KAIMING_TRANSPOSED, (4, 4, channels, self.features))
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        x, kernel, bias = promote_dtype(x, kernel, bias, dtype=self.dtype)
+        order = jnp.asarray([3, 1, 2, 0])  # phase, then tap
+        kernel = kernel[order][:, order].reshape(2, 2, 2, 2, channels, self.features)
+        kernel = jnp.transpose(kernel, (1, 3, 4, 0, 2, 5)).reshape(4 * channels, 4 * self.features)
+        x = jnp.pad(x, ((0, 0), (1, 1), (1, 1), (0, 0)))
+        neighbours = [x[:, a : a + height + 1, b : b + width + 1] for a in (0, 1) for b in (0, 1)]
+        y = jnp.concatenate(neighbours, axis=-1) @ kernel
+        y = y.reshape(views, height + 1, width + 1, 2, 2, self.features)
+        y = jnp.stack([y[:, :-1, :, 0], y[:, 1:, :, 1]], axis=2)
+        y = jnp.stack([y[:, :, :, :-1, 0], y[:, :, :, 1:, 1]], axis=4)
+        return y.reshape(views, 2 * height, 2 * width, self.features) + bias
+
+
+class Readout(nn.Module):
+    """The last convolution, 3x3: (n, 9 c) neighbourhoods and (n,) coverages, pooled over views -> (n, features).
+
+    See `network.neighborhoods`. `everywhere` convolves a map instead; it is for looking at maps.
+    """
+
+    features: int
+    channels: int
+    dtype: Any = None
+
+    def setup(self):
+        """Parameters of a 3x3 convolution."""
+        self.kernel = self.param("kernel", KAIMING, (KERNEL, KERNEL, self.channels, self.features))
+        self.bias = self.param("bias", nn.initializers.zeros, (self.features,))
+
+    def __call__(self, neighborhoods: Float[Array, "n k"], coverages: Float[Array, " n"]) -> Float[Array, "n d"]:
+        """Features of positions, in the dtype of the coverages."""
+        x, kernel = promote_dtype(neighborhoods, self.kernel, dtype=self.dtype)
+        kernel = kernel.reshape(-1, self.features)
+        return jnp.matmul(x, kernel, preferred_element_type=coverages.dtype) + coverages[:, None] * self.bias
+
+    def everywhere(self, x: Float[Array, "v h w c"]) -> Float[Array, "v h w d"]:
+        """Features of every pixel."""
+        x, kernel, bias = promote_dtype(x, self.kernel, self.bias, dtype=self.dtype)
+        layout = ("NHWC", "HWIO", "NHWC")
+        return jax.lax.conv_general_dilated(x, kernel, (1, 1), "SAME", dimension_numbers=layout) + bias
+
+
+class Upsampler(nn.Module):
+    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, hidden / 2), input of `Readout`.
+
+    axis_name: vmap axis to share batch statistics over.
+    """
+
+    config: UpsamplerConfig
+    dtype: Any = None
+    axis_name: str | tuple[str, ...] | None = None
+
+    @nn.compact
+    def __call__(
+        self, maps: list[Float[Array, "v h w d"]], train: bool = False, present: Bool[Array, " v"] | None = None
+    ) -> Float[Array, "v 4*h 4*w c"]:
+        """present: views that count in the batch statistics; None: all."""
+        hidden = self.config.hidden
+        mask = None if present is None else present[:, None, None, None]
+
+        def norm_relu(x, name):
+            norm = nn.BatchNorm(
+                use_running_average=not train,
+                momentum=MOMENTUM,
+                use_fast_variance=False,
+                dtype=self.dtype,
+                # several names are as good to it as one, whatever its annotation says
+                axis_name=self.axis_name if train else None,  # ty: ignore[invalid-argument-type]
+                name=name,
+            )
+            return jax.nn.leaky_relu(norm(x, mask=mask), SLOPE)
+
+        def convolution(features, name):
+            return Convolution(features, KAIMING, self.dtype, name=name)
+
+        projected = [
+            nn.Dense(hidden, dtype=self.dtype, kernel_init=KAIMING, name=f"project_{i}")(x) for i, x in enumerate(maps)
+        ]
+        x = norm_relu(convolution(2 * hidden, "fuse")(jnp.concatenate(projected, axis=-1)), "fuse_norm")
+        x = norm_relu(UpConvolution(hidden, self.dtype, name="up1")(x), "up1_norm")
+        x = norm_relu(convolution(hidden, "conv1")(x), "conv1_norm")
+        return norm_relu(UpConvolution(hidden // 2, self.dtype, name="up2")(x), "up2_norm")

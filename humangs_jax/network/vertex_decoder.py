@@ -1,0 +1,222 @@
+"""From features of a body vertex to its K Gaussians.
+
+Input of a vertex: pooled local feature, global token, positional encoding of the canonical position, and optionally its
+photo colour, the fraction of views that see it, and what the photographs show at distances along its normal. The first
+`tight` Gaussians of a vertex are those whose offsets a loss keeps small.
+"""
+
+import dataclasses
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.numerics import inverse_sigmoid
+from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.geometry import quaternion
+from humangs_jax.network.shells import Shells
+
+FREQUENCIES = (1, 2, 4, 8, 16, 32)
+INIT_STD = 0.02
+LAST_STD = 0.001
+INITIAL_OPACITY = -1.0
+"""Before the sigmoid."""
+COLOR_MARGIN = 0.01
+"""Photo colours are pulled this far inside (0, 1) before the inverse sigmoid: white stays correctable."""
+WEIGHT_EPSILON = 1e-9
+"""Added to skinning weights before their logarithm, as published."""
+THINNER = 1.2
+"""Less in the bias of the scale along the normal: a third of the thickness, so that outlines are sharp."""
+OBLIQUE = (0.36, 0.48, 0.8)
+"""A unit vector, no axis of a body: where normals are opposite, in few places, frames turn quickly between vertices."""
+SHELL_WIDTH = 6
+"""Numbers that enter per shell: colour, seen, inside, hull."""
+INITIAL_SHELL = 4.0
+"""Logit of the nearest shell, of 0 elsewhere: Gaussians start near the surface."""
+
+
+@dataclasses.dataclass(frozen=True)
+class VertexDecoderConfig:
+    """hidden: width. tight, free: Gaussians per vertex of the two kinds, K = tight + free.
+
+    skinning_joints: joints of the head that corrects skinning weights, None without it. offset_scale: offsets are
+    bounded to it by tanh (normalised units; what shells add is not), None leaves them unbounded as published.
+    initial_log_scale: initial bias of the scales, before the softplus. frame: axes of offsets and rotations, "canonical"
+    those of the canonical body (published), "normal" ones whose z is the vertex's normal, along which Gaussians start
+    `THINNER`. residual_color: colours are predicted relative to the photo colour.
+    """
+
+    hidden: int = 256
+    tight: int = 1
+    free: int = 4
+    skinning_joints: int | None = None
+    offset_scale: float | None = None
+    initial_log_scale: float = -3.0
+    frame: Literal["canonical", "normal"] = "canonical"
+    residual_color: bool = False
+
+    @property
+    def gaussians_per_vertex(self) -> int:
+        """K."""
+        return self.tight + self.free
+
+
+@pytree_dataclass
+class VertexFeatures:
+    """What the photographs say of each vertex.
+
+    local: (n, d) pooled feature. global_token: (d',) or None. photo_colors: (n, 3) and visible_fraction: (n,), or None.
+    shells: points off the surface, or None. normals: (n, 3) unit, of the canonical body, or None.
+    dropped_reads: how many vertices, over all views, were not read for want of capacity; None: not counted.
+    """
+
+    local: Float[Array, "n d"]
+    global_token: Float[Array, " e"] | None = None
+    photo_colors: Float[Array, "n 3"] | None = None
+    visible_fraction: Float[Array, " n"] | None = None
+    shells: Shells | None = None
+    normals: Float[Array, "n 3"] | None = None
+    dropped_reads: Int[Array, ""] | None = None
+
+
+@pytree_dataclass
+class RawGaussians:
+    """Heads before their activations.
+
+    geometry: (n, k, 10) offset, quaternion, scale. appearance: (n, k, 4) colour, opacity. skinning: (n, k, j) logits or
+    None. shells: (n, k, s) logits or None.
+    """
+
+    geometry: Float[Array, "n k 10"]
+    appearance: Float[Array, "n k 4"]
+    skinning: Float[Array, "n k j"] | None
+    shells: Float[Array, "n k s"] | None = None
+
+
+@pytree_dataclass
+class VertexGaussians:
+    """K Gaussians of every vertex, lengths in normalised units.
+
+    offsets: (n, k, 3) from the vertex. quats: (n, k, 4) wxyz, unit. scales: (n, k, 3). opacities: (n, k). colors: (n,
+    k, 3).
+    """
+
+    offsets: Float[Array, "n k 3"]
+    quats: Float[Array, "n k 4"]
+    scales: Float[Array, "n k 3"]
+    opacities: Float[Array, "n k"]
+    colors: Float[Array, "n k 3"]
+
+
+def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
+    """x, then sin(f pi x), cos(f pi x) for f = 1, 2, 4, 8, 16, 32."""
+    waves = [wave(f * np.pi * x) for f in FREQUENCIES for wave in (jnp.sin, jnp.cos)]
+    return jnp.concatenate([x, *waves], axis=-1)
+
+
+def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> Float[Array, "n c"]:
+    """What is configured of: local feature, global token, encoded position, photo colour as 2 rgb - 1, visible fraction,
+    normal, shells; in this order.
+    """
+    vertices = canonical.shape[0]
+    parts = [features.local]
+    if features.global_token is not None:
+        parts.append(jnp.broadcast_to(features.global_token, (vertices, features.global_token.shape[0])))
+    parts.append(positional_encoding(canonical))
+    if features.photo_colors is not None:
+        assert features.visible_fraction is not None  # it comes with the colours
+        parts += [2 * features.photo_colors - 1, features.visible_fraction[:, None]]
+    if features.normals is not None:
+        parts.append(features.normals)
+    if (shells := features.shells) is not None:
+        parts += [(2 * shells.colors - 1).reshape(vertices, -1), shells.seen, shells.inside, shells.hull]
+    return jnp.concatenate(parts, axis=-1)
+
+
+def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
+    """Rotations that take z to each normal, smooth in the normal but for the direction opposite to `OBLIQUE`."""
+    oblique = jnp.asarray(OBLIQUE, normals.dtype)
+    upright = quaternion.between(jnp.asarray([0.0, 0.0, 1.0], normals.dtype), oblique)
+    return quaternion.multiply(quaternion.between(oblique, normals), upright)
+
+
+def activate(raw: RawGaussians, config: VertexDecoderConfig, features: VertexFeatures | None = None) -> VertexGaussians:
+    """Quaternion normalised, scale softplus, colour and opacity sigmoid, offset bounded if so configured.
+
+    With shells each Gaussian chooses between them by weights that sum to 1; the mean distance along the normal and the mean
+    photo colour are what its own offset and colour correct.
+    """
+    offsets, quats, scales = jnp.split(raw.geometry, (3, 7), axis=-1)
+    quats = quaternion.normalize(quats)
+    if config.offset_scale is not None:
+        offsets = config.offset_scale * jnp.tanh(offsets / config.offset_scale)
+    colors, opacities = raw.appearance[..., :3], raw.appearance[..., 3]
+    seen = None if features is None or features.photo_colors is None else features.photo_colors[:, None]
+    if raw.shells is not None:
+        assert features is not None and features.shells is not None  # where the logits come from
+        shells, chosen = features.shells, jax.nn.softmax(raw.shells, axis=-1)
+        offsets = offsets.at[..., 2].add(chosen @ shells.distances)
+        seen = jnp.einsum("nks,nsc->nkc", chosen, shells.colors)
+    if config.frame == "normal":
+        assert features is not None and features.normals is not None  # such a network is given them
+        frames = normal_frames(features.normals)[:, None]
+        offsets = jnp.einsum("nkij,nkj->nki", quaternion.to_matrix(frames), offsets)
+        quats = quaternion.multiply(frames, quats)
+    if config.residual_color:
+        assert seen is not None  # such a network samples them
+        colors = colors + inverse_sigmoid(seen, COLOR_MARGIN)
+    return VertexGaussians(offsets, quats, jax.nn.softplus(scales), jax.nn.sigmoid(opacities), jax.nn.sigmoid(colors))
+
+
+def corrected_skinning_weights(
+    weights: Float[Array, "n j"], offsets: Float[Array, "g j"] | None, gaussians_per_vertex: int
+) -> Float[Array, "g j"]:
+    """Skinning weights of every Gaussian: its vertex's, or softmax(log(w + 1e-9) + offsets) with a skinning head."""
+    weights = jnp.repeat(weights, gaussians_per_vertex, axis=0)
+    if offsets is None:
+        return weights
+    return jax.nn.softmax(jnp.log(weights + WEIGHT_EPSILON) + offsets, axis=-1)
+
+
+class VertexDecoder(nn.Module):
+    """Decoder inputs (n, c) -> raw heads, in float32 at least.
+
+    That is a thousandth of the published network's arithmetic, and bfloat16 here would double the error of its
+    Gaussians.
+    """
+
+    config: VertexDecoderConfig
+    shells: int = 0
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "n c"]) -> RawGaussians:
+        config, k = self.config, self.config.gaussians_per_vertex
+
+        def hidden_layer(x, name):
+            return jax.nn.relu(nn.Dense(config.hidden, kernel_init=nn.initializers.normal(INIT_STD), name=name)(x))
+
+        def head(x, name, bias, kernel_init):
+            bias_init = lambda key, shape, dtype=jnp.float32: jnp.tile(jnp.asarray(bias, dtype), k)
+            last = nn.Dense(k * len(bias), kernel_init=kernel_init, bias_init=bias_init, name=f"{name}_out")
+            return last(hidden_layer(x, f"{name}_hidden")).reshape(x.shape[0], k, len(bias))
+
+        x = hidden_layer(hidden_layer(x, "trunk_0"), "trunk_1")
+        small = nn.initializers.normal(LAST_STD)
+        geometry = [0.0] * 3 + list(quaternion.IDENTITY) + [config.initial_log_scale] * 3
+        if config.frame == "normal":
+            geometry[-1] -= THINNER
+        skinning = None
+        if config.skinning_joints is not None:
+            skinning = head(x, "skinning", [0.0] * config.skinning_joints, nn.initializers.zeros)
+        shells = None
+        if self.shells:
+            shells = head(x, "shells", [INITIAL_SHELL] + [0.0] * (self.shells - 1), small)
+        return RawGaussians(
+            head(x, "geometry", geometry, small),
+            head(x, "appearance", [0.0] * 3 + [INITIAL_OPACITY], small),
+            skinning,
+            shells,
+        )

@@ -1,0 +1,197 @@
+"""Arms that go where they are wanted and stay clear of the body.
+
+An arm draws many candidates within its limits and keeps the one whose wrist comes nearest to a goal (hanging, on the hip,
+waving, ...) among those whose forearm and hand stay out of the trunk, the head, the legs and the other arm.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.people.kinematics import (
+    HEAD,
+    LEFT_ANKLE,
+    LEFT_COLLAR,
+    LEFT_ELBOW,
+    LEFT_HIP,
+    LEFT_KNEE,
+    LEFT_SHOULDER,
+    LEFT_WRIST,
+    LIMITS,
+    MIRROR,
+    NECK,
+    PELVIS,
+    RIGHT_ANKLE,
+    RIGHT_COLLAR,
+    RIGHT_ELBOW,
+    RIGHT_HIP,
+    RIGHT_KNEE,
+    RIGHT_SHOULDER,
+    RIGHT_WRIST,
+    SPINE3,
+    Build,
+    joint_positions,
+    rotation_matrix,
+    rotation_vector,
+)
+
+CANDIDATES = 400
+HAND_LENGTH = 0.6
+"""From the wrist to the knuckles and a little beyond, in lengths of the forearm."""
+HEAD_RADIUS = 0.14
+MARGIN = 0.015
+"""Metres that forearm and hand keep away from the body."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Goal:
+    """Where a wrist should be.
+
+    odds: of being drawn. place: of the left wrist relative to the shoulder in arm lengths, in axes of the chest.
+    raised: range of the upper arm's elevation, 0 is horizontal. forward: of its turn towards the front. flexed: of the elbow.
+    collar: how much the collar is raised.
+    """
+
+    odds: float
+    place: tuple[float, float, float]
+    raised: tuple[float, float] = (-1.45, -0.1)
+    forward: tuple[float, float] = (-0.5, 1.4)
+    flexed: tuple[float, float] = (0.05, 2.2)
+    collar: float = -0.08
+
+
+GOALS = {
+    "hang": Goal(0.36, (0.28, -1.0, 0.1), (-1.5, -1.05), (-0.25, 0.35), (0.05, 0.6)),
+    "away": Goal(0.14, (0.6, -0.85, 0.08), (-1.3, -0.7), flexed=(0.05, 0.6)),
+    "hip": Goal(0.09, (0.35, -0.82, 0.12)),
+    "front": Goal(0.09, (0.2, -0.3, 0.8)),
+    "low": Goal(0.06, (0.15, -0.75, 0.5)),
+    "chest": Goal(0.05, (-0.2, -0.4, 0.45)),
+    "wave": Goal(0.05, (0.55, 0.45, 0.25), (-1.45, 1.25), collar=0.15),
+    "side": Goal(0.04, (1.0, -0.1, 0.1), (-0.4, 0.4), collar=0.05),
+    "up": Goal(0.03, (0.25, 1.0, 0.1), (-0.5, 1.25), collar=0.3),
+    "reach": Goal(0.03, (0.15, 0.1, 0.95), (-0.6, 0.5), (0.6, 1.5), (0.05, 0.9), 0.02),
+    "back": Goal(0.02, (0.3, -0.85, -0.45), (-1.45, -0.7), (-0.9, 0.0), (0.05, 0.9)),
+    "face": Goal(0.02, (-0.2, 0.2, 0.5), (-1.3, 0.4), (0.0, 1.5), (1.2, 2.35), 0.05),
+    "diagonal": Goal(0.02, (0.75, 0.65, 0.1), (0.0, 1.1), (-0.2, 0.9), (0.05, 0.7), 0.2),
+}
+ARMS = (
+    (LEFT_COLLAR, LEFT_SHOULDER, LEFT_ELBOW, LEFT_WRIST),
+    (RIGHT_COLLAR, RIGHT_SHOULDER, RIGHT_ELBOW, RIGHT_WRIST),
+)
+
+
+def draw_goal(rng: np.random.Generator) -> str:
+    """The name of a goal."""
+    odds = np.asarray([goal.odds for goal in GOALS.values()])
+    return list(GOALS)[rng.choice(len(GOALS), p=odds / odds.sum())]
+
+
+def bend_arm(
+    rng: np.random.Generator,
+    build: Build,
+    rotations: Float[np.ndarray, "j 3"],
+    goal: str,
+    side: int,
+    *,
+    other_arm: bool = False,
+) -> float:
+    """Set collar, shoulder, elbow and wrist of one side (0 left, 1 right) in `rotations`; trunk, head and legs must be set.
+
+    other_arm: keep clear of the other arm, too. Returns how clear the arm is (metres, negative: it is not).
+    """
+    collar, shoulder, elbow, wrist = ARMS[side]
+    mirror, n, wanted = np.ones(3) if side == 0 else MIRROR, CANDIDATES, GOALS[goal]
+    rotations[collar] = np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
+    down, forward, twist, flex, pronation = np.zeros((5, n, 3))
+    down[:, 2] = rng.uniform(*wanted.raised, n)
+    forward[:, 1] = -rng.uniform(*wanted.forward, n)
+    twist[:, 0] = rng.uniform(-1.0, 0.8, n)
+    flex[:, 1] = -rng.uniform(*wanted.flexed, n)
+    pronation[:, 0] = rng.uniform(-0.4, 0.5)
+    if goal == "hang":  # a hanging arm swings about the axis of both shoulders
+        swing = rotation_matrix(np.stack([forward[:, 1], down[:, 1], down[:, 2]], 1))
+    else:
+        swing = rotation_matrix(forward) @ rotation_matrix(down)
+    upper = rotation_vector(swing @ rotation_matrix(twist)) * mirror
+    lower = rotation_vector(rotation_matrix(flex) @ rotation_matrix(pronation)) * mirror
+
+    world, positions = joint_positions(build, rotations)
+    rest = build.joints
+    upper_world = world[collar] @ rotation_matrix(upper)
+    elbows = positions[shoulder] + upper_world @ (rest[elbow] - rest[shoulder])
+    lower_world = upper_world @ rotation_matrix(lower)
+    wrists = elbows + lower_world @ (rest[wrist] - rest[elbow])
+    tips = elbows + lower_world @ ((rest[wrist] - rest[elbow]) * (1 + HAND_LENGTH))
+    reach = np.linalg.norm(rest[elbow] - rest[shoulder]) + np.linalg.norm(rest[wrist] - rest[elbow])
+    offset = np.asarray(wanted.place) * [1 - 2 * side, 1, 1] + rng.normal(0, 0.08, 3)
+    target = positions[shoulder] + reach * world[SPINE3] @ offset
+    capsules = body_capsules(build, world, positions) + (
+        arm_capsules(build, world, positions, 1 - side) if other_arm else []
+    )
+    clear = np.min([clearance(build, capsules, points) for points in _along(elbows, wrists, tips)], axis=0)
+    beyond = np.maximum(np.linalg.norm(upper, axis=1) - LIMITS[shoulder], 0)
+    cost = np.linalg.norm(wrists - target, axis=1) + 20 * np.maximum(MARGIN - clear, 0) + 5 * beyond
+    best = int(np.argmin(cost))
+    rotations[shoulder], rotations[elbow] = upper[best], lower[best]
+    rotations[wrist] = rng.normal(0, 1, 3) * [0.08, 0.12, 0.2]
+    return float(clear[best])
+
+
+def arm_clearance(build: Build, rotations: Float[np.ndarray, "j 3"]) -> float:
+    """How far (metres) both forearms and hands are from the body and each other; negative if one is inside."""
+    world, positions = joint_positions(build, rotations)
+    body, worst = body_capsules(build, world, positions), np.inf
+    for side in (0, 1):
+        _, _, elbow, wrist = ARMS[side]
+        tip = positions[wrist] + HAND_LENGTH * (positions[wrist] - positions[elbow])
+        points = np.concatenate(_along(positions[elbow][None], positions[wrist][None], tip[None]))
+        worst = min(worst, clearance(build, body + arm_capsules(build, world, positions, 1 - side), points).min())
+    return float(worst)
+
+
+Capsule = tuple[np.ndarray, np.ndarray, float]
+"""Two ends (3,) and a radius, metres."""
+
+
+def body_capsules(
+    build: Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"]
+) -> list[Capsule]:
+    """Trunk, legs and head of a posed body."""
+    sideways = 0.25 * (positions[LEFT_HIP] - positions[RIGHT_HIP])
+    top = positions[NECK] + world[SPINE3] @ np.asarray([0, -0.06, 0])
+    head = positions[HEAD] + world[HEAD] @ np.asarray([0, 0.09, 0.03])
+    return [
+        *((positions[PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius) for s in (-1.0, 0.0, 1.0)),
+        (positions[LEFT_HIP], positions[LEFT_KNEE], build.thigh_radius),
+        (positions[RIGHT_HIP], positions[RIGHT_KNEE], build.thigh_radius),
+        (positions[LEFT_KNEE], positions[LEFT_ANKLE], build.shin_radius),
+        (positions[RIGHT_KNEE], positions[RIGHT_ANKLE], build.shin_radius),
+        (head, head, HEAD_RADIUS),
+    ]
+
+
+def arm_capsules(
+    build: Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"], side: int
+) -> list[Capsule]:
+    """Upper arm, forearm and hand of one side."""
+    _, shoulder, elbow, wrist = ARMS[side]
+    tip = positions[wrist] + HAND_LENGTH * (positions[wrist] - positions[elbow])
+    radius = build.arm_radius + 0.01
+    return [(positions[shoulder], positions[elbow], radius), (positions[elbow], tip, radius)]
+
+
+def clearance(build: Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+    """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
+    distances = []
+    for a, b, radius in capsules:
+        axis = b - a
+        t = np.clip((points - a) @ axis / max(axis @ axis, 1e-9), 0, 1)
+        distances.append(np.linalg.norm(points - a - t[:, None] * axis, axis=1) - radius)
+    return np.min(distances, axis=0) - build.arm_radius
+
+
+def _along(elbows, wrists, tips):
+    """Points of the forearm and the hand that must not touch the body."""
+    return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]

@@ -1,0 +1,287 @@
+"""UV atlases: a mesh cut into charts that lie flat without folding over, packed into the unit square.
+
+A chart is a connected set of faces of one piece that look towards about the same side; it is projected along the mean of
+their normals, so that lengths shrink by a known, small factor and no texture is smeared. Where a chart folds over itself,
+the hidden faces become charts of their own: both sides of a fold are found by rasterizing the charts front to back and
+back to front. Charts are placed as bitmaps, the largest first, at the first free place. All charts have one scale, times
+the density that the caller asks for (faces may deserve more): a metre of surface gets about that many texels everywhere.
+
+Texture coordinates follow `rendering.mesh.texturing`: u to the right, v up.
+"""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.core.array_types import Float, Int
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.people.surfaces import edges_of, unit
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+
+SIDES = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
+"""Directions that charts look towards at first."""
+LEAST_COSINE = 0.45
+"""A face may join its neighbours' chart if it is turned away from the chart's side by no more than this cosine."""
+NEIGHBOUR_GAIN = 0.2
+"""What a neighbour in the same chart is worth, as a cosine."""
+SMOOTHING_STEPS = 8
+PEELINGS = 3
+"""How often folded charts are taken apart; what still overlaps then is counted by the tests."""
+GUTTER = 2
+"""Texels between charts, at least."""
+CELLS = 128
+"""Cells a side of the square as it is packed."""
+SHRINKING = 0.97
+"""Scale of the next try to pack, from that of the last."""
+VERTEX_STEP, FACE_STEP = 32768, 32768
+"""Charts are padded to multiples of these for the rasterizer: few shapes are compiled."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Atlas:
+    """uvs: (u, 2) in [0, 1], v up. faces: (f, 3) indices into uvs. vertices: (u,) the mesh vertex of each uv.
+
+    charts: (f,) chart of each face. size: texels a side. texel: metres of (flat) chart per
+    texel where the density is 1.
+    """
+
+    uvs: Float[np.ndarray, "u 2"]
+    faces: Int[np.ndarray, "f 3"]
+    vertices: Int[np.ndarray, " u"]
+    charts: Int[np.ndarray, " f"]
+    size: int
+    texel: float
+
+
+def unwrap(
+    vertices: Float[np.ndarray, "n 3"],
+    faces: Int[np.ndarray, "f 3"],
+    pieces: Int[np.ndarray, " f"],
+    size: int,
+    density: Float[np.ndarray, " f"],
+) -> Atlas:
+    """Charts of a mesh, none across two `pieces` (a number per face), packed into size x size texels.
+
+    density: texels per metre of each face relative to others; the same all over a piece.
+    """
+    corners = vertices[faces]
+    normals = unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
+    pairs = _adjacent(faces)
+    pairs = pairs[pieces[pairs[:, 0]] == pieces[pairs[:, 1]]]
+    sides = _choose_sides(normals, pairs)
+    layer = np.zeros(len(faces), np.int64)
+    for _ in range(PEELINGS):
+        charts = _connected(len(faces), pairs, sides + len(SIDES) * layer)
+        flat = _flatten(vertices, faces, normals, charts, sides, density)
+        hidden = _hidden(flat, size)
+        if not hidden.any():
+            break
+        layer[hidden] += 1
+    else:
+        charts = _connected(len(faces), pairs, sides + len(SIDES) * layer)
+        flat = _flatten(vertices, faces, normals, charts, sides, density)
+    return _pack(flat, size)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Flat:
+    """Charts before packing: points (u, 2) metres from the lower left corner of their chart, heights (u,) above its plane."""
+
+    points: np.ndarray
+    heights: np.ndarray
+    faces: np.ndarray
+    vertices: np.ndarray
+    point_charts: np.ndarray
+    charts: np.ndarray
+
+
+def _adjacent(faces):
+    """(p, 2) pairs of faces that share an edge."""
+    edges = np.sort(edges_of(faces).astype(np.int64), axis=1)
+    keys = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
+    order = np.argsort(keys, kind="stable")
+    same = np.flatnonzero(keys[order][1:] == keys[order][:-1])
+    return np.stack([order[same], order[same + 1]], 1) % len(faces)
+
+
+def _choose_sides(normals, pairs):
+    """(f,) side of each face: the one it looks at, unless its neighbours agree on another that it can see as well."""
+    cosines = normals @ SIDES.T
+    allowed = cosines >= np.minimum(LEAST_COSINE, cosines.max(1, keepdims=True))
+    sides = np.argmax(cosines, axis=1)
+    source, target = np.concatenate([pairs, pairs[:, ::-1]]).T
+    for _ in range(SMOOTHING_STEPS):
+        votes = np.bincount(target * len(SIDES) + sides[source], minlength=cosines.size).reshape(cosines.shape)
+        sides = np.argmax(np.where(allowed, cosines + NEIGHBOUR_GAIN * votes, -np.inf), axis=1)
+    return sides
+
+
+def _connected(count, pairs, labels):
+    """(f,) number of the connected set of faces of one label that a face belongs to."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    a, b = pairs[labels[pairs[:, 0]] == labels[pairs[:, 1]]].T
+    graph = coo_matrix((np.ones(len(a), bool), (a, b)), shape=(count, count))
+    return connected_components(graph, directed=False)[1].astype(np.int64)
+
+
+def _flatten(vertices, faces, normals, charts, sides, density):
+    """Every chart in a plane across its mean normal, turned so that its box is small, as large as its density says."""
+    count = int(charts.max()) + 1
+    keys, inverse = np.unique(charts.repeat(3) * len(vertices) + faces.reshape(-1), return_inverse=True)
+    owner, vertex = keys // len(vertices), keys % len(vertices)
+    axis = np.stack([np.bincount(charts, weights=normals[:, i], minlength=count) for i in range(3)], 1)
+    axis = unit(axis)
+    worst = np.full(count, np.inf)
+    np.minimum.at(worst, charts, np.sum(normals * axis[charts], 1))
+    some_side = np.zeros(count, np.int64)
+    some_side[charts] = sides
+    axis = np.where((worst < LEAST_COSINE)[:, None], SIDES[some_side], axis)
+    helper = np.where(np.abs(axis[:, 1:2]) < 0.8, [[0.0, 1.0, 0.0]], [[0.0, 0.0, 1.0]])
+    right = unit(np.cross(helper, axis))
+    up = np.cross(axis, right)
+    flat = np.stack([np.sum(vertices[vertex] * side[owner], 1) for side in (right, up)], 1)
+    flat = _turned(flat, owner, count)
+    low = np.stack([_extreme(np.minimum, flat[:, i], owner, count) for i in range(2)], 1)
+    heights = np.sum(vertices[vertex] * axis[owner], 1)
+    enlarged = np.ones(count)
+    enlarged[charts] = density
+    return _Flat(
+        ((flat - low[owner]) * enlarged[owner, None]).astype(np.float32),
+        heights,
+        inverse.reshape(-1, 3),
+        vertex,
+        owner,
+        charts,
+    )
+
+
+def _turned(flat, owner, count, angles=8):
+    """Points (u, 2) with every chart turned by the one of a few angles that makes its bounding box smallest, wide side right."""
+    best_area, best = np.full(count, np.inf), flat
+    for angle in np.arange(angles) * (np.pi / angles):
+        c, s = np.cos(angle), np.sin(angle)
+        turned = flat @ np.asarray([[c, s], [-s, c]])
+        extent = [_extreme(np.maximum, turned[:, i], owner, count) - _extreme(np.minimum, turned[:, i], owner, count)
+                  for i in range(2)]  # fmt: skip
+        area = extent[0] * extent[1] + np.where(extent[0] < extent[1], 1e-9, 0)
+        better = area < best_area - 1e-12
+        best_area = np.where(better, area, best_area)
+        best = np.where(better[owner][:, None], turned, best)
+    return best
+
+
+def _extreme(function, values, owner, count):
+    result = np.full(count, np.inf if function is np.minimum else -np.inf)
+    function.at(result, owner, values)
+    return result
+
+
+def _hidden(flat: _Flat, size):
+    """(f,) faces that lie below others of their chart, where charts overlap themselves."""
+    corners, scale = _shelves(flat, size)
+    pixels = (flat.points * scale + corners[flat.point_charts]).astype(np.float32)
+    span = max(float(np.ptp(flat.heights)), 1e-6)
+    depth = 2 - (flat.heights - flat.heights.min()) / span
+    near = _rasterize(pixels, depth, flat.faces, size)[0]
+    far = _rasterize(pixels, 3 - depth, flat.faces, size)[0]
+    hidden = np.zeros(len(flat.faces), bool)
+    hidden[far[near != far]] = True
+    return hidden
+
+
+def _shelves(flat, size):
+    """Rough places (charts, 2) in texels and the scale (texels per metre): rows of charts of falling height."""
+    count = int(flat.charts.max()) + 1
+    width, height = (_extreme(np.maximum, flat.points[:, i], flat.point_charts, count) for i in range(2))
+    order = np.argsort(-height)
+    scale = 0.9 * size / np.sqrt(np.sum(width * height))
+    while True:
+        corners, x, y, row = np.zeros((count, 2)), 0.0, 0.0, 0.0
+        for chart in order:
+            w, h = width[chart] * scale + GUTTER, height[chart] * scale + GUTTER
+            if x + w > size:
+                x, y, row = 0.0, y + row, 0.0
+            corners[chart] = x + GUTTER / 2, y + GUTTER / 2
+            x, row = x + w, max(row, h)
+        if y + row <= size and width.max() * scale + GUTTER <= size:
+            return corners, scale
+        scale *= 0.95
+
+
+def _rasterize(pixels, depth, faces, size):
+    """(size, size) face of every texel (-1: none) and (size, size, 3) its weights; y up, row 0 on top."""
+    points = np.stack([pixels[:, 0] * depth, (size - pixels[:, 1]) * depth, depth * np.ones(len(pixels))], 1)
+    points = np.pad(points.astype(np.float32), ((0, -len(points) % VERTEX_STEP), (0, 0)), constant_values=1)
+    faces = np.pad(faces.astype(np.int32), ((0, -len(faces) % FACE_STEP), (0, 0)))
+    camera = Camera(jnp.eye(3, dtype=jnp.float32), jnp.eye(4, dtype=jnp.float32), size, size)
+    fragments = rasterize_mesh(jnp.asarray(points), jnp.asarray(faces), camera)
+    return np.asarray(fragments.face_ids), np.asarray(fragments.barycentrics)
+
+
+def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s 3"]]:
+    """What every texel shows: its face (-1: none) and the weights of the face's corners. Row 0 is the top (v = 1)."""
+    return _rasterize(atlas.uvs * atlas.size, np.float32(1), atlas.faces, atlas.size)
+
+
+def _pack(flat: _Flat, size) -> Atlas:
+    """Charts as bitmaps of cells at the first free place, shrunk together until all fit."""
+    scale = size / np.sqrt(_box_areas(flat).sum())  # the boxes alone would fill the square: a start that is too large
+    while (corners := _place(flat, scale, size)) is None:
+        scale *= SHRINKING
+    uvs = (flat.points * scale + corners[flat.point_charts]) / size
+    return Atlas(uvs.astype(np.float32), flat.faces.astype(np.int32), flat.vertices, flat.charts, size, 1 / scale)
+
+
+def _box_areas(flat):
+    count = int(flat.charts.max()) + 1
+    width, height = (_extreme(np.maximum, flat.points[:, i], flat.point_charts, count) for i in range(2))
+    return width * height
+
+
+def _place(flat, scale, size):
+    """Corners (charts, 2) in texels, or None if the charts do not fit."""
+    cell = size // CELLS
+    masks = _bitmaps(flat, scale, cell)
+    if sum(np.count_nonzero(mask) for mask in masks) > CELLS * CELLS:
+        return None
+    free = np.ones((CELLS, CELLS), bool)
+    corners = np.zeros((len(masks), 2))
+    for chart in sorted(range(len(masks)), key=lambda i: -masks[i].size):
+        at = _first_free(free, masks[chart])
+        if at is None:
+            return None
+        rows, columns = masks[chart].shape
+        free[at[0] : at[0] + rows, at[1] : at[1] + columns] &= ~masks[chart]
+        corners[chart] = at[1] * cell + GUTTER / 2, at[0] * cell + GUTTER / 2
+    return corners
+
+
+def _first_free(free, mask):
+    """(row, column) at which all cells of a bitmap are free, the lowest one; None if there is none."""
+    rows, columns = (n - m + 1 for n, m in zip(free.shape, mask.shape, strict=True))
+    if rows < 1 or columns < 1:
+        return None
+    fits = np.ones((rows, columns), bool)
+    for row, column in np.argwhere(mask):
+        fits &= free[row : row + rows, column : column + columns]
+    place = int(np.argmax(fits))
+    return divmod(place, columns) if fits.flat[place] else None
+
+
+def _bitmaps(flat, scale, cell):
+    """For every chart the cells (rows, columns) that the boxes of its faces touch, half a gutter around them included."""
+    corners = (flat.points * scale)[flat.faces]
+    low = np.floor(corners.min(1) / cell).astype(np.int64)
+    high = np.floor((corners.max(1) + GUTTER) / cell).astype(np.int64)
+    count = int(flat.charts.max()) + 1
+    extent = np.zeros((count, 2), np.int64)
+    np.maximum.at(extent, flat.charts, high + 1)
+    start = np.concatenate([[0], np.cumsum(extent[:, 0] * extent[:, 1])])
+    cells = np.zeros(start[-1], bool)
+    for step in np.ndindex(*((high - low).max(0) + 1)):
+        x, y = np.minimum(low + step, high).T
+        cells[start[flat.charts] + y * extent[flat.charts, 0] + x] = True
+    return [cells[a:b].reshape(h, w) for a, b, (w, h) in zip(start[:-1], start[1:], extent, strict=True)]

@@ -1,0 +1,303 @@
+"""Skin, face, eyes and hair colours, painted in template coordinates so that they sit on the features of every shape."""
+
+import dataclasses
+
+import numpy as np
+
+from humangs_jax.people.fabrics import Material, Spots, band, colour, mix
+from humangs_jax.people.hair import SHORT_LINE, above_line, beard_field
+from humangs_jax.people.haircuts import LONG_CUTS, Haircut
+from humangs_jax.people.noise import Ripples, lattice
+
+EYE_X, EYE_Y, MOUTH_Y = 0.029, 0.330, 0.2629
+HAND_Y = 0.085
+"""Template height that parts the backs of the hands from the palms."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Complexion:
+    """Colours (3,) of skin, lips, hair, iris and nails; the rest are strengths in [0, 1].
+
+    brow: of the brows. freckles. wrinkles: of age. shadow: make-up on the lids, with its colour. liner: around the eyes.
+    blush: on the cheeks. tan: of arms and face against the rest.
+    """
+
+    skin: np.ndarray
+    lips: np.ndarray
+    hair: np.ndarray
+    iris: np.ndarray
+    nails: np.ndarray
+    shadow_colour: np.ndarray
+    brow: float
+    freckles: float
+    wrinkles: float
+    shadow: float
+    liner: float
+    blush: float
+    tan: float
+
+
+def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Complexion:
+    """Random colouring; fair skin goes with any hair, dark skin with dark hair, age with grey."""
+    darkness = rng.beta(1.05, 1.15)
+    fair, mid, dark = np.asarray([0.86, 0.67, 0.57]), np.asarray([0.70, 0.49, 0.36]), np.asarray([0.26, 0.155, 0.105])
+    skin = fair + (mid - fair) * min(2 * darkness, 1) if darkness < 0.5 else mid + (dark - mid) * (2 * darkness - 1)
+    undertone = rng.normal(0, 0.035)
+    skin = np.clip(skin * (1 + rng.normal(0, 0.02, 3)) * [1 + undertone, 1, 1 - 1.3 * undertone], 0.05, 0.92)
+    made_up = not male and rng.random() < 0.55
+    lips = skin * np.asarray([0.90, 0.64, 0.64])
+    if made_up and rng.random() < 0.75:
+        dye = colour(
+            rng.choice([rng.uniform(0.94, 1.03), rng.uniform(0.935, 0.97)]),
+            rng.uniform(0.45, 0.8),
+            rng.uniform(0.35, 0.75),
+        )
+        lips = 0.3 * lips + 0.7 * dye
+    grey = float(np.clip((years - 40) / 35, 0, 0.85))
+    odds = _hair_odds(darkness) * (1 - grey)
+    odds[4] += grey
+    if years > 60:
+        odds[5] *= 0.3
+    kind = rng.choice(["black", "brown", "blond", "red", "grey", "dyed"], p=odds / odds.sum())
+    hair = {
+        "black": colour(0.07, 0.3, rng.uniform(0.05, 0.12)),
+        "brown": colour(rng.uniform(0.05, 0.09), rng.uniform(0.5, 0.7), rng.uniform(0.15, 0.4)),
+        "blond": colour(rng.uniform(0.09, 0.13), rng.uniform(0.35, 0.6), rng.uniform(0.5, 0.76)),
+        "red": colour(rng.uniform(0.03, 0.06), rng.uniform(0.6, 0.8), rng.uniform(0.35, 0.6)),
+        "grey": colour(0.1, 0.05, rng.uniform(0.3, 0.66)),
+        "dyed": colour(rng.random(), 0.55, 0.55),
+    }[kind]
+    brown = darkness > 0.45 or rng.random() < 0.4
+    iris = colour(0.07, 0.6, rng.uniform(0.1, 0.3)) if brown else colour(rng.uniform(0.25, 0.62), 0.4, 0.5)
+    nails = skin * [1.02, 0.9, 0.9]
+    if made_up and rng.random() < 0.5:
+        nails = colour(rng.choice([rng.uniform(0.9, 1.05), rng.random()]), rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.8))
+    return Complexion(
+        skin=skin.astype(np.float32),
+        lips=np.asarray(lips, np.float32),
+        hair=hair,
+        iris=iris,
+        nails=np.asarray(nails, np.float32),
+        shadow_colour=colour(rng.random(), rng.uniform(0.2, 0.6), rng.uniform(0.2, 0.6)),
+        brow=rng.uniform(0.55, 0.95),
+        freckles=rng.uniform(0.3, 0.8) if darkness < 0.35 and rng.random() < 0.22 else 0.0,
+        wrinkles=float(np.clip((years - 35) / 40, 0, 1)),
+        shadow=rng.uniform(0.2, 0.7) if made_up and rng.random() < 0.6 else 0.0,
+        liner=rng.uniform(0.4, 0.9) if made_up else 0.0 if male else rng.uniform(0.0, 0.25),
+        blush=rng.uniform(0.3, 0.8) if made_up else rng.uniform(0.0, 0.35),
+        tan=rng.uniform(0.0, 0.12) * (darkness < 0.6),
+    )
+
+
+def _hair_odds(darkness):
+    dark = np.clip((darkness - 0.22) / 0.2, 0, 1)
+    fair_odds, dark_odds = (
+        np.asarray([0.2, 0.35, 0.22, 0.08, 0.06, 0.05]),
+        np.asarray([0.80, 0.12, 0.01, 0.0, 0.03, 0.03]),
+    )
+    return fair_odds + (dark_odds - fair_odds) * dark
+
+
+@dataclasses.dataclass(frozen=True)
+class Features:
+    """Shapes of what is painted on a face: brows, lips, lids, nose. Metres, or factors around 1."""
+
+    brow_thickness: float
+    brow_arch: float
+    brow_height: float
+    lip_width: float
+    lip_fullness: float
+    eye_opening: float
+    nose: float
+
+
+def sample_features(rng: np.random.Generator) -> Features:
+    """Random features."""
+    return Features(
+        brow_thickness=rng.uniform(0.0024, 0.0056),
+        brow_arch=rng.uniform(0.2, 1.7),
+        brow_height=rng.uniform(-0.0025, 0.0025),
+        lip_width=rng.uniform(0.9, 1.14),
+        lip_fullness=rng.uniform(0.65, 1.25),
+        eye_opening=rng.uniform(0.85, 1.15),
+        nose=rng.uniform(0.85, 1.25),
+    )
+
+
+def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut) -> Material:
+    """Skin with lips, cheeks, brows, lids, nostrils, stubble, nails, knuckles, freckles, and tones that vary over the body."""
+    cloud, blotches = Ripples(rng, 0.07), Ripples(rng, 0.25)
+    features, seed = sample_features(rng), int(rng.integers(1 << 20))
+
+    def albedo(s: Spots):
+        x, y, z = np.abs(s.template[:, 0]), s.template[:, 1], s.template[:, 2]
+        result = tones.skin * (1 + 0.035 * cloud(s.template) + 0.03 * blotches(s.template))[:, None]
+        result = result * (1 - tones.tan * np.clip((x - 0.2) / 0.3, 0, 1) * (y > -0.1))[:, None]
+        i = np.flatnonzero((x > 0.6) & (y > -0.1))
+        if len(i):
+            result[i] = _hand(tones, result[i], x[i], y[i], z[i])
+        red = np.exp(-(((y + 0.764) / 0.05) ** 2)) * (y < -0.5) + np.exp(-(((x - 0.411) / 0.03) ** 2)) * (y > 0) * (
+            z < 0
+        )
+        result = mix(result, result * np.asarray([0.96, 0.82, 0.8]), 0.5 * red)
+        i = np.flatnonzero((y > 0.19) & (z > -0.14) & (x < 0.2))
+        if len(i):
+            result[i] = _face(tones, haircut, features, result[i], x[i], y[i], z[i], s.template[i], seed)
+        return result
+
+    return Material(albedo, wrinkles=0.0, sheen=0.25)
+
+
+def _hand(tones, result, x, y, z):
+    """Palms are paler, knuckles and finger tips redder, nails shine."""
+    palm = np.clip((HAND_Y - y) / 0.012, 0, 1) * np.clip((x - 0.66) / 0.03, 0, 1)
+    pale = 0.35 * tones.skin + 0.65 * np.asarray([0.82, 0.62, 0.53], np.float32)
+    result = mix(result, pale, 0.55 * palm)
+    tip = np.clip((x - 0.79) / 0.03, 0, 1)
+    knuckle = np.exp(-(((x - 0.745) / 0.008) ** 2)) * (1 - palm)
+    return mix(result, result * np.asarray([0.98, 0.82, 0.8]), np.clip(0.5 * tip + 0.5 * knuckle, 0, 1))
+
+
+def _face(tones, haircut, features, result, x, y, z, template, seed):
+    front = np.clip((z - 0.07) / 0.02, 0, 1)
+    signed = template[:, 0]
+    result = _flushed(tones, features, result, x, y, front, template, seed)
+    result = _eyes(tones, features, result, x, y, front)
+    result = _aged(tones, result, x, y, z, front)
+    width = 0.026 * features.lip_width
+    corner = np.clip(1 - (x / width) ** 2, 0, 1)
+    bow = 0.009 * features.lip_fullness * corner * (1 - 0.35 * np.exp(-((x / 0.005) ** 2)))
+    low = 0.0115 * features.lip_fullness * corner**0.7
+    lips = band(y, MOUTH_Y - low, MOUTH_Y + bow, 0.002) * (corner > 0) * (z > 0.08)
+    shine = 1 + 0.25 * np.exp(-(((y - MOUTH_Y + 0.006) / 0.003) ** 2) - (x / 0.01) ** 2)
+    result = mix(result, tones.lips * shine[:, None], 0.85 * lips)
+    line = band(y, MOUTH_Y - 0.0012, MOUTH_Y + 0.0012, 0.001) * (x < width) * (z > 0.08)
+    result = mix(result, tones.lips * 0.35, line)
+    nostril = np.exp(-(((x - 0.0085 * features.nose) / 0.004) ** 2) - (((y - 0.2845) / 0.0025) ** 2)) * (z > 0.1)
+    result = mix(result, result * 0.3, np.clip(nostril, 0, 1))
+    brow_line = 0.3485 + features.brow_height + features.brow_arch * (0.0045 - 18 * (x - 0.033) ** 2)
+    inside = band(x, 0.012, 0.05, 0.006)
+    hairs = 0.7 + 0.6 * lattice(np.stack([signed / 0.0016 + y / 0.004, y / 0.006], -1), seed + 3)
+    brow = (
+        band(np.abs(y - brow_line), -1, features.brow_thickness * np.clip(1.5 - x / 0.06, 0.4, 1), 0.002)
+        * inside
+        * front
+    )
+    result = mix(result, np.minimum(tones.hair, 0.42) * 0.75, np.clip(tones.brow * brow * hairs, 0, 1))
+    return _stubble(tones, haircut, result, x, y, z, lips, template, seed)
+
+
+def _flushed(tones, features, result, x, y, front, template, seed):
+    """Cheeks, nose and ears; freckles."""
+    cheeks = np.exp(-(((x - 0.043) / 0.02) ** 2) - (((y - 0.292) / 0.018) ** 2))
+    nose = 0.7 * np.exp(-((x / (0.012 * features.nose)) ** 2) - (((y - 0.295) / 0.012) ** 2))
+    result = mix(result, result * np.asarray([1.02, 0.82, 0.80]), 0.6 * front * np.clip(cheeks + nose, 0, 1))
+    blush = np.exp(-(((x - 0.050) / 0.018) ** 2) - (((y - 0.298 - 0.3 * (x - 0.05)) / 0.014) ** 2))
+    result = mix(result, result * np.asarray([1.05, 0.68, 0.70]), tones.blush * front * blush)
+    ears = (x > 0.0745) & (y > 0.27) & (y < 0.36)
+    result = mix(result, result * np.asarray([1.0, 0.8, 0.77]), 0.7 * ears)
+    if tones.freckles > 0:
+        spots = lattice(template / 0.0034, seed + 7)
+        where = np.exp(-(((y - 0.305) / 0.022) ** 2)) * front
+        result = mix(
+            result, result * np.asarray([0.72, 0.58, 0.48]), tones.freckles * where * band(spots, 0.68, 2, 0.1)
+        )
+    return result
+
+
+def _eyes(tones, features, result, x, y, front):
+    """Sockets, make-up, lashes."""
+    socket = np.exp(-(((x - EYE_X) / 0.017) ** 2) - (((y - EYE_Y) / 0.010) ** 2))
+    result = mix(result, result * np.asarray([0.72, 0.66, 0.66]), 0.7 * socket * front)
+    lid = np.exp(-(((x - EYE_X - 0.002) / 0.017) ** 2) - (((y - EYE_Y - 0.008) / 0.007) ** 2)) * (y > EYE_Y)
+    result = mix(result, tones.shadow_colour, tones.shadow * lid * front)
+    rim = np.sqrt(((x - EYE_X) / 0.0155) ** 2 + ((y - EYE_Y - 0.001) / (0.0075 * features.eye_opening)) ** 2)
+    lashes = band(rim, 0.75, 1.08 + 0.18 * tones.liner, 0.15)
+    result = mix(result, result * 0.22, 0.8 * lashes * (y > EYE_Y - 0.002) * front)
+    wing = (
+        band(np.abs(y - EYE_Y - 0.25 * (x - 0.042)), -1, 0.0016) * band(x, 0.041, 0.041 + 0.008 * tones.liner) * front
+    )
+    return mix(result, result * 0.2, np.clip(tones.liner * (0.7 * lashes * (y < EYE_Y) + wing), 0, 1))
+
+
+def _aged(tones, result, x, y, z, front):
+    """Folds beside nose and mouth, lines on the forehead, bags and crow's feet."""
+    if tones.wrinkles <= 0:
+        return result
+    fold = np.abs(x - 0.0165 - 0.55 * (0.287 - y)) + 10 * (np.abs(y - 0.272) > 0.018)
+    forehead = np.abs(((y - 0.368 + 0.8 * x * x) / 0.0085) % 1 - 0.5) * 0.0085
+    lines = 0.8 * band(fold, -1, 0.0016, 0.002) + 0.55 * band(forehead, -1, 0.0008) * band(y, 0.36, 0.392, 0.006) * (
+        x < 0.045
+    )
+    bags = np.exp(-(((x - 0.028) / 0.013) ** 2) - (((y - 0.3165) / 0.004) ** 2))
+    feet = band(np.abs((y - EYE_Y) / np.maximum(x - 0.038, 1e-3) * 2 % 1 - 0.5), -1, 0.12, 0.1) * band(
+        x, 0.046, 0.056, 0.002
+    )
+    lines = lines + 0.5 * feet * (np.abs(y - EYE_Y) < 0.012)
+    return mix(
+        result,
+        result * np.asarray([0.68, 0.58, 0.55]),
+        np.clip(tones.wrinkles * front * (0.7 * lines + 0.45 * bags), 0, 0.8),
+    )
+
+
+def _stubble(tones, haircut, result, x, y, z, lips, template, seed):
+    """Roots of hair and beard, which also soften the edges of what grows there."""
+    grain = 0.7 + 0.6 * lattice(template / 0.0026, seed + 11)
+    above = above_line(template, SHORT_LINE, haircut.receding)
+    cover = np.clip((above + 0.006) / 0.016, 0, 1) * (1 - (np.abs(x) > 0.0765) * (y < 0.355))
+    scalp = {"bald": 0.12, "buzz": 0.8}.get(haircut.cut, 0.92)
+    if haircut.cut == "bald":
+        fringe = np.clip((0.352 - y) / 0.012, 0, 1)
+        scalp = 0.1 + 0.5 * fringe
+    elif haircut.cut in LONG_CUTS:
+        cover = cover * (above > 0.0)
+    result = mix(result, tones.hair * 0.8, np.clip(scalp * cover * grain, 0, 1))
+    chin = {"none": 0.0, "stubble": 0.75}.get(haircut.beard, 0.9)
+    if chin > 0:
+        kind = haircut.beard if haircut.beard in ("moustache", "goatee") else "full"
+        jaw = np.clip((beard_field(template, kind) + 0.005) / 0.018, 0, 1) * (1 - lips)
+        result = mix(result, 0.6 * tones.hair + 0.15 * result, np.clip(0.8 * chin * jaw * grain, 0, 1))
+    return result
+
+
+def eye_material(tones: Complexion) -> Material:
+    """White, iris, pupil and a catch-light that belongs to the surface."""
+
+    def albedo(s: Spots):
+        d = s.template
+        angle = np.arccos(np.clip(d[:, 2] / np.maximum(np.linalg.norm(d, axis=1), 1e-6), -1, 1))
+        white = np.asarray([0.84, 0.82, 0.80], np.float32)
+        result = mix(white, tones.iris, band(angle, -1, 0.47, 0.05))
+        result = mix(result, tones.iris * 0.4, band(angle, 0.40, 0.48, 0.05))
+        result = mix(result, np.asarray([0.02, 0.02, 0.02], np.float32), band(angle, -1, 0.21, 0.05))
+        glint = np.sqrt((d[:, 0] - 0.15) ** 2 + (d[:, 1] - 0.2) ** 2)
+        return mix(result, np.asarray([0.85, 0.85, 0.85], np.float32), band(glint, -1, 0.08, 0.05) * (d[:, 2] > 0))
+
+    return Material(albedo)
+
+
+def hair_material(rng: np.random.Generator, base: np.ndarray, haircut: Haircut) -> Material:
+    """Strands that run down from the crown: fine and coarse streaks, a bright ring, darker roots."""
+    seed = int(rng.integers(1 << 20))
+    tips = base * rng.uniform(0.75, 1.35)
+    curls = haircut.cut in ("curly", "afro")
+    ring = rng.uniform(0.385, 0.405)
+
+    def albedo(s: Spots):
+        x, y, z = s.template[:, 0], s.template[:, 1], s.template[:, 2] - 0.02
+        angle, radial = np.arctan2(x, z), np.sqrt(x * x + z * z)
+        if curls:
+            fine = lattice(s.template / 0.006, seed)
+            coarse = lattice(s.template / 0.02, seed + 1)
+        else:
+            strand, run = angle / 0.04, (y - 0.6 * radial) / 0.09
+            fine = lattice(np.stack([strand + 0.8 * np.sin(run), run, radial / 0.05], -1), seed)
+            coarse = lattice(np.stack([strand / 5, run / 2], -1), seed + 1)
+        shine = 0.0 if curls else np.exp(-(((y - ring + 0.012 * (coarse - 0.5)) / 0.016) ** 2)) * (0.4 + fine)
+        bright = 1 + haircut.grain * (1.2 * (fine - 0.5) + 0.9 * (coarse - 0.5)) + 0.5 * shine
+        down = np.clip((0.3 - y) / 0.35, 0, 1)
+        sheen = 0.035 * shine if not curls else 0.0
+        return mix(base, tips, down) * np.clip(bright, 0.25, 2.2)[:, None] + np.asarray(sheen)[..., None]
+
+    return Material(albedo, wrinkles=0.0, sheen=0.15 if curls else 0.45)

@@ -1,0 +1,273 @@
+"""Garments: shells cut out of the body and draped around it, and tubes (skirts) swept around hips and legs.
+
+A cut is a field over template coordinates, positive where there is cloth. A shell starts on the skin, is smoothed (cloth does
+not follow navels), moved outwards to the convex outlines of trunk and limbs, and never comes nearer to the skin than its ease.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from humangs_jax.people import anatomy as anatomy_module
+from humangs_jax.people import slices
+from humangs_jax.people.anatomy import ANKLE, Anatomy, sewn_coordinates, smoothstep
+from humangs_jax.people.noise import ripples
+from humangs_jax.people.surfaces import (
+    Surface,
+    boundary_edges,
+    cut,
+    grid_faces,
+    smooth,
+    turn_in_hems,
+    unit,
+    vertex_normals,
+)
+
+HEM_MARGIN = 0.012
+"""Skin is removed below cloth from this far inside the hem (metres of template coordinates)."""
+UNDER_A_HEM = 0.009
+"""Metres that a skirt is narrower where something hangs over it."""
+TUBE_COLUMNS, TUBE_STEP = 72, 0.035
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """How a shell hangs. Metres.
+
+    ease: distance from skin (at least) and from the outlines. hang: slope by which hanging cloth may narrow downwards (metres
+    per metre; large clings). sleeve, leg: width added at the end of the limb. fold: height of the folds. hem: depth of the hem.
+    quilt: period of padded rings, 0 for none. inner: nothing comes nearer to the skin than this (what is worn below).
+    calm: height above which there are no folds. skirted: below the hips it goes around both legs (tops), not around each.
+    """
+
+    ease: float
+    hang: float = 3.0
+    sleeve: float = 0.0
+    leg: float = 0.0
+    leg_hang: float = 3.0
+    fold: float = 0.004
+    hem: float = 0.008
+    quilt: float = 0.0
+    inner: float = 0.0
+    calm: float = 9.0
+    skirted: bool = False
+
+
+def shell(rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], fit: Fit) -> Surface:
+    """A garment that covers the skin where all fields (n,) over the body's vertices are positive."""
+    skin = anatomy.skin
+    surface = skin.with_attributes(
+        skin_point=skin.vertices, arm=anatomy.arm, leg=anatomy.leg, **{f"field{i}": f for i, f in enumerate(fields)}
+    )
+    for i in range(len(fields)):
+        surface = cut(surface, surface.attributes[f"field{i}"])
+    draped = _drape(rng, anatomy, surface, fit)
+    weights = smooth_weights(draped.weights, draped.faces, 4)
+    kept = {name: draped.attributes[name] for name in ("template", "cloth")}
+    return turn_in_hems(Surface(draped.vertices, draped.faces, weights, kept), fit.hem)
+
+
+def covered(fields: list[np.ndarray], margin: float = HEM_MARGIN) -> np.ndarray:
+    """(n,) whether a body vertex lies under the cloth of `fields`, hems excluded."""
+    return np.min(fields, axis=0) > margin
+
+
+def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> np.ndarray:
+    """Skinning weights (n, j) smoothed over a surface; rows sum to 1."""
+    used = weights.max(0) > 0
+    smoothed = np.zeros_like(weights)
+    smoothed[:, used] = smooth(weights[:, used], faces, iterations)
+    return smoothed / smoothed.sum(1, keepdims=True)
+
+
+def _drape(rng, anatomy, surface, fit):
+    below, arm, leg = (surface.attributes[name] for name in ("skin_point", "arm", "leg"))
+    normals = unit(smooth(surface.attributes["normals"], surface.faces, 2))
+    points = smooth(below, surface.faces, 8, keep_hems=True) + fit.ease * normals
+    points = _push_trunk(anatomy, points, arm, leg, fit)
+    for side in (0, 1):
+        points = _push_arm(anatomy, points, arm, side, fit)
+        points = points if fit.skirted else _push_leg(anatomy, points, leg, side, fit)
+    points = smooth(points, surface.faces, 3, keep_hems=True)
+    seat = _over_the_seat(surface.attributes["template"])
+    if seat.any():
+        points = points + seat[:, None] * (smooth(points, surface.faces, 15, keep_hems=True) - points)
+    outer = vertex_normals(points, surface.faces)
+    cloth = smooth(surface.attributes["cloth"], surface.faces, 10, keep_hems=True)  # as the points were
+    template = smooth(surface.attributes["template"], surface.faces, 8, keep_hems=True)
+    along_limbs = sewn_coordinates(cloth, template)
+    points = points + fold_heights(rng, along_limbs, arm, leg, fit)[:, None] * outer
+    distance = np.sum((points - below) * surface.attributes["normals"], -1)
+    least = max(0.55 * fit.ease, fit.inner)
+    points = points + np.maximum(least - distance, 0)[:, None] * surface.attributes["normals"]
+    hems = np.unique(boundary_edges(surface.faces))
+    points[hems] = smooth(points, surface.faces, 4, keep_hems=True)[hems]
+    side = np.sign(surface.attributes["template"][:, 0])
+    thighs = leg > 0.6  # trouser legs do not cross the middle
+    points[:, 0] = np.where(thighs, side * np.maximum(side * points[:, 0], 0.004), points[:, 0])
+    return surface.moved(points).with_attributes(cloth=cloth, template=template)
+
+
+def _over_the_seat(template):
+    """(n,) 1 between the buttocks and below the belly, where skin has a cleft and cloth has none."""
+    x, y, _ = template.T
+    return np.exp(-((x / 0.045) ** 2)) * smoothstep(0.22, 0.28, -y) * (y > -0.5)
+
+
+def fold_heights(rng, cloth: np.ndarray, arm: np.ndarray, leg: np.ndarray, fit: Fit) -> np.ndarray:
+    """(n,) metres outwards: soft waves, drapes that fall from chest and hips, rings where joints and cuffs gather cloth."""
+    along, around = cloth[:, 1], np.arctan2(cloth[:, 0], cloth[:, 2]) * cloth[:, 3]
+    heights = fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11)
+    if fit.fold == 0:
+        return heights
+    wander = ripples(rng, cloth[:, :3], wavelength=0.3)
+    drapes = np.sin(2 * np.pi * around / 0.09 + 2.5 * wander) * np.clip(-along / 0.35, 0, 1)
+    heights = heights + 0.8 * fit.fold * drapes * (1 - arm) * np.where(leg > 0.5, 0.35, 1.0)
+    slanted = along + 0.25 * around + 0.012 * ripples(rng, cloth[:, :3], wavelength=0.12)
+    rings = np.sin(2 * np.pi * slanted / 0.055) * (0.6 + 0.4 * ripples(rng, cloth[:, :3], wavelength=0.1))
+    elbows = arm * (np.exp(-(((along + 0.14) / 0.07) ** 2)) + 0.8 * np.exp(-(((along + 0.34) / 0.06) ** 2)))
+    knees = leg * (
+        np.exp(-(((along + 0.79) / 0.07) ** 2))
+        + 1.3 * np.exp(-(((along + 1.12) / 0.07) ** 2))
+        + 0.6 * np.exp(-(((along + 0.46) / 0.05) ** 2))
+    )
+    heights = heights + 1.3 * fit.fold * rings * (elbows + knees)
+    heights = heights * (1 - smoothstep(fit.calm - 0.08, fit.calm, along))
+    if fit.quilt > 0:
+        heights = heights + 0.011 * (np.abs(np.sin(np.pi * along / fit.quilt)) - 0.4)
+    return heights
+
+
+def _push_trunk(anatomy, points, arm, leg, fit):
+    outline = slices.hanging(anatomy.trunk, fit.hang)
+    angle, radius = slices.polar(points[:, [0, 2]], np.zeros((1, 2)))
+    wanted = outline.radius(points[:, 1], angle) + fit.ease
+    below_armpit = 1 - smoothstep(-0.03, 0.06, anatomy_height(anatomy, points))
+    amount = (1 - arm) * (1 if fit.skirted else 1 - leg) * below_armpit
+    grown = radius + amount * np.maximum(wanted - radius, 0)
+    scale = grown / np.maximum(radius, 1e-4)
+    return np.stack([points[:, 0] * scale, points[:, 1], points[:, 2] * scale], -1)
+
+
+def anatomy_height(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
+    """(n,) heights of points above the shoulders' height less that of the template: about template y for the trunk."""
+    shoulders = anatomy.joints[anatomy_module.LEFT_SHOULDER, 1]
+    return points[:, 1] - shoulders + anatomy_module.ARM_HEIGHT
+
+
+def _push_arm(anatomy, points, arm, side, fit):
+    outline = anatomy.arms[side]
+    along = np.abs(points[:, 0])
+    start, end = outline.levels[0] + 0.12, outline.levels[-1] - 0.1
+    extra = fit.sleeve * np.clip((along - start) / (end - start), 0, 1)
+    center = outline.center(along)
+    angle, radius = slices.polar(points[:, [1, 2]], center)
+    wanted = outline.radius(along, angle) + fit.ease + extra
+    own = (points[:, 0] > 0) if side == 0 else (points[:, 0] < 0)
+    scale = 1 + own * arm * np.maximum(wanted - radius, 0) / np.maximum(radius, 1e-4)
+    across = center + (points[:, [1, 2]] - center) * scale[:, None]
+    return np.stack([points[:, 0], across[:, 0], across[:, 1]], -1)
+
+
+def _push_leg(anatomy, points, leg, side, fit):
+    shape = anatomy.legs[side]
+    inner = shape.with_radii(np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii))
+    outline = slices.hanging(inner, fit.leg_hang)
+    center = outline.center(points[:, 1])
+    angle, radius = slices.polar(points[:, [0, 2]], center)
+    down = np.clip((-0.45 - points[:, 1]) / 0.65, 0, 1)
+    wanted = outline.radius(points[:, 1], angle) + fit.ease + fit.leg * down
+    own = (points[:, 0] > 0) if side == 0 else (points[:, 0] < 0)
+    scale = 1 + own * leg * np.maximum(wanted - radius, 0) / np.maximum(radius, 1e-4)
+    across = center + (points[:, [0, 2]] - center) * scale[:, None]
+    return np.stack([across[:, 0], points[:, 1], across[:, 1]], -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Skirt:
+    """top, bottom: template heights. ease, flare: metres added at the top, and per metre further down. pleats: count, depth.
+
+    gap: half width of an opening in front, metres, negative for none; it widens by `spread` metres per metre downwards.
+    cling: metres from the top over which it does not flare.
+    """
+
+    top: float
+    bottom: float
+    ease: float
+    flare: float
+    pleats: int = 0
+    pleat_depth: float = 0.0
+    gap: float = -1.0
+    spread: float = 0.0
+    cling: float = 0.0
+
+
+def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
+    """A tube around the hips and both legs."""
+    rows = max(3, int(np.ceil((cut_of.top - cut_of.bottom) / TUBE_STEP)) + 1)
+    template_y = np.linspace(cut_of.top, cut_of.bottom, rows)
+    y = rest_height(anatomy, template_y)
+    angle = np.arange(TUBE_COLUMNS) * (2 * np.pi / TUBE_COLUMNS)
+    outline = slices.blurred(slices.hanging(anatomy.hips_and_legs, 0.15))
+    height, around = (x.reshape(-1) for x in np.meshgrid(y, angle, indexing="ij"))
+    down = np.repeat((cut_of.top - template_y) / max(cut_of.top - cut_of.bottom, 1e-6), TUBE_COLUMNS)
+    drop = np.repeat(cut_of.top - template_y, TUBE_COLUMNS)
+    radius = outline.radius(height, around) + cut_of.ease + cut_of.flare * np.maximum(drop - cut_of.cling, 0)
+    radius = radius - UNDER_A_HEM * np.clip(1 - (drop - cut_of.cling) / 0.06, 0, 1) * (cut_of.cling > 0)
+    pleats = np.cos(cut_of.pleats * around) if cut_of.pleats else 0
+    wave = ripples(rng, np.stack([np.sin(around), 0.3 * height, np.cos(around)], -1), wavelength=0.9)
+    loose = np.clip((drop - cut_of.cling) / 0.25, 0, 1) * down**0.5
+    radius = radius + loose * (cut_of.pleat_depth * pleats + 0.012 * (1 + 4 * cut_of.flare) * wave)
+    vertices = np.stack([radius * np.sin(around), height, radius * np.cos(around)], -1).astype(np.float32)
+    template = np.stack([0.16 * np.sin(around), np.repeat(template_y, TUBE_COLUMNS), 0.02 + 0.16 * np.cos(around)], -1)
+    cloth = np.stack([template[:, 0], template[:, 1], template[:, 2] - 0.02, np.full(len(template), 0.16)], -1)
+    faces = grid_faces(rows, TUBE_COLUMNS, closed=True)
+    weights = _skirt_weights(anatomy, vertices, template[:, 1])
+    surface = Surface(
+        vertices, faces, weights, {"template": template.astype(np.float32), "cloth": cloth.astype(np.float32)}
+    )
+    if cut_of.gap > 0:
+        front = np.where(vertices[:, 2] > 0, np.abs(vertices[:, 0]) - cut_of.gap - cut_of.spread * drop, 1.0)
+        surface = cut(surface, front)
+    return turn_in_hems(surface, 0.008)
+
+
+def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
+    """Rest heights of the person for heights on the trunk and the legs of the template: where the skin of that height is."""
+    x, y, _ = anatomy.skin.attributes["template"].T
+    own = (np.abs(x) < 0.2) & (y < 0.14) & (y > ANKLE)
+    bins = np.floor((y[own] - ANKLE) / 0.03).astype(int)
+    counts = np.maximum(np.bincount(bins), 1)
+    template = np.bincount(bins, y[own]) / counts
+    rest = np.bincount(bins, anatomy.skin.vertices[own, 1]) / counts
+    known = np.bincount(bins) > 0
+    inside = np.interp(template_y, template[known], rest[known])
+    below, above = template_y - template[known][0], template_y - template[known][-1]
+    return inside + np.minimum(below, 0) + np.maximum(above, 0)
+
+
+def _skirt_weights(anatomy, vertices, template_y):
+    """The trunk's weights at the waist, then more and more of the thighs (and shins), shared by the side a vertex is on."""
+    template = anatomy.skin.attributes["template"]
+    near = np.flatnonzero((np.abs(template[:, 0]) < 0.2) & (template[:, 1] < 0.0) & (template[:, 1] > -0.4))[::2]
+    trunk = nearest_weights(anatomy, vertices, near)
+    left = smoothstep(-0.09, 0.09, vertices[:, 0])
+    thigh = 0.96 * smoothstep(0.27, 0.47, -template_y)
+    shin = 0.92 * smoothstep(0.68, 0.9, -template_y)
+    legs = np.zeros_like(trunk)
+    for joint, share in (
+        (anatomy_module.LEFT_HIP, left * (1 - shin)),
+        (anatomy_module.LEFT_HIP + 1, (1 - left) * (1 - shin)),
+        (anatomy_module.LEFT_KNEE, left * shin),
+        (anatomy_module.LEFT_KNEE + 1, (1 - left) * shin),
+    ):
+        legs[:, joint] = share
+    return (trunk * (1 - thigh)[:, None] + legs * thigh[:, None]).astype(np.float32)
+
+
+def nearest_weights(anatomy: Anatomy, points: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """(n, j) mean skinning weights of the body vertices nearest to each point, among candidate vertex indices."""
+    body = anatomy.skin.vertices[candidates]
+    squared = np.sum(points**2, -1)[:, None] - 2 * points @ body.T + np.sum(body**2, -1)[None]
+    nearest = np.argpartition(squared, 6, axis=1)[:, :6]
+    return anatomy.skin.weights[candidates][nearest].mean(1)

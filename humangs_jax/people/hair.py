@@ -1,0 +1,344 @@
+"""Hair: shells grown from the scalp, tubes that fall over neck and back, buns, ponytails, beards; and knitted caps.
+
+A hairline is a template height for each azimuth around the skull (0 in front, pi at the nape), the same on both sides.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from humangs_jax.people import slices
+from humangs_jax.people.anatomy import Anatomy, smoothstep
+from humangs_jax.people.garments import nearest_weights, smooth_weights
+from humangs_jax.people.haircuts import LONG_CUTS, Haircut
+from humangs_jax.people.noise import ripples
+from humangs_jax.people.poses import HEAD, NECK, SPINE3
+from humangs_jax.people.surfaces import (
+    Surface,
+    cut,
+    grid_faces,
+    join,
+    smooth,
+    sweep,
+    turn_in_hems,
+    unit,
+)
+
+SKULL = np.asarray([0.0, 0.345, 0.02])
+"""Middle of the skull in template coordinates."""
+CROWN, NECK_HEIGHT = 0.4356, 0.189
+
+SHORT_LINE = (
+    [0.0, 0.55, 0.95, 1.2, 1.36, 1.42, 1.86, 1.95, 2.3, 3.15],
+    [0.392, 0.388, 0.368, 0.325, 0.312, 0.353, 0.353, 0.275, 0.234, 0.226],
+)
+"""Azimuths and heights: forehead, temple, sideburn before the ear, above and behind the ear, nape."""
+CAP_LINE = ([0.0, 0.8, 1.5, 2.2, 3.15], [0.375, 0.37, 0.345, 0.325, 0.315])
+TUBE_COLUMNS = 60
+
+
+FRINGE_LINES = {
+    "straight": ([-3.15, -1.2, -1.12, -0.9, -0.5, 0.0, 0.5, 0.9, 1.12, 1.2, 3.15],
+                 [-9.0, -9.0, 0.30, 0.362, 0.384, 0.388, 0.384, 0.362, 0.30, -9.0, -9.0]),
+    "parted": ([-3.15, -1.16, -1.08, -0.85, -0.5, -0.1, 0.0, 0.1, 0.5, 0.85, 1.08, 1.16, 3.15],
+               [-9.0, -9.0, 0.30, 0.35, 0.388, 0.414, 0.419, 0.414, 0.388, 0.35, 0.30, -9.0, -9.0]),
+    "side": ([-3.15, -1.2, -1.1, -0.8, -0.3, 0.25, 0.55, 0.75, 0.95, 1.1, 1.18, 3.15],
+             [-9.0, -9.0, 0.30, 0.352, 0.374, 0.402, 0.415, 0.405, 0.37, 0.30, -9.0, -9.0]),
+}  # fmt: skip
+"""Signed azimuths and heights above which longer hair covers the face: blunt, parted in the middle, combed to the right."""
+
+
+def style(rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: float = 0.0) -> list[Surface]:
+    """The surfaces of a haircut, beard included, over clothes that are `over` metres from the skin."""
+    cut_name, thick, shift = haircut.cut, haircut.thickness, haircut.receding
+    parts = []
+    if cut_name in LONG_CUTS:
+        parts.append(
+            falling_tube(rng, anatomy, thick, haircut.bottom, fringe(rng, haircut), wave=haircut.wave, over=over)
+        )
+    elif cut_name in ("curly", "afro"):
+        bumps, size = (0.3, 0.035) if cut_name == "curly" else (0.1, 0.05)
+        parts.append(scalp_shell(rng, anatomy, thick, bumps, shift=shift, bump_size=size))
+    elif cut_name == "quiff":
+        parts.append(
+            scalp_shell(rng, anatomy, thick, 0.2, shift=shift, quiff=rng.uniform(0.012, 0.026), side=haircut.side)
+        )
+    elif cut_name not in ("buzz", "bald"):
+        bumps = 0.22 if cut_name == "short" else 0.12
+        parts.append(scalp_shell(rng, anatomy, thick, bumps, shift=shift, bump_size=0.035, side=haircut.side))
+    if cut_name == "ponytail":
+        parts.append(ponytail(rng, anatomy, rng.uniform(0.2, 0.38)))
+    if cut_name == "braid":
+        parts.append(ponytail(rng, anatomy, rng.uniform(0.28, 0.42), knots=0.028))
+    if cut_name == "bun":
+        parts.append(bun(rng, anatomy, rng.uniform(0.032, 0.05), rng.uniform(0.0, 1.1)))
+    if haircut.beard in ("moustache", "goatee", "full"):
+        parts.append(beard(rng, anatomy, haircut.beard_length, haircut.beard))
+    return parts
+
+
+def fringe(rng: np.random.Generator, haircut: Haircut) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """(azimuths, heights) -> metres above the ragged edge of hair around the face."""
+    angles, heights = (np.asarray(x) for x in FRINGE_LINES[haircut.fringe])
+    phase = rng.uniform(0, 6.28, 3)
+
+    def above(azimuths, height):
+        a = azimuths * haircut.side
+        ragged = (
+            0.0035 * np.sin(23 * a + phase[0]) + 0.0025 * np.sin(41 * a + phase[1]) + 0.003 * np.sin(9 * a + phase[2])
+        )
+        return height - np.interp(a, angles, heights) - ragged
+
+    return above
+
+
+def over_ears(haircut: Haircut) -> bool:
+    """Whether nothing is seen of the ears."""
+    return haircut.cut in LONG_CUTS
+
+
+def ears(template: np.ndarray) -> np.ndarray:
+    """(n,) the outer parts of the ears."""
+    x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
+    return (x > 0.0765) & (y > 0.265) & (y < 0.36) & (z < 0.03)
+
+
+def azimuth(template: np.ndarray) -> np.ndarray:
+    """(n,) angle around the skull in [0, pi]: 0 in front, pi at the nape."""
+    return np.abs(np.arctan2(np.abs(template[:, 0]), template[:, 2] - SKULL[2]))
+
+
+def above_line(template: np.ndarray, line: tuple, shift: float = 0.0) -> np.ndarray:
+    """(n,) height above a hairline; strongly negative away from the head."""
+    above = template[:, 1] - np.interp(azimuth(template), *line) - shift
+    return np.where((template[:, 1] > 0.2) & (np.abs(template[:, 0]) < 0.12), above, -1.0)
+
+
+def scalp_shell(
+    rng,
+    anatomy: Anatomy,
+    thickness: float,
+    bumps: float,
+    line: tuple = SHORT_LINE,
+    shift: float = 0.0,
+    crown: float = 0.0,
+    bump_size: float = 0.05,
+    quiff: float = 0.0,
+    side: float = 0.0,
+    rim: float = 0.0025,
+) -> Surface:
+    """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the hairline.
+
+    bumps: share of the thickness, `bump_size` metres wide. crown: metres that the top rises above that. quiff: metres that the
+    hair stands up above the forehead. side: +1 or -1 for a parting on that side of the head, 0 for none. rim: metres that its
+    edge stands off.
+    """
+    template = anatomy.skin.attributes["template"]
+    above = above_line(template, line, shift)
+    if line is SHORT_LINE:
+        above = above + 0.0035 * ripples(rng, template, 0.018) * (np.abs(template[:, 0]) < 0.07)
+    surface = cut(anatomy.skin.with_attributes(above=above), above)
+    normals = unit(smooth(surface.attributes["normals"], surface.faces, 8))
+    full = smoothstep(-0.002, 0.022, surface.attributes["above"])
+    grown = thickness * full * (1 + bumps * ripples(rng, surface.attributes["template"], bump_size))
+    grown = np.maximum(grown, rim) + 0.3 * rim
+    base = smooth(surface.vertices, surface.faces, 3, keep_hems=True)
+    x, y, z = surface.attributes["template"].T
+    top = smoothstep(0.385, 0.425, y)
+    if side:
+        parting = np.exp(-(((x - side * 0.035) / 0.009) ** 2)) * top * (z > -0.02)
+        grown = grown * (1 - 0.55 * parting) * (1 + 0.25 * top * np.clip(-side * (x - side * 0.035) / 0.06, -1, 1))
+    points = base + grown[:, None] * normals
+    raised = quiff * smoothstep(0.02, 0.085, z) * smoothstep(0.375, 0.41, y)
+    points = points + raised[:, None] * np.asarray([0.0, 0.95, 0.35])
+    points[:, 1] += crown * smoothstep(0.39, 0.42, surface.attributes["template"][:, 1])
+    return _finish(surface.moved(points), 0.006)
+
+
+def falling_tube(
+    rng,
+    anatomy: Anatomy,
+    thickness: float,
+    bottom: float,
+    opening: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    wave: float = 0.004,
+    ends: float | None = None,
+    over: float = 0.0,
+) -> Surface:
+    """Long hair, a hood or a headscarf: the skull's outline scaled up, then falling to the height `bottom` at the back.
+
+    opening(azimuths in (-pi, pi], template heights): positive outside of the face. ends: height at which it ends in front;
+    hair ends on the shoulders at the sides. over: metres between skin and what is worn below it.
+    """
+    skin, template = anatomy.skin, anatomy.skin.attributes["template"]
+    to_rest = _rest_heights(anatomy)
+    center = np.asarray([0.0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01])
+    scale = 1 + thickness / 0.09
+    ears = (np.abs(template[:, 0]) > 0.0735) & (template[:, 1] > 0.26) & (template[:, 1] < 0.36)
+    head = (template[:, 1] > 0.24) & (np.abs(template[:, 0]) < 0.1) & ~ears & (template[:, 2] < 0.125)
+    levels = np.concatenate([np.arange(-0.3, 0.24, 0.02), np.linspace(0.24, CROWN - 0.0015, 24)])
+    spine = np.repeat(center[None, [0, 2]], len(levels), 0)
+    points = skin.vertices[head]
+    skull = slices.blurred(slices.outlines(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.012))
+    falling = slices.hanging(skull, 0.25)
+    trunk = (np.abs(template[:, 0]) < 0.12) & (template[:, 1] < 0.24) & (template[:, 1] > -0.35)
+    points = skin.vertices[trunk]
+    back = slices.blurred(slices.outlines(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.02), 2)
+
+    angle = np.arange(TUBE_COLUMNS) * (2 * np.pi / TUBE_COLUMNS)
+    top = CROWN + (CROWN - SKULL[1]) * (scale - 1)
+    dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))
+    rows = np.concatenate([dome, np.arange(SKULL[1] - 0.02, min(bottom, 0.3), -0.022)])
+    row_height, around = (x.reshape(-1) for x in np.meshgrid(rows, angle, indexing="ij"))
+    height = to_rest(row_height)
+    inner = center[1] + (height - center[1]) / scale
+    brim, summit = to_rest(0.385), center[1] + (to_rest(top) - center[1]) / scale
+    vault = np.sqrt(np.clip(1 - np.clip((inner - brim) / (summit - brim), 0, 1) ** 2, 0, 1))  # the dome above the brim
+    radius = scale * vault * falling.radius(np.minimum(inner, brim), around)
+    below = smoothstep(0.0, 0.12, SKULL[1] - row_height)
+    radius = np.maximum(
+        radius,
+        (back.radius(height, around) + (0.034 + over) * smoothstep(-0.23, -0.17, -row_height)) * (row_height < 0.24),
+    )
+    radius = radius + below * wave * ripples(
+        rng, np.stack([3 * np.sin(around), height * 4, 3 * np.cos(around)], -1), 1.2
+    )
+    vertices = np.stack([center[0] + radius * np.sin(around), height, center[2] + radius * np.cos(around)], -1)
+    sides = np.abs((around + np.pi) % (2 * np.pi) - np.pi)
+    front = 0.15 if ends is None else ends
+    ends = np.interp(sides, [0, 1.2, 1.75, 2.2, np.pi], [front, front, max(bottom, front), bottom, bottom])
+    ends = ends + 0.012 * ripples(rng, np.stack([5 * np.sin(around), 0 * around, 5 * np.cos(around)], -1), 1.5)
+    signed = (around + np.pi) % (2 * np.pi) - np.pi
+    field = np.minimum(opening(signed, row_height), row_height - ends)
+    flat = np.stack([0.09 * np.sin(around), row_height, SKULL[2] + 0.09 * np.cos(around)], -1).astype(np.float32)
+    weights = _falling_weights(anatomy, vertices.astype(np.float32), row_height)
+    faces = grid_faces(len(rows), TUBE_COLUMNS, closed=True)
+    surface = Surface(vertices.astype(np.float32), faces, weights, {"template": flat})
+    surface = surface.with_attributes(
+        cloth=np.concatenate(
+            [flat - np.asarray([0, 0, 0.02], np.float32), np.full((len(flat), 1), 0.09, np.float32)], 1
+        )
+    )
+    surface = cut(surface, field)
+    return _finish(surface.moved(smooth(surface.vertices, surface.faces, 1, keep_hems=True)), 0.008)
+
+
+def bun(rng, anatomy: Anatomy, radius: float, elevation: float) -> Surface:
+    """A ball of hair on the back of the head."""
+    to_rest = _rest_heights(anatomy)
+    direction = np.asarray([0, np.sin(elevation), -np.cos(elevation)])
+    center = np.asarray([0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01]) + direction * (0.095 + 0.55 * radius)
+    return _rigid(anatomy, _ball(center, radius * np.asarray([1.0, 0.9, 0.85])), HEAD)
+
+
+def ponytail(rng, anatomy: Anatomy, length: float, knots: float = 0.0) -> Surface:
+    """A tapering tail from the back of the head down the back; a braid with knots every so many metres."""
+    to_rest = _rest_heights(anatomy)
+    start = np.asarray([0, to_rest(0.36), anatomy.joints[HEAD, 2] - 0.105])
+    rows = 40 if knots else 16
+    t = np.linspace(0, 1, rows)
+    sway = 0.012 * np.sin(3 * t + rng.uniform(0, 6)) * t
+    line = start + np.stack([sway, -length * t**1.3, -0.05 * np.sin(np.pi * np.minimum(t * 1.6, 1) / 1.3) - 0.01], -1)
+    radius = np.interp(t, [0, 0.12, 0.4, 0.8, 1], [0.016, 0.026, 0.030, 0.020, 0.004])
+    if knots:
+        radius = 0.85 * radius * (1 + 0.22 * np.cos(2 * np.pi * length * t / knots))
+    columns = 14
+    vertices, faces = sweep(line, np.tile([1.0, 0.0, 0.0], (rows, 1)), np.stack([radius, radius], -1), columns)
+    weights = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
+    follow = smoothstep(0.1, 1.0, np.repeat(t, columns)) * 0.8
+    weights[:, HEAD], weights[:, SPINE3] = 1 - follow, follow
+    return _painted(Surface(vertices, faces, weights))
+
+
+def beard_field(template: np.ndarray, kind: str) -> np.ndarray:
+    """Positive where a beard grows: full, goatee or moustache."""
+    x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
+    lips = 1 - (x / 0.027) ** 2 - ((y - 0.262) / 0.0115) ** 2
+    cheek = 0.279 + 0.30 * np.maximum(x - 0.03, 0) - 0.1 * np.maximum(0.02 - x, 0)
+    field = np.minimum.reduce([cheek - y, y - 0.2, z - 0.012, -0.02 * lips])
+    if kind == "goatee":
+        field = np.minimum(field, 0.031 - x)
+    if kind == "moustache":
+        field = np.minimum.reduce([field, 0.034 - x, y - 0.2625 + 0.25 * np.maximum(x - 0.02, 0)])
+    return np.where((y > 0.19) & (x < 0.08) & (z > 0.0), field, -1.0)
+
+
+def beard(rng, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
+    """A beard that thins out towards the cheeks."""
+    template = anatomy.skin.attributes["template"]
+    field = beard_field(template, kind)
+    ragged = np.where(field > -0.5, field + 0.002 * ripples(rng, template, 0.012), -1.0)
+    surface = cut(anatomy.skin.with_attributes(above=field), ragged)
+    normals = unit(smooth(surface.attributes["normals"], surface.faces, 4))
+    full = smoothstep(0.0, 0.016, surface.attributes["above"])
+    chin = smoothstep(0.25, 0.225, surface.attributes["template"][:, 1])
+    grown = (
+        thickness * full * (0.6 + 0.8 * chin) * (1 + 0.25 * ripples(rng, surface.attributes["template"], 0.02)) + 0.0010
+    )
+    return _finish(surface.moved(surface.vertices + grown[:, None] * normals), 0.002)
+
+
+def _finish(surface, depth):
+    weights = smooth_weights(surface.weights, surface.faces, 2)
+    kept = {name: surface.attributes[name] for name in ("template", "cloth")}
+    return turn_in_hems(Surface(surface.vertices, surface.faces, weights, kept), depth)
+
+
+def _painted(surface):
+    """Template and cloth coordinates of hair that does not come from the scalp: its own position."""
+    flat = surface.vertices - surface.vertices.mean(0)
+    cloth = np.concatenate([flat, np.full((len(flat), 1), 0.09)], 1).astype(np.float32)
+    return surface.with_attributes(template=(flat + SKULL).astype(np.float32), cloth=cloth)
+
+
+def _rigid(anatomy, vertices_and_faces, joint):
+    vertices, faces = vertices_and_faces
+    weights = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
+    weights[:, joint] = 1
+    return _painted(Surface(vertices, faces, weights))
+
+
+def _ball(center, radii, rows=12, columns=20):
+    polar, around = (
+        x.reshape(-1)
+        for x in np.meshgrid(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns, indexing="ij")
+    )
+    directions = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], -1)
+    return (center + directions * radii).astype(np.float32), grid_faces(rows, columns, closed=True)
+
+
+def eyeballs(anatomy: Anatomy) -> Surface:
+    """Two balls in the sockets; their `template` attribute is the unit direction from the ball's middle."""
+    parts = []
+    for joint in (23, 24):
+        center = anatomy.joints[joint]
+        lids = np.sort(np.linalg.norm(anatomy.skin.vertices - center, axis=1))[:12]
+        directions, faces = _ball(np.zeros(3), np.ones(3), 14, 22)
+        weights = np.zeros((len(directions), anatomy.skin.weights.shape[1]), np.float32)
+        weights[:, joint] = 1
+        cloth = np.concatenate([directions, np.ones((len(directions), 1), np.float32)], 1)
+        attributes = {"template": directions, "cloth": cloth}
+        parts.append(
+            Surface((center + directions * lids.mean() * 0.985).astype(np.float32), faces, weights, attributes)
+        )
+    return join(parts)
+
+
+def _rest_heights(anatomy):
+    """Template heights of head and neck -> rest heights of the person."""
+    neck = anatomy.joints[NECK, 1]
+    factor = (anatomy.skin.vertices[:, 1].max() - neck) / (CROWN - NECK_HEIGHT)
+    return lambda y: neck + (y - NECK_HEIGHT) * factor
+
+
+def _falling_weights(anatomy, vertices, template_y):
+    """The head's above the jaw; further down more and more of what lies below."""
+    template = anatomy.skin.attributes["template"]
+    near = np.flatnonzero((np.abs(template[:, 0]) < 0.15) & (template[:, 1] > -0.3) & (template[:, 1] < 0.26))[::2]
+    head = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
+    head[:, HEAD] = 1
+    own = smoothstep(0.06, 0.25, template_y)[:, None]
+    lower = template_y < 0.26
+    trunk = head.copy()
+    trunk[lower] = nearest_weights(anatomy, vertices[lower], near)
+    return (head * own + trunk * (1 - own)).astype(np.float32)

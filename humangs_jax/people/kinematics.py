@@ -1,0 +1,253 @@
+"""Joints, their limits, rotations as numpy arrays, forward kinematics, and legs that reach for a foot's place.
+
+Joints in SMPL-X order, T-pose at rest, the person faces +z with the left side at +x. Angles in radians, about the axes of the
+parent joint at rest.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+
+PELVIS, LEFT_HIP, RIGHT_HIP, SPINE1, LEFT_KNEE, RIGHT_KNEE, SPINE2, LEFT_ANKLE, RIGHT_ANKLE, SPINE3 = range(10)
+LEFT_FOOT, RIGHT_FOOT, NECK, LEFT_COLLAR, RIGHT_COLLAR, HEAD = range(10, 16)
+LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST = range(16, 22)
+LEFT_HAND, RIGHT_HAND, JOINTS = 25, 40, 55
+
+LIMITS = {
+    PELVIS: 1.0,
+    LEFT_HIP: 1.7,
+    RIGHT_HIP: 1.7,
+    SPINE1: 0.35,
+    SPINE2: 0.35,
+    SPINE3: 0.35,
+    LEFT_KNEE: 2.1,
+    RIGHT_KNEE: 2.1,
+    LEFT_ANKLE: 0.8,
+    RIGHT_ANKLE: 0.8,
+    LEFT_FOOT: 0.9,
+    RIGHT_FOOT: 0.9,
+    NECK: 0.5,
+    HEAD: 0.5,
+    LEFT_COLLAR: 0.35,
+    RIGHT_COLLAR: 0.35,
+    LEFT_SHOULDER: 2.3,
+    RIGHT_SHOULDER: 2.3,
+    LEFT_ELBOW: 2.4,
+    RIGHT_ELBOW: 2.4,
+    LEFT_WRIST: 0.8,
+    RIGHT_WRIST: 0.8,
+}
+"""Largest rotation angle of a joint that the prior may draw; fingers: FINGER_LIMIT; jaw and eyes stay at rest."""
+FINGER_LIMIT = 1.5
+
+MIRROR = np.asarray([1.0, -1.0, -1.0])
+"""The rotation vector of the mirrored rotation (left and right exchanged)."""
+BALL_HEIGHT, HEEL_BACK = 0.0112, 0.064
+"""Of the shipped body, in lengths of a leg: the joint at the ball of the foot above the sole; the heel behind the ankle."""
+REACH = 0.998
+"""A leg is never stretched beyond this share of its length: the knee's direction would be lost."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Build:
+    """What the prior must know of a body: rest joints (j, 3), parents, and radii in metres of its clothed parts."""
+
+    joints: Float[np.ndarray, "j 3"]
+    parents: tuple[int, ...]
+    torso_radius: float
+    thigh_radius: float
+    shin_radius: float
+    arm_radius: float
+
+    @property
+    def leg(self) -> float:
+        """Length of a leg from hip to ankle, metres."""
+        hip, knee, ankle = self.joints[[LEFT_HIP, LEFT_KNEE, LEFT_ANKLE]]
+        return float(np.linalg.norm(knee - hip) + np.linalg.norm(ankle - knee))
+
+    @property
+    def hip_width(self) -> float:
+        """Distance of a hip from the middle, metres."""
+        return float(0.5 * (self.joints[LEFT_HIP, 0] - self.joints[RIGHT_HIP, 0]))
+
+    @property
+    def sole(self) -> float:
+        """Height of the sole in T-pose."""
+        return float(self.joints[[LEFT_FOOT, RIGHT_FOOT], 1].mean() - BALL_HEIGHT * self.leg)
+
+
+def rotation_matrix(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
+    """Rodrigues' formula for rotation vectors (..., 3)."""
+    angle = np.sqrt(np.sum(vectors * vectors, axis=-1))[..., None, None]
+    x, y, z = np.moveaxis(vectors / np.maximum(angle[..., 0], 1e-9), -1, 0)
+    zero = np.zeros_like(x)
+    skew = np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2)
+    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+
+
+def rotation_vector(matrix: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3"]:
+    """The rotation vector, no longer than pi, of (..., 3, 3) rotations."""
+    m = matrix
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    x, y, z = (m[..., i, j] - m[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    xy, xz, yz = (m[..., i, j] + m[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
+    # rows of 4 q q^T: each is the quaternion (wxyz) times one of its entries; the one of the largest entry is the most exact
+    rows = np.stack([
+        np.stack([1 + xx + yy + zz, x, y, z], -1),
+        np.stack([x, 1 + xx - yy - zz, xy, xz], -1),
+        np.stack([y, xy, 1 - xx + yy - zz, yz], -1),
+        np.stack([z, xz, yz, 1 - xx - yy + zz], -1),
+    ], -2)  # fmt: skip
+    best = np.argmax(np.einsum("...ii->...i", rows), axis=-1)
+    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    return q[..., 1:] * np.where(sine < 1e-9, 2.0, angle / np.maximum(sine, 1e-9))
+
+
+def between(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"], t: float) -> Float[np.ndarray, "*n 3"]:
+    """Rotation vectors on the way from a to b, the shortest one, t in [0, 1]."""
+    first = rotation_matrix(a)
+    step = rotation_vector(np.swapaxes(first, -1, -2) @ rotation_matrix(b))
+    return rotation_vector(first @ rotation_matrix(t * step))
+
+
+def about_x(angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation about x: legs and feet swing backwards, heels up, for positive angles."""
+    return rotation_matrix(np.asarray([angle, 0.0, 0.0]))
+
+
+def about_y(angle: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation about the vertical: to the left for positive angles."""
+    return rotation_matrix(np.asarray([0.0, angle, 0.0]))
+
+
+def joint_positions(
+    build: Build, rotations: Float[np.ndarray, "j 3"]
+) -> tuple[Float[np.ndarray, "j 3 3"], Float[np.ndarray, "j 3"]]:
+    """World rotations (j, 3, 3) and positions (j, 3) of all joints for rotation vectors (j, 3)."""
+    local = rotation_matrix(rotations)
+    world, positions = np.empty_like(local), np.empty_like(build.joints, dtype=np.float64)
+    for j, parent in enumerate(build.parents):
+        if parent < 0:
+            world[j], positions[j] = local[j], build.joints[j]
+        else:
+            world[j] = world[parent] @ local[j]
+            positions[j] = positions[parent] + world[parent] @ (build.joints[j] - build.joints[parent])
+    return world, positions
+
+
+def limited(rotations: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3"]:
+    """Rotation vectors (j, 3) shortened to the limits of their joints."""
+    angle = np.linalg.norm(rotations, axis=1)
+    return rotations * np.minimum(1, _limit_angles() / np.maximum(angle, 1e-9))[:, None]
+
+
+def excess(rotations: Float[np.ndarray, "j 3"], joints: tuple[int, ...]) -> float:
+    """By how much (radians) the worst of some joints exceeds its limit; negative if none does."""
+    return float(np.max(np.linalg.norm(rotations[list(joints)], axis=1) - _limit_angles()[list(joints)]))
+
+
+def _limit_angles():
+    limit = np.zeros(JOINTS)
+    limit[list(LIMITS)] = list(LIMITS.values())
+    limit[LEFT_HAND:] = FINGER_LIMIT
+    return limit
+
+
+# Legs ----------------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Foot:
+    """Where a foot is: what its sole would touch if it were flat.
+
+    x, z: the point below the ball, metres. yaw: its heading. pitch: positive rolls it onto the toes, which stay flat where
+    they are, negative onto the heel. lift: of all of it above the ground, metres.
+    """
+
+    x: float
+    z: float
+    yaw: float = 0.0
+    pitch: float = 0.0
+    lift: float = 0.0
+
+
+LEGS = (
+    (LEFT_HIP, LEFT_KNEE, LEFT_ANKLE, LEFT_FOOT),
+    (RIGHT_HIP, RIGHT_KNEE, RIGHT_ANKLE, RIGHT_FOOT),
+)
+
+
+def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Position of the ankle, the ground at y = 0, and orientation of the foot. side: 0 left, 1 right."""
+    _, _, ankle, ball = LEGS[side]
+    a, b = build.joints[ankle], build.joints[ball]
+    turn, orientation = about_y(foot.yaw), about_y(foot.yaw) @ about_x(foot.pitch)
+    if foot.pitch >= 0:
+        pivot, offset = np.asarray([0.0, b[1] - build.sole, 0.0]), a - b
+    else:
+        heel = np.asarray([a[0], build.sole, a[2] - HEEL_BACK * build.leg])
+        pivot, offset = turn @ (heel - [b[0], build.sole, b[2]]), a - heel
+    return np.asarray([foot.x, foot.lift, foot.z]) + pivot + orientation @ offset, orientation
+
+
+def highest_pelvis(
+    build: Build, turn: Float[np.ndarray, "3 3"], x: float, z: float, feet: tuple[Foot, Foot], reach: float = REACH
+) -> float:
+    """The greatest height of the pelvis, turned so, above x, z, at which both legs get to their feet."""
+    heights = []
+    for side, foot in enumerate(feet):
+        hip = turn @ (build.joints[LEGS[side][0]] - build.joints[PELVIS])
+        ankle, _ = ankle_of(build, side, foot)
+        away = np.hypot(x + hip[0] - ankle[0], z + hip[2] - ankle[2])
+        heights.append(ankle[1] + np.sqrt(max((reach * build.leg) ** 2 - away**2, 0.0)) - hip[1])
+    return min(heights)
+
+
+def place_feet(
+    build: Build, rotations: Float[np.ndarray, "j 3"], pelvis: Float[np.ndarray, "3"], feet: tuple[Foot, Foot]
+) -> float:
+    """Set hips, knees, ankles and toes (in place) so that the feet are where they are to be; the pelvis's rotation stays.
+
+    pelvis: where the pelvis joint is, the ground at y = 0. Returns how far (metres) the worse ankle is from its place,
+    which is 0 unless a leg is too short.
+    """
+    turn = rotation_matrix(rotations[PELVIS])
+    missed = []
+    for side, foot in enumerate(feet):
+        hip, knee, ankle, ball = LEGS[side]
+        target, orientation = ankle_of(build, side, foot)
+        start = pelvis + turn @ (build.joints[hip] - build.joints[PELVIS])
+        thigh, shin = build.joints[knee] - build.joints[hip], build.joints[ankle] - build.joints[knee]
+        bend = _knee_angle(thigh, shin, np.linalg.norm(target - start))
+        # knees point between where the pelvis and where the foot looks
+        across = turn[:, 0] + orientation[:, 0]
+        chain = thigh + about_x(bend) @ shin
+        upper = _frame(target - start, across) @ _frame(chain, np.asarray([1.0, 0.0, 0.0])).T
+        lower = upper @ about_x(bend)
+        rotations[hip] = rotation_vector(turn.T @ upper)
+        rotations[knee] = [bend, 0, 0]
+        rotations[ankle] = rotation_vector(lower.T @ orientation)
+        rotations[ball] = [-max(foot.pitch, 0.0), 0, 0]
+        missed.append(float(np.linalg.norm(start + upper @ chain - target)))
+    return max(missed)
+
+
+def _knee_angle(thigh, shin, distance):
+    """The bend, backwards, at which hip and ankle are so far apart."""
+    wanted = 0.5 * (distance**2 - thigh @ thigh - shin @ shin) - thigh[0] * shin[0]
+    cosine, sine = thigh[1] * shin[1] + thigh[2] * shin[2], thigh[2] * shin[1] - thigh[1] * shin[2]
+    return float(np.arctan2(sine, cosine) + np.arccos(np.clip(wanted / np.hypot(cosine, sine), -1, 1)))
+
+
+def _frame(direction, across):
+    """Orthonormal columns: the direction, what of `across` is orthogonal to it, and their product."""
+    u = direction / np.linalg.norm(direction)
+    s = across - (across @ u) * u
+    s = s / np.linalg.norm(s)
+    return np.stack([u, s, np.cross(u, s)], axis=1)

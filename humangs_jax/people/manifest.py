@@ -1,0 +1,75 @@
+"""The manifest of a written set: with what it was made, and who is finished.
+
+{"format": "humangs-synthetic", "version": 2, "generator_version": ..., "split": ..., "settings": {...}, "subjects": [...]}
+"""
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+from humangs_jax.people.seeds import GENERATOR_VERSION
+
+MANIFEST = "manifest.json"
+FORMAT, VERSION = "humangs-synthetic", 2
+
+
+def read_manifest(folder: str | Path) -> dict[str, Any]:
+    """What a set was made with. Raises: ValueError, one line naming the file, if it is no manifest of this format."""
+    file = Path(folder) / MANIFEST
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{file}: cannot be read: {error}") from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"{file}: format: expected a manifest of {FORMAT!r}")
+    if content.get("version") not in (1, VERSION):
+        raise ValueError(f"{file}: version: expected {VERSION}, got {content.get('version')!r}")
+    return {"generator_version": 1, "split": None} | content
+
+
+def begin_set(folder: str | Path, split: str, settings: dict[str, Any]) -> None:
+    """Start a set in a folder, or check that the one that is there can be continued.
+
+    Raises: ValueError if it was made by another version of the generator, of another split, or with other settings.
+    """
+    folder = Path(folder)
+    if not (folder / MANIFEST).is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_manifest(folder, split, settings)
+        return
+    earlier, file = read_manifest(folder), folder / MANIFEST
+    if earlier["generator_version"] != GENERATOR_VERSION:
+        raise ValueError(
+            f"{file}: written by version {earlier['generator_version']} of the generator, this is version "
+            f"{GENERATOR_VERSION}: choose another folder"
+        )
+    if earlier["split"] != split:
+        raise ValueError(
+            f"{file}: people of the split '{earlier['split']}', now asked for '{split}': choose another folder"
+        )
+    changed = [
+        f"{name} {earlier['settings'].get(name)} -> {settings.get(name)}"
+        for name in sorted(settings.keys() | earlier["settings"].keys())
+        if earlier["settings"].get(name) != settings.get(name)
+    ]
+    if changed:
+        raise ValueError(
+            f"{file}: written with settings other than asked for now ({', '.join(changed)}): choose another folder"
+        )
+
+
+def write_manifest(folder: str | Path, split: str, settings: dict[str, Any]) -> None:
+    """List the finished subjects; written aside, then renamed, so that it is never half there."""
+    folder = Path(folder)
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "generator_version": GENERATOR_VERSION,
+        "split": split,
+        "settings": settings,
+        "subjects": sorted(file.parent.name for file in folder.glob("[0-9]*/capture.json")),
+    }
+    temporary = folder / f".{MANIFEST}.{os.getpid()}"
+    temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    temporary.replace(folder / MANIFEST)

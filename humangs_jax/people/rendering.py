@@ -1,0 +1,140 @@
+"""Views of a synthetic person: rasterized at twice the size, shaded per pixel, box-averaged."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.core.array_types import Float, Int
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.people.fabrics import Spots
+from humangs_jax.people.noise import Folds
+from humangs_jax.people.shading import bend_normals, lit_share, occlusion, shade
+from humangs_jax.people.subject import SyntheticSubject
+from humangs_jax.people.surfaces import vertex_normals
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+
+SUPERSAMPLING = 2
+VERTEX_STEP, FACE_STEP = 4096, 8192
+"""Meshes are padded to multiples of these, so that few shapes are compiled."""
+INSIDE_SHADE = 0.45
+"""Brightness of the inner side of cloth."""
+FOLD_SLOPE = 0.6
+"""Slope of painted creases on the most wrinkled cloth."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PosedSubject:
+    """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n, 3), openness (n,), share of
+    the key light that arrives (n,).
+    """
+
+    subject: SyntheticSubject
+    rotations: Float[np.ndarray, "j 3"]
+    translation: Float[np.ndarray, "3"]
+    vertices: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    openness: Float[np.ndarray, " n"]
+    lit: Float[np.ndarray, " n"]
+
+
+def pose_subject(
+    subject: SyntheticSubject, rotations: Float[np.ndarray, "j 3"], translation: Float[np.ndarray, "3"]
+) -> PosedSubject:
+    """Skin the mesh and gather what its shading needs."""
+    vertices = subject.posed_vertices(rotations, translation).astype(np.float32)
+    normals = vertex_normals(vertices, subject.surface.faces)
+    lit = lit_share(vertices, normals, subject.lights.directions[0])
+    return PosedSubject(subject, rotations, translation, vertices, normals, occlusion(vertices, normals), lit)
+
+
+def render_view(
+    posed: PosedSubject, camera: Camera, background: float = 1.0
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    """(h, w, 3) picture on the background and (h, w) coverage of one camera, both in [0, 1]."""
+    s = SUPERSAMPLING
+    large = camera.resized(camera.width * s, camera.height * s)
+    faces = posed.subject.surface.faces
+    fragments = rasterize_mesh(*_padded(posed.vertices, faces), large)
+    ids = np.asarray(fragments.face_ids).reshape(-1)
+    seen = np.flatnonzero(ids >= 0)
+    barycentrics = np.asarray(fragments.barycentrics).reshape(-1, 3)[seen]
+    eye = np.asarray(camera.center, np.float32)
+    picture = np.full((len(ids), 3), background, np.float32)
+    picture[seen] = _shade_pixels(posed, ids[seen], barycentrics, eye)
+    shape = (camera.height, s, camera.width, s)
+    image = picture.reshape(*shape, 3).mean(axis=(1, 3))
+    mask = (ids >= 0).astype(np.float32).reshape(shape).mean(axis=(1, 3))
+    return np.clip(image, 0, 1), mask
+
+
+def _padded(vertices, faces):
+    """Repeats a vertex and appends faces without area up to the next step: the rasterizer then compiles few times."""
+    extra_vertices, extra_faces = -len(vertices) % VERTEX_STEP, -len(faces) % FACE_STEP
+    vertices = np.concatenate([vertices, np.repeat(vertices[:1], extra_vertices, 0)])
+    return jnp.asarray(vertices), jnp.asarray(np.concatenate([faces, np.zeros((extra_faces, 3), faces.dtype)]))
+
+
+def _shade_pixels(posed, ids, weights, eye):
+    albedo, slopes = paint(posed.subject, ids, spots_at(posed.subject, ids, weights))
+    return light_points(posed, ids, weights, albedo, slopes, eye)
+
+
+def light_points(
+    posed: PosedSubject,
+    face_ids: Int[np.ndarray, " m"],
+    weights: Float[np.ndarray, "m 3"],
+    albedo: Float[np.ndarray, "m 3"],
+    slopes: Float[np.ndarray, "m 3"],
+    eye: Float[np.ndarray, "3"] | None = None,
+) -> Float[np.ndarray, "m 3"]:
+    """Colours (m, 3) in the subject's light of points on faces, given by the weights of their corners, as painted (see `paint`).
+
+    eye: where they are seen from, which tells cloth's inner side; None: everything is seen from outside.
+    """
+    subject = posed.subject
+    corners = subject.surface.faces[face_ids]
+    values = np.concatenate([posed.vertices, posed.normals, posed.openness[:, None], posed.lit[:, None]], 1)
+    points, normals, shades = np.split(_blend(values, corners, weights), [3, 6], 1)
+    openness, lit = shades.T
+    normals = normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-9)
+    if eye is not None:
+        a, b, c = (posed.vertices[corners[:, i]] for i in range(3))
+        inside = np.sum(np.cross(b - a, c - a) * (eye - points), -1) < 0
+        normals = np.where(inside[:, None], -normals, normals)
+        openness = np.where(inside, INSIDE_SHADE * openness, openness)
+    normals = np.where((slopes != 0).any(1, keepdims=True), bend_normals(normals, slopes), normals)
+    sheens = np.asarray([material.sheen for material in subject.materials], np.float32)
+    return shade(subject.lights, albedo, normals, openness, sheens[subject.face_materials[face_ids]], lit)
+
+
+def spots_at(subject: SyntheticSubject, face_ids: Int[np.ndarray, " m"], weights: Float[np.ndarray, "m 3"]) -> Spots:
+    """Points on faces, given by the weights of their corners, as materials see them."""
+    attributes = subject.surface.attributes
+    values = np.concatenate([attributes["cloth"], attributes["template"]], axis=1)
+    blended = _blend(values, subject.surface.faces[face_ids], weights)
+    return Spots(blended[:, :4], blended[:, 4:])
+
+
+def _blend(values, corners, weights):
+    return sum(weights[:, i : i + 1] * values[corners[:, i]] for i in range(3))
+
+
+def paint(
+    subject: SyntheticSubject, face_ids: Int[np.ndarray, " n"], spots: Spots
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """What the materials say of points on given faces: albedo (n, 3) and slope (n, 3) of the painted folds."""
+    material_ids = subject.face_materials[face_ids]
+    albedo, slope = np.empty((len(face_ids), 3), np.float32), np.zeros((len(face_ids), 3), np.float32)
+    order = np.argsort(material_ids, kind="stable")
+    bounds = np.searchsorted(material_ids[order], np.arange(len(subject.materials) + 1))
+    for k, material in enumerate(subject.materials):
+        chosen = order[bounds[k] : bounds[k + 1]]
+        if len(chosen) == 0:
+            continue
+        own = Spots(spots.cloth[chosen], spots.template[chosen])
+        albedo[chosen] = material.albedo(own)
+        if material.wrinkles > 0:
+            folds = Folds(np.random.default_rng([subject.seed, 100 + k]), upright=material.draped)
+            slope[chosen] = FOLD_SLOPE * material.wrinkles * folds.slope(own.cloth[:, :3])
+    return np.clip(albedo, 0.01, None), slope

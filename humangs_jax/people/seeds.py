@@ -1,0 +1,63 @@
+"""Which seeds and keys are for what. Written down once: people of one range are never seen in another.
+
+A seed names a person. Written people are made from the seed by numpy; people made on the fly from its keys, whose words are
+(appearance, seed), so that the person, and the split, can be read off every key.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.core.array_types import Key
+
+GENERATOR_VERSION = 2
+"""What a seed makes: counted up whenever the same seed gives another person, pose or picture. Manifests tell it, and sets of
+different versions are not mixed in one folder."""
+
+TRAIN = range(0, 1_000_000)
+VALIDATION = range(1_000_000, 1_001_000)
+TEST = range(2_000_000, 2_001_000)
+"""Held out of training and of every choice made on the validation people."""
+DEMO = range(3_000_000, 3_001_000)
+"""People of the documentation and the tests."""
+
+SPLITS = {"train": TRAIN, "validation": VALIDATION, "test": TEST, "demo": DEMO}
+
+KEY_KIND = "threefry2x32"
+"""Implementation of all keys of people, whatever the default: the words of a key are its seed."""
+APPEARANCES = 2**32
+
+
+def split_of(seed: int) -> str:
+    """Name of the range that a seed lies in. Raises ValueError if it lies in none."""
+    for name, seeds in SPLITS.items():
+        if seed in seeds:
+            return name
+    raise ValueError(
+        f"seed {seed} lies in no range: {', '.join(f'{n} {r.start}..{r.stop - 1}' for n, r in SPLITS.items())}"
+    )
+
+
+def seeds_of(split: str, first: int, count: int) -> range:
+    """`count` seeds of a split from its `first`-th on. Raises ValueError if they reach beyond the split."""
+    people = SPLITS[split]
+    if first < 0 or count < 1 or first + count > len(people):
+        raise ValueError(
+            f"subjects {first}..{first + count - 1} reach beyond the split '{split}', which has {len(people)}"
+        )
+    return people[first : first + count]
+
+
+def subject_key(seed: int, appearance: int = 0) -> Key:
+    """The key of a person; further appearances (other clothes, pose, light) have further keys.
+
+    Raises: ValueError if the seed lies in no range of `SPLITS`.
+    """
+    split_of(seed)
+    words = np.asarray([appearance % APPEARANCES, seed], np.uint32)
+    return jax.random.wrap_key_data(jnp.asarray(words), impl=KEY_KIND)
+
+
+def seed_of_key(key: Key) -> int:
+    """The seed of the person that a key of `subject_key` is for."""
+    return int(jax.random.key_data(key)[..., 1])

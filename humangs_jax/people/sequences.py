@@ -1,0 +1,345 @@
+"""Smooth motions: walking along curves, turning on the spot, reaching for things. Soles on the ground stay where they are.
+
+Walks and turns are footprints along a path; feet roll from heel to toe on each and swing to the next, the pelvis goes along
+and as high as the legs let it, legs are solved for (`kinematics.place_feet`). Reaches keep both feet planted and move from
+pose to pose. World as everywhere: y up, metres, the ground at y = 0 where the soles are those of the bare body.
+"""
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.people.arms import ARMS, arm_clearance, bend_arm, draw_goal
+from humangs_jax.people.hands import pose_hand
+from humangs_jax.people.kinematics import (
+    HEAD,
+    JOINTS,
+    LEFT_FOOT,
+    LEFT_HAND,
+    LEGS,
+    NECK,
+    PELVIS,
+    RIGHT_HAND,
+    SPINE1,
+    SPINE2,
+    SPINE3,
+    Build,
+    Foot,
+    about_y,
+    between,
+    highest_pelvis,
+    place_feet,
+    rotation_matrix,
+    rotation_vector,
+)
+from humangs_jax.people.poses import bend_trunk
+from humangs_jax.people.stances import STANCES, in_world
+
+FPS = 30.0
+STANCE_SHARE = 0.62
+"""Of a stride that a foot is on the ground."""
+HEEL_STRIKE, TOE_OFF = 0.28, 0.85
+"""Pitch of the foot, radians, when it comes down on the heel and leaves from the toes, at a long stride."""
+FLAT_FROM, FLAT_UNTIL = 0.15, 0.55
+"""Shares of the stance between which the sole is flat."""
+LONG_STEP = 0.75
+"""Lengths of a leg."""
+SMOOTHING = 4
+"""Frames to both sides over which the pelvis's height is smoothed, below what the legs allow."""
+SPARE = 0.995
+"""Of the legs' reach that the pelvis's height uses."""
+TRIES = 12
+"""Goals tried for an arm until the way there is clear."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sequence:
+    """rotations: (m, j, 3) axis-angle. translations: (m, 3) metres. planted: (m, 2) feet that are on the ground. kind, fps."""
+
+    kind: str
+    rotations: Float[np.ndarray, "m j 3"]
+    translations: Float[np.ndarray, "m 3"]
+    planted: Bool[np.ndarray, "m 2"]
+    fps: float = FPS
+
+
+def sample_sequence(rng: np.random.Generator, build: Build, frames: int = 60, kind: str | None = None) -> Sequence:
+    """A motion of so many frames at 30 a second. kind: "walk", "turn" or "reach"; None draws one.
+
+    Raises: ValueError if there is no such kind, or no frame.
+    """
+    if frames < 1:
+        raise ValueError(f"frames: expected at least 1, got {frames}")
+    if kind is None:
+        odds = np.asarray([odds for odds, _ in KINDS.values()])
+        kind = list(KINDS)[rng.choice(len(KINDS), p=odds / odds.sum())]
+    if kind not in KINDS:
+        raise ValueError(f"no kind of sequence {kind!r}: expected one of {', '.join(KINDS)}")
+    rotations, pelvis, planted = KINDS[kind][1](rng, build, frames)
+    return Sequence(kind, rotations, pelvis - build.joints[PELVIS], planted)
+
+
+# Walking and turning -------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class Gait:
+    """How someone goes.
+
+    cadence: strides a second. step: metres forward per step. bend: radians turned per step. width: metres from the line that
+    a foot keeps. lift: metres that a swinging foot is raised. turn_out: of the feet. swing: of the arms, radians.
+    """
+
+    cadence: float
+    step: float
+    bend: float
+    width: float
+    lift: float
+    turn_out: float
+    swing: float
+
+
+def _walk(rng, build, frames):
+    step = rng.uniform(0.3, LONG_STEP) * build.leg
+    curved = rng.random() < 0.6
+    gait = Gait(
+        cadence=rng.uniform(0.75, 1.05),
+        step=step,
+        bend=rng.normal(0, 0.16) if curved else 0.0,
+        width=build.hip_width * rng.uniform(0.5, 0.9),
+        lift=rng.uniform(0.04, 0.09),
+        turn_out=rng.uniform(0.0, 0.18),
+        swing=rng.uniform(0.25, 0.5) * min(1.0, step / build.leg / 0.6),
+    )
+    return _step_along(rng, build, frames, gait)
+
+
+def _turn(rng, build, frames):
+    gait = Gait(
+        cadence=rng.uniform(0.6, 0.9),
+        step=rng.uniform(-0.02, 0.06),
+        bend=rng.choice([-1, 1]) * rng.uniform(0.25, 0.5),
+        width=build.hip_width * rng.uniform(0.95, 1.3),
+        lift=rng.uniform(0.05, 0.09),
+        turn_out=rng.uniform(0.05, 0.2),
+        swing=rng.uniform(0.03, 0.15),
+    )
+    return _step_along(rng, build, frames, gait)
+
+
+def _step_along(rng, build, frames, gait):
+    time = np.arange(frames) / FPS
+    start = rng.uniform(0, 1)
+    begin_heading = rng.uniform(-np.pi, np.pi) if abs(gait.step) < 0.1 * build.leg else rng.uniform(-0.7, 0.7)
+    phase = start + gait.cadence * time  # strides; two steps each
+    heading = lambda p: begin_heading + 2 * gait.bend * (p - start)
+    track = _path(heading, 2 * gait.step, start, phase[-1])
+    feet = [tuple(_foot_at(build, gait, heading, track, side, p) for side in (0, 1)) for p in phase]
+    planted = np.asarray([[(p + 0.5 * side) % 1 < STANCE_SHARE for side in (0, 1)] for p in phase])
+
+    rotations = np.zeros((frames, JOINTS, 3))
+    sway = 0.25 * gait.width * np.sin(2 * np.pi * (phase - 0.06))  # over the foot that stands: left at a quarter stride
+    lean = rng.normal(0.02, 0.02) + 0.12 * max(gait.step, 0) / build.leg
+    twist = 0.14 * gait.step / build.leg / 0.6
+    turns = np.empty((frames, 3, 3))
+    for i, p in enumerate(phase):
+        once = 2 * np.pi * p
+        roll = 0.05 * np.sin(once - 0.1) * min(1.0, gait.step / build.leg + 0.3)
+        turns[i] = about_y(heading(p) - twist * np.cos(once)) @ rotation_matrix(np.asarray([0.4 * lean, 0, roll]))
+        for joint, share in ((SPINE1, 0.3), (SPINE2, 0.4), (SPINE3, 0.3)):
+            rotations[i, joint] = np.asarray([0.6 * lean, 2 * twist * np.cos(once - 0.2), -0.8 * roll]) * share
+        look = np.clip(1.2 * gait.bend, -0.5, 0.5)  # to where the path leads
+        rotations[i, NECK] = [-0.3 * lean, 0.5 * look - 0.5 * twist * np.cos(once - 0.2), 0]
+        rotations[i, HEAD] = [-0.3 * lean, 0.5 * look - 0.5 * twist * np.cos(once - 0.2), 0]
+    rotations[:, PELVIS] = rotation_vector(turns)
+    centers = np.stack([track(p) for p in phase])
+    centers += np.stack([about_y(heading(p))[:, 0] * s for p, s in zip(phase, sway, strict=True)])
+    pelvis = _ride(build, turns, centers, feet)
+    for i in range(frames):
+        place_feet(build, rotations[i], pelvis[i], feet[i])
+    _swing_arms(rng, build, rotations, phase, gait)
+    return rotations, pelvis, planted
+
+
+def _path(heading, stride, first, last):
+    """Where the body's line is (3,) at a phase: the integral of the heading."""
+    grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
+    direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)
+    along = np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(0.5 * (direction[1:] + direction[:-1]) * np.diff(grid)[:, None], 0)]
+    )
+    at = lambda p: np.asarray([np.interp(p, grid, along[:, k]) for k in range(3)])
+    origin = at(first)
+    return lambda p: stride * (at(p) - origin)
+
+
+def _foot_at(build, gait, heading, track, side, phase):
+    """The foot of a side at a phase (strides); the left one comes down at whole phases, the right one half a stride later."""
+    number, share = divmod(phase + 0.5 * side, 1.0)
+    down = number - 0.5 * side
+    here, there = (_footprint(build, gait, heading, track, side, down + k) for k in (0, 1))
+    long = np.clip(gait.step / (LONG_STEP * build.leg), 0.15, 1.0)
+    strike, off = HEEL_STRIKE * long if gait.step > 0.2 * build.leg else 0.0, TOE_OFF * (0.35 + 0.65 * long)
+    if share < STANCE_SHARE:
+        u = share / STANCE_SHARE
+        pitch = (
+            -strike * (1 - _ease(u / FLAT_FROM)) if u < FLAT_FROM else off * _rise((u - FLAT_UNTIL) / (1 - FLAT_UNTIL))
+        )
+        return dataclasses.replace(here, pitch=float(pitch))
+    u = (share - STANCE_SHARE) / (1 - STANCE_SHARE)
+    s = _ease(u)
+    turned = (there.yaw - here.yaw) * s
+    return Foot(
+        x=float(here.x + s * (there.x - here.x)),
+        z=float(here.z + s * (there.z - here.z)),
+        yaw=float(here.yaw + turned),
+        # the toes come up quickly, so that they clear the ground
+        pitch=float(off * (1 - _ease(min(1.0, u / 0.6))) - strike * _ease((u - 0.4) / 0.6)),
+        lift=float(gait.lift * np.sin(np.pi * _ease(u)) ** 2),
+    )
+
+
+def _footprint(build, gait, heading, track, side, down):
+    """Where the foot that comes down at a phase stands: beside the line, ahead of the pelvis as it passes in mid-stance."""
+    middle = down + 0.5 * STANCE_SHARE
+    yaw, sign = heading(middle), 1 - 2 * side
+    ahead = (
+        build.joints[LEFT_FOOT, 2] - build.joints[PELVIS, 2] - 0.04 * build.leg
+    )  # of the ball before the pelvis, standing
+    x, _, z = track(middle) + about_y(yaw) @ np.asarray([sign * gait.width, 0.0, ahead])
+    return Foot(float(x), float(z), float(yaw + sign * gait.turn_out))
+
+
+def _swing_arms(rng, build, rotations, phase, gait):
+    """Arms hang and swing against the legs; a hanging pose found once, its swing about the axis of the shoulders."""
+    stood = rotations[0].copy()
+    stood[[joint for leg in LEGS for joint in leg]] = 0
+    for side in (0, 1):
+        for _ in range(TRIES):
+            if bend_arm(rng, build, stood, "hang", side) > 0.01:
+                break
+        pose_hand(rng, stood, side)
+    hand_of = (slice(LEFT_HAND, RIGHT_HAND), slice(RIGHT_HAND, JOINTS))
+    for side in (0, 1):
+        collar, shoulder, elbow, wrist = ARMS[side]
+        sign = 1 - 2 * side
+        forward = -sign * np.cos(2 * np.pi * (phase - 0.04))  # the left arm is back when the left heel comes down
+        base = rotation_matrix(stood[shoulder])
+        for i, f in enumerate(forward):
+            rotations[i, shoulder] = rotation_vector(rotation_matrix(np.asarray([-gait.swing * f, 0, 0])) @ base)
+            flexed = stood[elbow] + np.asarray([0, -sign * 0.35 * gait.swing * (1 + f), 0])
+            rotations[i, elbow] = flexed
+            rotations[i, collar] = stood[collar] + np.asarray([0, -sign * 0.05 * f * min(1.0, gait.swing / 0.4), 0])
+        rotations[:, wrist] = stood[wrist]
+        rotations[:, hand_of[side]] = stood[hand_of[side]]
+
+
+# Reaching ------------------------------------------------------------------------------------------------------------
+
+
+def _reach(rng, build, frames):
+    """From pose to pose on planted feet: the hands go to places, the trunk and the knees help."""
+    width = build.hip_width / build.leg
+    name = rng.choice(["stand", "contrapposto", "wide", "stride"], p=[0.4, 0.2, 0.2, 0.2])
+    heading = rng.uniform(-0.7, 0.7)
+    stance = STANCES[name][1](rng, width)
+    left, right = (in_world(foot, build.leg, heading) for foot in stance.feet)
+    feet = left, right
+    keys, times, t = [], [], 0.0
+    while True:
+        keys.append(_key_pose(rng, build, heading, stance, feet, keys[-1] if keys else None))
+        times.append(t)
+        if t > frames / FPS:
+            break
+        t += rng.uniform(0.7, 1.4)
+    rotations, centers, turns = np.zeros((frames, JOINTS, 3)), np.zeros((frames, 3)), np.zeros((frames, 3, 3))
+    sinks = np.zeros(frames)
+    for i in range(frames):
+        k = int(np.searchsorted(times, i / FPS, side="right")) - 1
+        a, b = keys[k], keys[k + 1]
+        # three quarters of the time on the way, then a rest
+        s = _ease((i / FPS - times[k]) / (0.8 * (times[k + 1] - times[k])))
+        rotations[i] = between(a[0], b[0], s)
+        centers[i], sinks[i] = (1 - s) * a[1] + s * b[1], (1 - s) * a[2] + s * b[2]
+        turns[i] = rotation_matrix(rotations[i, PELVIS])
+    pelvis = _ride(build, turns, centers, [feet] * frames, sinks)
+    for i in range(frames):
+        place_feet(build, rotations[i], pelvis[i], feet)
+    return rotations, pelvis, np.ones((frames, 2), bool)
+
+
+def _key_pose(rng, build, heading, stance, feet, before):
+    """(rotations, place of the pelvis on the ground plane, how much lower it is than it could be)."""
+    rotations = np.zeros((JOINTS, 3))
+    sink = stance.sink * build.leg + (rng.uniform(0.05, 0.3) * build.leg if rng.random() < 0.3 else 0.0)
+    stooped = sink / build.leg
+    tilt, turned = 0.5 * stooped + rng.uniform(0, 0.05), rng.normal(0, 0.15)
+    turn = about_y(heading + turned) @ rotation_matrix(np.asarray([tilt, 0, stance.roll]))
+    rotations[PELVIS] = rotation_vector(turn)
+    middle = 0.5 * (feet[0].x + feet[1].x), 0.5 * (feet[0].z + feet[1].z)
+    back = about_y(heading) @ np.asarray([rng.normal(0, 0.02), 0, rng.normal(-0.08, 0.02)]) * build.leg
+    center = np.asarray([middle[0] + back[0], 0.0, middle[1] + back[2]])
+    height = highest_pelvis(build, turn, center[0], center[2], feet, SPARE) - sink
+    place_feet(build, rotations, np.asarray([center[0], height, center[2]]), feet)
+    bend_trunk(rng, rotations, stance.lean + 1.2 * stooped, stance.roll)
+    for side in (0, 1):
+        best, best_clear = rotations, -np.inf
+        for _ in range(TRIES):
+            tried = rotations.copy()
+            goal = "hang" if rng.random() < 0.2 else draw_goal(rng)
+            bend_arm(rng, build, tried, goal, side, other_arm=side == 1)
+            clear = _clear_of(build, tried, side)
+            if before is not None:  # the way there counts as much as the place
+                clear = min(clear, *(_clear_of(build, between(before[0], tried, t), side) for t in (0.25, 0.5, 0.75)))
+            if clear > best_clear:
+                best, best_clear = tried, clear
+            if clear > 0.0:
+                break
+        rotations = best
+        pose_hand(rng, rotations, side)
+    return rotations, center, sink
+
+
+def _clear_of(build, rotations, side):
+    """`arm_clearance`; while the left arm (side 0) is placed, the right one is held out of the way."""
+    if side == 0:
+        rotations = rotations.copy()
+        rotations[list(ARMS[1])] = 0
+    return arm_clearance(build, rotations)
+
+
+# Shared --------------------------------------------------------------------------------------------------------------
+
+
+def _ride(build, turns, centers, feet, sinks=None):
+    """Places of the pelvis (m, 3): above the centers, smoothly, never higher than the legs allow, less `sinks`."""
+    heights = np.asarray([
+        highest_pelvis(build, turn, center[0], center[2], both, SPARE)
+        for turn, center, both in zip(turns, centers, feet, strict=True)
+    ])  # fmt: skip
+    window = lambda values: np.lib.stride_tricks.sliding_window_view(
+        np.pad(values, SMOOTHING, mode="edge"), 2 * SMOOTHING + 1
+    )
+    weights = np.hanning(2 * SMOOTHING + 3)[1:-1]
+    smooth = window(window(heights).min(-1)) @ (weights / weights.sum())
+    pelvis = centers.copy()
+    pelvis[:, 1] = smooth - (0.0 if sinks is None else sinks)
+    return pelvis
+
+
+def _ease(t):
+    """From 0 to 1 with rest at both ends (speed and acceleration)."""
+    t = np.clip(t, 0.0, 1.0)
+    return t**3 * (10 - 15 * t + 6 * t**2)
+
+
+def _rise(t):
+    """From 0 with rest, to 1 in full motion."""
+    t = np.clip(t, 0.0, 1.0)
+    return t**2 * (3 - t) / 2
+
+
+KINDS: dict[str, tuple[float, Callable]] = {"walk": (0.5, _walk), "turn": (0.2, _turn), "reach": (0.3, _reach)}
+"""Name -> probability, and what makes (rotations, places of the pelvis, planted) of a generator, a build and a length."""

@@ -1,0 +1,219 @@
+"""Triangle surfaces on the host: sub-surfaces, exact cuts along a level set, smoothing, hems.
+
+A `Surface` carries per-vertex attributes through every operation, so that a garment cut out of the body keeps its skinning
+weights, its cloth coordinates and the skin point below it. Metres; faces counter-clockwise seen from outside; float32.
+"""
+
+import dataclasses
+
+import numpy as np
+
+from humangs_jax.core.array_types import Bool, Float, Int
+
+NORMAL_FLOOR = 1e-12
+"""Added to lengths before dividing: vertices without area get the zero normal."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Surface:
+    """vertices: (n, 3) metres at rest. faces: (f, 3). weights: (n, j) skinning weights. attributes: name -> (n, ...)."""
+
+    vertices: Float[np.ndarray, "n 3"]
+    faces: Int[np.ndarray, "f 3"]
+    weights: Float[np.ndarray, "n j"]
+    attributes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+    def moved(self, vertices: Float[np.ndarray, "n 3"]) -> "Surface":
+        """The same surface with other vertex positions."""
+        return dataclasses.replace(self, vertices=np.asarray(vertices, np.float32))
+
+    def with_attributes(self, **attributes: np.ndarray) -> "Surface":
+        """The same surface with more (or other) attributes."""
+        return dataclasses.replace(self, attributes={**self.attributes, **attributes})
+
+
+def vertex_normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
+    """(n, 3) area-weighted unit normals."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    face_normals = np.cross(b - a, c - a)
+    return unit(scatter_add(faces.T.reshape(-1), np.tile(face_normals, (3, 1)), len(vertices)))
+
+
+def scatter_add(
+    indices: Int[np.ndarray, " m"], values: Float[np.ndarray, "m c"], count: int
+) -> Float[np.ndarray, "count c"]:
+    """Sums of the rows of `values` (m, c) that share an index, (count, c) float32."""
+    columns = [np.bincount(indices, weights=values[:, c], minlength=count) for c in range(values.shape[1])]
+    return np.stack(columns, axis=1).astype(np.float32)
+
+
+def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Vectors over their lengths along the last axis."""
+    return vectors / (np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)) + NORMAL_FLOOR)
+
+
+def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    """(e, 2) directed edges of all faces, three per face."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+    """(e, 2) directed edges that only one face has: the hems."""
+    edges = edges_of(faces).astype(np.int64)
+    count = int(faces.max()) + 1
+    keys = np.minimum(edges[:, 0], edges[:, 1]) * count + np.maximum(edges[:, 0], edges[:, 1])
+    _, inverse, uses = np.unique(keys, return_inverse=True, return_counts=True)
+    return edges[uses[inverse] == 1].astype(np.int32)
+
+
+def smooth(
+    values: Float[np.ndarray, "n c"],
+    faces: Int[np.ndarray, "f 3"],
+    iterations: int,
+    strength: float = 0.5,
+    keep_hems: bool = False,
+) -> Float[np.ndarray, "n c"]:
+    """Laplacian smoothing of vertex values (n, c): each step moves a vertex towards the mean of its neighbours.
+
+    keep_hems: vertices on the boundary only feel their neighbours on the boundary, so that hems stay crisp and do not shrink.
+    """
+    count = len(values)
+    edges = edges_of(faces)
+    source, target = np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]])
+    if keep_hems:
+        hems = boundary_edges(faces)
+        on_hem = np.zeros(count, bool)
+        on_hem[hems] = True
+        inner = ~on_hem[target]
+        source = np.concatenate([source[inner], hems[:, 0], hems[:, 1]])
+        target = np.concatenate([target[inner], hems[:, 1], hems[:, 0]])
+    neighbours = np.maximum(np.bincount(target, minlength=count), 1).astype(np.float32)[:, None]
+    lonely = np.bincount(target, minlength=count) == 0
+    for _ in range(iterations):
+        mean = scatter_add(target, values[source], count) / neighbours
+        mean[lonely] = values[lonely]
+        values = values + strength * (mean - values)
+    return values.astype(np.float32)
+
+
+def compact(surface: Surface, face_mask: Bool[np.ndarray, " f"]) -> Surface:
+    """The faces chosen by a (f,) mask and only the vertices they use."""
+    faces = surface.faces[face_mask]
+    used = np.zeros(len(surface.vertices), bool)
+    used[faces] = True
+    index = np.cumsum(used) - 1
+    return Surface(
+        surface.vertices[used],
+        index[faces].astype(np.int32),
+        surface.weights[used],
+        {name: value[used] for name, value in surface.attributes.items()},
+    )
+
+
+def cut(surface: Surface, field: Float[np.ndarray, " n"]) -> Surface:
+    """The part where a per-vertex field (n,) is positive, cut exactly along its zero line."""
+    field = np.where(np.abs(field) < 1e-6, 1e-6, field).astype(np.float32)
+    inside = field > 0
+    count = inside[surface.faces].sum(1)
+    whole, mixed = surface.faces[count == 3], surface.faces[(count == 1) | (count == 2)]
+    if len(mixed) == 0:
+        return compact(surface, count == 3)
+    # turn each mixed face so that its odd corner (alone on its side) comes first
+    sides = inside[mixed]
+    odd_side = sides.sum(1) == 1
+    odd = np.argmax(sides == odd_side[:, None], axis=1)
+    corners = mixed[np.arange(len(mixed))[:, None], (odd[:, None] + np.arange(3)) % 3]
+    a, b, c = corners.T
+    keys = np.stack([np.stack([a, b], 1), np.stack([a, c], 1)]).reshape(-1, 2)
+    keys = np.sort(keys, axis=1)
+    pairs, inverse = np.unique(keys, axis=0, return_inverse=True)
+    new = (inverse.reshape(-1) + len(surface.vertices)).astype(np.int32)
+    on_ab, on_ac = new[: len(mixed)], new[len(mixed) :]
+    kept_tip = np.stack([a, on_ab, on_ac], 1)[odd_side]
+    base = ~odd_side
+    kept_base = np.concatenate([np.stack([on_ab, b, c], 1)[base], np.stack([on_ab, c, on_ac], 1)[base]])
+    f0, f1 = field[pairs[:, 0]], field[pairs[:, 1]]
+    t = (f0 / (f0 - f1)).astype(np.float32)
+
+    def extended(values):
+        at = t.reshape(-1, *([1] * (values.ndim - 1)))
+        between = values[pairs[:, 0]] * (1 - at) + values[pairs[:, 1]] * at
+        return np.concatenate([values, between.astype(values.dtype)])
+
+    grown = Surface(
+        extended(surface.vertices),
+        np.concatenate([whole, kept_tip, kept_base]).astype(np.int32),
+        extended(surface.weights),
+        {name: extended(value) for name, value in surface.attributes.items()},
+    )
+    return compact(grown, np.ones(len(grown.faces), bool))
+
+
+def join(surfaces: list[Surface]) -> Surface:
+    """Several surfaces as one; only attributes that all of them have are kept."""
+    offsets = np.cumsum([0] + [len(s.vertices) for s in surfaces[:-1]])
+    names = set.intersection(*(set(s.attributes) for s in surfaces))
+    return Surface(
+        np.concatenate([s.vertices for s in surfaces]),
+        np.concatenate([s.faces + offset for s, offset in zip(surfaces, offsets, strict=True)]).astype(np.int32),
+        np.concatenate([s.weights for s in surfaces]),
+        {name: np.concatenate([s.attributes[name] for s in surfaces]) for name in names},
+    )
+
+
+def turn_in_hems(surface: Surface, depth: float) -> Surface:
+    """A strip folded inwards along every boundary, `depth` metres against the normal: cloth seen edge-on has a thickness."""
+    hems = boundary_edges(surface.faces)
+    if len(hems) == 0:
+        return surface
+    rim, local = np.unique(hems, return_inverse=True)
+    local = local.reshape(-1, 2) + len(surface.vertices)
+    normals = vertex_normals(surface.vertices, surface.faces)
+    inner = surface.vertices[rim] - depth * normals[rim]
+    faces = np.concatenate(
+        [np.stack([hems[:, 1], hems[:, 0], local[:, 0]], 1), np.stack([hems[:, 1], local[:, 0], local[:, 1]], 1)]
+    )
+    return Surface(
+        np.concatenate([surface.vertices, inner]).astype(np.float32),
+        np.concatenate([surface.faces, faces]).astype(np.int32),
+        np.concatenate([surface.weights, surface.weights[rim]]),
+        {name: np.concatenate([value, value[rim]]) for name, value in surface.attributes.items()},
+    )
+
+
+def grid_faces(rows: int, columns: int, closed: bool) -> Int[np.ndarray, "f 3"]:
+    """Triangles of a (rows, columns) grid of vertices, row-major; `closed`: the last column joins the first.
+
+    Counter-clockwise seen from the side where columns run to the right and rows run down.
+    """
+    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns if closed else columns - 1), indexing="ij")
+    right = (column + 1) % columns
+    a, b = row * columns + column, row * columns + right
+    c, d = (row + 1) * columns + column, (row + 1) * columns + right
+    return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.int32)
+
+
+def sweep(
+    path: Float[np.ndarray, "m 3"],
+    across: Float[np.ndarray, "m 3"],
+    widths: Float[np.ndarray, "m 2"],
+    columns: int = 10,
+    closed: bool = False,
+) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]:
+    """Vertices (m columns, 3) and faces of a tube of elliptic sections along a path (m, 3).
+
+    across: (m, 3) directions of the first half axis, made normal to the path. widths: (m, 2) half axes, metres.
+    closed: the path's end joins its start; otherwise the ends are open (let the widths run out to close them).
+    """
+    tangent = unit(np.roll(path, -1, 0) - np.roll(path, 1, 0)) if closed else unit(np.gradient(path, axis=0))
+    first = unit(across - np.sum(across * tangent, -1, keepdims=True) * tangent)
+    second = np.cross(tangent, first)
+    angle = np.arange(columns) * (2 * np.pi / columns)
+    ring = (
+        np.cos(angle)[None, :, None] * (widths[:, :1] * first)[:, None]
+        + np.sin(angle)[None, :, None] * (widths[:, 1:] * second)[:, None]
+    )
+    vertices = (path[:, None] + ring).reshape(-1, 3).astype(np.float32)
+    rows = len(path) + closed
+    faces = grid_faces(rows, columns, closed=True) % len(vertices)
+    return vertices, np.ascontiguousarray(faces[:, ::-1])

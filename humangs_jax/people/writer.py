@@ -1,0 +1,348 @@
+"""Synthetic people as capture folders: pictures, masks, cameras and body poses on disk, made from nothing but seeds.
+
+out/manifest.json                    with what the set was made and who is finished, see `manifest`
+out/SEED/                            a capture (docs/capture_format.md): views of one person in one or several poses
+out/SEED/held_out/                   a capture of its own with the views that reconstruction may not see
+out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
+out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see `scans`
+out/SEED/depth/NAME.png, maps/NAME.exr    where asked for, see `maps`; also in held_out/
+"""
+
+import dataclasses
+import os
+import shutil
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.data.capture import Capture, save_capture
+from humangs_jax.data.motion import Motion, save_motion
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.atomic import replace_folder
+from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
+from humangs_jax.people.manifest import begin_set, write_manifest
+from humangs_jax.people.maps import render_maps, write_depth, write_maps
+from humangs_jax.people.poses import sample_rotations
+from humangs_jax.people.rendering import PosedSubject, pose_subject, render_view
+from humangs_jax.people.scans import export_scan
+from humangs_jax.people.seeds import SPLITS, seeds_of, split_of
+from humangs_jax.people.sequences import sample_sequence
+from humangs_jax.people.subject import SyntheticSubject, make_subject
+
+HELD_OUT = "held_out"
+"""Sub-folder of a subject's folder: a capture of its own with the views that reconstruction may not see."""
+POSE_STREAM, CAMERA_STREAM, HELD_OUT_STREAM, CLOSE_STREAM, MOTION_STREAM = 1, 2, 3, 4, 5
+"""Independent random streams of a seed; stream 0 makes the person."""
+STALE = 3600.0
+"""Seconds after which a half-written folder is taken for the remains of a killed run."""
+GROUNDED_EVERY = 5
+"""Frames between those that tell how high a motion is above the ground."""
+MANIFEST_EVERY = 30.0
+"""Seconds between two updates of the manifest."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """What is written of each person.
+
+    image_size: pixels a side; smaller sizes are box averages of it (the loader makes them).
+    poses: how many; each is seen by `views` cameras of the published protocol and `close_views` nearer ones.
+    held_out_views: cameras of the same pose, and of each of `novel_poses` others, in held_out/.
+    frames: 0: poses are independent. Otherwise they are `poses` evenly spaced frames of a motion of so many at 30 a second.
+    depth, maps: files beside each picture. scan_texture: texels a side of the scan's texture, 0: no scan.
+    """
+
+    image_size: int = 512
+    poses: int = 1
+    views: int = 60
+    close_views: int = 0
+    held_out_views: int = 0
+    novel_poses: int = 0
+    frames: int = 0
+    depth: bool = False
+    maps: bool = False
+    scan_texture: int = 0
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A picture to take: of the pose number `frame`, by a camera."""
+
+    frame: int
+    name: str
+    camera: Camera
+
+
+def sample_pose(subject: SyntheticSubject, index: int) -> PosedSubject:
+    """The subject in its pose of that number, standing on y = 0. Pose 0 is the one of the input views."""
+    rng = np.random.default_rng([subject.seed, POSE_STREAM, index])
+    return stand(subject, sample_rotations(rng, subject.build))
+
+
+def stand(subject: SyntheticSubject, rotations: np.ndarray) -> PosedSubject:
+    """The subject in a pose of rotations (j, 3), its lowest point on y = 0."""
+    rotations, translation = np.asarray(rotations, np.float32), np.zeros(3, np.float32)
+    translation[1] = -subject.posed_vertices(rotations, translation)[:, 1].min()
+    return pose_subject(subject, rotations, translation)
+
+
+def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = None) -> Motion:
+    """The subject's motion, see `sequences`; its lowest points, soles of shoes included, are on y = 0 about all the time."""
+    sequence = sample_sequence(np.random.default_rng([subject.seed, MOTION_STREAM]), subject.build, frames, kind)
+    rotations, translations = sequence.rotations.astype(np.float32), sequence.translations.astype(np.float32)
+    asked = range(0, frames, GROUNDED_EVERY)
+    lowest = [subject.posed_vertices(rotations[i], translations[i])[:, 1].min() for i in asked]
+    translations[:, 1] -= np.median(lowest)
+    return Motion(jnp.asarray(rotations), jnp.asarray(translations), sequence.fps)
+
+
+def capture_views(
+    subject: SyntheticSubject, body: BodyModel, poses: list[PosedSubject], views: Sequence[View]
+) -> Capture:
+    """A capture of these views."""
+    pictures = [render_view(poses[view.frame], view.camera) for view in views]
+    images, masks = (np.stack(x) for x in zip(*pictures, strict=True))
+    rotations, translations = (np.stack([getattr(p, name) for p in poses]) for name in ("rotations", "translation"))
+    return Capture(
+        images=images,
+        masks=masks,
+        cameras=jax.tree.map(lambda *leaves: jnp.stack(leaves), *[view.camera for view in views]),
+        frames=np.asarray([view.frame for view in views], np.int32),
+        body=body,
+        betas=subject.betas,
+        poses=jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray(translations)),
+        names=tuple(view.name for view in views),
+    )
+
+
+def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout) -> None:
+    """One person as `layout` says. Written whole or not at all; an existing folder is replaced."""
+    subject = make_subject(seed, body)
+    rngs = {stream: np.random.default_rng([seed, stream]) for stream in (CAMERA_STREAM, HELD_OUT_STREAM, CLOSE_STREAM)}
+    motion = sample_motion(subject, layout.frames) if layout.frames else None
+    if motion is None:
+        posed = [sample_pose(subject, i) for i in range(layout.poses)]
+    else:
+        shown = np.linspace(0, layout.frames - 1, layout.poses).round().astype(int)
+        rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
+        posed = [pose_subject(subject, rotations[i], translations[i]) for i in shown]
+    size = layout.image_size
+    around = lambda stream, place, count, poses: [
+        place(rngs[stream], p.vertices, spread_azimuths(rngs[stream], count), size) for p in poses if count
+    ]
+    views = _views(around(CAMERA_STREAM, cameras_around, layout.views, posed))
+    views += _views(around(CLOSE_STREAM, close_cameras, layout.close_views, posed), mark="c")
+    others = [posed[0], *(sample_pose(subject, layout.poses + i) for i in range(layout.novel_poses))]
+    held_out = _views(around(HELD_OUT_STREAM, cameras_around, layout.held_out_views, others))
+
+    def write(temporary: Path):
+        _write_views(temporary, subject, body, posed, views, layout)
+        if held_out:
+            _write_views(temporary / HELD_OUT, subject, body, others, held_out, layout)
+        if motion is not None:
+            save_motion(temporary / "motion.npz", motion)
+        if layout.scan_texture:
+            pose = BodyPose(jnp.asarray(posed[0].rotations), jnp.asarray(posed[0].translation))
+            export_scan(subject, temporary / "scan", pose, lit=True, texture_size=layout.scan_texture)
+
+    replace_folder(folder, write)
+
+
+def write_subject(
+    folder: str | Path,
+    seed: int,
+    *,
+    body: BodyModel,
+    image_size: int = 512,
+    input_views: int = 4,
+    held_out_views: int = 8,
+    novel_poses: int = 0,
+) -> None:
+    """A capture of `input_views` evenly spread photos of a standing person, and `held_out/` with other views.
+
+    The held-out capture shows the same pose (frame 0) from `held_out_views` other cameras, then each of `novel_poses` other
+    poses (frames 1, 2, ...) from as many. Written whole or not at all; an existing folder is replaced.
+    """
+    layout = Layout(image_size, views=input_views, held_out_views=held_out_views, novel_poses=novel_poses)
+    write_person(folder, seed, body, layout)
+
+
+def write_training_subject(
+    folder: str | Path, seed: int, *, body: BodyModel, image_size: int = 256, poses: int = 2, views: int = 12
+) -> None:
+    """ONE capture of `poses` frames with `views` views each, azimuths evenly spread with jitter. Written whole or not at all."""
+    write_person(folder, seed, body, Layout(image_size, poses=poses, views=views))
+
+
+def synthesize(
+    out: str | Path,
+    subjects: int,
+    first_seed: int = 0,
+    *,
+    training: bool = True,
+    image_size: int = 256,
+    views: int = 12,
+    poses: int = 2,
+    held_out_views: int = 8,
+    body: BodyModel | None = None,
+    progress: bool = True,
+) -> list[Path]:
+    """Write `subjects` people, seeds from `first_seed` on, see `write_set`.
+
+    training: one capture of `poses` x `views` each; otherwise `views` input photos of one pose and `held_out_views` held-out
+    ones, `poses` - 1 novel poses among them. Returns the folders. Raises: see `write_set`.
+    """
+    layout = Layout(image_size, poses=poses, views=views)
+    if not training:
+        layout = Layout(image_size, views=views, held_out_views=held_out_views, novel_poses=poses - 1)
+    split = split_of(first_seed)
+    return write_set(out, subjects, layout, split, first_seed - SPLITS[split].start, body=body, progress=progress)
+
+
+def write_set(
+    out: str | Path,
+    subjects: int,
+    layout: Layout,
+    split: str = "train",
+    first: int = 0,
+    *,
+    workers: int = 1,
+    body: BodyModel | None = None,
+    progress: bool = True,
+) -> list[Path]:
+    """Write people `first` .. `first + subjects - 1` of a split into `out`/SEED; folders that are there already are kept.
+
+    Arguments:
+        workers: processes that make people; with more than one they use the CPU, whatever the default device is. The
+            files are the same. More than one needs the calling script to be guarded by `if __name__ == "__main__"`.
+        body: the package's own if not given. progress: show a bar.
+
+    Returns the folders. Raises: ValueError if the people reach beyond the split, `out` was written with other settings or by
+    another version of the generator, or (at the end, the others being written) some could not be made.
+    """
+    from tqdm import tqdm
+
+    out, seeds, settings = Path(out), seeds_of(split, first, subjects), dataclasses.asdict(layout)
+    begin_set(out, split, settings)
+    folders = {seed: out / f"{seed:07d}" for seed in seeds}
+    missing = [seed for seed, folder in folders.items() if not (folder / "capture.json").is_file()]
+    _remove_remains(out)
+    failed: dict[int, Exception] = {}
+    written = time.monotonic()
+    try:
+        with tqdm(total=subjects, initial=subjects - len(missing), desc="people", disable=not progress) as bar:
+            for seed, error in _make(missing, folders, layout, body, workers):
+                if error is not None:
+                    failed[seed] = error
+                    bar.write(f"seed {seed}: {error}")
+                bar.update(1)
+                if time.monotonic() - written > MANIFEST_EVERY:
+                    write_manifest(out, split, settings)
+                    written = time.monotonic()
+    finally:
+        write_manifest(out, split, settings)
+    if failed:
+        seed, error = next(iter(failed.items()))
+        raise ValueError(
+            f"{out}: {len(failed)} of {subjects} people could not be made, the first of them {seed}: {error}"
+        )
+    return list(folders.values())
+
+
+def _make(seeds, folders, layout, body, workers):
+    """Yields (seed, None or what went wrong) as people are finished."""
+    if workers <= 1 or len(seeds) <= 1:
+        if body is None and seeds:
+            from humangs_jax.body.library import load_body
+
+            body = load_body()
+        for seed in seeds:
+            yield seed, _attempt(folders[seed], seed, body, layout)
+        return
+    import concurrent.futures.process
+    import multiprocessing
+
+    context = multiprocessing.get_context("spawn")
+    count = min(workers, len(seeds))
+    with concurrent.futures.ProcessPoolExecutor(count, context, _start_worker, (body,)) as pool:
+        futures = {pool.submit(_work, folders[seed], seed, layout): seed for seed in seeds}
+        try:
+            for future in concurrent.futures.as_completed(futures):
+                yield futures[future], future.result()
+        except concurrent.futures.process.BrokenProcessPool as error:
+            raise OSError(
+                "a process that makes people was killed, perhaps for want of memory: try fewer workers"
+            ) from error
+        except BaseException:  # interrupted: nobody waits for people half made
+            pool.shutdown(wait=False, cancel_futures=True)
+            for process in multiprocessing.active_children():
+                process.terminate()
+            raise
+
+
+def _attempt(folder, seed, body, layout):
+    try:
+        write_person(folder, seed, body, layout)
+    except (
+        ValueError,
+        ArithmeticError,
+        IndexError,
+        KeyError,
+    ) as error:  # of the generator; a full disk ends everything
+        return error
+    return None
+
+
+_worker: dict[str, Any] = {}
+
+
+def _start_worker(body):
+    """One thread each: the processes are the parallelism."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
+    jax.config.update("jax_platforms", "cpu")
+    from humangs_jax.body.library import load_body
+
+    _worker["body"] = load_body() if body is None else body
+
+
+def _work(folder, seed, layout):
+    return _attempt(folder, seed, _worker["body"], layout)
+
+
+def _views(batches: list[Camera], mark: str = "") -> list[View]:
+    """The views of batches[frame]."""
+    numbered = [(frame, batch, i) for frame, batch in enumerate(batches) for i in range(batch.K.shape[0])]
+    return [View(frame, f"{frame}_{mark}{i:02d}", batch[i]) for frame, batch, i in numbered]
+
+
+def _write_views(folder, subject, body, posed, views, layout):
+    capture = capture_views(subject, body, posed, views)
+    save_capture(folder, capture)
+    for name in ("depth", "maps"):
+        if getattr(layout, name):
+            (folder / name).mkdir()
+    if not (layout.depth or layout.maps):
+        return
+    assert capture.masks is not None
+    for i, view in enumerate(views):
+        maps = render_maps(posed[view.frame], view.camera)
+        if layout.depth:
+            write_depth(folder / "depth" / f"{view.name}.png", maps.depth)
+        if layout.maps:
+            write_maps(folder / "maps" / f"{view.name}.exr", capture.images[i], capture.masks[i], maps, view.camera)
+
+
+def _remove_remains(out):
+    """Half-written folders of killed runs."""
+    for folder in out.glob(".[0-9]*.[0-9]*"):
+        if folder.is_dir() and time.time() - folder.stat().st_mtime > STALE:
+            shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,253 @@
+"""Triangle meshes to pixels: which face is seen at every pixel centre, where on that face, and how far away.
+
+Conventions: OpenCV cameras, pixel centres at +0.5, depth is the camera's z. The nearest face wins, of equally near
+ones the one of lower index; both sides of a face are seen. A face covers the pixel centres inside it AND on its edges.
+Faces without area in the image cover nothing. Faces that reach behind the near plane are dropped whole; those that
+also reach before it may be missing from the picture and are counted in `Fragments.overflow`.
+
+Method: scanlines. Faces of a body cover a few pixels or none, so that tiles of pixels times lists of faces would
+mostly test pixels that a face does not touch. Instead each face is expanded to its rows of pixel centres and each row
+to the pixels of its span (see `_window`); these fragments meet in a z-buffer by two scatters, first the least
+depth of a pixel, then the least face number at that depth. Both levels run in steps of a fixed number of slots, and as
+many steps as the mesh needs: shapes are static, yet there is no capacity that a mesh could exceed.
+
+Watertight: an edge function is taken from the pixel's point of view, (a - p) x (b - p), the ends a and b in an order
+that depends on their positions alone. Two faces that share an edge so compute one number with opposite signs, whatever
+the compiler contracts, and close to a vertex the differences are exact: both may claim a pixel, but never neither.
+
+Derivatives: fragments are constants (`stop_gradient`); `interpolate_attributes` is differentiable with respect to the attributes.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, owners
+
+SPAN_SLACK = 16
+"""Spans of pixels are widened by this many roundings of the coordinates; the edge functions decide."""
+
+AREA_ROUNDING = 2
+"""A face whose area is below this many roundings of the area's own computation has none."""
+
+NO_FACE = jnp.iinfo(jnp.int32).max
+
+
+@dataclasses.dataclass(frozen=True)
+class RasterConfig:
+    """Knobs of the rasterizer; the picture depends on `near` alone.
+
+    near: faces with a corner at z <= near are dropped, in the units of the vertices.
+    rows_per_step, fragments_per_step: slots per step of the two loops. Large steps waste time on slots that stay empty,
+    small ones on the overhead of more steps.
+    """
+
+    near: float = 0.01
+    rows_per_step: int = 1 << 15
+    fragments_per_step: int = 1 << 16
+
+
+DEFAULT_CONFIG = RasterConfig()
+
+
+@pytree_dataclass
+class Fragments:
+    """What a camera sees of a mesh.
+
+    face_ids: (h, w) index of the face, -1 where there is none.
+    barycentrics: (h, w, 3) perspective-correct weights of the face's corners, >= 0, of sum 1; 0 where there is no face.
+    depth: (h, w) z in the camera, in the units of the vertices; -1 where there is no face.
+    overflow: faces that may be missing from the picture: they cross the near plane, are not finite numbers of pixels, or
+        come after the first 2^30 rows of pixels.
+    """
+
+    face_ids: Int[Array, "h w"]
+    barycentrics: Float[Array, "h w 3"]
+    depth: Float[Array, "h w"]
+    overflow: Int[Array, ""]
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def rasterize_mesh(
+    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera, config: RasterConfig = DEFAULT_CONFIG
+) -> Fragments:
+    """The nearest face at every pixel centre of one camera; batch with `jax.vmap`."""
+    vertices, camera = lax.stop_gradient((vertices, camera))
+    if faces.shape[0] == 0 or vertices.shape[0] == 0:  # a face without area stands for no face
+        vertices, faces = jnp.ones((1, 3), vertices.dtype), jnp.zeros((1, 3), jnp.int32)
+    width, height = camera.width, camera.height
+    corners = _project(vertices, camera)[faces.astype(jnp.int32)].reshape(-1, 9)
+    drawn, overflow = _drawn(corners, config.near)
+    first_row, rows = _rows(corners, drawn, width, height)
+    row_end = cumsum(rows)
+    depth, face_ids = _z_buffer(corners, first_row, row_end - rows, row_end, width, height, config)
+    covered = face_ids != NO_FACE
+    weights = _weights_by_pixel(corners, jnp.where(covered, face_ids, 0), width, config.fragments_per_step)
+    weights = jnp.where(covered[:, None], weights, 0.0)
+    return Fragments(
+        face_ids=jnp.where(covered, face_ids, -1).reshape(height, width),
+        barycentrics=weights.reshape(height, width, 3),
+        depth=jnp.where(covered, depth, -1.0).reshape(height, width),
+        overflow=overflow + jnp.sum((rows > 0) & (row_end >= SUM_LIMIT), dtype=jnp.int32),
+    )
+
+
+@jax.jit
+def interpolate_attributes(
+    fragments: Fragments, faces: Int[Array, "f 3"], attributes: Float[Array, "n c"], background: Float[Array, " c"]
+) -> Float[Array, "h w c"]:
+    """Values at the corners of the faces, blended over the seen surface; `background` where there is no face.
+
+    Corners may have numbers of their own: with `faces` the texture indices of the same faces, in the same order, and
+    `attributes` the texture coordinates, this is the texture coordinate of every pixel.
+    """
+    if faces.shape[0] == 0:
+        return jnp.broadcast_to(background, (*fragments.face_ids.shape, background.shape[0]))
+    covered = fragments.face_ids >= 0
+    corners = attributes[faces].reshape(faces.shape[0], -1)[jnp.where(covered, fragments.face_ids, 0)]
+    # three terms, not a sum over an axis of three: 70 times as fast on XLA's CPU backend
+    a, b, c = jnp.split(corners, 3, axis=-1)
+    weight_a, weight_b, weight_c = jnp.split(fragments.barycentrics, 3, axis=-1)
+    return jnp.where(covered[..., None], weight_a * a + weight_b * b + weight_c * c, background)
+
+
+def _project(vertices, camera):
+    """(n, 3): pixel position x, y and depth z. Written out: matrix products are of low precision on GPU and TPU."""
+    R, t, K = camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3], camera.K
+    x, y, z = (R[i, 0] * vertices[:, 0] + R[i, 1] * vertices[:, 1] + R[i, 2] * vertices[:, 2] + t[i] for i in range(3))
+    return jnp.stack([K[0, 0] * (x / z) + K[0, 2], K[1, 1] * (y / z) + K[1, 2], z], axis=-1).astype(vertices.dtype)
+
+
+def _first_pixel(low, size):
+    """First pixel whose centre is at `low` or after; clipped to [0, size]."""
+    return jnp.clip(jnp.ceil(low - 0.5), 0, size).astype(jnp.int32)
+
+
+def _last_pixel(high, size):
+    """Last pixel whose centre is at `high` or before; clipped to [-1, size - 1]."""
+    return jnp.clip(jnp.floor(high - 0.5), -1, size - 1).astype(jnp.int32)
+
+
+def _pixel_centers(pixel, width, dtype):
+    return (pixel % width).astype(dtype) + 0.5, (pixel // width).astype(dtype) + 0.5
+
+
+def _drawn(corners, near):
+    """Faces before the near plane that have an area in the image; and how many faces are left out that may be seen."""
+    z = corners[:, 2::3]
+    ab, ac = corners[:, 3:5] - corners[:, 0:2], corners[:, 6:8] - corners[:, 0:2]
+    area = jnp.abs(ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
+    rounding = AREA_ROUNDING * jnp.finfo(corners.dtype).eps * jnp.abs(ab).sum(-1) * jnp.abs(ac).sum(-1)
+    whole = (z > near).all(-1) & jnp.isfinite(area)
+    lost = ~whole & ~(z <= near).all(-1)  # also where z is NaN
+    return whole & (area > rounding), jnp.sum(lost, dtype=jnp.int32)
+
+
+def _rows(corners, drawn, width, height):
+    """First row of pixel centres of every face, and how many; 0 rows if its bounding box holds no pixel centre."""
+    x, y = (jnp.where(drawn[:, None], corners[:, i::3], 0.0) for i in range(2))
+    drawn &= _first_pixel(x.min(-1), width) <= _last_pixel(x.max(-1), width)
+    first = _first_pixel(y.min(-1), height)
+    return first, jnp.where(drawn, jnp.maximum(_last_pixel(y.max(-1), height) - first + 1, 0), 0)
+
+
+def _spans(corners, row, width):
+    """First column and number of the pixel centres of this row that may lie inside the face."""
+    y = row.astype(corners.dtype) + 0.5
+    left, right = jnp.full_like(y, jnp.inf), jnp.full_like(y, -jnp.inf)
+    x = [corners[:, 3 * i] for i in range(3)]
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        ay, by = corners[:, 3 * a + 1], corners[:, 3 * b + 1]
+        # a horizontal edge needs no part: its ends belong to the other two edges
+        crosses = (jnp.minimum(ay, by) <= y) & (y <= jnp.maximum(ay, by)) & (ay != by)
+        at = x[a] + (y - ay) / jnp.where(ay == by, 1.0, by - ay) * (x[b] - x[a])
+        left = jnp.minimum(left, jnp.where(crosses, at, jnp.inf))
+        right = jnp.maximum(right, jnp.where(crosses, at, -jnp.inf))
+    largest = jnp.maximum(jnp.maximum(jnp.abs(x[0]), jnp.abs(x[1])), jnp.abs(x[2]))
+    slack = SPAN_SLACK * jnp.finfo(corners.dtype).eps * (largest + 1.0)
+    first = _first_pixel(left - slack, width)
+    return first, jnp.maximum(_last_pixel(right + slack, width) - first + 1, 0)
+
+
+def _weigh(corners, x, y):
+    """Perspective-correct weights (three arrays), depth, and whether the face covers the points (x, y)."""
+    corner_x, corner_y = [corners[..., 3 * i] for i in range(3)], [corners[..., 3 * i + 1] for i in range(3)]
+    edges = []
+    for a, b in ((1, 2), (2, 0), (0, 1)):
+        ax, ay, bx, by = corner_x[a], corner_y[a], corner_x[b], corner_y[b]
+        swap = (ay > by) | ((ay == by) & (ax > bx))
+        ax, ay, bx, by = ax - x, ay - y, bx - x, by - y
+        low_x, low_y, high_x, high_y = (jnp.where(swap, p, q) for p, q in ((bx, ax), (by, ay), (ax, bx), (ay, by)))
+        edge = low_x * high_y - low_y * high_x
+        edges.append(jnp.where(swap, -edge, edge))
+    smallest = jnp.minimum(jnp.minimum(edges[0], edges[1]), edges[2])
+    largest = jnp.maximum(jnp.maximum(edges[0], edges[1]), edges[2])
+    inside = ((smallest >= 0) | (largest <= 0)) & (smallest != largest)  # both windings; equal only if all are 0
+    areas = [jnp.abs(edge) for edge in edges]
+    total = areas[0] + areas[1] + areas[2]
+    total = jnp.where(total > 0, total, 1.0)
+    over_z = [area / total / corners[..., 3 * i + 2] for i, area in enumerate(areas)]
+    depth = 1 / (over_z[0] + over_z[1] + over_z[2])
+    return [value * depth for value in over_z], depth, inside
+
+
+def _weights_by_pixel(corners, face_ids, width, pixels_per_step):
+    """(h w, 3) weights of the corners of each pixel's face. In steps: small buffers are several times faster on CPU."""
+
+    def weights(pixel_and_face):
+        pixel, face = pixel_and_face
+        return jnp.stack(_weigh(corners[face], *_pixel_centers(pixel, width, corners.dtype))[0])
+
+    pixels = jnp.arange(face_ids.shape[0], dtype=jnp.int32)
+    return lax.map(weights, (pixels, face_ids), batch_size=pixels_per_step)
+
+
+def _window(first, end, start, size):
+    """Slots start .. start + size of items that own the slots first .. end: item of each, its place in the item, used or not."""
+    item = owners(first, size, start)
+    slot = start + jnp.arange(size, dtype=jnp.int32)
+    return item, slot - first[item], slot < end[-1]
+
+
+def _z_buffer(corners, first_row, row_begin, row_end, width, height, config):
+    """Depth and face of every pixel (h w): infinity and NO_FACE where there is none."""
+
+    def draw_rows(state):
+        start, depth, face_ids = state
+        face, place, used = _window(row_begin, row_end, start, config.rows_per_step)
+        row = first_row[face] + place
+        first_column, columns = _spans(corners[face], row, width)
+        columns = jnp.where(used, columns, 0)
+        end = cumsum(columns)
+        begin = end - columns
+
+        def draw_fragments(state):
+            start, depth, face_ids = state
+            span, place, used = _window(begin, end, start, config.fragments_per_step)
+            pixel = row[span] * width + first_column[span] + place
+            x, y = _pixel_centers(pixel, width, corners.dtype)
+            _, z, inside = _weigh(corners[face[span]], x, y)
+            drawn = jnp.where(used & inside, pixel, width * height)  # out of bounds: dropped
+            before = depth.at[drawn].get(mode="fill", fill_value=-1.0)
+            depth = depth.at[drawn].min(z, mode="drop")
+            nearest = depth.at[drawn].get(mode="fill", fill_value=-1.0)
+            # a pixel that came nearer forgets its face; then the lowest of the faces at its new depth takes it
+            face_ids = face_ids.at[jnp.where(nearest < before, drawn, width * height)].set(NO_FACE, mode="drop")
+            wins = jnp.where(z == nearest, drawn, width * height)
+            face_ids = face_ids.at[wins].min(face[span], mode="drop")
+            return start + config.fragments_per_step, depth, face_ids
+
+        more = lambda state: state[0] < end[-1]
+        _, depth, face_ids = lax.while_loop(more, draw_fragments, (jnp.zeros((), jnp.int32), depth, face_ids))
+        return start + config.rows_per_step, depth, face_ids
+
+    depth = jnp.full(width * height, jnp.inf, corners.dtype)
+    face_ids = jnp.full(width * height, NO_FACE, jnp.int32)
+    more = lambda state: state[0] < row_end[-1]
+    return lax.while_loop(more, draw_rows, (jnp.zeros((), jnp.int32), depth, face_ids))[1:]

@@ -1,0 +1,103 @@
+"""The image by its definition: every Gaussian on every pixel, one after the other. The oracle of `splatting`.
+
+Shares no code with the tiled renderer: its projection multiplies plain matrices, its compositing is the loop of the
+formula, its gradients are autodiff's. With a_j the columns of M and C = cov2d = M M^T + eps2d I, the exponent is
+
+    d^T C^-1 d = (sum_j (a_j x d)^2 + eps2d |d|^2) / det C,   det C = sum_i<j (a_i x a_j)^2 + eps2d |M|^2 + eps2d^2,
+
+sums of squares, accurate for needles of any length (the inverse of C has no correct digit left at 1e8 pixels). Memory and
+time grow with Gaussians times pixels; use it in float64 on small images.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.numerics import at_least_float32
+from humangs_jax.geometry import transform
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.constants import LARGEST_FOOTPRINT
+from humangs_jax.rendering.gaussians import Gaussians, covariance_factors
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
+from humangs_jax.rendering.splatting import Rendering
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def render_dense(
+    gaussians: Gaussians,
+    camera: Camera,
+    config: SplatConfig = DEFAULT_CONFIG,
+    background: Float[Array, "3"] | None = None,
+) -> Rendering:
+    """Same arguments and meaning as `splatting.render`; of `config`, only what decides on what is drawn plays a part."""
+    if background is None:
+        background = jnp.ones(3, gaussians.means.dtype)
+    gaussians, camera, background = at_least_float32((gaussians, camera, background))
+    centers, axes, depths, visible = _project(gaussians, camera, config)
+    determinants = _determinant(axes, config.eps2d)
+    order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
+    y, x = jnp.mgrid[: camera.height, : camera.width] + 0.5
+    pixels = jnp.stack([x, y], axis=-1).astype(centers.dtype)
+
+    def draw(state, splat):
+        color, distance, transmittance, ended = state
+        center, axis, determinant, depth, is_visible, opacity, rgb = splat
+        d = pixels - center
+        squared = jnp.sum(_cross(axis, d[..., None]) ** 2, axis=-1) + config.eps2d * jnp.sum(d**2, axis=-1)
+        raw = opacity * jnp.exp(-0.5 * squared / determinant)
+        alpha = jnp.where(raw < config.alpha_max, raw, config.alpha_max)
+        alpha = jnp.where(is_visible & (raw >= config.alpha_min), alpha, 0.0)
+        ended = ended | (transmittance * (1 - alpha) <= config.transmittance_stop)
+        alpha = jnp.where(ended, 0.0, alpha)
+        weight = alpha * transmittance
+        state = color + weight[..., None] * rgb, distance + weight * depth, transmittance * (1 - alpha), ended
+        return state, None
+
+    blank = jnp.zeros((camera.height, camera.width), centers.dtype)
+    state = jnp.zeros((*blank.shape, 3), blank.dtype), blank, blank + 1, blank > 0
+    splats = centers, axes, determinants, depths, visible, gaussians.opacities, gaussians.colors
+    (color, distance, transmittance, _), _ = lax.scan(draw, state, jax.tree.map(lambda leaf: leaf[order], splats))
+    alpha = 1 - transmittance
+    some = alpha > 0
+    depth = jnp.where(some, distance / jnp.where(some, alpha, 1.0), 0.0)
+    return Rendering(color + transmittance[..., None] * background, alpha, depth, jnp.int32(0))
+
+
+def _project(gaussians, camera, config):
+    """Centres (g, 2), axes (g, 2, 3), depths (g,) and whether each is drawn; those that are not lie at z = 1.
+
+    Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + eps2d I.
+    """
+    p = transform.apply(camera.cam_from_world, gaussians.means)
+    visible = (p[:, 2] > config.near) & (gaussians.opacities >= config.opacity_min)
+    depths = jnp.where(visible, p[:, 2], 1.0)
+    slopes = jnp.where(visible[:, None], p[:, :2], 0.0) / depths[:, None]
+    focal, center = jnp.stack([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]
+
+    at = slopes
+    if config.jacobian_margin is not None:
+        size = jnp.asarray([camera.width, camera.height], slopes.dtype)
+        extra = config.jacobian_margin * 0.5 * size / focal
+        at = jnp.clip(slopes, -center / focal - extra, (size - center) / focal + extra)
+    jacobian = jnp.concatenate(
+        [jnp.broadcast_to(jnp.eye(2, dtype=at.dtype), (*depths.shape, 2, 2)), -at[..., None]], axis=-1
+    )
+    jacobian = focal[:, None] * jacobian / depths[:, None, None]
+    image_from_world = jacobian @ camera.cam_from_world[:3, :3]
+    axes = image_from_world @ covariance_factors(gaussians, config.normalize_quats)
+    small = jnp.all(jnp.abs(axes) < LARGEST_FOOTPRINT, axis=(1, 2))
+    return slopes * focal + center, jnp.where(small[:, None, None], axes, 0.0), depths, visible & small
+
+
+def _determinant(axes, eps2d):
+    """Determinant of axes axes^T + eps2d I (Cauchy-Binet): of a needle, the matrix itself cancels in float64 too."""
+    pairs = _cross(axes[..., jnp.asarray([0, 1, 2])], axes[..., jnp.asarray([1, 2, 0])])
+    return jnp.sum(pairs**2, axis=-1) + eps2d * jnp.sum(axes**2, axis=(-1, -2)) + eps2d**2
+
+
+def _cross(a, b):
+    """Cross products of the columns of two (..., 2, n): (..., n)."""
+    return a[..., 0, :] * b[..., 1, :] - a[..., 1, :] * b[..., 0, :]

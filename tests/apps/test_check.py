@@ -1,0 +1,209 @@
+import dataclasses
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.apps import check as module
+from humangs_jax.apps.check import OUTLINE, ViewCheck, check_capture, draw_body, overlay, side_tints
+from humangs_jax.body.model import BodyModel, rest_pose
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import capture_from_arrays
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.io.images import read_image
+
+SIZE = 64
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+
+
+@functools.cache
+def boxes():
+    """A torso and two arms as boxes, each moved by a joint of its own; 1 m tall, 1.2 m wide, unequal in front and behind."""
+
+    def box(low, high):
+        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+        return low + corners * (np.asarray(high) - low)
+
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    triangles = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    parts = [box([-0.2, -0.6, -0.1], [0.2, 0.4, 0.1]), box([0.2, 0.1, -0.05], [0.7, 0.3, 0.05])]
+    parts += [box([-0.5, 0.1, -0.05], [-0.2, 0.3, 0.05])]
+    weights = np.repeat(np.eye(3), 8, axis=0)
+    return BodyModel(
+        template=jnp.asarray(np.concatenate(parts), jnp.float32),
+        shape_directions=jnp.zeros((24, 3, 2)),
+        pose_directions=None,
+        joint_regressor=jnp.asarray(weights.T / 8, jnp.float32),
+        skinning_weights=jnp.asarray(weights, jnp.float32),
+        faces=jnp.asarray(np.concatenate([triangles + 8 * i for i in range(3)])),
+        parents=(-1, 0, 0),
+        joint_names=("pelvis", "left_arm", "right_arm"),
+        name="boxes",
+    )
+
+
+def cameras(views=3, width=SIZE, height=SIZE):
+    K = intrinsics_from_fov(0.8, width, height)
+    azimuths = 0.4 + jnp.arange(views) * 2 * jnp.pi / views
+    return orbit(jnp.asarray([0.1, -0.1, 0.0]), 2.5, azimuths, 0.1, K, width, height)
+
+
+def capture(change=lambda matrix: matrix, masks=True, empty_masks=False, **arrays):
+    """Photos of the boxes themselves, with cameras told after `change`."""
+    seen, body = cameras(), boxes()
+    white = np.ones((SIZE, SIZE, 3), np.float32)
+    pictures = [draw_body(body, jnp.zeros(0), rest_pose(body), seen[i], white)[1] for i in range(3)]
+    covered = np.stack([np.asarray(p.covered) for p in pictures])
+    values = dict(
+        images=np.where(covered[..., None], np.stack([np.asarray(p.shaded) for p in pictures]), 1.0),
+        masks=covered.astype(np.float32) * (not empty_masks) if masks else None,
+        K=seen.K,
+        cam_from_world=np.stack([change(np.asarray(m, float)) for m in seen.cam_from_world]),
+        rotations=np.zeros((1, 3, 3)),
+        translations=np.zeros((1, 3)),
+        body=body,
+    )
+    return capture_from_arrays(**{**values, **arrays})
+
+
+def test_a_right_capture_has_full_overlap_and_no_warning(tmp_path):
+    report = check_capture(capture(), tmp_path / "check.png")
+    assert report.ok and len(report.views) == 3
+    for view in report.views:
+        assert view.iou == 1.0 and view.inside == 1.0
+    text = str(report)
+    assert "000" in text and "1.000" in text and "100%" in text and "warning:" not in text
+    sheet, _ = read_image(tmp_path / "check.png")
+    assert (np.abs(sheet - OUTLINE).max(-1) < 0.01).sum() > 100  # the outlines
+    assert (sheet[..., 2] - sheet[..., 0] > 0.2).sum() > 50  # something blue
+    assert (sheet[..., 0] - sheet[..., 2] > 0.2).sum() > 50  # something red
+    assert [p.name for p in tmp_path.iterdir()] == ["check.png"]
+
+
+def test_left_is_blue_and_right_is_red_on_the_photo():
+    body = boxes()
+    front = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.6, SIZE, SIZE), SIZE, SIZE)[0]
+    picture, parts = draw_body(body, jnp.zeros(0), rest_pose(body), front, np.ones((SIZE, SIZE, 3), np.float32))
+    # seen from the front the person's left arm (x > 0) is on the right of the picture
+    covered = np.asarray(parts.covered)
+    row = int(SIZE / 2 - 0.2 / (3 * np.tan(0.3)) * SIZE / 2)
+    columns = np.flatnonzero(covered[row])
+    assert picture[row, columns[-3], 2] > picture[row, columns[-3], 0] + 0.2
+    assert picture[row, columns[2], 0] > picture[row, columns[2], 2] + 0.2
+    np.testing.assert_allclose(side_tints(body)[:8], np.broadcast_to(module.MIDDLE, (8, 3)), atol=1e-6)
+
+
+def test_without_names_of_sides_the_tints_go_by_position():
+    body = dataclasses.replace(boxes(), joint_names=("a", "b", "c"))
+    np.testing.assert_allclose(side_tints(body)[8:], side_tints(boxes())[8:], atol=1e-6)
+
+
+def test_overlay_changes_only_the_body():
+    photo = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
+    picture, parts = draw_body(boxes(), jnp.zeros(0), rest_pose(boxes()), cameras()[0], photo)
+    covered = np.asarray(parts.covered)
+    assert 0.05 < covered.mean() < 0.5
+    np.testing.assert_array_equal(picture[~covered], photo[~covered])
+    edge = np.abs(picture - OUTLINE).max(-1) < 1e-6
+    assert edge.any() and not (edge & ~covered).any() and edge.sum() < covered.sum() / 2
+    inner = covered & ~edge
+    expected = (1 - module.OPACITY) * photo + module.OPACITY * np.asarray(parts.shaded)
+    np.testing.assert_allclose(picture[inner], expected[inner], atol=1e-6)
+    np.testing.assert_array_equal(overlay(photo, parts), picture)
+
+
+Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # (x, y, z) -> (x, z, -y): z-up to y-up
+MISTAKES = {
+    "is the inverse": np.linalg.inv,
+    "a world with z up": lambda m: m @ Z_UP,
+    "looks along -z": lambda m: FLIP @ m,
+    "camera to world in OpenGL": lambda m: np.linalg.inv(FLIP @ m),
+    "camera's translation is in millimetres": lambda m: np.block([[m[:3, :3], m[:3, 3:] * 1000], [m[3:]]]),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_the_usual_mistakes_are_named(tmp_path, mistake):
+    report = check_capture(capture(MISTAKES[mistake]), tmp_path / "check.png")
+    assert not report.ok
+    for view in report.views:
+        assert mistake in view.warnings[-1] and view.iou < 0.5
+    assert str(report).count("it would fit if") == 3
+    assert (tmp_path / "check.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_without_masks_no_wrong_mistake_is_named(tmp_path, mistake):
+    report = check_capture(capture(MISTAKES[mistake], masks=False), tmp_path / "check.png")
+    for view in report.views:
+        assert view.iou is None
+        assert all(mistake in warning for warning in view.warnings if "would fit" in warning)
+    assert str(report).count("no mask") == 3
+
+
+def test_mistakes_in_pictures_and_poses_are_named(tmp_path):
+    right = capture()
+    aside = replace(right.cameras, K=right.cameras.K.at[:, 0, 2].add(12))  # off the middle, then mirrored
+    flipped = {name: np.roll(getattr(right, name), 12, axis=2)[:, :, ::-1].copy() for name in ("images", "masks")}
+    millimetres = replace(right.poses, translation=jnp.asarray([[400.0, 300.0, 200.0]]))
+    shift = np.eye(4)
+    shift[:3, 3] = [-0.4, -0.3, -0.2]
+    moved = right.cameras.cam_from_world @ jnp.asarray(shift, jnp.float32)
+    wrong = {
+        "the mask is inverted": dict(masks=1 - right.masks),
+        "the photo is mirrored": {**flipped, "cameras": aside},
+        "the body's translation is in millimetres": dict(
+            poses=millimetres, cameras=replace(right.cameras, cam_from_world=moved)
+        ),
+    }
+    for mistake, changes in wrong.items():
+        report = check_capture(dataclasses.replace(right, **changes), tmp_path / "check.png")
+        named = [view.warnings[-1:] for view in report.views]
+        assert sum(mistake in warning for warnings in named for warning in warnings) >= 2, (mistake, named)
+
+
+def test_warnings_tell_what_is_wrong(tmp_path):
+    def warnings(**arrays):
+        return " | ".join(check_capture(capture(**arrays), tmp_path / "check.png").views[0].warnings)
+
+    behind = np.asarray(cameras()[0].center) * 3
+    assert "the body is behind the camera" in warnings(translations=behind[None])
+    assert "outside the frame" in warnings(translations=np.array([[0.0, 5.0, 0.0]]))
+    assert "IoU 0." in warnings(translations=np.array([[0.0, 0.7, 0.0]]))
+    assert "in metres?" in warnings(translations=-50 * behind[None])
+    assert "mask is empty" in warnings(empty_masks=True)
+
+
+def test_photos_are_shrunk_and_cameras_with_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "LONGEST_SIDE", SIZE // 2)
+    report = check_capture(capture(), tmp_path / "check.png")
+    assert (
+        report.ok and min(view.iou for view in report.views) > 0.7
+    )  # arms are 2 pixels thick then; a wrong scale leaves 0.3
+    sheet, _ = read_image(tmp_path / "check.png")
+    assert sheet.shape[1] < 2 * SIZE
+
+
+def test_each_view_shows_its_own_frame(tmp_path):
+    moved = np.array([[0.0, 0.0, 0.0], [0.0, 3.0, 0.0]])
+    report = check_capture(
+        capture(rotations=np.zeros((2, 3, 3)), translations=moved, frames=[0, 1, 0]), tmp_path / "check.png"
+    )
+    assert [not view.warnings for view in report.views] == [True, False, True]
+
+
+def test_report_is_a_table():
+    report = module.CheckReport((ViewCheck("front", 0.5, 0.25, ("too small",)), ViewCheck("left-side", None, 1.0)))
+    header, front, left, warning = str(report).splitlines()
+    assert header.split() == ["view", "silhouette", "IoU", "body", "in", "frame"]
+    assert front.split() == ["front", "0.500", "25%", "!"] and left.split() == ["left-side", "no", "mask", "100%"]
+    assert warning == "warning: front: too small" and not report.ok
+
+
+def test_drawing_compiles_once_per_image_size():
+    body, counts = boxes(), []
+    for i in range(3):
+        draw_body(body, jnp.zeros(0), rest_pose(body), cameras()[i], np.ones((SIZE, SIZE, 3), np.float32))
+        counts.append(module._picture._cache_size())
+    assert counts[0] == counts[1] == counts[2]

@@ -1,0 +1,97 @@
+import json
+import subprocess
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from humangs_jax.apps.demo import run_demo
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.io.exr import read_exr
+
+PRODUCTS = {
+    "animation.gif",
+    "animation.mp4",
+    "avatar.npz",
+    "avatar.ply",
+    "inputs.png",
+    "novel_views.exr",
+    "novel_views.png",
+    "report.json",
+}
+LEAST_PSNR, LEAST_SSIM = 22.0, 0.85  # dB over the held-out views: what the README promises of the shipped weights
+
+
+FRAME_SIZE = 64
+
+
+def video_frames(path):
+    """(m, h, w, 3) bytes by ffmpeg itself: imageio's reader leaves file handles open."""
+    import imageio_ffmpeg
+
+    command = [
+        imageio_ffmpeg.get_ffmpeg_exe(),
+        "-v",
+        "error",
+        "-i",
+        str(path),
+        "-f",
+        "rawvideo",
+        "-pix_fmt",
+        "rgb24",
+        "-",
+    ]
+    data = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=True).stdout
+    return np.frombuffer(data, np.uint8).reshape(-1, FRAME_SIZE, FRAME_SIZE, 3)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    run_demo(folder / "demo_out", frame_size=FRAME_SIZE)
+    assert [p.name for p in folder.iterdir()] == ["demo_out"]  # nothing else is left behind
+    return folder / "demo_out"
+
+
+def test_every_product_is_there(out):
+    assert {p.name for p in out.iterdir()} == PRODUCTS
+
+
+def test_the_report_holds_what_is_promised(out):
+    report = json.loads((out / "report.json").read_text())
+    assert report["psnr"] >= LEAST_PSNR and report["ssim"] >= LEAST_SSIM
+    assert report["psnr"] > report["baseline_psnr"]
+    assert report["psnr_foreground"] > report["baseline_psnr_foreground"]
+    assert {"reconstruct", "animate", "render_held_out"} <= set(report["timings"])
+    assert {"compile", "run"} == set(report["timings"]["reconstruct"])
+    assert {"jax", "flax", "humangs_jax", "python"} <= set(report["versions"]) and report["device"]
+
+
+def test_pictures_show_a_person(out):
+    for name in ("inputs.png", "novel_views.png"):
+        picture = iio.imread(out / name)
+        assert picture.std() > 20 and (picture == 255).all(-1).mean() > 0.3, name
+    frames = iio.imread(out / "animation.gif").astype(float)
+    assert len(frames) == len(video_frames(out / "animation.mp4")) >= 24
+    covered = (frames.min(-1) < 200).mean(axis=(1, 2))
+    assert (covered > 0.04).all() and (covered < 0.5).all()
+    assert np.abs(np.diff(frames, axis=0)).mean(axis=(1, 2, 3)).min() > 0.05  # every frame moves
+    border = np.concatenate([frames[:, 0], frames[:, -1], frames[:, :, 0], frames[:, :, -1]], axis=1)
+    assert border.min() > 230  # nobody is cut by the frame
+
+
+def test_exr_agrees_with_itself(out):
+    views = read_exr(out / "novel_views.exr")
+    assert len(views) == 6
+    for view in views:
+        alpha = view.rgba[..., 3]
+        assert view.rgba.dtype == np.float32 and 0.03 < alpha.mean() < 0.5
+        assert (view.rgba[..., :3] <= alpha[..., None] + 1e-4).all()  # premultiplied, on black
+        distance = np.linalg.norm(view.camera.center - np.asarray([0.0, 0.9, 0.0]))
+        depths = view.depth[alpha > 0.9]
+        assert abs(np.median(depths) - distance) < 0.5 and (view.depth[alpha == 0] == 0).all()
+
+
+def test_the_avatar_can_be_loaded_again(out):
+    avatar = Avatar.load(out / "avatar.npz")
+    assert len(avatar.parents) == 55 and np.isfinite(avatar.gaussians.means).all()

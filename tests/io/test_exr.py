@@ -1,0 +1,153 @@
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.io.exr import ExrView, read_exr, write_exr
+
+HEIGHT, WIDTH = 13, 9  # odd and unequal: a transposed or strided write cannot pass
+
+
+def matrices(i):
+    K = intrinsics_from_fov(0.7, WIDTH, HEIGHT)
+    camera = orbit(jnp.zeros(3), 3.0, jnp.arange(3) * 0.7, 0.1, K, WIDTH, HEIGHT)[i]
+    return dict(K=np.asarray(camera.K), cam_from_world=np.asarray(camera.cam_from_world))
+
+
+def make_view(i, **changes):
+    random = np.random.default_rng(i)
+    values = dict(
+        rgba=random.random((HEIGHT, WIDTH, 4), np.float32),
+        depth=random.random((HEIGHT, WIDTH), np.float32) * 1e4,
+        **matrices(i),
+        name=f"cam{i}",
+        channels={f"position.{axis}": random.normal(size=(HEIGHT, WIDTH)).astype(np.float32) for axis in "XYZ"},
+        attributes={"humangs": json.dumps({"frame": i})},
+    )
+    return ExrView(**{**values, **changes})
+
+
+def assert_same(a, b):
+    assert a.name == b.name and dict(a.attributes) == dict(b.attributes)
+    np.testing.assert_array_equal(a.rgba, b.rgba)
+    np.testing.assert_array_equal(a.depth, b.depth)
+    assert a.channels.keys() == b.channels.keys()
+    for name in a.channels:
+        np.testing.assert_array_equal(a.channels[name], b.channels[name])
+    np.testing.assert_array_equal(a.camera.K, b.camera.K)
+    np.testing.assert_array_equal(a.camera.cam_from_world, b.camera.cam_from_world)
+    assert (a.camera.width, a.camera.height) == (b.camera.width, b.camera.height)
+
+
+def test_several_views_round_trip_exactly(tmp_path):
+    views = [make_view(i) for i in range(3)]
+    views[0].rgba[0, :3, 0] = [np.inf, -0.0, 1e-42]  # float32 to the last bit, denormals included
+    write_exr(tmp_path / "novel_views.exr", views)
+    for a, b in zip(views, read_exr(tmp_path / "novel_views.exr"), strict=True):
+        assert_same(a, b)
+        assert b.rgba.dtype == b.depth.dtype == np.float32
+    assert [p.name for p in tmp_path.iterdir()] == ["novel_views.exr"]
+
+
+STRIDED = {
+    "flipped rows": lambda x: x[::-1],
+    "flipped columns": lambda x: x[:, ::-1],
+    "transposed": lambda x: np.swapaxes(x, 0, 1),
+    "cropped": lambda x: x[2:-1, 1:-2],
+    "every other": lambda x: x[::2, ::2],
+    "fortran": lambda x: np.asfortranarray(x),
+}
+
+
+@pytest.mark.parametrize("how", STRIDED)
+def test_strided_arrays_are_written_right(tmp_path, how):
+    whole = make_view(0)
+    change = STRIDED[how]
+    view = ExrView(change(whole.rgba), change(whole.depth), channels={"n.X": change(whole.rgba)[..., 1]})
+    assert not view.depth.flags.c_contiguous
+    write_exr(tmp_path / "a.exr", view)
+    (back,) = read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(back.rgba, view.rgba)
+    np.testing.assert_array_equal(back.depth, view.depth)
+    np.testing.assert_array_equal(back.channels["n.X"], view.rgba[..., 1])
+    assert back.name == "view000" and back.K is None and back.attributes == {}
+
+
+def test_other_types_become_float32(tmp_path):
+    view = make_view(0, rgba=make_view(0).rgba.astype(np.float64), depth=make_view(0).depth.astype(np.float16))
+    write_exr(tmp_path / "a.exr", view)
+    (back,) = read_exr(tmp_path / "a.exr")
+    np.testing.assert_array_equal(back.rgba, view.rgba.astype(np.float32))
+    np.testing.assert_array_equal(back.depth, view.depth.astype(np.float32))
+
+
+def test_files_of_others(tmp_path):
+    """Half floats without alpha, and grey ones."""
+    import OpenEXR
+
+    image = np.random.default_rng(0).random((HEIGHT, WIDTH)).astype(np.float16)
+    for name, channels in (("rgb", "RGB"), ("grey", "Y")):
+        with OpenEXR.File({}, {c: image for c in channels}) as file:
+            file.write(str(tmp_path / f"{name}.exr"))
+        (view,) = read_exr(tmp_path / f"{name}.exr")
+        np.testing.assert_array_equal(view.rgba[..., :3], np.repeat(image[..., None], 3, -1).astype(np.float32))
+        assert (view.rgba[..., 3] == 1).all() and view.depth is None
+    with OpenEXR.File({}, {"Z": image}) as file:
+        file.write(str(tmp_path / "depth.exr"))
+    with pytest.raises(ValueError, match=r"depth.exr: part .*expected channels R, G, B"):
+        read_exr(tmp_path / "depth.exr")
+    with OpenEXR.File({"K": np.eye(4, dtype="f")}, {"Y": image}) as file:
+        file.write(str(tmp_path / "camera.exr"))
+    with pytest.raises(ValueError, match=r"camera.exr: part .*K: expected a 3 x 3 matrix"):
+        read_exr(tmp_path / "camera.exr")
+    with pytest.raises(ValueError, match="no camera"):
+        _ = ExrView(np.zeros((4, 4, 4), np.float32)).camera
+
+
+def with_small_channel():
+    view = make_view(0)
+    view.channels["n"] = np.zeros((2, 2), np.float32)  # past the shape check of the constructor
+    return view
+
+
+BAD = {
+    "none": (lambda: [], "views: expected at least one"),
+    "names": (lambda: [make_view(0), make_view(1, name="cam0")], "different names"),
+    "sizes": (
+        lambda: [make_view(0), ExrView(np.zeros((4, 4, 4), np.float32))],
+        "views: expected one image size",
+    ),
+    "half a camera": (lambda: make_view(0, K=None), "'cam0': expected both K and cam_from_world"),
+    "channel size": (lambda: with_small_channel(), "'cam0': channel n: expected"),
+    "channel twice": (
+        lambda: make_view(0, channels={"Z": np.zeros((HEIGHT, WIDTH), np.float32)}),
+        "Z is there already",
+    ),
+    "attribute": (lambda: make_view(0, attributes={"type": "photo"}), "'cam0': attributes: type"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_views_write_nothing(tmp_path, case):
+    make, told = BAD[case]
+    with pytest.raises(ValueError, match=told):
+        write_exr(tmp_path / "a.exr", make())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bad_files(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no.exr: no such file"):
+        read_exr(tmp_path / "no.exr")
+    (tmp_path / "bad.exr").write_bytes(b"hello" * 10)
+    with pytest.raises(OSError, match=r"bad.exr: not an OpenEXR file"):
+        read_exr(tmp_path / "bad.exr")
+    write_exr(tmp_path / "whole.exr", [make_view(i) for i in range(3)])
+    data = (tmp_path / "whole.exr").read_bytes()
+    for share in (0.1, 0.5, 0.95):
+        (tmp_path / "cut.exr").write_bytes(data[: int(share * len(data))])
+        with pytest.raises(OSError, match=r"cut.exr: (damaged: \d of 3 parts|not a readable OpenEXR file)"):
+            read_exr(tmp_path / "cut.exr")
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        write_exr(tmp_path / "nowhere" / "a.exr", make_view(0))

@@ -1,0 +1,67 @@
+"""The published network's numbers at every stage: the copy of the reference that tests carry.
+
+`data/golden_a.pt` is a checkpoint of the published network with random weights at small sizes, in the released format;
+`data/golden_a_subject_0.npz` the reference's numbers for one subject, some stages thinned out (see `THINNED`). Both come
+from the project's golden data `golden_a` (computed in float64 by the authors' release, stored as float32);
+`python tests/network/network_golden.py GOLDEN_DIRECTORY` makes the npz again.
+"""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from humangs_jax.network.conversion import read_state_dict
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+DATA = Path(__file__).parent / "data"
+CHECKPOINT = DATA / "golden_a.pt"
+SUBJECT = DATA / "golden_a_subject_0.npz"
+
+every = lambda step, axes=1, before=0: (slice(None),) * before + (slice(None, None, step),) * axes
+THINNED = {
+    "out_ray_d": every(4, 2, 2),
+    "out_pose_feature": every(4, 2, 2),
+    "mid_feature_map_stride4": every(2, 1, 1),
+    "mid_decoder_input": every(4),
+    "mid_raw_geometry": every(4),
+    "mid_raw_appearance": every(4),
+    "asset_lbs_weights": every(20),
+    **{f"asset_{name}": every(7) for name in ("means3D", "rotations", "scales", "colors", "opacity")},
+    "posed_means3D": every(7),
+    "posed_rotations": every(7),
+}
+"""What the carried copy keeps of each stage."""
+
+
+def load_script(name):
+    """A script of experiments/ as a module."""
+    spec = importlib.util.spec_from_file_location(name, EXPERIMENTS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+check_parity = load_script("check_parity")
+
+
+def load_subject():
+    """Arrays of the carried subject in the layout of the golden files (b = 1), stages thinned out."""
+    arrays = dict(np.load(SUBJECT))
+    arrays = {name: x if name in check_parity.PER_VIEW else x[None] for name, x in arrays.items()}
+    return arrays | {"in_lbs_weights": read_state_dict(CHECKPOINT)[0]["tpose_lbs_weights"]}
+
+
+def thinned_errors(found, carried):
+    """Relative errors of one subject's stages, of which `carried` keeps a part."""
+    expected = {name: x for name, x in carried.items() if not name.startswith("in_")}
+    return check_parity.relative_errors({name: found[name][THINNED.get(name, ())] for name in expected}, expected)
+
+
+if __name__ == "__main__":
+    arrays = dict(np.load(Path(sys.argv[1]) / "golden_a.npz"))
+    views = arrays["in_image"].shape[1]
+    del arrays["in_lbs_weights"]  # the checkpoint carries them
+    first = {name: x[:views] if name in check_parity.PER_VIEW else x[0] for name, x in arrays.items()}
+    np.savez_compressed(SUBJECT, **{name: x[THINNED.get(name, ())] for name, x in first.items()})

@@ -1,0 +1,336 @@
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from network_cases import ALL_TOKENS, TINY, random_inputs, random_variables
+
+from humangs_jax.core.pytree import replace
+from humangs_jax.network import presets
+from humangs_jax.network.humangs import (
+    Encoding,
+    HumanGSConfig,
+    apply_humangs,
+    dropped_tokens,
+    encode,
+    project_and_test,
+    read_vertices,
+    sample_vertices,
+    select_tokens,
+    subject_unit,
+)
+from humangs_jax.network.transformer import Block
+from humangs_jax.network.vertex_decoder import SHELL_WIDTH, VertexDecoder
+from humangs_jax.network.weights import expected_variables
+
+FLOAT32_TOLERANCE = 1e-5
+"""The same sums in another order: a few layers of float32 roundings on numbers of order one."""
+BFLOAT16_TOLERANCE = 0.05
+"""bfloat16 has 8 bits (0.4 %); some twenty roundings in a row on numbers of order one."""
+
+
+PER_VIEW = ("images", "posed_vertices", "posed_normals", "position_maps", "depth_maps")
+
+
+@functools.partial(jax.jit, static_argnames=("config",))
+def run(variables, inputs, config):
+    """Encoding and outputs, compiled once per configuration and shape (the compiler merges what both compute)."""
+    return encode(variables, inputs, config), apply_humangs(variables, inputs, config)[0]
+
+
+def close(a, b, tolerance=FLOAT32_TOLERANCE):
+    pairs = zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    return all(np.allclose(x, y, rtol=tolerance, atol=tolerance) for x, y in pairs)
+
+
+@functools.cache
+def variables_of(config):
+    return random_variables(config)
+
+
+# shapes
+
+
+@pytest.mark.parametrize("name", sorted(presets.PRESETS))
+def test_presets_have_the_shapes_they_promise(name):
+    """Traced at full size, nothing is computed."""
+    config = presets.PRESETS[name]()
+    views, vertices, size = 4, 37, config.image_size
+    inputs = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, random_inputs(0, views, vertices, size)))
+    variables = expected_variables(config)
+    encoding, outputs = jax.eval_shape(lambda v, x: run(v, x, config), variables, inputs)
+    side = size // config.patch_size * (4 if config.upsampler.enabled else 1)
+    width = config.upsampler.hidden // 2 if config.upsampler.enabled else config.transformer.width
+    assert encoding.maps.shape == (views, side, side, width)
+    assert encoding.maps.dtype == (jnp.bfloat16 if config.dtype == "bfloat16" else jnp.float32) or side == size // 8
+    assert outputs.gaussians.means.shape == (vertices * config.decoder.gaussians_per_vertex, 3)
+    assert outputs.tight_offsets.shape == (vertices, 1, 3)
+    assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((outputs.gaussians, variables)))
+
+
+def test_the_published_network_has_99_million_parameters():
+    params = expected_variables(presets.published())["params"]
+    assert round(sum(leaf.size for leaf in jax.tree.leaves(params)) / 1e6) == 99
+
+
+@pytest.mark.parametrize(
+    ("views", "vertices", "tight", "free", "joints"), [(1, 5, 1, 0, None), (3, 40, 0, 2, 7), (6, 1, 2, 3, 55)]
+)
+def test_any_number_of_views_vertices_and_gaussians(views, vertices, tight, free, joints):
+    decoder = dataclasses.replace(TINY.decoder, tight=tight, free=free, skinning_joints=joints)
+    config = dataclasses.replace(TINY, decoder=decoder)
+    inputs = jax.eval_shape(lambda: random_inputs(0, views, vertices))
+    _, outputs = jax.eval_shape(lambda v, x: run(v, x, config), expected_variables(config), inputs)
+    count = vertices * (tight + free)
+    assert outputs.gaussians.opacities.shape == (count,) and outputs.tight_offsets.shape == (vertices, tight, 3)
+    assert (outputs.skinning_offsets is None) if joints is None else (outputs.skinning_offsets.shape == (count, joints))
+
+
+@pytest.mark.parametrize("class_token", [True, False])
+@pytest.mark.parametrize("sample_rgb", [True, False])
+def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
+    config = dataclasses.replace(
+        TINY,
+        transformer=dataclasses.replace(TINY.transformer, class_token=class_token),
+        upsampler=dataclasses.replace(TINY.upsampler, enabled=class_token),
+        sampling=dataclasses.replace(TINY.sampling, sample_rgb=sample_rgb),
+        decoder=dataclasses.replace(TINY.decoder, residual_color=sample_rgb),
+    )
+    variables = expected_variables(config)
+    assert bool(variables["batch_stats"]) == class_token
+    encoding, _ = jax.eval_shape(lambda v: run(v, random_inputs(), config), variables)
+    assert (encoding.global_token is not None) == class_token
+    kernel = variables["params"]["decoder"]["trunk_0"]["kernel"]
+    local = TINY.upsampler.out if class_token else TINY.transformer.width
+    assert kernel.shape[0] == local + TINY.transformer.width * class_token + 39 + 4 * sample_rgb + 3 + 7 * SHELL_WIDTH
+
+
+# values
+
+
+def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
+    inputs = random_inputs()
+    inputs = replace(inputs, images=jnp.full_like(inputs.images, 0.7))
+    plain = dataclasses.replace(
+        TINY,
+        sampling=dataclasses.replace(TINY.sampling, shells=()),
+        decoder=dataclasses.replace(TINY.decoder, frame="canonical"),
+    )
+    decoder = jax.jit(VertexDecoder(plain.decoder).init)(jax.random.key(0), jnp.zeros((1, plain.decoder_width)))
+    variables = variables_of(plain)
+    variables = {**variables, "params": {**variables["params"], "decoder": decoder["params"]}}
+    fresh = run(variables, inputs, plain)[1].gaussians
+    unit, k = subject_unit(inputs.canonical_vertices), plain.decoder.gaussians_per_vertex
+    assert np.abs(fresh.means - jnp.repeat(inputs.canonical_vertices, k, axis=0)).max() < 0.02
+    assert np.allclose(fresh.scales, 0.0082 * unit, rtol=0.1)  # softplus(-4.8) = 8.2 mm
+    assert np.allclose(fresh.opacities, jax.nn.sigmoid(-1.0), atol=0.01) and np.allclose(fresh.colors, 0.7, atol=0.01)
+    assert np.allclose(jnp.abs(fresh.quats[:, 0]), 1, atol=0.01)
+
+
+def test_deeper_blocks_begin_smaller():
+    config = presets.TransformerConfig(width=64, layers=4, attention=presets.AttentionConfig(head_width=32))
+    kernel = jax.jit(Block(config, 3).init)(jax.random.key(0), jnp.zeros((2, 64)))["params"]["mlp_in"]["kernel"]
+    assert np.isclose(kernel.std(), 0.02 / np.sqrt(2 * 4), rtol=0.05)
+
+
+def test_the_order_of_the_views_does_not_matter():
+    """Maps are permuted with the views, everything pooled stays."""
+    inputs, order = random_inputs(), jnp.asarray([1, 0])
+    per_view = {name: getattr(inputs, name) for name in PER_VIEW}
+    permuted = replace(
+        inputs,
+        cameras=jax.tree.map(lambda x: x[order], inputs.cameras),
+        **{name: x[order] for name, x in per_view.items()},
+    )
+    variables = variables_of(ALL_TOKENS)
+    (encoding, outputs), (other_encoding, other_outputs) = (run(variables, x, ALL_TOKENS) for x in (inputs, permuted))
+    assert close(encoding.maps[order], other_encoding.maps) and not close(encoding.maps, other_encoding.maps)
+    assert close(encoding.global_token, other_encoding.global_token) and close(outputs, other_outputs)
+
+
+def test_foreground_tokens_are_all_tokens_when_everything_is_foreground():
+    inputs = random_inputs()
+    patches = 2 * (32 // 8) ** 2
+    config = dataclasses.replace(TINY, token_capacity=patches + 50)
+    variables = variables_of(ALL_TOKENS)
+    assert close(run(variables, inputs, config), run(variables, inputs, ALL_TOKENS))
+
+
+def test_background_patches_are_unseen_and_dropped_ones_are_counted():
+    inputs = random_inputs()
+    foreground = np.zeros((2, 32, 32), bool)
+    foreground[0, 8:24, 16:32] = foreground[1, 3, 9] = True  # four patches, and one
+    inputs = replace(inputs, foreground=jnp.asarray(foreground))
+    variables = variables_of(TINY)
+    roomy, exact, tight = TINY, *(dataclasses.replace(TINY, token_capacity=n) for n in (5, 3))
+    encoding, outputs = run(variables, inputs, roomy)
+    assert outputs.dropped_tokens == 0 and close(
+        (encoding, outputs), run(variables, inputs, exact)
+    )  # padding is nothing
+    touched = np.kron(foreground.reshape(2, 4, 8, 4, 8).any((2, 4)), np.ones((8, 8), bool))
+    noise = jnp.where(touched[..., None], inputs.images, 0.123)
+    assert close(encoding, run(variables, replace(inputs, images=noise), roomy)[0])
+    assert not close(encoding, run(variables, replace(inputs, images=inputs.images.at[1, 0, 8].add(0.5)), roomy)[0])
+    packing = select_tokens(inputs, tight)
+    assert dropped_tokens(inputs, tight) == 2 and packing.count == 3 and np.array_equal(packing.indices, [6, 7, 10])
+
+
+def test_bfloat16_is_close():
+    variables, inputs = variables_of(ALL_TOKENS), random_inputs()
+    encoding, outputs = run(variables, inputs, dataclasses.replace(ALL_TOKENS, dtype="bfloat16"))
+    exact_encoding, exact = run(variables, inputs, ALL_TOKENS)
+    assert encoding.maps.dtype == jnp.bfloat16
+    scale = jnp.abs(exact_encoding.maps).max()
+    assert jnp.abs(encoding.maps.astype(jnp.float32) - exact_encoding.maps).max() < BFLOAT16_TOLERANCE * scale
+    assert close(outputs.gaussians.means, exact.gaussians.means, BFLOAT16_TOLERANCE)
+    assert close(outputs.gaussians.colors, exact.gaussians.colors, 2 * BFLOAT16_TOLERANCE)
+
+
+def test_unseen_vertices_are_grey_and_pool_nothing():
+    inputs = replace(random_inputs(), depth_maps=jnp.full((2, 32, 32), -1.0))
+    encoding = Encoding(jnp.ones((2, 16, 16, 4)), jnp.ones(16))
+    variables = variables_of(TINY)
+    features = sample_vertices(variables, encoding, inputs, TINY)
+    assert np.array_equal(features.local, np.zeros((20, 8))) and np.array_equal(
+        features.photo_colors, np.full((20, 3), 0.5)
+    )
+    assert np.array_equal(features.visible_fraction, np.zeros(20))
+    every = dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, pool="all"))
+    assert np.abs(sample_vertices(variables, encoding, inputs, every).local).min(axis=1).max() > 0
+
+
+# views that are padding, vertices that are not seen
+
+
+def padded(inputs, views):
+    """Garbage behind the views that there are."""
+    missing = views - len(inputs.images)
+    extend = lambda x, junk: jnp.concatenate([x, jnp.broadcast_to(jnp.asarray(junk, x.dtype), (missing, *x.shape[1:]))])
+    return replace(
+        inputs,
+        images=extend(inputs.images, 0.9),
+        cameras=jax.tree.map(lambda x: extend(x, x[-1]), inputs.cameras),
+        posed_vertices=extend(inputs.posed_vertices, 0.1),
+        posed_normals=extend(inputs.posed_normals, 0.5),
+        position_maps=extend(inputs.position_maps, 0.2),
+        depth_maps=extend(inputs.depth_maps, 9.0),
+        foreground=extend(inputs.foreground, True),
+        view_count=jnp.asarray(len(inputs.images)),
+    )
+
+
+PUBLISHED_LIKE = dataclasses.replace(
+    ALL_TOKENS,
+    sampling=dataclasses.replace(ALL_TOKENS.sampling, pool="all", convention="mixed"),
+)
+
+
+@pytest.mark.parametrize("train", [False, True])
+@pytest.mark.parametrize("config", [dataclasses.replace(TINY, token_capacity=64), PUBLISHED_LIKE])
+def test_padding_views_change_nothing(config, train):
+    inputs, variables = random_inputs(), variables_of(PUBLISHED_LIKE)
+    apply = jax.jit(lambda x: apply_humangs(variables, x, config, train))
+    (outputs, statistics), (expected, expected_statistics) = apply(padded(inputs, 3)), apply(inputs)
+    assert close((outputs, statistics), (expected, expected_statistics), 10 * FLOAT32_TOLERANCE)
+    assert not close(outputs, apply(replace(padded(inputs, 3), view_count=jnp.asarray(3)))[0], 1e-3)
+
+
+@pytest.mark.slow
+def test_subjects_with_different_numbers_of_views_share_a_batch():
+    subjects = [random_inputs(seed, views) for seed, views in enumerate((1, 3, 2))]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(padded(x, 3) for x in subjects))
+    variables = variables_of(PUBLISHED_LIKE)
+    apply = lambda x: apply_humangs(variables, x, PUBLISHED_LIKE)[0]
+    together = jax.jit(jax.vmap(apply))(batch)
+    for index, subject in enumerate(subjects):
+        assert close(jax.tree.map(lambda x, i=index: x[i], together), jax.jit(apply)(subject), 10 * FLOAT32_TOLERANCE)
+
+
+def test_views_are_read_only_for_the_vertices_they_see():
+    inputs = random_inputs()
+    inputs = replace(inputs, depth_maps=inputs.depth_maps.at[0, :, :16].set(-1.0))
+    variables, needed = variables_of(TINY), int(read_vertices(inputs, TINY))
+    seen = project_and_test(inputs, TINY)[1].sum(axis=1)
+    assert needed == seen.max() and seen.min() < needed
+    of_capacity = lambda n: dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, vertex_capacity=n))
+    reference, exact, tight = (run(variables, inputs, of_capacity(n))[1] for n in (None, needed, needed - 1))
+    assert close(exact, reference) and exact.dropped_reads == 0
+    assert tight.dropped_reads == (seen == needed).sum() and not close(tight.gaussians, reference.gaussians)
+
+
+# gradients and batches
+
+
+def loss(variables, inputs, config):
+    outputs, _ = apply_humangs(variables, inputs, config, train=True)
+    leaves = [*jax.tree.leaves(outputs.gaussians), outputs.tight_offsets]
+    return sum(jnp.sum(jnp.sin(leaf)) for leaf in leaves)
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def gradients(variables, continuous, inputs, config):
+    of = lambda params, continuous: loss({**variables, "params": params}, replace(inputs, **continuous), config)
+    return jax.grad(of, (0, 1))(variables["params"], continuous)
+
+
+def test_gradients_are_finite_and_reach_every_parameter():
+    inputs = random_inputs()
+    cameras = inputs.cameras
+    posed = (
+        inputs.posed_vertices.at[:, 0].set(cameras.center).at[:, 1].set(2 * cameras.center)
+    )  # in and behind the camera
+    inputs = replace(inputs, depth_maps=inputs.depth_maps.at[:, :16].set(-1.0))  # some vertices are seen by none
+    continuous = {"posed_vertices": posed, "images": inputs.images, "canonical_vertices": inputs.canonical_vertices}
+    config = dataclasses.replace(TINY, transformer=dataclasses.replace(TINY.transformer, remat=True))
+    of_params, of_inputs = gradients(variables_of(TINY), continuous, inputs, config)
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((of_params, of_inputs)))
+    silent = [path for path, leaf in jax.tree_util.tree_leaves_with_path(of_params) if not np.abs(leaf).max() > 0]
+    assert not silent
+
+
+def test_a_vmap_over_subjects_is_a_loop():
+    subjects = [random_inputs(seed) for seed in range(2)]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
+    variables = variables_of(TINY)
+    apply = functools.partial(apply_humangs, config=TINY, train=True)
+    one = jax.jit(apply)
+    looped = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(one(variables, x) for x in subjects))
+    assert close(jax.jit(jax.vmap(apply, in_axes=(None, 0)))(variables, batch), looped)
+
+
+# what is refused
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"image_size": 100}, "no multiple of patch_size"),
+        ({"transformer": presets.TransformerConfig(width=100)}, "head_width"),
+        ({"sampling": dataclasses.replace(TINY.sampling, shells=(0.0, 0.1))}, "along the normals"),
+        ({"transformer": presets.TransformerConfig(layers=3)}, "layers"),
+        ({"decoder": presets.VertexDecoderConfig(residual_color=True)}, "sample_rgb"),
+        ({"decoder": presets.VertexDecoderConfig(tight=0, free=0)}, "tight"),
+    ],
+)
+def test_configurations_that_do_not_fit_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        HumanGSConfig(**changes)
+
+
+def test_images_must_be_those_of_the_cameras():
+    apply = lambda inputs: jax.eval_shape(lambda x: apply_humangs(variables_of(TINY), x, TINY), inputs)
+    inputs = random_inputs()
+    with pytest.raises(ValueError, match="32 x 32 but their cameras say 64 x 32"):
+        apply(replace(inputs, cameras=replace(inputs.cameras, width=64)))
+    odd = random_inputs(size=36)
+    with pytest.raises(ValueError, match="36 x 36 cannot be cut"):
+        apply(odd)
+
+
+@pytest.mark.parametrize("missing", ["posed_normals", "canonical_normals"])
+def test_shells_need_normals(missing):
+    inputs = replace(random_inputs(), **{missing: None})
+    with pytest.raises(ValueError, match=missing):
+        jax.eval_shape(lambda v: run(v, inputs, TINY), expected_variables(TINY))

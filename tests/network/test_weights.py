@@ -1,0 +1,170 @@
+import dataclasses
+import json
+import os
+
+import jax
+import numpy as np
+import pytest
+from network_cases import TINY, random_inputs, random_variables
+from safetensors.numpy import load_file, save_file
+
+from humangs_jax.core.configuration import config_from_json, config_to_json
+from humangs_jax.network import presets, weights
+from humangs_jax.network.humangs import apply_humangs
+from humangs_jax.network.weights import fit_variables, load_weights, save_weights
+
+VARIABLES = random_variables(TINY)
+NO_RGB = dataclasses.replace(TINY.sampling, sample_rgb=False)
+TEXTURE = "params/encoder/tokenizer/texture"
+
+
+@pytest.fixture
+def file(tmp_path):
+    save_weights(tmp_path / "weights.safetensors", VARIABLES, TINY)
+    return tmp_path / "weights.safetensors"
+
+
+def rewrite(file, change, **metadata):
+    """The same file with other tensors or another header."""
+    tensors = load_file(file)
+    header = {"format": weights.FORMAT, "version": weights.VERSION, "config": config_to_json(TINY)} | metadata
+    change(tensors)
+    save_file(tensors, file, header)
+
+
+def test_round_trip(file):
+    variables, config = load_weights(file)
+    assert config == TINY and jax.tree.structure(variables) == jax.tree.structure(VARIABLES)
+    assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (variables, VARIABLES)), strict=True))
+    assert os.listdir(file.parent) == [file.name]
+
+
+def test_half_precision_halves_the_file_and_loads_as_float32(file, tmp_path):
+    half = tmp_path / "half.safetensors"
+    save_weights(half, VARIABLES, TINY, "float16")
+    variables, _ = load_weights(half)
+    for ours, exact in zip(*map(jax.tree.leaves, (variables, VARIABLES)), strict=True):
+        assert ours.dtype == np.float32 and np.allclose(ours, exact, rtol=2**-11, atol=1e-7)
+    assert half.stat().st_size < 0.65 * file.stat().st_size  # the header stays
+    huge = jax.tree.map(lambda x: x * 1e6, VARIABLES)
+    with pytest.raises(ValueError, match="overflows float16"):
+        save_weights(half, huge, TINY, "float16")
+    assert load_weights(half)[1] == TINY  # what was there is there
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda t: t.pop(TEXTURE), f"'{TEXTURE}' is missing"),
+        (lambda t: t.update(extra=np.zeros(2, np.float32)), "'extra' is unknown"),
+        (lambda t: t.update({TEXTURE: t[TEXTURE][:, :4].copy()}), rf"'{TEXTURE}' has shape \(3, 4, 8, 2\)"),
+        (lambda t: t[TEXTURE].__setitem__((0, 0, 0, 0), np.nan), f"'{TEXTURE}' holds numbers that are not finite"),
+    ],
+)
+def test_tensors_that_do_not_fit_are_named(file, change, message):
+    rewrite(file, change)
+    with pytest.raises(ValueError, match=message):
+        load_weights(file)
+
+
+@pytest.mark.parametrize(
+    ("metadata", "message"),
+    [
+        ({"format": "other"}, "found format 'other'"),
+        ({"version": "9"}, "version '9'"),
+        ({"config": "{"}, "no JSON"),
+        ({"config": "[]"}, "expected an object"),
+        (
+            {"config": json.dumps({"transformer": {"widht": 3}})},
+            "config.transformer.widht: TransformerConfig has no such",
+        ),
+        ({"config": json.dumps({"dtype": "float8"})}, "config.dtype: 'float8'"),
+        ({"config": json.dumps({"patch_size": 8.5})}, "config.patch_size"),
+        ({"config": json.dumps({"patch_size": True})}, "config.patch_size"),
+        ({"config": json.dumps({"image_size": 100})}, "no multiple of patch_size"),
+    ],
+)
+def test_bad_headers_are_clear_errors(file, metadata, message):
+    rewrite(file, lambda t: None, **metadata)
+    with pytest.raises(ValueError, match=message):
+        load_weights(file)
+
+
+def test_no_file_and_no_weights(tmp_path, monkeypatch):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        load_weights(tmp_path / "nowhere.safetensors")
+    garbage = tmp_path / "garbage.safetensors"
+    garbage.write_bytes(b"\x10\0\0\0\0\0\0\0not safetensors at all")
+    with pytest.raises(ValueError, match="no readable safetensors"):
+        load_weights(garbage)
+    monkeypatch.setattr(weights, "SHIPPED", "assets/nothing.safetensors")
+    with pytest.raises(FileNotFoundError, match="ships no weights"):
+        load_weights()
+
+
+def test_nothing_is_written_that_could_not_be_read(tmp_path):
+    wrong = dataclasses.replace(TINY, texture=presets.TriplaneConfig(4, 2))
+    with pytest.raises(ValueError, match=TEXTURE):
+        save_weights(tmp_path / "w.safetensors", VARIABLES, wrong)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", sorted(presets.PRESETS))
+def test_configurations_survive_json(name):
+    config = presets.PRESETS[name]()
+    assert config_from_json(type(config), config_to_json(config)) == config
+    assert config_from_json(type(config), "{}") == type(config)()
+
+
+def grown(**decoder):
+    """TINY without shells and in the canonical frame, and a network with shells and another number of Gaussians."""
+    plain = dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, shells=()))
+    plain = dataclasses.replace(plain, decoder=dataclasses.replace(plain.decoder, frame="canonical"))
+    return plain, dataclasses.replace(TINY, decoder=dataclasses.replace(TINY.decoder, **decoder))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("more", [-1, 0, 2])
+def test_a_network_that_grows_keeps_the_opacities_and_colours_it_has_learnt(more):
+    old, new = grown(free=TINY.decoder.free + more)
+    variables, inputs = random_variables(old, 3), random_inputs()
+    before, _ = apply_humangs(variables, inputs, old)
+    after, _ = apply_humangs(fit_variables(variables, old, new), inputs, new)
+    per_vertex = lambda outputs, config: np.asarray(outputs.gaussians.opacities).reshape(
+        -1, config.decoder.gaussians_per_vertex
+    )
+    a, b = per_vertex(before, old), per_vertex(after, new)
+    both = min(a.shape[1], b.shape[1])
+    assert np.allclose(a[:, :both], b[:, :both], atol=1e-6)
+
+
+def test_geometry_starts_anew_in_another_frame_alone():
+    old, new = grown()
+    variables = random_variables(old, 3)
+    geometry = lambda tree: np.asarray(tree["params"]["decoder"]["geometry_out"]["kernel"])
+    assert np.abs(geometry(fit_variables(variables, old, new))).max() < 0.01 < np.abs(geometry(variables)).max()
+    frame = dataclasses.replace(old, decoder=dataclasses.replace(old.decoder, frame="normal"))
+    assert np.array_equal(
+        geometry(fit_variables(random_variables(frame), frame, new)), geometry(random_variables(frame))
+    )
+
+
+def test_fitting_to_the_same_network_changes_nothing():
+    same = fit_variables(VARIABLES, TINY, TINY)
+    assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (same, VARIABLES)), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sampling": dataclasses.replace(TINY.sampling, shells=(0.0, 0.2))}, "shells"),
+        ({"decoder": dataclasses.replace(TINY.decoder, tight=2)}, "decoder.tight 1"),
+        ({"decoder": dataclasses.replace(TINY.decoder, residual_color=False), "sampling": NO_RGB}, "sample_rgb True"),
+        ({"decoder": dataclasses.replace(TINY.decoder, hidden=24)}, "decoder/"),
+        ({"transformer": dataclasses.replace(TINY.transformer, layers=6)}, "block_4"),
+        ({"texture": dataclasses.replace(TINY.texture, resolution=4)}, "texture"),
+    ],
+)
+def test_networks_that_differ_more_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        fit_variables(VARIABLES, TINY, dataclasses.replace(TINY, **changes))

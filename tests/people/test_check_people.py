@@ -1,0 +1,90 @@
+"""The scripts that look at people: faults are found where they are made, sheets are drawn."""
+
+import dataclasses
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from humangs_jax.body.library import load_body
+from humangs_jax.people import cameras
+from humangs_jax.people.seeds import DEMO
+from humangs_jax.people.subject import make_subject
+from humangs_jax.people.writer import sample_pose
+
+EXPERIMENTS = Path(__file__).parents[2] / "experiments"
+SIZE = 96
+
+
+def script(name):
+    spec = importlib.util.spec_from_file_location(name, EXPERIMENTS / f"{name}.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def body():
+    return load_body()
+
+
+@pytest.fixture(scope="module")
+def posed(body):
+    return sample_pose(make_subject(DEMO[28], body), 0)  # a T-shirt and jeans
+
+
+@pytest.fixture(scope="module")
+def camera(posed):
+    return cameras.cameras_around(
+        np.random.default_rng(0), posed.vertices, np.asarray([posed.rotations[0, 1]], float), SIZE
+    )[0]
+
+
+def faults(body, posed, camera):
+    module = script("check_people")
+    pixels, *counts = module.count_faults(body, posed, camera)
+    return pixels, dict(zip(module.FAULTS, np.asarray(counts) / pixels, strict=True))
+
+
+def test_a_dressed_person_has_hardly_any_fault(body, posed, camera):
+    pixels, shares = faults(body, posed, camera)
+    assert pixels > 500
+    assert shares["poking"] < 0.01 and shares["hollow"] < 0.01 and shares["gaps"] < 0.01
+
+
+def test_skin_that_is_pushed_through_cloth_is_counted(body, posed, camera):
+    _, before = faults(body, posed, camera)
+    pushed = posed.vertices + 0.04 * posed.normals * (posed.subject.cover > 0)[:, None]
+    _, after = faults(body, dataclasses.replace(posed, vertices=pushed.astype(np.float32)), camera)
+    assert after["poking"] > before["poking"] + 0.005
+    assert after["inside"] >= after["poking_deep"]
+
+
+def test_holes_in_cloth_are_counted(body, posed, camera):
+    subject = posed.subject
+    middle = posed.vertices[subject.surface.faces].mean(1)
+    chest = (subject.face_materials >= 2) & (np.abs(middle[:, 1] - 0.65 * posed.vertices[:, 1].max()) < 0.08)
+    front = chest & (middle[:, 2] > middle[chest, 2].mean())
+    surface = dataclasses.replace(subject.surface, faces=subject.surface.faces[~front])
+    torn = dataclasses.replace(subject, surface=surface, face_materials=subject.face_materials[~front])
+    _, shares = faults(body, dataclasses.replace(posed, subject=torn), camera)
+    assert shares["hollow"] + shares["gaps"] > 0.02
+
+
+def test_a_sheet_is_drawn_twice_alike(tmp_path, monkeypatch):
+    import imageio.v3 as iio
+
+    module = script("contact_sheets")
+    files = []
+    for name in ("one", "two"):
+        out = tmp_path / name
+        sizes = ["--subjects", "1", "--scale", "0.3", "--suffix", ".png", "--sheets", "front_back"]
+        monkeypatch.setattr(sys, "argv", ["contact_sheets.py", "--out", str(out), *sizes])
+        module.main()
+        files.append(out / "people_front_back.png")
+    assert files[0].read_bytes() == files[1].read_bytes()
+    picture = iio.imread(files[0])
+    assert picture.ndim == 3 and (picture != 255).any(-1).mean() > 0.03

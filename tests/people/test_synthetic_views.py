@@ -1,0 +1,293 @@
+"""Written sets: cameras of the protocol and close ones, maps that agree with the body, resuming, processes, splits."""
+
+import filecmp
+import itertools
+import json
+import os
+import tempfile
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
+from humangs_jax.data.motion import load_motion
+from humangs_jax.io.atomic import replace_folder
+from humangs_jax.io.exr import read_exr
+from humangs_jax.people import cameras, maps, seeds, writer
+from humangs_jax.people.live_bank import build_bank
+from humangs_jax.people.seeds import DEMO, SPLITS, seeds_of, split_of
+from humangs_jax.people.subject import make_subject
+from humangs_jax.people.written import find_people
+from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
+
+SIZE = 32
+BODY = load_body()
+LAYOUT = writer.Layout(SIZE, poses=2, views=3, close_views=1, held_out_views=1, novel_poses=1, depth=True, maps=True)
+SAME_SURFACE = 2e-3
+"""Metres: the skin's mesh is the body's but for the faces under cloth; pixels at their rim differ."""
+EIGHT_BITS = 0.5 / 255 + 1e-6
+
+
+@pytest.fixture(scope="module")
+def body():
+    return BODY
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, body):
+    root = tmp_path_factory.mktemp("set")
+    writer.write_set(root, 1, LAYOUT, "demo", body=body, progress=False)
+    return root
+
+
+def fast(monkeypatch, made=None):
+    """Writes folders with nothing but their seed: what is tested is who is written, not what."""
+
+    def write_person(folder, seed, body, layout):
+        if made is not None:
+            made.append(seed)
+        if seed % 10 == 7:
+            raise ValueError("a hole at the hem")
+        replace_folder(folder, lambda f: (f.mkdir(), (f / "capture.json").write_text(str(seed))))
+
+    monkeypatch.setattr(writer, "write_person", write_person)
+
+
+def test_a_written_person_has_all_views_in_all_forms(folder, body):
+    person = folder / f"{DEMO[0]:07d}"
+    capture = load_capture(person, body=body)
+    assert capture.names == ("0_00", "0_01", "0_02", "1_00", "1_01", "1_02", "0_c00", "1_c00")
+    np.testing.assert_array_equal(capture.frames, [0, 0, 0, 1, 1, 1, 0, 1])
+    held_out = load_capture(person / "held_out", body=body)
+    assert held_out.names == ("0_00", "1_00")
+    np.testing.assert_array_equal(held_out.pose(0).rotations, capture.pose(0).rotations)
+    assert np.abs(held_out.pose(1).rotations - capture.pose(1).rotations).max() > 0.05  # a novel pose
+    for where, views in ((person, capture), (person / "held_out", held_out)):
+        for i, name in enumerate(views.names):
+            (view,) = read_exr(where / "maps" / f"{name}.exr")
+            np.testing.assert_array_equal(view.cam_from_world, views.cameras.cam_from_world[i])
+            np.testing.assert_array_equal(view.K, views.cameras.K[i])
+            on_white = view.rgba[..., :3] + (1 - view.rgba[..., 3:])
+            np.testing.assert_allclose(on_white, views.images[i], atol=EIGHT_BITS)
+            np.testing.assert_allclose(view.rgba[..., 3], views.masks[i], atol=EIGHT_BITS)
+            depth = maps.read_depth(where / "depth" / f"{name}.png")
+            np.testing.assert_allclose(depth, view.depth, atol=0.51 * maps.DEPTH_UNIT)
+            assert ((depth > 0) == (view.channels["position.X"] != 0)).mean() > 0.99
+            assert ((depth > 0) & (views.masks[i] == 0)).sum() == 0  # what is hit in its middle is covered
+            assert ((depth == 0) & (views.masks[i] == 1)).sum() <= 2  # a gap between four samples
+    manifest = json.loads((folder / "manifest.json").read_text())
+    assert manifest["generator_version"] == seeds.GENERATOR_VERSION and manifest["split"] == "demo"
+    assert manifest["subjects"] == [person.name] and manifest["settings"]["image_size"] == SIZE
+
+
+def test_maps_agree_with_the_body_where_it_is_bare(body):
+    person = make_subject(DEMO[1], body)
+    posed = writer.sample_pose(person, 0)
+    camera = cameras.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([0.3]), 64)[0]
+    shown = maps.render_maps(posed, camera)
+    pose = BodyPose(jnp.asarray(posed.rotations), jnp.asarray(posed.translation))
+    rest = jax.jit(shape_body)(body, jnp.asarray(person.betas))
+    naked = rasterize_mesh(jax.jit(pose_body)(body, rest, pose).vertices, body.faces, camera)
+    expected = np.asarray(interpolate_attributes(naked, body.faces, rest.vertices, jnp.zeros(3)))
+    fragments = rasterize_mesh(*maps.padded(posed.vertices, person.surface.faces), camera)
+    ids = np.asarray(fragments.face_ids)
+    np.testing.assert_array_equal(shown.depth > 0, ids >= 0)
+    skin = (ids >= 0) & (person.face_materials[ids] == 0) & (np.asarray(naked.depth) > 0)
+    assert skin.sum() > 15
+    depth_error = np.abs(shown.depth - np.asarray(naked.depth))[skin]
+    position_error = np.linalg.norm(shown.position - expected, axis=-1)[skin]
+    assert (depth_error < SAME_SURFACE).mean() > 0.95 and np.median(depth_error) < 1e-5
+    assert (position_error < SAME_SURFACE).mean() > 0.95 and np.median(position_error) < 1e-5
+    cloth = (ids >= 0) & (person.face_materials[ids] > 1) & (np.asarray(naked.depth) > 0)
+    assert np.mean(shown.depth[cloth] < np.asarray(naked.depth)[cloth]) > 0.9  # cloth is in front of the skin
+
+
+@given(st.integers(0, 10_000))
+@settings(deadline=None, max_examples=15)
+def test_close_cameras_are_close_and_outside(seed):
+    rng = np.random.default_rng(seed)
+    vertices = rng.normal(size=(300, 3)) * [0.2, 0.5, 0.15] + [0.0, 0.9, 0.0]
+    batch = cameras.close_cameras(rng, vertices, cameras.spread_azimuths(rng, 6), 64)
+    center, radius = cameras.bounding_sphere(vertices)
+    eyes = np.asarray(batch.center)
+    nearest = np.linalg.norm(eyes[:, None] - vertices[None], axis=-1).min(1)
+    assert (nearest > cameras.CLEARANCE - 1e-4).all()
+    # the middle of the person is at most the spread away from what a camera looks at
+    distance = np.linalg.norm(eyes - center, axis=1) / radius
+    assert (distance < 1.7 + cameras.CLOSE_SPREAD + 0.06).all() and distance.mean() < 1.7
+    forward = np.asarray(batch.cam_from_world)[:, 2, :3]
+    along = np.einsum("vk,vk->v", center - eyes, forward)
+    off_axis = np.linalg.norm(center - eyes - along[:, None] * forward, axis=1)
+    assert (off_axis < radius * cameras.CLOSE_SPREAD + 1e-3).all()  # they look at the person
+    assert (np.arcsin(-forward[:, 1]) > np.deg2rad(-5.1)).all() and (np.arcsin(-forward[:, 1]) < np.deg2rad(15.1)).all()
+
+
+def test_the_loader_shrinks_a_set_to_smaller_sizes(folder, body):
+    source = lambda size: CaptureSource(CaptureCache(find_people(folder, "demo"), body), ViewSampling(), size, size)
+    small, large = (Loader(source(size), 1).batch_at(0).inputs for size in (SIZE // 2, SIZE))
+    blocks = np.asarray(large.images).reshape(1, 4, SIZE // 2, 2, SIZE // 2, 2, 3)
+    np.testing.assert_allclose(small.images, blocks.mean((3, 5)), atol=1e-6)
+    with pytest.raises(ValueError, match="of the split 'demo', where 'train' was expected"):
+        find_people(folder)
+
+
+def test_sequences_are_written_with_their_motion_and_a_scan(tmp_path, body):
+    layout = writer.Layout(SIZE, poses=3, views=1, frames=20, scan_texture=128)
+    (person,) = writer.write_set(tmp_path, 1, layout, "demo", 2, body=body, progress=False)
+    capture, motion = load_capture(person, body=body), load_motion(person / "motion.npz")
+    assert motion.rotations.shape == (20, 55, 3) and motion.fps == 30
+    np.testing.assert_array_equal(capture.frames, [0, 1, 2])
+    for frame, of_motion in enumerate((0, 10, 19)):  # evenly spaced
+        np.testing.assert_array_equal(capture.pose(frame).rotations, motion.rotations[of_motion])
+        np.testing.assert_array_equal(capture.pose(frame).translation, motion.translations[of_motion])
+    scan = json.loads((person / "scan" / "scan.json").read_text())
+    np.testing.assert_allclose(scan["rotations"], capture.pose(0).rotations, atol=1e-6)
+    assert {"scan.obj", "scan.glb", "material.mtl"} <= {path.name for path in (person / "scan").iterdir()}
+
+
+def test_depths_that_do_not_fit_are_an_error(tmp_path):
+    with pytest.raises(ValueError, match="do not fit into 16 bits"):
+        maps.write_depth(tmp_path / "depth.png", np.full((2, 2), 7.0, np.float32))
+    from humangs_jax.io.images import write_png
+
+    write_png(tmp_path / "eight.png", np.zeros((2, 2), np.float32))
+    with pytest.raises(ValueError, match="expected a 16-bit grey PNG"):
+        maps.read_depth(tmp_path / "eight.png")
+
+
+def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):
+    made = []
+    fast(monkeypatch, made)
+    layout = writer.Layout(SIZE, views=2)
+    write = lambda count, **changes: writer.write_set(
+        tmp_path, count, **{"layout": layout, "split": "demo", "body": BODY, "progress": False} | changes
+    )
+    remains = tmp_path / f".{DEMO[9]:07d}.123"
+    remains.mkdir()
+    os.utime(remains, (time.time() - 2 * writer.STALE,) * 2)
+    write(2)
+    assert not remains.exists()
+    write(4)
+    assert made == list(DEMO[:4])  # nobody twice
+    with pytest.raises(ValueError, match=r"image_size 32 -> 64\): choose another folder"):
+        write(4, layout=writer.Layout(64, views=2))
+    with pytest.raises(ValueError, match="of the split 'demo', now asked for 'train'"):
+        write(4, split="train")
+    monkeypatch.setattr("humangs_jax.people.manifest.GENERATOR_VERSION", seeds.GENERATOR_VERSION + 1)
+    with pytest.raises(ValueError, match=f"version {seeds.GENERATOR_VERSION} of the generator, this is version"):
+        write(4)
+
+
+def test_people_that_cannot_be_made_are_named_and_the_others_written(tmp_path, monkeypatch):
+    fast(monkeypatch)
+    with pytest.raises(ValueError, match=f"1 of 9 people could not be made, the first of them {DEMO[7]}: a hole"):
+        writer.write_set(tmp_path, 9, writer.Layout(SIZE), "demo", body=BODY, progress=False)
+    assert len(json.loads((tmp_path / "manifest.json").read_text())["subjects"]) == 8
+
+
+@pytest.mark.slow
+def test_processes_write_the_same_files(tmp_path):
+    layout = writer.Layout(SIZE, views=1, close_views=1, depth=True, maps=True)
+    alone, together = tmp_path / "alone", tmp_path / "together"
+    writer.write_set(alone, 3, layout, "demo", progress=False)
+    writer.write_set(together, 3, layout, "demo", workers=2, progress=False)
+    files = sorted(f.relative_to(alone) for f in alone.rglob("*") if f.is_file())
+    assert files == sorted(f.relative_to(together) for f in together.rglob("*") if f.is_file())
+    texts = [f for f in files if f.suffix in (".png", ".exr", ".json")]
+    assert len(texts) == 1 + 3 * (1 + 2 * 4)
+    _, different, errors = filecmp.cmpfiles(alone, together, texts, shallow=False)
+    assert different == errors == []
+    for file in set(files) - set(texts):  # an npz tells when it was written
+        a, b = np.load(alone / file), np.load(together / file)
+        assert all(np.array_equal(a[key], b[key]) for key in a)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "layout", "first"),
+    [
+        (("--subjects", "3"), writer.Layout(512, 1, 60, 12), 0),
+        (("--size", "128", "--poses", "4", "--sequences", "--frames", "30", "--depth", "--first", "7"),
+         writer.Layout(128, 4, 60, 12, frames=30, depth=True), 7),
+        (("--views", "4", "--close-views", "0", "--held-out", "8", "--maps", "--scans"),
+         writer.Layout(512, 1, 4, 0, 8, maps=True, scan_texture=2048), 0),
+        (("--for-training",), writer.Layout(256, 2, 12), 0),
+    ],
+)  # fmt: skip
+def test_the_command_line_asks_for_layouts(arguments, layout, first, tmp_path, monkeypatch):
+    from humangs_jax import cli
+
+    asked = []
+    monkeypatch.setattr(writer, "write_set", lambda *a, **k: asked.append((a, k)) or [tmp_path])
+    monkeypatch.setattr("sys.argv", ["humangs", "synth", "--out", str(tmp_path), *arguments])
+    cli.main()
+    ((_, _, *rest), keywords) = asked[0]
+    assert rest == [layout, "train", first] and keywords["workers"] >= 1
+
+
+@pytest.mark.parametrize(
+    "arguments", [("--subjects", "0"), ("--held-out", "-1"), ("--sequences", "--poses", "9", "--frames", "8")]
+)
+def test_wrong_numbers_are_one_line(arguments, tmp_path, monkeypatch, capsys):
+    from humangs_jax import cli
+
+    monkeypatch.setattr("sys.argv", ["humangs", "synth", "--out", str(tmp_path / "new"), *arguments])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    error = capsys.readouterr().err
+    assert stopped.value.code == 2 and error.count("\n") == 1 and arguments[-2] in error
+    assert not (tmp_path / "new").exists()
+
+
+# Nobody of the test split can be drawn in training: all ways to people go through seeds of a split ----------------------
+
+
+@given(st.sampled_from(sorted(SPLITS)), st.integers(-5, 1_000_100), st.integers(-2, 1_000_100))
+@settings(deadline=None, max_examples=80)
+def test_seeds_of_a_split_are_of_that_split_or_refused(split, first, count):
+    try:
+        drawn = seeds_of(split, first, count)
+    except ValueError as error:
+        assert "reach beyond the split" in str(error)
+        assert first < 0 or count < 1 or first + count > len(SPLITS[split])
+    else:
+        assert len(drawn) == count and {split_of(drawn[0]), split_of(drawn[-1])} == {split}
+
+
+def test_the_splits_share_no_seed():
+    """Ranges are intervals: what is not in order after sorting overlaps."""
+    ranges = sorted(SPLITS.values(), key=lambda r: r.start)
+    assert all(a.stop <= b.start for a, b in itertools.pairwise(ranges))
+    assert all(r.step == 1 and 0 <= r.start < r.stop <= 2**32 for r in ranges)  # seeds are words of keys
+
+
+@given(st.integers(0, len(SPLITS["train"]) - 1), st.integers(1, 50))
+@settings(deadline=None, max_examples=25)
+def test_written_training_people_are_training_people(first, count):
+    """`synthesize` and `write_set`: every person written lies in the split that was asked for, or nothing is written."""
+    written = []
+    with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
+        patch.setattr(writer, "_attempt", lambda folder, seed, body, layout: written.append(seed))
+        for split in ("train", "test"):
+            written.clear()
+            start = SPLITS[split].start + first % len(SPLITS[split])
+            try:
+                writer.synthesize(os.path.join(folder, split), count, start, body=BODY, progress=False)
+            except ValueError as error:
+                assert "reach beyond" in str(error) and not written
+            else:
+                assert len(written) == count and {split_of(seed) for seed in written} == {split}
+
+
+@given(st.integers(0, 999), st.sampled_from(["validation", "test", "demo"]))
+@settings(deadline=None, max_examples=20)
+def test_a_training_bank_takes_nobody_of_another_split(number, other):
+    with pytest.raises(ValueError, match=f"belongs to the range '{other}', not to 'train'"):
+        build_bank([5, SPLITS[other][number]], BODY, split="train", progress=False)
