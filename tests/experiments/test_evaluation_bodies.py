@@ -54,7 +54,7 @@ def test_a_rim_stays_where_it_is(body):
 
 
 def test_the_made_up_body_is_the_same_people(body, monkeypatch):
-    monkeypatch.setattr("SMPLX_SEED_VERTICES", 1000)
+    monkeypatch.setattr(bodies, "SMPLX_SEED_VERTICES", 1000)
     made = bodies.smplx_body(body)
     small = decimate(body, 1000)
     assert made.joint_names == JOINT_NAMES and made.name == "SMPLX_MADE_UP" and made.pose_directions is not None
@@ -72,7 +72,7 @@ def test_other_joints_are_no_smplx(body, tmp_path):
 
 
 def test_fractions_are_as_they_are_and_split(body, monkeypatch):
-    monkeypatch.setattr("SMPLX_SEED_VERTICES", 600)
+    monkeypatch.setattr(bodies, "SMPLX_SEED_VERTICES", 600)
     config = dataclasses.replace(tiny(), body_vertices=1000, longest_edge=0.05)
     cases = bodies.body_cases(body, config)
     assert list(cases) == ["default", "SMPL-X format", "1/4", "1/16", "1/4, edges split", "1/16, edges split"]
