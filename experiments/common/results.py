@@ -15,6 +15,7 @@ A page shows it between `<!-- table: NAME -->` and `<!-- end -->`. Scripts write
 import argparse
 import datetime
 import json
+import math
 import os
 import platform
 import re
@@ -63,6 +64,12 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]], alig
     """A table. align holds "l" or "r" for each column; by default the first is aligned to the left, others to the right."""
     rule = [ALIGNMENTS[side] for side in align or default_alignment(header)]
     return "\n".join("| " + " | ".join(str(cell) for cell in row) + " |" for row in (header, rule, *rows))
+
+
+def significant(value: float, digits: int = 2) -> str:
+    """A number with at least so many digits, without an exponent."""
+    decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1
+    return f"{value:.{max(0, decimals)}f}"
 
 
 def default_alignment(header: Sequence[str]) -> str:
