@@ -26,12 +26,13 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import prepare_process
-from experiments.common.results import markdown_table, write_json
+from experiments.common.results import markdown_table, publish, significant, write_json
 
 INPUTS, TARGETS = 4, 3
 """Views of an example."""
 POSES, VIEWS = 2, 6
 """Of written people: poses, and cameras around each."""
+PLACES = {"disk": "from disk", "memory": "kept in memory"}
 STEPS = 5
 """Training steps that are timed."""
 
@@ -159,6 +160,28 @@ def waits(sizes: dict[str, Any], step_s: float) -> dict[str, dict[str, float]]:
     return results
 
 
+def ways(of_size: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """The numbers of each way, as the tables name it."""
+    written = f"written by `synth` (people, posing, PNG included; {POSES * VIEWS} views each)"
+    kept = {f"read by the loader, {place}": of_size["read"][name] for name, place in PLACES.items()}
+    return {written: of_size["synth"], **kept, "on the fly": of_size["live"]}
+
+
+def cpu_table(sizes: dict[str, Any]) -> str:
+    """CPU ms a view, one column for each size."""
+    columns = [ways(of_size) for of_size in sizes.values()]
+    rows = [[name, *(significant(1e3 * column[name]["cpu_s_per_view"]) for column in columns)] for name in columns[0]]
+    return markdown_table(["CPU ms a view", *(f"{size} px" for size in sizes)], rows)
+
+
+def rates_table(sizes: dict[str, Any]) -> str:
+    """Views and subjects a second, one column for each size."""
+    columns = [ways(of_size) for of_size in sizes.values()]
+    cell = lambda numbers: f"{significant(numbers['views_per_s'])} ({significant(numbers['subjects_per_s'])})"
+    rows = [[name, *(cell(column[name]) for column in columns)] for name in columns[0]]
+    return markdown_table(["views (subjects) a second, one process", *(f"{size} px" for size in sizes)], rows)
+
+
 def machine() -> dict[str, Any]:
     """Where this was measured."""
     import jax
@@ -178,6 +201,9 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the numbers here")
+    parser.add_argument(
+        "--page", type=Path, help="page whose tables data_loading_cpu and data_loading_rates are written"
+    )
     parser.add_argument("--sizes", type=int, nargs="+", default=[128, 256, 512], help="pixels a side")
     parser.add_argument("--subjects", type=int, default=4, help="people written, and in the bank")
     parser.add_argument("--examples", type=int, default=8, help="examples read and drawn")
@@ -227,6 +253,9 @@ def main() -> None:
             )
     if arguments.json:
         write_json(arguments.json, result)
+    if arguments.page:
+        publish(arguments.page, "data_loading_cpu", cpu_table(sizes), result)
+        publish(arguments.page, "data_loading_rates", rates_table(sizes), result)
 
 
 if __name__ == "__main__":
