@@ -180,7 +180,7 @@ def page_text(
     lines: Sequence[dict[str, Any]], facts: dict[str, Any], config: dict[str, Any], pictures: dict[str, str]
 ) -> str:
     """The page in Markdown. pictures: links by the end of their names."""
-    views, optimizer, size = config["views"], config["optimizer"], config["model"]["image_size"]
+    views, optimizer, size = config["views"], config["optimizer"], config["model"]["conventions"]["image_size"]
     counts = " or ".join(str(count) for count in sorted(set(views["input_counts"])))
     other = ("structural_scales", "random_background")
     terms = [f"{value:g} {name}" for name, value in config["loss"].items() if value and name not in other]
