@@ -33,7 +33,9 @@ def render_pages(repository: Path, write: bool) -> list[str]:
         old = page.read_text()
         names = [match["name"] for match in SECTION.finditer(old)]
         faults += [f"{page.name}: no docs/results/{name}.json for its table" for name in names if name not in known]
-        faults += [f"{page.name}: a table marker without its end" for _ in range(old.count("<!-- table: ") - len(names))]
+        faults += [
+            f"{page.name}: a table marker without its end" for _ in range(old.count("<!-- table: ") - len(names))
+        ]
         shown.update(names)
         new = rendered(old, results, [name for name in names if name in known])
         if new != old and write:

@@ -12,6 +12,7 @@ A page shows it between `<!-- table: NAME -->` and `<!-- end -->`. Scripts write
 `experiments/render_tables.py` renders all pages from the JSON files again.
 """
 
+import argparse
 import datetime
 import json
 import os
@@ -89,30 +90,56 @@ def text_of(blocks: Sequence[str | dict[str, Any]]) -> str:
     return "\n\n".join(block if isinstance(block, str) else markdown_table(**block) for block in blocks)
 
 
-def publish(page: Path, name: str, text: str, numbers: object = None, merge: bool = False) -> None:
+def add_outputs(parser: argparse.ArgumentParser, name: str) -> None:
+    """The options of `write_outputs`."""
+    parser.add_argument("--json", type=Path, help="write the numbers here")
+    parser.add_argument(
+        "--page", type=Path, help=f"page whose table {name} is written, with its docs/results/{name}.json"
+    )
+
+
+def write_outputs(arguments: argparse.Namespace, name: str, text: str, numbers: object) -> None:
+    """Prints a section; writes the numbers and the page's section of that name where asked."""
+    print(text)
+    if arguments.json:
+        write_json(arguments.json, numbers)
+    if arguments.page:
+        publish(arguments.page, name, text, numbers)
+
+
+def publish(page: Path, name: str, text: str, numbers: object = None, row: str | None = None) -> None:
     """Writes results/NAME.json beside a page, and the page's section of that name.
 
-    merge: the rows that an old table of the same header has and the new one has not (by their first cells) stay.
+    row: the first cell of the rows of this run. They replace those of the same name, other rows and their numbers stay.
 
     Raises: FileNotFoundError; ValueError if the page lacks the section.
     """
     check_section(page, name)
     path, blocks = page.parent / "results" / f"{name}.json", blocks_of(text)
-    if merge and path.exists():
-        blocks = merged(json.loads(path.read_text())["blocks"], blocks)
-    write_json(path, run_record() | {"blocks": blocks, "numbers": numbers})
+    record = run_record()
+    if row is not None and path.exists():
+        old = json.loads(path.read_text())
+        blocks, record["source"] = merged(old["blocks"], blocks), old.get("source")
+        numbers = (old["numbers"] or {}) | {row: numbers}
+    elif row is not None:
+        numbers = {row: numbers}
+    record |= {"blocks": blocks, "numbers": numbers}
+    write_json(path, record)
     write_text(page, rendered(page.read_text(), path.parent, (name,)))
 
 
 def merged(old: Sequence[Any], new: Sequence[Any]) -> list[Any]:
-    """New blocks, whose tables keep the other rows of the old tables of the same header."""
-    blocks = []
+    """Old blocks with the rows of new tables of the same header, by their first cells; other new blocks behind them."""
+    blocks = list(old)
     for block in new:
-        rows = [r for o in old if isinstance(o, dict) and isinstance(block, dict) and o["header"] == block["header"] for r in o["rows"]]
-        if rows:
-            update = {row[0]: row for row in block["rows"]}
-            block = block | {"rows": [update.pop(row[0], row) for row in rows] + list(update.values())}
-        blocks.append(block)
+        same = [
+            i for i, o in enumerate(blocks) if o == block or (isinstance(o, dict) and o["header"] == block["header"])
+        ]
+        if not same:
+            blocks.append(block)
+        elif isinstance(block, dict):
+            rows = {row[0]: row for row in (*blocks[same[0]]["rows"], *block["rows"])}
+            blocks[same[0]] = block | {"rows": list(rows.values())}
     return blocks
 
 

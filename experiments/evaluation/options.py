@@ -28,7 +28,7 @@ def add_people_options(parser: argparse.ArgumentParser, subjects: int) -> None:
         help="patches that the network looks at; as it was trained if not given",
     )
     parser.add_argument("--json", type=Path, help="write the numbers here, and go on from what is there")
-    parser.add_argument("--docs", type=Path, help="page whose section is filled")
+    parser.add_argument("--page", "--docs", type=Path, help="page whose table is written")
     parser.add_argument("--lpips-backbone", type=Path, help="weights of the network under LPIPS")
     parser.add_argument("--lpips-heads", type=Path, help="heads of LPIPS, where the backbone's file does not have them")
     parser.add_argument("--lpips-net", choices=("vgg", "alex", "squeeze"), default="vgg", help="which network that is")

@@ -26,7 +26,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.compiled_costs import compiled_costs
 from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
-from experiments.common.results import markdown_table, write_json
+from experiments.common.results import add_outputs, markdown_table, publish, write_outputs
 from experiments.reconstruction.cases import (
     benchmark_inputs,
     compiled,
@@ -51,15 +51,15 @@ def main() -> None:
     parser.add_argument("--stages", action="store_true", help="also time the stages")
     parser.add_argument("--memory", type=int, nargs="*", default=[], help="numbers of views to analyse the memory for")
     parser.add_argument("--memory-size", type=int, default=512)
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, "reconstruction_benchmark")
     arguments = parser.parse_args()
     prepare_process()
     result = benchmark(arguments)
-    print(table(result))
+    write_outputs(arguments, "reconstruction_benchmark", table(result), result)
     if arguments.memory:
         print(memory_table(result))
-    if arguments.json:
-        write_json(arguments.json, result)
+        if arguments.page:
+            publish(arguments.page, "reconstruction_memory", memory_table(result), result["memory"])
 
 
 def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import Any, cast
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.compiled_costs import compiled_costs
-from experiments.common.results import markdown_table, write_json
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.reconstruction.benchmark import configured
 
 RECOMPUTED = {
@@ -34,12 +34,10 @@ def main() -> None:
     parser.add_argument(
         "--dtype", choices=("auto", "float32", "bfloat16"), default="auto", help="auto: float32 on a CPU"
     )
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, "transformer_compilation")
     arguments = parser.parse_args()
     result = measure(arguments)
-    print(table(result))
-    if arguments.json:
-        write_json(arguments.json, result)
+    write_outputs(arguments, "transformer_compilation", table(result), result)
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:

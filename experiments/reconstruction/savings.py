@@ -23,7 +23,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.compiled_costs import compiled_costs
 from experiments.common.interleaved import medians, prepare_process
-from experiments.common.results import markdown_table, write_json
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.reconstruction.benchmark import configured
 from experiments.reconstruction.cases import benchmark_inputs, compiled, foreground, random_variables
 
@@ -39,13 +39,11 @@ def main() -> None:
         "--dtype", choices=("auto", "float32", "bfloat16"), default="auto", help="auto: float32 on a CPU"
     )
     parser.add_argument("--repeats", type=int, default=3, help="timed rounds; 0: errors only")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, "reconstruction_savings")
     arguments = parser.parse_args()
     prepare_process()
     result = measure(arguments)
-    print(table(result))
-    if arguments.json:
-        write_json(arguments.json, result)
+    write_outputs(arguments, "reconstruction_savings", table(result), result)
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:

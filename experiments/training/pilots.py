@@ -13,11 +13,12 @@ import dataclasses
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-FIRST, MARK = "as it is", "pilots"
+FIRST, TABLE = "as it is", "training_pilots"
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "training.md"
 TOKENS = 1024
 """For 4 photographs of 256 pixels."""
@@ -35,7 +36,7 @@ def main() -> None:
     parser.add_argument("--fresh", action="store_true", help="start from nothing; has a table of its own")
     parser.add_argument("--steps", type=int, default=150, help="of each run")
     parser.add_argument("--only", nargs="+", help="names of the runs to make; all if not given")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="page with the table")
+    parser.add_argument("--page", type=Path, default=DOCS, help="page with the table")
     arguments = parser.parse_args()
     from humangs_jax.core.allocator import keep_freed_memory
 
@@ -88,7 +89,7 @@ def network_variants(base):
 
 def run(arguments, parser) -> None:
     """Make the runs that are missing, then write the table."""
-    from experiments.common.results import around_section, write_json
+    from experiments.common.results import check_section, write_json
     from experiments.evaluation.results import file_digest
     from humangs_jax.core.configuration import config_to_json
     from humangs_jax.network.weights import load_weights
@@ -113,9 +114,9 @@ def run(arguments, parser) -> None:
         parser.error(f"--only {sorted(unknown)}: expected names of {', '.join(runs)}")
     start = None if arguments.fresh else file_digest(arguments.start) if arguments.start else "shipped"
     settings = {"steps": arguments.steps, "start": start, "bank": file_digest(arguments.bank)}
-    path, mark = arguments.out / "pilots.json", f"{MARK}, fresh" if arguments.fresh else MARK
+    path, table = arguments.out / "pilots.json", TABLE + "_fresh" * arguments.fresh
     try:
-        around_section(arguments.docs, mark)
+        check_section(arguments.page, table)
     except (ValueError, OSError) as error:
         parser.error(str(error))
     if FIRST not in {*names, *kept(path, settings, parser)}:
@@ -129,7 +130,7 @@ def run(arguments, parser) -> None:
         row |= {"steps": config.steps, "config": json.loads(config_to_json(config)), "live": live}
         rows = kept(path, settings, parser) | {name: row}  # another process may have added to it
         write_json(path, {"settings": settings, "runs": rows})
-    write_table(arguments.docs, kept(path, settings, parser), mark)
+    write_table(arguments.page, kept(path, settings, parser), list(runs), table)
 
 
 def kept(path, settings, parser):
@@ -175,9 +176,9 @@ def pilot(arguments, config, live, started, name) -> dict:
     return {key: numbers[key] for key in COLUMNS} | {"cpu_seconds": seconds}
 
 
-def write_table(page: Path, rows: dict, mark: str) -> None:
-    """One row a run, each score as a difference to the first."""
-    from experiments.common.results import markdown_table, write_section
+def write_table(page: Path, rows: dict, names: Sequence[str], table: str) -> None:
+    """One row a run, each score as a difference to the first; the runs that were not made, too."""
+    from experiments.common.results import markdown_table, publish
 
     first = rows[FIRST]
     lines, forms = [], {True: ("{:.2f}", "{:.2f}", "{:.4f}"), False: ("{:+.2f}", "{:+.2f}", "{:+.4f}")}
@@ -185,8 +186,9 @@ def write_table(page: Path, rows: dict, mark: str) -> None:
         scores = [row[key] if name == FIRST else row[key] - first[key] for key in COLUMNS]
         texts = [form.format(score) for form, score in zip(forms[name == FIRST], scores, strict=True)]
         lines.append([name, *texts, row["steps"], f"{row['cpu_seconds']:.0f}"])
+    lines += [[name, *["not run"] * 5] for name in names if name not in rows]
     header = ["run", "PSNR, dB", "in the foreground, dB", "SSIM", "steps", "CPU s"]
-    write_section(page, mark, markdown_table(header, lines))
+    publish(page, table, markdown_table(header, lines), rows)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.common import results as reports
 from experiments.splatting import benchmark, scaling, scenes, tradeoff, work
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
@@ -181,13 +180,3 @@ def test_pareto_front_holds_what_nothing_beats():
 def test_slope_of_linear_growth_is_one():
     rows = [{"size": n, "forward_cpu_ms": 3.0 * n} for n in (1, 2, 8)]
     assert scaling.slope(rows, "forward") == pytest.approx(1)
-
-
-def test_sections_of_a_page_are_replaced(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("before\n<!-- x -->\nold\n<!-- end x -->\nafter\n")
-    for text in ("new", "newer"):
-        reports.write_section(page, "x", text)
-        assert page.read_text() == f"before\n<!-- x -->\n{text}\n<!-- end x -->\nafter\n"
-    with pytest.raises(ValueError, match="markers"):
-        reports.write_section(page, "y", "text")
