@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import network_golden as golden
 import numpy as np
 import pytest
-from network_golden import check_parity
 
+from experiments.paper import check_parity
 from humangs_jax.network.conversion import load_checkpoint
 
 TOLERANCES = {"float32": 2e-5, "float64": 1e-6}
