@@ -2,7 +2,7 @@
 
 A running error analysis (Higham, section 3.3): beside every number its bound, in units of the last place u = 2^-24. It
 holds for both schedules, in any order of their sums, with or without fused multiplications. Bounds follow the magnitudes
-of the terms, not the results, which cancel: the first column of the sums is 1e-3 of the sum of its terms' magnitudes.
+of the terms, not the results, which cancel.
 """
 
 from typing import NamedTuple
