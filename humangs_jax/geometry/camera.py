@@ -9,7 +9,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Matrix3, Matrix4, Vector3
 from humangs_jax.core.numerics import safe_normalize
-from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
 
 RIGID_TOLERANCE = 1e-3
@@ -17,8 +17,10 @@ RIGID_TOLERANCE = 1e-3
 
 
 @pytree_dataclass
-class Camera:
+class Camera(Batchable):
     """A pinhole camera, or a batch of cameras of one image size (leading axes on K and cam_from_world).
+
+    A batch can be indexed and iterated over: `for camera in cameras`.
 
     K: (3, 3) intrinsics in pixels. cam_from_world: (4, 4) rigid. width, height: pixels, static.
     """
@@ -76,10 +78,6 @@ class Camera:
         """The same camera for a world whose lengths are divided by `unit`."""
         translation = self.cam_from_world[..., :3, 3] / unit
         return replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
-
-    def __getitem__(self, index: int | slice) -> "Camera":
-        """One camera (or some) of a batch."""
-        return jax.tree.map(lambda leaf: leaf[index], self)
 
 
 def stack_cameras(cameras: list[Camera]) -> Camera:

@@ -9,14 +9,14 @@ from typing import Literal
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.svd3 import left_singular_vectors
 
 
 @pytree_dataclass
-class Gaussians:
-    """A set of 3D Gaussians.
+class Gaussians(Batchable):
+    """A set of 3D Gaussians, or a batch of sets (leading axes on every field).
 
     means: (g, 3) metres. quats: (g, 4) wxyz, normalised where used. scales: (g, 3) standard deviations, metres.
     opacities: (g,) in [0, 1]. colors: (g, 3) linear RGB in [0, 1].

@@ -26,7 +26,7 @@ from jax.sharding import PartitionSpec as P
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.buffers import round_up
 from humangs_jax.core.numerics import at_least_float32, safe_divide
-from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering import binning, constants
 from humangs_jax.rendering.compositing import composite, pack_splats
@@ -69,7 +69,7 @@ class BufferOverflowError(ValueError):
 
 
 @pytree_dataclass
-class Rendering:
+class Rendering(Batchable):
     """One image of a set of Gaussians.
 
     rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is seen, weighted as the
