@@ -6,8 +6,10 @@ A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres i
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from humangs_jax.core.array_types import Array, Float, Matrix3, Matrix4, Vector3
+from humangs_jax.core.checks import FINITE, POSITIVE, Values
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
@@ -78,6 +80,19 @@ class Camera(Batchable):
         """The same camera for a world whose lengths are divided by `unit`."""
         translation = self.cam_from_world[..., :3, 3] / unit
         return replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
+
+
+def camera_values(cameras: Camera) -> dict[str, tuple[Array | np.ndarray, Values]]:
+    """What `core.checks.check_values` needs to check one camera or a batch; they are few numbers, read on the host."""
+    K, cam_from_world = cameras.K, cameras.cam_from_world
+    if isinstance(K, Tracer) or isinstance(cam_from_world, Tracer):
+        return {"camera.K": (K, FINITE), "camera.cam_from_world": (cam_from_world, FINITE)}
+    K = np.asarray(K)
+    return {
+        "camera.K": (K, FINITE),
+        "camera.K focal lengths": (K[..., [0, 1], [0, 1]], POSITIVE),
+        "camera.cam_from_world": (np.asarray(cam_from_world), FINITE),
+    }
 
 
 def stack_cameras(cameras: list[Camera]) -> Camera:

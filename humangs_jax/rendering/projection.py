@@ -23,10 +23,12 @@ import jax.numpy as jnp
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering import constants
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
 
 
 class ProjectedGaussians(NamedTuple):
@@ -100,6 +102,21 @@ def project(
         r01=r01,
         r11=r11,
         visible=in_front & small & (determinant > 0),
+    )
+
+
+def drawn_camera(camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> Camera:
+    """The camera of the image that is drawn: `config.scale` times the size, at least one pixel."""
+    if config.scale == 1:
+        return camera
+    return camera.resized(*(max(1, round(size * config.scale)) for size in (camera.width, camera.height)))
+
+
+def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> ProjectedGaussians:
+    """`project` on the image that `config` draws: the first half of `splatting.render`."""
+    gaussians, camera = at_least_float32((gaussians, drawn_camera(camera, config)))
+    return project(
+        gaussians, camera, config.near, config.eps2d, config.jacobian_margin, normalize_quats=config.normalize_quats
     )
 
 

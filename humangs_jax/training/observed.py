@@ -30,8 +30,9 @@ from humangs_jax.network.transformer import Block, Transformer
 from humangs_jax.network.upsampler import Upsampler
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.objectives.loss_networks import LossNetworks
+from humangs_jax.rendering.drawing import Rendering, draw_projected
 from humangs_jax.rendering.gaussians import Gaussians, skin_gaussians
-from humangs_jax.rendering.splatting import Rendering, draw_projected, project_gaussians
+from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.forward import token_share
 from humangs_jax.training.probes import Named, Recorder, inexact_leaves

@@ -15,7 +15,7 @@ import pytest
 
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.reference import render_dense
+from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SplatConfig
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -68,7 +68,7 @@ def files(tmp_path_factory):
         gaussians = Gaussians(*(double[name] for name in PARAMETERS))
 
         def loss(gaussians):
-            image = render_dense(gaussians, camera, background=jnp.zeros(3)).rgb
+            image = render_reference(gaussians, camera, background=jnp.zeros(3)).rgb
             return jnp.mean((image - target) ** 2), image
 
         gradients, image = jax.jit(jax.grad(loss, has_aux=True))(gaussians)
