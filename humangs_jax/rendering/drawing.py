@@ -100,7 +100,7 @@ def _draw(projected, gaussians, camera, background, config: SplatConfig, mesh: M
         visibility = jnp.zeros(0, blank.dtype) if config.visibility else None
         return _blended(blank, 1 + blank[:, :1], grid, background, 0.0, jnp.int32(0), visibility)
 
-    depths = jnp.where(projected.visible, lax.stop_gradient(projected.depth), jnp.inf)
+    depths = jnp.where(projected.visible, lax.stop_gradient(projected.depths), jnp.inf)
     order = binning.depth_order(depths)
     footprints = binning.footprints_by(projected, gaussians.opacities, config)
     footprints = jax.tree.map(lambda plane: take(plane, order), footprints)
@@ -109,7 +109,7 @@ def _draw(projected, gaussians, camera, background, config: SplatConfig, mesh: M
     # rounding of depths.
     nearest = jnp.min(depths)
     nearest = jnp.where(nearest < jnp.inf, nearest, 0.0)
-    behind = jnp.where(projected.visible, projected.depth - nearest, 0.0)
+    behind = jnp.where(projected.visible, projected.depths - nearest, 0.0)
     seen = jnp.concatenate([gaussians.colors, behind[:, None]], axis=-1)
     splats = pack_splats(projected, gaussians.opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")

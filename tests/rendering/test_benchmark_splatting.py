@@ -154,7 +154,7 @@ def test_work_needed_agrees_with_brute_force(load, files):
     scene = scenes.load_scene(files / "scene.npz", SIZE)
     config = SplatConfig()
     projected, _ = work.projected_splats(scene, config)
-    order = np.argsort(projected.depth, kind="stable")
+    order = np.argsort(projected.depths, kind="stable")
     x, y, xx, xy, yy = (np.asarray(projected[i], np.float64)[order, None, None] for i in (0, 1, 3, 4, 5))
     dx, dy = np.arange(SIZE) + 0.5 - x, (np.arange(SIZE) + 0.5)[:, None] - y
     squared = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)

@@ -52,10 +52,12 @@ def from_scene(gaussians, grid, config):
     """Splats and lists as the renderer makes them."""
     g, dtype = gaussians.means.shape[0], gaussians.means.dtype
     projected = project_gaussians(gaussians, camera(dtype, grid.width, grid.height), config)
-    order = binning.depth_order(jnp.where(projected.visible, projected.depth, jnp.inf))
+    order = binning.depth_order(jnp.where(projected.visible, projected.depths, jnp.inf))
     ellipses = jax.tree.map(lambda plane: plane[order], binning.footprints_by(projected, gaussians.opacities, config))
     pairs = binning.emit_pairs(ellipses, grid, g * grid.tiles, g * grid.tiles)
-    features = jnp.concatenate([gaussians.colors, jnp.where(projected.visible, projected.depth, 0.0)[:, None]], axis=-1)
+    features = jnp.concatenate(
+        [gaussians.colors, jnp.where(projected.visible, projected.depths, 0.0)[:, None]], axis=-1
+    )
     splats = compositing.pack_splats(projected, gaussians.opacities, features, config.alpha_min)[order]
     return splats, sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, g)
 
