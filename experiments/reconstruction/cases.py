@@ -81,8 +81,8 @@ def foreground(inputs: Any, config: Any) -> tuple[Any, int, float]:
     """(configuration for foreground tokens with room for these photos, tokens that the person touches, their share)."""
     import jax
 
-    from humangs_jax.core.buffers import round_up
     from humangs_jax.network.humangs import needed_tokens
+    from humangs_jax.rendering.buffers import round_up
 
     touched = int(jax.jit(needed_tokens, static_argnames="config")(inputs, config))
     patches = int(np.prod(inputs.images.shape[:3])) // config.architecture.encoder.patch_size**2
