@@ -66,7 +66,7 @@ def describe_all(body, arguments):
     """Counts and spreads over descriptions."""
     import numpy as np
 
-    from humangs_jax.people.person import describe
+    from humangs_jax.people.subject import describe
 
     people = [describe(arguments.first + i, body) for i in range(arguments.described)]
     kinds = collections.Counter(g.kind for p in people for g in p.garments)
@@ -249,7 +249,7 @@ def draw(file, people, seen):
     import matplotlib.pyplot as plt
     import numpy as np
 
-    from humangs_jax.people import poses
+    from humangs_jax.people import kinematics as poses
 
     figure = plt.figure(figsize=(17, 9.5))
     grid = figure.add_gridspec(2, 5)

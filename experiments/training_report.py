@@ -58,8 +58,8 @@ def train(arguments: argparse.Namespace) -> bool:
     from benchmark_data import machine
 
     from humangs_jax.body.library import load_body
+    from humangs_jax.people.manifest import find_people
     from humangs_jax.people.writer import Layout, write_set
-    from humangs_jax.people.written import find_people
     from humangs_jax.training.config import PRESETS
     from humangs_jax.training.loop import train as run
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from humangs_jax.people.anatomy import WRIST
-from humangs_jax.people.patterns import Fabric, sample_fabric
+from humangs_jax.people.fabrics import Fabric, sample_fabric
 
 TOPS = ("tank", "tee", "longsleeve", "polo", "shirt", "blouse", "sweater", "turtleneck", "hoodie", "jersey")
 OUTER = ("jacket", "denim_jacket", "blazer", "cardigan", "vest", "puffer", "coat", "hooded_jacket")

@@ -11,8 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
-from humangs_jax.people.arms import ARMS, arm_clearance, bend_arm, draw_goal
-from humangs_jax.people.hands import pose_hand
+from humangs_jax.people.arms import ARMS, arm_clearance, bend_arm, draw_goal, pose_hand
 from humangs_jax.people.kinematics import (
     HEAD,
     JOINTS,
@@ -34,8 +33,7 @@ from humangs_jax.people.kinematics import (
     rotation_matrix,
     rotation_vector,
 )
-from humangs_jax.people.poses import bend_trunk
-from humangs_jax.people.stances import STANCES, in_world
+from humangs_jax.people.poses import STANCES, bend_trunk, in_world
 
 FPS = 30.0
 STANCE_SHARE = 0.62

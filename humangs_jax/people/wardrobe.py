@@ -5,12 +5,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from humangs_jax.people import accessories, shoes, tailoring, trimmings
+from humangs_jax.people import accessories, tailoring, trimmings
+from humangs_jax.people.accessories import pair
 from humangs_jax.people.anatomy import CROTCH, WAIST, Anatomy, leg_coordinates
-from humangs_jax.people.fabrics import Material
+from humangs_jax.people.fabrics import Material, weave
 from humangs_jax.people.garments import HEM_MARGIN, Fit, Skirt, shell, skirt
 from humangs_jax.people.outfits import BOTTOMS, DRESSES, OUTER, SHOES, SKIRTS, TOPS, Garment
-from humangs_jax.people.patterns import weave
 from humangs_jax.people.surfaces import Surface, compact
 
 Cover = Callable[[np.ndarray], np.ndarray]
@@ -355,13 +355,13 @@ def _shoes(rng, outfit, garment):
     colours = trimmings.leather(garment.fabric.rng(2), garment.kind, garment.fabric.base, 0.004)
     material = Material(colours, sheen=0.2 if garment.kind != "sneakers" else 0.08)
     if garment.kind == "sandals":
-        outfit.add(shoes.pair(anatomy, 0.024, sole, 0.004), material, layered=False)
+        outfit.add(pair(anatomy, 0.024, sole, 0.004), material, layered=False)
         template = anatomy.skin.attributes["template"]
         for field in tailoring.sandal_straps(template):
             outfit.add(shell(rng, anatomy, [field], Fit(ease=0.005, fold=0.0, hem=0.004)), material, layered=False)
         return
     ease = 0.017 if sizes["over"] else 0.006
-    surface = shoes.pair(anatomy, height, sole, ease)
+    surface = pair(anatomy, height, sole, ease)
     outfit.hide(lambda t: tailoring.shaft(t, height), 0.012)
     if not sizes["over"]:
         outfit.pieces = [_unhidden_legs(piece) for piece in outfit.pieces]

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 
 from humangs_jax.body.library import load_body
-from humangs_jax.people import lettering, outfits, shading, subject
+from humangs_jax.people import outfits, shading, subject
 from humangs_jax.people.anatomy import ARM_GIRTH, ARMHOLE, TRUNK_GIRTH
 from humangs_jax.people.fabrics import Material, Spots
-from humangs_jax.people.haircuts import BEARDS, CUTS
-from humangs_jax.people.person import HEIGHT_RANGE, YEARS, describe
+from humangs_jax.people.hair import BEARDS, CUTS
 from humangs_jax.people.seeds import DEMO
+from humangs_jax.people.subject import HEIGHT_RANGE, YEARS, describe
+from humangs_jax.people.trimmings import EMBLEMS, bitmap, emblem, written
 
 MILLIMETRES = 4e-3
 """The stature is set by two vertices of the mean body; another one may be the highest."""
@@ -104,21 +105,21 @@ def test_the_person_of_a_subject_is_its_description(body, people):
 
 
 def test_words_read_from_left_to_right():
-    cells = lettering.bitmap("L7")
+    cells = bitmap("L7")
     rows = ["".join("#" if c else "." for c in row) for row in cells]
     assert rows[0] == "#.....#####." and rows[6] == "#####..#....", rows
     x, y = np.meshgrid(np.arange(12) + 0.5, 6.5 - np.arange(7))
-    drawn = lettering.written(cells, x.ravel(), y.ravel()).reshape(7, 12)
+    drawn = written(cells, x.ravel(), y.ravel()).reshape(7, 12)
     np.testing.assert_array_equal(drawn > 0.5, cells)
-    assert lettering.written(cells, np.asarray([-3.0, 50.0]), np.asarray([3.0, 3.0])).max() == 0
+    assert written(cells, np.asarray([-3.0, 50.0]), np.asarray([3.0, 3.0])).max() == 0
 
 
-@pytest.mark.parametrize("kind", lettering.EMBLEMS)
+@pytest.mark.parametrize("kind", EMBLEMS)
 def test_emblems_are_closed_shapes(kind):
     angle = np.linspace(0, 2 * np.pi, 50)
-    assert (lettering.emblem(kind, 1.6 * np.sin(angle), 1.6 * np.cos(angle)) < 0).all()
+    assert (emblem(kind, 1.6 * np.sin(angle), 1.6 * np.cos(angle)) < 0).all()
     x, y = np.meshgrid(np.linspace(-1.2, 1.2, 60), np.linspace(-1.2, 1.2, 60))
-    assert 0.05 < (lettering.emblem(kind, x.ravel(), y.ravel()) > 0).mean() < 0.6
+    assert 0.05 < (emblem(kind, x.ravel(), y.ravel()) > 0).mean() < 0.6
 
 
 def test_a_chest_print_faces_the_viewer_and_a_sleeve_has_its_own_coordinates():
@@ -162,7 +163,7 @@ def test_highlights_are_bent_not_cut():
 
 
 def test_fabrics_of_one_seed_are_one_fabric():
-    from humangs_jax.people.patterns import sample_fabric, weave
+    from humangs_jax.people.fabrics import sample_fabric, weave
 
     rng = np.random.default_rng(0)
     cloth = rng.uniform(-0.2, 0.2, (300, 4)).astype(np.float32)

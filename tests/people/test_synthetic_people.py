@@ -9,7 +9,9 @@ import pytest
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import load_capture
-from humangs_jax.people import cameras, fabrics, patterns, poses, rendering, seeds, subject, writer
+from humangs_jax.people import cameras, fabrics, rendering, seeds, subject, writer
+from humangs_jax.people.fabrics import PATTERNS
+from humangs_jax.people.kinematics import LEFT_HIP, LEFT_KNEE
 from humangs_jax.people.seeds import DEMO, SPLITS, split_of
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
@@ -145,12 +147,12 @@ def test_garments_move_with_the_pose(people):
     rotations = np.zeros((55, 3), np.float32)
     rest = person.posed_vertices(rotations, np.zeros(3))
     np.testing.assert_allclose(rest, person.surface.vertices, atol=1e-5)
-    rotations[poses.LEFT_HIP] = [-0.6, 0, 0]
+    rotations[LEFT_HIP] = [-0.6, 0, 0]
     moved = np.linalg.norm(person.posed_vertices(rotations, np.zeros(3)) - rest, axis=1)
     template = person.surface.attributes["template"]
     is_cloth = np.ones(len(rest), bool)
     is_cloth[np.unique(person.surface.faces[person.face_materials <= 1])] = False
-    knee = person.build.joints[poses.LEFT_KNEE]
+    knee = person.build.joints[LEFT_KNEE]
     near_knee = np.linalg.norm(rest - (knee + np.asarray([0, 0.1, 0])), axis=1) < 0.15
     assert np.median(moved[near_knee]) > 0.05
     assert moved[(template[:, 1] > 0.25) & ~is_cloth].max() < 1e-5
@@ -213,7 +215,7 @@ def test_patterns_stay_in_range_and_differ():
     cloth[:, 3] = 0.16
     spots = fabrics.Spots(cloth, cloth[:, :3])
     seen = []
-    for name, (_, make) in patterns.PATTERNS.items():
+    for name, (_, make) in PATTERNS.items():
         base, other = fabrics.colour(0.6, 0.7, 0.5), fabrics.colour(0.1, 0.6, 0.8)
         colours = make(np.random.default_rng(1), base, other)(spots)
         assert colours.shape == (500, 3) and np.isfinite(colours).all(), name

@@ -8,8 +8,9 @@ import pytest
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.motion import Motion, load_motion, save_motion
-from humangs_jax.people import kinematics, poses
+from humangs_jax.people import kinematics
 from humangs_jax.people.arms import arm_clearance
+from humangs_jax.people.kinematics import LEFT_KNEE, RIGHT_KNEE, Build
 from humangs_jax.people.sequences import KINDS, sample_sequence
 
 FRAMES = 50
@@ -27,7 +28,7 @@ def body():
 
 @pytest.fixture(scope="module")
 def build(body):
-    return poses.Build(np.asarray(body.joint_regressor @ body.template, float), body.parents, 0.13, 0.1, 0.08, 0.035)
+    return Build(np.asarray(body.joint_regressor @ body.template, float), body.parents, 0.13, 0.1, 0.08, 0.035)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +87,7 @@ def test_motions_are_smooth(drawn, case):
 def test_legs_and_arms_keep_to_their_limits(build, drawn, case):
     for rotations in drawn[case].rotations:
         assert kinematics.excess(rotations, tuple(range(1, 22))) < 0.05
-        assert (rotations[[poses.LEFT_KNEE, poses.RIGHT_KNEE], 0] > -0.03).all()
+        assert (rotations[[LEFT_KNEE, RIGHT_KNEE], 0] > -0.03).all()
     inside = [arm_clearance(build, rotations) < -0.03 for rotations in drawn[case].rotations]
     assert np.mean(inside) < 0.1
 

@@ -15,17 +15,7 @@ from jax.scipy.special import ndtri
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.people.fabrics import ALBEDO_LIMIT
-from humangs_jax.people.shading import (
-    CELL,
-    DARKEST,
-    LIFT,
-    REACH,
-    SCENES,
-    SHADOW_DENSITY,
-    SHOULDER,
-    STRIDES,
-    WHITEST,
-)
+from humangs_jax.people.shading import CELL, DARKEST, LIFT, REACH, SCENES, SHADOW_DENSITY, SHOULDER, STRIDES, WHITEST
 
 GRID = (112, 104, 80)
 """Voxels along x, y and z: 2.8 m x 2.6 m x 2 m, more than any pose takes; what lies beyond casts no shade."""

@@ -14,7 +14,7 @@ from humangs_jax.people.cameras import (
     FRAME,
     VERTICAL_FOV,
 )
-from humangs_jax.people.live_pose import pick
+from humangs_jax.people.on_the_fly import pick
 
 CAMERA_NUMBERS = 5
 
