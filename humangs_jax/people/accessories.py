@@ -360,7 +360,7 @@ def shoulder_bag(anatomy: Anatomy, size: float, side: float, ease: float) -> Sur
 COLUMNS = 32
 
 
-def pair(anatomy: Anatomy, height: float, sole: float, ease: float) -> Surface:
+def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> Surface:
     """Both shoes. height: of the shaft above the floor; sole: its thickness; ease: metres between foot and leather."""
     return join([_shoe(anatomy, side, height, sole, ease) for side in (0, 1)])
 

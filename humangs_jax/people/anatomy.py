@@ -9,7 +9,7 @@ import functools
 
 import numpy as np
 
-from humangs_jax.people.kinematics import HEAD, LEFT_ANKLE, LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER, LEFT_WRIST, NECK
+from humangs_jax.people.kinematics import LEFT_ANKLE, LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER, LEFT_WRIST
 from humangs_jax.people.surfaces import Outlines, Surface, blurred, outlines, vertex_normals
 
 BODY_NAME, BODY_VERTICES = "makehuman", 13380
@@ -137,6 +137,3 @@ def measure(
         own = vertices[(template[:, 0] * side > 0.2) & (template[:, 1] > -0.05) & (np.abs(template[:, 0]) < 0.68)]
         arms.append(blurred(outlines(np.abs(own[:, 0]), own[:, [1, 2]], along, centers, 0.025)))
     return Anatomy(skin, joints, parents, arm, leg, blurred(torso), blurred(hips), tuple(legs), tuple(arms))
-
-
-__all__ = ["HEAD", "NECK", "Anatomy", "measure", "smoothstep"]

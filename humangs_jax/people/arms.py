@@ -10,35 +10,7 @@ import dataclasses
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.people.kinematics import (
-    FINGER_LIMIT,
-    HEAD,
-    LEFT_ANKLE,
-    LEFT_COLLAR,
-    LEFT_ELBOW,
-    LEFT_HAND,
-    LEFT_HIP,
-    LEFT_KNEE,
-    LEFT_SHOULDER,
-    LEFT_WRIST,
-    LIMITS,
-    MIRROR,
-    NECK,
-    PELVIS,
-    RIGHT_ANKLE,
-    RIGHT_COLLAR,
-    RIGHT_ELBOW,
-    RIGHT_HAND,
-    RIGHT_HIP,
-    RIGHT_KNEE,
-    RIGHT_SHOULDER,
-    RIGHT_WRIST,
-    SPINE3,
-    Build,
-    joint_positions,
-    rotation_matrix,
-    rotation_vector,
-)
+from humangs_jax.people import kinematics as kin
 
 CANDIDATES = 400
 HAND_LENGTH = 0.6
@@ -81,8 +53,8 @@ GOALS = {
     "diagonal": Goal(0.02, (0.75, 0.65, 0.1), (0.0, 1.1), (-0.2, 0.9), (0.05, 0.7), 0.2),
 }
 ARMS = (
-    (LEFT_COLLAR, LEFT_SHOULDER, LEFT_ELBOW, LEFT_WRIST),
-    (RIGHT_COLLAR, RIGHT_SHOULDER, RIGHT_ELBOW, RIGHT_WRIST),
+    (kin.LEFT_COLLAR, kin.LEFT_SHOULDER, kin.LEFT_ELBOW, kin.LEFT_WRIST),
+    (kin.RIGHT_COLLAR, kin.RIGHT_SHOULDER, kin.RIGHT_ELBOW, kin.RIGHT_WRIST),
 )
 
 
@@ -94,7 +66,7 @@ def draw_goal(rng: np.random.Generator) -> str:
 
 def bend_arm(
     rng: np.random.Generator,
-    build: Build,
+    build: kin.Build,
     rotations: Float[np.ndarray, "j 3"],
     goal: str,
     side: int,
@@ -106,7 +78,7 @@ def bend_arm(
     other_arm: keep clear of the other arm, too. Returns how clear the arm is (metres, negative: it is not).
     """
     collar, shoulder, elbow, wrist = ARMS[side]
-    mirror, n, wanted = np.ones(3) if side == 0 else MIRROR, CANDIDATES, GOALS[goal]
+    mirror, n, wanted = np.ones(3) if side == 0 else kin.MIRROR, CANDIDATES, GOALS[goal]
     rotations[collar] = np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
     down, forward, twist, flex, pronation = np.zeros((5, n, 3))
     down[:, 2] = rng.uniform(*wanted.raised, n)
@@ -115,27 +87,27 @@ def bend_arm(
     flex[:, 1] = -rng.uniform(*wanted.flexed, n)
     pronation[:, 0] = rng.uniform(-0.4, 0.5)
     if goal == "hang":  # a hanging arm swings about the axis of both shoulders
-        swing = rotation_matrix(np.stack([forward[:, 1], down[:, 1], down[:, 2]], 1))
+        swing = kin.rotation_matrix(np.stack([forward[:, 1], down[:, 1], down[:, 2]], 1))
     else:
-        swing = rotation_matrix(forward) @ rotation_matrix(down)
-    upper = rotation_vector(swing @ rotation_matrix(twist)) * mirror
-    lower = rotation_vector(rotation_matrix(flex) @ rotation_matrix(pronation)) * mirror
+        swing = kin.rotation_matrix(forward) @ kin.rotation_matrix(down)
+    upper = kin.rotation_vector(swing @ kin.rotation_matrix(twist)) * mirror
+    lower = kin.rotation_vector(kin.rotation_matrix(flex) @ kin.rotation_matrix(pronation)) * mirror
 
-    world, positions = joint_positions(build, rotations)
+    world, positions = kin.joint_positions(build, rotations)
     rest = build.joints
-    upper_world = world[collar] @ rotation_matrix(upper)
+    upper_world = world[collar] @ kin.rotation_matrix(upper)
     elbows = positions[shoulder] + upper_world @ (rest[elbow] - rest[shoulder])
-    lower_world = upper_world @ rotation_matrix(lower)
+    lower_world = upper_world @ kin.rotation_matrix(lower)
     wrists = elbows + lower_world @ (rest[wrist] - rest[elbow])
     tips = elbows + lower_world @ ((rest[wrist] - rest[elbow]) * (1 + HAND_LENGTH))
     reach = np.linalg.norm(rest[elbow] - rest[shoulder]) + np.linalg.norm(rest[wrist] - rest[elbow])
     offset = np.asarray(wanted.place) * [1 - 2 * side, 1, 1] + rng.normal(0, 0.08, 3)
-    target = positions[shoulder] + reach * world[SPINE3] @ offset
+    target = positions[shoulder] + reach * world[kin.SPINE3] @ offset
     capsules = body_capsules(build, world, positions) + (
         arm_capsules(build, world, positions, 1 - side) if other_arm else []
     )
     clear = np.min([clearance(build, capsules, points) for points in _along(elbows, wrists, tips)], axis=0)
-    beyond = np.maximum(np.linalg.norm(upper, axis=1) - LIMITS[shoulder], 0)
+    beyond = np.maximum(np.linalg.norm(upper, axis=1) - kin.LIMITS[shoulder], 0)
     cost = np.linalg.norm(wrists - target, axis=1) + 20 * np.maximum(MARGIN - clear, 0) + 5 * beyond
     best = int(np.argmin(cost))
     rotations[shoulder], rotations[elbow] = upper[best], lower[best]
@@ -143,9 +115,9 @@ def bend_arm(
     return float(clear[best])
 
 
-def arm_clearance(build: Build, rotations: Float[np.ndarray, "j 3"]) -> float:
+def arm_clearance(build: kin.Build, rotations: Float[np.ndarray, "j 3"]) -> float:
     """How far (metres) both forearms and hands are from the body and each other; negative if one is inside."""
-    world, positions = joint_positions(build, rotations)
+    world, positions = kin.joint_positions(build, rotations)
     body, worst = body_capsules(build, world, positions), np.inf
     for side in (0, 1):
         _, _, elbow, wrist = ARMS[side]
@@ -160,24 +132,27 @@ Capsule = tuple[np.ndarray, np.ndarray, float]
 
 
 def body_capsules(
-    build: Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"]
+    build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"]
 ) -> list[Capsule]:
     """Trunk, legs and head of a posed body."""
-    sideways = 0.25 * (positions[LEFT_HIP] - positions[RIGHT_HIP])
-    top = positions[NECK] + world[SPINE3] @ np.asarray([0, -0.06, 0])
-    head = positions[HEAD] + world[HEAD] @ np.asarray([0, 0.09, 0.03])
+    sideways = 0.25 * (positions[kin.LEFT_HIP] - positions[kin.RIGHT_HIP])
+    top = positions[kin.NECK] + world[kin.SPINE3] @ np.asarray([0, -0.06, 0])
+    head = positions[kin.HEAD] + world[kin.HEAD] @ np.asarray([0, 0.09, 0.03])
     return [
-        *((positions[PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius) for s in (-1.0, 0.0, 1.0)),
-        (positions[LEFT_HIP], positions[LEFT_KNEE], build.thigh_radius),
-        (positions[RIGHT_HIP], positions[RIGHT_KNEE], build.thigh_radius),
-        (positions[LEFT_KNEE], positions[LEFT_ANKLE], build.shin_radius),
-        (positions[RIGHT_KNEE], positions[RIGHT_ANKLE], build.shin_radius),
+        *(
+            (positions[kin.PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius)
+            for s in (-1.0, 0.0, 1.0)
+        ),
+        (positions[kin.LEFT_HIP], positions[kin.LEFT_KNEE], build.thigh_radius),
+        (positions[kin.RIGHT_HIP], positions[kin.RIGHT_KNEE], build.thigh_radius),
+        (positions[kin.LEFT_KNEE], positions[kin.LEFT_ANKLE], build.shin_radius),
+        (positions[kin.RIGHT_KNEE], positions[kin.RIGHT_ANKLE], build.shin_radius),
         (head, head, HEAD_RADIUS),
     ]
 
 
 def arm_capsules(
-    build: Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"], side: int
+    build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"], side: int
 ) -> list[Capsule]:
     """Upper arm, forearm and hand of one side."""
     _, shoulder, elbow, wrist = ARMS[side]
@@ -186,7 +161,7 @@ def arm_capsules(
     return [(positions[shoulder], positions[elbow], radius), (positions[elbow], tip, radius)]
 
 
-def clearance(build: Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+def clearance(build: kin.Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
     distances = []
     for a, b, radius in capsules:
@@ -235,7 +210,7 @@ GESTURES = {
 
 def pose_hand(rng: np.random.Generator, rotations: Float[np.ndarray, "j 3"], side: int) -> None:
     """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: on the way from relaxed to some gesture."""
-    first, mirror = (LEFT_HAND, np.ones(3)) if side == 0 else (RIGHT_HAND, MIRROR)
+    first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
     odds = np.asarray([gesture.odds for gesture in GESTURES.values()])
     goal = list(GESTURES.values())[rng.choice(len(odds), p=odds / odds.sum())]
     start, t = GESTURES["relaxed"], rng.beta(2.5, 1.0)
@@ -247,7 +222,7 @@ def pose_hand(rng: np.random.Generator, rotations: Float[np.ndarray, "j 3"], sid
         curl = curls[name] * rng.uniform(0.85, 1.15) + rng.normal(0, 0.03)
         for bone, share in enumerate(BONE_SHARE):
             # fingers do not bend backwards, and spread at the palm only
-            bend = np.clip(curl * share * rng.uniform(0.9, 1.1), -0.1, FINGER_LIMIT - 0.1)
+            bend = np.clip(curl * share * rng.uniform(0.9, 1.1), -0.1, kin.FINGER_LIMIT - 0.1)
             aside = SPLAY[name] * spread if bone == 0 else 0.0
             rotations[first + 3 * finger + bone] = np.asarray([0, -aside, -bend]) * mirror
     rotations[first + 12] = np.asarray([0.25 * thumb, 0.45 * thumb, -0.35 * thumb]) * mirror

@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 
 from humangs_jax.body.skinning import joint_transforms
-from humangs_jax.core.array_types import Array, Bool, Float, Int, Key, UInt8
+from humangs_jax.core.array_types import Array, Float, Int, Key, UInt8
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.loading.examples import Example
 from humangs_jax.data.views import SubjectViews
@@ -28,18 +28,17 @@ from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.people.baking import SLOPE_STEP, SLOPE_ZERO
 from humangs_jax.people.bank import UV_STEPS, PeopleBank
+from humangs_jax.people.cameras import CAMERA_NUMBERS, azimuths_from, camera_from, pick
 from humangs_jax.people.kinematics import MIRROR
-from humangs_jax.people.on_the_fly_camera import CAMERA_NUMBERS, azimuths_from, camera_from
-from humangs_jax.people.on_the_fly_light import (
+from humangs_jax.people.shading import (
     LIGHT_NUMBERS,
-    LiveLights,
-    bend_normals,
+    Lights,
     dyes_from,
+    light_points,
     lights_from,
-    shade,
+    seen_from_behind,
     shaded_vertices,
 )
-from humangs_jax.people.rendering import INSIDE_SHADE
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from humangs_jax.rendering.tiling import cumsum
 
@@ -54,11 +53,6 @@ def rotations_from(u: Float[Array, "2"], bank: PeopleBank, person: Int[Array, ""
     return between(bank.rotations[person, pose], bank.rotations[person, other], MIXING * u[1])
 
 
-def pick(u: Float[Array, "*b"], count: Int[Array, ""] | int) -> Int[Array, "*b"]:
-    """One of the numbers 0 .. count - 1 for each u in [0, 1)."""
-    return jnp.minimum((u * count).astype(jnp.int32), count - 1)
-
-
 def between(a: Float[Array, "j 3"], b: Float[Array, "j 3"], amount: Float[Array, ""] | float) -> Float[Array, "j 3"]:
     """Rotation vectors on the shortest way from a (amount 0) to b (amount 1), joint by joint (slerp)."""
     p, q = quaternion.from_axis_angle(a), quaternion.from_axis_angle(b)
@@ -71,10 +65,7 @@ def between(a: Float[Array, "j 3"], b: Float[Array, "j 3"], amount: Float[Array,
         jnp.where(near, 1 - amount, jnp.sin((1 - amount) * angle) / sine) * p
         + jnp.where(near, amount, jnp.sin(amount * angle) / sine) * q
     )
-    mixed = jnp.where(mixed[:, :1] < 0, -mixed, mixed)
-    length = jnp.sqrt(jnp.sum(mixed[:, 1:] ** 2, -1, keepdims=True))
-    turn = 2 * jnp.arctan2(length, mixed[:, :1])
-    return mixed[:, 1:] * jnp.where(length < 1e-6, 2.0, turn / jnp.where(length < 1e-6, 1.0, length))
+    return quaternion.to_axis_angle(mixed)
 
 
 def pose_person(
@@ -149,7 +140,7 @@ class Scene:
     vertices: Float[Array, "o n 3"]
     corners: Float[Array, "o f 15"]
     dyes: Float[Array, "m 3 3"]
-    lights: LiveLights
+    lights: Lights
 
 
 def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
@@ -210,7 +201,7 @@ def make_scene(
     bank: PeopleBank,
     person: Int[Array, ""],
     rotations: Float[Array, "o j 3"],
-    lights: LiveLights,
+    lights: Lights,
     dye: Float[Array, "m 3 3"],
 ) -> Scene:
     """A person of the bank in given poses, light and dyes."""
@@ -218,7 +209,7 @@ def make_scene(
 
     def pose(rotations):
         vertices, normals, translation = pose_person(bank, person, rotations)
-        openness, lit = shaded_vertices(vertices, normals, faces, lights.directions[0])
+        openness, lit = shaded_vertices(vertices, normals, lights.directions[0], faces)
         values = jnp.concatenate([normals, openness[:, None], lit[:, None]], axis=-1)
         return vertices, translation, values[faces].reshape(faces.shape[0], 15)
 
@@ -280,7 +271,7 @@ def draw_view(
     fine = camera.resized(camera.width * s, camera.height * s)
     vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
     fragments = rasterize_mesh(vertices, faces, fine)
-    behind = _seen_from_behind(vertices, faces, camera.center)
+    behind = seen_from_behind(vertices, faces, camera.center)
     colors = _light_pixels(bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step)
     covered = (fragments.face_ids >= 0).reshape(-1, 1).astype(colors.dtype)
     return _box_average(colors, camera, s), _box_average(covered, camera, s)[..., 0]
@@ -290,11 +281,6 @@ def _box_average(samples, camera, s):
     """Means (h, w, c) of s x s samples (h s w s, c); added one by one: XLA's CPU backend reduces two axes slowly."""
     samples = samples.reshape(camera.height, s, camera.width, s, -1)
     return sum(samples[:, i, :, j] for i in range(s) for j in range(s)) / (s * s)
-
-
-def _seen_from_behind(vertices, faces, eye) -> Bool[Array, " f"]:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return jnp.sum(jnp.cross(b - a, c - a) * (eye - a), axis=-1) < 0
 
 
 def _light_pixels(bank, scene, corners, behind, fragments, step):
@@ -312,22 +298,17 @@ def _light_pixels(bank, scene, corners, behind, fragments, step):
         start, colors = state
         pixels = lax.dynamic_slice_in_dim(listed, start, step)
         face, weight = jnp.maximum(ids.at[pixels].get(mode="fill", fill_value=0), 0), weights[pixels]
-        lit = _light_points(bank, scene, corners[face], face, weight, behind[face])
+        lit = _color_points(bank, scene, corners[face], face, weight, behind[face])
         return start + step, colors.at[pixels].set(lit, mode="drop")
 
     blank = jnp.full((count, 3), BACKGROUND, weights.dtype)
     return lax.while_loop(lambda state: state[0] < total, light, (jnp.zeros((), jnp.int32), blank))[1]
 
 
-def _light_points(bank, scene, corners, faces, weights, behind):
+def _color_points(bank, scene, corners, faces, weights, behind):
     """(p, 3) colours of points on faces (p,): corners (p, 15), see `Scene`; their weights (p, 3); inner sides (p,)."""
     person = scene.person
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
-    blended = wa * corners[:, :5] + wb * corners[:, 5:10] + wc * corners[:, 10:]
-    normals, openness, lit = blended[:, :3], blended[:, 3], blended[:, 4]
-    normals = normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9)
-    normals = jnp.where(behind[:, None], -normals, normals)
-    openness = jnp.where(behind, INSIDE_SHADE, 1.0) * openness
     uv = bank.uvs[person, faces].astype(weights.dtype)
     painted = _sample(bank.texture, person, (wa * uv[:, 0] + wb * uv[:, 1] + wc * uv[:, 2]) / UV_STEPS)
     pieces = bank.face_pieces[person, faces].astype(jnp.int32)
@@ -335,7 +316,7 @@ def _light_points(bank, scene, corners, faces, weights, behind):
     albedo = sum(painted[:, i : i + 1] * dye[:, :, i] for i in range(3)) / 255
     slopes = (painted[:, 3:] - SLOPE_ZERO) * SLOPE_STEP
     albedo, sheen = jnp.clip(albedo, DARKEST_ALBEDO, None), bank.sheen[person, pieces]
-    return shade(scene.lights, albedo, bend_normals(normals, slopes), openness, lit, sheen)
+    return light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
 
 
 def _sample(texture, person, at):

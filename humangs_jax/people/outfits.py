@@ -35,6 +35,9 @@ class Garment:
     details: frozenset[str] = frozenset()
 
 
+Odds = Mapping[str, float | int]
+
+
 @dataclasses.dataclass(frozen=True)
 class Style:
     """Clothes that go together. men, women: odds of the style. tops, bottoms, coats, shoes: odds of kinds of garments.
@@ -45,17 +48,15 @@ class Style:
 
     men: float
     women: float
-    tops: Mapping[str, float]
-    bottoms: Mapping[str, float]
-    shoes: Mapping[str, float]
-    coats: Mapping[str, float] = dataclasses.field(default_factory=lambda: {"hooded_jacket": 1, "jacket": 1})
+    tops: Odds
+    bottoms: Odds
+    shoes: Odds
+    coats: Odds = dataclasses.field(default_factory=lambda: {"hooded_jacket": 1, "jacket": 1})
     outer: float = 0.06
     tucked: float = 0.22
     skirt: float = 0.12
     scarf: float = 0.1
-    headwear: Mapping[str, float] = dataclasses.field(
-        default_factory=lambda: {"beanie": 0.05, "cap": 0.07, "brim_hat": 0.05}
-    )
+    headwear: Odds = dataclasses.field(default_factory=lambda: {"beanie": 0.05, "cap": 0.07, "brim_hat": 0.05})
     no_sunglasses: float = 0.96
 
 

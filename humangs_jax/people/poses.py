@@ -9,46 +9,8 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.people import kinematics as kin
 from humangs_jax.people.arms import bend_arm, draw_goal, pose_hand
-from humangs_jax.people.kinematics import (
-    FINGER_LIMIT,
-    HEAD,
-    JOINTS,
-    LEFT_ANKLE,
-    LEFT_ELBOW,
-    LEFT_FOOT,
-    LEFT_HAND,
-    LEFT_HIP,
-    LEFT_KNEE,
-    LEFT_SHOULDER,
-    LEFT_WRIST,
-    LEGS,
-    LIMITS,
-    MIRROR,
-    NECK,
-    PELVIS,
-    RIGHT_ANKLE,
-    RIGHT_ELBOW,
-    RIGHT_FOOT,
-    RIGHT_HAND,
-    RIGHT_HIP,
-    RIGHT_KNEE,
-    RIGHT_SHOULDER,
-    RIGHT_WRIST,
-    SPINE1,
-    SPINE2,
-    SPINE3,
-    Build,
-    Foot,
-    about_y,
-    excess,
-    highest_pelvis,
-    joint_positions,
-    limited,
-    place_feet,
-    rotation_matrix,
-    rotation_vector,
-)
 
 TRIES = 20
 """Stances drawn until one is within the limits of the joints; after that the person just stands."""
@@ -62,7 +24,7 @@ class Stance:
     pelvis, left side up. lean: how far forward the trunk bends to keep the balance.
     """
 
-    feet: tuple[Foot, Foot]
+    feet: tuple[kin.Foot, kin.Foot]
     sink: float = 0.0
     tilt: float = 0.0
     roll: float = 0.0
@@ -70,38 +32,38 @@ class Stance:
 
 
 def sample_stance(
-    rng: np.random.Generator, build: Build, rotations: Float[np.ndarray, "j 3"]
+    rng: np.random.Generator, build: kin.Build, rotations: Float[np.ndarray, "j 3"]
 ) -> tuple[Stance, np.ndarray]:
     """Sets the pelvis (but for its heading, which stays) and the legs in `rotations`; the stance and the pelvis's place (3,)."""
     names = list(STANCES)
     odds = np.asarray([STANCES[name][0] for name in names])
-    heading = rotations[PELVIS].copy()
+    heading = rotations[kin.PELVIS].copy()
     for _ in range(TRIES):
         stance = STANCES[names[rng.choice(len(names), p=odds / odds.sum())]][1](rng, build.hip_width / build.leg)
         pelvis, missed = take_stance(build, rotations, heading[1], stance)
-        if missed < 1e-6 and excess(rotations, tuple(j for leg in LEGS for j in leg)) < 0:
+        if missed < 1e-6 and kin.excess(rotations, tuple(j for leg in kin.LEGS for j in leg)) < 0:
             return stance, pelvis
     stance = _stand(rng, build.hip_width / build.leg)
     return stance, take_stance(build, rotations, heading[1], stance)[0]
 
 
 def take_stance(
-    build: Build, rotations: Float[np.ndarray, "j 3"], heading: float, stance: Stance
+    build: kin.Build, rotations: Float[np.ndarray, "j 3"], heading: float, stance: Stance
 ) -> tuple[Float[np.ndarray, "3"], float]:
     """Sets pelvis and legs; where the pelvis is, the ground at y = 0, and how far the worse foot is from its place."""
-    turn = about_y(heading) @ rotation_matrix(np.asarray([stance.tilt, 0.0, stance.roll]))
-    rotations[PELVIS] = rotation_vector(turn)
+    turn = kin.about_y(heading) @ kin.rotation_matrix(np.asarray([stance.tilt, 0.0, stance.roll]))
+    rotations[kin.PELVIS] = kin.rotation_vector(turn)
     left, right = (in_world(foot, build.leg, heading) for foot in stance.feet)
     feet = left, right
-    height = highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg
+    height = kin.highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg
     pelvis = np.asarray([0.0, height, 0.0])
-    return pelvis, place_feet(build, rotations, pelvis, feet)
+    return pelvis, kin.place_feet(build, rotations, pelvis, feet)
 
 
-def in_world(foot: Foot, leg: float, heading: float) -> Foot:
+def in_world(foot: kin.Foot, leg: float, heading: float) -> kin.Foot:
     """A foot of a stance, in legs and before the turn, in metres after it."""
-    x, _, z = about_y(heading) @ np.asarray([foot.x * leg, 0.0, foot.z * leg])
-    return Foot(float(x), float(z), heading + foot.yaw, foot.pitch, foot.lift * leg)
+    x, _, z = kin.about_y(heading) @ np.asarray([foot.x * leg, 0.0, foot.z * leg])
+    return kin.Foot(float(x), float(z), heading + foot.yaw, foot.pitch, foot.lift * leg)
 
 
 def _pair(rng, width, *, spread=(0.0, 0.08), apart=(0.0, 0.06), turn_out=(-0.05, 0.35)):
@@ -109,7 +71,7 @@ def _pair(rng, width, *, spread=(0.0, 0.08), apart=(0.0, 0.06), turn_out=(-0.05,
     feet = []
     for sign in (1, -1):
         x = sign * (width + rng.uniform(*spread))
-        feet.append(Foot(x, 0.08 + rng.choice([-1, 1]) * rng.uniform(*apart), sign * rng.uniform(*turn_out)))
+        feet.append(kin.Foot(x, 0.08 + rng.choice([-1, 1]) * rng.uniform(*apart), sign * rng.uniform(*turn_out)))
     return feet
 
 
@@ -183,7 +145,7 @@ def _one_leg(rng, width):
         z, lift, pitch = z - rng.uniform(0.3, 0.55), rng.uniform(0.1, 0.45), rng.uniform(0.5, 1.2)
     else:
         x, lift = x + sign * rng.uniform(0.2, 0.5), rng.uniform(0.05, 0.3)
-    feet[raised] = Foot(x, z, feet[raised].yaw, pitch, lift)
+    feet[raised] = kin.Foot(x, z, feet[raised].yaw, pitch, lift)
     return Stance(
         tuple(feet), sink=rng.uniform(0.0, 0.05), roll=sign * rng.uniform(0, 0.08), lean=rng.uniform(-0.05, 0.1)
     )
@@ -210,42 +172,6 @@ STANCES: dict[str, tuple[float, Callable[[np.random.Generator, float], Stance]]]
 """Name -> probability, and what draws it from a generator and the distance of a hip from the middle in legs."""
 
 
-__all__ = [
-    "FINGER_LIMIT",
-    "HEAD",
-    "JOINTS",
-    "LEFT_ANKLE",
-    "LEFT_ELBOW",
-    "LEFT_FOOT",
-    "LEFT_HAND",
-    "LEFT_HIP",
-    "LEFT_KNEE",
-    "LEFT_SHOULDER",
-    "LEFT_WRIST",
-    "LIMITS",
-    "MIRROR",
-    "NECK",
-    "PELVIS",
-    "RIGHT_ANKLE",
-    "RIGHT_ELBOW",
-    "RIGHT_FOOT",
-    "RIGHT_HAND",
-    "RIGHT_HIP",
-    "RIGHT_KNEE",
-    "RIGHT_SHOULDER",
-    "RIGHT_WRIST",
-    "SPINE1",
-    "SPINE2",
-    "SPINE3",
-    "Build",
-    "bend_trunk",
-    "joint_positions",
-    "limited",
-    "rotation_matrix",
-    "rotation_vector",
-    "sample_rotations",
-]
-
 BOTH_ARMS = 0.45
 """Share of people whose arms have the same goal."""
 ATTEMPTS = 3
@@ -254,10 +180,10 @@ CLEAR = 0.0
 """Metres: an arm that is at least so clear is taken."""
 
 
-def sample_rotations(rng: np.random.Generator, build: Build) -> Float[np.ndarray, "j 3"]:
+def sample_rotations(rng: np.random.Generator, build: kin.Build) -> Float[np.ndarray, "j 3"]:
     """(j, 3) rotation vectors of a random plausible pose; the lowest points of planted feet are at one height."""
-    rotations = np.zeros((JOINTS, 3))
-    rotations[PELVIS] = [0.0, rng.uniform(-0.7, 0.7), 0.0]
+    rotations = np.zeros((kin.JOINTS, 3))
+    rotations[kin.PELVIS] = [0.0, rng.uniform(-0.7, 0.7), 0.0]
     stance, _ = sample_stance(rng, build, rotations)
     bend_trunk(rng, rotations, stance.lean, stance.roll)
     both, goal = rng.random() < BOTH_ARMS, draw_goal(rng)
@@ -268,7 +194,7 @@ def sample_rotations(rng: np.random.Generator, build: Build) -> Float[np.ndarray
                 break
             wanted = draw_goal(rng)
         pose_hand(rng, rotations, side)
-    return limited(rotations)
+    return kin.limited(rotations)
 
 
 def bend_trunk(rng: np.random.Generator, rotations: Float[np.ndarray, "j 3"], lean: float, roll: float) -> None:
@@ -279,7 +205,7 @@ def bend_trunk(rng: np.random.Generator, rotations: Float[np.ndarray, "j 3"], le
     bowed = rng.random() < 0.08
     lean = lean + rng.normal(0.03, 0.07) + (rng.uniform(0.2, 0.7) if bowed else 0.0)
     side, turn = rng.normal(0, 0.06) - 0.8 * roll, rng.normal(0, 0.14)
-    for joint, share in ((SPINE1, 0.3), (SPINE2, 0.35), (SPINE3, 0.35)):
+    for joint, share in ((kin.SPINE1, 0.3), (kin.SPINE2, 0.35), (kin.SPINE3, 0.35)):
         rotations[joint] = np.asarray([lean, turn, side]) * share
     look = rng.normal(0, 1, 3) * [0.12, 0.28, 0.07]
-    rotations[NECK], rotations[HEAD] = 0.45 * look - [0.4 * lean, 0, 0], 0.55 * look
+    rotations[kin.NECK], rotations[kin.HEAD] = 0.45 * look - [0.4 * lean, 0, 0], 0.55 * look

@@ -122,7 +122,7 @@ def test_cloth_covers_and_leaves_the_body(body, people, posed):
         rng = np.random.default_rng(0)
         camera = cameras.cameras_around(rng, p.vertices, np.asarray([0.4]), SIZE)[0]
         skin = np.asarray(rasterize_mesh(naked.vertices, body.faces, camera).face_ids) >= 0
-        fragments = rasterize_mesh(*rendering._padded(p.vertices, person.surface.faces), camera)
+        fragments = rasterize_mesh(*rendering.padded(p.vertices, person.surface.faces), camera)
         ids = np.asarray(fragments.face_ids)
         dressed = ids >= 0
         assert (skin & dressed).sum() > 0.93 * skin.sum()  # the cloth is where the body is
@@ -134,7 +134,7 @@ def test_hardly_any_skin_pokes_through(people, posed, views):
     for person, p, (batch, _, _) in zip(people, posed, views, strict=True):
         faces = person.surface.faces
         for k in range(3):
-            fragments = rasterize_mesh(*rendering._padded(p.vertices, faces), batch[k])
+            fragments = rasterize_mesh(*rendering.padded(p.vertices, faces), batch[k])
             ids, weights = np.asarray(fragments.face_ids), np.asarray(fragments.barycentrics)
             seen = ids >= 0
             under = (person.under_cloth[faces[ids[seen]]] * weights[seen]).sum(-1)
