@@ -198,7 +198,7 @@ def synth(
         for_training: short for 2 poses x 12 views at 256 pixels and no others, enough for `humangs train`.
         workers: processes; as many as there are cores if not given.
     """
-    from humangs_jax.people.writer import Layout, write_set
+    from humangs_jax.people import Layout, write_set
 
     counts = {"subjects": subjects, "size": size, "views": views, "poses": poses, "frames": frames}
     if wrong := [name for name, count in counts.items() if count < 1]:
@@ -415,7 +415,7 @@ def train(
     from humangs_jax.body.library import load_body
     from humangs_jax.network.weights import load_weights
     from humangs_jax.objectives.loss_networks import load_loss_networks
-    from humangs_jax.people.written import find_people
+    from humangs_jax.people import find_people
     from humangs_jax.training.diagnose import diagnose_run
     from humangs_jax.training.launch import fitting_losses, read_config, training_people
     from humangs_jax.training.loop import train as run
