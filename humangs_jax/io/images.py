@@ -3,14 +3,13 @@
 The orientation flag that phones write into JPEG files (EXIF) is ignored: a calibration speaks of the stored pixels.
 """
 
-import os
 import subprocess
-import uuid
 from pathlib import Path
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.io.atomic import replace_file
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOUR_TYPES = {2: "rgb", 4: "grey and alpha", 6: "rgba"}
@@ -47,13 +46,7 @@ def write_png(path: str | Path, image: Float[np.ndarray, "h w 3"] | Float[np.nda
     """
     from PIL import Image
 
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-    try:
-        Image.fromarray(to_uint8(image)).save(temporary, format="PNG")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    replace_file(path, lambda temporary: Image.fromarray(to_uint8(image)).save(temporary, format="PNG"))
 
 
 def to_uint8(image: Float[np.ndarray, "*shape"]) -> np.ndarray:
