@@ -23,7 +23,7 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.video import write_video
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
-from humangs_jax.data.photographs import DEMO_CAPTURE
+from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.io.atomic import add_files
 from humangs_jax.network.weights import load_weights
 

@@ -244,7 +244,7 @@ def check(
     """
     from humangs_jax.apps.check import check_capture
     from humangs_jax.data.capture import load_capture
-    from humangs_jax.data.photographs import capture_folder
+    from humangs_jax.data.photos import capture_folder
     from humangs_jax.fitting.fit_record import FIT_FILE, read_fit_record
 
     photos = load_capture(capture)

@@ -5,11 +5,10 @@ import os
 from pathlib import Path
 
 from humangs_jax.body.library import load_body
-from humangs_jax.data.capture import Capture, load_capture
-from humangs_jax.data.capture_reading import DEFAULT_BODY
+from humangs_jax.data.capture import DEFAULT_BODY, Capture, load_capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.reading import read_keypoints
-from humangs_jax.data.photographs import Photographs, load_photographs
+from humangs_jax.data.photos import Photos, load_photos
 from humangs_jax.fitting.fit_capture import check_place, fit_photographs, write_fitted
 from humangs_jax.fitting.landmark_fit import FitConfig
 
@@ -31,7 +30,7 @@ def fit_from_keypoints(
     from humangs_jax.fitting.examination import examine
 
     target = check_place(capture, out, overwrite)
-    photographs = load_photographs(capture)
+    photographs = load_photos(capture)
     found = read_keypoints_of(photographs, keypoints, person)
     model = load_body(body)
     body_file = DEFAULT_BODY if body is None else str(body)
@@ -102,7 +101,7 @@ def fit_from_scan(
     if joints is not None:
         known = read_joints(joints)
     elif views is not None and keypoints is not None:
-        known = joints_from_views(views, read_keypoints_of(load_photographs(views), keypoints, person))
+        known = joints_from_views(views, read_keypoints_of(load_photos(views), keypoints, person))
     fitted = fit_scan(scan, body=load_body(body), joints=known, clothed=not bare, height=height)
     body_file = DEFAULT_BODY if body is None else os.path.relpath(body.resolve(), out.resolve())
     save_scan_fit(out, fitted, body_file, overwrite=overwrite)
@@ -110,7 +109,7 @@ def fit_from_scan(
     print(f"{out}: body.npz, scan_fit.json and body_in_scan.ply")
 
 
-def read_keypoints_of(views: Photographs | Capture, path: Path, person: int | None) -> Keypoints:
+def read_keypoints_of(views: Photos | Capture, path: Path, person: int | None) -> Keypoints:
     """Keypoints of the views of a capture. Raises: see `read_keypoints`."""
     height, width = views.images.shape[1:3]
     return read_keypoints(path, views.names, width, height, person=person)

@@ -19,7 +19,9 @@ from pathlib import Path
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
 """A temporary file of another machine (on a shared disk) is abandoned when it was not touched for this long."""
-_TEMPORARY = re.compile(r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?")
+_TEMPORARY = re.compile(
+    r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?"
+)
 
 
 def write_bytes(path: str | os.PathLike, data: bytes) -> None:
