@@ -16,14 +16,14 @@ def config_to_json(config: Any, indent: int | None = None) -> str:
 
 
 def config_from_json(cls: type[T], text: str) -> T:
-    """Inverse of `config_to_json` for a configuration of class `cls`; fields that are absent take their defaults.
+    """Inverse of `config_to_json` for a configuration of class `cls`; missing fields take their defaults.
 
     Raises: ValueError for a field that the configuration does not have or a value of another type, naming it.
     """
     try:
         values = json.loads(text)
     except json.JSONDecodeError as error:
-        raise ValueError(f"configuration is no JSON: {error}") from error
+        raise ValueError(f"configuration is not JSON: {error}") from error
     return _build(cls, values, "config")
 
 
@@ -36,7 +36,7 @@ def config_from_file(cls: type[T], path: Path) -> T:
 
 
 def _build(annotation: Any, value: Any, path: str) -> Any:
-    """A JSON value as what its annotation says."""
+    """A JSON value, converted to its annotation."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if dataclasses.is_dataclass(annotation):
         return _build_dataclass(annotation, value, path)
@@ -53,7 +53,7 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
             return tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
     elif _matches(value, annotation):
         return value
-    raise ValueError(f"{path}: {value!r} is no {annotation}")
+    raise ValueError(f"{path}: expected {_named(annotation)}, got {value!r}")
 
 
 def _build_dataclass(cls, values, path):
@@ -63,6 +63,10 @@ def _build_dataclass(cls, values, path):
     if unknown := sorted(set(values) - set(annotations)):
         raise ValueError(f"{path}.{unknown[0]}: {cls.__name__} has no such field")
     return cls(**{name: _build(annotations[name], value, f"{path}.{name}") for name, value in values.items()})
+
+
+def _named(annotation):
+    return annotation.__name__ if isinstance(annotation, type) else str(annotation)
 
 
 def _matches(value, annotation):

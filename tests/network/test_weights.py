@@ -72,7 +72,7 @@ def test_tensors_that_do_not_fit_are_named(file, change, message):
     [
         ({"format": "other"}, "found format 'other'"),
         ({"version": "9"}, "version '9'"),
-        ({"config": "{"}, "no JSON"),
+        ({"config": "{"}, "not JSON"),
         ({"config": "[]"}, "expected an object"),
         (
             {"config": json.dumps({"transformer": {"widht": 3}})},
