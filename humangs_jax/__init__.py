@@ -16,7 +16,7 @@ _PUBLIC = {
     "Capture": "data.capture",
     "CaptureError": "data.capture",
     "Gaussians": "rendering.gaussians",
-    "HumanGSConfig": "network.humangs",
+    "HumanGSConfig": "network.config",
     "Motion": "data.motion",
     "PRESETS": "network.presets",
     "Rendering": "rendering.splatting",

@@ -55,9 +55,9 @@ def reconstruct(
     _require_parent(out)
     variables, config = load_weights(weights)
     if tokens != "as_trained":
-        config = dataclasses.replace(config, tokens=tokens)
+        config = config.with_execution(tokens=tokens)
     if dtype != "as_trained":
-        config = dataclasses.replace(config, dtype=dtype)
+        config = config.with_execution(dtype=dtype)
     avatar = run(variables, config, photos)
     avatar.save(out)
     print(f"{out}: {len(avatar.gaussians.means):,} Gaussians from {len(photos.images)} photos")
@@ -474,7 +474,7 @@ def convert(
         raise ValueError(f"--losses {losses}: the same file as --out")
     networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)
     converted = load_checkpoint(checkpoint, head_width)
-    config = dataclasses.replace(converted.config, sampling=dataclasses.replace(converted.config.sampling, pool=pool))
+    config = converted.config.with_conventions(pool=pool)
     save_weights(out, converted.variables, config, dtype)
     print(f"{out}: {describe(converted)}")
     if losses is None:

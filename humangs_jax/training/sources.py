@@ -33,7 +33,7 @@ def stage_loader(make_source: MakeSource, config: TrainConfig, step: int, mesh: 
 def captured_people(folders: Sequence[str | Path], body: BodyModel) -> MakeSource:
     """Capture folders whose parameters belong to `body`; pictures that are decoded once serve all stages."""
     cache = CaptureCache(folders, body)
-    return lambda config: CaptureSource(cache, config.views, config.model.image_size, config.target_size)
+    return lambda config: CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size)
 
 
 def live_people(bank: PeopleBank, settings: LiveConfig = DEFAULT_CONFIG) -> MakeSource:
@@ -44,7 +44,7 @@ def live_people(bank: PeopleBank, settings: LiveConfig = DEFAULT_CONFIG) -> Make
         live = dataclasses.replace(
             settings,
             target_views=views.target_count,
-            input_size=config.model.image_size,
+            input_size=config.model.conventions.image_size,
             target_size=config.target_size,
             mixed_pose_share=views.mixed_pose_share,
             jitter=views.jitter,
