@@ -31,9 +31,9 @@ from experiments.common.results import markdown_table, publish, write_json
 
 VARIANTS = {
     "kept": {},
-    "recomputed": {"transformer": {"scan": True, "remat": True}},
+    "recomputed": {"scan": True, "remat": "full"},
     "foreground": {"tokens": "foreground"},
-    "foreground, recomputed": {"tokens": "foreground", "transformer": {"scan": True, "remat": True}},
+    "foreground, recomputed": {"tokens": "foreground", "scan": True, "remat": "full"},
 }
 """What the backward pass finds of the blocks, and which patches become tokens."""
 FOREGROUND_SHARE = 0.22
@@ -169,12 +169,12 @@ def configured(arguments: argparse.Namespace, size: int, variant: str, chips: in
     batch = arguments.per_chip * chips
     config = settings(arguments.preset, size, arguments.views, arguments.targets, batch)
     fields = dict(VARIANTS[variant])
-    patches = arguments.views * (size // config.model.patch_size) ** 2
+    patches = arguments.views * (size // config.model.architecture.encoder.patch_size) ** 2
     tokens = patches
     if fields.get("tokens") == "foreground":
         tokens = fields["token_capacity"] = int(FOREGROUND_SHARE * patches)
     # what "auto" would choose there: it asks for the devices at hand
-    fields["attention"] = {"implementation": "xla" if tokens < XLA_TOKENS else "chunked"}
+    fields["attention"] = "xla" if tokens < XLA_TOKENS else "chunked"
     config = with_model(config, **fields)
     return dataclasses.replace(config, microbatch_size=1)
 

@@ -14,7 +14,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.body.smplx import EXPRESSION_COLUMNS, SHAPE_COLUMNS
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.network.humangs import HumanGSConfig
+from humangs_jax.network.config import HumanGSConfig
 
 SMPLX_SEED_VERTICES = 3493
 """Vertices of the decimated body that the made-up one grows from: with a vertex for each of its faces about SMPL-X's 10,475."""
@@ -40,7 +40,7 @@ def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
     for name, divisor in FRACTIONS.items():
         small = decimate(body, len(body.template) // divisor)
         cases[name] = BodyCase(small, small)
-    if config.longest_edge is not None:
+    if config.conventions.longest_edge is not None:
         for name in FRACTIONS:
             small = cases[name].body
             cases[f"{name}, edges split"] = BodyCase(small, gaussian_body(small, config))

@@ -1,7 +1,6 @@
 """What evaluations share before they start: options, the network, and what their rows depend on."""
 
 import argparse
-import dataclasses
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -62,7 +61,7 @@ def load_network(arguments: argparse.Namespace) -> tuple[Any, Any, str]:
         path = arguments.weights or shipped
         variables, config = load_weights(path)
         digest = file_digest(path)
-    return variables, dataclasses.replace(config, tokens=arguments.tokens or config.tokens), digest
+    return variables, config.with_execution(tokens=arguments.tokens), digest
 
 
 def settings_of(arguments: argparse.Namespace, digest: str, tokens: str, lpips: Any) -> dict[str, Any]:

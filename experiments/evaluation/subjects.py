@@ -23,7 +23,8 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.io.images import to_uint8
-from humangs_jax.network.humangs import HumanGSConfig, Variables
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.parts import Variables
 from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.rendering import PosedSubject

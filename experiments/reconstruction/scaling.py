@@ -51,8 +51,9 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     import jax
 
     full = configured("paper", "auto", arguments.size)
-    transformer = dataclasses.replace(full.transformer, width=WIDTH, layers=LAYERS)
-    half = dataclasses.replace(full, transformer=transformer)
+    encoder = full.architecture.encoder
+    transformer = dataclasses.replace(encoder.transformer, width=WIDTH, layers=LAYERS)
+    half = full.with_parts(encoder=dataclasses.replace(encoder, transformer=transformer))
     variables = random_variables(half)
     rows = []
     for views in arguments.views:

@@ -74,7 +74,7 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
         return jax.tree.map(lambda plane: plane[order], ellipses)
 
     def rows(projected, gaussians, order):
-        seen = jnp.concatenate([gaussians.colors, projected.depth[:, None]], axis=-1)
+        seen = jnp.concatenate([gaussians.colors, projected.depths[:, None]], axis=-1)
         splats = pack_splats(projected, gaussians.opacities, seen, config.alpha_min)
         return splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
 
@@ -84,7 +84,7 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
     gaussians, camera = scene.gaussians(), scene.camera()
     grid = TileGrid(scene.size, scene.size, config.tile_size)
     projected = stage("project", lambda g: project(g, camera), gaussians)
-    order = stage("depth order", binning.depth_order, projected.depth)
+    order = stage("depth order", binning.depth_order, projected.depths)
     pairs = stage(
         "pairs",
         lambda *a: binning.emit_pairs(footprints(*a), grid, config.max_rows, config.max_pairs),

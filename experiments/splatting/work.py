@@ -191,7 +191,7 @@ def make_lists(scene: Scene, config: Any, tile_size: int, dtype: type = np.float
 
     @jax.jit
     def sort_by_depth(projected, reach):
-        order = binning.depth_order(jnp.where(projected.visible, projected.depth, jnp.inf))
+        order = binning.depth_order(jnp.where(projected.visible, projected.depths, jnp.inf))
         if config.square:
             footprints = binning.square_footprints(projected, reach, config.radius_sigma)
         else:

@@ -97,7 +97,7 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
     program, compile_s = case.compiled(compiler_options())
     case.program = program
     costs = compiled_costs(program)
-    product, product_flops = matmul_program(case.config.model.dtype)
+    product, product_flops = matmul_program(case.config.model.execution.dtype)
     load = os.getloadavg()[0]
     times = medians({"matmul": product, "step": lambda: case.run(program)}, arguments.repeats, arguments.warm_up)
     wall, cpu = map(float, times["step"])
@@ -119,10 +119,10 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
         "peak_rss_mb": peak_rss_mb(),
         "compile_cpu_s": compile_s,
         "tokens": token_count(case.config),
-        "gaussians": len(case.body.template) * case.config.model.decoder.gaussians_per_vertex,
+        "gaussians": len(case.body.template) * case.config.model.architecture.decoder.gaussians_per_vertex,
         "parameters": sum(x.size for x in jax.tree.leaves(case.state.params)),
         "losses": case.metrics,
-        "dtype": case.config.model.dtype,
+        "dtype": case.config.model.execution.dtype,
         "repeats": arguments.repeats,
         "load_average": load,
         "device": jax.devices()[0].device_kind,
@@ -133,8 +133,10 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
 def token_count(config: Any) -> int:
     """Slots for tokens."""
     model = config.model
-    patches = config.views.input_counts[0] * (model.image_size // model.patch_size) ** 2
-    return model.token_capacity if model.tokens == "foreground" else patches
+    patches = (
+        config.views.input_counts[0] * (model.conventions.image_size // model.architecture.encoder.patch_size) ** 2
+    )
+    return model.execution.token_capacity if model.tokens == "foreground" else patches
 
 
 def steps_table(result: dict[str, Any]) -> str:

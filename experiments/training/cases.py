@@ -16,7 +16,7 @@ def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -
     config = PRESETS[preset]()
     return dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, image_size=size),
+        model=config.model.with_conventions(image_size=size),
         views=ViewSampling(input_counts=(views,), target_count=targets),
         target_size=size,
         batch_size=batch,
@@ -24,13 +24,16 @@ def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -
     )
 
 
-def with_model(config: Any, **fields: Any) -> Any:
-    """With other fields of the network; `transformer` and `attention` take dictionaries of fields of theirs."""
-    model = config.model
-    transformer = dataclasses.replace(model.transformer, **fields.pop("transformer", {}))
-    attention = dataclasses.replace(transformer.attention, **fields.pop("attention", {}))
-    transformer = dataclasses.replace(transformer, attention=attention)
-    return dataclasses.replace(config, model=dataclasses.replace(model, transformer=transformer, **fields))
+def with_model(config: Any, upsampler: Any = None, **execution: Any) -> Any:
+    """With other fields of the network's `Execution`, or with an upsampler in proportion to the network."""
+    model = config.model.with_execution(**execution)
+    if upsampler is not None:
+        encoder, reader = model.architecture.encoder, model.architecture.reader
+        model = model.with_parts(
+            encoder=dataclasses.replace(encoder, upsampler=upsampler),
+            reader=dataclasses.replace(reader, output_width=encoder.transformer.width),
+        )
+    return dataclasses.replace(config, model=model)
 
 
 def abstract_batch(config: Any, joints: int, betas: int) -> Any:
@@ -54,7 +57,7 @@ def abstract_batch(config: Any, joints: int, betas: int) -> Any:
         )
 
     def example(_):
-        inputs = views(config.views.input_counts[0], config.model.image_size)
+        inputs = views(config.views.input_counts[0], config.model.conventions.image_size)
         return Example(inputs, views(config.views.target_count, config.target_size))
 
     return jax.eval_shape(jax.vmap(example), jax.ShapeDtypeStruct((config.batch_size,), jnp.int32))
@@ -86,9 +89,11 @@ def written_subject(folder: Path, config: Any, body: Any, seed: int = 0) -> Path
     from humangs_jax.people import write_training_subject
 
     views = config.views.input_counts[0] + config.views.target_count
-    path = folder / f"{config.model.image_size}_{views}"
+    path = folder / f"{config.model.conventions.image_size}_{views}"
     if not path.exists():
-        write_training_subject(path, seed, body=body, image_size=config.model.image_size, poses=1, views=views)
+        write_training_subject(
+            path, seed, body=body, image_size=config.model.conventions.image_size, poses=1, views=views
+        )
     return path
 
 
@@ -137,7 +142,9 @@ class Case:
         from humangs_jax.data.loader import CaptureCache, CaptureSource
 
         cache = CaptureCache([self.capture], self.full_body)
-        return CaptureSource(cache, self.config.views, self.config.model.image_size, self.config.target_size)
+        return CaptureSource(
+            cache, self.config.views, self.config.model.conventions.image_size, self.config.target_size
+        )
 
     def fit(self) -> None:
         """Room for the foreground tokens of this person, as a run would have."""

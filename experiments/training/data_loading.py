@@ -120,7 +120,7 @@ def measure_training(folder: Path, body: Any) -> dict[str, Any]:
 
     sampling = ViewSampling(input_counts=(INPUTS,), target_count=TARGETS)
     config = dataclasses.replace(small(), views=sampling)
-    sizes = config.model.image_size, config.target_size
+    sizes = config.model.conventions.image_size, config.target_size
     write_set(folder, 2, Layout(max(sizes), poses=POSES, views=VIEWS), "train", 0, body=body, progress=False)
     bank = build_bank([0, 1], body, "train", pose_count=4)
     sources = {

@@ -51,7 +51,8 @@ def training_variants(base):
     view = lambda **changes: replace(base, views=replace(base.views, **changes))
     loss = lambda **changes: replace(base, loss=replace(base.loss, **changes))
     rate = lambda x: replace(base, optimizer=replace(base.optimizer, learning_rate=x))
-    k = lambda free: replace(base, model=replace(model, decoder=replace(model.decoder, free=free)))
+    decoder = lambda model, **fields: model.with_parts(decoder=replace(model.architecture.decoder, **fields))
+    k = lambda free: replace(base, model=decoder(model, free=free))
     counts = view(input_counts=(1, 2, 4, 4, 6))
     return {
         FIRST: (base, {}),
@@ -60,7 +61,7 @@ def training_variants(base):
         "rate 2e-4": (rate(2e-4), {}),
         "2 subjects a step, half of the steps": (replace(base, batch_size=2, steps=base.steps // 2), {}),
         "2 targets": (view(target_count=2), {}),
-        "1, 2, 4, 4 or 6 inputs": (replace(counts, model=replace(model, token_capacity=TOKENS * 7 // 5)), {}),
+        "1, 2, 4, 4 or 6 inputs": (replace(counts, model=model.with_execution(token_capacity=TOKENS * 7 // 5)), {}),
         "squared error alone": (loss(structural=0.0), {}),
         "structural 0.5": (loss(structural=0.5), {}),
         "silhouette 0.5": (loss(silhouette=0.5), {}),
@@ -76,12 +77,15 @@ def training_variants(base):
 def network_variants(base):
     """Name -> (configuration, settings of the live people): of the network, from nothing."""
     replace, model = dataclasses.replace, base.model
-    bare = replace(model, sampling=replace(model.sampling, shells=()))
-    fine = replace(model, body_vertices=6000, longest_edge=0.02, decoder=replace(model.decoder, free=1))
+    parts = model.architecture
+    bare = model.with_parts(reader=replace(parts.reader, shells=()))
+    canonical = bare.with_parts(decoder=replace(parts.decoder, frame="canonical"))
+    fine = model.with_parts(decoder=replace(parts.decoder, free=1))
+    fine = fine.with_conventions(body_vertices=6000, longest_edge=0.02)
     networks = {
         FIRST: model,
         "no shells": bare,
-        "no shells, Gaussians in the canonical frame": replace(bare, decoder=replace(model.decoder, frame="canonical")),
+        "no shells, Gaussians in the canonical frame": canonical,
         "edges to 2 cm, K = 2": fine,
     }
     return {name: (replace(base, model=network), {}) for name, network in networks.items()}
@@ -100,7 +104,7 @@ def run(arguments, parser) -> None:
     base = small()
     base = dataclasses.replace(
         base,
-        model=dataclasses.replace(model, token_capacity=TOKENS),
+        model=model.with_execution(token_capacity=TOKENS),
         views=dataclasses.replace(base.views, input_counts=(4,), target_count=4),
         loss=LossConfig(),
         optimizer=OptimizerConfig(learning_rate=4e-4, warmup_steps=20),

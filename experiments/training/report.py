@@ -243,7 +243,7 @@ def table_of_facts(lines: Sequence[dict[str, Any]], facts: dict[str, Any], confi
     rows = {
         "run": f"preset `{facts['config']}` from fresh weights, {config['steps']} steps of {config['batch_size']} people",
         "people": f"{facts['people']} for training, {POSES} poses x {VIEWS} views each; {facts['validation']} for validation",
-        "photos": f"{counts} of {config['model']['image_size']} px",
+        "photos": f"{counts} of {config['model']['conventions']['image_size']} px",
         "targets": f"{views['target_count']} of {config['target_size']} px",
         "loss": " + ".join(terms),
         "learning rate": f"{optimizer['learning_rate']:g} after {optimizer['warmup_steps']} steps{average_text(config)}",

@@ -25,7 +25,7 @@ def variants(case: Case) -> dict[str, tuple[dict[str, Any], dict[str, Any] | Non
         "with an upsampler": ({"upsampler": upsampler(model)}, options, False),
         "with an upsampler, convolutions as XLA differentiates them": ({"upsampler": upsampler(model)}, options, True),
         "all patches are tokens": ({"tokens": "all"}, options, False),
-        "blocks recomputed, in a loop": ({"transformer": {"remat": True, "scan": True}}, options, False),
+        "blocks recomputed, in a loop": ({"remat": "full", "scan": True}, options, False),
         "bfloat16": ({"dtype": "bfloat16"}, options, False),
     }
 
@@ -34,8 +34,7 @@ def upsampler(model: Any) -> Any:
     """One in proportion to the network."""
     from humangs_jax.network.upsampler import UpsamplerConfig
 
-    width = model.transformer.width
-    return UpsamplerConfig(hidden=width // 3, out=width)
+    return UpsamplerConfig(hidden=model.architecture.encoder.transformer.width // 3)
 
 
 def variant_numbers(
@@ -99,7 +98,9 @@ def stages(case: Case) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
 
     from humangs_jax.core.pytree import replace
     from humangs_jax.data.views import prepare_inputs
-    from humangs_jax.network.humangs import decode, encode_with_statistics, sample_vertices
+    from humangs_jax.network.humangs import decode, part_variables
+    from humangs_jax.network.humangs import read as read_features
+    from humangs_jax.network.parts import Pass
     from humangs_jax.training.forward import draw_targets, white_backgrounds
     from humangs_jax.training.optimizer import make_optimizer
     from humangs_jax.training.step import loss_terms
@@ -107,16 +108,17 @@ def stages(case: Case) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
     config, body, networks, example = case.config, case.body, case.networks, first(case.batch)
     targets, variables = example.targets, {"params": case.state.params, "batch_stats": case.state.batch_stats}
     jit = lambda function, *inputs: jax.jit(function, compiler_options=compiler_options())(*inputs)
-    pose = lambda views: prepare_inputs(body, views, config.model, config.raster)
+    pose = lambda views: prepare_inputs(body, views, config.model)
     inputs = jit(pose, example.inputs)
 
     def encode(params):
-        return encode_with_statistics({**variables, "params": params}, inputs, config.model, True)[0]
+        own = part_variables({**variables, "params": params}, "encoder")
+        return config.model.architecture.encoder.apply(own, inputs, Pass(config.model, train=True))[0]
 
     def read(params, encoding):
         own = {**variables, "params": params}
-        features = sample_vertices(own, encoding, inputs, config.model)
-        return decode(own, features, inputs.canonical_vertices, config.model)
+        features = read_features(own, encoding, inputs, config.model)
+        return decode(own, features, inputs, config.model)
 
     def draw(outputs, gaussians):
         outputs = replace(outputs, gaussians=gaussians)

@@ -13,7 +13,6 @@ import numpy as np
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
-from humangs_jax.core.buffers import round_up
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, gaussian_body, pad_views, prepare_inputs, standardize
@@ -22,6 +21,7 @@ from humangs_jax.network.humangs import apply_humangs, needed_tokens
 from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
+from humangs_jax.rendering.buffers import round_up
 
 
 def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar:

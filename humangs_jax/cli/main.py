@@ -13,6 +13,7 @@ from typing import Literal
 import tyro
 
 from humangs_jax.core.allocator import keep_freed_memory
+from humangs_jax.core.compile_cache import enable_compile_cache
 
 Positional = tyro.conf.Positional
 
@@ -504,6 +505,7 @@ def main() -> None:
     """Entry point of the console script."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # no notes of XLA's between our lines
     keep_freed_memory()
+    enable_compile_cache()
     try:
         tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="humangs", description=__doc_summary__)
     except (ValueError, OSError) as error:

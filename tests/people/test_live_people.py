@@ -13,7 +13,7 @@ from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.geometry.camera import project
-from humangs_jax.network.humangs import subject_unit
+from humangs_jax.network.inputs import subject_unit
 from humangs_jax.network.presets import tiny
 from humangs_jax.people import cameras, live, live_bank, live_camera, live_light, live_pose, rendering, shading
 from humangs_jax.people.live_source import jitted_example, live_source

@@ -15,7 +15,7 @@ import pytest
 from experiments.splatting import benchmark, scaling, scenes, tradeoff, work
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.reference import render_dense
+from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SplatConfig
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -68,7 +68,7 @@ def files(tmp_path_factory):
         gaussians = Gaussians(*(double[name] for name in PARAMETERS))
 
         def loss(gaussians):
-            image = render_dense(gaussians, camera, background=jnp.zeros(3)).rgb
+            image = render_reference(gaussians, camera, background=jnp.zeros(3)).rgb
             return jnp.mean((image - target) ** 2), image
 
         gradients, image = jax.jit(jax.grad(loss, has_aux=True))(gaussians)
@@ -142,7 +142,7 @@ def test_work_needed_agrees_with_brute_force(files):
     scene = scenes.load_scene(files / "scene.npz", SIZE)
     config = SplatConfig()
     projected, _ = work.projected_splats(scene, config)
-    order = np.argsort(projected.depth, kind="stable")
+    order = np.argsort(projected.depths, kind="stable")
     x, y, xx, xy, yy = (np.asarray(projected[i], np.float64)[order, None, None] for i in (0, 1, 3, 4, 5))
     dx, dy = np.arange(SIZE) + 0.5 - x, (np.arange(SIZE) + 0.5)[:, None] - y
     squared = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
