@@ -27,7 +27,7 @@ from experiments.training.plot import draw_curve, read_lines, steps_of, validati
 
 TABLES = ("training_run_steps", "training_run_facts")
 SIZE, POSES, VIEWS = 256, 2, 12
-"""Pictures of a person."""
+"""Images of a person."""
 COLUMNS = 5
 """Validations that are shown."""
 AVERAGED = 20
@@ -89,7 +89,7 @@ def train(arguments: argparse.Namespace) -> bool:
 
 
 def reported(config: Any, steps: int) -> Any:
-    """The preset for a run of so many steps: ten validations, a hundred log lines, a warm-up of a tenth at most."""
+    """The preset for a run of that many steps: ten validations, a hundred log lines, a warm-up of a tenth at most."""
     warmup = min(config.optimizer.warmup_steps, steps // 10)
     tenth = max(1, steps // 10)
     return dataclasses.replace(
