@@ -86,5 +86,5 @@ def test_nobody_to_train_on_is_an_error(tmp_path, body):
 
 
 def test_the_file_of_the_shipped_weights_run_is_the_preset():
-    path = Path(__file__).parents[2] / "experiments" / "configs" / "small.json"
+    path = Path(__file__).parents[2] / "experiments" / "training" / "small.json"
     assert config_from_file(TrainConfig, path) == small()
