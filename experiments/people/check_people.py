@@ -115,7 +115,7 @@ def describe_all(body, arguments):
     """Counts and spreads over descriptions."""
     import numpy as np
 
-    from humangs_jax.people.person import describe
+    from humangs_jax.people.subject import describe
 
     people = [describe(arguments.first + i, body) for i in range(arguments.described)]
     kinds = collections.Counter(g.kind for p in people for g in p.garments)
@@ -206,19 +206,19 @@ def count_faults(body, posed, camera):
     import numpy as np
 
     from humangs_jax.body.model import BodyPose, pose_body, shape_body
-    from humangs_jax.people.rendering import _padded
+    from humangs_jax.people.rendering import padded
     from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
     subject = posed.subject
     faces, materials = subject.surface.faces, subject.face_materials
-    everything = rasterize_mesh(*_padded(posed.vertices, faces), camera)
+    everything = rasterize_mesh(*padded(posed.vertices, faces), camera)
     ids = np.asarray(everything.face_ids)
     seen, depth = ids >= 0, np.asarray(everything.depth)
     weights = np.asarray(everything.barycentrics)
     cover = (subject.cover[faces[ids]] * weights).sum(-1)
     inside = seen & (materials[ids] == 0) & (cover > 0)
     cloth = np.where((materials >= 2)[:, None], faces, 0)
-    behind = rasterize_mesh(*_padded(posed.vertices, cloth), camera)
+    behind = rasterize_mesh(*padded(posed.vertices, cloth), camera)
     cloth_ids, cloth_depth = np.asarray(behind.face_ids), np.asarray(behind.depth)
     eye = np.asarray(camera.center)
     outer = (cloth_ids >= 0) & _faces_the_eye(posed.vertices, faces, eye)[cloth_ids]
@@ -298,7 +298,7 @@ def draw(file, people, seen):
     import matplotlib.pyplot as plt
     import numpy as np
 
-    from humangs_jax.people import poses
+    from humangs_jax.people import kinematics as poses
 
     figure = plt.figure(figsize=(17, 9.5))
     grid = figure.add_gridspec(2, 5)

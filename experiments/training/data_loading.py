@@ -63,7 +63,7 @@ def measure_synth(out: Path, size: int, subjects: int, body: Any) -> dict[str, f
 def measure_read(out: Path, size: int, examples: int, body: Any) -> dict[str, dict[str, float]]:
     """Examples of written people through the loader: from disk every time, and from memory."""
     from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
-    from humangs_jax.people.written import find_people
+    from humangs_jax.people.manifest import find_people
 
     sampling = ViewSampling(input_counts=(INPUTS,), target_count=TARGETS)
     results = {}
@@ -80,9 +80,9 @@ def measure_live(size: int, people: int, examples: int, body: Any) -> dict[str, 
     """Build a bank, compile, draw examples one by one."""
     import jax
 
-    from humangs_jax.people.live import LiveConfig
-    from humangs_jax.people.live_bank import build_bank
-    from humangs_jax.people.live_source import jitted_example
+    from humangs_jax.people.bank import build_bank
+    from humangs_jax.people.on_the_fly import OnTheFlyConfig
+    from humangs_jax.people.source import jitted_example
 
     texture = 1024 if size > 256 else 512
     build_bank([0, 1], body, "train", texture_size=texture)
@@ -91,7 +91,7 @@ def measure_live(size: int, people: int, examples: int, body: Any) -> dict[str, 
     accelerator = jax.default_backend() != "cpu"
     views = INPUTS + TARGETS
     wide = {"views_at_once": views, "pixels_per_step": 1 << 30} if accelerator else {}
-    config = LiveConfig(input_views=INPUTS, target_views=TARGETS, input_size=size, target_size=size, **wide)
+    config = OnTheFlyConfig(input_views=INPUTS, target_views=TARGETS, input_size=size, target_size=size, **wide)
     draw = lambda i: jax.block_until_ready(jitted_example(banks[0], jax.random.key(i), config))
     first = seconds(lambda: draw(0))
     draw(1)
@@ -109,11 +109,11 @@ def measure_training(folder: Path, body: Any) -> dict[str, Any]:
 
     from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling, Waiting
     from humangs_jax.data.views import gaussian_body
-    from humangs_jax.people.live import LiveConfig
-    from humangs_jax.people.live_bank import build_bank
-    from humangs_jax.people.live_source import live_source
+    from humangs_jax.people.bank import build_bank
+    from humangs_jax.people.manifest import find_people
+    from humangs_jax.people.on_the_fly import OnTheFlyConfig
+    from humangs_jax.people.source import on_the_fly_source
     from humangs_jax.people.writer import Layout, write_set
-    from humangs_jax.people.written import find_people
     from humangs_jax.training.config import small
     from humangs_jax.training.state import init_state
     from humangs_jax.training.step import train_step
@@ -124,7 +124,7 @@ def measure_training(folder: Path, body: Any) -> dict[str, Any]:
     write_set(folder, 2, Layout(max(sizes), poses=POSES, views=VIEWS), "train", 0, body=body, progress=False)
     bank = build_bank([0, 1], body, "train", pose_count=4)
     sources = {
-        "live": live_source(bank, LiveConfig(INPUTS, TARGETS, *sizes), (INPUTS,)),
+        "live": on_the_fly_source(bank, OnTheFlyConfig(INPUTS, TARGETS, *sizes), (INPUTS,)),
         "read": CaptureSource(CaptureCache(find_people(folder), body), sampling, *sizes),
     }
     state, model_body = init_state(config, None), gaussian_body(body, config.model)

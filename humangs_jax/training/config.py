@@ -137,7 +137,7 @@ def published() -> TrainConfig:
     return TrainConfig(
         model=presets.published(),
         splat=SPLAT_PRESETS["inria"],
-        views=ViewSampling(target_count=4),
+        views=ViewSampling(target_count=4, rule="window"),
         loss=LossConfig(structural=0.0, silhouette=0.0, perceptual=1.0, lpips=0.1, random_background=0.0),
         target_size=512,
         steps=100_000,

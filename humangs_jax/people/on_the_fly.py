@@ -1,13 +1,13 @@
-"""People on the fly: a pure, jittable function of a key from a bank of dressed people to views to learn from.
+"""People on the fly: a pure, jittable function of a key, from a bank of dressed people to views to learn from.
 
-A key picks a person of the bank, dyes the clothes anew, mirrors left and right, picks poses, light and cameras, and draws
-the views with the project's rasterizer. The same key gives the same bits on the same platform; nothing but jax.numpy runs,
-on CPU, GPU and TPU alike. What differs from `rendering.render_view`: colours come from baked textures, normals are
-skinned instead of measured, the key light throws soft shadows.
+A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two similar poses of the
+person's own), light and cameras, and draws the views with the project's rasterizer. The same key gives the same bits on the
+same platform; only jax.numpy runs, on CPU, GPU and TPU. Differences from `rendering.render_view`: colours come from baked
+textures, normals are skinned instead of measured, vertices follow a few joints each.
 
     bank = load_bank("people.npz")
-    example = jax.jit(live_example, static_argnames="config")(bank, key, LiveConfig())
-    batch = jax.vmap(live_example, in_axes=(None, 0, None))(bank, keys, LiveConfig())
+    example = jax.jit(on_the_fly_example, static_argnames="config")(bank, key, OnTheFlyConfig())
+    batch = jax.vmap(on_the_fly_example, in_axes=(None, 0, None))(bank, keys, OnTheFlyConfig())
 """
 
 import dataclasses
@@ -19,35 +19,83 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
+from humangs_jax.body.skinning import joint_transforms
+from humangs_jax.core.array_types import Array, Float, Int, Key, UInt8
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.loading.examples import Example
 from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.people.baking import SLOPE_STEP, SLOPE_ZERO
-from humangs_jax.people.live_bank import UV_STEPS, PeopleBank
-from humangs_jax.people.live_camera import CAMERA_NUMBERS, azimuths_from, camera_from
-from humangs_jax.people.live_light import (
+from humangs_jax.people.bank import UV_STEPS, PeopleBank
+from humangs_jax.people.cameras import CAMERA_NUMBERS, azimuths_from, camera_from, pick
+from humangs_jax.people.kinematics import MIRROR
+from humangs_jax.people.shading import (
     LIGHT_NUMBERS,
-    LiveLights,
-    bend_normals,
+    Lights,
     dyes_from,
+    light_points,
     lights_from,
-    shade,
+    seen_from_behind,
     shaded_vertices,
 )
-from humangs_jax.people.live_pose import pick, pose_person, rotations_from
-from humangs_jax.people.poses import MIRROR
-from humangs_jax.people.rendering import INSIDE_SHADE
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from humangs_jax.rendering.tiling import cumsum
+
+MIXING = 0.5
+"""Farthest that a pose is moved towards the nearest one: everything between the two is then reached from one of them."""
+
+
+def rotations_from(u: Float[Array, "2"], bank: PeopleBank, person: Int[Array, ""]) -> Float[Array, "j 3"]:
+    """(j, 3) rotation vectors of a pose of a person; u in [0, 1) says which and how far on the way to the next."""
+    pose = pick(u[0], bank.rotations.shape[1])
+    other = bank.nearest[person, pose]
+    return between(bank.rotations[person, pose], bank.rotations[person, other], MIXING * u[1])
+
+
+def between(a: Float[Array, "j 3"], b: Float[Array, "j 3"], amount: Float[Array, ""] | float) -> Float[Array, "j 3"]:
+    """Rotation vectors on the shortest way from a (amount 0) to b (amount 1), joint by joint (slerp)."""
+    p, q = quaternion.from_axis_angle(a), quaternion.from_axis_angle(b)
+    cosine = jnp.sum(p * q, -1, keepdims=True)
+    q = jnp.where(cosine < 0, -q, q)
+    angle = jnp.arccos(jnp.clip(jnp.abs(cosine), 0, 1))
+    near = angle < 1e-3
+    sine = jnp.where(near, 1.0, jnp.sin(angle))
+    mixed = (
+        jnp.where(near, 1 - amount, jnp.sin((1 - amount) * angle) / sine) * p
+        + jnp.where(near, amount, jnp.sin(amount * angle) / sine) * q
+    )
+    return quaternion.to_axis_angle(mixed)
+
+
+def pose_person(
+    bank: PeopleBank, person: Int[Array, ""], rotations: Float[Array, "j 3"]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "3"]]:
+    """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the translation (3,)."""
+    nowhere = jnp.zeros(3, rotations.dtype)
+    transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[:, :3].reshape(-1, 12)
+    blended = _blend(transforms, bank.joint_ids[person], bank.joint_weights[person].astype(rotations.dtype))
+    x, y, z = jnp.split(bank.vertices[person], 3, axis=-1)
+    nx, ny, nz = jnp.split(bank.normals[person].astype(rotations.dtype), 3, axis=-1)
+    # written out: matrix products are of low precision on GPU and TPU
+    vertices = blended[:, 0::4] * x + blended[:, 1::4] * y + blended[:, 2::4] * z + blended[:, 3::4]
+    normals = blended[:, 0::4] * nx + blended[:, 1::4] * ny + blended[:, 2::4] * nz
+    translation = nowhere.at[1].set(-vertices[:, 1].min())
+    return vertices + translation, normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9), translation
+
+
+def _blend(transforms: Float[Array, "j 12"], ids: UInt8[Array, "n k"], weights: Float[Array, "n k"]):
+    """(n, 12) rows of the vertices' blended transforms. Weights are stored in few bits: their sum is made 1 again."""
+    weights = weights / weights.sum(-1, keepdims=True)
+    return sum(weights[:, i : i + 1] * transforms[ids[:, i].astype(jnp.int32)] for i in range(ids.shape[1]))
+
 
 BACKGROUND = 1.0
 DARKEST_ALBEDO = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
-class LiveConfig:
+class OnTheFlyConfig:
     """What an example shows.
 
     input_views, target_views; input_size, target_size: pixels a side. poses: poses per example; targets show any of them.
@@ -74,11 +122,11 @@ class LiveConfig:
     pixels_per_step: int = 1 << 14
 
 
-DEFAULT_CONFIG = LiveConfig()
+ON_THE_FLY = OnTheFlyConfig()
 
 
 @pytree_dataclass
-class LiveScene:
+class Scene:
     """A person as a key has them stand there, in several poses o; what all views of an example share.
 
     person: () index in the bank. rotations: (o, j, 3). translations: (o, 3). vertices: (o, n, 3) metres.
@@ -92,10 +140,10 @@ class LiveScene:
     vertices: Float[Array, "o n 3"]
     corners: Float[Array, "o f 15"]
     dyes: Float[Array, "m 3 3"]
-    lights: LiveLights
+    lights: Lights
 
 
-def live_example(bank: PeopleBank, key: Key, config: LiveConfig = DEFAULT_CONFIG) -> Example:
+def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
     """Views of somebody of the bank: some shown, others asked for."""
     numbers = _draw_numbers(bank, key, config)
     scene = scene_from(numbers, bank, config)
@@ -112,8 +160,8 @@ def live_example(bank: PeopleBank, key: Key, config: LiveConfig = DEFAULT_CONFIG
     return Example(*(jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts))
 
 
-def draw_scene(bank: PeopleBank, key: Key, config: LiveConfig = DEFAULT_CONFIG) -> LiveScene:
-    """What the views of `live_example` of this key show."""
+def draw_scene(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Scene:
+    """What the views of `on_the_fly_example` of this key show."""
     return scene_from(_draw_numbers(bank, key, config), bank, config)
 
 
@@ -140,7 +188,7 @@ def _draw_numbers(bank, key, config):
     return {name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
 
 
-def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: LiveConfig) -> LiveScene:
+def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: OnTheFlyConfig) -> Scene:
     """Who, in which poses, colours and light; numbers in [0, 1) by name."""
     person = pick(numbers["person"], bank.people)
     rotations = jax.vmap(lambda u: rotations_from(u, bank, person))(numbers["poses"])
@@ -153,20 +201,20 @@ def make_scene(
     bank: PeopleBank,
     person: Int[Array, ""],
     rotations: Float[Array, "o j 3"],
-    lights: LiveLights,
+    lights: Lights,
     dye: Float[Array, "m 3 3"],
-) -> LiveScene:
+) -> Scene:
     """A person of the bank in given poses, light and dyes."""
     faces = bank.faces[person].astype(jnp.int32)
 
     def pose(rotations):
         vertices, normals, translation = pose_person(bank, person, rotations)
-        openness, lit = shaded_vertices(vertices, normals, faces, lights.directions[0])
+        openness, lit = shaded_vertices(vertices, normals, lights.directions[0], faces)
         values = jnp.concatenate([normals, openness[:, None], lit[:, None]], axis=-1)
         return vertices, translation, values[faces].reshape(faces.shape[0], 15)
 
     vertices, translations, corners = lax.map(pose, rotations)
-    return LiveScene(person, rotations, translations, vertices, corners, dye, lights)
+    return Scene(person, rotations, translations, vertices, corners, dye, lights)
 
 
 class _Plan(NamedTuple):
@@ -216,14 +264,14 @@ def _batch(config, count):
 
 
 def draw_view(
-    bank: PeopleBank, scene: LiveScene, pose: Int[Array, ""], camera: Camera, config: LiveConfig = DEFAULT_CONFIG
+    bank: PeopleBank, scene: Scene, pose: Int[Array, ""], camera: Camera, config: OnTheFlyConfig = ON_THE_FLY
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
     """(h, w, 3) picture on white and (h, w) coverage of one of the scene's poses, both in [0, 1]."""
     s = config.supersampling
     fine = camera.resized(camera.width * s, camera.height * s)
     vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
     fragments = rasterize_mesh(vertices, faces, fine)
-    behind = _seen_from_behind(vertices, faces, camera.center)
+    behind = seen_from_behind(vertices, faces, camera.center)
     colors = _light_pixels(bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step)
     covered = (fragments.face_ids >= 0).reshape(-1, 1).astype(colors.dtype)
     return _box_average(colors, camera, s), _box_average(covered, camera, s)[..., 0]
@@ -233,11 +281,6 @@ def _box_average(samples, camera, s):
     """Means (h, w, c) of s x s samples (h s w s, c); added one by one: XLA's CPU backend reduces two axes slowly."""
     samples = samples.reshape(camera.height, s, camera.width, s, -1)
     return sum(samples[:, i, :, j] for i in range(s) for j in range(s)) / (s * s)
-
-
-def _seen_from_behind(vertices, faces, eye) -> Bool[Array, " f"]:
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    return jnp.sum(jnp.cross(b - a, c - a) * (eye - a), axis=-1) < 0
 
 
 def _light_pixels(bank, scene, corners, behind, fragments, step):
@@ -255,22 +298,17 @@ def _light_pixels(bank, scene, corners, behind, fragments, step):
         start, colors = state
         pixels = lax.dynamic_slice_in_dim(listed, start, step)
         face, weight = jnp.maximum(ids.at[pixels].get(mode="fill", fill_value=0), 0), weights[pixels]
-        lit = _light_points(bank, scene, corners[face], face, weight, behind[face])
+        lit = _color_points(bank, scene, corners[face], face, weight, behind[face])
         return start + step, colors.at[pixels].set(lit, mode="drop")
 
     blank = jnp.full((count, 3), BACKGROUND, weights.dtype)
     return lax.while_loop(lambda state: state[0] < total, light, (jnp.zeros((), jnp.int32), blank))[1]
 
 
-def _light_points(bank, scene, corners, faces, weights, behind):
-    """(p, 3) colours of points on faces (p,): corners (p, 15), see `LiveScene`; their weights (p, 3); inner sides (p,)."""
+def _color_points(bank, scene, corners, faces, weights, behind):
+    """(p, 3) colours of points on faces (p,): corners (p, 15), see `Scene`; their weights (p, 3); inner sides (p,)."""
     person = scene.person
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
-    blended = wa * corners[:, :5] + wb * corners[:, 5:10] + wc * corners[:, 10:]
-    normals, openness, lit = blended[:, :3], blended[:, 3], blended[:, 4]
-    normals = normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9)
-    normals = jnp.where(behind[:, None], -normals, normals)
-    openness = jnp.where(behind, INSIDE_SHADE, 1.0) * openness
     uv = bank.uvs[person, faces].astype(weights.dtype)
     painted = _sample(bank.texture, person, (wa * uv[:, 0] + wb * uv[:, 1] + wc * uv[:, 2]) / UV_STEPS)
     pieces = bank.face_pieces[person, faces].astype(jnp.int32)
@@ -278,7 +316,7 @@ def _light_points(bank, scene, corners, faces, weights, behind):
     albedo = sum(painted[:, i : i + 1] * dye[:, :, i] for i in range(3)) / 255
     slopes = (painted[:, 3:] - SLOPE_ZERO) * SLOPE_STEP
     albedo, sheen = jnp.clip(albedo, DARKEST_ALBEDO, None), bank.sheen[person, pieces]
-    return shade(scene.lights, albedo, bend_normals(normals, slopes), openness, lit, sheen)
+    return light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
 
 
 def _sample(texture, person, at):

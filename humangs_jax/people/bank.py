@@ -1,4 +1,4 @@
-"""Banks of dressed people, ready for a device: made on the host once, all of one shape, drawn from by `live.live_example`.
+"""Banks of dressed people, ready for a device: made on the host once, all of one shape, drawn from by `live.on_the_fly_example`.
 
 A bank holds people of ONE range of seeds (see `seeds`): what is drawn from a bank for training is nobody of the test range,
 whatever the key. About 3 MB a person at 512 texels a side.
@@ -19,8 +19,9 @@ from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.io.atomic import replace_file
 from humangs_jax.io.npz import read_npz
-from humangs_jax.people import poses
 from humangs_jax.people.baking import BakedSubject, bake_subject
+from humangs_jax.people.kinematics import joint_positions
+from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.seeds import GENERATOR_VERSION, split_of
 from humangs_jax.people.subject import SyntheticSubject, make_subject
 
@@ -203,12 +204,12 @@ def _arrays(subject: SyntheticSubject, baked: BakedSubject, pose_count):
 def sample_poses(subject: SyntheticSubject, count: int) -> Float[np.ndarray, "q j 3"]:
     """(q, j, 3) poses of a subject by the prior."""
     generators = (np.random.default_rng([subject.seed, POSE_STREAM, i]) for i in range(count))
-    return np.stack([poses.sample_rotations(rng, subject.build) for rng in generators]).astype(np.float32)
+    return np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(np.float32)
 
 
 def _nearest(build, rotations):
     """(q,) for each pose the other one whose joints are nearest to its own."""
-    places = np.stack([poses.joint_positions(build, r.astype(np.float64))[1] for r in rotations])
+    places = np.stack([joint_positions(build, r.astype(np.float64))[1] for r in rotations])
     away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(-1) + 1e9 * np.eye(len(places))
     return np.argmin(away, axis=1).astype(np.int32)
 

@@ -1,6 +1,7 @@
-"""People made on the fly as a source: a pure function of a key, and keys that belong to one split."""
+"""Sources of people made on the fly: a pure function of a key, and keys that belong to one split."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Mapping
 
 import jax
@@ -10,7 +11,10 @@ import numpy as np
 from humangs_jax.core.array_types import Key
 from humangs_jax.data.loading.examples import Example
 from humangs_jax.data.loading.order import SUBJECT_STREAM
+from humangs_jax.people.bank import PeopleBank
+from humangs_jax.people.on_the_fly import ON_THE_FLY, OnTheFlyConfig, on_the_fly_example
 from humangs_jax.people.seeds import SPLITS, subject_key
+from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
 
 MakeExample = Callable[[Key, int], Example]
 """(key, number of input views) -> Example; pure, usually jitted with the number static."""
@@ -53,3 +57,28 @@ class GeneratedSource:
         """See `Source`."""
         example = self.make(self.drawn_key(seed, index), input_count)
         return jax.tree.map(np.asarray if self.on_host else jnp.asarray, example)
+
+
+def jitted_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
+    """`on_the_fly_example`, compiled once per configuration and shape of the bank; with `CPU_COMPILER_OPTIONS` on a CPU."""
+    return _compiled()(bank, key, config=config)
+
+
+@functools.cache
+def _compiled():
+    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    return jax.jit(on_the_fly_example, static_argnames="config", compiler_options=options)
+
+
+def on_the_fly_source(
+    bank: PeopleBank, config: OnTheFlyConfig, input_counts: tuple[int, ...] = (4,), on_host: bool = False
+) -> GeneratedSource:
+    """Examples of a bank for `loader.Loader` and `loader.Mixture`: of people of the bank's split, whatever the key.
+
+    input_counts replace `config.input_views`; each is compiled once. on_host: see `GeneratedSource`.
+    """
+
+    def make(key: Key, input_count: int) -> Example:
+        return jitted_example(bank, key, config=dataclasses.replace(config, input_views=input_count))
+
+    return GeneratedSource(make=make, split=bank.split, input_counts=input_counts, on_host=on_host)
