@@ -65,16 +65,19 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     folder.mkdir(parents=True, exist_ok=True)
     prune(folder, CACHE_BYTES)
     os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
-    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"  # default 1: most of our programs take less
+    # of every program (default: those that took a second): a small one is read in 1 ms and compiled in 20 or more
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
-if least := os.environ.get("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", float(least))
+jax.config.update(
+    "jax_persistent_cache_min_compile_time_secs",
+    float(os.environ.get("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "1")),
+)
 
 for owner, name in ((np.testing, "assert_allclose"), (np, "allclose"), (np, "isclose")):
     setattr(owner, name, scaled_comparison(getattr(owner, name)))
 
 
-@pytest.fixture(autouse=True, scope="session")
+@pytest.fixture(scope="session", autouse=True)
 def _plain_compiler():
     if "HUMANGS_PLAIN_COMPILER" in os.environ:
         from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS

@@ -17,16 +17,18 @@ reference is stored as float32: half a rounding step is 6e-8."""
 
 
 @pytest.mark.parametrize("dtype", TOLERANCES)
-def test_every_stage_agrees(dtype):
+@pytest.mark.parametrize("name", golden.POOLS)
+def test_every_stage_agrees(name, dtype):
+    checkpoint, subject = golden.carried(name)
     with jax.enable_x64(dtype == "float64"):
-        converted, arrays = load_checkpoint(golden.CHECKPOINT), golden.load_subject()
-        assert converted.config.sampling.pool == "all"  # as golden_a
-        config = dataclasses.replace(converted.config, dtype="float32")
+        converted, arrays = load_checkpoint(checkpoint), golden.load_subject(name)
+        sampling = dataclasses.replace(converted.config.sampling, pool=golden.POOLS[name])
+        config = dataclasses.replace(converted.config, dtype="float32", sampling=sampling)
         variables = jax.tree.map(lambda x: jnp.asarray(x, dtype), converted.variables)
         inputs, weights, transforms = check_parity.subject_inputs(arrays, 0, dtype)
         compute = jax.jit(check_parity.compute_stages, static_argnames="config")
         found = compute(variables, inputs, config, weights, transforms)
         assert all(x.dtype == dtype for x in found.values())
-    errors = golden.thinned_errors(jax.tree.map(np.asarray, found), dict(np.load(golden.SUBJECT)))
+    errors = golden.thinned_errors(jax.tree.map(np.asarray, found), dict(np.load(subject)))
     assert len(errors) == 17
     assert max(errors.values()) < TOLERANCES[dtype], errors
