@@ -13,24 +13,27 @@ Without `--compile` a minute each. Numbers and what follows from them: docs/scal
 
 import argparse
 import dataclasses
+import functools
 import json
 import math
 import os
+import re
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.accelerator.collectives import collectives
 from experiments.common.compiled_costs import compiled_costs, program_costs
-from experiments.common.results import markdown_table, write_json, write_section
+from experiments.common.hlo import Computation, Instruction, Program, known_trips, parse_program
+from experiments.common.results import markdown_table, publish, write_json
 
 VARIANTS = {
     "kept": {},
-    "recomputed": {"transformer": {"scan": True, "remat": True}},
+    "recomputed": {"scan": True, "remat": "full"},
     "foreground": {"tokens": "foreground"},
-    "foreground, recomputed": {"tokens": "foreground", "transformer": {"scan": True, "remat": True}},
+    "foreground, recomputed": {"tokens": "foreground", "scan": True, "remat": "full"},
 }
 """What the backward pass finds of the blocks, and which patches become tokens."""
 FOREGROUND_SHARE = 0.22
@@ -57,7 +60,8 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     if arguments.page:
-        write_section(arguments.page, "cost", table(json.loads(arguments.json.read_text())))
+        numbers = json.loads(arguments.json.read_text())
+        publish(arguments.page, "training_cost", table(numbers), numbers)
         return
     result = json.loads(arguments.json.read_text()) if arguments.json and arguments.json.exists() else {}
     if arguments.compile != (arguments.libtpu is not None):
@@ -165,12 +169,12 @@ def configured(arguments: argparse.Namespace, size: int, variant: str, chips: in
     batch = arguments.per_chip * chips
     config = settings(arguments.preset, size, arguments.views, arguments.targets, batch)
     fields = dict(VARIANTS[variant])
-    patches = arguments.views * (size // config.model.patch_size) ** 2
+    patches = arguments.views * (size // config.model.architecture.encoder.patch_size) ** 2
     tokens = patches
     if fields.get("tokens") == "foreground":
         tokens = fields["token_capacity"] = int(FOREGROUND_SHARE * patches)
     # what "auto" would choose there: it asks for the devices at hand
-    fields["attention"] = {"implementation": "xla" if tokens < XLA_TOKENS else "chunked"}
+    fields["attention"] = "xla" if tokens < XLA_TOKENS else "chunked"
     config = with_model(config, **fields)
     return dataclasses.replace(config, microbatch_size=1)
 
@@ -208,6 +212,74 @@ def table(result: dict[str, Any]) -> str:
             cells += [f"{row['compile_cpu_s']:.0f}", f"{row['bytes'] / 1e9:.0f}", f"{needed / 1e9:.1f}"]
         rows.append([*cells, *["refused" if "refused" in row else "-"] * (len(header) - len(cells))])
     return markdown_table(header, rows)
+
+
+SENT = {"all-gather": 1, "reduce-scatter": 1, "all-reduce": 2, "all-to-all": 1}
+"""Passes over the array. `collective-permute` sends it once, whole."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Collectives:
+    """By kind: calls, bytes of the whole arrays, and bytes that each device sends. unknown_trips: loops counted once."""
+
+    calls: dict[str, int]
+    array_bytes: dict[str, int]
+    sent_bytes: dict[str, int]
+    unknown_trips: int
+
+
+def collectives(text: str, devices: int) -> Collectives:
+    """Of an optimised program. devices: the size of a group where the program does not say (one group of all)."""
+    counter = _Counter(parse_program(text), devices)
+    total = counter.computation(counter.program.entry)
+    pick = lambda what: {kind: number for (kind, name), number in sorted(total.items()) if name == what}
+    return Collectives(pick("calls"), pick("array"), pick("sent"), len(counter.unknown))
+
+
+def group_size(attributes: str, devices: int) -> int:
+    """Devices of a group, of `replica_groups={{0,1},{2,3}}` or `[groups,size]<=[...]`."""
+    if found := re.search(r"replica_groups=\[(\d+),(\d+)\]", attributes):
+        return int(found[2])
+    if found := re.search(r"replica_groups=\{\{([\d,]+)\}", attributes):
+        return len(found[1].split(","))
+    return devices
+
+
+class _Counter:
+    def __init__(self, program: Program, devices: int):
+        self.program, self.devices = program, devices
+        self.unknown: set[str] = set()
+
+    @functools.cache  # noqa: B019, a counter lives as long as its program
+    def computation(self, name: str) -> Counter:
+        computation, total = self.program.computations[name], Counter()
+        for x in computation.instructions.values():
+            total.update(self.instruction(computation, x))
+        return total
+
+    def instruction(self, computation: Computation, x: Instruction) -> Counter:
+        kind = x.opcode.removesuffix("-start")
+        if kind in SENT or kind == "collective-permute":
+            return self.collective(computation, x, kind)
+        if x.opcode == "while":
+            trips = known_trips(self.program, computation, x)
+            if trips is None:
+                self.unknown.add(x.name)
+            body = self.computation(x.names("body")[0])
+            return Counter({key: (1 if trips is None else trips) * number for key, number in body.items()})
+        total = Counter()
+        for key in ("calls", "to_apply", "branch_computations", "true_computation", "false_computation"):
+            for name in x.names(key):
+                if name in self.program.computations:
+                    total.update(self.computation(name))
+        return total
+
+    def collective(self, computation: Computation, x: Instruction, kind: str) -> Counter:
+        given = sum(computation.instructions[name].size for name in x.operands if name in computation.instructions)
+        size = group_size(x.attributes, self.devices)
+        whole = given * size if kind == "all-gather" else given
+        share = 1 if kind == "collective-permute" else SENT[kind] * (size - 1) / size
+        return Counter({(kind, "calls"): 1, (kind, "array"): whole, (kind, "sent"): math.ceil(whole * share)})
 
 
 if __name__ == "__main__":

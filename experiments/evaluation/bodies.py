@@ -1,7 +1,7 @@
 """The same weights, people and photos on other bodies: another topology in SMPL-X's format, and fewer vertices.
 
     python experiments/evaluation/bodies.py --subjects 8 --views 4 --json bodies.json
-        [--docs docs/evaluation.md] [--pictures P.png]
+        [--page docs/evaluation.md] [--pictures P.png]
 
 Bodies: "default", the one that the weights were trained on; "SMPL-X format", a made-up body of another
 topology, written as an SMPL-X file and read by its loader, to whose joints the poses go by name; "1/4" and "1/16" of the default
@@ -25,7 +25,7 @@ from statistics import median
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import around_section, markdown_table, write_json, write_section
+from experiments.common.results import check_section, markdown_table, publish, write_json
 from experiments.evaluation.options import (
     COUNTS,
     add_people_options,
@@ -34,8 +34,18 @@ from experiments.evaluation.options import (
     load_network,
     settings_of,
 )
-from experiments.evaluation.results import TASKS, Row, cell, finished, kept_rows, mean_scores
-from experiments.evaluation.tables import SHOWN, TASK_NAMES, about, printed_table
+from experiments.evaluation.results import (
+    SHOWN,
+    TASK_NAMES,
+    TASKS,
+    Row,
+    about,
+    cell,
+    finished,
+    kept_rows,
+    mean_scores,
+    printed_table,
+)
 
 PAINTED = "painted default body"
 """Cell of a row that holds the scores of the baseline."""
@@ -53,13 +63,13 @@ def main() -> None:
     check_people_options(parser, arguments)
     lpips = load_lpips(parser, arguments)
     try:
-        if arguments.docs:
-            around_section(arguments.docs, "bodies")
+        if arguments.page:
+            check_section(arguments.page, "evaluation_bodies")
         report = evaluate(arguments, lpips)
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    if arguments.docs:
-        write_section(arguments.docs, "bodies", bodies_section(report))
+    if arguments.page:
+        publish(arguments.page, "evaluation_bodies", bodies_section(report), report)
 
 
 def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]:
@@ -67,9 +77,8 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     import jax
     from tqdm import tqdm
 
-    from experiments.evaluation.evaluation_bodies import as_it_is, body_cases
-    from experiments.evaluation.scores import draw_avatar, lpips_scorer, score_tasks
-    from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
+    from experiments.evaluation.body_cases import as_it_is, body_cases
+    from experiments.evaluation.subjects import HeldOut, draw_avatar, lpips_scorer, make_evaluation_subject, score_tasks
     from humangs_jax.avatar.evaluate import draw_painted_body, painted_body
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.body.library import load_body

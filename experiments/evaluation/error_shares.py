@@ -8,7 +8,6 @@ and 2 s a person on 2 CPU cores.
 """
 
 import argparse
-import dataclasses
 import sys
 from pathlib import Path
 
@@ -56,7 +55,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, float]:
 
     variables, model = load_weights(arguments.weights)
     views = ViewSampling(input_counts=(arguments.views,), target_count=arguments.targets)
-    config = TrainConfig(model=dataclasses.replace(model, token_capacity=0), views=views)
+    config = TrainConfig(model=model, views=views)
     body = load_body()
     cache = CaptureCache(find_captures(arguments.people), body)
     examples, body = validation_examples(cache, config, len(cache)), gaussian_body(body, model)

@@ -1,7 +1,6 @@
 """What evaluations share before they start: options, the network, and what their rows depend on."""
 
 import argparse
-import dataclasses
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -28,7 +27,7 @@ def add_people_options(parser: argparse.ArgumentParser, subjects: int) -> None:
         help="patches that the network looks at; as it was trained if not given",
     )
     parser.add_argument("--json", type=Path, help="write the numbers here, and go on from what is there")
-    parser.add_argument("--docs", type=Path, help="page whose section is filled")
+    parser.add_argument("--page", "--docs", type=Path, help="page whose table is written")
     parser.add_argument("--lpips-backbone", type=Path, help="weights of the network under LPIPS")
     parser.add_argument("--lpips-heads", type=Path, help="heads of LPIPS, where the backbone's file does not have them")
     parser.add_argument("--lpips-net", choices=("vgg", "alex", "squeeze"), default="vgg", help="which network that is")
@@ -62,7 +61,7 @@ def load_network(arguments: argparse.Namespace) -> tuple[Any, Any, str]:
         path = arguments.weights or shipped
         variables, config = load_weights(path)
         digest = file_digest(path)
-    return variables, dataclasses.replace(config, tokens=arguments.tokens or config.tokens), digest
+    return variables, config.with_execution(tokens=arguments.tokens), digest
 
 
 def settings_of(arguments: argparse.Namespace, digest: str, tokens: str, lpips: Any) -> dict[str, Any]:

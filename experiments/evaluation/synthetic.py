@@ -1,7 +1,7 @@
 """Reconstruct unseen synthetic people from a few photos and compare with held-out views, in the same pose and in others.
 
     python experiments/evaluation/synthetic.py --subjects 32 --views 1 2 4 6 --json evaluation.json
-        [--pictures sheet.png] [--plot views.png] [--docs docs/evaluation.md]
+        [--pictures sheet.png] [--plot views.png] [--page docs/evaluation.md]
 
 Subjects are drawn from the test seeds (`humangs_jax.people.seeds`), which training never sees; choices are made
 on `--split validation`. A person is made once, photographed from evenly spaced places (`evaluation/subjects.py`), reconstructed
@@ -16,9 +16,10 @@ input views that see it (grey where none does), posed likewise. `evaluation/resu
 after every person. Run again it goes on: what the file holds with the same settings (weights, split, sizes, ...) is not
 computed again; a file of other settings is replaced.
 
---pictures shows the best five people beside the worst five, by PSNR; --plot needs matplotlib (the `notebooks` extra); --docs
-fills the section `views` of a page. LPIPS needs weights (`--lpips-backbone`, docs/loss_networks.md); without them it is missing:
-null, and a dash in the table. About 10 s of CPU time a person with four numbers of views, and a minute or two of compiling.
+--pictures shows the best five people beside the worst five, by PSNR; --plot needs matplotlib (the `notebooks` extra);
+--page writes the table evaluation_views of a page. LPIPS needs weights (`--lpips-backbone`, docs/loss_networks.md); without them
+it is missing: null, and a dash in the table. About 10 s of CPU time a person with four numbers of views, and a minute or two of
+compiling.
 """
 
 import argparse
@@ -29,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import around_section, write_json, write_section
+from experiments.common.results import check_section, publish, write_json
 from experiments.evaluation.options import (
     COUNTS,
     add_people_options,
@@ -38,8 +39,16 @@ from experiments.evaluation.options import (
     load_network,
     settings_of,
 )
-from experiments.evaluation.results import COLUMNS, extremes, headline, kept_rows, table_row, views_report
-from experiments.evaluation.tables import printed_table, views_section
+from experiments.evaluation.results import (
+    COLUMNS,
+    extremes,
+    headline,
+    kept_rows,
+    printed_table,
+    table_row,
+    views_report,
+    views_section,
+)
 
 
 def main() -> None:
@@ -56,14 +65,14 @@ def main() -> None:
     arguments.views = sorted(set(arguments.views))
     lpips = load_lpips(parser, arguments)
     try:
-        if arguments.docs:
-            around_section(arguments.docs, "views")
+        if arguments.page:
+            check_section(arguments.page, "evaluation_views")
         report = evaluate(arguments, lpips)
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    if arguments.docs:
-        section = views_section(report, arguments.docs, arguments.pictures, arguments.plot)
-        write_section(arguments.docs, "views", section)
+    if arguments.page:
+        section = views_section(report, arguments.page, arguments.pictures, arguments.plot)
+        publish(arguments.page, "evaluation_views", section, report)
 
 
 def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]:
@@ -71,8 +80,13 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     from tqdm import tqdm
 
     from experiments.evaluation.pictures import plot_views, strip_of, write_sheet
-    from experiments.evaluation.scores import draw_person, lpips_scorer, score_person
-    from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
+    from experiments.evaluation.subjects import (
+        HeldOut,
+        draw_person,
+        lpips_scorer,
+        make_evaluation_subject,
+        score_person,
+    )
     from humangs_jax.body.library import load_body
     from humangs_jax.people.seeds import seeds_of
 

@@ -44,7 +44,7 @@ def run(arguments) -> None:
     """Every person; numbers are written at the end."""
     from tqdm import tqdm
 
-    from experiments.common.results import markdown_table, write_json, write_section
+    from experiments.common.results import markdown_table, publish, write_json
     from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
     from humangs_jax.body.library import load_body
     from humangs_jax.network.weights import load_weights
@@ -54,13 +54,15 @@ def run(arguments) -> None:
     for seed in tqdm(range(FIRST, FIRST + arguments.people), desc="people"):
         subject = make_evaluation_subject(seed, body, [VIEWS], SIZE, HeldOut(views=6, poses=0))
         rows.append({"seed": seed} | compare(variables, config, body, subject, arguments))
-    write_json(arguments.json, {"people": rows, **vars(arguments) | {"json": None, "pictures": None}})
+    options = {name: getattr(arguments, name) for name in ("noise_px", "outliers", "set")}
+    result = {"people": rows, "settings": options}
+    write_json(arguments.json, result)
     cells = [[row["seed"], *(f"{row[key]:.2f}" for key in COLUMNS)] for row in rows]
     cells.append(["mean", *(f"{sum(row[key] for row in rows) / len(rows):.2f}" for key in COLUMNS)])
     text = markdown_table(["person", *COLUMNS.values()], cells)
     print(text)
     if arguments.docs:
-        write_section(PAGE, "end to end", text)
+        publish(PAGE, "fit_end_to_end", text, result)
 
 
 COLUMNS = {
@@ -78,7 +80,7 @@ def compare(variables, config, body, subject, arguments) -> dict:
 
     import numpy as np
 
-    from experiments.evaluation.scores import draw_avatar
+    from experiments.evaluation.subjects import draw_avatar
     from humangs_jax.avatar.evaluate import score
     from humangs_jax.avatar.reconstruct import reconstruct
 

@@ -71,9 +71,9 @@ def run(arguments) -> None:
     if arguments.plot:
         plot(results, arguments.plot)
     if arguments.docs:
-        from experiments.common.results import write_section
+        from experiments.common.results import publish
 
-        write_section(PAGE, "fit", table(results))
+        publish(PAGE, "fit_keypoints", table(results), results)
 
 
 def write(path: Path, results: dict) -> None:

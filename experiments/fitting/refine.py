@@ -1,6 +1,6 @@
 """How much refinement mends cameras and poses that are a little off, on synthetic people of unseen seeds.
 
-    python experiments/fitting/refine.py --subjects 4 --views 6 --json refine.json [--docs docs/fitting_refinement.md]
+    python experiments/fitting/refine.py --subjects 4 --views 6 --json refine.json [--page docs/fitting_refinement.md]
 
 The start: all focal lengths off by 5 %, every camera turned by 2 degrees about a random axis through its centre, every joint
 (the root and the fingers, too) by 3 degrees about a random axis; true shape. --exact starts at the truth instead, which should
@@ -30,8 +30,9 @@ from statistics import mean
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import around_section, markdown_table, write_json, write_section
+from experiments.common.results import check_section, markdown_table, publish, write_json
 
+TABLE = "fit_refinement"
 CASES = ("bare", "clothed", "keypoints", "clothed+keypoints", "clothed+photos")
 
 
@@ -47,19 +48,19 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES), help="what to refine by")
     parser.add_argument("--exact", action="store_true", help="start at the truth: nothing should be kept")
     parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--docs", type=Path, help="page whose section `refine` is filled")
+    parser.add_argument("--page", type=Path, help=f"page whose table {TABLE} is written")
     parser.add_argument("--pictures", type=Path, help="folder for pictures of every person before and after")
     arguments = parser.parse_args()
     if min(arguments.subjects, arguments.views) < 1 or arguments.first < 0:
         parser.error("--subjects and --views must be at least 1, --first at least 0")
     try:
-        if arguments.docs:
-            around_section(arguments.docs, "refine")
+        if arguments.page:
+            check_section(arguments.page, TABLE)
         report = evaluate(arguments)
     except (ValueError, OSError) as error:
         parser.error(str(error))
-    if arguments.docs:
-        write_section(arguments.docs, "refine", section(report))
+    if arguments.page:
+        publish(arguments.page, TABLE, section(report), report)
 
 
 def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -16,19 +16,20 @@ cores about 3 s a scan and 20 s to compile, without joints four times as long.
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import write_json
+from experiments.common.results import markdown_table, publish, significant, write_json
 
 POSE_STREAM, JOINT_STREAM, PLACE_STREAM = 31, 33, 34
 PAIRS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 JOINTS = ("nose", *(f"{side}_{part}" for part in PAIRS for side in ("left", "right")))
 KINDS = ("bare", "clothed")
-SUCCESS = 50.0
+TABLE, SUCCESS = "fit_scans", 50.0
 """Millimetres of vertices on average: people turned round are above 100."""
 
 
@@ -44,6 +45,7 @@ def main() -> None:
     )
     parser.add_argument("--without-joints", action="store_true", help="search for the pose")
     parser.add_argument("--json", type=Path, help="write the numbers here")
+    parser.add_argument("--page", type=Path, help=f"page whose table {TABLE} or {TABLE}_without_joints is written")
     parser.add_argument("--pictures", type=Path, help="write scans with the fitted body, worst and best people, here")
     arguments = parser.parse_args()
     if arguments.subjects < 1:
@@ -52,8 +54,10 @@ def main() -> None:
         report = evaluate(arguments)
     except ValueError as error:
         parser.error(str(error))
-    for kind in arguments.kinds:
-        print(kind, report[kind])
+    text = table(report, arguments.kinds)
+    print(text)
+    if arguments.page:
+        publish(arguments.page, TABLE + "_without_joints" * arguments.without_joints, text, report)
 
 
 def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -175,6 +179,35 @@ def summary(rows):
         "mean_surface_mm_of_successes": float(np.mean([row["surface_mm"] for row in good])) if good else None,
         "seconds_per_scan": float(np.median([row["seconds"] for row in rows])),
     }
+
+
+def table(report: dict[str, Any], kinds: Sequence[str]) -> str:
+    """One row for each kind: of all scans if joints were given, else of those whose pose was found."""
+    if report["settings"]["joints"]:
+        header = [
+            f"scans, {len(JOINTS)} joints given with {report['settings']['noise_mm']:g} mm of noise",
+            "vertices, mean",
+        ]
+        header += ["surface, mean", "surface, worst person", "seconds a scan"]
+        names = ("mean_vertex_mm", "mean_surface_mm", "worst_surface_mm")
+        row = lambda kind: [
+            *(f"{significant(report[kind][name])} mm" for name in names),
+            f"{report[kind]['seconds_per_scan']:.1f}",
+        ]
+        return markdown_table(header, [[kind, *row(kind)] for kind in kinds])
+    header = [
+        "scans, no joints",
+        f"found (vertices within {SUCCESS:g} mm)",
+        "of these: vertices, mean",
+        "surface, mean",
+    ]
+    rows = []
+    for kind in kinds:
+        all_rows = [r for r in report["subjects"] if r["kind"] == kind]
+        found = [r for r in all_rows if r["vertex_mm"] < SUCCESS]
+        means = [f"{np.mean([r[x] for r in found]):.1f} mm" if found else "-" for x in ("vertex_mm", "surface_mm")]
+        rows.append([kind, f"{len(found)} of {len(all_rows)}", *means])
+    return markdown_table(header, rows)
 
 
 def draw_extremes(path, drawn, kinds):

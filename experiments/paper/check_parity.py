@@ -139,17 +139,20 @@ def complete_config(config: Any, release: dict[str, Any], dtype: str, image_size
 
     Raises: ValueError naming a setting that does not agree with the checkpoint's shapes.
     """
-    transformer, decoder = config.transformer, config.decoder
+    from humangs_jax.network.config import paper_parts
+
+    encoder, _, decoder = paper_parts(config.architecture)
+    transformer = encoder.transformer
     found = {
-        "neural_texture.resolution": config.texture.resolution,
-        "neural_texture.dim": config.texture.channels,
-        "image_tokenizer.patch_size": config.patch_size,
+        "neural_texture.resolution": encoder.texture.resolution,
+        "neural_texture.dim": encoder.texture.channels,
+        "image_tokenizer.patch_size": encoder.patch_size,
         "transformer.d": transformer.width,
-        "transformer.d_head": transformer.attention.head_width,
+        "transformer.d_head": transformer.head_width,
         "transformer.n_layer": transformer.layers,
-        "transformer.use_qk_norm": transformer.attention.qk_norm,
+        "transformer.use_qk_norm": transformer.qk_norm,
         "transformer.use_cls_token": transformer.class_token,
-        "transformer.use_upsampler": config.upsampler.enabled,
+        "transformer.use_upsampler": encoder.upsampler is not None,
         "vertex_decoder.hidden_dim": decoder.hidden,
         "vertex_decoder.learnable_lbs_weights": decoder.skinning_joints is not None,
     }
@@ -165,13 +168,8 @@ def complete_config(config: Any, release: dict[str, Any], dtype: str, image_size
             )
         decoder = dataclasses.replace(decoder, tight=tight, free=free)
     pool = "visible" if release["transformer.project_all_vertices"] is False else "all"
-    return dataclasses.replace(
-        config,
-        image_size=image_size,
-        dtype="bfloat16" if dtype == "bfloat16" else "float32",
-        decoder=decoder,
-        sampling=dataclasses.replace(config.sampling, pool=pool),
-    )
+    config = config.with_parts(decoder=decoder).with_conventions(image_size=image_size, pool=pool)
+    return config.with_execution(dtype="bfloat16" if dtype == "bfloat16" else "float32")
 
 
 def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
@@ -181,7 +179,7 @@ def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
 
     from humangs_jax.core.pytree import replace
     from humangs_jax.geometry.camera import Camera
-    from humangs_jax.network.humangs import HumanGSInputs
+    from humangs_jax.network.inputs import HumanGSInputs
 
     own = lambda name: jnp.asarray(arrays[name][index], dtype)
     images = jnp.moveaxis(own("in_image"), 1, -1)
@@ -209,36 +207,53 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
 
     And TIES (g, 4, 4), TIE_LEVELS (g, 4): all readings of the posed rotations, see `nearest_candidates`.
     """
+    import flax.linen as nn
     import jax.numpy as jnp
 
     from humangs_jax.geometry import quaternion
-    from humangs_jax.network.stages import network_stages
+    from humangs_jax.network.config import paper_parts
+    from humangs_jax.network.humangs import apply_humangs, part_variables
+    from humangs_jax.network.parts import Pass
+    from humangs_jax.network.stages import Recorder
+    from humangs_jax.network.triplane import sample_triplane
     from humangs_jax.network.vertex_decoder import corrected_skinning_weights
     from humangs_jax.rendering.gaussians import skin_gaussians
 
     channels_first = lambda x: jnp.moveaxis(x, -1, 1)
-    stages = network_stages(variables, inputs, config)
-    features, gaussians = stages.features, stages.outputs.gaussians
+    config = config.with_execution(scan=False, remat="none")
+    encoder, reader, _ = paper_parts(config.architecture)
+    recorder = Recorder()
+    with nn.intercept_methods(recorder.watch):
+        outputs, _ = apply_humangs(variables, inputs, config, stage=recorder)
+    stages = recorder.outputs
+    (encoding, _), features, gaussians = stages["encoding"], stages["vertex features"], outputs.gaussians
+    maps = encoding.maps
+    if (
+        encoder.upsampler is not None
+    ):  # vertices read the last convolution only where they need it; here it is everywhere
+        convolution = reader.output(maps.shape[-1], Pass(config))
+        maps = convolution.apply(part_variables(variables, "reader"), maps, method="everywhere")
+    pixels, texture = stages["pixels"], variables["params"]["encoder"]["tokenizer"]["texture"]
     entering = [features.local]
     if features.global_token is not None:
         entering.append(jnp.broadcast_to(features.global_token, (len(features.local), *features.global_token.shape)))
     weights = corrected_skinning_weights(
-        skinning_weights, stages.outputs.skinning_offsets, config.decoder.gaussians_per_vertex
+        skinning_weights, outputs.skinning_offsets, config.architecture.decoder.gaussians_per_vertex
     )
     transforms = jnp.einsum("gj,jab->gab", weights, joint_transforms)
-    posed = skin_gaussians(gaussians, transforms, config.skinning)
+    posed = skin_gaussians(gaussians, transforms, config.conventions.skinning)
     rotations = quaternion.to_matrix(quaternion.normalize(gaussians.quats))
     candidates, q_abs = quaternion.candidates_from_matrix(transforms[:, :3, :3] @ rotations)
     return {
-        "out_ray_d": channels_first(stages.rays[..., 3:]),
-        "out_pose_feature": channels_first(stages.pose_features),
-        "mid_tokens": stages.tokens.reshape(len(inputs.images), -1, stages.tokens.shape[-1]),
-        "mid_block_0": stages.first_block,
-        "mid_encoder_out": stages.encoded,
-        "mid_feature_map_stride4": channels_first(stages.maps)[:, :, ::MAP_STRIDE, ::MAP_STRIDE],
+        "out_ray_d": channels_first(pixels[..., 6:9]),
+        "out_pose_feature": channels_first(sample_triplane(texture, pixels[..., 9:])),
+        "mid_tokens": stages["tokens"].reshape(len(inputs.images), -1, stages["tokens"].shape[-1]),
+        "mid_block_0": stages["block 0"],
+        "mid_encoder_out": stages["final norm"],
+        "mid_feature_map_stride4": channels_first(maps)[:, :, ::MAP_STRIDE, ::MAP_STRIDE],
         "mid_decoder_input": jnp.concatenate(entering, axis=-1),
-        "mid_raw_geometry": stages.raw.geometry,
-        "mid_raw_appearance": stages.raw.appearance,
+        "mid_raw_geometry": stages["raw heads"].geometry,
+        "mid_raw_appearance": stages["raw heads"].appearance,
         "asset_means3D": gaussians.means,
         "asset_rotations": gaussians.quats,
         "asset_scales": gaussians.scales,
@@ -317,7 +332,7 @@ def run_checkpoint(checkpoint: Path, arrays: Path, config: Path, dtype: str) -> 
             f"{arrays}: in_lbs_weights has shape {expected['in_lbs_weights'].shape}, the checkpoint's "
             f"{converted.skinning_weights.shape}"
         )
-    working = jnp.float64 if dtype == "float64" else jnp.float32  # bfloat16: products only, see models.humangs
+    working = jnp.float64 if dtype == "float64" else jnp.float32  # bfloat16: products only, see `network.execution`
     variables = jax.tree.map(lambda x: jnp.asarray(x, working), converted.variables)
     compute = jax.jit(compute_stages, static_argnames="config")
     with jax.default_matmul_precision("highest"):  # GPUs and TPUs multiply float32 in fewer bits otherwise

@@ -19,12 +19,33 @@ on 2 CPU cores. Expected: poking below 0.1 %.
 import argparse
 import collections
 import json
-import os
+import sys
 from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import markdown_table, publish, write_json
 
 DEPTH, HOLLOW_DEPTH = 0.06, 0.01
 """Metres: how far behind poking skin its cloth may lie; how much nearer the missing body must be."""
-FAULTS = ("poking", "poking_deep", "inside", "hollow", "gaps")
+FAULTS = {
+    "poking": "skin inside of a hem (deeper than 0) is seen although the outer side of cloth is at most 6 cm behind it on the "
+    "ray",
+    "poking_deep": "of it, skin more than 1 cm inside of the hem",
+    "inside": "all skin more than 1 cm inside of a hem that is seen at all, rightly (up a sleeve, under a skirt) or not: an "
+    "upper bound of what pokes",
+    "hollow": "the inner side of cloth is seen where the naked body would be at least 1 cm nearer: one looks into empty clothes",
+    "gaps": "the background is seen where the naked body would be",
+}
+SPREADS = {
+    "stature": ("stature, m", 2),
+    "years": ("years", 0),
+    "weight": ("weight coefficient", 2),
+    "muscle": ("muscle coefficient", 2),
+    "skin_brightness": ("brightness of the skin", 2),
+    "foreground_share": ("share of the picture that is person", 3),
+}
+"""Rows of the table of diversity, and their digits."""
 DEEP = 0.01
 """Metres inside of a hem: deep."""
 SHARE_BINS = 40
@@ -40,6 +61,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256, help="side of the pictures")
     parser.add_argument("--first", type=int, default=0, help="first seed (training people by default)")
     parser.add_argument("--json", type=Path, help="write the numbers here")
+    parser.add_argument("--page", type=Path, help="page whose tables people_faults and people_diversity are written")
     parser.add_argument("--plots", type=Path, help="write the diversity plots here")
     parser.add_argument("--worst", type=int, default=0, help="print the seeds with most faults")
     arguments = parser.parse_args()
@@ -56,18 +78,44 @@ def main() -> None:
             ranked = sorted(faults, key=lambda row: -row[name])[: arguments.worst]
             print(name, [(row["seed"], row["pose"], f"{row[name]:.2%}") for row in ranked])
     if arguments.json:
-        temporary = arguments.json.with_name(f".{arguments.json.name}.part")
-        temporary.write_text(json.dumps(result, indent=1) + "\n")
-        os.replace(temporary, arguments.json)
+        write_json(arguments.json, result)
+    if arguments.page:
+        publish(arguments.page, "people_faults", faults_table(result), {name: result[name] for name in FAULTS})
+        publish(arguments.page, "people_diversity", diversity_table(result), result)
     if arguments.plots:
         draw(arguments.plots, people, seen)
+
+
+def faults_table(result: dict[str, Any]) -> str:
+    """One row for each fault."""
+    rows = []
+    for name, definition in FAULTS.items():
+        mean, worst, poses = (result[name][key] for key in ("mean", "worst", "poses_above_0.1_percent"))
+        rows.append([name.replace("_", ", "), definition, f"{mean:.4%}", f"{worst:.2%}", f"{poses:.1%}"])
+    return markdown_table(["fault", "definition", "mean", "worst pose", "poses above 0.1 %"], rows, "lllll")
+
+
+def diversity_table(result: dict[str, Any]) -> str:
+    """One row for each measure."""
+    rows = [[label, *(f"{x:.{digits}f}" for x in result[name].values())] for name, (label, digits) in SPREADS.items()]
+    header = [
+        f"of {result['described']:,} people",
+        "mean",
+        "standard deviation",
+        "least",
+        "5 %",
+        "median",
+        "95 %",
+        "most",
+    ]
+    return markdown_table(header, rows, "l" * len(header))
 
 
 def describe_all(body, arguments):
     """Counts and spreads over descriptions."""
     import numpy as np
 
-    from humangs_jax.people.person import describe
+    from humangs_jax.people.subject import describe
 
     people = [describe(arguments.first + i, body) for i in range(arguments.described)]
     kinds = collections.Counter(g.kind for p in people for g in p.garments)
@@ -158,19 +206,19 @@ def count_faults(body, posed, camera):
     import numpy as np
 
     from humangs_jax.body.model import BodyPose, pose_body, shape_body
-    from humangs_jax.people.rendering import _padded
+    from humangs_jax.people.rendering import padded
     from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
     subject = posed.subject
     faces, materials = subject.surface.faces, subject.face_materials
-    everything = rasterize_mesh(*_padded(posed.vertices, faces), camera)
+    everything = rasterize_mesh(*padded(posed.vertices, faces), camera)
     ids = np.asarray(everything.face_ids)
     seen, depth = ids >= 0, np.asarray(everything.depth)
     weights = np.asarray(everything.barycentrics)
     cover = (subject.cover[faces[ids]] * weights).sum(-1)
     inside = seen & (materials[ids] == 0) & (cover > 0)
     cloth = np.where((materials >= 2)[:, None], faces, 0)
-    behind = rasterize_mesh(*_padded(posed.vertices, cloth), camera)
+    behind = rasterize_mesh(*padded(posed.vertices, cloth), camera)
     cloth_ids, cloth_depth = np.asarray(behind.face_ids), np.asarray(behind.depth)
     eye = np.asarray(camera.center)
     outer = (cloth_ids >= 0) & _faces_the_eye(posed.vertices, faces, eye)[cloth_ids]
@@ -250,7 +298,7 @@ def draw(file, people, seen):
     import matplotlib.pyplot as plt
     import numpy as np
 
-    from humangs_jax.people import poses
+    from humangs_jax.people import kinematics as poses
 
     figure = plt.figure(figsize=(17, 9.5))
     grid = figure.add_gridspec(2, 5)

@@ -77,7 +77,7 @@ def all_around(body, arguments):
 
 def close_ups(body, arguments):
     """A row of heads, a row of the same heads from the side, a row of hands."""
-    from humangs_jax.people import poses
+    from humangs_jax.people import kinematics as poses
 
     rows = [[], [], []]
     for seed in _seeds(arguments, arguments.close_ups, offset=200):
@@ -119,7 +119,7 @@ def sequences(body, arguments):
 
 def poses_world(subject, rotations):
     """(3, 3) rotation of the pelvis."""
-    from humangs_jax.people import poses
+    from humangs_jax.people import kinematics as poses
 
     return poses.joint_positions(subject.build, rotations.astype(float))[0][poses.PELVIS]
 

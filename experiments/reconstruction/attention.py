@@ -15,7 +15,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import medians, prepare_process
-from experiments.common.results import markdown_table, write_json
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.reconstruction.cases import compiled, matmul_program
 
 FORMS = ("chunked", "xla")
@@ -30,13 +30,11 @@ def main() -> None:
     parser.add_argument("--heads", type=int, default=12)
     parser.add_argument("--width", type=int, default=64, help="of a head")
     parser.add_argument("--repeats", type=int, default=3, help="timed rounds")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, "attention")
     arguments = parser.parse_args()
     prepare_process()
     result = measure(arguments)
-    print(table(result))
-    if arguments.json:
-        write_json(arguments.json, result)
+    write_outputs(arguments, "attention", table(result), result)
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:

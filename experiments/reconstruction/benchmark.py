@@ -26,7 +26,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.compiled_costs import compiled_costs
 from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
-from experiments.common.results import markdown_table, write_json
+from experiments.common.results import add_outputs, markdown_table, publish, write_outputs
 from experiments.reconstruction.cases import (
     benchmark_inputs,
     compiled,
@@ -51,15 +51,15 @@ def main() -> None:
     parser.add_argument("--stages", action="store_true", help="also time the stages")
     parser.add_argument("--memory", type=int, nargs="*", default=[], help="numbers of views to analyse the memory for")
     parser.add_argument("--memory-size", type=int, default=512)
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, "reconstruction_benchmark")
     arguments = parser.parse_args()
     prepare_process()
     result = benchmark(arguments)
-    print(table(result))
+    write_outputs(arguments, "reconstruction_benchmark", table(result), result)
     if arguments.memory:
         print(memory_table(result))
-    if arguments.json:
-        write_json(arguments.json, result)
+        if arguments.page:
+            publish(arguments.page, "reconstruction_memory", memory_table(result), result["memory"])
 
 
 def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -71,14 +71,14 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
     inputs = benchmark_inputs(config, arguments.views, arguments.size)
     variables = random_variables(config)
     packed, touched, share = foreground(inputs, config)
-    cases = {"all": dataclasses.replace(config, tokens="all"), "foreground": packed}
+    cases = {"all": config.with_execution(tokens="all"), "foreground": packed}
     patches = round(touched / share)
 
-    product, product_flops = matmul_program(config.dtype)
+    product, product_flops = matmul_program(config.execution.dtype)
     runs, facts = {"matmul": product}, {}
     for name, case in cases.items():
         program, facts[name] = reconstruction(variables, inputs, case)
-        facts[name]["tokens"] = patches if name == "all" else case.token_capacity
+        facts[name]["tokens"] = patches if name == "all" else case.execution.token_capacity
         runs[name] = lambda program=program: jax.block_until_ready(program(variables, inputs))
         if arguments.stages:
             runs |= {f"{name} {stage}": run for stage, run in stages(variables, inputs, case).items()}
@@ -153,29 +153,31 @@ def stages(variables: Any, inputs: Any, config: Any) -> dict[str, Any]:
     """The three public stages, each compiled by itself."""
     import jax
 
-    from humangs_jax.network.humangs import decode, encode, sample_vertices
+    from humangs_jax.network.humangs import decode, encode, read
 
     encoding = encode(variables, inputs, config)
-    features = sample_vertices(variables, encoding, inputs, config)
+    features = read(variables, encoding, inputs, config)
     wait = jax.block_until_ready
     return {
         "encode": lambda: wait(encode(variables, inputs, config)),
-        "sample_vertices": lambda: wait(sample_vertices(variables, encoding, inputs, config)),
-        "decode": lambda: wait(decode(variables, features, inputs.canonical_vertices, config)),
+        "read": lambda: wait(read(variables, encoding, inputs, config)),
+        "decode": lambda: wait(decode(variables, features, inputs, config)),
     }
 
 
 def whole_network_flops(variables: Any, inputs: Any, config: Any) -> int:
     """Operations of the network whose last convolution is evaluated at every pixel and not where vertices read it."""
+    from humangs_jax.network.config import paper_parts
     from humangs_jax.network.humangs import apply_humangs
 
     program, _ = compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)
     here = compiled_costs(program).matrix_flops
-    if not config.upsampler.enabled:
+    encoder, reader, _ = paper_parts(config.architecture)
+    if encoder.upsampler is None or reader.output_width is None:
         return here
     views, height, width = inputs.images.shape[:3]
-    pixels = views * (4 * height // config.patch_size) * (4 * width // config.patch_size)
-    per_position = 2 * 9 * config.readout.channels * config.readout.features
+    pixels = views * (4 * height // encoder.patch_size) * (4 * width // encoder.patch_size)
+    per_position = 2 * 9 * (encoder.upsampler.hidden // 2) * reader.output_width
     return here + per_position * (pixels - inputs.canonical_vertices.shape[0])
 
 
@@ -186,7 +188,7 @@ def memory(config: Any, views: int, size: int) -> dict[str, float]:
     from humangs_jax.network.humangs import apply_humangs
     from humangs_jax.network.weights import expected_variables
 
-    subject = benchmark_inputs(dataclasses.replace(config, tokens="all"), views, size)
+    subject = benchmark_inputs(config.with_execution(tokens="all"), views, size)
     if config.tokens == "foreground":
         config = foreground(subject, config)[0]
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), subject)

@@ -5,7 +5,6 @@ photos, drawn from cameras of the published protocol (1.8 bounding radii away, v
 the photos show changes no cost but one: how many patches the person touches.
 """
 
-import dataclasses
 import functools
 import time
 from collections.abc import Callable
@@ -82,12 +81,12 @@ def foreground(inputs: Any, config: Any) -> tuple[Any, int, float]:
     """(configuration for foreground tokens with room for these photos, tokens that the person touches, their share)."""
     import jax
 
-    from humangs_jax.core.buffers import round_up
-    from humangs_jax.network.humangs import touched_patches
+    from humangs_jax.network.humangs import needed_tokens
+    from humangs_jax.rendering.buffers import round_up
 
-    touched = int(jax.jit(touched_patches, static_argnames="config")(inputs, config))
-    patches = int(np.prod(inputs.images.shape[:3])) // config.patch_size**2
-    config = dataclasses.replace(config, tokens="foreground", token_capacity=round_up(touched))
+    touched = int(jax.jit(needed_tokens, static_argnames="config")(inputs, config))
+    patches = int(np.prod(inputs.images.shape[:3])) // config.architecture.encoder.patch_size**2
+    config = config.with_execution(tokens="foreground", token_capacity=round_up(touched))
     return config, touched, touched / patches
 
 

@@ -8,7 +8,6 @@ Half a minute on 2 cores. Numbers: docs/performance_reconstruction.md.
 """
 
 import argparse
-import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -16,13 +15,13 @@ from typing import Any, cast
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.compiled_costs import compiled_costs
-from experiments.common.results import markdown_table, write_json
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.reconstruction.benchmark import configured
 
 RECOMPUTED = {
-    "nothing": {},
-    "all but products with weights": {"remat": True, "remat_policy": "dots"},
-    "blocks": {"remat": True},
+    "nothing": "none",
+    "all but products with weights": "dots",
+    "blocks": "full",
 }
 
 
@@ -34,12 +33,10 @@ def main() -> None:
     parser.add_argument(
         "--dtype", choices=("auto", "float32", "bfloat16"), default="auto", help="auto: float32 on a CPU"
     )
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, "transformer_compilation")
     arguments = parser.parse_args()
     result = measure(arguments)
-    print(table(result))
-    if arguments.json:
-        write_json(arguments.json, result)
+    write_outputs(arguments, "transformer_compilation", table(result), result)
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -51,26 +48,27 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     rows = []
     for scan in (False, True):
         for recomputed, how in RECOMPUTED.items():
-            transformer = dataclasses.replace(config.transformer, scan=scan, **how)
-            rows.append({"scan": scan, "recomputed": recomputed, **compilation(transformer, config, arguments.tokens)})
+            case = config.with_execution(scan=scan, remat=how)
+            rows.append({"scan": scan, "recomputed": recomputed, **compilation(case, arguments.tokens)})
     return {
         "rows": rows,
         "preset": arguments.preset,
         "tokens": arguments.tokens,
-        "dtype": config.dtype,
+        "dtype": config.execution.dtype,
         "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
     }
 
 
-def compilation(transformer: Any, config: Any, tokens: int) -> dict[str, float]:
+def compilation(config: Any, tokens: int) -> dict[str, float]:
     """Seconds to trace and compile, MiB of temporaries and matrix operations, forward and with gradients."""
     import jax
     import jax.numpy as jnp
 
     from humangs_jax.network.transformer import Transformer
 
-    module = Transformer(transformer, config.compute_dtype)
+    transformer = config.architecture.encoder.transformer
+    module = Transformer(transformer, config.execution)
     variables = jax.eval_shape(module.init, jax.random.key(0), jnp.zeros((2, transformer.width)))
     x = jax.ShapeDtypeStruct((tokens, transformer.width), jnp.float32)
     forward = lambda variables, x: cast(list[Any], module.apply(variables, x))

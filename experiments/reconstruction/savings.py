@@ -12,7 +12,6 @@ Published sizes at 256 take 2 minutes on 2 cores. Numbers: docs/performance_reco
 """
 
 import argparse
-import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -23,7 +22,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.compiled_costs import compiled_costs
 from experiments.common.interleaved import medians, prepare_process
-from experiments.common.results import markdown_table, write_json
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.reconstruction.benchmark import configured
 from experiments.reconstruction.cases import benchmark_inputs, compiled, foreground, random_variables
 
@@ -39,37 +38,36 @@ def main() -> None:
         "--dtype", choices=("auto", "float32", "bfloat16"), default="auto", help="auto: float32 on a CPU"
     )
     parser.add_argument("--repeats", type=int, default=3, help="timed rounds; 0: errors only")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, "reconstruction_savings")
     arguments = parser.parse_args()
     prepare_process()
     result = measure(arguments)
-    print(table(result))
-    if arguments.json:
-        write_json(arguments.json, result)
+    write_outputs(arguments, "reconstruction_savings", table(result), result)
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     """Everything that the JSON holds."""
     import jax
 
-    from humangs_jax.network.humangs import read_vertices
+    from humangs_jax.network.config import paper_parts
+    from humangs_jax.network.humangs import needed_reads
     from humangs_jax.network.weights import load_weights
 
     config = configured(arguments.preset, arguments.dtype, arguments.size)
     variables = None
     if arguments.weights:
         variables, config = load_weights(arguments.weights)
-    config = dataclasses.replace(config, tokens="all")
+    config = config.with_execution(tokens="all")
     variables = variables or random_variables(config)
     inputs = benchmark_inputs(config, arguments.views, arguments.size)
-    capacity = int(jax.jit(read_vertices, static_argnames="config")(inputs, config))
-    seeing = lambda c: dataclasses.replace(c, sampling=dataclasses.replace(c.sampling, vertex_capacity=capacity))
+    capacity = int(jax.jit(needed_reads, static_argnames="config")(inputs, config))
+    seeing = lambda c: c.with_execution(vertex_capacity=capacity)
     packed, touched, share = foreground(inputs, config)
 
     networks: dict[str, Callable[[Any, Any], Any]] = {"as published": lambda v, x: everywhere(v, x, config)}
-    if config.upsampler.enabled:
+    if paper_parts(config.architecture)[1].output_width is not None:
         networks["last convolution where read"] = lambda v, x: network(v, x, config)
-    if config.sampling.pool == "visible":
+    if config.conventions.pool == "visible":
         networks["only views that see the vertex"] = lambda v, x: network(v, x, seeing(config))
         networks["foreground tokens"] = lambda v, x: network(v, x, seeing(packed))
     else:
@@ -100,10 +98,10 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         "vertices": int(inputs.canonical_vertices.shape[0]),
         "weights": arguments.weights.name if arguments.weights else "random",
         "preset": arguments.preset,
-        "pool": config.sampling.pool,
+        "pool": config.conventions.pool,
         "views": arguments.views,
         "size": arguments.size,
-        "dtype": config.dtype,
+        "dtype": config.execution.dtype,
         "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
     }
@@ -122,21 +120,25 @@ def everywhere(variables: Any, inputs: Any, config: Any) -> Any:
 
     from humangs_jax.core.pytree import replace
     from humangs_jax.network.bilinear import sample_bilinear, texel_indices
-    from humangs_jax.network.humangs import assemble, decode_heads, encode, project_and_test, sample_vertices
+    from humangs_jax.network.config import paper_parts
+    from humangs_jax.network.humangs import decode, encode, part_variables, read
+    from humangs_jax.network.parts import Pass
     from humangs_jax.network.pixel_aligned import COUNT_EPSILON, sum_over_views
+    from humangs_jax.network.reader import project_and_test, view_weights
 
+    run, reader = Pass(config), paper_parts(config.architecture)[1]
     encoding = encode(variables, inputs, config)
-    features = sample_vertices(variables, encoding, inputs, config)
-    if config.upsampler.enabled:
-        maps = config.readout.apply({"params": variables["params"]["readout"]}, encoding.maps, method="everywhere")
-        pixels, visible = project_and_test(inputs, config)
-        weights = (visible if config.sampling.pool == "visible" else jnp.ones_like(visible)).astype(pixels.dtype)
+    features = read(variables, encoding, inputs, config)
+    if reader.output_width is not None:
+        convolution = reader.output(encoding.maps.shape[-1], run)
+        maps: Any = convolution.apply(part_variables(variables, "reader"), encoding.maps, method="everywhere")
+        pixels, visible = project_and_test(inputs, run)
+        weights = view_weights(visible, inputs, run).astype(pixels.dtype)
         size = (inputs.cameras.width, inputs.cameras.height)
-        indices = texel_indices(pixels, size, (maps.shape[2], maps.shape[1]), config.sampling.convention)
+        indices = texel_indices(pixels, size, (maps.shape[2], maps.shape[1]), config.conventions.pixel_grid)
         sums = sum_over_views(sample_bilinear, maps, indices, weights)
         features = replace(features, local=sums / (jnp.sum(weights, axis=0) + COUNT_EPSILON)[:, None])
-    raw = decode_heads(variables, features, inputs.canonical_vertices, config)
-    return assemble(raw, features, inputs.canonical_vertices, config).gaussians
+    return decode(variables, features, inputs, config).gaussians
 
 
 def errors(gaussians: Any, reference: Any, inputs: Any) -> dict[str, float]:

@@ -22,7 +22,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.compiled_costs import compiled_costs
 from experiments.common.interleaved import medians, prepare_process
-from experiments.common.results import markdown_table, write_json
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.reconstruction.benchmark import configured
 from experiments.reconstruction.cases import benchmark_inputs, compiled, foreground, random_variables
 
@@ -36,14 +36,12 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4, 8, 16])
     parser.add_argument("--size", type=int, default=256, help="side of the photos, pixels")
     parser.add_argument("--repeats", type=int, default=1, help="timed rounds")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, "reconstruction_scaling")
     parser.add_argument("--picture", type=Path, help="draw them here (.png)")
     arguments = parser.parse_args()
     prepare_process()
     result = measure(arguments)
-    print(table(result))
-    if arguments.json:
-        write_json(arguments.json, result)
+    write_outputs(arguments, "reconstruction_scaling", table(result), result)
     if arguments.picture:
         draw(result, arguments.picture)
 
@@ -53,8 +51,9 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     import jax
 
     full = configured("paper", "auto", arguments.size)
-    transformer = dataclasses.replace(full.transformer, width=WIDTH, layers=LAYERS)
-    half = dataclasses.replace(full, transformer=transformer)
+    encoder = full.architecture.encoder
+    transformer = dataclasses.replace(encoder.transformer, width=WIDTH, layers=LAYERS)
+    half = full.with_parts(encoder=dataclasses.replace(encoder, transformer=transformer))
     variables = random_variables(half)
     rows = []
     for views in arguments.views:

@@ -24,7 +24,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
-from experiments.common.results import write_json
+from experiments.common.results import markdown_table, publish, write_json
 from experiments.splatting.scenes import (
     PARAMETERS,
     Reference,
@@ -44,6 +44,7 @@ from experiments.splatting.scenes import (
     make_target,
 )
 
+TABLE = "splatting_benchmark"
 DIRECTIONS = ("forward", "forward_backward")
 
 
@@ -55,6 +56,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512, help="side of the image, pixels")
     parser.add_argument("--yardstick", type=Path, help="folder of a compiled yardstick")
     parser.add_argument("--json", type=Path, help="write the numbers here")
+    parser.add_argument("--page", type=Path, help=f"page whose table {TABLE} gets this run's rows")
     parser.add_argument("--repeats", type=int, default=15, help="timed rounds; 0: errors only")
     parser.add_argument("--preset", default="exact", help="name in SPLAT_PRESETS")
     parser.add_argument("--config", type=json.loads, default={}, help="JSON of SplatConfig fields over the preset")
@@ -69,9 +71,12 @@ def main() -> None:
     arguments = parser.parse_args()
     prepare_process()
     result = benchmark(arguments)
-    print(table(result))
+    print(printed(result))
     if arguments.json:
         write_json(arguments.json, result)
+    if arguments.page:
+        tables = [table for table in (times_table([result]), errors_table([result])) if table]
+        publish(arguments.page, TABLE, "\n\n".join(tables), result, name_of(result))
 
 
 def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -211,7 +216,7 @@ def work(scene: Scene, config: Any, dtype: type) -> dict[str, float]:
     return tile_work(scene, config, dtype)
 
 
-def table(result: Mapping[str, Any]) -> str:
+def printed(result: Mapping[str, Any]) -> str:
     """What is printed."""
     number = lambda value, form: "-" if value is None else format(value, form)
     theirs, ratio = result["yardstick"] or {}, result["ratio"] or {}
@@ -237,6 +242,45 @@ def table(result: Mapping[str, Any]) -> str:
         lines.append(f"{measure:12}" + "".join(f"{number(row[name], form):>12}" for name in PARAMETERS))
     lines.append("work: " + ", ".join(f"{name.replace('_', ' ')} {value:,}" for name, value in result["work"].items()))
     return "\n".join(lines)
+
+
+def name_of(run: Mapping[str, Any]) -> str:
+    """Scene, size and how many devices shared the image."""
+    devices = len(run["devices"])
+    return f"{run['scene']} {run['size']}" + (f", {devices} devices" if devices > 1 else "")
+
+
+def times_table(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Wall and CPU ms, and their ratios to the yardstick's."""
+    rows = []
+    for run in runs:
+        if run["forward_ms"] is None:
+            continue
+        cells = [name_of(run)]
+        for name in DIRECTIONS:
+            cells.append(f"{run[f'{name}_ms']:.0f}, {run[f'{name}_cpu_ms']:.0f}")
+            ratio = run["ratio"]
+            cells.append(f"{ratio[f'{name}_ms']:.2f}, {ratio[f'{name}_cpu_ms']:.2f}" if ratio else "-")
+        cells.append(", ".join(f"{seconds:.1f}" for seconds in run["compile_s_each"].values()))
+        rows.append([*cells, f"{run['peak_rss_mb']:.0f}"])
+    header = ["wall, CPU", "forward, ms", "/ yardstick", "forward+backward, ms", "/ yardstick"]
+    return markdown_table([*header, "compile each, s", "peak memory, MiB"], rows)
+
+
+def errors_table(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Errors of images and gradients; empty where no run had a reference."""
+    rows = []
+    for run in runs:
+        if run["psnr"] is None:
+            continue
+        cells = [f"{name_of(run)}, {run['dtype']}", f"{run['psnr']:.1f}", f"{run['max_abs_error']:.1e}"]
+        cells.append(f"{run['fraction_above_2e-4']:.4%}")
+        for measure, worst, form in (("relative_l2", max, ".1e"), ("cosine", min, ".8f"), ("signed_bias", max, ".0e")):
+            values = [abs(value) for value in run[f"gradient_{measure}"].values() if value is not None]
+            cells.append(format(worst(values), form) if values else "-")
+        rows.append(cells)
+    header = ["error to float64", "PSNR, dB", "largest", "pixels off by > 2e-4"]
+    return markdown_table([*header, "gradients: relative L2", "cosine", "signed bias"], rows) if rows else ""
 
 
 if __name__ == "__main__":

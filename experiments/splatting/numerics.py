@@ -1,12 +1,11 @@
 """The extremes of splatting: is everything finite, and how far is float32 from float64?
 
-    python experiments/splatting/numerics.py [--json OUT] [--table docs/numerics.md] [--only WORD]
+    python experiments/splatting/numerics.py [--json OUT] [--page docs/numerics.md] [--only WORD]
 
-Every case of `splatting/numerics_cases.py` is drawn, with the gradients of a random loss with respect to everything, by the tiled
-renderer in float32 and by the dense oracle in float64 from the same numbers; and by the tiled renderer in float64, which
-shows that what is left is rounding. Prints a table of errors and bounds, writes it into the section `numerics` of a
-Markdown page, and exits with status 1 if a number is not finite, a bound exceeded, or something seen that should not be.
-Three minutes on two cores, nearly all of it compilation.
+Every case of `splatting/numerics_cases.py` is rendered, with the gradients of a random loss with respect to everything, by the
+tiled renderer in float32 and by the reference in float64 from the same numbers; and by the tiled renderer in float64, which shows
+that only rounding remains. Prints a table of errors and bounds. Exit status 1 if a number is not finite, a bound is exceeded, or
+something is visible that should not be. Three minutes on two cores, nearly all of it compilation.
 """
 
 import argparse
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import markdown_table, write_json, write_section
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 
 if TYPE_CHECKING:
     from experiments.splatting.numerics_cases import Case, Outcome
@@ -33,8 +32,7 @@ HEADER = (
 def main() -> int:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--table", type=Path, help="Markdown page whose section 'numerics' becomes the table")
+    add_outputs(parser, "splatting_numerics")
     parser.add_argument("--only", default="", help="only cases whose name contains this")
     arguments = parser.parse_args()
 
@@ -45,11 +43,7 @@ def main() -> int:
         if arguments.only in name:
             rows.append((case, measure(case), measure(case, in_float64=True)))
             print(f"{'ok' if passes(rows[-1]) else 'FAILED':7}{name}", flush=True)
-    print(table(rows))
-    if arguments.json:
-        write_json(arguments.json, [as_json(row) for row in rows])
-    if arguments.table:
-        write_section(arguments.table, "numerics", table(rows))
+    write_outputs(arguments, "splatting_numerics", table(rows), [as_json(row) for row in rows])
     return 0 if rows and all(map(passes, rows)) else 1
 
 

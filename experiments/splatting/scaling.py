@@ -22,7 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import medians, prepare_process
-from experiments.common.results import markdown_table, write_json, write_section
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.splatting.benchmark import DIRECTIONS, compiled
 from experiments.splatting.scenes import PARAMETERS, Scene, load_scene, make_target, orbiting
 
@@ -42,9 +42,8 @@ def main() -> None:
     parser.add_argument("--measured", type=Path, help="JSON of an earlier run, instead of a scene")
     parser.add_argument("--size", type=int, default=512, help="side of the image where pixels are not what grows")
     parser.add_argument("--repeats", type=int, default=7, help="timed rounds")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, "splatting_scaling")
     parser.add_argument("--picture", type=Path, help="draw the growth here")
-    parser.add_argument("--page", type=Path, help="Markdown page whose section 'splatting_scaling' becomes the table")
     arguments = parser.parse_args()
     if bool(arguments.scene) == bool(arguments.measured):
         parser.error("give either --scene or --measured")
@@ -53,12 +52,7 @@ def main() -> None:
     else:
         prepare_process()
         result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats)
-    text = table(result)
-    print(text)
-    if arguments.json:
-        write_json(arguments.json, result)
-    if arguments.page:
-        write_section(arguments.page, "splatting_scaling", text)
+    write_outputs(arguments, "splatting_scaling", table(result), result)
     if arguments.picture:
         draw(result, arguments.picture)
 

@@ -17,7 +17,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import medians, prepare_process
-from experiments.common.results import markdown_table, write_json, write_section
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.splatting.benchmark import DIRECTIONS, compiled
 from experiments.splatting.scenes import Scene, load_scene, make_target
 
@@ -31,17 +31,11 @@ def main() -> None:
     parser.add_argument("--scene", nargs="+", required=True, help="npz files of scenes, or 'demo'")
     parser.add_argument("--size", type=int, nargs="+", default=[512], help="sides of the image, pixels")
     parser.add_argument("--repeats", type=int, default=11, help="timed rounds")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--page", type=Path, help="Markdown page whose section 'splatting_stages' becomes the table")
+    add_outputs(parser, "splatting_stages")
     arguments = parser.parse_args()
     prepare_process()
     results = [measure(load_scene(s, size), arguments.repeats) for s in arguments.scene for size in arguments.size]
-    text = table(results)
-    print(text)
-    if arguments.json:
-        write_json(arguments.json, results)
-    if arguments.page:
-        write_section(arguments.page, "splatting_stages", text)
+    write_outputs(arguments, "splatting_stages", table(results), results)
 
 
 def measure(scene: Scene, repeats: int) -> dict[str, Any]:
@@ -80,7 +74,7 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
         return jax.tree.map(lambda plane: plane[order], ellipses)
 
     def rows(projected, gaussians, order):
-        seen = jnp.concatenate([gaussians.colors, projected.depth[:, None]], axis=-1)
+        seen = jnp.concatenate([gaussians.colors, projected.depths[:, None]], axis=-1)
         splats = pack_splats(projected, gaussians.opacities, seen, config.alpha_min)
         return splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
 
@@ -90,7 +84,7 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
     gaussians, camera = scene.gaussians(), scene.camera()
     grid = TileGrid(scene.size, scene.size, config.tile_size)
     projected = stage("project", lambda g: project(g, camera), gaussians)
-    order = stage("depth order", binning.depth_order, projected.depth)
+    order = stage("depth order", binning.depth_order, projected.depths)
     pairs = stage(
         "pairs",
         lambda *a: binning.emit_pairs(footprints(*a), grid, config.max_rows, config.max_pairs),

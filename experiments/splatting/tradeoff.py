@@ -27,7 +27,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import prepare_process, timed
-from experiments.common.results import markdown_table, write_json, write_section
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.splatting.benchmark import DIRECTIONS, compiled
 from experiments.splatting.scenes import (
     PARAMETERS,
@@ -97,9 +97,8 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512, help="side of the image, pixels")
     parser.add_argument("--repeats", type=int, default=9, help="timed rounds")
     parser.add_argument("--only", nargs="+", help="knobs to measure (also: hidden, combined, preset)")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, "splatting_tradeoff")
     parser.add_argument("--picture", type=Path, help="draw the Pareto front here")
-    parser.add_argument("--page", type=Path, help="Markdown page to write the table into")
     parser.add_argument("--section", default="splatting_tradeoff", help="the page's section")
     arguments = parser.parse_args()
     if bool(arguments.scene) == bool(arguments.measured):
@@ -109,12 +108,7 @@ def main() -> None:
     else:
         prepare_process()
         result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats, arguments.only)
-    text = table(result)
-    print(text)
-    if arguments.json:
-        write_json(arguments.json, result)
-    if arguments.page:
-        write_section(arguments.page, arguments.section, text)
+    write_outputs(arguments, arguments.section, table(result), result)
     if arguments.picture:
         draw(result, arguments.picture)
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import markdown_table, write_json, write_section
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.splatting.scenes import Scene, load_scene
 
 if TYPE_CHECKING:
@@ -62,16 +62,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", nargs="+", required=True, help="npz files of scenes, or 'demo'")
     parser.add_argument("--size", type=int, nargs="+", default=[512], help="sides of the image, pixels")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--page", type=Path, help="Markdown page whose section 'splatting_work' becomes the table")
+    add_outputs(parser, "splatting_work")
     arguments = parser.parse_args()
     results = [count(load_scene(scene, size)) for scene in arguments.scene for size in arguments.size]
-    text = table(results)
-    print(text)
-    if arguments.json:
-        write_json(arguments.json, results)
-    if arguments.page:
-        write_section(arguments.page, "splatting_work", text)
+    write_outputs(arguments, "splatting_work", table(results), results)
 
 
 def count(scene: Scene) -> dict[str, Any]:
@@ -197,7 +191,7 @@ def make_lists(scene: Scene, config: Any, tile_size: int, dtype: type = np.float
 
     @jax.jit
     def sort_by_depth(projected, reach):
-        order = binning.depth_order(jnp.where(projected.visible, projected.depth, jnp.inf))
+        order = binning.depth_order(jnp.where(projected.visible, projected.depths, jnp.inf))
         if config.square:
             footprints = binning.square_footprints(projected, reach, config.radius_sigma)
         else:

@@ -18,18 +18,16 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.compiled_costs import compiled_costs
 from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
-from experiments.common.results import write_json, write_section
-from experiments.training.case import CASES, Case, compiler_options
-from experiments.training.results import TABLES
-from experiments.training.stages import stage_numbers
-from experiments.training.variants import variant_numbers
+from experiments.common.results import markdown_table, publish, write_json
+from experiments.training.cases import CASES, Case, compiler_options
+from experiments.training.variants import stage_numbers, variant_numbers
 
 MEBI = 1 / 2**20
 
@@ -70,7 +68,7 @@ def main() -> None:
         text = make(result)
         print(text, end="\n\n")
         if arguments.page:
-            write_section(arguments.page, name, text)
+            publish(arguments.page, name, text, result)
 
 
 def benchmark(case: Case, arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
@@ -99,7 +97,7 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
     program, compile_s = case.compiled(compiler_options())
     case.program = program
     costs = compiled_costs(program)
-    product, product_flops = matmul_program(case.config.model.dtype)
+    product, product_flops = matmul_program(case.config.model.execution.dtype)
     load = os.getloadavg()[0]
     times = medians({"matmul": product, "step": lambda: case.run(program)}, arguments.repeats, arguments.warm_up)
     wall, cpu = map(float, times["step"])
@@ -121,10 +119,10 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
         "peak_rss_mb": peak_rss_mb(),
         "compile_cpu_s": compile_s,
         "tokens": token_count(case.config),
-        "gaussians": len(case.body.template) * case.config.model.decoder.gaussians_per_vertex,
+        "gaussians": len(case.body.template) * case.config.model.architecture.decoder.gaussians_per_vertex,
         "parameters": sum(x.size for x in jax.tree.leaves(case.state.params)),
         "losses": case.metrics,
-        "dtype": case.config.model.dtype,
+        "dtype": case.config.model.execution.dtype,
         "repeats": arguments.repeats,
         "load_average": load,
         "device": jax.devices()[0].device_kind,
@@ -135,8 +133,81 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
 def token_count(config: Any) -> int:
     """Slots for tokens."""
     model = config.model
-    patches = config.views.input_counts[0] * (model.image_size // model.patch_size) ** 2
-    return model.token_capacity if model.tokens == "foreground" else patches
+    patches = (
+        config.views.input_counts[0] * (model.conventions.image_size // model.architecture.encoder.patch_size) ** 2
+    )
+    return model.execution.token_capacity if model.tokens == "foreground" else patches
+
+
+def steps_table(result: dict[str, Any]) -> str:
+    """One line per case. The share is of CPU time on a CPU, which others use, too, and of wall time elsewhere."""
+    header = [
+        "one subject a step",
+        "tokens",
+        "Gaussians",
+        "wall, CPU s",
+        "samples/s",
+        "TFLOP",
+        "GB",
+        "share of floor",
+    ]
+    header += ["MiB temporaries", "peak MiB", "compile, CPU s"]
+    rows = [
+        [
+            name,
+            row["tokens"],
+            row["gaussians"],
+            f"{row['ms'] / 1e3:.1f}, {row['cpu_ms'] / 1e3:.2f}",
+            f"{row['samples_per_s']:.3f}",
+            f"{row['flops'] / 1e12:.2f}",
+            f"{row['bytes'] / 1e9:.0f}",
+            f"{row['share_of_floor_cpu' if row['device'] == 'cpu' else 'share_of_floor']:.2f}",
+            f"{row['temporary_mb']:.0f}",
+            f"{row['peak_rss_mb']:.0f}",
+            f"{row['compile_cpu_s']:.0f}",
+        ]
+        for name, row in result.items()
+    ]
+    machines = "; ".join(
+        f"{name}: {row['dtype']}, {row['device']}, jax {row['jax']}, products {row['matmul_gflops']:.0f} GFLOP/s (wall), "
+        f"load {row['load_average']:.1f}, {row['repeats']} timed"
+        for name, row in result.items()
+    )
+    return markdown_table(header, rows) + f"\n\n{machines}."
+
+
+def stages_table(result: dict[str, Any]) -> str:
+    """One column per case, CPU ms."""
+    cases = {name: row["stages"] for name, row in result.items() if "stages" in row}
+    if not cases:
+        return ""
+    names = list(next(iter(cases.values())))
+    rows = [[name, *(f"{case[name][1]:.0f}" for case in cases.values())] for name in names]
+    step = ["the step", *(f"{result[name]['cpu_ms']:.0f}" for name in cases)]
+    return markdown_table(["CPU ms", *cases], [*rows, step])
+
+
+def variants_table(result: dict[str, Any]) -> str:
+    """What one change does to the step."""
+    rows = []
+    for name, row in result.items():
+        for variant, numbers in row.get("variants", {}).items():
+            ratio = numbers["cpu_ms"] / numbers["as_it_is_cpu_ms"]
+            cells = (numbers["cpu_ms"], ratio, numbers["ms"], numbers["flops"] / 1e9)
+            rows.append(
+                [f"{name}: {variant}", f"{cells[0]:.0f}", f"{cells[1]:.2f}", f"{cells[2]:.0f}", f"{cells[3]:.0f}"]
+            )
+            rows[-1] += [f"{numbers['temporary_mb']:.0f}", f"{numbers['compile_cpu_s']:.0f}"]
+    header = ["step", "CPU ms", "/ as it is", "wall ms", "GFLOP", "MiB temporaries", "compile, CPU s"]
+    return markdown_table(header, rows) if rows else ""
+
+
+TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
+    "training_steps": steps_table,
+    "training_stages": stages_table,
+    "training_variants": variants_table,
+}
+"""Section of the page: what makes its table from all of the JSON."""
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
-"""What the benchmark and the cost page of training share: settings, abstract and real arguments of a training step."""
+"""What the benchmark and the cost page of training share: settings, arguments of a training step, and the step's program."""
 
 import dataclasses
+import time
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -
     config = PRESETS[preset]()
     return dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, image_size=size),
+        model=config.model.with_conventions(image_size=size),
         views=ViewSampling(input_counts=(views,), target_count=targets),
         target_size=size,
         batch_size=batch,
@@ -23,13 +24,16 @@ def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -
     )
 
 
-def with_model(config: Any, **fields: Any) -> Any:
-    """With other fields of the network; `transformer` and `attention` take dictionaries of fields of theirs."""
-    model = config.model
-    transformer = dataclasses.replace(model.transformer, **fields.pop("transformer", {}))
-    attention = dataclasses.replace(transformer.attention, **fields.pop("attention", {}))
-    transformer = dataclasses.replace(transformer, attention=attention)
-    return dataclasses.replace(config, model=dataclasses.replace(model, transformer=transformer, **fields))
+def with_model(config: Any, upsampler: Any = None, **execution: Any) -> Any:
+    """With other fields of the network's `Execution`, or with an upsampler in proportion to the network."""
+    model = config.model.with_execution(**execution)
+    if upsampler is not None:
+        encoder, reader = model.architecture.encoder, model.architecture.reader
+        model = model.with_parts(
+            encoder=dataclasses.replace(encoder, upsampler=upsampler),
+            reader=dataclasses.replace(reader, output_width=encoder.transformer.width),
+        )
+    return dataclasses.replace(config, model=model)
 
 
 def abstract_batch(config: Any, joints: int, betas: int) -> Any:
@@ -53,7 +57,7 @@ def abstract_batch(config: Any, joints: int, betas: int) -> Any:
         )
 
     def example(_):
-        inputs = views(config.views.input_counts[0], config.model.image_size)
+        inputs = views(config.views.input_counts[0], config.model.conventions.image_size)
         return Example(inputs, views(config.views.target_count, config.target_size))
 
     return jax.eval_shape(jax.vmap(example), jax.ShapeDtypeStruct((config.batch_size,), jnp.int32))
@@ -85,7 +89,123 @@ def written_subject(folder: Path, config: Any, body: Any, seed: int = 0) -> Path
     from humangs_jax.people import write_training_subject
 
     views = config.views.input_counts[0] + config.views.target_count
-    path = folder / f"{config.model.image_size}_{views}"
+    path = folder / f"{config.model.conventions.image_size}_{views}"
     if not path.exists():
-        write_training_subject(path, seed, body=body, image_size=config.model.image_size, poses=1, views=views)
+        write_training_subject(
+            path, seed, body=body, image_size=config.model.conventions.image_size, poses=1, views=views
+        )
     return path
+
+
+CASES = {
+    "small 256": ("small", 256, 4, 2),
+    "published 256": ("published", 256, 4, 4),
+    "published 512": ("published", 512, 4, 4),
+    "tiny 32": ("tiny", 32, 2, 2),
+}
+"""Preset, size of photographs and targets, input views, targets. The last one is for tests."""
+
+
+class Case:
+    """Everything that a step of one configuration needs; `state` is what the last step gave."""
+
+    def __init__(self, preset: str, size: int, views: int, targets: int, dtype: str, batch: int = 1):
+        import jax
+
+        from humangs_jax.body.library import load_body
+
+        if dtype == "auto":
+            dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
+        self.config = with_model(settings(preset, size, views, targets, batch), dtype=dtype)
+        self.program: Any = None
+        self.full_body = load_body()
+        self.networks = random_networks(self.config)
+
+    def prepare(self, folder: Path) -> "Case":
+        """Makes the person, reads the batch, draws the weights."""
+        import jax
+
+        from humangs_jax.data.loader import Loader
+        from humangs_jax.data.views import gaussian_body
+
+        config = self.config
+        self.capture = written_subject(folder, config, self.full_body)
+        self.loader = Loader(self.source(), config.batch_size, reader="plain")
+        self.body = gaussian_body(self.full_body, config.model)
+        self.batch = jax.block_until_ready(self.loader.batch_at(0))
+        self.fit()
+        self.state = fresh_state(config)
+        return self
+
+    def source(self) -> Any:
+        """Examples of the person; nothing is read yet."""
+        from humangs_jax.data.loader import CaptureCache, CaptureSource
+
+        cache = CaptureCache([self.capture], self.full_body)
+        return CaptureSource(
+            cache, self.config.views, self.config.model.conventions.image_size, self.config.target_size
+        )
+
+    def fit(self) -> None:
+        """Room for the foreground tokens of this person, as a run would have."""
+        import jax
+
+        from humangs_jax.data.views import prepare_inputs
+
+        if self.config.model.tokens == "foreground":
+            from experiments.reconstruction.cases import foreground
+
+            inputs = jax.jit(prepare_inputs, static_argnames="config")(
+                self.body, first(self.batch).inputs, self.config.model
+            )
+            self.config = with_model(
+                self.config, token_capacity=foreground(inputs, self.config.model)[0].token_capacity
+            )
+
+    def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float]:
+        """(the step as a program, CPU seconds that it took to trace and compile)."""
+        import jax
+
+        from humangs_jax.training.step import jitted_train_step
+
+        step = jax.jit(
+            jitted_train_step().__wrapped__,
+            static_argnames=("config", "mesh"),
+            donate_argnames="state",
+            compiler_options=options,
+        )
+        start = time.process_time()
+        arguments = self.state, self.batch, self.body, self.networks
+        program = step.lower(*arguments, config=self.config, mesh=None).compile()
+        return program, time.process_time() - start
+
+    def run(self, program: Any) -> None:
+        """One step."""
+        import jax
+
+        self.state, metrics = program(self.state, self.batch, self.body, self.networks)
+        self.metrics = {name: float(value) for name, value in jax.device_get(metrics).items()}
+
+
+def fresh_state(config: Any) -> Any:
+    """A training state of random weights."""
+    from experiments.reconstruction.cases import random_variables
+    from humangs_jax.training.state import init_state
+
+    return init_state(config, random_variables(config.model))
+
+
+def first(batch: Any) -> Any:
+    """Its first subject."""
+    import jax
+
+    return jax.tree.map(lambda x: x[0], batch)
+
+
+def compiler_options() -> dict[str, Any] | None:
+    """Those of a training step here."""
+    import jax
+
+    from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
+
+    return CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None

@@ -18,7 +18,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import peak_rss_mb, prepare_process, timed
-from experiments.common.results import markdown_table, write_json, write_section
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 
 PARTS = ("save", "to disk", "restore")
 
@@ -29,20 +29,14 @@ def main() -> None:
     parser.add_argument("--presets", nargs="+", default=["small"], help="published, paper, small or tiny")
     parser.add_argument("--repeats", type=int, default=3, help="checkpoints timed, after one that is not")
     parser.add_argument("--folder", type=Path, help="where checkpoints are written, and deleted again: a temporary one")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--page", type=Path, help="Markdown page whose section 'checkpoints' becomes the table")
+    add_outputs(parser, "checkpoints")
     arguments = parser.parse_args()
     prepare_process()
     results = []
     for preset in arguments.presets:
         with tempfile.TemporaryDirectory(dir=arguments.folder) as folder:
             results.append(measure(preset, Path(folder), arguments.repeats))
-    text = table(results)
-    print(text)
-    if arguments.json:
-        write_json(arguments.json, results)
-    if arguments.page:
-        write_section(arguments.page, "checkpoints", text)
+    write_outputs(arguments, "checkpoints", table(results), results)
 
 
 def measure(preset: str, folder: Path, repeats: int) -> dict[str, Any]:

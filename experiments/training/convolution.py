@@ -17,7 +17,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import medians, prepare_process
-from experiments.common.results import markdown_table, write_json, write_section
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 
 MAPS = ((4, 16, 16, 256, 128), (4, 64, 64, 128, 128))
 """Views, height, width, channels in, channels out."""
@@ -30,17 +30,11 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=3, help="timed rounds")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--page", type=Path, help="Markdown page whose section 'convolution' becomes the table")
+    add_outputs(parser, "convolution")
     arguments = parser.parse_args()
     prepare_process()
     result = benchmark(MAPS, arguments.repeats)
-    text = table(result)
-    print(text)
-    if arguments.json:
-        write_json(arguments.json, result)
-    if arguments.page:
-        write_section(arguments.page, "convolution", text)
+    write_outputs(arguments, "convolution", table(result), result)
 
 
 def benchmark(maps: Sequence[tuple[int, int, int, int, int]], repeats: int) -> dict[str, Any]:

@@ -26,12 +26,13 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import prepare_process
-from experiments.common.results import markdown_table, write_json
+from experiments.common.results import markdown_table, publish, significant, write_json
 
 INPUTS, TARGETS = 4, 3
 """Views of an example."""
 POSES, VIEWS = 2, 6
 """Of written people: poses, and cameras around each."""
+PLACES = {"disk": "from disk", "memory": "kept in memory"}
 STEPS = 5
 """Training steps that are timed."""
 
@@ -62,7 +63,7 @@ def measure_synth(out: Path, size: int, subjects: int, body: Any) -> dict[str, f
 def measure_read(out: Path, size: int, examples: int, body: Any) -> dict[str, dict[str, float]]:
     """Examples of written people through the loader: from disk every time, and from memory."""
     from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
-    from humangs_jax.people.written import find_people
+    from humangs_jax.people.manifest import find_people
 
     sampling = ViewSampling(input_counts=(INPUTS,), target_count=TARGETS)
     results = {}
@@ -79,9 +80,9 @@ def measure_live(size: int, people: int, examples: int, body: Any) -> dict[str, 
     """Build a bank, compile, draw examples one by one."""
     import jax
 
-    from humangs_jax.people.live import LiveConfig
-    from humangs_jax.people.live_bank import build_bank
-    from humangs_jax.people.live_source import jitted_example
+    from humangs_jax.people.bank import build_bank
+    from humangs_jax.people.on_the_fly import OnTheFlyConfig
+    from humangs_jax.people.source import jitted_example
 
     texture = 1024 if size > 256 else 512
     build_bank([0, 1], body, "train", texture_size=texture)
@@ -90,7 +91,7 @@ def measure_live(size: int, people: int, examples: int, body: Any) -> dict[str, 
     accelerator = jax.default_backend() != "cpu"
     views = INPUTS + TARGETS
     wide = {"views_at_once": views, "pixels_per_step": 1 << 30} if accelerator else {}
-    config = LiveConfig(input_views=INPUTS, target_views=TARGETS, input_size=size, target_size=size, **wide)
+    config = OnTheFlyConfig(input_views=INPUTS, target_views=TARGETS, input_size=size, target_size=size, **wide)
     draw = lambda i: jax.block_until_ready(jitted_example(banks[0], jax.random.key(i), config))
     first = seconds(lambda: draw(0))
     draw(1)
@@ -108,22 +109,22 @@ def measure_training(folder: Path, body: Any) -> dict[str, Any]:
 
     from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling, Waiting
     from humangs_jax.data.views import gaussian_body
-    from humangs_jax.people.live import LiveConfig
-    from humangs_jax.people.live_bank import build_bank
-    from humangs_jax.people.live_source import live_source
+    from humangs_jax.people.bank import build_bank
+    from humangs_jax.people.manifest import find_people
+    from humangs_jax.people.on_the_fly import OnTheFlyConfig
+    from humangs_jax.people.source import on_the_fly_source
     from humangs_jax.people.writer import Layout, write_set
-    from humangs_jax.people.written import find_people
     from humangs_jax.training.config import small
     from humangs_jax.training.state import init_state
     from humangs_jax.training.step import train_step
 
     sampling = ViewSampling(input_counts=(INPUTS,), target_count=TARGETS)
     config = dataclasses.replace(small(), views=sampling)
-    sizes = config.model.image_size, config.target_size
+    sizes = config.model.conventions.image_size, config.target_size
     write_set(folder, 2, Layout(max(sizes), poses=POSES, views=VIEWS), "train", 0, body=body, progress=False)
     bank = build_bank([0, 1], body, "train", pose_count=4)
     sources = {
-        "live": live_source(bank, LiveConfig(INPUTS, TARGETS, *sizes), (INPUTS,)),
+        "live": on_the_fly_source(bank, OnTheFlyConfig(INPUTS, TARGETS, *sizes), (INPUTS,)),
         "read": CaptureSource(CaptureCache(find_people(folder), body), sampling, *sizes),
     }
     state, model_body = init_state(config, None), gaussian_body(body, config.model)
@@ -159,6 +160,28 @@ def waits(sizes: dict[str, Any], step_s: float) -> dict[str, dict[str, float]]:
     return results
 
 
+def ways(of_size: dict[str, Any]) -> dict[str, dict[str, float]]:
+    """The numbers of each way, as the tables name it."""
+    written = f"written by `synth` (people, posing, PNG included; {POSES * VIEWS} views each)"
+    kept = {f"read by the loader, {place}": of_size["read"][name] for name, place in PLACES.items()}
+    return {written: of_size["synth"], **kept, "on the fly": of_size["live"]}
+
+
+def cpu_table(sizes: dict[str, Any]) -> str:
+    """CPU ms a view, one column for each size."""
+    columns = [ways(of_size) for of_size in sizes.values()]
+    rows = [[name, *(significant(1e3 * column[name]["cpu_s_per_view"]) for column in columns)] for name in columns[0]]
+    return markdown_table(["CPU ms a view", *(f"{size} px" for size in sizes)], rows)
+
+
+def rates_table(sizes: dict[str, Any]) -> str:
+    """Views and subjects a second, one column for each size."""
+    columns = [ways(of_size) for of_size in sizes.values()]
+    cell = lambda numbers: f"{significant(numbers['views_per_s'])} ({significant(numbers['subjects_per_s'])})"
+    rows = [[name, *(cell(column[name]) for column in columns)] for name in columns[0]]
+    return markdown_table(["views (subjects) a second, one process", *(f"{size} px" for size in sizes)], rows)
+
+
 def machine() -> dict[str, Any]:
     """Where this was measured."""
     import jax
@@ -178,6 +201,9 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the numbers here")
+    parser.add_argument(
+        "--page", type=Path, help="page whose tables data_loading_cpu and data_loading_rates are written"
+    )
     parser.add_argument("--sizes", type=int, nargs="+", default=[128, 256, 512], help="pixels a side")
     parser.add_argument("--subjects", type=int, default=4, help="people written, and in the bank")
     parser.add_argument("--examples", type=int, default=8, help="examples read and drawn")
@@ -227,6 +253,9 @@ def main() -> None:
             )
     if arguments.json:
         write_json(arguments.json, result)
+    if arguments.page:
+        publish(arguments.page, "data_loading_cpu", cpu_table(sizes), result)
+        publish(arguments.page, "data_loading_rates", rates_table(sizes), result)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What the loss networks cost for one picture: counted arithmetic, memory, time, alone and with the gradient.
+"""What the loss networks cost for one pair of images: counted arithmetic, memory, time, alone and with the gradient.
 
     python experiments/training/loss_networks.py --json OUT [--page docs/loss_networks.md]
 
@@ -12,25 +12,19 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--json", type=Path, help="write the numbers here")
-    parser.add_argument("--page", type=Path, help="write the table into this page, between its markers")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="sides of the pictures in pixels")
+    add_outputs(parser, "loss_networks")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="sides of the images, pixels")
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
-    from experiments.common.results import markdown_table, write_json, write_section
 
     rows = [row for size in arguments.sizes for row in measure(size, arguments.repeats)]
-    table = markdown_table(HEADER, [format_row(row) for row in rows])
-    print(table)
-    if arguments.json:
-        write_json(arguments.json, rows)
-    if arguments.page:
-        write_section(arguments.page, "costs", table)
+    write_outputs(arguments, "loss_networks", table(rows), rows)
 
 
 HEADER = ("loss", "side", "GFLOP", "with gradient", "MiB", "with gradient", "CPU s", "with gradient")
@@ -72,6 +66,11 @@ def measure(size: int, repeats: int) -> list[dict]:
         print(row, file=sys.stderr, flush=True)
         rows.append(row)
     return rows
+
+
+def table(rows: list[dict]) -> str:
+    """One line for each network and size."""
+    return markdown_table(HEADER, [format_row(row) for row in rows])
 
 
 def format_row(row: dict) -> list[str]:

@@ -13,11 +13,12 @@ import dataclasses
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-FIRST, MARK = "as it is", "pilots"
+FIRST, TABLE = "as it is", "training_pilots"
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "training.md"
 TOKENS = 1024
 """For 4 photographs of 256 pixels."""
@@ -35,7 +36,7 @@ def main() -> None:
     parser.add_argument("--fresh", action="store_true", help="start from nothing; has a table of its own")
     parser.add_argument("--steps", type=int, default=150, help="of each run")
     parser.add_argument("--only", nargs="+", help="names of the runs to make; all if not given")
-    parser.add_argument("--docs", type=Path, default=DOCS, help="page with the table")
+    parser.add_argument("--page", type=Path, default=DOCS, help="page with the table")
     arguments = parser.parse_args()
     from humangs_jax.core.allocator import keep_freed_memory
 
@@ -50,7 +51,8 @@ def training_variants(base):
     view = lambda **changes: replace(base, views=replace(base.views, **changes))
     loss = lambda **changes: replace(base, loss=replace(base.loss, **changes))
     rate = lambda x: replace(base, optimizer=replace(base.optimizer, learning_rate=x))
-    k = lambda free: replace(base, model=replace(model, decoder=replace(model.decoder, free=free)))
+    decoder = lambda model, **fields: model.with_parts(decoder=replace(model.architecture.decoder, **fields))
+    k = lambda free: replace(base, model=decoder(model, free=free))
     counts = view(input_counts=(1, 2, 4, 4, 6))
     return {
         FIRST: (base, {}),
@@ -59,7 +61,7 @@ def training_variants(base):
         "rate 2e-4": (rate(2e-4), {}),
         "2 subjects a step, half of the steps": (replace(base, batch_size=2, steps=base.steps // 2), {}),
         "2 targets": (view(target_count=2), {}),
-        "1, 2, 4, 4 or 6 inputs": (replace(counts, model=replace(model, token_capacity=TOKENS * 7 // 5)), {}),
+        "1, 2, 4, 4 or 6 inputs": (replace(counts, model=model.with_execution(token_capacity=TOKENS * 7 // 5)), {}),
         "squared error alone": (loss(structural=0.0), {}),
         "structural 0.5": (loss(structural=0.5), {}),
         "silhouette 0.5": (loss(silhouette=0.5), {}),
@@ -75,12 +77,15 @@ def training_variants(base):
 def network_variants(base):
     """Name -> (configuration, settings of the live people): of the network, from nothing."""
     replace, model = dataclasses.replace, base.model
-    bare = replace(model, sampling=replace(model.sampling, shells=()))
-    fine = replace(model, body_vertices=6000, longest_edge=0.02, decoder=replace(model.decoder, free=1))
+    parts = model.architecture
+    bare = model.with_parts(reader=replace(parts.reader, shells=()))
+    canonical = bare.with_parts(decoder=replace(parts.decoder, frame="canonical"))
+    fine = model.with_parts(decoder=replace(parts.decoder, free=1))
+    fine = fine.with_conventions(body_vertices=6000, longest_edge=0.02)
     networks = {
         FIRST: model,
         "no shells": bare,
-        "no shells, Gaussians in the canonical frame": replace(bare, decoder=replace(model.decoder, frame="canonical")),
+        "no shells, Gaussians in the canonical frame": canonical,
         "edges to 2 cm, K = 2": fine,
     }
     return {name: (replace(base, model=network), {}) for name, network in networks.items()}
@@ -88,7 +93,7 @@ def network_variants(base):
 
 def run(arguments, parser) -> None:
     """Make the runs that are missing, then write the table."""
-    from experiments.common.results import around_section, write_json
+    from experiments.common.results import check_section, write_json
     from experiments.evaluation.results import file_digest
     from humangs_jax.core.configuration import config_to_json
     from humangs_jax.network.weights import load_weights
@@ -99,7 +104,7 @@ def run(arguments, parser) -> None:
     base = small()
     base = dataclasses.replace(
         base,
-        model=dataclasses.replace(model, token_capacity=TOKENS),
+        model=model.with_execution(token_capacity=TOKENS),
         views=dataclasses.replace(base.views, input_counts=(4,), target_count=4),
         loss=LossConfig(),
         optimizer=OptimizerConfig(learning_rate=4e-4, warmup_steps=20),
@@ -113,9 +118,9 @@ def run(arguments, parser) -> None:
         parser.error(f"--only {sorted(unknown)}: expected names of {', '.join(runs)}")
     start = None if arguments.fresh else file_digest(arguments.start) if arguments.start else "shipped"
     settings = {"steps": arguments.steps, "start": start, "bank": file_digest(arguments.bank)}
-    path, mark = arguments.out / "pilots.json", f"{MARK}, fresh" if arguments.fresh else MARK
+    path, table = arguments.out / "pilots.json", TABLE + "_fresh" * arguments.fresh
     try:
-        around_section(arguments.docs, mark)
+        check_section(arguments.page, table)
     except (ValueError, OSError) as error:
         parser.error(str(error))
     if FIRST not in {*names, *kept(path, settings, parser)}:
@@ -129,7 +134,7 @@ def run(arguments, parser) -> None:
         row |= {"steps": config.steps, "config": json.loads(config_to_json(config)), "live": live}
         rows = kept(path, settings, parser) | {name: row}  # another process may have added to it
         write_json(path, {"settings": settings, "runs": rows})
-    write_table(arguments.docs, kept(path, settings, parser), mark)
+    write_table(arguments.page, kept(path, settings, parser), list(runs), table)
 
 
 def kept(path, settings, parser):
@@ -150,8 +155,8 @@ def pilot(arguments, config, live, started, name) -> dict:
     from humangs_jax.data.loader import CaptureCache, find_captures
     from humangs_jax.data.views import gaussian_body
     from humangs_jax.network.weights import fit_variables
-    from humangs_jax.people.live import LiveConfig
-    from humangs_jax.people.live_bank import load_bank
+    from humangs_jax.people.bank import load_bank
+    from humangs_jax.people.on_the_fly import OnTheFlyConfig
     from humangs_jax.training.loop import train
     from humangs_jax.training.sources import captured_people, live_people, mixed_people
     from humangs_jax.training.validation import validate, validation_examples
@@ -159,7 +164,7 @@ def pilot(arguments, config, live, started, name) -> dict:
     body, begin = load_body(), time.process_time()
     people = [
         captured_people(find_captures(arguments.people), body),
-        live_people(load_bank(arguments.bank), LiveConfig(**live)),
+        live_people(load_bank(arguments.bank), OnTheFlyConfig(**live)),
     ]
     variables = None if started is None else fit_variables(*started, config.model)
     state = train(config, body, mixed_people(people, [1, 1]), arguments.out / name, variables=variables, progress=False)
@@ -175,9 +180,9 @@ def pilot(arguments, config, live, started, name) -> dict:
     return {key: numbers[key] for key in COLUMNS} | {"cpu_seconds": seconds}
 
 
-def write_table(page: Path, rows: dict, mark: str) -> None:
-    """One row a run, each score as a difference to the first."""
-    from experiments.common.results import markdown_table, write_section
+def write_table(page: Path, rows: dict, names: Sequence[str], table: str) -> None:
+    """One row a run, each score as a difference to the first; the runs that were not made, too."""
+    from experiments.common.results import markdown_table, publish
 
     first = rows[FIRST]
     lines, forms = [], {True: ("{:.2f}", "{:.2f}", "{:.4f}"), False: ("{:+.2f}", "{:+.2f}", "{:+.4f}")}
@@ -185,8 +190,9 @@ def write_table(page: Path, rows: dict, mark: str) -> None:
         scores = [row[key] if name == FIRST else row[key] - first[key] for key in COLUMNS]
         texts = [form.format(score) for form, score in zip(forms[name == FIRST], scores, strict=True)]
         lines.append([name, *texts, row["steps"], f"{row['cpu_seconds']:.0f}"])
+    lines += [[name, *["not run"] * 5] for name in names if name not in rows]
     header = ["run", "PSNR, dB", "in the foreground, dB", "SSIM", "steps", "CPU s"]
-    write_section(page, mark, markdown_table(header, lines))
+    publish(page, table, markdown_table(header, lines), rows)
 
 
 if __name__ == "__main__":

@@ -59,8 +59,8 @@ def train(arguments: argparse.Namespace) -> bool:
     """Make people, train until the end or an interruption; whether it is the end. Facts go to out/report.json."""
     from experiments.training.data_loading import machine
     from humangs_jax.body.library import load_body
+    from humangs_jax.people.manifest import find_people
     from humangs_jax.people.writer import Layout, write_set
-    from humangs_jax.people.written import find_people
     from humangs_jax.training.config import PRESETS
     from humangs_jax.training.loop import train as run
 
@@ -180,7 +180,7 @@ def page_text(
     lines: Sequence[dict[str, Any]], facts: dict[str, Any], config: dict[str, Any], pictures: dict[str, str]
 ) -> str:
     """The page in Markdown. pictures: links by the end of their names."""
-    views, optimizer, size = config["views"], config["optimizer"], config["model"]["image_size"]
+    views, optimizer, size = config["views"], config["optimizer"], config["model"]["conventions"]["image_size"]
     counts = " or ".join(str(count) for count in sorted(set(views["input_counts"])))
     other = ("structural_scales", "random_background")
     terms = [f"{value:g} {name}" for name, value in config["loss"].items() if value and name not in other]

@@ -13,6 +13,7 @@ from typing import Literal
 import tyro
 
 from humangs_jax.core.allocator import keep_freed_memory
+from humangs_jax.core.compile_cache import enable_compile_cache
 
 Positional = tyro.conf.Positional
 
@@ -55,9 +56,9 @@ def reconstruct(
     _require_parent(out)
     variables, config = load_weights(weights)
     if tokens != "as_trained":
-        config = dataclasses.replace(config, tokens=tokens)
+        config = config.with_execution(tokens=tokens)
     if dtype != "as_trained":
-        config = dataclasses.replace(config, dtype=dtype)
+        config = config.with_execution(dtype=dtype)
     avatar = run(variables, config, photos)
     avatar.save(out)
     print(f"{out}: {len(avatar.gaussians.means):,} Gaussians from {len(photos.images)} photos")
@@ -197,7 +198,7 @@ def synth(
         for_training: short for 2 poses x 12 views at 256 pixels and no others, enough for `humangs train`.
         workers: processes; as many as there are cores if not given.
     """
-    from humangs_jax.people.writer import Layout, write_set
+    from humangs_jax.people import Layout, write_set
 
     counts = {"subjects": subjects, "size": size, "views": views, "poses": poses, "frames": frames}
     if wrong := [name for name, count in counts.items() if count < 1]:
@@ -414,7 +415,7 @@ def train(
     from humangs_jax.body.library import load_body
     from humangs_jax.network.weights import load_weights
     from humangs_jax.objectives.loss_networks import load_loss_networks
-    from humangs_jax.people.written import find_people
+    from humangs_jax.people import find_people
     from humangs_jax.training.diagnose import diagnose_run
     from humangs_jax.training.launch import fitting_losses, read_config, training_people
     from humangs_jax.training.loop import train as run
@@ -474,7 +475,7 @@ def convert(
         raise ValueError(f"--losses {losses}: the same file as --out")
     networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)
     converted = load_checkpoint(checkpoint, head_width)
-    config = dataclasses.replace(converted.config, sampling=dataclasses.replace(converted.config.sampling, pool=pool))
+    config = converted.config.with_conventions(pool=pool)
     save_weights(out, converted.variables, config, dtype)
     print(f"{out}: {describe(converted)}")
     if losses is None:
@@ -504,6 +505,7 @@ def main() -> None:
     """Entry point of the console script."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # no notes of XLA's between our lines
     keep_freed_memory()
+    enable_compile_cache()
     try:
         tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="humangs", description=__doc_summary__)
     except (ValueError, OSError) as error:

@@ -21,7 +21,7 @@ def replace_folder(folder: str | Path, write: Callable[[Path], None]) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def replace_file(path: str | Path, write: Callable[[Path], None]) -> None:
+def replace_file(path: str | Path, write: Callable[[Path], object]) -> None:
     """Calls write(temporary), which makes that file, and renames it to `path`. The temporary one has the same ending."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

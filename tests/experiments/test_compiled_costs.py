@@ -1,6 +1,5 @@
 """Counts of compiled programs against what the arithmetic is known to be."""
 
-import dataclasses
 import functools
 import math
 import re
@@ -11,7 +10,9 @@ import pytest
 
 from experiments.common import compiled_costs as costs
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.network.humangs import HumanGSInputs, encode
+from humangs_jax.network.config import paper_parts
+from humangs_jax.network.humangs import encode
+from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables
 
@@ -217,22 +218,23 @@ def empty_inputs(views, size, vertices=20):
 
 @pytest.mark.parametrize("tokens", ["all", "foreground"])
 def test_encoder_of_the_tiny_preset(tokens):
-    config = dataclasses.replace(tiny(), tokens=tokens)
+    config = tiny().with_execution(tokens=tokens)
+    encoder = paper_parts(config.architecture)[0]
     views, size = 2, 32
     inputs = jax.eval_shape(lambda: empty_inputs(views, size))
     compiled = encode.lower(expected_variables(config), inputs, config=config).compile()
     counted = costs.compiled_costs(compiled)
 
-    side, width, hidden = size // config.patch_size, config.transformer.width, config.upsampler.hidden
+    side, width, hidden = size // encoder.patch_size, encoder.transformer.width, encoder.upsampler.hidden
     patches = views * side**2
-    slots = patches if tokens == "all" else config.token_capacity
+    slots = patches if tokens == "all" else config.execution.token_capacity
     length = slots + 1
-    channels = 9 + 3 * config.texture.channels
-    layer = length * width * (3 + 1 + 2 * config.transformer.mlp_ratio) * width + 2 * length * length * width
+    channels = 9 + 3 * encoder.texture.channels
+    layer = length * width * (3 + 1 + 2 * encoder.transformer.mlp_ratio) * width + 2 * length * length * width
     products = {
         "rays": views * size**2 * 3 * 3,
-        "tokenizer": slots * config.patch_size**2 * channels * width,
-        "layers": config.transformer.layers * layer,
+        "tokenizer": slots * encoder.patch_size**2 * channels * width,
+        "layers": encoder.transformer.layers * layer,
         "projections": 4 * patches * width * hidden,
         "up1": views * (side + 1) ** 2 * 4 * (2 * hidden) * 4 * hidden,
         "up2": views * (2 * side + 1) ** 2 * 4 * hidden * 4 * (hidden // 2),
@@ -241,9 +243,9 @@ def test_encoder_of_the_tiny_preset(tokens):
     # the first 3x3 convolution and the one between the doublings
     convolutions = views * side**2 * 9 * 4 * hidden * 2 * hidden + views * (2 * side) ** 2 * 9 * hidden * hidden
     assert counted.convolution_flops >= 2 * convolutions
-    softmax = (width // config.transformer.attention.head_width) * length**2
-    gelu = length * config.transformer.mlp_ratio * width
-    transcendentals = config.transformer.layers * (softmax + gelu) + views * size**2  # rays are made unit vectors
+    softmax = (width // encoder.transformer.head_width) * length**2
+    gelu = length * encoder.transformer.mlp_ratio * width
+    transcendentals = encoder.transformer.layers * (softmax + gelu) + views * size**2  # rays are made unit vectors
     assert 1 <= counted.transcendentals / transcendentals < 1 + NORMS_SHARE
     assert counted.unknown_trips == 0 and counted.uncounted == ()
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.evaluation import bodies, evaluation_bodies, results, scores, subjects, synthetic
+from experiments.evaluation import bodies, body_cases, results, subjects, synthetic
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables, save_weights
 from humangs_jax.objectives.backbones import channels, random_weights
@@ -34,7 +34,7 @@ def run(script, monkeypatch, *arguments):
 
 
 def test_lpips_is_missing_without_weights():
-    assert scores.lpips_scorer(None)(np.zeros((1, 8, 8, 3)), np.ones((1, 8, 8, 3))) is None
+    assert subjects.lpips_scorer(None)(np.zeros((1, 8, 8, 3)), np.ones((1, 8, 8, 3))) is None
     row = {key: None if "lpips" in key else 0.5 for key in results.COLUMNS}
     assert results.table_row(row).split().count("-") == 2
 
@@ -44,7 +44,7 @@ def test_lpips_is_the_mean_over_views_of_clipped_pictures():
     weights = Lpips(random_weights(jax.random.key(0), BACKBONES["alex"]), heads, "alex")
     truth, predicted = np.random.default_rng(0).random((2, 2, 32, 32, 3)).astype(np.float32)
     predicted += 0.5
-    found = scores.lpips_scorer(weights)(predicted, truth)
+    found = subjects.lpips_scorer(weights)(predicted, truth)
     expected = [float(jax.jit(lpips)(weights, *pair)) for pair in zip(np.clip(predicted, 0, 1), truth, strict=True)]
     assert np.isclose(found, np.mean(expected), rtol=1e-6) and found > 0
 
@@ -72,12 +72,12 @@ def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch)
     def draw(variables, config, subject, count):
         drawn.append((subject.seed, count))
         truth = np.asarray(subject.held_out.images)
-        return scores.Drawn(truth + 0.1 / count, np.clip(truth, 0, 0.8))
+        return subjects.Drawn(truth + 0.1 / count, np.clip(truth, 0, 0.8))
 
     monkeypatch.setattr(subjects, "make_evaluation_subject", lambda *a: made.append(a[0]) or make(*a))
-    monkeypatch.setattr(scores, "draw_person", draw)
+    monkeypatch.setattr(subjects, "draw_person", draw)
     page, out, pictures = tmp_path / "page.md", tmp_path / "a.json", tmp_path / "sheet.png"
-    page.write_text("Before\n<!-- views -->\nold\n<!-- end views -->\nAfter\n")
+    page.write_text("Before\n<!-- table: evaluation_views -->\nold\n<!-- end -->\nAfter\n")
     options = ("--weights", weights, "--json", out, *SMALL)
     run(synthetic, monkeypatch, "--subjects", 2, "--views", 2, 1, *options)
     first, second = 2_000_000, 2_000_001
@@ -92,7 +92,7 @@ def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch)
     assert report["subjects"][1]["seed"] == second and report["subjects"][1]["psnr"] > 10
 
     made.clear(), drawn.clear()
-    run(synthetic, monkeypatch, "--subjects", 2, "--views", 1, 2, 4, *options, "--docs", page, "--pictures", pictures)
+    run(synthetic, monkeypatch, "--subjects", 2, "--views", 1, 2, 4, *options, "--page", page, "--pictures", pictures)
     assert made == [first, second] and drawn == [(first, 4), (second, 4)]
     assert "| new views, same pose | 4 |" in page.read_text() and page.read_text().endswith("After\n")
     made.clear(), drawn.clear()
@@ -111,14 +111,14 @@ def test_bodies_see_the_same_photos_and_what_they_cost_is_noted(weights, tmp_pat
         seen.append((len(capture.body.template), capture.images))
         return SimpleNamespace(gaussians=SimpleNamespace(means=np.zeros((3 * len(capture.body.template), 3))))
 
-    monkeypatch.setattr(evaluation_bodies, "SMPLX_SEED_VERTICES", 600)
+    monkeypatch.setattr(body_cases, "SMPLX_SEED_VERTICES", 600)
     monkeypatch.setattr("humangs_jax.avatar.reconstruct.reconstruct", reconstructed)
-    monkeypatch.setattr(scores, "draw_avatar", lambda avatar, views: np.clip(views.images + 0.1, 0, 1))
+    monkeypatch.setattr(subjects, "draw_avatar", lambda avatar, views: np.clip(views.images + 0.1, 0, 1))
     monkeypatch.setattr("humangs_jax.avatar.evaluate.painted_body", lambda inputs: None)
     monkeypatch.setattr("humangs_jax.avatar.evaluate.draw_painted_body", lambda colors, views: 0.5 * views.images)
     page, out, pictures = tmp_path / "page.md", tmp_path / "a.json", tmp_path / "bodies.png"
-    page.write_text("<!-- bodies -->\n<!-- end bodies -->\n")
-    options = ("--subjects", 1, "--views", 1, "--weights", weights, "--json", out, "--docs", page, *SMALL)
+    page.write_text("<!-- table: evaluation_bodies -->\n<!-- end -->\n")
+    options = ("--subjects", 1, "--views", 1, "--weights", weights, "--json", out, "--page", page, *SMALL)
     run(bodies, monkeypatch, *options)
     assert [count for count, _ in seen] == [13380, 13380, 1796, 1796, 3345, 3345, 836, 836]  # once to compile
     assert all(np.array_equal(images, seen[0][1]) for _, images in seen)

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from experiments.evaluation import results, tables
+from experiments.evaluation import results
 
 SETTINGS = {
     "weights": "0123456789abcdef",
@@ -80,15 +80,15 @@ def test_the_best_and_the_worst_are_different_people():
 def test_it_is_told_where_more_photos_are_worse():
     better = results.views_report({5: row(v1=20, v2=21, v4=22)}, SETTINGS, [5], [1, 2, 4])
     assert results.falls(better, "novel") == []
-    assert "never worse" in tables.verdict(better, "novel") and "1 of 1 people" in tables.verdict(better, "novel")
+    assert "never worse" in results.verdict(better, "novel") and "1 of 1 people" in results.verdict(better, "novel")
     worse = results.views_report({5: row(v1=20, v2=19.5, v4=14)}, SETTINGS, [5], [1, 2, 4])
-    said = tables.verdict(worse, "animation")
+    said = results.verdict(worse, "animation")
     assert "by 0.50 dB from 1 to 2" in said and "by 5.50 dB from 2 to 4" in said and "0 of 1 people" in said
 
 
 def test_the_page_has_the_tables_and_its_pictures(tmp_path):
     report = results.views_report({s: row(v1=20 + s, v4=24 + s) for s in (1, 2)}, SETTINGS, [1, 2], [1, 4])
-    section = tables.views_section(report, tmp_path / "docs/page.md", tmp_path / "docs/images/sheet.png")
+    section = results.views_section(report, tmp_path / "docs/page.md", tmp_path / "docs/images/sheet.png")
     assert "| new views, unseen poses | 4 | 24.50 | 0.900 | 18.50 | 15.00 | 0.800 | 9.00 |" in section
     assert "LPIPS" not in section and "(images/sheet.png)" in section and "| worst 1 | 1 | 25.00 |" in section
-    assert "-" in tables.printed_table(report["by_views"])
+    assert "-" in results.printed_table(report["by_views"])

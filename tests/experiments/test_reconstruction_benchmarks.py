@@ -39,9 +39,12 @@ def test_the_page_is_made_of_what_the_benchmarks_write(tmp_path):
         "attention": ("reconstruction/attention", "--tokens", 33, "--heads", 2, "--repeats", 1),
         "compilation": ("reconstruction/compilation", "--preset", "tiny", "--tokens", 32),
     }
+    page = tmp_path / "page.md"
+    page.write_text((REPOSITORY / "docs" / "performance_reconstruction.md").read_text())
     for name, (script, *arguments) in options.items():
         size = ("--memory-size", 64) if name == "benchmark" else ()
-        run(script, *arguments, *size, "--json", tmp_path / f"{name}.json", folder=tmp_path)
+        out = ("--json", tmp_path / f"{name}.json", "--page", page)
+        run(script, *arguments, *size, *out, folder=tmp_path)
     results = {name: json.loads((tmp_path / f"{name}.json").read_text()) for name in options}
 
     benchmark = results["benchmark"]
@@ -59,7 +62,4 @@ def test_the_page_is_made_of_what_the_benchmarks_write(tmp_path):
     assert all(row["offsets_relative_l2"] < 1e-5 and row["psnr"] > 80 for row in exact)
     assert rows["foreground tokens"]["flops"] < exact[0]["flops"] < rows["as published"]["flops"]
 
-    page = tmp_path / "page.md"
-    page.write_text((REPOSITORY / "docs" / "performance_reconstruction.md").read_text())
-    run("reconstruction/results", "--results", tmp_path, "--page", page, folder=tmp_path)
     assert "tiny, 2 views of 256" in page.read_text()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.accelerator import collectives
-from experiments.common.results import write_section
+from experiments.accelerator import training_cost
+from experiments.common.results import publish
 from experiments.training import checkpoints, convolution
 
 REPOSITORY = Path(__file__).parents[2]
@@ -66,7 +66,7 @@ def page(tmp_path):
 
 
 def test_traffic_between_devices():
-    counted = collectives.collectives(PROGRAM, 8)
+    counted = training_cost.collectives(PROGRAM, 8)
     assert counted.calls == {"all-gather": 1, "all-reduce": 5, "reduce-scatter": 1}
     assert counted.array_bytes == {"all-gather": WHOLE, "all-reduce": 5 * WHOLE, "reduce-scatter": WHOLE}
     sent = {"all-gather": WHOLE * 3 // 4, "all-reduce": 5 * 2 * WHOLE * 3 // 4, "reduce-scatter": WHOLE * 3 // 4}
@@ -80,13 +80,13 @@ def test_asynchronous_traffic_counts_once():
         "  %zero = s32[]", "  %whole = f32[64,8]{1,0} all-gather-done((f32[16,8], f32[64,8]) %s)\n  %zero = s32[]"
     )
     assert text.count("all-gather") == 2
-    assert collectives.collectives(text, 8) == collectives.collectives(PROGRAM, 8)
+    assert training_cost.collectives(text, 8) == training_cost.collectives(PROGRAM, 8)
 
 
 def test_groups_of_devices():
-    assert collectives.group_size("replica_groups={{0,2,4,6},{1,3,5,7}}, x", 8) == 4
-    assert collectives.group_size("replica_groups=[2,128]<=[256]", 256) == 128
-    assert collectives.group_size("replica_groups={}", 256) == 256
+    assert training_cost.group_size("replica_groups={{0,2,4,6},{1,3,5,7}}, x", 8) == 4
+    assert training_cost.group_size("replica_groups=[2,128]<=[256]", 256) == 128
+    assert training_cost.group_size("replica_groups={}", 256) == 256
 
 
 def test_convolutions_are_timed_in_a_loop_and_out_of_it(page):
@@ -94,7 +94,7 @@ def test_convolutions_are_timed_in_a_loop_and_out_of_it(page):
     result = json.loads(json.dumps(convolution.benchmark([(2, 4, 5, 3, 6)], repeats=1)))
     (row,) = result["maps"]
     assert all(row["cpu_ms"][way] > 0 for way in convolution.WAYS)
-    write_section(path, "convolution", convolution.table(result))
+    publish(path, "convolution", convolution.table(result), result)
     assert "| 2 x 4 x 5 x 3 -> 6 |" in path.read_text()
 
 
@@ -105,7 +105,7 @@ def test_checkpoints_are_saved_restored_and_weighed(page, tmp_path):
     assert result["state_bytes"] >= 4 * numbers and result["disk_bytes"] > 0.8 * result["state_bytes"]
     times = result["ms"]
     assert all(wall > 0 for wall, _ in times.values()) and times["save"][0] < times["to disk"][0]
-    write_section(path, "checkpoints", checkpoints.table([result]))
+    publish(path, "checkpoints", checkpoints.table([result]), [result])
     assert "| tiny |" in path.read_text()
 
 

@@ -22,8 +22,8 @@ def test_every_stage_agrees(name, dtype):
     checkpoint, subject = golden.carried(name)
     with jax.enable_x64(dtype == "float64"):
         converted, arrays = load_checkpoint(checkpoint), golden.load_subject(name)
-        sampling = dataclasses.replace(converted.config.sampling, pool=golden.POOLS[name])
-        config = dataclasses.replace(converted.config, dtype="float32", sampling=sampling)
+        conventions = dataclasses.replace(converted.config.conventions, pool=golden.POOLS[name])
+        config = dataclasses.replace(converted.config, conventions=conventions).with_execution(dtype="float32")
         variables = jax.tree.map(lambda x: jnp.asarray(x, dtype), converted.variables)
         inputs, weights, transforms = check_parity.subject_inputs(arrays, 0, dtype)
         compute = jax.jit(check_parity.compute_stages, static_argnames="config")

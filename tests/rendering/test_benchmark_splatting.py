@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.common import results as reports
 from experiments.splatting import benchmark, scaling, scenes, tradeoff, work
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.reference import render_dense
+from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SplatConfig
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -69,7 +68,7 @@ def files(tmp_path_factory):
         gaussians = Gaussians(*(double[name] for name in PARAMETERS))
 
         def loss(gaussians):
-            image = render_dense(gaussians, camera, background=jnp.zeros(3)).rgb
+            image = render_reference(gaussians, camera, background=jnp.zeros(3)).rgb
             return jnp.mean((image - target) ** 2), image
 
         gradients, image = jax.jit(jax.grad(loss, has_aux=True))(gaussians)
@@ -143,7 +142,7 @@ def test_work_needed_agrees_with_brute_force(files):
     scene = scenes.load_scene(files / "scene.npz", SIZE)
     config = SplatConfig()
     projected, _ = work.projected_splats(scene, config)
-    order = np.argsort(projected.depth, kind="stable")
+    order = np.argsort(projected.depths, kind="stable")
     x, y, xx, xy, yy = (np.asarray(projected[i], np.float64)[order, None, None] for i in (0, 1, 3, 4, 5))
     dx, dy = np.arange(SIZE) + 0.5 - x, (np.arange(SIZE) + 0.5)[:, None] - y
     squared = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
@@ -181,13 +180,3 @@ def test_pareto_front_holds_what_nothing_beats():
 def test_slope_of_linear_growth_is_one():
     rows = [{"size": n, "forward_cpu_ms": 3.0 * n} for n in (1, 2, 8)]
     assert scaling.slope(rows, "forward") == pytest.approx(1)
-
-
-def test_sections_of_a_page_are_replaced(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("before\n<!-- x -->\nold\n<!-- end x -->\nafter\n")
-    for text in ("new", "newer"):
-        reports.write_section(page, "x", text)
-        assert page.read_text() == f"before\n<!-- x -->\n{text}\n<!-- end x -->\nafter\n"
-    with pytest.raises(ValueError, match="markers"):
-        reports.write_section(page, "y", "text")

@@ -205,12 +205,12 @@ def test_narrow_gaussians_give_a_float32_image_eagerly(dtype):
 @pytest.mark.parametrize("status", [0, 1])
 def test_the_script_writes_its_table_and_fails_on_a_bound(tmp_path, monkeypatch, capsys, status):
     page = tmp_path / "numerics.md"
-    page.write_text("before\n<!-- numerics -->\nold\n<!-- end numerics -->\nafter\n")
+    page.write_text("before\n<!-- table: splatting_numerics -->\nold\n<!-- end -->\nafter\n")
     case = cases.CASES["opacity: 0"]
     outcome = cases.Outcome(True, 2 * case.image if status else 0.0, 0.0, 0.0, "K", 0.0, 0)
     exact = cases.dataclasses.replace(outcome, image=0.0)
     monkeypatch.setattr(cases, "measure", lambda case, in_float64=False: exact if in_float64 else outcome)
-    monkeypatch.setattr(sys, "argv", ["numerics.py", "--only", "opacity: 0", "--table", str(page)])
+    monkeypatch.setattr(sys, "argv", ["numerics.py", "--only", "opacity: 0", "--page", str(page)])
     assert numerics.main() == status
     text = page.read_text()
     assert text.startswith("before") and text.endswith("after\n") and "old" not in text and "opacity: 0" in text

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from splat_scenes import camera, random_gaussians
 
 from humangs_jax.rendering import binning, compositing
+from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.rendering.schedules import fat_chunks, small_blocks
 from humangs_jax.rendering.splat_config import SplatConfig
-from humangs_jax.rendering.splatting import _footprints, _project
 from humangs_jax.rendering.tiling import TileGrid, TileLists, sort_into_tiles
 
 EXACT = 1e-10
@@ -51,11 +51,13 @@ def by_hand(seed, lengths, dtype, grid=GRID, opacities=(0.05, 1.0)):
 def from_scene(gaussians, grid, config):
     """Splats and lists as the renderer makes them."""
     g, dtype = gaussians.means.shape[0], gaussians.means.dtype
-    projected = _project(gaussians, camera(dtype, grid.width, grid.height), config)
-    order = binning.depth_order(jnp.where(projected.visible, projected.depth, jnp.inf))
-    ellipses = jax.tree.map(lambda plane: plane[order], _footprints(projected, gaussians, config))
+    projected = project_gaussians(gaussians, camera(dtype, grid.width, grid.height), config)
+    order = binning.depth_order(jnp.where(projected.visible, projected.depths, jnp.inf))
+    ellipses = jax.tree.map(lambda plane: plane[order], binning.footprints_by(projected, gaussians.opacities, config))
     pairs = binning.emit_pairs(ellipses, grid, g * grid.tiles, g * grid.tiles)
-    features = jnp.concatenate([gaussians.colors, jnp.where(projected.visible, projected.depth, 0.0)[:, None]], axis=-1)
+    features = jnp.concatenate(
+        [gaussians.colors, jnp.where(projected.visible, projected.depths, 0.0)[:, None]], axis=-1
+    )
     splats = compositing.pack_splats(projected, gaussians.opacities, features, config.alpha_min)[order]
     return splats, sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, g)
 
