@@ -1,7 +1,5 @@
 """Every stage of the published network against its authors' numbers (see network_golden.py)."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import network_golden as golden
@@ -22,8 +20,7 @@ def test_every_stage_agrees(name, dtype):
     checkpoint, subject = golden.carried(name)
     with jax.enable_x64(dtype == "float64"):
         converted, arrays = load_checkpoint(checkpoint), golden.load_subject(name)
-        conventions = dataclasses.replace(converted.config.conventions, pool=golden.POOLS[name])
-        config = dataclasses.replace(converted.config, conventions=conventions).with_execution(dtype="float32")
+        config = converted.config.with_conventions(pool=golden.POOLS[name]).with_execution(dtype="float32")
         variables = jax.tree.map(lambda x: jnp.asarray(x, dtype), converted.variables)
         inputs, weights, transforms = check_parity.subject_inputs(arrays, 0, dtype)
         compute = jax.jit(check_parity.compute_stages, static_argnames="config")
