@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import network_golden as golden
 import numpy as np
 import pytest
+from rounding import bound
 
 from experiments.paper import check_parity
 from humangs_jax.network.conversion import load_checkpoint
@@ -28,4 +29,4 @@ def test_every_stage_agrees(name, dtype):
         assert all(x.dtype == dtype for x in found.values())
     errors = golden.thinned_errors(jax.tree.map(np.asarray, found), dict(np.load(subject)))
     assert len(errors) == 17
-    assert max(errors.values()) < TOLERANCES[dtype], errors
+    assert max(errors.values()) < (bound(TOLERANCES[dtype]) if dtype == "float32" else TOLERANCES[dtype]), errors
