@@ -7,6 +7,7 @@ HUMANGS_TOLERANCE_SCALE: factor on all float32 bounds, see rounding.py.
 HUMANGS_PLAIN_COMPILER: if set, programs are compiled without `splatting.CPU_COMPILER_OPTIONS` (wide vectors).
 """
 
+import contextlib
 import datetime
 import hashlib
 import importlib.metadata
@@ -31,7 +32,7 @@ MOST_MAPPINGS = 20_000
 MAPPINGS = Path("/proc/self/maps")
 
 CACHE_BYTES = 2 << 30
-"""Size to which the compile cache is cut before a run. One whole run with `-m ''` writes less than half of it."""
+"""Size to which the compile cache is cut before a run, oldest use first."""
 
 SLOW_RUNS = Path(__file__).parent / "slow_runs.json"
 """When each slow test last ran, its seconds and its result: committed, written by `.ci/run slow`."""
@@ -41,16 +42,22 @@ def cache_folder() -> Path:
     """Compiled programs of this jaxlib on this kind of processor, which JAX's own keys leave out."""
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     cpu = Path("/proc/cpuinfo")
-    flags = [line for line in cpu.read_text().splitlines() if line.startswith("flags")] if cpu.exists() else []
+    flags = (
+        [line for line in cpu.read_text().splitlines() if line.startswith(("flags", "Features"))]
+        if cpu.exists()
+        else []
+    )
     machine = hashlib.sha256(f"{platform.machine()} {flags[:1]}".encode()).hexdigest()[:12]
     return root / "humangs_jax" / "tests" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{machine}"
 
 
 def prune(folder: Path, size: int) -> None:
     """Deletes the files used longest ago until `size` bytes are left."""
-    files = [
-        (max(stat.st_atime, stat.st_mtime), stat.st_size, path) for path in folder.glob("*") if (stat := path.stat())
-    ]
+    files = []
+    for path in folder.iterdir():
+        with contextlib.suppress(FileNotFoundError):  # another run prunes at the same time
+            stat = path.stat()
+            files.append((max(stat.st_atime, stat.st_mtime), stat.st_size, path))
     excess = sum(bytes_ for _, bytes_, _ in files) - size
     for _, bytes_, path in sorted(files):
         if excess <= 0:
