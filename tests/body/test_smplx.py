@@ -47,7 +47,7 @@ def made_up_file(n=9, columns=20, seed=0):
 
 
 def check_script():
-    path = Path(__file__).parents[2] / "experiments" / "check_body.py"
+    path = Path(__file__).parents[2] / "experiments" / "paper" / "check_body.py"
     spec = importlib.util.spec_from_file_location("check_body", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
