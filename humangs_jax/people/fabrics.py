@@ -18,14 +18,14 @@ from humangs_jax.people.noise import Ripples, hashed, lattice
 SHOULDER_RIDGE = -0.02
 """Template z of the line from neck to shoulder on which front and back are sewn together."""
 ALBEDO_LIMIT = 0.88
-"""White clothes stay darker than the white background."""
+"""Largest albedo: white clothes stay darker than the white background."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Spots:
     """Points on a surface. cloth: (n, 4), see `anatomy.cloth_coordinates`. template: (n, 3) template coordinates.
 
-    Coordinates of sleeves and trouser legs are made sharp at their seams, where patterns meet, whatever was given.
+    Coordinates of sleeves and trouser legs are recomputed, so that they are sharp at seams, where patterns meet.
     """
 
     cloth: Float[np.ndarray, "n 4"]
@@ -83,7 +83,7 @@ def colour(hue: float, saturation: float, value: float) -> Float[np.ndarray, "3"
 
 
 def random_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """A dye: neutrals, denim blues, earth colours or something loud."""
+    """A dye: neutral, muted, vivid, an earth colour or navy."""
     kind = rng.choice(["neutral", "muted", "vivid", "earth", "navy"], p=[0.28, 0.28, 0.22, 0.11, 0.11])
     if kind == "neutral":
         return colour(rng.random(), rng.uniform(0, 0.06), rng.choice([0.1, 0.18, 0.32, 0.5, 0.7, 0.85]))
@@ -164,7 +164,7 @@ def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabr
 
 
 def _dye(rng, kind):
-    """A colour that the trade sells the garment in."""
+    """A usual colour of a kind of garment."""
     sober = {
         "denim": (0.57, 0.63, 0.3, 0.75, 0.12, 0.6),
         "cotton": (0.06, 0.13, 0.15, 0.5, 0.2, 0.75),

@@ -10,16 +10,18 @@ import numpy as np
 
 from humangs_jax.people.anatomy import Anatomy, smoothstep
 from humangs_jax.people.garments import nearest_weights, smooth_weights
-from humangs_jax.people.kinematics import HEAD, NECK, SPINE3
+from humangs_jax.people.kinematics import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3
 from humangs_jax.people.noise import ripples
 from humangs_jax.people.surfaces import (
     Surface,
+    ball,
     blurred,
     cut,
     grid_faces,
     hanging,
     join,
     outlines,
+    rigid,
     smooth,
     sweep,
     turn_in_hems,
@@ -43,7 +45,7 @@ CUTS = {
 """Odds for men and women."""
 LONG_CUTS = ("bob", "long")
 FRINGES = {"straight": 0.28, "parted": 0.34, "side": 0.38}
-"""Odds of what hangs over the forehead of longer hair."""
+"""Odds of a fringe of longer hair."""
 BEARDS = {"none": 0.5, "stubble": 0.2, "moustache": 0.05, "goatee": 0.09, "full": 0.16}
 """Odds for men."""
 
@@ -69,7 +71,7 @@ class Haircut:
 
 
 def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set[str]) -> Haircut:
-    """A random cut that goes under what is worn on the head; old men lose hair."""
+    """A random cut that fits under the headwear; old men lose hair."""
     odds = np.asarray([value[0 if male else 1] for value in CUTS.values()])
     names = list(CUTS)
     if male and years > 45:
@@ -177,12 +179,12 @@ def fringe(rng: np.random.Generator, haircut: Haircut) -> Callable[[np.ndarray, 
 
 
 def over_ears(haircut: Haircut) -> bool:
-    """Whether nothing is seen of the ears."""
+    """Whether the hair hides the ears."""
     return haircut.cut in LONG_CUTS
 
 
 def ears(template: np.ndarray) -> np.ndarray:
-    """(n,) the outer parts of the ears."""
+    """(n,) whether a vertex is on the outer part of an ear."""
     x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
     return (x > 0.0765) & (y > 0.265) & (y < 0.36) & (z < 0.03)
 
@@ -312,11 +314,13 @@ def bun(rng, anatomy: Anatomy, radius: float, elevation: float) -> Surface:
     to_rest = _rest_heights(anatomy)
     direction = np.asarray([0, np.sin(elevation), -np.cos(elevation)])
     center = np.asarray([0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01]) + direction * (0.095 + 0.55 * radius)
-    return _rigid(anatomy, _ball(center, radius * np.asarray([1.0, 0.9, 0.85])), HEAD)
+    directions, faces = ball(12, 20)
+    vertices = center + directions * (radius * np.asarray([1.0, 0.9, 0.85]))
+    return _painted(rigid(vertices, faces, HEAD, len(anatomy.joints)))
 
 
 def ponytail(rng, anatomy: Anatomy, length: float, knots: float = 0.0) -> Surface:
-    """A tapering tail from the back of the head down the back; a braid with knots every so many metres."""
+    """A tapering tail from the back of the head down the back; a braid has knots, `knots` metres apart."""
     to_rest = _rest_heights(anatomy)
     start = np.asarray([0, to_rest(0.36), anatomy.joints[HEAD, 2] - 0.105])
     rows = 40 if knots else 16
@@ -371,40 +375,19 @@ def _finish(surface, depth):
 def _painted(surface):
     """Template and cloth coordinates of hair that does not come from the scalp: its own position."""
     flat = surface.vertices - surface.vertices.mean(0)
-    cloth = np.concatenate([flat, np.full((len(flat), 1), 0.09)], 1).astype(np.float32)
-    return surface.with_attributes(template=(flat + SKULL).astype(np.float32), cloth=cloth)
-
-
-def _rigid(anatomy, vertices_and_faces, joint):
-    vertices, faces = vertices_and_faces
-    weights = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
-    weights[:, joint] = 1
-    return _painted(Surface(vertices, faces, weights))
-
-
-def _ball(center, radii, rows=12, columns=20):
-    polar, around = (
-        x.reshape(-1)
-        for x in np.meshgrid(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns, indexing="ij")
-    )
-    directions = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], -1)
-    return (center + directions * radii).astype(np.float32), grid_faces(rows, columns, closed=True)
+    return surface.painted(flat + SKULL, flat, 0.09)
 
 
 def eyeballs(anatomy: Anatomy) -> Surface:
     """Two balls in the sockets; their `template` attribute is the unit direction from the ball's middle."""
     parts = []
-    for joint in (23, 24):
+    directions, faces = ball(14, 22)
+    directions = directions.astype(np.float32)
+    for joint in (LEFT_EYE, RIGHT_EYE):
         center = anatomy.joints[joint]
         lids = np.sort(np.linalg.norm(anatomy.skin.vertices - center, axis=1))[:12]
-        directions, faces = _ball(np.zeros(3), np.ones(3), 14, 22)
-        weights = np.zeros((len(directions), anatomy.skin.weights.shape[1]), np.float32)
-        weights[:, joint] = 1
-        cloth = np.concatenate([directions, np.ones((len(directions), 1), np.float32)], 1)
-        attributes = {"template": directions, "cloth": cloth}
-        parts.append(
-            Surface((center + directions * lids.mean() * 0.985).astype(np.float32), faces, weights, attributes)
-        )
+        eye = rigid(center + directions * lids.mean() * 0.985, faces, joint, len(anatomy.joints))
+        parts.append(eye.painted(directions, directions, 1.0))
     return join(parts)
 
 
@@ -416,7 +399,7 @@ def _rest_heights(anatomy):
 
 
 def _falling_weights(anatomy, vertices, template_y):
-    """The head's above the jaw; further down more and more of what lies below."""
+    """Weights of the head above the jaw, blending into those of the nearest skin further down."""
     template = anatomy.skin.attributes["template"]
     near = np.flatnonzero((np.abs(template[:, 0]) < 0.15) & (template[:, 1] > -0.3) & (template[:, 1] < 0.26))[::2]
     head = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
