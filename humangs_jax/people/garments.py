@@ -69,11 +69,6 @@ def shell(rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], 
     return turn_in_hems(Surface(draped.vertices, draped.faces, weights, kept), fit.hem)
 
 
-def covered(fields: list[np.ndarray], margin: float = HEM_MARGIN) -> np.ndarray:
-    """(n,) whether a body vertex lies under the cloth of `fields`, hems excluded."""
-    return np.min(fields, axis=0) > margin
-
-
 def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> np.ndarray:
     """Skinning weights (n, j) smoothed over a surface; rows sum to 1."""
     used = weights.max(0) > 0
