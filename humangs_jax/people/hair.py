@@ -12,6 +12,7 @@ from humangs_jax.people.anatomy import Anatomy, smoothstep
 from humangs_jax.people.garments import nearest_weights, smooth_weights
 from humangs_jax.people.kinematics import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3
 from humangs_jax.people.noise import ripples
+from humangs_jax.people.outfits import HEADWEAR, drawn, row
 from humangs_jax.people.surfaces import (
     Surface,
     ball,
@@ -29,20 +30,22 @@ from humangs_jax.people.surfaces import (
 )
 
 CUTS = {
-    "cropped": (0.22, 0.03),
-    "short": (0.26, 0.10),
-    "quiff": (0.10, 0.01),
-    "curly": (0.08, 0.12),
-    "afro": (0.05, 0.05),
-    "buzz": (0.09, 0.01),
-    "bald": (0.07, 0.004),
-    "bob": (0.012, 0.17),
-    "long": (0.025, 0.25),
-    "ponytail": (0.02, 0.11),
-    "bun": (0.03, 0.08),
-    "braid": (0.01, 0.05),
+    "cropped": (0.22, 0.03, (0.005, 0.010)),
+    "short": (0.26, 0.10, (0.012, 0.022)),
+    "quiff": (0.10, 0.01, (0.010, 0.016)),
+    "curly": (0.08, 0.12, (0.024, 0.045)),
+    "afro": (0.05, 0.05, (0.045, 0.085)),
+    "buzz": (0.09, 0.01, 0.008),
+    "bald": (0.07, 0.004, 0.008),
+    "bob": (0.012, 0.17, (0.012, 0.024)),
+    "long": (0.025, 0.25, (0.010, 0.022)),
+    "ponytail": (0.02, 0.11, 0.008),
+    "bun": (0.03, 0.08, 0.008),
+    "braid": (0.01, 0.05, 0.008),
 }
-"""Odds for men and women."""
+"""Odds for men and women, thickness (metres, or their range)."""
+NOT_UNDER_HEADWEAR = ("curly", "afro", "quiff", "bun")
+"""Cuts that no headwear fits over."""
 LONG_CUTS = ("bob", "long")
 FRINGES = {"straight": 0.28, "parted": 0.34, "side": 0.38}
 """Odds of a fringe of longer hair."""
@@ -72,33 +75,21 @@ class Haircut:
 
 def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set[str]) -> Haircut:
     """A random cut that fits under the headwear; old men lose hair."""
-    odds = np.asarray([value[0 if male else 1] for value in CUTS.values()])
-    names = list(CUTS)
+    headwear = bool(worn & set(HEADWEAR))
+    odds = {name: value[0 if male else 1] for name, value in CUTS.items()}
     if male and years > 45:
-        odds[names.index("bald")] *= 3.0
-    if worn & {"cap", "beanie", "brim_hat", "headscarf"}:
-        odds[[names.index(n) for n in ("curly", "afro", "quiff", "bun")]] = 0
-    cut = str(rng.choice(names, p=odds / odds.sum()))
-    thickness = {
-        "cropped": rng.uniform(0.005, 0.010),
-        "short": rng.uniform(0.012, 0.022),
-        "quiff": rng.uniform(0.010, 0.016),
-        "curly": rng.uniform(0.024, 0.045),
-        "afro": rng.uniform(0.045, 0.085),
-        "bob": rng.uniform(0.012, 0.024),
-        "long": rng.uniform(0.010, 0.022),
-    }.get(cut, 0.008)
-    if worn & {"cap", "beanie", "brim_hat", "headscarf"}:
-        thickness = min(thickness, 0.010)
+        odds["bald"] *= 3.0
+    cut = drawn(rng, odds | (dict.fromkeys(NOT_UNDER_HEADWEAR, 0) if headwear else {}))
+    thickness = row(rng, {name: value[2] for name, value in CUTS.items()}, cut)
+    thickness = min(thickness, 0.010) if headwear else thickness
     bottom = rng.uniform(0.15, 0.2) if cut == "bob" else rng.uniform(-0.17, 0.1)
     wave = rng.choice([rng.uniform(0.002, 0.004), rng.uniform(0.006, 0.014)], p=[0.55, 0.45])
     receding = rng.uniform(-0.004, 0.012 + 0.012 * (years > 45)) if male else rng.uniform(-0.006, 0.004)
-    beards = np.asarray(list(BEARDS.values()))
-    beard = str(rng.choice(list(BEARDS), p=beards / beards.sum())) if male and years > 17 else "none"
+    beard = drawn(rng, BEARDS) if male and years > 17 else "none"
     long = 0.35 if rng.random() < 0.8 else 1.0
     return Haircut(
         cut=cut,
-        fringe=str(rng.choice(list(FRINGES), p=list(FRINGES.values()))),
+        fringe=drawn(rng, FRINGES),
         side=float(rng.choice([-1, 1])),
         thickness=float(thickness),
         bottom=bottom,
