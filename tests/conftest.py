@@ -1,14 +1,25 @@
-"""Settings that every test shares."""
+"""Settings that every test shares: the compile cache, the switches of `.ci/run isa`, the record of slow runs.
 
-import atexit
+Environment variables:
+
+JAX_COMPILATION_CACHE_DIR: where compiled programs are kept; default `cache_folder()`.
+HUMANGS_TOLERANCE_SCALE: factor on all float32 bounds, see rounding.py.
+HUMANGS_PLAIN_COMPILER: if set, programs are compiled without `splatting.CPU_COMPILER_OPTIONS` (wide vectors).
+"""
+
+import datetime
+import hashlib
+import importlib.metadata
+import json
 import os
-import shutil
-import tempfile
+import platform
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings
+from rounding import scaled_comparison
 
 jax.config.update("jax_platforms", "cpu")  # numbers in the tests are the CPU's
 
@@ -19,12 +30,56 @@ MOST_MAPPINGS = 20_000
 """Every compiled program maps memory, and Linux ends a process that has 65,530 mappings: XLA then aborts in mid-compilation."""
 MAPPINGS = Path("/proc/self/maps")
 
-if "PYTEST_XDIST_WORKER" not in os.environ and "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+CACHE_BYTES = 2 << 30
+"""Size to which the compile cache is cut before a run. One whole run with `-m ''` writes less than half of it."""
+
+SLOW_RUNS = Path(__file__).parent / "slow_runs.json"
+"""When each slow test last ran, its seconds and its result: committed, written by `.ci/run slow`."""
+
+
+def cache_folder() -> Path:
+    """Compiled programs of this jaxlib on this kind of processor, which JAX's own keys leave out."""
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    cpu = Path("/proc/cpuinfo")
+    flags = [line for line in cpu.read_text().splitlines() if line.startswith("flags")] if cpu.exists() else []
+    machine = hashlib.sha256(f"{platform.machine()} {flags[:1]}".encode()).hexdigest()[:12]
+    return root / "humangs_jax" / "tests" / f"jaxlib-{importlib.metadata.version('jaxlib')}-{machine}"
+
+
+def prune(folder: Path, size: int) -> None:
+    """Deletes the files used longest ago until `size` bytes are left."""
+    files = [
+        (max(stat.st_atime, stat.st_mtime), stat.st_size, path) for path in folder.glob("*") if (stat := path.stat())
+    ]
+    excess = sum(bytes_ for _, bytes_, _ in files) - size
+    for _, bytes_, path in sorted(files):
+        if excess <= 0:
+            break
+        path.unlink(missing_ok=True)
+        excess -= bytes_
+
+
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     # workers, and the programs that tests start, inherit it: what one has compiled the others need not
-    folder = tempfile.mkdtemp(prefix="humangs_compiled_")
-    os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    folder = cache_folder()
+    folder.mkdir(parents=True, exist_ok=True)
+    prune(folder, CACHE_BYTES)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder)
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.1"  # default 1: most of our programs take less
 jax.config.update("jax_compilation_cache_dir", os.environ["JAX_COMPILATION_CACHE_DIR"])
+if least := os.environ.get("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"):
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", float(least))
+
+for owner, name in ((np.testing, "assert_allclose"), (np, "allclose"), (np, "isclose")):
+    setattr(owner, name, scaled_comparison(getattr(owner, name)))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _plain_compiler():
+    if "HUMANGS_PLAIN_COMPILER" in os.environ:
+        from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
+
+        CPU_COMPILER_OPTIONS.clear()
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -32,3 +87,32 @@ def _forget_programs():
     yield
     if MAPPINGS.exists() and MAPPINGS.read_bytes().count(b"\n") > MOST_MAPPINGS:
         jax.clear_caches()
+
+
+def pytest_configure(config):
+    config.pluginmanager.register(SlowRuns(), "slow_runs")
+
+
+class SlowRuns:
+    """Collects the slow tests that ran, in the process that all workers report to, and writes `SLOW_RUNS`."""
+
+    def __init__(self):
+        self.runs = {}
+
+    def pytest_runtest_logreport(self, report):
+        if "slow" not in report.keywords:
+            return
+        run = self.runs.setdefault(report.nodeid, {"seconds": 0.0, "result": "passed"})
+        run["seconds"] += report.duration
+        if report.outcome != "passed" and run["result"] != "failed":
+            run["result"] = report.outcome
+
+    def pytest_sessionfinish(self, session):
+        if not self.runs or hasattr(session.config, "workerinput"):
+            return
+        known = json.loads(SLOW_RUNS.read_text()) if SLOW_RUNS.exists() else {}
+        today = datetime.datetime.now(datetime.UTC).date().isoformat()
+        for test, run in self.runs.items():
+            known[test] = {"date": today, "seconds": round(run["seconds"]), "result": run["result"]}
+        rows = ",\n".join(f"  {json.dumps(test)}: {json.dumps(known[test])}" for test in sorted(known))
+        SLOW_RUNS.write_text("{\n" + rows + "\n}\n")

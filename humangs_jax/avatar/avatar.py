@@ -2,8 +2,6 @@
 
 import json
 import os
-import tempfile
-from pathlib import Path
 from typing import Literal
 
 import jax.numpy as jnp
@@ -11,6 +9,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.io.atomic import replace_file
 from humangs_jax.rendering.gaussians import Gaussians
 
 FORMAT = "humangs-avatar"
@@ -30,7 +29,7 @@ _ARRAYS = (
 
 @pytree_dataclass
 class Avatar:
-    """A person who can be animated: Gaussians in the T-pose (theta = 0), vertex-major, k Gaussians of a vertex together.
+    """A person who can be animated: Gaussians in the T-pose (theta = 0), vertex-major, the k Gaussians of a vertex together.
 
     gaussians: canonical, metres. skinning_weights: (g, j), rows sum to 1. rest_vertices: (n, 3) and rest_joints: (j, 3), the
     shaped body in the T-pose. faces: (f, 3). parents: joint tree, root -1. skinning: "affine" or "rotation". rendering: the
@@ -48,8 +47,7 @@ class Avatar:
     rendering: Literal["exact", "inria"] = static_field(default="exact")
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write one compressed `.npz` (no pickle), under a temporary name first."""
-        path = Path(path)
+        """Write one compressed `.npz` (no pickle); it appears whole or not at all."""
         header = {
             "format": FORMAT,
             "version": VERSION,
@@ -61,17 +59,9 @@ class Avatar:
         values = {name: getattr(self.gaussians, name) for name in _ARRAYS[:5]}
         values |= {name: getattr(self, name) for name in _ARRAYS[5:]}
         arrays = {name: np.asarray(value) for name, value in values.items()}
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".npz")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                header_array = np.asarray(json.dumps(header))
-                # no array is called allow_pickle, the stub's only other keyword
-                np.savez_compressed(file, header=header_array, **arrays)  # ty: ignore[invalid-argument-type]
-            os.chmod(temporary, 0o644)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        header_array = np.asarray(json.dumps(header))
+        # no array is called allow_pickle, the stub's only other keyword
+        replace_file(path, lambda temporary: np.savez_compressed(temporary, header=header_array, **arrays))  # ty: ignore[invalid-argument-type]
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Avatar":

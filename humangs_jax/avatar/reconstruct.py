@@ -1,10 +1,9 @@
 """Photos with body poses -> one forward pass -> an avatar; one person, or many in one batch.
 
 Programs are compiled once per bucket: numbers of views and of foreground tokens are rounded up to few sizes
-(`capacity.round_up`), and what was added is masked.
+(`buffers.round_up`), and padding is masked.
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import jax
@@ -13,13 +12,16 @@ import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyModel, shape_body
-from humangs_jax.core.array_types import Array, Int, PyTree
-from humangs_jax.core.buffers import round_up
+from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, gaussian_body, pad_views, prepare_inputs, standardize
-from humangs_jax.network.humangs import HumanGSConfig, HumanGSInputs, apply_humangs, touched_patches
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.humangs import apply_humangs, needed_tokens
+from humangs_jax.network.inputs import HumanGSInputs
+from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
+from humangs_jax.rendering.buffers import round_up
 
 
 def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar:
@@ -33,7 +35,7 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     """
     _require_views(capture, "capture")
     body = gaussian_body(capture.body, config)
-    views = standardize(capture, config.image_size)
+    views = standardize(capture, config.conventions.image_size)
     bucket = round_up(capture.view_count, smallest=1)
     if bucket > capture.view_count:
         views = pad_views(views, bucket)
@@ -62,7 +64,7 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
     coefficients = max(len(capture.betas) for capture in captures)
     subjects = []
     for capture in captures:
-        views = pad_views(standardize(capture, config.image_size), bucket)
+        views = pad_views(standardize(capture, config.conventions.image_size), bucket)
         betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
         subjects.append(replace(views, betas=betas))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
@@ -73,47 +75,51 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
 
 def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
     """The configuration with room for all that some inputs hold, those of one subject or of a batch."""
-    sampling = dataclasses.replace(config.sampling, vertex_capacity=None)  # reading all is 2 % of the time
-    capacity = 0 if config.tokens == "all" else round_up(int(_touched_patches(inputs, config)))
-    return dataclasses.replace(config, token_capacity=capacity, sampling=sampling)
+    capacity = 0 if config.tokens == "all" else round_up(int(_needed_tokens(inputs, config)))
+    return config.with_execution(
+        token_capacity=capacity, vertex_capacity=None
+    )  # reading all vertices is 2 % of the time
 
 
 def reconstruct_views(
     variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews
 ) -> tuple[Avatar, Int[Array, ""]]:
     """The pure function behind `reconstruct`: one subject's views -> avatar, and the count of foreground patches that did
-    not fit into `config.token_capacity`.
+    not fit into `config.execution.token_capacity`.
 
     Batch over subjects with `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`, with a body from `gaussian_body`.
     """
     return _assemble(variables, config, body, views, prepare_inputs(body, views, config))
 
 
-def _assemble(variables, config, body, views, inputs):
-    outputs, _ = apply_humangs(variables, inputs, config)
-    rest = shape_body(body, views.betas)
-    avatar = Avatar(
+def make_avatar(outputs: HumanGSOutputs, body: BodyModel, betas: Float[Array, " s"], config: HumanGSConfig) -> Avatar:
+    """Canonical Gaussians on the body of a person: what can be posed."""
+    rest = shape_body(body, betas)
+    per_vertex = outputs.gaussians.means.shape[0] // body.template.shape[0]
+    return Avatar(
         gaussians=outputs.gaussians,
-        skinning_weights=corrected_skinning_weights(
-            body.skinning_weights, outputs.skinning_offsets, config.decoder.gaussians_per_vertex
-        ),
+        skinning_weights=corrected_skinning_weights(body.skinning_weights, outputs.skinning_offsets, per_vertex),
         rest_vertices=rest.vertices,
         rest_joints=rest.joints,
         faces=body.faces,
         parents=body.parents,
         joint_names=body.joint_names,
-        skinning=config.skinning,
-        rendering=config.rendering,
+        skinning=config.conventions.skinning,
+        rendering=config.conventions.rendering,
     )
-    return avatar, outputs.dropped_tokens
+
+
+def _assemble(variables, config, body, views, inputs):
+    outputs, _ = apply_humangs(variables, inputs, config)
+    return make_avatar(outputs, body, views.betas, config), outputs.dropped_tokens
 
 
 def _prepare_subjects(body, batch, config):
     return jax.lax.map(lambda views: prepare_inputs(body, views, config), batch)
 
 
-def _most_touched(inputs, config):
-    count = lambda subject: touched_patches(subject, config)
+def _most_needed(inputs, config):
+    count = lambda subject: needed_tokens(subject, config)
     return jnp.max(jax.vmap(count)(inputs)) if inputs.images.ndim == 5 else count(inputs)
 
 
@@ -137,4 +143,4 @@ _assemble_batch = jax.jit(
 )
 _prepare = jax.jit(prepare_inputs, static_argnames="config")
 _prepare_batch = jax.jit(_prepare_subjects, static_argnames="config")
-_touched_patches = jax.jit(_most_touched, static_argnames="config")
+_needed_tokens = jax.jit(_most_needed, static_argnames="config")

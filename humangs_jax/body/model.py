@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from humangs_jax.body import skinning
 from humangs_jax.core.array_types import Array, Float, Int
-from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, static_field
 from humangs_jax.geometry import quaternion
 
 
@@ -48,7 +48,7 @@ class BodyModel:
 
 
 @pytree_dataclass
-class BodyPose:
+class BodyPose(Batchable):
     """A pose.
 
     rotations: (j, 3) axis-angle of each joint relative to its parent, radians. translation: (3,) metres, applied last.
@@ -59,7 +59,7 @@ class BodyPose:
 
 
 @pytree_dataclass
-class RestBody:
+class RestBody(Batchable):
     """A shaped body in T-pose (theta = 0). vertices: (n, 3) metres. joints: (j, 3) metres."""
 
     vertices: Float[Array, "n 3"]
@@ -67,7 +67,7 @@ class RestBody:
 
 
 @pytree_dataclass
-class PosedBody:
+class PosedBody(Batchable):
     """A posed body.
 
     vertices: (n, 3) metres. joint_transforms: (j, 4, 4) from rest to posed space, translation included.

@@ -40,7 +40,7 @@ class Reconstruct:
     tokens: Literal["as_trained", "all", "foreground"] = "as_trained"
     """The patches of the photos that the network reads: all, or those that show the person, which is several times
     faster. For weights trained with the other setting it is an approximation (docs/performance_reconstruction.md)."""
-    dtype: Literal["as_trained", "float32", "bfloat16"] = "as_trained"
+    dtype: Literal["float32", "bfloat16"] = "float32"
     """Of the encoder's matrix products. bfloat16 is faster on GPU and TPU."""
 
     def run(self) -> None:
@@ -52,8 +52,8 @@ class Reconstruct:
         photos = load_capture(self.capture)
         require_parent(self.out)
         variables, config = load_weights(self.weights)
-        chosen = {"tokens": self.tokens, "dtype": self.dtype}
-        config = dataclasses.replace(config, **{name: x for name, x in chosen.items() if x != "as_trained"})
+        tokens = None if self.tokens == "as_trained" else self.tokens
+        config = config.with_execution(tokens=tokens, dtype=self.dtype)
         avatar = reconstruct(variables, config, photos)
         avatar.save(self.out)
         print(f"{self.out}: {len(avatar.gaussians.means):,} Gaussians from {len(photos.images)} photos")

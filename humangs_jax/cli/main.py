@@ -15,6 +15,7 @@ from humangs_jax.cli.captures import ImportCameras, Synth
 from humangs_jax.cli.fit import Check, Fit
 from humangs_jax.cli.training import Convert, Train
 from humangs_jax.core.allocator import keep_freed_memory
+from humangs_jax.core.compile_cache import enable_compile_cache
 
 
 class Command(Protocol):
@@ -45,6 +46,7 @@ def main() -> None:
     """Entry point of the console script."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # XLA's notes would appear between our lines
     keep_freed_memory()
+    enable_compile_cache()
     try:
         tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="humangs", description=DESCRIPTION).run()
     except (ValueError, OSError) as error:

@@ -77,7 +77,7 @@ class Train:
         from humangs_jax.body.library import load_body
         from humangs_jax.network.weights import load_weights
         from humangs_jax.objectives.loss_networks import load_loss_networks
-        from humangs_jax.people.written import find_people
+        from humangs_jax.people import find_people
         from humangs_jax.training.diagnose import diagnose_run
         from humangs_jax.training.launch import fitting_losses, read_config, training_people
         from humangs_jax.training.loop import train
@@ -90,6 +90,7 @@ class Train:
         variables = None
         if self.init_weights is not None:
             variables, model = load_weights(self.init_weights)
+            model = dataclasses.replace(model, execution=settings.model.execution)
             settings = dataclasses.replace(settings, model=model)
         body = load_body()
         people = training_people(self.data, self.live, self.out, body)
@@ -150,8 +151,7 @@ class Convert:
             raise ValueError(f"--losses {losses}: the same file as --out")
         networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)
         converted = load_checkpoint(checkpoint, self.head_width)
-        sampling = dataclasses.replace(converted.config.sampling, pool=self.pool)
-        save_weights(out, converted.variables, dataclasses.replace(converted.config, sampling=sampling), self.dtype)
+        save_weights(out, converted.variables, converted.config.with_conventions(pool=self.pool), self.dtype)
         print(f"{out}: {describe(converted)}")
         if losses is None:
             print(f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*); --losses keeps them")

@@ -1,18 +1,49 @@
-"""Configurations (frozen dataclasses, nested) as JSON and back, checked against their annotations."""
+"""Configurations (frozen dataclasses, nested) as JSON and back, checked against their annotations.
 
+A field annotated with a `typing.Protocol` may hold any dataclass that follows it. Its JSON names the class under "kind", as
+"humangs_jax.network.encoder.PatchTransformer". Reading imports modules of this package only; others must be imported before.
+"""
+
+import contextlib
 import dataclasses
+import importlib
 import json
+import sys
 import types
 import typing
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 T = TypeVar("T")
+KIND = "kind"
+"""Key of the class of a part."""
+
+
+def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
+    """A field that trades accuracy or memory for speed: a row of docs/knobs.md.
+
+    cost, gain: in a few words. measured: the page of docs/ with the measurement.
+    """
+    return dataclasses.field(default=default, metadata={"cost": cost, "gain": gain, "measured": measured})
 
 
 def config_to_json(config: Any, indent: int | None = None) -> str:
     """A configuration as JSON, sub-configurations nested."""
-    return json.dumps(dataclasses.asdict(config), indent=indent)
+    return json.dumps(_plain(config), indent=indent)
+
+
+def _plain(value: Any, kind: bool = False) -> Any:
+    """A configuration as what JSON has. kind: whether the class must be named."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        annotations = typing.get_type_hints(type(value))
+        named = {KIND: f"{type(value).__module__}.{type(value).__qualname__}"} if kind else {}
+        names = [field.name for field in dataclasses.fields(value)]
+        return named | {name: _plain(getattr(value, name), _is_protocol(annotations[name])) for name in names}
+    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def _is_protocol(annotation):
+    return getattr(annotation, "_is_protocol", False)
 
 
 def config_from_json(cls: type[T], text: str) -> T:
@@ -23,7 +54,7 @@ def config_from_json(cls: type[T], text: str) -> T:
     try:
         values = json.loads(text)
     except json.JSONDecodeError as error:
-        raise ValueError(f"configuration is no JSON: {error}") from error
+        raise ValueError(f"the configuration is not JSON: {error}") from error
     return _build(cls, values, "config")
 
 
@@ -38,6 +69,9 @@ def config_from_file(cls: type[T], path: Path) -> T:
 def _build(annotation: Any, value: Any, path: str) -> Any:
     """A JSON value as what its annotation says."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if _is_protocol(annotation) and isinstance(value, dict):
+        cls = _find_part(value.get(KIND), annotation, path)
+        return _build_dataclass(cls, {name: x for name, x in value.items() if name != KIND}, path)
     if dataclasses.is_dataclass(annotation):
         return _build_dataclass(annotation, value, path)
     if origin in (typing.Union, types.UnionType):
@@ -53,7 +87,24 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
             return tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
     elif _matches(value, annotation):
         return value
-    raise ValueError(f"{path}: {value!r} is no {annotation}")
+    raise ValueError(f"{path}: {value!r} is not a {annotation}")
+
+
+def _find_part(kind, protocol, path):
+    """The class that a "kind" names."""
+    expected = f"{path}.{KIND}: expected the full name of a dataclass that is a {protocol.__name__}, got {kind!r}"
+    if not isinstance(kind, str) or "." not in kind:
+        raise ValueError(expected)
+    module, _, name = kind.rpartition(".")
+    if module not in sys.modules and module.startswith("humangs_jax."):
+        with contextlib.suppress(ImportError):
+            importlib.import_module(module)
+    if module not in sys.modules:
+        raise ValueError(f"{expected}: import the module {module} first")
+    cls = getattr(sys.modules[module], name, None)
+    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls) and issubclass(cls, protocol)):
+        raise ValueError(expected)
+    return cls
 
 
 def _build_dataclass(cls, values, path):

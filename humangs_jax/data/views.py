@@ -11,9 +11,9 @@ from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.network.humangs import HumanGSConfig, HumanGSInputs, subject_unit
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.rendering.mesh.position_map import gouraud_position_map, plain_position_map, vertex_normals
-from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
 MASK_THRESHOLD = 0.5
 """A pixel belongs to the person when its mask is above this."""
@@ -53,18 +53,16 @@ def pad_views(views: SubjectViews, count: int) -> SubjectViews:
 
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it."""
-    if config.body_vertices is not None and config.body_vertices < len(body.template):
-        body = decimate(body, config.body_vertices)
-    return body if config.longest_edge is None else split_long_edges(body, config.longest_edge)
+    vertices, edge = config.conventions.body_vertices, config.conventions.longest_edge
+    if vertices is not None and vertices < len(body.template):
+        body = decimate(body, vertices)
+    return body if edge is None else split_long_edges(body, edge)
 
 
-def prepare_inputs(
-    body: BodyModel, views: SubjectViews, config: HumanGSConfig, raster: RasterConfig | None = None
-) -> HumanGSInputs:
+def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
     """Pose the body for every view and rasterize it: position maps, depth maps and the foreground of the photos.
 
-    Pure and jittable; not meant to be differentiated with respect to the body. raster: how the mesh is rasterized, which
-    has no capacity that a scene could exceed; None: the default.
+    Pure and jittable; nothing here is differentiated with respect to the body.
     """
     rest = shape_body(body, views.betas)
 
@@ -74,11 +72,11 @@ def prepare_inputs(
     posed = jax.vmap(pose_view)(views.rotations, views.translations)
     unit = subject_unit(rest.vertices)
     canonical, cameras = rest.vertices / unit, views.cameras.in_units(unit)
-    draw = {"plain": plain_position_map, "gouraud": gouraud_position_map}[config.position_map]
+    draw = {"plain": plain_position_map, "gouraud": gouraud_position_map}[config.conventions.position_map]
 
     def rasterize_view(arguments):
         vertices, camera = arguments
-        return draw(vertices / unit, canonical, body.faces, camera, raster or RasterConfig())
+        return draw(vertices / unit, canonical, body.faces, camera, config.execution.raster)
 
     normals = lambda vertices: vertex_normals(vertices, body.faces)
 
@@ -93,8 +91,8 @@ def prepare_inputs(
         depth_maps=depth_maps,
         foreground=(views.masks > MASK_THRESHOLD) | (depth_maps >= 0),
         view_count=views.view_count,
-        posed_normals=jax.vmap(normals)(posed) if config.sampling.shells else None,
-        canonical_normals=normals(rest.vertices) if config.decoder.frame == "normal" else None,
+        posed_normals=jax.vmap(normals)(posed),
+        canonical_normals=normals(rest.vertices),
     )
 
 

@@ -6,10 +6,12 @@ A world point p is seen at K [R | t] p with (R | t) = `cam_from_world`; metres i
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from humangs_jax.core.array_types import Array, Float, Matrix3, Matrix4, Vector3
+from humangs_jax.core.checks import FINITE, POSITIVE, Values
 from humangs_jax.core.numerics import safe_normalize
-from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
 
 RIGID_TOLERANCE = 1e-3
@@ -17,8 +19,10 @@ RIGID_TOLERANCE = 1e-3
 
 
 @pytree_dataclass
-class Camera:
+class Camera(Batchable):
     """A pinhole camera, or a batch of cameras of one image size (leading axes on K and cam_from_world).
+
+    A batch can be indexed and iterated over: `for camera in cameras`.
 
     K: (3, 3) intrinsics in pixels. cam_from_world: (4, 4) rigid. width, height: pixels, static.
     """
@@ -77,9 +81,18 @@ class Camera:
         translation = self.cam_from_world[..., :3, 3] / unit
         return replace(self, cam_from_world=self.cam_from_world.at[..., :3, 3].set(translation))
 
-    def __getitem__(self, index: int | slice) -> "Camera":
-        """One camera (or some) of a batch."""
-        return jax.tree.map(lambda leaf: leaf[index], self)
+
+def camera_values(cameras: Camera) -> dict[str, tuple[Array | np.ndarray, Values]]:
+    """What `core.checks.check_values` needs to check one camera or a batch; they are few numbers, read on the host."""
+    K, cam_from_world = cameras.K, cameras.cam_from_world
+    if isinstance(K, Tracer) or isinstance(cam_from_world, Tracer):
+        return {"camera.K": (K, FINITE), "camera.cam_from_world": (cam_from_world, FINITE)}
+    K = np.asarray(K)
+    return {
+        "camera.K": (K, FINITE),
+        "camera.K focal lengths": (K[..., [0, 1], [0, 1]], POSITIVE),
+        "camera.cam_from_world": (np.asarray(cam_from_world), FINITE),
+    }
 
 
 def stack_cameras(cameras: list[Camera]) -> Camera:

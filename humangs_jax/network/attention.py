@@ -12,8 +12,7 @@ softmax is always float32), and "chunked" otherwise. On a CPU of two cores, 4,09
 2.6 s of processor time and 7.9 with its gradient, "chunked" 0.8 and 2.9 (experiments/benchmark_attention.py).
 """
 
-import dataclasses
-from typing import Any, Literal
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -21,34 +20,19 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.network.execution import AttentionKernel, Execution
 
 NORM_EPSILON = 1e-5
 PRODUCT = "product"
-"""Name of the arrays of a block that `TransformerConfig.remat_policy` may keep for the backward pass."""
+"""Name of the arrays of a block that `Execution.remat` "dots" may keep for the backward pass."""
 XLA_TOKENS = 8192
 """Up to here L x L logits of all heads fit beside a model on any accelerator (12 heads, float32: 3 GB a layer)."""
 
-Resolved = Literal["xla", "cudnn", "chunked"]
-Implementation = Literal["auto", Resolved]
 
-
-@dataclasses.dataclass(frozen=True)
-class AttentionConfig:
-    """head_width: features per head. qk_norm: RMSNorm over the head on q and k.
-
-    implementation: see the module. query_chunk: queries per block of the chunked form.
-    """
-
-    head_width: int = 64
-    qk_norm: bool = True
-    implementation: Implementation = "auto"
-    query_chunk: int = 1024
-
-
-def resolve_implementation(implementation: Implementation, tokens: int, dtype: Any) -> Resolved:
+def resolve_implementation(implementation: str, tokens: int, dtype: Any) -> AttentionKernel:
     """What "auto" stands for on the default backend, for that many tokens of that dtype."""
     if implementation != "auto":
-        return implementation
+        return cast(AttentionKernel, implementation)
     backend = jax.default_backend()
     if backend == "gpu" and jnp.dtype(dtype).itemsize == 2:
         return "cudnn"
@@ -95,7 +79,7 @@ def attention(
     k: Float[Array, "l h e"],
     v: Float[Array, "l h e"],
     count: Int[Array, ""] | None = None,
-    implementation: Implementation = "auto",
+    implementation: str = "auto",
     query_chunk: int = 1024,
 ) -> Float[Array, "l h e"]:
     """Attention of every token to the first `count` tokens (None: to all)."""
@@ -112,23 +96,24 @@ def attention(
 class Attention(nn.Module):
     """Multi-head self-attention without biases; tokens (l, d) -> (l, d)."""
 
-    config: AttentionConfig
+    head_width: int
+    qk_norm: bool
+    execution: Execution
     kernel_init: Any
-    dtype: Any = None
 
     @nn.compact
     def __call__(self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> Float[Array, "l d"]:
         length, width = tokens.shape
-        heads = width // self.config.head_width
+        heads, dtype = width // self.head_width, self.execution.compute_dtype
         dense = lambda features, name: nn.Dense(
-            features, use_bias=False, dtype=self.dtype, kernel_init=self.kernel_init, name=name
+            features, use_bias=False, dtype=dtype, kernel_init=self.kernel_init, name=name
         )
         qkv = checkpoint_name(dense(3 * width, "qkv")(tokens), PRODUCT)
-        qkv = qkv.reshape(length, 3, heads, self.config.head_width)
+        qkv = qkv.reshape(length, 3, heads, self.head_width)
         q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
-        if self.config.qk_norm:
-            q = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=self.dtype, name="q_norm")(q)
-            k = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=self.dtype, name="k_norm")(k)
-        out = attention(q, k, v, count, self.config.implementation, self.config.query_chunk)
+        if self.qk_norm:
+            q = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name="q_norm")(q)
+            k = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name="k_norm")(k)
+        out = attention(q, k, v, count, self.execution.attention, self.execution.attention_chunk)
         out = checkpoint_name(out, PRODUCT)
         return dense(width, "out")(out.reshape(length, width))

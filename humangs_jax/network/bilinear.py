@@ -14,11 +14,11 @@ import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float
 
-Convention = Literal["half_pixel", "mixed"]
+PixelGrid = Literal["half_pixel", "mixed"]
 
 
 def texel_indices(
-    pixels: Float[Array, "*p 2"], image_size: tuple[int, int], grid_size: tuple[int, int], convention: Convention
+    pixels: Float[Array, "*p 2"], image_size: tuple[int, int], grid_size: tuple[int, int], convention: PixelGrid
 ) -> Float[Array, "*p 2"]:
     """Positions in pixels of an image -> texel indices of a grid that covers it; sizes are (width, height)."""
     image, grid = jnp.asarray(image_size, pixels.dtype), jnp.asarray(grid_size, pixels.dtype)

@@ -10,18 +10,20 @@ import functools
 import os
 import statistics
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from humangs_jax.io.tensor_file import is_safetensors, read_tensors, safetensors_metadata
-from humangs_jax.network.attention import AttentionConfig
-from humangs_jax.network.humangs import HumanGSConfig, Variables
+from humangs_jax.network.config import Architecture, HumanGSConfig, paper_parts
+from humangs_jax.network.encoder import PatchTransformer
+from humangs_jax.network.parts import Variables
 from humangs_jax.network.presets import published
+from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.triplane import TriplaneConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
-from humangs_jax.network.vertex_decoder import VertexDecoderConfig
+from humangs_jax.network.vertex_decoder import VertexDecoder
 from humangs_jax.network.weights import FORMAT, expected_variables, flatten_variables, variables_from_tensors
 
 LOSS_PREFIX = "loss_computer."
@@ -82,7 +84,7 @@ MODULES = {  # our module: the release's, and the layout of its weight
     "encoder/upsampler/conv1_norm": ("upsampler.up1.4", SAME),
     "encoder/upsampler/up2": ("upsampler.up2.0", TRANSPOSED_CONVOLUTION),
     "encoder/upsampler/up2_norm": ("upsampler.up2.1", SAME),
-    "readout": ("upsampler.up2.3", CONVOLUTION),
+    "reader": ("upsampler.up2.3", CONVOLUTION),
     "decoder/trunk_0": ("vertex_decoder.trunk.0", LINEAR),
     "decoder/trunk_1": ("vertex_decoder.trunk.2", LINEAR),
     "decoder/geometry_hidden": ("vertex_decoder.geo_head.0", LINEAR),
@@ -180,18 +182,15 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
         raise ValueError(
             f"tensor 'image_tokenizer.1.weight' has {patch_numbers} inputs: no square patch of {per_pixel} channels"
         )
-    upsampler = dataclasses.replace(base.upsampler, enabled=False)
+    upsampler, output_width = None, None
     if has("upsampler."):
-        upsampler = UpsamplerConfig(
-            hidden=shape("upsampler.proj.0.weight", 4)[0], out=shape("upsampler.up2.3.weight", 4)[0]
-        )
+        upsampler = UpsamplerConfig(hidden=shape("upsampler.proj.0.weight", 4)[0])
+        output_width = shape("upsampler.up2.3.weight", 4)[0]
     gaussians = max(1, shape("vertex_decoder.geo_head.2.weight", 2)[0] // 10)
     joints = None
     if has("vertex_decoder.lbs_head."):
         joints = shape("vertex_decoder.lbs_head.2.weight", 2)[0] // gaussians
-    return dataclasses.replace(
-        base,
-        image_size=patch * max(1, base.image_size // patch),
+    encoder = PatchTransformer(
         patch_size=patch,
         texture=TriplaneConfig(resolution, channels),
         transformer=TransformerConfig(
@@ -199,13 +198,17 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
             layers=_count_layers(state),
             mlp_ratio=max(1, shape("transformer_blocks.0.mlp.mlp.0.weight", 2)[0] // width),
             class_token="cls_token" in state,
-            attention=_infer_attention(state, head_width),
+            **_infer_heads(state, head_width),
         ),
         upsampler=upsampler,
-        decoder=VertexDecoderConfig(
-            hidden=shape("vertex_decoder.trunk.0.weight", 2)[0], tight=1, free=gaussians - 1, skinning_joints=joints
-        ),
     )
+    decoder = VertexDecoder(
+        hidden=shape("vertex_decoder.trunk.0.weight", 2)[0], tight=1, free=gaussians - 1, skinning_joints=joints
+    )
+    size = patch * max(1, base.conventions.image_size // patch)
+    conventions = dataclasses.replace(base.conventions, image_size=size)
+    architecture = Architecture(encoder, PixelAlignedReader(output_width=output_width), decoder)
+    return HumanGSConfig(architecture, conventions, base.execution)
 
 
 def _shape(state: StateDict, key: str, axes: int) -> tuple[int, ...]:
@@ -224,18 +227,18 @@ def _count_layers(state: StateDict) -> int:
     return len(indices)
 
 
-def _infer_attention(state: StateDict, head_width: int | None) -> AttentionConfig:
-    """The width of a head is that of its norms, where there are any."""
+def _infer_heads(state: StateDict, head_width: int | None) -> dict[str, Any]:
+    """Width of a head, which is that of its norms, and whether there are norms."""
     if not any(key.endswith((".attn.q_norm.weight", ".attn.k_norm.weight")) for key in state):
         if head_width is None:
             raise ValueError("no tensor 'transformer_blocks.0.attn.q_norm.weight' tells the width of a head: give it")
         if head_width < 1:
             raise ValueError(f"the width of a head must be at least 1, got {head_width}")
-        return AttentionConfig(head_width=head_width, qk_norm=False)
+        return {"head_width": head_width, "qk_norm": False}
     (found,) = _shape(state, "transformer_blocks.0.attn.q_norm.weight", 1)
     if head_width not in (None, found):
         raise ValueError(f"tensor 'transformer_blocks.0.attn.q_norm.weight' says heads of {found}, not {head_width}")
-    return AttentionConfig(head_width=found)
+    return {"head_width": found, "qk_norm": True}
 
 
 def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
@@ -263,7 +266,7 @@ def load_checkpoint(path: str | os.PathLike, head_width: int | None = None) -> C
     try:
         config = infer_config(state, head_width)
         vertices, joints = _shape(state, SKINNING_WEIGHTS, 2)
-        skinning_shape = (vertices, config.decoder.skinning_joints or joints)
+        skinning_shape = (vertices, paper_parts(config.architecture)[2].skinning_joints or joints)
         _check(state, expected_shapes(config) | {SKINNING_WEIGHTS: skinning_shape})
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
@@ -277,19 +280,20 @@ def load_checkpoint(path: str | os.PathLike, head_width: int | None = None) -> C
 def describe(converted: Converted) -> str:
     """The network in one line."""
     config, leaves = converted.config, flatten_variables(converted.variables["params"]).values()
-    transformer, decoder = config.transformer, config.decoder
+    encoder, _, decoder = paper_parts(config.architecture)
+    transformer = encoder.transformer
     parts = [
         f"{sum(x.size for x in leaves):,} parameters",
         f"width {transformer.width}",
-        f"{transformer.layers} layers of {transformer.width // transformer.attention.head_width} heads",
-        f"patches of {config.patch_size}",
-        f"texture {config.texture.resolution} x {config.texture.channels}",
+        f"{transformer.layers} layers of {transformer.width // transformer.head_width} heads",
+        f"patches of {encoder.patch_size}",
+        f"texture {encoder.texture.resolution} x {encoder.texture.channels}",
         f"{decoder.gaussians_per_vertex} Gaussians a vertex",
     ]
     optional = {
         "class token": transformer.class_token,
-        "normalised queries and keys": transformer.attention.qk_norm,
-        "upsampler": config.upsampler.enabled,
+        "normalised queries and keys": transformer.qk_norm,
+        "upsampler": encoder.upsampler is not None,
         "skinning head": decoder.skinning_joints is not None,
     }
     return ", ".join(parts + [name if there else f"no {name}" for name, there in optional.items()])

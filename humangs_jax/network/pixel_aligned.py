@@ -1,13 +1,9 @@
-"""Pixel-aligned features: vertices projected into the photographs, maps read there, views pooled.
+"""Pixel-aligned features: vertices projected into the photos, maps read there, views pooled.
 
-Lengths are normalised units throughout (see `network.humangs`): cameras, vertices and depth maps alike.
+Lengths are normalised units throughout (see `network.inputs`): cameras, vertices and depth maps alike.
 """
 
-import dataclasses
-import itertools
-import math
 from collections.abc import Callable
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +11,7 @@ import jax.numpy as jnp
 from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.network.bilinear import Convention, sample_bilinear, sample_nearest, texel_indices
+from humangs_jax.network.bilinear import PixelGrid, sample_bilinear, sample_nearest, texel_indices
 
 DEPTH_EPSILON = 1e-6
 """Added to z before the division, as published."""
@@ -25,31 +21,6 @@ COUNT_EPSILON = 1e-8
 """Added to the number of pooled views, as published: no view at all gives zeros."""
 UNSEEN_COLOR = 0.5
 """Photo colour of a vertex that no view sees."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PixelAlignedConfig:
-    """How vertices read the photographs.
-
-    pool: "visible" averages over the views that see the vertex (paper), "all" over every view (release).
-    convention: "half_pixel" is correct, "mixed" is the published one (see `network.bilinear`).
-    sample_rgb: also read the photo colour at each vertex, averaged over the views that see it, and their fraction.
-    vertex_capacity: vertices that a view is read for at most, None for all: views cost nothing where they see nothing.
-    shells: ascending distances along the vertex normals, normalised units, at which the photographs are looked up too, see
-    `network.shells`; none: that is left out.
-    """
-
-    pool: Literal["visible", "all"] = "visible"
-    convention: Convention = "half_pixel"
-    sample_rgb: bool = False
-    vertex_capacity: int | None = None
-    shells: tuple[float, ...] = ()
-
-    def __post_init__(self):
-        """Raises ValueError for distances that are no ascending list."""
-        ascending = all(a < b for a, b in itertools.pairwise(self.shells))
-        if not (ascending and all(0 <= x < math.inf for x in self.shells)):
-            raise ValueError(f"shells {self.shells}: expected ascending distances, finite and at least 0")
 
 
 def project_vertices(camera: Camera, vertices: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
@@ -67,14 +38,14 @@ def visible_vertices(
     depths: Float[Array, " n"],
     depth_map: Float[Array, "h w"],
     image_size: tuple[int, int],
-    convention: Convention,
+    grid: PixelGrid,
 ) -> Bool[Array, " n"]:
     """Which projected vertices lie inside the image, in front of the camera and not behind the rasterized surface.
 
     depth_map: rasterized z, -1 on background, so that a vertex over background is unseen. image_size: (width, height).
     """
     height, width = depth_map.shape
-    indices = texel_indices(pixels, image_size, (width, height), convention)
+    indices = texel_indices(pixels, image_size, (width, height), grid)
     surface = sample_nearest(depth_map, indices)
     inside = jnp.all((pixels > 0) & (pixels < jnp.asarray(image_size, pixels.dtype)), axis=-1)
     return inside & (depths > 0) & (depths < surface + DEPTH_TOLERANCE)
@@ -89,19 +60,19 @@ def sum_over_views(
 ) -> PyTree:
     """Sum over views of weight * read(map of the view, texel indices), one view after the other: memory for one.
 
-    read: (h, w, c), (m, 2) -> a pytree of (m, ...). capacity: a view is read for so many vertices at most, the first
-    ones of positive weight; None reads it for all of them, also where the weight is zero.
+    read: (h, w, c), (m, 2) -> a pytree of (m, ...). capacity: vertices for which a view is read at most, the first ones of
+    positive weight; None reads it for all of them, also where the weight is zero.
     """
     vertices = weights.shape[1]
 
     @jax.checkpoint  # what was read is read again for gradients: it is larger than the maps
     def add_view(total, view):
-        grid, positions, weight = view
+        texels, positions, weight = view
         if capacity is None or capacity >= vertices:
-            values = read(grid, positions)
+            values = read(texels, positions)
             return jax.tree.map(lambda t, x: t + _times(weight, x), total, values), None
         seen = jnp.nonzero(weight > 0, size=capacity, fill_value=vertices)[0]
-        values = read(grid, positions.at[seen].get(mode="fill", fill_value=0))
+        values = read(texels, positions.at[seen].get(mode="fill", fill_value=0))
         weight = weight.at[seen].get(mode="fill", fill_value=0)
         return jax.tree.map(lambda t, x: t.at[seen].add(_times(weight, x), mode="drop"), total, values), None
 
@@ -122,11 +93,11 @@ def dropped_reads(weights: Float[Array, "v n"], capacity: int | None) -> Int[Arr
 
 
 def photo_colors(
-    images: Float[Array, "v h w 3"], pixels: Float[Array, "v n 2"], visible: Bool[Array, "v n"], convention: Convention
+    images: Float[Array, "v h w 3"], pixels: Float[Array, "v n 2"], visible: Bool[Array, "v n"], grid: PixelGrid
 ) -> Float[Array, "n 3"]:
     """Mean photo colour over the views that see each vertex, grey where none does."""
     size = (images.shape[2], images.shape[1])
-    colors = jax.vmap(sample_bilinear)(images, texel_indices(pixels, size, size, convention))
+    colors = jax.vmap(sample_bilinear)(images, texel_indices(pixels, size, size, grid))
     counts = jnp.sum(visible, axis=0)[:, None]
     mean = jnp.einsum("vnc,vn->nc", colors, visible.astype(colors.dtype)) / jnp.maximum(counts, 1)
     return jnp.where(counts > 0, mean, UNSEEN_COLOR)

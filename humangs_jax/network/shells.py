@@ -1,8 +1,8 @@
-"""Points off the body's surface, looked up in all photographs: where loose clothes and hair are, and their colour.
+"""Points off the body's surface, looked up in all photos: where loose clothes and hair are, and their colour.
 
-Each vertex has one point at every distance of a list along its posed normal. A point that some photograph shows before
-the background alone belongs to nobody; those that all photographs show before the person are in the visual hull
-(Laurentini 1994). Lengths are normalised units, as in `pixel_aligned`.
+Each vertex has one point at every distance of a list along its posed normal. Where a photo shows the background, the point is not
+part of the person. Points that all photos show on the person are in the visual hull (Laurentini 1994). Lengths are
+normalised units, as in `pixel_aligned`.
 """
 
 import jax
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.network.bilinear import Convention, sample_bilinear, sample_nearest, texel_indices
+from humangs_jax.network.bilinear import PixelGrid, sample_bilinear, sample_nearest, texel_indices
 from humangs_jax.network.pixel_aligned import DEPTH_TOLERANCE, UNSEEN_COLOR, project_vertices
 
 WEIGHT_EPSILON = 1e-6
@@ -22,12 +22,12 @@ SQUARED_DISTANCE_EPSILON = 1e-6
 
 @pytree_dataclass
 class Shells:
-    """What the photographs say of the points s along the normal of each vertex.
+    """What the photos show at the s points along the normal of each vertex.
 
-    distances: (s,). colors: (n, s, 3) mean photo colour over the views that see the point before the person, weighted by
-    how much the posed normal faces them; grey where none does. seen: (n, s) the sum of those weights over the number of
-    views. inside: (n, s) share of the views with the point before the person. hull: (n, s) the
-    least of them, 0 outside of the visual hull. Views whose picture ends before the point say nothing; without any both are 1.
+    distances: (s,). colors: (n, s, 3) mean photo colour over the views in which the point is visible and on the person, weighted
+    by how much the posed normal faces them; grey without such a view. seen: (n, s) the sum of those weights over the number of
+    views. inside: (n, s) mean mask at the point over the views that contain it. hull: (n, s) the minimum of the same, 0
+    outside of the visual hull. A view that does not contain the point is ignored; without any view both are 1.
     """
 
     distances: Float[Array, " s"]
@@ -46,7 +46,7 @@ def sample_shells(
     normals: Float[Array, "v n 3"],
     distances: tuple[float, ...],
     present: Bool[Array, " v"],
-    convention: Convention,
+    grid: PixelGrid,
 ) -> Shells:
     """Look the points at `distances` from the posed vertices up in every view that is `present`.
 
@@ -60,8 +60,8 @@ def sample_shells(
     def view(image, mask, depth_map, camera, vertices, normals):
         points = (vertices[:, None] + steps[:, None] * normals[:, None]).reshape(-1, 3)
         pixels, depths = project_vertices(camera, points)
-        indices = texel_indices(pixels, size, size, convention)
-        mask = mask[..., None].astype(image.dtype)  # the background's colour is nobody's
+        indices = texel_indices(pixels, size, size, grid)
+        mask = mask[..., None].astype(image.dtype)  # the colour of the background is not used
         read = sample_bilinear(jnp.concatenate([image * mask, mask], axis=-1), indices)
         surface = sample_nearest(depth_map, indices)
         framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (depths > 0)
@@ -78,11 +78,11 @@ def sample_shells(
     mean = jnp.einsum("vpc,vp->pc", colors, weights) / jnp.maximum(total, WEIGHT_EPSILON)[:, None]
     known = jnp.sum(framed, axis=0)
     inside = jnp.where(known > 0, jnp.sum(masks * framed, axis=0) / jnp.maximum(known, 1), 1)
-    grid = lambda x: x.reshape(count, len(distances), *x.shape[1:])
+    by_vertex = lambda x: x.reshape(count, len(distances), *x.shape[1:])
     return Shells(
         distances=steps,
-        colors=grid(jnp.where((total > WEIGHT_EPSILON)[:, None], mean, UNSEEN_COLOR)),
-        seen=grid(total / jnp.maximum(jnp.sum(present), 1)),
-        inside=grid(inside),
-        hull=grid(jnp.min(jnp.where(framed, masks, 1), axis=0)),
+        colors=by_vertex(jnp.where((total > WEIGHT_EPSILON)[:, None], mean, UNSEEN_COLOR)),
+        seen=by_vertex(total / jnp.maximum(jnp.sum(present), 1)),
+        inside=by_vertex(inside),
+        hull=by_vertex(jnp.min(jnp.where(framed, masks, 1), axis=0)),
     )

@@ -1,10 +1,10 @@
-"""From photographs to tokens: patches of rgb, Plücker rays and neural texture, one bias-free linear map.
+"""From photos to tokens: patches of rgb, Plücker rays and neural texture, one bias-free linear map.
 
 Channel order of a pixel: 2 rgb - 1 (3), moment (3), direction (3), texture planes xy, xz, yz. Channels run fastest
 inside a pixel, pixels row-major inside a patch, patches row-major inside a view, views in their order.
 """
 
-from typing import Any, Literal
+from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -15,8 +15,6 @@ from humangs_jax.network.transformer import INIT_STD
 from humangs_jax.network.triplane import TriplaneConfig, sample_triplane
 
 TEXTURE_STD = 0.1
-
-TokenSelection = Literal["all", "foreground"]
 
 
 @pytree_dataclass
@@ -54,6 +52,8 @@ def unpack_tokens(tokens: Float[Array, "l d"], packing: Packing, patches: int) -
 class Tokenizer(nn.Module):
     """Patches of pixels (l, pixels, 12: rgb, rays, canonical position) -> tokens (l, d); owns the neural texture."""
 
+    stage_name = "tokens"
+    learned_input = False
     width: int
     texture: TriplaneConfig
     dtype: Any = None

@@ -5,7 +5,8 @@ convolution of stride 2 (2H -> H, H -> H/2), norm, LeakyReLU, and a 3x3 convolut
 bare). Maps are (v, h, w, c).
 
 The last convolution is half of that arithmetic, and only body vertices read what it computes, from positions between
-its pixels. So it is a module of its own, `Readout`, that is applied to what the vertices have read of its input.
+its pixels. So it is a module of its own, `OutputConvolution`, that the reader applies to what the vertices have read of
+its input.
 """
 
 import dataclasses
@@ -30,14 +31,9 @@ KAIMING_TRANSPOSED = nn.initializers.variance_scaling(2.0, "fan_in", "normal")
 
 @dataclasses.dataclass(frozen=True)
 class UpsamplerConfig:
-    """enabled: off, the map is the final token map itself (ablation). hidden, out: widths, see the module.
+    """hidden: width, see the module. features: "intermediate" aggregates four depths, "final" upsamples the last (ablation)."""
 
-    features: "intermediate" aggregates four depths, "final" upsamples the last one only (ablation).
-    """
-
-    enabled: bool = True
     hidden: int = 256
-    out: int = 768
     features: Literal["intermediate", "final"] = "intermediate"
 
 
@@ -71,7 +67,7 @@ class UpConvolution(nn.Module):
         return y.reshape(views, 2 * height, 2 * width, self.features) + bias
 
 
-class Readout(nn.Module):
+class OutputConvolution(nn.Module):
     """The last convolution, 3x3: (n, 9 c) neighbourhoods and (n,) coverages, pooled over views -> (n, features).
 
     See `network.neighborhoods`. `everywhere` convolves a map instead; it is for looking at maps.
@@ -100,10 +96,12 @@ class Readout(nn.Module):
 
 
 class Upsampler(nn.Module):
-    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, hidden / 2), input of `Readout`.
+    """Token maps, each (v, h, w, d) -> (v, 4h, 4w, hidden / 2), input of `OutputConvolution`.
 
     axis_name: vmap axis to share batch statistics over.
     """
+
+    stage_name = "maps"
 
     config: UpsamplerConfig
     dtype: Any = None

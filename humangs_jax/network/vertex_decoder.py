@@ -1,23 +1,26 @@
 """From features of a body vertex to its K Gaussians.
 
 Input of a vertex: pooled local feature, global token, positional encoding of the canonical position, and optionally its
-photo colour, the fraction of views that see it, and what the photographs show at distances along its normal. The first
+photo colour, the fraction of views that see it, and what the photos show at distances along its normal. The first
 `tight` Gaussians of a vertex are those whose offsets a loss keeps small.
 """
 
 import dataclasses
-from typing import Literal
+from typing import Literal, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Float, Key
 from humangs_jax.core.numerics import inverse_sigmoid
-from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
-from humangs_jax.network.shells import Shells
+from humangs_jax.network.inputs import HumanGSInputs, subject_unit
+from humangs_jax.network.parts import HumanGSOutputs, Pass, Variables
+from humangs_jax.network.reader import VertexFeatures
+from humangs_jax.rendering.gaussians import Gaussians
 
 FREQUENCIES = (1, 2, 4, 8, 16, 32)
 INIT_STD = 0.02
@@ -29,18 +32,18 @@ COLOR_MARGIN = 0.01
 WEIGHT_EPSILON = 1e-9
 """Added to skinning weights before their logarithm, as published."""
 THINNER = 1.2
-"""Less in the bias of the scale along the normal: a third of the thickness, so that outlines are sharp."""
+"""Subtracted from the bias of the scale along the normal: a third of the thickness, so that outlines are sharp."""
 OBLIQUE = (0.36, 0.48, 0.8)
-"""A unit vector, no axis of a body: where normals are opposite, in few places, frames turn quickly between vertices."""
-SHELL_WIDTH = 6
-"""Numbers that enter per shell: colour, seen, inside, hull."""
+"""A unit vector along no axis of a body. Where normals are opposite to it, frames turn quickly between vertices."""
 INITIAL_SHELL = 4.0
 """Logit of the nearest shell, of 0 elsewhere: Gaussians start near the surface."""
 
 
 @dataclasses.dataclass(frozen=True)
-class VertexDecoderConfig:
-    """hidden: width. tight, free: Gaussians per vertex of the two kinds, K = tight + free.
+class VertexDecoder:
+    """The paper's decoder: a light MLP from the features of a vertex to its Gaussians.
+
+    hidden: width. tight, free: Gaussians per vertex of the two kinds, K = tight + free.
 
     skinning_joints: joints of the head that corrects skinning weights, None without it. offset_scale: offsets are
     bounded to it by tanh (normalised units; what shells add is not), None leaves them unbounded as published.
@@ -58,28 +61,58 @@ class VertexDecoderConfig:
     frame: Literal["canonical", "normal"] = "canonical"
     residual_color: bool = False
 
+    def __post_init__(self):
+        """Raises ValueError without a Gaussian."""
+        if self.gaussians_per_vertex < 1:
+            raise ValueError("decoder: tight + free must be at least 1")
+
     @property
     def gaussians_per_vertex(self) -> int:
         """K."""
         return self.tight + self.free
 
+    def init(self, key: Key, features: VertexFeatures, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{"params"} of `DecoderModule`."""
+        entering = jax.eval_shape(self._entering, features, inputs)
+        return cast(Variables, self._module(features).init(key, jnp.zeros((1, entering.shape[-1]))))
 
-@pytree_dataclass
-class VertexFeatures:
-    """What the photographs say of each vertex.
+    def apply(self, variables: Variables, features: VertexFeatures, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+        """Gaussians of the n vertices, vertex-major, metres. Raises ValueError for features that lack the normals."""
+        unit = subject_unit(inputs.canonical_vertices)
+        canonical = inputs.canonical_vertices / unit
 
-    local: (n, d) pooled feature. global_token: (d',) or None. photo_colors: (n, 3) and visible_fraction: (n,), or None.
-    shells: points off the surface, or None. normals: (n, 3) unit, of the canonical body, or None.
-    dropped_reads: how many vertices, over all views, were not read for want of capacity; None: not counted.
-    """
+        def heads(learned):
+            entering = self._entering(replace(features, **learned), inputs)
+            return cast(RawGaussians, self._module(features).apply(variables, entering))
 
-    local: Float[Array, "n d"]
-    global_token: Float[Array, " e"] | None = None
-    photo_colors: Float[Array, "n 3"] | None = None
-    visible_fraction: Float[Array, " n"] | None = None
-    shells: Shells | None = None
-    normals: Float[Array, "n 3"] | None = None
-    dropped_reads: Int[Array, ""] | None = None
+        raw = run.stage("raw heads", heads, {"local": features.local, "global_token": features.global_token})
+        return run.stage("canonical Gaussians", lambda raw: self._assemble(raw, features, canonical, unit), raw)
+
+    def _module(self, features: VertexFeatures):
+        return DecoderModule(self, 0 if features.shells is None else features.shells.distances.shape[0])
+
+    def _entering(self, features: VertexFeatures, inputs: HumanGSInputs) -> Float[Array, "n c"]:
+        if self.frame == "normal" and features.normals is None:
+            raise ValueError('decoder.frame "normal" needs canonical_normals of the inputs, see `prepare_inputs`')
+        features = features if self.frame == "normal" else replace(features, normals=None)
+        return decoder_input(features, inputs.canonical_vertices / subject_unit(inputs.canonical_vertices))
+
+    def _assemble(self, raw: "RawGaussians", features: VertexFeatures, canonical: Array, unit: Array) -> HumanGSOutputs:
+        at_vertices = activate(raw, self, features)
+        flat = lambda x: x.reshape(-1, *x.shape[2:])
+        return HumanGSOutputs(
+            gaussians=Gaussians(
+                means=flat(canonical[:, None] + at_vertices.offsets) * unit,
+                quats=flat(at_vertices.quats),
+                scales=flat(at_vertices.scales) * unit,
+                opacities=flat(at_vertices.opacities),
+                colors=flat(at_vertices.colors),
+            ),
+            tight_offsets=at_vertices.offsets[:, : self.tight],
+            skinning_offsets=None if raw.skinning is None else flat(raw.skinning),
+            dropped_tokens=jnp.zeros((), jnp.int32),
+            dropped_reads=jnp.zeros((), jnp.int32) if features.dropped_reads is None else features.dropped_reads,
+        )
 
 
 @pytree_dataclass
@@ -143,7 +176,7 @@ def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
     return quaternion.multiply(quaternion.between(oblique, normals), upright)
 
 
-def activate(raw: RawGaussians, config: VertexDecoderConfig, features: VertexFeatures | None = None) -> VertexGaussians:
+def activate(raw: RawGaussians, config: VertexDecoder, features: VertexFeatures | None = None) -> VertexGaussians:
     """Quaternion normalised, scale softplus, colour and opacity sigmoid, offset bounded if so configured.
 
     With shells each Gaussian chooses between them by weights that sum to 1; the mean distance along the normal and the mean
@@ -181,14 +214,14 @@ def corrected_skinning_weights(
     return jax.nn.softmax(jnp.log(weights + WEIGHT_EPSILON) + offsets, axis=-1)
 
 
-class VertexDecoder(nn.Module):
+class DecoderModule(nn.Module):
     """Decoder inputs (n, c) -> raw heads, in float32 at least.
 
     That is a thousandth of the published network's arithmetic, and bfloat16 here would double the error of its
     Gaussians.
     """
 
-    config: VertexDecoderConfig
+    config: VertexDecoder
     shells: int = 0
 
     @nn.compact

@@ -1,10 +1,11 @@
-"""Weights on disk: one safetensors file, tensors under their path in the variables, the configuration in its header.
+"""Weights on disk: one safetensors file, tensors under their path in the variables, what they are in its header.
 
 Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format": "humangs-weights",
-"version": "1", "config": JSON of the configuration}. float16 halves the file (and rounds to 11 bits); loading gives
-float32.
+"version": "2", "architecture": JSON, "conventions": JSON}. Files of version 1 (one "config", which said how the network ran, too)
+still load. float16 halves the file (and rounds to 11 bits); loading gives float32.
 """
 
+import json
 import os
 from importlib import resources
 from pathlib import Path
@@ -15,10 +16,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.configuration import config_from_json, config_to_json
-from humangs_jax.network.humangs import HumanGSConfig, Variables, init_humangs
+from humangs_jax.io.atomic import replace_file
+from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
+from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.parts import Variables
 
 FORMAT = "humangs-weights"
-VERSION = "1"
+VERSION = "2"
 SHIPPED = "assets/weights.safetensors"
 HEADS = "params/decoder/"
 
@@ -51,21 +55,16 @@ def save_weights(
         for key, tensor in tensors.items():
             if np.abs(tensor).max(initial=0) > np.finfo(np.float16).max:
                 raise ValueError(f"{key}: overflows float16; store it as float32")
-    metadata = {"format": FORMAT, "version": VERSION, "config": config_to_json(config)}
+    recorded = {name: config_to_json(getattr(config, name)) for name in ("architecture", "conventions")}
+    metadata = {"format": FORMAT, "version": VERSION, **recorded}
     data = save({key: np.ascontiguousarray(x, np.dtype(dtype)) for key, x in tensors.items()}, metadata)
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_bytes(data)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    replace_file(Path(path), lambda temporary: temporary.write_bytes(data))
 
 
 def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, HumanGSConfig]:
-    """Variables (float32) and configuration of a file; None loads the weights that come with the package.
+    """Variables (float32) and configuration of a file, with default `Execution`; None loads the weights of this package.
 
-    Raises: FileNotFoundError; ValueError if the file is no weights file of ours, or a tensor is missing, unknown, of
+    Raises: FileNotFoundError; ValueError if the file is not a weights file of this package, or a tensor is missing, unknown, of
     the wrong shape or not finite, naming file and key.
     """
     if path is None:
@@ -82,12 +81,19 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no mapping)
     except (SafetensorError, TypeError) as error:
-        raise ValueError(f"{path} is no readable safetensors file: {error}") from error
-    if metadata.get("format") != FORMAT or metadata.get("version") != VERSION:
+        raise ValueError(f"{path} is not a readable safetensors file: {error}") from error
+    if metadata.get("format") != FORMAT or metadata.get("version") not in ("1", VERSION):
         found = f"format {metadata.get('format')!r}, version {metadata.get('version')!r}"
-        raise ValueError(f"{path}: expected header format {FORMAT!r}, version {VERSION!r}; found {found}")
+        raise ValueError(f"{path}: expected header format {FORMAT!r}, version {VERSION!r} or '1'; found {found}")
     try:
-        config = config_from_json(HumanGSConfig, metadata.get("config", ""))
+        if metadata["version"] == VERSION:
+            config = HumanGSConfig(
+                config_from_json(Architecture, metadata.get("architecture", "")),
+                config_from_json(Conventions, metadata.get("conventions", "")),
+            )
+        else:
+            config = config_of_version_1(metadata.get("config", ""))
+            tensors = {key.replace("params/readout/", "params/reader/"): x for key, x in tensors.items()}
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     return variables_from_tensors(tensors, config, str(path)), config
@@ -96,28 +102,33 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
 def fit_variables(variables: Variables, old: HumanGSConfig, new: HumanGSConfig) -> Variables:
     """Variables of the network `old` for the network `new`, to train on.
 
-    `new` may have shells where `old` has none, another number of free Gaussians and other settings without tensors. What is
-    new starts as initialised, but unheard where it enters a layer (0). With another `decoder.frame` offsets and rotations
-    start anew: theirs are of other axes. Raises: ValueError naming the setting or the tensor if more differs.
+    Both have the paper's reader and decoder. `new` may have shells where `old` has none, another number of free Gaussians and
+    other settings without tensors. New tensors start as initialised, and with zero weight where they enter a layer. With
+    another `decoder.frame` offsets and rotations are initialised again, because their axes differ.
+
+    Raises: ValueError naming the setting or the tensor if more differs.
     """
-    for part, name in (("sampling", "sample_rgb"), ("decoder", "tight")):  # either shifts what tensors hold
-        was, wanted = (getattr(getattr(config, part), name) for config in (old, new))
+    (_, old_reader, old_decoder), (_, new_reader, new_decoder) = map(paper_parts, (old.architecture, new.architecture))
+    for name, was, wanted in (  # either shifts what tensors hold
+        ("reader.sample_rgb", old_reader.sample_rgb, new_reader.sample_rgb),
+        ("decoder.tight", old_decoder.tight, new_decoder.tight),
+    ):
         if was != wanted:
-            raise ValueError(f"{part}.{name} {was}: that of trained weights cannot become {wanted}")
-    if old.sampling.shells not in ((), new.sampling.shells):
-        raise ValueError(f"shells {old.sampling.shells}: those of trained weights cannot become {new.sampling.shells}")
+            raise ValueError(f"{name} {was}: that of trained weights cannot become {wanted}")
+    if old_reader.shells not in ((), new_reader.shells):
+        raise ValueError(f"shells {old_reader.shells}: those of trained weights cannot become {new_reader.shells}")
     ours = flatten_variables(variables)
     fresh = flatten_variables(init_humangs(jax.random.key(0), new))
     anew = {f"{HEADS}shells_{name}/{kind}" for name in ("hidden", "out") for kind in ("kernel", "bias")} - set(ours)
     if unknown := sorted((set(ours) - set(fresh)) | (set(fresh) - set(ours) - anew)):
         raise ValueError(f"tensor {unknown[0]!r} is in one of the two networks alone")
-    if old.decoder.frame != new.decoder.frame:
+    if old_decoder.frame != new_decoder.frame:
         anew |= {key for key in ours if key.startswith(f"{HEADS}geometry_out")}
 
     def fit(key, leaf):
         if key in anew:
             return leaf
-        if key == f"{HEADS}trunk_0/kernel" and old.decoder_width <= new.decoder_width:
+        if key == f"{HEADS}trunk_0/kernel" and len(ours[key]) <= len(leaf):
             rows = len(ours[key])  # shells and normals enter last
             leaf = leaf.at[rows:].set(0).at[:rows].set(ours[key])
         elif key.startswith(HEADS) and key.split("/")[-2].endswith("_out"):
@@ -131,6 +142,43 @@ def fit_variables(variables: Variables, old: HumanGSConfig, new: HumanGSConfig) 
 
     structure = jax.tree.structure(expected_variables(new))
     return jax.tree.unflatten(structure, [fit(key, leaf) for key, leaf in fresh.items()])
+
+
+def config_of_version_1(text: str) -> HumanGSConfig:
+    """The configuration of a file of version 1, where one object mixed architecture, conventions and execution.
+
+    Raises: ValueError for text that is not such a configuration.
+    """
+    try:
+        old = json.loads(text)
+        encoder, upsampler, sampling = old["transformer"], old["upsampler"], old["sampling"]
+        sizes, heads = ("width", "layers", "mlp_ratio", "class_token"), ("head_width", "qk_norm")
+        conventions = ("image_size", "tokens", "position_map", "ray_origins", "skinning", "rendering", "body_vertices")
+        upsampled = upsampler["enabled"]
+        new = {
+            "architecture": {
+                "encoder": {
+                    "kind": "humangs_jax.network.encoder.PatchTransformer",
+                    "patch_size": old["patch_size"],
+                    "texture": old["texture"],
+                    "transformer": {key: encoder[key] for key in sizes}
+                    | {key: encoder["attention"][key] for key in heads},
+                    "upsampler": {key: upsampler[key] for key in ("hidden", "features")} if upsampled else None,
+                },
+                "reader": {
+                    "kind": "humangs_jax.network.reader.PixelAlignedReader",
+                    "output_width": upsampler["out"] if upsampled else None,
+                    "sample_rgb": sampling["sample_rgb"],
+                    "shells": sampling["shells"],
+                },
+                "decoder": {"kind": "humangs_jax.network.vertex_decoder.VertexDecoder"} | old["decoder"],
+            },
+            "conventions": {key: old[key] for key in (*conventions, "longest_edge")}
+            | {"pool": sampling["pool"], "pixel_grid": sampling["convention"]},
+        }
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"config of version 1: {error!r}") from error
+    return config_from_json(HumanGSConfig, json.dumps(new))
 
 
 def variables_from_tensors(tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str) -> Variables:

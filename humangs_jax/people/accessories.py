@@ -1,19 +1,29 @@
-"""What is worn on top: hoods, scarves, hats, glasses, bags, necklaces.
+"""What is worn on top and on the feet: hoods, scarves, hats, glasses, bags, necklaces, shoes.
 
-Swept tubes, sheets and boxes that follow one joint or the nearest skin.
+Swept tubes, sheets, boxes and outlines that follow one joint or the nearest skin.
 """
 
 import numpy as np
 
-from humangs_jax.people import hair, slices, tailoring
-from humangs_jax.people.anatomy import Anatomy
-from humangs_jax.people.fabrics import Material, band, colour, mix
+from humangs_jax.people import hair, tailoring
+from humangs_jax.people.anatomy import FLOOR, Anatomy
+from humangs_jax.people.fabrics import Material, band, colour, mix, weave
 from humangs_jax.people.garments import nearest_weights, rest_height, smooth_weights
+from humangs_jax.people.kinematics import HEAD, LEFT_ANKLE
 from humangs_jax.people.noise import ripples
 from humangs_jax.people.outfits import Garment
-from humangs_jax.people.patterns import weave
-from humangs_jax.people.poses import HEAD
-from humangs_jax.people.surfaces import Surface, grid_faces, join, sweep, turn_in_hems, unit
+from humangs_jax.people.surfaces import (
+    Outlines,
+    Surface,
+    blurred,
+    grid_faces,
+    hanging,
+    join,
+    outlines,
+    sweep,
+    turn_in_hems,
+    unit,
+)
 
 RING = 40
 """Points of a ring around neck or head."""
@@ -155,7 +165,7 @@ def _tail(rng, anatomy, start, side, length, thickness, ease):
     rows = max(5, int(length / 0.03))
     y = np.linspace(start[1] + 0.01, start[1] - length, rows)
     x = side * (0.028 + 0.012 * np.linspace(0, 1, rows)) + 0.006 * np.sin(np.linspace(0, 3, rows))
-    outline = slices.blurred(slices.hanging(anatomy.trunk, 0.2), 2)
+    outline = blurred(hanging(anatomy.trunk, 0.2), 2)
     z = outline.radius(y, np.arctan2(x, np.full(rows, 0.12))) + ease + 0.016
     z = np.maximum(z, start[2] + 0.7 * thickness + np.linspace(0, 0.01, rows))
     path = np.stack([x, y, z], -1)
@@ -345,3 +355,69 @@ def shoulder_bag(anatomy: Anatomy, size: float, side: float, ease: float) -> Sur
     reach = anatomy.hips_and_legs.radius(levels, np.full(7, angle)).mean() + ease + half[2] + 0.008
     center = np.asarray([reach * np.sin(angle), y, reach * np.cos(angle)])
     return _bag(anatomy, center, half, angle, np.flatnonzero(near))
+
+
+COLUMNS = 32
+
+
+def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> Surface:
+    """Both shoes. height: of the shaft above the floor; sole: its thickness; ease: metres between foot and leather."""
+    return join([_shoe(anatomy, side, height, sole, ease) for side in (0, 1)])
+
+
+def _shoe(anatomy, side, height, sole, ease):
+    template = anatomy.skin.attributes["template"]
+    sign = 1 if side == 0 else -1
+    own = np.flatnonzero((template[:, 0] * sign > 0) & (template[:, 1] < FLOOR + height + 0.06))
+    points = anatomy.skin.vertices[own]
+    floor = points[:, 1].min()
+    shaft = (
+        np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1)) if height > 0.1 else np.asarray([height])
+    )
+    low = np.asarray([0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072])
+    levels = floor + np.concatenate([low[low < height - 0.004], shaft])
+    shape = _outlines(points, levels)
+    shape = hanging(shape, 0.6)  # the sole is as wide as what is above it
+    angle = np.arange(COLUMNS) * (2 * np.pi / COLUMNS)
+    rows = [
+        (floor - sole, 0, 0.0),
+        (floor - sole, 0, 0.0),
+        (floor - 0.3 * sole, 0, 0.004),
+        (floor + 0.004, 0, 0.004),
+        (floor + 0.006, 0, 0.0),
+    ]
+    rows += [(level, i, 0.0) for i, level in enumerate(levels) if i > 0]
+    rings = []
+    for k, (y, i, extra) in enumerate(rows):
+        radius = shape.radius(np.full(COLUMNS, levels[i]), angle) + ease + extra
+        radius = np.zeros(COLUMNS) if k == 0 else radius
+        rings.append(
+            np.stack(
+                [
+                    shape.centers[i, 0] + radius * np.sin(angle),
+                    np.full(COLUMNS, y),
+                    shape.centers[i, 1] + radius * np.cos(angle),
+                ],
+                -1,
+            )
+        )
+    vertices = np.concatenate(rings).astype(np.float32)
+    faces = grid_faces(len(rows), COLUMNS, closed=True)[:, ::-1]
+    weights = nearest_weights(anatomy, vertices, own)
+    weights = smooth_weights(weights, faces, 3)
+    ankle = anatomy.joints[LEFT_ANKLE + side]
+    local = vertices - np.asarray([ankle[0], floor, ankle[2]])
+    cloth = np.concatenate([local, np.full((len(local), 1), 0.06)], 1).astype(np.float32)
+    surface = Surface(
+        vertices, np.ascontiguousarray(faces), weights, {"template": local.astype(np.float32), "cloth": cloth}
+    )
+    return turn_in_hems(surface, 0.01)
+
+
+def _outlines(points, levels):
+    """Thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices."""
+    thin, thick = (outlines(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03))
+    shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
+    smooth = blurred(thick, 2)
+    mixed = [a + (b - a) * shin for a, b in ((thin.centers, thick.centers), (thin.radii, smooth.radii))]
+    return Outlines(levels, *mixed)

@@ -9,9 +9,8 @@ import functools
 
 import numpy as np
 
-from humangs_jax.people import slices
-from humangs_jax.people.poses import HEAD, LEFT_ANKLE, LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER, LEFT_WRIST, NECK
-from humangs_jax.people.surfaces import Surface, vertex_normals
+from humangs_jax.people.kinematics import LEFT_ANKLE, LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER, LEFT_WRIST
+from humangs_jax.people.surfaces import Outlines, Surface, blurred, outlines, vertex_normals
 
 BODY_NAME, BODY_VERTICES = "makehuman", 13380
 """The body that the cuts below were measured on."""
@@ -40,10 +39,10 @@ class Anatomy:
     parents: tuple[int, ...]
     arm: np.ndarray
     leg: np.ndarray
-    trunk: slices.Outlines
-    hips_and_legs: slices.Outlines
-    legs: tuple[slices.Outlines, slices.Outlines]
-    arms: tuple[slices.Outlines, slices.Outlines]
+    trunk: Outlines
+    hips_and_legs: Outlines
+    legs: tuple[Outlines, Outlines]
+    arms: tuple[Outlines, Outlines]
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
@@ -123,23 +122,18 @@ def measure(
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)
     trunk_points = vertices[body & (template[:, 1] > -0.6)]
     spine = np.zeros((len(levels), 2))
-    torso = slices.outlines(trunk_points[:, 1], trunk_points[:, [0, 2]], levels, spine, 0.025)
+    torso = outlines(trunk_points[:, 1], trunk_points[:, [0, 2]], levels, spine, 0.025)
     lower = vertices[body & (template[:, 1] < WAIST + 0.03)]
-    hips = slices.outlines(lower[:, 1], lower[:, [0, 2]], levels, spine, 0.025)
+    hips = outlines(lower[:, 1], lower[:, [0, 2]], levels, spine, 0.025)
     legs, arms = [], []
     for side, offset in ((1, 0), (-1, 1)):
         line = joints[[LEFT_ANKLE + offset, LEFT_KNEE + offset, LEFT_HIP + offset]]
         centers = np.stack([np.interp(levels, line[:, 1], line[:, i]) for i in (0, 2)], -1)
         own = vertices[(template[:, 0] * side > 0.004) & (template[:, 1] < CROTCH + 0.1) & (template[:, 1] > -1.15)]
-        legs.append(slices.blurred(slices.outlines(own[:, 1], own[:, [0, 2]], levels, centers, 0.025)))
+        legs.append(blurred(outlines(own[:, 1], own[:, [0, 2]], levels, centers, 0.025)))
         along = np.arange(0.05, 0.8, 0.02)
         line = joints[[LEFT_SHOULDER + offset, LEFT_WRIST + offset]]
         centers = np.stack([np.interp(along, np.abs(line[:, 0]), line[:, i]) for i in (1, 2)], -1)
         own = vertices[(template[:, 0] * side > 0.2) & (template[:, 1] > -0.05) & (np.abs(template[:, 0]) < 0.68)]
-        arms.append(slices.blurred(slices.outlines(np.abs(own[:, 0]), own[:, [1, 2]], along, centers, 0.025)))
-    return Anatomy(
-        skin, joints, parents, arm, leg, slices.blurred(torso), slices.blurred(hips), tuple(legs), tuple(arms)
-    )
-
-
-__all__ = ["HEAD", "NECK", "Anatomy", "measure", "smoothstep"]
+        arms.append(blurred(outlines(np.abs(own[:, 0]), own[:, [1, 2]], along, centers, 0.025)))
+    return Anatomy(skin, joints, parents, arm, leg, blurred(torso), blurred(hips), tuple(legs), tuple(arms))

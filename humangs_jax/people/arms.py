@@ -1,7 +1,8 @@
-"""Arms that go where they are wanted and stay clear of the body.
+"""Arms that reach a goal and stay clear of the body, and hands.
 
 An arm draws many candidates within its limits and keeps the one whose wrist comes nearest to a goal (hanging, on the hip,
-waving, ...) among those whose forearm and hand stay out of the trunk, the head, the legs and the other arm.
+waving, ...) among those whose forearm and hand stay out of the trunk, the head, the legs and the other arm. Hands blend a few
+gestures.
 """
 
 import dataclasses
@@ -9,32 +10,7 @@ import dataclasses
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.people.kinematics import (
-    HEAD,
-    LEFT_ANKLE,
-    LEFT_COLLAR,
-    LEFT_ELBOW,
-    LEFT_HIP,
-    LEFT_KNEE,
-    LEFT_SHOULDER,
-    LEFT_WRIST,
-    LIMITS,
-    MIRROR,
-    NECK,
-    PELVIS,
-    RIGHT_ANKLE,
-    RIGHT_COLLAR,
-    RIGHT_ELBOW,
-    RIGHT_HIP,
-    RIGHT_KNEE,
-    RIGHT_SHOULDER,
-    RIGHT_WRIST,
-    SPINE3,
-    Build,
-    joint_positions,
-    rotation_matrix,
-    rotation_vector,
-)
+from humangs_jax.people import kinematics as kin
 
 CANDIDATES = 400
 HAND_LENGTH = 0.6
@@ -77,8 +53,8 @@ GOALS = {
     "diagonal": Goal(0.02, (0.75, 0.65, 0.1), (0.0, 1.1), (-0.2, 0.9), (0.05, 0.7), 0.2),
 }
 ARMS = (
-    (LEFT_COLLAR, LEFT_SHOULDER, LEFT_ELBOW, LEFT_WRIST),
-    (RIGHT_COLLAR, RIGHT_SHOULDER, RIGHT_ELBOW, RIGHT_WRIST),
+    (kin.LEFT_COLLAR, kin.LEFT_SHOULDER, kin.LEFT_ELBOW, kin.LEFT_WRIST),
+    (kin.RIGHT_COLLAR, kin.RIGHT_SHOULDER, kin.RIGHT_ELBOW, kin.RIGHT_WRIST),
 )
 
 
@@ -90,7 +66,7 @@ def draw_goal(rng: np.random.Generator) -> str:
 
 def bend_arm(
     rng: np.random.Generator,
-    build: Build,
+    build: kin.Build,
     rotations: Float[np.ndarray, "j 3"],
     goal: str,
     side: int,
@@ -102,7 +78,7 @@ def bend_arm(
     other_arm: keep clear of the other arm, too. Returns how clear the arm is (metres, negative: it is not).
     """
     collar, shoulder, elbow, wrist = ARMS[side]
-    mirror, n, wanted = np.ones(3) if side == 0 else MIRROR, CANDIDATES, GOALS[goal]
+    mirror, n, wanted = np.ones(3) if side == 0 else kin.MIRROR, CANDIDATES, GOALS[goal]
     rotations[collar] = np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
     down, forward, twist, flex, pronation = np.zeros((5, n, 3))
     down[:, 2] = rng.uniform(*wanted.raised, n)
@@ -111,27 +87,27 @@ def bend_arm(
     flex[:, 1] = -rng.uniform(*wanted.flexed, n)
     pronation[:, 0] = rng.uniform(-0.4, 0.5)
     if goal == "hang":  # a hanging arm swings about the axis of both shoulders
-        swing = rotation_matrix(np.stack([forward[:, 1], down[:, 1], down[:, 2]], 1))
+        swing = kin.rotation_matrix(np.stack([forward[:, 1], down[:, 1], down[:, 2]], 1))
     else:
-        swing = rotation_matrix(forward) @ rotation_matrix(down)
-    upper = rotation_vector(swing @ rotation_matrix(twist)) * mirror
-    lower = rotation_vector(rotation_matrix(flex) @ rotation_matrix(pronation)) * mirror
+        swing = kin.rotation_matrix(forward) @ kin.rotation_matrix(down)
+    upper = kin.rotation_vector(swing @ kin.rotation_matrix(twist)) * mirror
+    lower = kin.rotation_vector(kin.rotation_matrix(flex) @ kin.rotation_matrix(pronation)) * mirror
 
-    world, positions = joint_positions(build, rotations)
+    world, positions = kin.joint_positions(build, rotations)
     rest = build.joints
-    upper_world = world[collar] @ rotation_matrix(upper)
+    upper_world = world[collar] @ kin.rotation_matrix(upper)
     elbows = positions[shoulder] + upper_world @ (rest[elbow] - rest[shoulder])
-    lower_world = upper_world @ rotation_matrix(lower)
+    lower_world = upper_world @ kin.rotation_matrix(lower)
     wrists = elbows + lower_world @ (rest[wrist] - rest[elbow])
     tips = elbows + lower_world @ ((rest[wrist] - rest[elbow]) * (1 + HAND_LENGTH))
     reach = np.linalg.norm(rest[elbow] - rest[shoulder]) + np.linalg.norm(rest[wrist] - rest[elbow])
     offset = np.asarray(wanted.place) * [1 - 2 * side, 1, 1] + rng.normal(0, 0.08, 3)
-    target = positions[shoulder] + reach * world[SPINE3] @ offset
+    target = positions[shoulder] + reach * world[kin.SPINE3] @ offset
     capsules = body_capsules(build, world, positions) + (
         arm_capsules(build, world, positions, 1 - side) if other_arm else []
     )
     clear = np.min([clearance(build, capsules, points) for points in _along(elbows, wrists, tips)], axis=0)
-    beyond = np.maximum(np.linalg.norm(upper, axis=1) - LIMITS[shoulder], 0)
+    beyond = np.maximum(np.linalg.norm(upper, axis=1) - kin.LIMITS[shoulder], 0)
     cost = np.linalg.norm(wrists - target, axis=1) + 20 * np.maximum(MARGIN - clear, 0) + 5 * beyond
     best = int(np.argmin(cost))
     rotations[shoulder], rotations[elbow] = upper[best], lower[best]
@@ -139,9 +115,9 @@ def bend_arm(
     return float(clear[best])
 
 
-def arm_clearance(build: Build, rotations: Float[np.ndarray, "j 3"]) -> float:
+def arm_clearance(build: kin.Build, rotations: Float[np.ndarray, "j 3"]) -> float:
     """How far (metres) both forearms and hands are from the body and each other; negative if one is inside."""
-    world, positions = joint_positions(build, rotations)
+    world, positions = kin.joint_positions(build, rotations)
     body, worst = body_capsules(build, world, positions), np.inf
     for side in (0, 1):
         _, _, elbow, wrist = ARMS[side]
@@ -156,24 +132,27 @@ Capsule = tuple[np.ndarray, np.ndarray, float]
 
 
 def body_capsules(
-    build: Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"]
+    build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"]
 ) -> list[Capsule]:
     """Trunk, legs and head of a posed body."""
-    sideways = 0.25 * (positions[LEFT_HIP] - positions[RIGHT_HIP])
-    top = positions[NECK] + world[SPINE3] @ np.asarray([0, -0.06, 0])
-    head = positions[HEAD] + world[HEAD] @ np.asarray([0, 0.09, 0.03])
+    sideways = 0.25 * (positions[kin.LEFT_HIP] - positions[kin.RIGHT_HIP])
+    top = positions[kin.NECK] + world[kin.SPINE3] @ np.asarray([0, -0.06, 0])
+    head = positions[kin.HEAD] + world[kin.HEAD] @ np.asarray([0, 0.09, 0.03])
     return [
-        *((positions[PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius) for s in (-1.0, 0.0, 1.0)),
-        (positions[LEFT_HIP], positions[LEFT_KNEE], build.thigh_radius),
-        (positions[RIGHT_HIP], positions[RIGHT_KNEE], build.thigh_radius),
-        (positions[LEFT_KNEE], positions[LEFT_ANKLE], build.shin_radius),
-        (positions[RIGHT_KNEE], positions[RIGHT_ANKLE], build.shin_radius),
+        *(
+            (positions[kin.PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius)
+            for s in (-1.0, 0.0, 1.0)
+        ),
+        (positions[kin.LEFT_HIP], positions[kin.LEFT_KNEE], build.thigh_radius),
+        (positions[kin.RIGHT_HIP], positions[kin.RIGHT_KNEE], build.thigh_radius),
+        (positions[kin.LEFT_KNEE], positions[kin.LEFT_ANKLE], build.shin_radius),
+        (positions[kin.RIGHT_KNEE], positions[kin.RIGHT_ANKLE], build.shin_radius),
         (head, head, HEAD_RADIUS),
     ]
 
 
 def arm_capsules(
-    build: Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"], side: int
+    build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"], side: int
 ) -> list[Capsule]:
     """Upper arm, forearm and hand of one side."""
     _, shoulder, elbow, wrist = ARMS[side]
@@ -182,7 +161,7 @@ def arm_capsules(
     return [(positions[shoulder], positions[elbow], radius), (positions[elbow], tip, radius)]
 
 
-def clearance(build: Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+def clearance(build: kin.Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
     distances = []
     for a, b, radius in capsules:
@@ -195,3 +174,57 @@ def clearance(build: Build, capsules: list[Capsule], points: Float[np.ndarray, "
 def _along(elbows, wrists, tips):
     """Points of the forearm and the hand that must not touch the body."""
     return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]
+
+
+FINGERS = ("index", "middle", "pinky", "ring")
+"""In the order of SMPL-X's joints; the thumb comes last."""
+BONE_SHARE = (0.85, 1.0, 0.7)
+"""Of a finger's curl that its knuckles take, from the palm outwards."""
+SPLAY = {"index": 1.0, "middle": 0.15, "ring": -0.6, "pinky": -1.2}
+
+
+@dataclasses.dataclass(frozen=True)
+class Gesture:
+    """odds: of being drawn. curl: of index, middle, ring, pinky, radians a knuckle. spread: angle between fingers.
+
+    thumb: how far it lies across the palm, 0 beside it, 1 across.
+    """
+
+    odds: float
+    curl: tuple[float, float, float, float]
+    spread: float = 0.0
+    thumb: float = 0.2
+
+
+GESTURES = {
+    "relaxed": Gesture(0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25),
+    "flat": Gesture(0.15, (0.03, 0.03, 0.04, 0.05), 0.0, 0.05),
+    "spread": Gesture(0.1, (0.0, 0.0, 0.0, 0.0), 0.16, -0.3),
+    "fist": Gesture(0.12, (1.3, 1.35, 1.35, 1.35), 0.0, 1.0),
+    "point": Gesture(0.06, (0.02, 1.2, 1.3, 1.3), 0.0, 0.8),
+    "two": Gesture(0.03, (0.02, 0.02, 1.3, 1.3), 0.12, 0.9),
+    "thumb up": Gesture(0.03, (1.2, 1.3, 1.3, 1.3), 0.0, -0.4),
+    "hold": Gesture(0.11, (0.65, 0.7, 0.75, 0.8), 0.05, 0.6),
+}
+
+
+def pose_hand(rng: np.random.Generator, rotations: Float[np.ndarray, "j 3"], side: int) -> None:
+    """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: on the way from relaxed to some gesture."""
+    first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
+    odds = np.asarray([gesture.odds for gesture in GESTURES.values()])
+    goal = list(GESTURES.values())[rng.choice(len(odds), p=odds / odds.sum())]
+    start, t = GESTURES["relaxed"], rng.beta(2.5, 1.0)
+    mix = lambda a, b: (1 - t) * np.asarray(a) + t * np.asarray(b)
+    index, middle, ring, pinky = mix(start.curl, goal.curl)
+    curls = {"index": index, "middle": middle, "ring": ring, "pinky": pinky}
+    spread, thumb = mix(start.spread, goal.spread), mix(start.thumb, goal.thumb) + rng.normal(0, 0.08)
+    for finger, name in enumerate(FINGERS):
+        curl = curls[name] * rng.uniform(0.85, 1.15) + rng.normal(0, 0.03)
+        for bone, share in enumerate(BONE_SHARE):
+            # fingers do not bend backwards, and spread at the palm only
+            bend = np.clip(curl * share * rng.uniform(0.9, 1.1), -0.1, kin.FINGER_LIMIT - 0.1)
+            aside = SPLAY[name] * spread if bone == 0 else 0.0
+            rotations[first + 3 * finger + bone] = np.asarray([0, -aside, -bend]) * mirror
+    rotations[first + 12] = np.asarray([0.25 * thumb, 0.45 * thumb, -0.35 * thumb]) * mirror
+    rotations[first + 13] = np.asarray([0.0, 0.35 * thumb, -0.1 * thumb]) * mirror
+    rotations[first + 14] = np.asarray([0.0, 0.5 * max(thumb, 0.0), 0.0]) * mirror

@@ -10,8 +10,8 @@ import dataclasses
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float, Int, UInt8
-from humangs_jax.people import poses
 from humangs_jax.people.atlas import Atlas, texels, unwrap
+from humangs_jax.people.kinematics import HEAD
 from humangs_jax.people.rendering import paint, spots_at
 from humangs_jax.people.subject import SyntheticSubject
 from humangs_jax.people.surfaces import vertex_normals
@@ -24,7 +24,7 @@ SLOPE_ZERO = 128
 """Byte of no slope."""
 FACE_DENSITY = 2.0
 """Texels per metre of skin and eyes of the head, relative to everything else."""
-HEAD_JOINTS = (poses.HEAD, 22, 23, 24)
+HEAD_JOINTS = (HEAD, 22, 23, 24)
 """Head, jaw and eyes."""
 SKIN, EYES = 0, 1
 """Materials of a subject that `make_subject` puts first."""

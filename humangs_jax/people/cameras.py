@@ -1,4 +1,8 @@
-"""Cameras like those of the published protocol: around the person, vertical field of view 60 degrees, near the horizon."""
+"""Cameras like those of the published protocol: around the person, vertical field of view 60 degrees, near the horizon.
+
+`cameras_around` and `close_cameras` draw from a numpy generator for written people, `camera_from` takes numbers in [0, 1) and
+runs on the device, for people made on the fly.
+"""
 
 import functools
 
@@ -6,8 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Float
-from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
 
 VERTICAL_FOV = np.deg2rad(60.0)
 DISTANCE_FACTOR = (1.8, 2.2)
@@ -21,18 +25,10 @@ CLEARANCE = 0.3
 """Metres: no close camera is nearer to a point of the surface."""
 FRAME = 0.98
 """Share of the half frame that the person may reach; a camera that is too near for it steps back."""
-
-_orbit = jax.jit(orbit, static_argnums=(5, 6))
-
-
-@functools.partial(jax.jit, static_argnums=(5, 6))
-def _orbits(targets, distances, azimuths, elevations, K, width, height):
-    """Cameras that each look at a target of their own."""
-
-    def one(target, distance, azimuth, elevation):
-        return orbit(target, distance[None], azimuth[None], elevation[None], K, width, height)[0]
-
-    return jax.vmap(one)(targets, distances, azimuths, elevations)
+POINT_STEP = 4096
+"""Points are padded to a multiple of this: few shapes are compiled."""
+CAMERA_NUMBERS = 5
+UP = (0.0, 1.0, 0.0)
 
 
 def bounding_sphere(vertices: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
@@ -54,11 +50,10 @@ def cameras_around(
     center, radius = bounding_sphere(vertices)
     distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
     elevations = rng.uniform(*ELEVATION, len(azimuths))
-    near = [nearest_distance(vertices - center, a, e) for a, e in zip(azimuths, elevations, strict=True)]
-    placed = (jnp.asarray(x, jnp.float32) for x in (np.maximum(distances, near), azimuths, elevations))
-    K = intrinsics_from_fov(VERTICAL_FOV, image_size, image_size)
-    target = jnp.asarray(center, jnp.float32)
-    return _orbit(target, *placed, K, image_size, image_size)
+    points = np.pad(vertices - center, ((0, -len(vertices) % POINT_STEP), (0, 0)), mode="edge")
+    near = _nearest_distances(jnp.asarray(points), *(jnp.asarray(x, jnp.float32) for x in (azimuths, elevations)))
+    targets = np.broadcast_to(center, (len(azimuths), 3))
+    return _orbits(targets, np.maximum(distances, np.asarray(near)), azimuths, elevations, image_size)
 
 
 def close_cameras(
@@ -71,24 +66,95 @@ def close_cameras(
     targets = center + rng.uniform(0, CLOSE_SPREAD, (count, 1)) * (towards - center)
     distances = radius * rng.uniform(*CLOSE_FACTOR, count)
     elevations = rng.uniform(*ELEVATION, count)
+    ce = np.cos(elevations)
+    directions = np.stack([ce * np.sin(azimuths), np.sin(elevations), ce * np.cos(azimuths)], -1)
     for i in range(count):
-        direction = _direction(azimuths[i], elevations[i])
-        while np.linalg.norm(vertices - targets[i] - distances[i] * direction, axis=1).min() < CLEARANCE:
+        while np.linalg.norm(vertices - targets[i] - distances[i] * directions[i], axis=1).min() < CLEARANCE:
             distances[i] += 0.05 * radius
-    K = intrinsics_from_fov(VERTICAL_FOV, image_size, image_size)
+    return _orbits(targets, distances, azimuths, elevations, image_size)
+
+
+def _orbits(targets, distances, azimuths, elevations, size):
+    """A batch of cameras that each look at a target of their own."""
     placed = (jnp.asarray(x, jnp.float32) for x in (targets, distances, azimuths, elevations))
-    return _orbits(*placed, K, image_size, image_size)
+    return _placed(*placed, intrinsics_from_fov(VERTICAL_FOV, size, size), size)
 
 
-def _direction(azimuth, elevation):
-    """Unit vector from the target towards a camera."""
-    sa, ca, se, ce = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
-    return np.asarray([ce * sa, se, ce * ca])
+@functools.partial(jax.jit, static_argnums=5)
+def _placed(targets, distances, azimuths, elevations, K, size):
+    one = lambda target, *rest: orbit(target, *(x[None] for x in rest), K, size, size)[0]
+    return jax.vmap(one)(targets, distances, azimuths, elevations)
 
 
-def nearest_distance(points: Float[np.ndarray, "n 3"], azimuth: float, elevation: float) -> float:
-    """Least distance from the origin at which a camera that looks at it has all points (n, 3) in its square frame."""
-    sa, ca, se, ce = np.sin(azimuth), np.cos(azimuth), np.sin(elevation), np.cos(elevation)
-    towards, up, right = _direction(azimuth, elevation), np.asarray([-se * sa, ce, -se * ca]), np.asarray([ca, 0, -sa])
-    reach = np.maximum(np.abs(points @ up), np.abs(points @ right))
-    return float(np.max(reach / (FRAME * np.tan(VERTICAL_FOV / 2)) + points @ towards))
+def camera_from(
+    u: Float[Array, "5"],
+    vertices: Float[Array, "n 3"],
+    count: Int[Array, ""] | int,
+    azimuth: Float[Array, ""],
+    close_share: Float[Array, ""] | float,
+    size: int,
+) -> Camera:
+    """A square camera of `size` pixels that looks at a posed person from an azimuth.
+
+    u: in [0, 1). count: vertices that are no padding. With probability close_share it is a close one, see `close_cameras`;
+    others see all of the person.
+    """
+    is_close, tilt, spread, outwards, place = u
+    low, high = vertices.min(0), vertices.max(0)
+    center = 0.5 * (low + high)
+    radius = jnp.sqrt(jnp.max(jnp.sum((vertices - center) ** 2, -1)))
+    close = is_close < close_share
+    elevation = _within(ELEVATION, tilt)
+    factor = jnp.where(close, _within(CLOSE_FACTOR, spread), _within(DISTANCE_FACTOR, spread))
+    towards_vertex = vertices[pick(place, count)] - center
+    target = center + jnp.where(close, CLOSE_SPREAD * outwards, 0.0) * towards_vertex
+    along = _along_axes(vertices - target, azimuth, elevation)
+    ahead, above, aside = along
+    beside = CLEARANCE**2 - (above * above + aside * aside)  # a camera on its axis comes no nearer than that to a point
+    clear = jnp.max(jnp.where(beside > 0, ahead + jnp.sqrt(jnp.maximum(beside, 0)), -jnp.inf))
+    distance = jnp.maximum(factor * radius, jnp.where(close, clear, _nearest_distance(*along)))
+    K = intrinsics_from_fov(VERTICAL_FOV, size, size).astype(vertices.dtype)
+    eye = target + distance * _axes(azimuth, elevation)[0]
+    return look_at(eye, target, jnp.asarray(UP, vertices.dtype), K, size, size)
+
+
+def _nearest_distance(ahead, above, aside):
+    """Least distance from the origin at which a camera that looks at it has all points in its square frame."""
+    return jnp.max(jnp.maximum(jnp.abs(above), jnp.abs(aside)) / (FRAME * np.tan(VERTICAL_FOV / 2)) + ahead)
+
+
+@jax.jit
+def _nearest_distances(points, azimuths, elevations):
+    return jax.vmap(lambda a, e: _nearest_distance(*_along_axes(points, a, e)))(azimuths, elevations)
+
+
+def _within(limits, share):
+    return limits[0] + (limits[1] - limits[0]) * share
+
+
+def _axes(azimuth, elevation):
+    """Unit vectors towards a camera, up and right in its image."""
+    sa, ca, se, ce = jnp.sin(azimuth), jnp.cos(azimuth), jnp.sin(elevation), jnp.cos(elevation)
+    zero = jnp.zeros_like(sa)
+    return jnp.stack([ce * sa, se, ce * ca]), jnp.stack([-se * sa, ce, -se * ca]), jnp.stack([ca, zero, -sa])
+
+
+def _along_axes(points, azimuth, elevation):
+    """Coordinates (n,) along `_axes`; written out: matrix products are of low precision on GPU and TPU."""
+    return tuple(jnp.sum(points * axis, -1) for axis in _axes(azimuth, elevation))
+
+
+def azimuths_from(u: Float[Array, " numbers"], jitter: float, scattered_share: float) -> Float[Array, " v"]:
+    """(v,) azimuths all around from a random start, each off by up to half `jitter` of the spacing; or anywhere.
+
+    u: 2 + 2 v numbers in [0, 1).
+    """
+    count = len(u) // 2 - 1
+    scattered, start, offsets, places = u[0], u[1], u[2 : 2 + count], u[2 + count :]
+    even = 2 * np.pi / count * (jnp.arange(count) + jitter * (offsets - 0.5)) + 2 * np.pi * start
+    return jnp.where(scattered < scattered_share, 2 * np.pi * places, even)
+
+
+def pick(u: Float[Array, "*b"], count: Int[Array, ""] | int) -> Int[Array, "*b"]:
+    """One of the numbers 0 .. count - 1 for each u in [0, 1)."""
+    return jnp.minimum((u * count).astype(jnp.int32), count - 1)

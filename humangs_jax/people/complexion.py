@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 
 from humangs_jax.people.fabrics import Material, Spots, band, colour, mix
-from humangs_jax.people.hair import SHORT_LINE, above_line, beard_field
-from humangs_jax.people.haircuts import LONG_CUTS, Haircut
+from humangs_jax.people.hair import LONG_CUTS, SHORT_LINE, Haircut, above_line, beard_field
 from humangs_jax.people.noise import Ripples, lattice
 
 EYE_X, EYE_Y, MOUTH_Y = 0.029, 0.330, 0.2629

@@ -1,7 +1,8 @@
-"""Materials: functions from points on a surface to colour, and the dyes they are made of. Patterns are in `patterns`.
+"""Fabrics and materials: functions from points on a surface to colour.
 
-A material maps `Spots` (points on a surface) to albedo in [0, ALBEDO_LIMIT], evaluated per pixel, so that it is crisp at any
-resolution.
+A material maps `Spots` (points on a surface) to albedo in [0, ALBEDO_LIMIT]. It is evaluated per pixel or texel, so it is
+crisp at any resolution. A `Fabric` is a choice (pattern, dyes, seed); `weave` turns it into colour at every point. Periods of
+patterns are metres on the cloth; the finest is a few millimetres.
 """
 
 import colorsys
@@ -12,6 +13,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.people.anatomy import ARMHOLE, SAME_GIRTH, TRUNK_GIRTH, sewn_coordinates
+from humangs_jax.people.noise import Ripples, hashed, lattice
 
 SHOULDER_RIDGE = -0.02
 """Template z of the line from neck to shoulder on which front and back are sewn together."""
@@ -118,3 +120,314 @@ def band(
 ) -> Float[np.ndarray, " n"]:
     """1 between low and high (metres), with soft edges."""
     return np.clip((x - low) / soft + 0.5, 0, 1) * np.clip((high - x) / soft + 0.5, 0, 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fabric:
+    """pattern: key of PATTERNS. base, other: (3,) dyes. seed: of everything else about it (periods, prints, buttons)."""
+
+    pattern: str
+    base: Float[np.ndarray, "3"]
+    other: Float[np.ndarray, "3"]
+    seed: int
+
+    def rng(self, stream: int) -> np.random.Generator:
+        """Random numbers of the fabric's own; one stream for each feature."""
+        return np.random.default_rng([self.seed, stream])
+
+
+def weave(fabric: Fabric) -> Callable[[Spots], np.ndarray]:
+    """The fabric's colour as a function of points: Spots -> (n, 3)."""
+    return PATTERNS[fabric.pattern][1](fabric.rng(0), fabric.base, fabric.other)
+
+
+def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabric:
+    """A fabric that suits a kind of garment; with probability `plainness` in one dye or nearly so."""
+    if rng.random() < plainness:
+        pattern = str(rng.choice(["plain", "melange", "tweed"], p=[0.66, 0.2, 0.14]))
+    else:
+        names = [n for n in PATTERNS if PATTERNS[n][0] > 0]
+        odds = np.asarray([PATTERNS[n][0] for n in names])
+        pattern = str(rng.choice(names, p=odds / odds.sum()))
+    base = _dye(rng, kind)
+    if kind in ("jeans", "denim_jacket"):
+        pattern = "denim"
+    if kind in ("cargo", "hooded_jacket", "shorts") and rng.random() < 0.25:
+        pattern = "camouflage"
+    if kind in ("puffer", "leggings", "backpack") and rng.random() < 0.7:
+        pattern = "plain"
+    if kind in ("cap", "brim_hat") and pattern not in ("camouflage", "melange", "checks", "herringbone"):
+        pattern = "plain"
+    if kind in ("sneakers", "flats", "sandals", "ankle_boots", "boots", "belt", "watch", "necklace", "glasses"):
+        pattern = "plain"
+    return Fabric(pattern, base, accent(rng, base), int(rng.integers(1 << 31)))
+
+
+def _dye(rng, kind):
+    """A colour that the trade sells the garment in."""
+    sober = {
+        "denim": (0.57, 0.63, 0.3, 0.75, 0.12, 0.6),
+        "cotton": (0.06, 0.13, 0.15, 0.5, 0.2, 0.75),
+        "leather": (0.05, 0.09, 0.2, 0.7, 0.06, 0.4),
+        "suit": (0.58, 0.68, 0.05, 0.35, 0.06, 0.4),
+    }
+    trade = {
+        "jeans": ("denim", 0.85), "denim_jacket": ("denim", 0.9), "chinos": ("cotton", 0.6), "cargo": ("cotton", 0.65),
+        "slim": ("suit", 0.5), "blazer": ("suit", 0.6), "coat": ("suit", 0.35), "flats": ("leather", 0.75),
+        "boots": ("leather", 0.75), "ankle_boots": ("leather", 0.75), "belt": ("leather", 0.9), "sandals": ("leather", 0.7),
+        "shoulder_bag": ("leather", 0.5), "watch": ("leather", 0.6), "trousers": ("cotton", 0.5), "glasses": ("leather", 0.6),
+        "sunglasses": ("leather", 0.85), "track": ("suit", 0.5), "leggings": ("suit", 0.6), "wide": ("cotton", 0.4),
+    }  # fmt: skip
+    cloth, odds = trade.get(kind, ("", 0.0))
+    if rng.random() < odds:
+        low_h, high_h, low_s, high_s, low_v, high_v = sober[cloth]
+        return colour(rng.uniform(low_h, high_h), rng.uniform(low_s, high_s), rng.uniform(low_v, high_v))
+    if kind in ("shirt", "socks", "sneakers") and rng.random() < 0.45:
+        return colour(rng.random(), rng.uniform(0, 0.05), rng.uniform(0.72, 0.87))
+    if kind in ("sneakers", "leggings", "coat", "puffer", "slim") and rng.random() < 0.4:
+        return colour(rng.random(), rng.uniform(0, 0.1), rng.uniform(0.06, 0.16))
+    if kind in ("sneakers", "flats", "sandals", "ankle_boots", "boots") and rng.random() < 0.6:
+        return colour(rng.uniform(0.03, 0.12), rng.uniform(0.0, 0.5), rng.uniform(0.1, 0.7))
+    return random_colour(rng)
+
+
+def plain(rng, base):
+    """One dye, slightly uneven."""
+    cloud = Ripples(rng, 0.12)
+    return lambda s: base * (1 + 0.03 * cloud(s.cloth[:, :3]))[:, None]
+
+
+def stripes(rng, base, other, upright=False):
+    """Stripes around (or, upright, along) the limb."""
+    period = rng.choice([0.014, 0.02, 0.035, 0.055, 0.09])
+    share = rng.uniform(0.25, 0.6)
+
+    def albedo(s):
+        x = s.around if upright else s.along
+        phase = (x / period) % 1
+        return mix(base, other, band(phase * period, 0.0, share * period))
+
+    return albedo
+
+
+def checks(rng, base, other):
+    """Gingham or tartan."""
+    period = rng.choice([0.03, 0.05, 0.08])
+    third, thin = accent(rng, base), rng.random() < 0.6
+
+    def albedo(s):
+        across = band((s.around / period) % 1 * period, 0, period / 2)
+        along = band((s.along / period) % 1 * period, 0, period / 2)
+        result = mix(base, other, 0.5 * (across + along))
+        if thin:
+            lines = np.maximum(
+                band((s.around / period + 0.25) % 1 * period, 0, 0.004),
+                band((s.along / period + 0.25) % 1 * period, 0, 0.004),
+            )
+            result = mix(result, third, 0.7 * lines)
+        return result
+
+    return albedo
+
+
+def dots(rng, base, other):
+    """Polka dots in a triangular grid."""
+    period, size = rng.choice([0.03, 0.045, 0.07]), rng.uniform(0.2, 0.34)
+
+    def albedo(s):
+        row = np.floor(s.along / period)
+        x = ((s.around / period + 0.5 * (row % 2)) % 1 - 0.5) * period
+        y = ((s.along / period) % 1 - 0.5) * period
+        return mix(base, other, band(np.sqrt(x * x + y * y), -1, size * period, 0.002))
+
+    return albedo
+
+
+def flowers(rng, base, other):
+    """Scattered blossoms of five petals in two dyes."""
+    period, seed, third = rng.choice([0.05, 0.075]), int(rng.integers(1 << 20)), accent(rng, base)
+
+    def albedo(s):
+        plane = np.stack([s.around, s.along], -1) / period
+        cell = np.floor(plane).astype(np.int64)
+        jitter = np.stack([hashed(cell, seed), hashed(cell, seed + 1)], -1) * 0.4 + 0.3
+        d = (plane - cell - jitter) * period
+        r, a = np.sqrt(np.sum(d * d, -1)), np.arctan2(d[:, 1], d[:, 0]) + 6 * hashed(cell, seed + 2)
+        petals = band(r, -1, period * (0.2 + 0.08 * np.cos(5 * a)), 0.002)
+        dye = mix(other, third, (hashed(cell, seed + 3) > 0.5).astype(np.float32))
+        result = mix(base, dye, petals)
+        return mix(result, np.asarray([0.85, 0.75, 0.3], np.float32), band(r, -1, period * 0.07, 0.002))
+
+    return albedo
+
+
+def mottled(rng, base, other):
+    """Camouflage, batik, tie-dye: thresholded or soft noise."""
+    scale, seed = rng.choice([0.03, 0.06, 0.1]), int(rng.integers(1 << 20))
+    hard, third = rng.random() < 0.5, accent(rng, other)
+
+    def albedo(s):
+        p = s.cloth[:, :3] / scale
+        n = 0.65 * lattice(p, seed) + 0.35 * lattice(2.1 * p, seed + 1)
+        width = 0.02 if hard else 0.2
+        first = np.clip((n - 0.47) / width + 0.5, 0, 1)
+        second = np.clip((lattice(p * 1.2 + 7.7, seed + 2) - 0.62) / width + 0.5, 0, 1)
+        return mix(mix(base, other, first), third, 0.8 * second)
+
+    return albedo
+
+
+def melange(rng, base, other):
+    """Knit or tweed: fine grain."""
+    seed, share = int(rng.integers(1 << 20)), rng.uniform(0.2, 0.5)
+
+    def albedo(s):
+        fine = lattice(np.stack([s.around / 0.006, s.along / 0.009], -1), seed)
+        return mix(base, other, share * fine)
+
+    return albedo
+
+
+def denim(rng, base, _other):
+    """Faded on the front of the thighs and at creases, grained along the thread."""
+    cloud, seed = Ripples(rng, 0.15), int(rng.integers(1 << 20))
+    fade, holes = rng.uniform(0.1, 0.6), rng.random() < 0.12
+
+    def albedo(s):
+        front = np.clip(s.cloth[:, 2] / 0.08, 0, 1) * np.exp(-(((s.along + 0.6) / 0.14) ** 2)) * (s.cloth[:, 3] < 0.14)
+        thread = lattice(np.stack([s.around / 0.003, s.along / 0.016], -1), seed) - 0.5
+        crease = np.clip(np.abs(lattice(np.stack([s.around / 0.09, s.along / 0.022], -1), seed + 1) - 0.5) * 8, 0, 1)
+        worn = np.exp(-(((s.along + 0.47) / 0.05) ** 2)) + 0.5 * np.exp(-(((s.along + 0.78) / 0.06) ** 2))
+        bright = 1 + 0.07 * cloud(s.cloth[:, :3]) + fade * front + 0.14 * thread + 0.5 * fade * worn * (1 - crease)
+        result = base * bright[:, None]
+        if holes:
+            at = ((s.along + 0.72) / 0.03) ** 2 + (s.around / 0.05) ** 2
+            frayed = band(at + 0.6 * lattice(np.stack([s.around / 0.02, s.along / 0.004], -1), seed + 2), -1, 0.8, 0.2)
+            result = mix(result, np.asarray([0.75, 0.74, 0.72], np.float32), 0.8 * frayed * (s.cloth[:, 2] > 0))
+        return result
+
+    return albedo
+
+
+def camouflage(rng, base, _other):
+    """Four earth, sand, town or sea colours in torn blots, larger ones below smaller ones."""
+    palettes = (
+        ((0.24, 0.26, 0.14), (0.10, 0.12, 0.07), (0.33, 0.24, 0.15), (0.52, 0.47, 0.32)),
+        ((0.68, 0.58, 0.42), (0.52, 0.42, 0.29), (0.40, 0.32, 0.22), (0.78, 0.70, 0.56)),
+        ((0.45, 0.46, 0.47), (0.14, 0.14, 0.15), (0.28, 0.29, 0.30), (0.72, 0.73, 0.74)),
+        ((0.14, 0.20, 0.32), (0.06, 0.08, 0.14), (0.24, 0.33, 0.46), (0.45, 0.54, 0.62)),
+    )
+    dyes = np.asarray(palettes[rng.choice(len(palettes), p=[0.5, 0.2, 0.2, 0.1])], np.float32)
+    scale, seed = rng.uniform(0.045, 0.09), int(rng.integers(1 << 20))
+
+    def albedo(s):
+        p = s.cloth[:, :3] / scale * np.asarray([0.8, 1.4, 0.8], np.float32)
+        warp = np.stack([lattice(2.3 * p + k, seed + k) for k in range(3)], -1) - 0.5
+        result = np.broadcast_to(dyes[0], (len(p), 3))
+        for k, level in ((1, 0.56), (2, 0.6), (3, 0.66)):
+            blots = lattice((0.8 + 0.35 * k) * (p + 0.9 * warp) + 11.3 * k, seed + 10 * k)
+            result = mix(result, dyes[k], np.clip((blots - level) / 0.03 + 0.5, 0, 1))
+        return result
+
+    return albedo
+
+
+def herringbone(rng, base, other):
+    """Zigzags of slanted threads."""
+    period, pitch, share = rng.choice([0.03, 0.045]), rng.choice([0.008, 0.012]), rng.uniform(0.35, 0.7)
+
+    def albedo(s):
+        side = np.abs((s.around / period) % 2 - 1) * period
+        phase = ((s.along + side) / pitch) % 1
+        return mix(base, base + share * (other - base), band(phase * pitch, 0, 0.5 * pitch))
+
+    return albedo
+
+
+def argyle(rng, base, other):
+    """Diamonds with thin lines across."""
+    period, third = rng.choice([0.06, 0.09]), accent(rng, other)
+
+    def albedo(s):
+        x, y = s.around / period, s.along / (1.6 * period)
+        u, v = (x + y) % 1, (x - y) % 1
+        diamond = band(u * period, 0, period / 2) * band(v * period, 0, period / 2)
+        lines = np.maximum(band(((u + 0.25) % 1) * period, 0, 0.003), band(((v + 0.25) % 1) * period, 0, 0.003))
+        return mix(mix(base, other, diamond), third, 0.8 * lines)
+
+    return albedo
+
+
+def dip_dye(rng, base, other):
+    """One dye runs into another along the garment, or in rings around a middle (tie-dye)."""
+    rings, level, wide = rng.random() < 0.5, rng.uniform(-0.35, 0.0), rng.uniform(0.05, 0.25)
+    seed, third = int(rng.integers(1 << 20)), accent(rng, other)
+
+    def albedo(s):
+        wobble = lattice(s.cloth[:, :3] / 0.05, seed) - 0.5
+        if not rings:
+            return mix(base, other, np.clip((s.along + 0.05 * wobble - level) / wide + 0.5, 0, 1))
+        r = np.sqrt(s.around**2 + (s.along + 0.1) ** 2) + 0.06 * wobble
+        a = np.arctan2(s.around, s.along + 0.1)
+        twist = (r / 0.13 + a / np.pi) % 1
+        return mix(mix(base, other, np.clip(np.abs(twist - 0.5) * 4 - 0.5, 0, 1)), third, band(twist, 0.4, 0.6, 0.15))
+
+    return albedo
+
+
+def tweed(rng, base, other):
+    """Woven in two threads of nearly one colour."""
+    seed, share = int(rng.integers(1 << 20)), rng.uniform(0.08, 0.25)
+
+    def albedo(s):
+        warp = lattice(np.stack([s.around / 0.004, s.along / 0.02], -1), seed)
+        weft = lattice(np.stack([s.around / 0.02, s.along / 0.004], -1), seed + 1)
+        return mix(base, other, share * warp * weft * 2)
+
+    return albedo
+
+
+def cable_knit(rng, base, _other):
+    """Plaits of thick yarn: light and dark, no second dye."""
+    period = rng.choice([0.05, 0.07])
+
+    def albedo(s):
+        x, y = (s.around / period) % 1 - 0.5, s.along / 0.045
+        strand = np.sin(2 * np.pi * (y + 0.8 * np.abs(x))) * np.sign(x)
+        inside = band(np.abs(x) * period, -1, 0.3 * period)
+        ribs = np.cos(2 * np.pi * s.around / 0.008)
+        return base * (1 + 0.13 * strand * inside + 0.07 * ribs * (1 - inside))[:, None]
+
+    return albedo
+
+
+def colour_blocks(rng, base, other):
+    """A chest (or thigh) in another dye, with a line between."""
+    level, wide, third = rng.uniform(-0.15, 0.06), rng.uniform(0.01, 0.03), accent(rng, other)
+
+    def albedo(s):
+        upper = mix(base, other, band(s.along, level, 9.0))
+        return mix(upper, third, band(s.along, level - wide, level))
+
+    return albedo
+
+
+PATTERNS: dict[str, tuple[float, Callable]] = {
+    "plain": (0.05, lambda rng, a, b: plain(rng, a)),
+    "stripes": (0.2, stripes),
+    "upright": (0.08, lambda rng, a, b: stripes(rng, a, b, upright=True)),
+    "checks": (0.17, checks),
+    "dots": (0.06, dots),
+    "flowers": (0.09, flowers),
+    "mottled": (0.05, mottled),
+    "camouflage": (0.05, camouflage),
+    "melange": (0.03, melange),
+    "blocks": (0.09, colour_blocks),
+    "herringbone": (0.03, herringbone),
+    "argyle": (0.03, argyle),
+    "dip_dye": (0.04, dip_dye),
+    "cable_knit": (0.03, cable_knit),
+    "tweed": (0.0, tweed),
+    "denim": (0.0, denim),
+}
+"""Odds among fabrics that are not plain, and (rng, base, other) -> colour as a function of points."""

@@ -8,15 +8,17 @@ import dataclasses
 
 import numpy as np
 
-from humangs_jax.people import anatomy as anatomy_module
-from humangs_jax.people import slices
-from humangs_jax.people.anatomy import ANKLE, Anatomy, sewn_coordinates, smoothstep
+from humangs_jax.people.anatomy import ANKLE, ARM_HEIGHT, Anatomy, sewn_coordinates, smoothstep
+from humangs_jax.people.kinematics import LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER
 from humangs_jax.people.noise import ripples
 from humangs_jax.people.surfaces import (
     Surface,
+    blurred,
     boundary_edges,
     cut,
     grid_faces,
+    hanging,
+    polar,
     smooth,
     turn_in_hems,
     unit,
@@ -139,8 +141,8 @@ def fold_heights(rng, cloth: np.ndarray, arm: np.ndarray, leg: np.ndarray, fit: 
 
 
 def _push_trunk(anatomy, points, arm, leg, fit):
-    outline = slices.hanging(anatomy.trunk, fit.hang)
-    angle, radius = slices.polar(points[:, [0, 2]], np.zeros((1, 2)))
+    outline = hanging(anatomy.trunk, fit.hang)
+    angle, radius = polar(points[:, [0, 2]], np.zeros((1, 2)))
     wanted = outline.radius(points[:, 1], angle) + fit.ease
     below_armpit = 1 - smoothstep(-0.03, 0.06, anatomy_height(anatomy, points))
     amount = (1 - arm) * (1 if fit.skirted else 1 - leg) * below_armpit
@@ -151,8 +153,8 @@ def _push_trunk(anatomy, points, arm, leg, fit):
 
 def anatomy_height(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
     """(n,) heights of points above the shoulders' height less that of the template: about template y for the trunk."""
-    shoulders = anatomy.joints[anatomy_module.LEFT_SHOULDER, 1]
-    return points[:, 1] - shoulders + anatomy_module.ARM_HEIGHT
+    shoulders = anatomy.joints[LEFT_SHOULDER, 1]
+    return points[:, 1] - shoulders + ARM_HEIGHT
 
 
 def _push_arm(anatomy, points, arm, side, fit):
@@ -161,7 +163,7 @@ def _push_arm(anatomy, points, arm, side, fit):
     start, end = outline.levels[0] + 0.12, outline.levels[-1] - 0.1
     extra = fit.sleeve * np.clip((along - start) / (end - start), 0, 1)
     center = outline.center(along)
-    angle, radius = slices.polar(points[:, [1, 2]], center)
+    angle, radius = polar(points[:, [1, 2]], center)
     wanted = outline.radius(along, angle) + fit.ease + extra
     own = (points[:, 0] > 0) if side == 0 else (points[:, 0] < 0)
     scale = 1 + own * arm * np.maximum(wanted - radius, 0) / np.maximum(radius, 1e-4)
@@ -172,9 +174,9 @@ def _push_arm(anatomy, points, arm, side, fit):
 def _push_leg(anatomy, points, leg, side, fit):
     shape = anatomy.legs[side]
     inner = shape.with_radii(np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii))
-    outline = slices.hanging(inner, fit.leg_hang)
+    outline = hanging(inner, fit.leg_hang)
     center = outline.center(points[:, 1])
-    angle, radius = slices.polar(points[:, [0, 2]], center)
+    angle, radius = polar(points[:, [0, 2]], center)
     down = np.clip((-0.45 - points[:, 1]) / 0.65, 0, 1)
     wanted = outline.radius(points[:, 1], angle) + fit.ease + fit.leg * down
     own = (points[:, 0] > 0) if side == 0 else (points[:, 0] < 0)
@@ -208,7 +210,7 @@ def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
     template_y = np.linspace(cut_of.top, cut_of.bottom, rows)
     y = rest_height(anatomy, template_y)
     angle = np.arange(TUBE_COLUMNS) * (2 * np.pi / TUBE_COLUMNS)
-    outline = slices.blurred(slices.hanging(anatomy.hips_and_legs, 0.15))
+    outline = blurred(hanging(anatomy.hips_and_legs, 0.15))
     height, around = (x.reshape(-1) for x in np.meshgrid(y, angle, indexing="ij"))
     down = np.repeat((cut_of.top - template_y) / max(cut_of.top - cut_of.bottom, 1e-6), TUBE_COLUMNS)
     drop = np.repeat(cut_of.top - template_y, TUBE_COLUMNS)
@@ -256,10 +258,10 @@ def _skirt_weights(anatomy, vertices, template_y):
     shin = 0.92 * smoothstep(0.68, 0.9, -template_y)
     legs = np.zeros_like(trunk)
     for joint, share in (
-        (anatomy_module.LEFT_HIP, left * (1 - shin)),
-        (anatomy_module.LEFT_HIP + 1, (1 - left) * (1 - shin)),
-        (anatomy_module.LEFT_KNEE, left * shin),
-        (anatomy_module.LEFT_KNEE + 1, (1 - left) * shin),
+        (LEFT_HIP, left * (1 - shin)),
+        (LEFT_HIP + 1, (1 - left) * (1 - shin)),
+        (LEFT_KNEE, left * shin),
+        (LEFT_KNEE + 1, (1 - left) * shin),
     ):
         legs[:, joint] = share
     return (trunk * (1 - thigh)[:, None] + legs * thigh[:, None]).astype(np.float32)

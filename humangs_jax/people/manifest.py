@@ -1,4 +1,4 @@
-"""The manifest of a written set: with what it was made, and who is finished.
+"""Sets written by `humangs synth`: the manifest with the settings and the finished subjects, and how a set is found.
 
 {"format": "humangs-synthetic", "version": 2, "generator_version": ..., "split": ..., "settings": {...}, "subjects": [...]}
 """
@@ -8,7 +8,8 @@ import os
 from pathlib import Path
 from typing import Any
 
-from humangs_jax.people.seeds import GENERATOR_VERSION
+from humangs_jax.data.loading.captures import find_captures
+from humangs_jax.people.seeds import GENERATOR_VERSION, split_of
 
 MANIFEST = "manifest.json"
 FORMAT, VERSION = "humangs-synthetic", 2
@@ -73,3 +74,20 @@ def write_manifest(folder: str | Path, split: str, settings: dict[str, Any]) -> 
     temporary = folder / f".{MANIFEST}.{os.getpid()}"
     temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     temporary.replace(folder / MANIFEST)
+
+
+def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
+    """The capture folders in `root`, sorted by name; where a manifest says that they are synthetic, only of one split.
+
+    Folders without a manifest (real captures) are taken as they are. split None: any.
+    Raises: ValueError if a written set holds a subject of another split, or there is no capture.
+    """
+    root = Path(root)
+    folders = find_captures(root)
+    if split is not None and (root / MANIFEST).is_file():
+        read_manifest(root)
+        for folder in folders:
+            if folder.name.isdigit() and split_of(int(folder.name)) != split:
+                other = split_of(int(folder.name))
+                raise ValueError(f"{folder}: a subject of the split '{other}', where '{split}' was expected")
+    return folders

@@ -1,26 +1,36 @@
-"""Views of a synthetic person: rasterized at twice the size, shaded per pixel, box-averaged."""
+"""Views of a synthetic person: rasterized at twice the size, shaded per pixel, box-averaged; depth and position maps.
+
+Maps sample the point in the middle of each pixel. depth: along the optical axis, metres, 0 where nothing is hit. position:
+where that point is on the person in T-pose, metres: on bare skin a point of the shaped body, on cloth a point of the garment.
+"""
 
 import dataclasses
+from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.exr import ExrView, write_exr
+from humangs_jax.people import shading
 from humangs_jax.people.fabrics import Spots
 from humangs_jax.people.noise import Folds
-from humangs_jax.people.shading import bend_normals, lit_share, occlusion, shade
 from humangs_jax.people.subject import SyntheticSubject
 from humangs_jax.people.surfaces import vertex_normals
-from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 SUPERSAMPLING = 2
-VERTEX_STEP, FACE_STEP = 4096, 8192
-"""Meshes are padded to multiples of these, so that few shapes are compiled."""
-INSIDE_SHADE = 0.45
-"""Brightness of the inner side of cloth."""
+VERTEX_STEP, FACE_STEP, POINT_STEP = 4096, 8192, 1 << 15
+"""Meshes are padded to multiples of these and points are coloured so many at a time, so that few shapes are compiled."""
 FOLD_SLOPE = 0.6
 """Slope of painted creases on the most wrinkled cloth."""
+DEPTH_UNIT = 1e-4
+"""Metres per level of a depth file (16-bit PNG): up to 6.5 m, 0 where nothing is hit."""
+
+_shaded_vertices, _seen_from_behind = jax.jit(shading.shaded_vertices), jax.jit(shading.seen_from_behind)
+_light_points = jax.jit(shading.light_points)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,42 +52,40 @@ def pose_subject(
     subject: SyntheticSubject, rotations: Float[np.ndarray, "j 3"], translation: Float[np.ndarray, "3"]
 ) -> PosedSubject:
     """Skin the mesh and gather what its shading needs."""
+    faces, count = subject.surface.faces, len(subject.surface.vertices)
     vertices = subject.posed_vertices(rotations, translation).astype(np.float32)
-    normals = vertex_normals(vertices, subject.surface.faces)
-    lit = lit_share(vertices, normals, subject.lights.directions[0])
-    return PosedSubject(subject, rotations, translation, vertices, normals, occlusion(vertices, normals), lit)
+    normals = vertex_normals(vertices, faces)
+    shades = _shaded_vertices(padded(vertices, faces)[0], padded(normals, faces)[0], subject.lights.directions[0])
+    return PosedSubject(subject, rotations, translation, vertices, normals, *(np.asarray(x)[:count] for x in shades))
+
+
+def padded(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[Array, "n_padded 3"], Int[Array, "f_padded 3"]]:
+    """A mesh with repeated vertices and faces without area up to the next step of sizes."""
+    spare_vertices, spare_faces = -len(vertices) % VERTEX_STEP, -len(faces) % FACE_STEP
+    vertices = np.concatenate([vertices, np.repeat(vertices[:1], spare_vertices, axis=0)]).astype(np.float32)
+    return jnp.asarray(vertices), jnp.asarray(np.pad(faces, ((0, spare_faces), (0, 0))))
 
 
 def render_view(
     posed: PosedSubject, camera: Camera, background: float = 1.0
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-    """(h, w, 3) picture on the background and (h, w) coverage of one camera, both in [0, 1]."""
-    s = SUPERSAMPLING
-    large = camera.resized(camera.width * s, camera.height * s)
-    faces = posed.subject.surface.faces
-    fragments = rasterize_mesh(*_padded(posed.vertices, faces), large)
+    """(h, w, 3) image on the background and (h, w) coverage of one camera, both in [0, 1]."""
+    s, subject = SUPERSAMPLING, posed.subject
+    fragments = rasterize_mesh(
+        *padded(posed.vertices, subject.surface.faces), camera.resized(camera.width * s, camera.height * s)
+    )
     ids = np.asarray(fragments.face_ids).reshape(-1)
     seen = np.flatnonzero(ids >= 0)
-    barycentrics = np.asarray(fragments.barycentrics).reshape(-1, 3)[seen]
-    eye = np.asarray(camera.center, np.float32)
-    picture = np.full((len(ids), 3), background, np.float32)
-    picture[seen] = _shade_pixels(posed, ids[seen], barycentrics, eye)
+    weights = np.asarray(fragments.barycentrics).reshape(-1, 3)[seen]
+    albedo, slopes = paint(subject, ids[seen], spots_at(subject, ids[seen], weights))
+    samples = np.full((len(ids), 3), background, np.float32)
+    samples[seen] = light_points(posed, ids[seen], weights, albedo, slopes, camera.center)
     shape = (camera.height, s, camera.width, s)
-    image = picture.reshape(*shape, 3).mean(axis=(1, 3))
+    image = samples.reshape(*shape, 3).mean(axis=(1, 3))
     mask = (ids >= 0).astype(np.float32).reshape(shape).mean(axis=(1, 3))
     return np.clip(image, 0, 1), mask
-
-
-def _padded(vertices, faces):
-    """Repeats a vertex and appends faces without area up to the next step: the rasterizer then compiles few times."""
-    extra_vertices, extra_faces = -len(vertices) % VERTEX_STEP, -len(faces) % FACE_STEP
-    vertices = np.concatenate([vertices, np.repeat(vertices[:1], extra_vertices, 0)])
-    return jnp.asarray(vertices), jnp.asarray(np.concatenate([faces, np.zeros((extra_faces, 3), faces.dtype)]))
-
-
-def _shade_pixels(posed, ids, weights, eye):
-    albedo, slopes = paint(posed.subject, ids, spots_at(posed.subject, ids, weights))
-    return light_points(posed, ids, weights, albedo, slopes, eye)
 
 
 def light_points(
@@ -86,38 +94,43 @@ def light_points(
     weights: Float[np.ndarray, "m 3"],
     albedo: Float[np.ndarray, "m 3"],
     slopes: Float[np.ndarray, "m 3"],
-    eye: Float[np.ndarray, "3"] | None = None,
+    eye: Float[Array, "3"] | None = None,
 ) -> Float[np.ndarray, "m 3"]:
-    """Colours (m, 3) in the subject's light of points on faces, given by the weights of their corners, as painted (see `paint`).
+    """Colours (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the weights of the corners.
 
     eye: where they are seen from, which tells cloth's inner side; None: everything is seen from outside.
     """
-    subject = posed.subject
-    corners = subject.surface.faces[face_ids]
-    values = np.concatenate([posed.vertices, posed.normals, posed.openness[:, None], posed.lit[:, None]], 1)
-    points, normals, shades = np.split(_blend(values, corners, weights), [3, 6], 1)
-    openness, lit = shades.T
-    normals = normals / (np.linalg.norm(normals, axis=1, keepdims=True) + 1e-9)
+    subject, faces = posed.subject, posed.subject.surface.faces
+    values = np.concatenate([posed.normals, posed.openness[:, None], posed.lit[:, None]], axis=1)
+    behind = np.zeros(len(faces), bool)
     if eye is not None:
-        a, b, c = (posed.vertices[corners[:, i]] for i in range(3))
-        inside = np.sum(np.cross(b - a, c - a) * (eye - points), -1) < 0
-        normals = np.where(inside[:, None], -normals, normals)
-        openness = np.where(inside, INSIDE_SHADE * openness, openness)
-    normals = np.where((slopes != 0).any(1, keepdims=True), bend_normals(normals, slopes), normals)
-    sheens = np.asarray([material.sheen for material in subject.materials], np.float32)
-    return shade(subject.lights, albedo, normals, openness, sheens[subject.face_materials[face_ids]], lit)
+        behind = np.asarray(_seen_from_behind(*padded(posed.vertices, faces), eye))
+    sheen = np.asarray([material.sheen for material in subject.materials], np.float32)[subject.face_materials]
+    colors = [np.zeros((0, 3), np.float32)]
+    for start in range(0, len(face_ids), POINT_STEP):
+        part = slice(start, start + POINT_STEP)
+        ids = face_ids[part]
+        points = (
+            values[faces[ids]].reshape(-1, 15),
+            weights[part],
+            behind[ids],
+            albedo[part],
+            slopes[part],
+            sheen[ids],
+        )
+        spare = POINT_STEP - len(ids)
+        points = (np.pad(x, [(0, spare)] + [(0, 0)] * (x.ndim - 1)) for x in points)
+        colors.append(np.asarray(_light_points(subject.lights, *points))[: len(ids)])
+    return np.concatenate(colors)
 
 
 def spots_at(subject: SyntheticSubject, face_ids: Int[np.ndarray, " m"], weights: Float[np.ndarray, "m 3"]) -> Spots:
     """Points on faces, given by the weights of their corners, as materials see them."""
     attributes = subject.surface.attributes
     values = np.concatenate([attributes["cloth"], attributes["template"]], axis=1)
-    blended = _blend(values, subject.surface.faces[face_ids], weights)
+    corners = subject.surface.faces[face_ids]
+    blended = sum(weights[:, i : i + 1] * values[corners[:, i]] for i in range(3))
     return Spots(blended[:, :4], blended[:, 4:])
-
-
-def _blend(values, corners, weights):
-    return sum(weights[:, i : i + 1] * values[corners[:, i]] for i in range(3))
 
 
 def paint(
@@ -138,3 +151,58 @@ def paint(
             folds = Folds(np.random.default_rng([subject.seed, 100 + k]), upright=material.draped)
             slope[chosen] = FOLD_SLOPE * material.wrinkles * folds.slope(own.cloth[:, :3])
     return np.clip(albedo, 0.01, None), slope
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceMaps:
+    """See the module."""
+
+    depth: Float[np.ndarray, "h w"]
+    position: Float[np.ndarray, "h w 3"]
+
+
+def render_maps(posed: PosedSubject, camera: Camera) -> SurfaceMaps:
+    """The maps of one camera."""
+    surface = posed.subject.surface
+    vertices, faces = padded(posed.vertices, surface.faces)
+    fragments = rasterize_mesh(vertices, faces, camera)
+    rest, _ = padded(surface.vertices, surface.faces)
+    position = np.asarray(interpolate_attributes(fragments, faces, rest, jnp.zeros(3)))
+    return SurfaceMaps(np.maximum(np.asarray(fragments.depth), 0), position)
+
+
+def write_depth(path: str | Path, depth: Float[np.ndarray, "h w"]) -> None:
+    """A 16-bit PNG in steps of `DEPTH_UNIT`. Raises: ValueError if a depth does not fit."""
+    from PIL import Image
+
+    levels = np.rint(depth / DEPTH_UNIT)
+    if not 0 <= levels.min() <= levels.max() <= 65535:
+        raise ValueError(f"{path}: depths of {depth.min():.3g} to {depth.max():.3g} m do not fit into 16 bits")
+    Image.fromarray(levels.astype(np.uint16)).save(path, format="PNG")
+
+
+def read_depth(path: str | Path) -> Float[np.ndarray, "h w"]:
+    """Metres, 0 where nothing is hit. Raises: OSError if the file cannot be read; ValueError if it is no 16-bit grey PNG."""
+    from PIL import Image
+
+    with Image.open(path) as image:
+        if not image.mode.startswith("I"):
+            raise ValueError(f"{path}: expected a 16-bit grey PNG, got mode {image.mode}")
+        return (np.asarray(image).astype(np.float64) * DEPTH_UNIT).astype(np.float32)
+
+
+def write_maps(
+    path: str | Path,
+    image: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w"],
+    maps: SurfaceMaps,
+    camera: Camera,
+) -> None:
+    """An OpenEXR file: R, G, B premultiplied by A, depth Z, position.X/Y/Z, the camera in the header.
+
+    image: as rendered on white.
+    """
+    rgba = np.concatenate([image - (1 - mask[..., None]), mask[..., None]], axis=-1)
+    channels = {f"position.{axis}": maps.position[..., i] for i, axis in enumerate("XYZ")}
+    K, cam_from_world = np.asarray(camera.K), np.asarray(camera.cam_from_world)
+    write_exr(path, ExrView(rgba, maps.depth, K, cam_from_world, name=Path(path).stem, channels=channels))

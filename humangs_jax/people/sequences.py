@@ -11,31 +11,9 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
-from humangs_jax.people.arms import ARMS, arm_clearance, bend_arm, draw_goal
-from humangs_jax.people.hands import pose_hand
-from humangs_jax.people.kinematics import (
-    HEAD,
-    JOINTS,
-    LEFT_FOOT,
-    LEFT_HAND,
-    LEGS,
-    NECK,
-    PELVIS,
-    RIGHT_HAND,
-    SPINE1,
-    SPINE2,
-    SPINE3,
-    Build,
-    Foot,
-    about_y,
-    between,
-    highest_pelvis,
-    place_feet,
-    rotation_matrix,
-    rotation_vector,
-)
-from humangs_jax.people.poses import bend_trunk
-from humangs_jax.people.stances import STANCES, in_world
+from humangs_jax.people import kinematics as kin
+from humangs_jax.people.arms import ARMS, arm_clearance, bend_arm, draw_goal, pose_hand
+from humangs_jax.people.poses import STANCES, bend_trunk, in_world
 
 FPS = 30.0
 STANCE_SHARE = 0.62
@@ -65,7 +43,7 @@ class Sequence:
     fps: float = FPS
 
 
-def sample_sequence(rng: np.random.Generator, build: Build, frames: int = 60, kind: str | None = None) -> Sequence:
+def sample_sequence(rng: np.random.Generator, build: kin.Build, frames: int = 60, kind: str | None = None) -> Sequence:
     """A motion of so many frames at 30 a second. kind: "walk", "turn" or "reach"; None draws one.
 
     Raises: ValueError if there is no such kind, or no frame.
@@ -78,7 +56,7 @@ def sample_sequence(rng: np.random.Generator, build: Build, frames: int = 60, ki
     if kind not in KINDS:
         raise ValueError(f"no kind of sequence {kind!r}: expected one of {', '.join(KINDS)}")
     rotations, pelvis, planted = KINDS[kind][1](rng, build, frames)
-    return Sequence(kind, rotations, pelvis - build.joints[PELVIS], planted)
+    return Sequence(kind, rotations, pelvis - build.joints[kin.PELVIS], planted)
 
 
 # Walking and turning -------------------------------------------------------------------------------------------------
@@ -139,7 +117,7 @@ def _step_along(rng, build, frames, gait):
     feet = [tuple(_foot_at(build, gait, heading, track, side, p) for side in (0, 1)) for p in phase]
     planted = np.asarray([[(p + 0.5 * side) % 1 < STANCE_SHARE for side in (0, 1)] for p in phase])
 
-    rotations = np.zeros((frames, JOINTS, 3))
+    rotations = np.zeros((frames, kin.JOINTS, 3))
     sway = 0.25 * gait.width * np.sin(2 * np.pi * (phase - 0.06))  # over the foot that stands: left at a quarter stride
     lean = rng.normal(0.02, 0.02) + 0.12 * max(gait.step, 0) / build.leg
     twist = 0.14 * gait.step / build.leg / 0.6
@@ -147,18 +125,20 @@ def _step_along(rng, build, frames, gait):
     for i, p in enumerate(phase):
         once = 2 * np.pi * p
         roll = 0.05 * np.sin(once - 0.1) * min(1.0, gait.step / build.leg + 0.3)
-        turns[i] = about_y(heading(p) - twist * np.cos(once)) @ rotation_matrix(np.asarray([0.4 * lean, 0, roll]))
-        for joint, share in ((SPINE1, 0.3), (SPINE2, 0.4), (SPINE3, 0.3)):
+        turns[i] = kin.about_y(heading(p) - twist * np.cos(once)) @ kin.rotation_matrix(
+            np.asarray([0.4 * lean, 0, roll])
+        )
+        for joint, share in ((kin.SPINE1, 0.3), (kin.SPINE2, 0.4), (kin.SPINE3, 0.3)):
             rotations[i, joint] = np.asarray([0.6 * lean, 2 * twist * np.cos(once - 0.2), -0.8 * roll]) * share
         look = np.clip(1.2 * gait.bend, -0.5, 0.5)  # to where the path leads
-        rotations[i, NECK] = [-0.3 * lean, 0.5 * look - 0.5 * twist * np.cos(once - 0.2), 0]
-        rotations[i, HEAD] = [-0.3 * lean, 0.5 * look - 0.5 * twist * np.cos(once - 0.2), 0]
-    rotations[:, PELVIS] = rotation_vector(turns)
+        rotations[i, kin.NECK] = [-0.3 * lean, 0.5 * look - 0.5 * twist * np.cos(once - 0.2), 0]
+        rotations[i, kin.HEAD] = [-0.3 * lean, 0.5 * look - 0.5 * twist * np.cos(once - 0.2), 0]
+    rotations[:, kin.PELVIS] = kin.rotation_vector(turns)
     centers = np.stack([track(p) for p in phase])
-    centers += np.stack([about_y(heading(p))[:, 0] * s for p, s in zip(phase, sway, strict=True)])
+    centers += np.stack([kin.about_y(heading(p))[:, 0] * s for p, s in zip(phase, sway, strict=True)])
     pelvis = _ride(build, turns, centers, feet)
     for i in range(frames):
-        place_feet(build, rotations[i], pelvis[i], feet[i])
+        kin.place_feet(build, rotations[i], pelvis[i], feet[i])
     _swing_arms(rng, build, rotations, phase, gait)
     return rotations, pelvis, planted
 
@@ -191,7 +171,7 @@ def _foot_at(build, gait, heading, track, side, phase):
     u = (share - STANCE_SHARE) / (1 - STANCE_SHARE)
     s = _ease(u)
     turned = (there.yaw - here.yaw) * s
-    return Foot(
+    return kin.Foot(
         x=float(here.x + s * (there.x - here.x)),
         z=float(here.z + s * (there.z - here.z)),
         yaw=float(here.yaw + turned),
@@ -206,29 +186,31 @@ def _footprint(build, gait, heading, track, side, down):
     middle = down + 0.5 * STANCE_SHARE
     yaw, sign = heading(middle), 1 - 2 * side
     ahead = (
-        build.joints[LEFT_FOOT, 2] - build.joints[PELVIS, 2] - 0.04 * build.leg
+        build.joints[kin.LEFT_FOOT, 2] - build.joints[kin.PELVIS, 2] - 0.04 * build.leg
     )  # of the ball before the pelvis, standing
-    x, _, z = track(middle) + about_y(yaw) @ np.asarray([sign * gait.width, 0.0, ahead])
-    return Foot(float(x), float(z), float(yaw + sign * gait.turn_out))
+    x, _, z = track(middle) + kin.about_y(yaw) @ np.asarray([sign * gait.width, 0.0, ahead])
+    return kin.Foot(float(x), float(z), float(yaw + sign * gait.turn_out))
 
 
 def _swing_arms(rng, build, rotations, phase, gait):
     """Arms hang and swing against the legs; a hanging pose found once, its swing about the axis of the shoulders."""
     stood = rotations[0].copy()
-    stood[[joint for leg in LEGS for joint in leg]] = 0
+    stood[[joint for leg in kin.LEGS for joint in leg]] = 0
     for side in (0, 1):
         for _ in range(TRIES):
             if bend_arm(rng, build, stood, "hang", side) > 0.01:
                 break
         pose_hand(rng, stood, side)
-    hand_of = (slice(LEFT_HAND, RIGHT_HAND), slice(RIGHT_HAND, JOINTS))
+    hand_of = (slice(kin.LEFT_HAND, kin.RIGHT_HAND), slice(kin.RIGHT_HAND, kin.JOINTS))
     for side in (0, 1):
         collar, shoulder, elbow, wrist = ARMS[side]
         sign = 1 - 2 * side
         forward = -sign * np.cos(2 * np.pi * (phase - 0.04))  # the left arm is back when the left heel comes down
-        base = rotation_matrix(stood[shoulder])
+        base = kin.rotation_matrix(stood[shoulder])
         for i, f in enumerate(forward):
-            rotations[i, shoulder] = rotation_vector(rotation_matrix(np.asarray([-gait.swing * f, 0, 0])) @ base)
+            rotations[i, shoulder] = kin.rotation_vector(
+                kin.rotation_matrix(np.asarray([-gait.swing * f, 0, 0])) @ base
+            )
             flexed = stood[elbow] + np.asarray([0, -sign * 0.35 * gait.swing * (1 + f), 0])
             rotations[i, elbow] = flexed
             rotations[i, collar] = stood[collar] + np.asarray([0, -sign * 0.05 * f * min(1.0, gait.swing / 0.4), 0])
@@ -254,35 +236,35 @@ def _reach(rng, build, frames):
         if t > frames / FPS:
             break
         t += rng.uniform(0.7, 1.4)
-    rotations, centers, turns = np.zeros((frames, JOINTS, 3)), np.zeros((frames, 3)), np.zeros((frames, 3, 3))
+    rotations, centers, turns = np.zeros((frames, kin.JOINTS, 3)), np.zeros((frames, 3)), np.zeros((frames, 3, 3))
     sinks = np.zeros(frames)
     for i in range(frames):
         k = int(np.searchsorted(times, i / FPS, side="right")) - 1
         a, b = keys[k], keys[k + 1]
         # three quarters of the time on the way, then a rest
         s = _ease((i / FPS - times[k]) / (0.8 * (times[k + 1] - times[k])))
-        rotations[i] = between(a[0], b[0], s)
+        rotations[i] = kin.between(a[0], b[0], s)
         centers[i], sinks[i] = (1 - s) * a[1] + s * b[1], (1 - s) * a[2] + s * b[2]
-        turns[i] = rotation_matrix(rotations[i, PELVIS])
+        turns[i] = kin.rotation_matrix(rotations[i, kin.PELVIS])
     pelvis = _ride(build, turns, centers, [feet] * frames, sinks)
     for i in range(frames):
-        place_feet(build, rotations[i], pelvis[i], feet)
+        kin.place_feet(build, rotations[i], pelvis[i], feet)
     return rotations, pelvis, np.ones((frames, 2), bool)
 
 
 def _key_pose(rng, build, heading, stance, feet, before):
     """(rotations, place of the pelvis on the ground plane, how much lower it is than it could be)."""
-    rotations = np.zeros((JOINTS, 3))
+    rotations = np.zeros((kin.JOINTS, 3))
     sink = stance.sink * build.leg + (rng.uniform(0.05, 0.3) * build.leg if rng.random() < 0.3 else 0.0)
     stooped = sink / build.leg
     tilt, turned = 0.5 * stooped + rng.uniform(0, 0.05), rng.normal(0, 0.15)
-    turn = about_y(heading + turned) @ rotation_matrix(np.asarray([tilt, 0, stance.roll]))
-    rotations[PELVIS] = rotation_vector(turn)
+    turn = kin.about_y(heading + turned) @ kin.rotation_matrix(np.asarray([tilt, 0, stance.roll]))
+    rotations[kin.PELVIS] = kin.rotation_vector(turn)
     middle = 0.5 * (feet[0].x + feet[1].x), 0.5 * (feet[0].z + feet[1].z)
-    back = about_y(heading) @ np.asarray([rng.normal(0, 0.02), 0, rng.normal(-0.08, 0.02)]) * build.leg
+    back = kin.about_y(heading) @ np.asarray([rng.normal(0, 0.02), 0, rng.normal(-0.08, 0.02)]) * build.leg
     center = np.asarray([middle[0] + back[0], 0.0, middle[1] + back[2]])
-    height = highest_pelvis(build, turn, center[0], center[2], feet, SPARE) - sink
-    place_feet(build, rotations, np.asarray([center[0], height, center[2]]), feet)
+    height = kin.highest_pelvis(build, turn, center[0], center[2], feet, SPARE) - sink
+    kin.place_feet(build, rotations, np.asarray([center[0], height, center[2]]), feet)
     bend_trunk(rng, rotations, stance.lean + 1.2 * stooped, stance.roll)
     for side in (0, 1):
         best, best_clear = rotations, -np.inf
@@ -292,7 +274,9 @@ def _key_pose(rng, build, heading, stance, feet, before):
             bend_arm(rng, build, tried, goal, side, other_arm=side == 1)
             clear = _clear_of(build, tried, side)
             if before is not None:  # the way there counts as much as the place
-                clear = min(clear, *(_clear_of(build, between(before[0], tried, t), side) for t in (0.25, 0.5, 0.75)))
+                clear = min(
+                    clear, *(_clear_of(build, kin.between(before[0], tried, t), side) for t in (0.25, 0.5, 0.75))
+                )
             if clear > best_clear:
                 best, best_clear = tried, clear
             if clear > 0.0:
@@ -316,7 +300,7 @@ def _clear_of(build, rotations, side):
 def _ride(build, turns, centers, feet, sinks=None):
     """Places of the pelvis (m, 3): above the centers, smoothly, never higher than the legs allow, less `sinks`."""
     heights = np.asarray([
-        highest_pelvis(build, turn, center[0], center[2], both, SPARE)
+        kin.highest_pelvis(build, turn, center[0], center[2], both, SPARE)
         for turn, center, both in zip(turns, centers, feet, strict=True)
     ])  # fmt: skip
     window = lambda values: np.lib.stride_tricks.sliding_window_view(

@@ -1,46 +1,44 @@
-"""Soft light on posed surfaces: sky and ground, three wide lights, occlusion and soft shadows from a voxel grid, painted folds.
+"""Soft light on posed surfaces, in JAX: sky and ground, three wide lights, occlusion and soft shadows, painted folds.
 
-Everything is diffuse or nearly so and fixed in the world, so that a point has one colour from wherever it is seen.
+Everything is diffuse or nearly so and fixed in the world: a point has one colour from wherever it is seen. Occlusion and the
+shadow of the key light come from a voxel grid that holds the posed person. Openness is how empty the grid is in front of a
+point; the shadow is what the grid holds on the way towards the light. Both are per vertex and smooth: no shadow map, no rays.
+Exposure and white balance differ from person to person, so that colours are no constants.
 """
 
-import dataclasses
+import math
 
+import jax.numpy as jnp
 import numpy as np
+from jax import lax
+from jax.scipy.special import ndtri
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.people.fabrics import ALBEDO_LIMIT
-from humangs_jax.people.surfaces import unit
 
 CELL = 0.025
 """Edge of a voxel of the occupancy grid, metres."""
+GRID = (112, 104, 80)
+"""Voxels along x, y and z: 2.8 m x 2.6 m x 2 m, more than any pose takes; what lies outside casts no shadow."""
+MARGIN = 6
+"""Empty voxels around the person."""
 REACH = (0.045, 0.11)
-"""Distances from the surface at which the grid is sampled, metres."""
-
-
+"""Distances from the surface at which the grid is sampled for openness, metres."""
 STRIDES = (0.06, 0.085, 0.115, 0.155, 0.205, 0.27, 0.36, 0.47, 0.6)
 """Distances towards the key light at which the grid is sampled for shadows, metres."""
 LIFT = 0.03
 """Metres above the surface at which the way to the light begins."""
 SHADOW_DENSITY, DARKEST = 2.2, 0.4
-"""Extinction per unit of what the samples find, and the share of the key light that is left at least."""
-
+"""Extinction per unit of what the samples find, and the least share of the key light that arrives."""
 SHOULDER, WHITEST = 0.72, 0.97
 """Brightness from which highlights are compressed, and the one that they approach."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Lights:
-    """directions: (k, 3) towards the lights, the key light first. strengths: (k, 3).
-
-    sky, ground: (3,) ambient from above and below. gain: (3,) exposure and white balance of the camera.
-    """
-
-    directions: Float[np.ndarray, "k 3"]
-    strengths: Float[np.ndarray, "k 3"]
-    sky: Float[np.ndarray, "3"]
-    ground: Float[np.ndarray, "3"]
-    gain: Float[np.ndarray, "3"]
-
+WRAP, GLOSS = 0.25, 0.12
+"""Cosine by which a wide light reaches beyond the terminator; strength of highlights on the glossiest material."""
+INSIDE_SHADE = 0.45
+"""Brightness of the inner side of cloth."""
+LIGHT_NUMBERS = 28
+WARM = np.asarray([1.0, 0.0, -1.0])
 
 SCENES = {
     "studio": (0.34, (-0.8, 0.8), (0.5, 1.0), (0.5, 0.75), (0.18, 0.34), (0.68, 0.82), 0.0, 0.68),
@@ -51,6 +49,21 @@ SCENES = {
 }
 """Kinds of light: odds; azimuth and elevation of the key light (radians), its strength, that of the fill, the sky's; how much
 warmer the key is than the sky; and the ground's brightness against the sky's."""
+_SCENES = np.asarray([np.hstack(row) for row in SCENES.values()], np.float32)
+
+
+@pytree_dataclass
+class Lights:
+    """directions: (k, 3) towards the lights, the key light first. strengths: (k, 3).
+
+    sky, ground: (3,) ambient from above and below. gain: (3,) exposure and white balance of the camera.
+    """
+
+    directions: Float[Array, "k 3"]
+    strengths: Float[Array, "k 3"]
+    sky: Float[Array, "3"]
+    ground: Float[Array, "3"]
+    gain: Float[Array, "3"]
 
 
 def sample_lights(rng: np.random.Generator) -> Lights:
@@ -60,105 +73,191 @@ def sample_lights(rng: np.random.Generator) -> Lights:
     _, azimuths, heights, key, fill, sky_range, warmth, bounce = scene
     azimuth = rng.uniform(*azimuths) * rng.choice([-1, 1])
     angles = azimuth + np.asarray([0.0, rng.uniform(1.4, 2.4) * rng.choice([-1, 1]), np.pi + rng.uniform(-0.5, 0.5)])
-    elevation = np.asarray([rng.uniform(*heights), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)])
-    directions = np.stack(
-        [np.cos(elevation) * np.sin(angles), np.sin(elevation), np.cos(elevation) * np.cos(angles)], -1
-    )
+    elevations = np.asarray([rng.uniform(*heights), rng.uniform(0.1, 0.5), rng.uniform(0.4, 0.9)])
     power = np.asarray([rng.uniform(*key), rng.uniform(*fill), rng.uniform(0.4, 1.2) * fill[1]])
-    warm = np.asarray([1.0, 0.0, -1.0])
-    tint = 1 + rng.uniform(-0.03, 0.03, (3, 3)) + warmth * np.asarray([[1.0], [0.0], [0.0]]) * warm
-    sky = rng.uniform(*sky_range) * (1 + rng.uniform(-0.02, 0.02, 3) - 0.5 * warmth * warm)
+    tint = rng.uniform(-0.03, 0.03, (3, 3))
+    sky = rng.uniform(*sky_range) * (1 + rng.uniform(-0.02, 0.02, 3) - 0.5 * warmth * WARM)
     exposure, balance, green = np.exp(rng.normal(0.06, 0.12)), rng.normal(0, 0.045), rng.normal(0, 0.012)
     gain = np.clip(exposure, 0.75, 1.3) * np.asarray([1 + balance, 1 + green, 1 - balance])
-    return Lights(
-        directions.astype(np.float32),
-        (power[:, None] * tint).astype(np.float32),
-        sky.astype(np.float32),
-        (bounce * sky * (1 + rng.uniform(-0.06, 0.06, 3))).astype(np.float32),
-        gain.astype(np.float32),
+    ground = bounce * sky * (1 + rng.uniform(-0.06, 0.06, 3))
+    return _lights(np, angles, elevations, power, tint, warmth, sky, ground, gain)
+
+
+def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
+    """The scenes of `sample_lights` on the device; u: `LIGHT_NUMBERS` numbers in [0, 1)."""
+    odds = np.cumsum(_SCENES[:, 0])
+    row = jnp.asarray(_SCENES)[jnp.sum(u[0] * odds[-1] >= odds[:-1])]
+    azimuth, height, key, fill, sky = row[1:11].reshape(5, 2)
+    warmth, bounce = row[11], row[12]
+    within = lambda limits, share: limits[0] + (limits[1] - limits[0]) * share
+    sign = lambda number: jnp.where(number < 0.5, -1.0, 1.0)
+    turns = jnp.stack([jnp.zeros(()), sign(u[1]) * within((1.4, 2.4), u[2]), np.pi + within((-0.5, 0.5), u[3])])
+    elevations = jnp.stack([within(height, u[6]), within((0.1, 0.5), u[7]), within((0.4, 0.9), u[8])])
+    power = jnp.stack([within(key, u[9]), within(fill, u[10]), within((0.4, 1.2), u[11]) * fill[1]])
+    tint, color = within((-0.03, 0.03), u[12:21].reshape(3, 3)), within(sky, u[21]) * (1 - 0.5 * warmth * WARM)
+    normal = lambda number: ndtri(jnp.clip(number, 1e-4, 1 - 1e-4))
+    exposure, balance, green = 0.12 * normal(u[22]) + 0.06, 0.045 * normal(u[23]), 0.012 * normal(u[24])
+    gain = jnp.clip(jnp.exp(exposure), 0.72, 1.35) * jnp.stack([1 + balance, 1 + green, 1 - balance])
+    ground = bounce * color * (1 + within((-0.06, 0.06), u[25:28]))
+    return _lights(
+        jnp, within(azimuth, u[4]) * sign(u[5]) + turns, elevations, power, tint, warmth, color, ground, gain
     )
 
 
-def occlusion(vertices: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """(n,) openness of each vertex in [0.35, 1]: how empty the grid is in front of it."""
-    grid, low = _grid(vertices)
-    dark = np.zeros(len(vertices), np.float32)
-    for reach in REACH:
-        dark += _trilinear(grid, (vertices + reach * normals - low) / CELL - 0.5) / len(REACH)
-    return np.clip(1.08 - 2.6 * dark, 0.35, 1.0)
+def _lights(numpy, angles, elevations, power, tint, warmth, sky, ground, gain):
+    """numpy: the module of the arrays' kind."""
+    flat = numpy.cos(elevations)
+    directions = numpy.stack([flat * numpy.sin(angles), numpy.sin(elevations), flat * numpy.cos(angles)], -1)
+    strengths = power[:, None] * (1 + tint + warmth * np.outer([1.0, 0.0, 0.0], WARM))
+    return Lights(*(jnp.asarray(x, jnp.float32) for x in (directions, strengths, sky, ground, gain)))
 
 
-def lit_share(
-    vertices: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, " n"]:
-    """(n,) share of a wide light from `direction` that reaches each vertex past the rest of the person, in [DARKEST, 1]."""
-    grid, low = _grid(vertices)
+def shaded_vertices(
+    vertices: Float[Array, "n 3"],
+    normals: Float[Array, "n 3"],
+    direction: Float[Array, "3"],
+    faces: Int[Array, "f 3"] | None = None,
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    """(n,) openness in [0.35, 1] and (n,) share of the light from `direction` that arrives, in [DARKEST, 1].
+
+    faces: where they are given, as for training on the fly, their middles fill the grid as well (meshes may have edges longer
+    than a voxel), and the way to the light is sampled at the nearest voxels, which takes an eighth of the lookups.
+    """
+    low = vertices.min(0) - MARGIN * CELL
+    points, towards_light = vertices, _trilinear
+    if faces is not None:
+        middles = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
+        points, towards_light = jnp.concatenate([vertices, middles]), _nearest
+    grid = _blurred(_occupancy(points, low))
+    place = lambda points: (points - low) / CELL - 0.5
+    dark = sum(_trilinear(grid, place(vertices + reach * normals)) for reach in REACH) / len(REACH)
+    openness = jnp.clip(1.08 - 2.6 * dark, 0.35, 1.0)
     start = vertices + LIFT * normals
-    found = np.zeros(len(vertices), np.float32)
-    for stride in STRIDES:
-        found += _trilinear(grid, (start + stride * direction - low) / CELL - 0.5)
-    return np.maximum(np.exp(-SHADOW_DENSITY * found), DARKEST).astype(np.float32)
+    found = sum(towards_light(grid, place(start + stride * direction)) for stride in STRIDES)
+    return openness, jnp.maximum(jnp.exp(-SHADOW_DENSITY * found), DARKEST)
 
 
-def _grid(vertices):
-    """Blurred occupancy of voxels, and where the grid begins."""
-    low = vertices.min(0) - 6 * CELL
-    size = np.ceil((vertices.max(0) + 6 * CELL - low) / CELL).astype(int)
-    cells = ((vertices - low) / CELL).astype(int)
-    grid = np.zeros(size, np.float32)
-    grid[tuple(cells.T)] = 1
-    for _ in range(2):
-        for axis in range(3):
-            grid = (np.roll(grid, 1, axis) + grid + np.roll(grid, -1, axis)) / 3
-    return grid, low
+def _occupancy(points, low):
+    """Grid with 1 in the voxels that hold a point. Duplicates all write the same number: the order does not matter."""
+    cells = ((points - low) / CELL).astype(jnp.int32)
+    return jnp.zeros(GRID, points.dtype).at[cells[:, 0], cells[:, 1], cells[:, 2]].set(1.0, mode="drop")
+
+
+def _blurred(grid):
+    """Means over 3 x 3 x 3 voxels, twice; by banded matrices, which XLA does not unroll into one huge expression."""
+    for axis, size in enumerate(GRID):
+        apart = np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
+        weights = jnp.asarray(np.maximum(3 - apart, 0) / 9, grid.dtype)
+        grid = jnp.moveaxis(jnp.tensordot(weights, grid, (1, axis), precision=lax.Precision.HIGHEST), 0, axis)
+    return grid
+
+
+def _nearest(grid, at):
+    """Grid values (n,) at the voxels nearest to fractional indices (n, 3), 0 outside of the grid."""
+    x, y, z = jnp.round(at).astype(jnp.int32).T
+    size = jnp.asarray(GRID)
+    index = (x * GRID[1] + y) * GRID[2] + z
+    inside = (x >= 0) & (y >= 0) & (z >= 0) & (x < size[0]) & (y < size[1]) & (z < size[2])
+    return jnp.where(inside, grid.reshape(-1)[jnp.where(inside, index, 0)], 0.0)
 
 
 def _trilinear(grid, at):
-    """Grid values at fractional indices (n, 3)."""
-    at = np.clip(at, 0, np.asarray(grid.shape) - 1.001)  # the border of the grid is empty
-    base = np.floor(at).astype(int)
-    t = np.clip(at - base, 0, 1).astype(np.float32)
-    total = np.zeros(len(at), np.float32)
+    """Grid values (n,) at fractional indices (n, 3); outside of the grid those of its border, which is empty."""
+    base = jnp.clip(jnp.floor(at).astype(jnp.int32), 0, jnp.asarray(GRID) - 2)
+    t = jnp.clip(at - base, 0, 1)
+    index = (base[:, 0] * GRID[1] + base[:, 1]) * GRID[2] + base[:, 2]
+    flat = grid.reshape(-1)
+    total = jnp.zeros(len(at), at.dtype)
     for corner in range(8):
         bits = np.asarray([corner & 1, corner >> 1 & 1, corner >> 2])
-        total += np.prod(np.where(bits, t, 1 - t), axis=1) * grid[tuple((base + bits).T)]
+        share = jnp.where(bits, t, 1 - t)
+        value = flat[index + (bits[0] * GRID[1] + bits[1]) * GRID[2] + bits[2]]
+        total += share[:, 0] * share[:, 1] * share[:, 2] * value
     return total
+
+
+def seen_from_behind(
+    vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], eye: Float[Array, "3"]
+) -> Bool[Array, " f"]:
+    """(f,) whether a point sees the inner side of a face."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    return jnp.sum(jnp.cross(b - a, c - a) * (eye - a), axis=-1) < 0
+
+
+def light_points(
+    lights: Lights,
+    corners: Float[Array, "p 15"],
+    weights: Float[Array, "p 3"],
+    behind: Bool[Array, " p"],
+    albedo: Float[Array, "p 3"],
+    slopes: Float[Array, "p 3"],
+    sheen: Float[Array, " p"],
+) -> Float[Array, "p 3"]:
+    """Colours (p, 3) of points on faces.
+
+    corners: normal (3), openness and share of the key light of each corner of the point's face. weights: of the corners.
+    behind: whether the inner side is seen. albedo, slopes, sheen: of the material there.
+    """
+    wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
+    blended = wa * corners[:, :5] + wb * corners[:, 5:10] + wc * corners[:, 10:]
+    normals, openness, lit = _unit(blended[:, :3]), blended[:, 3], blended[:, 4]
+    normals = jnp.where(behind[:, None], -normals, normals)
+    openness = jnp.where(behind, INSIDE_SHADE, 1.0) * openness
+    return shade(lights, albedo, bend_normals(normals, slopes), openness, lit, sheen)
 
 
 def shade(
     lights: Lights,
-    albedo: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    openness: Float[np.ndarray, " n"],
-    sheen: Float[np.ndarray, " n"],
-    lit: Float[np.ndarray, " n"] | None = None,
-) -> Float[np.ndarray, "n 3"]:
-    """(n, 3) colours in [0, 1] of points with albedo (n, 3), unit normals (n, 3), openness (n,), sheen (n,).
-
-    lit: (n,) share of the key light that arrives; None: all of it.
-    """
-    up = 0.5 + 0.5 * normals[:, 1:2]
-    light = (lights.ground + (lights.sky - lights.ground) * up) * openness[:, None]
-    half = openness[:, None] ** 0.5
-    for i, (direction, strength) in enumerate(zip(lights.directions, lights.strengths, strict=True)):
-        if i == 0 and lit is not None:
-            strength = strength * lit[:, None]
-        cosine = normals @ direction
-        wrapped = np.clip((cosine + 0.25) / 1.25, 0, 1)  # a wide light reaches a little beyond the terminator
-        light = light + strength * wrapped[:, None] * half
-        gloss = np.clip(cosine, 0, 1) ** 12 * sheen
-        albedo = albedo + 0.12 * gloss[:, None] * strength
-    return rolled_off(np.minimum(albedo, ALBEDO_LIMIT) * light * lights.gain).astype(np.float32)
+    albedo: Float[Array, "*p 3"],
+    normals: Float[Array, "*p 3"],
+    openness: Float[Array, "*p"],
+    lit: Float[Array, "*p"],
+    sheen: Float[Array, "*p"],
+) -> Float[Array, "*p 3"]:
+    """Colours in [0, 1] of points; normals are unit, `lit` is the share of the key light that arrives."""
+    up = 0.5 + 0.5 * normals[..., 1:2]
+    light = (lights.ground + (lights.sky - lights.ground) * up) * openness[..., None]
+    half = jnp.sqrt(openness)
+    for k in range(lights.directions.shape[0]):
+        arrives = half * lit if k == 0 else half
+        x, y, z = lights.directions[k]
+        cosine = normals[..., 0] * x + normals[..., 1] * y + normals[..., 2] * z
+        wrapped = jnp.clip((cosine + WRAP) / (1 + WRAP), 0, 1)
+        light += lights.strengths[k] * (wrapped * arrives)[..., None]
+        gloss = GLOSS * jnp.clip(cosine, 0, 1) ** 12 * sheen * (lit if k == 0 else 1.0)
+        albedo = albedo + gloss[..., None] * lights.strengths[k]
+    return rolled_off(jnp.minimum(albedo, ALBEDO_LIMIT) * light * lights.gain)
 
 
-def rolled_off(colours: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Colours (n, 3) from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns out at once."""
-    above = np.maximum(colours - SHOULDER, 0)
+def rolled_off(colors: Float[Array, "*p 3"]) -> Float[Array, "*p 3"]:
+    """Colours from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns out at once."""
     reach = WHITEST - SHOULDER
-    return np.minimum(np.maximum(colours, 0), SHOULDER) + reach * (1 - np.exp(-above / reach))
+    colors = jnp.maximum(colors, 0)
+    return jnp.minimum(colors, SHOULDER) + reach * (1 - jnp.exp(-jnp.maximum(colors - SHOULDER, 0) / reach))
 
 
-def bend_normals(normals: Float[np.ndarray, "n 3"], slope: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """Normals (n, 3) tilted against the gradient (n, 3) of a height field on the surface."""
-    along = slope - np.sum(slope * normals, -1, keepdims=True) * normals
-    return unit(normals - along)
+def bend_normals(normals: Float[Array, "*p 3"], slopes: Float[Array, "*p 3"]) -> Float[Array, "*p 3"]:
+    """Normals tilted against the gradient of a height field on the surface."""
+    return _unit(normals - (slopes - jnp.sum(slopes * normals, -1, keepdims=True) * normals))
+
+
+def _unit(vectors):
+    return vectors / (jnp.linalg.norm(vectors, axis=-1, keepdims=True) + 1e-9)
+
+
+def dyes_from(u: Float[Array, "4 m"], groups: Int[Array, " m"], dyeable: Float[Array, " m"]) -> Float[Array, "m 3 3"]:
+    """(m, 3, 3) matrices that recolour each piece: hue, saturation and brightness of cloth.
+
+    Pieces of one group are dyed alike. u: in [0, 1). Hues are turned about the grey axis for half of the pieces,
+    brightness changes for all.
+    """
+    turned, turn, pale, bright = u
+    hue = jnp.where(turned < 0.5, 2 * np.pi * (turn - 0.5), 0.0)
+    saturation, brightness = jnp.exp(-0.6 + 0.6 * pale), jnp.exp(-0.5 + 0.8 * bright)
+    grey = jnp.full((3, 3), 1 / 3)
+    # Rodrigues' formula about (1, 1, 1) / sqrt(3)
+    skew = jnp.asarray([[0, -1, 1], [1, 0, -1], [-1, 1, 0]]) / math.sqrt(3)
+    each = lambda values: values[:, None, None]
+    rotation = each(jnp.cos(hue)) * (jnp.eye(3) - grey) + each(jnp.sin(hue)) * skew
+    matrices = each(brightness) * (grey + each(saturation) * rotation)
+    return jnp.where(each(dyeable) > 0, matrices[groups], jnp.eye(3))

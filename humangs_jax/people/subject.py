@@ -1,4 +1,7 @@
-"""A synthetic person from a seed: one skinned triangle mesh, a material per face, lights, and a source of poses."""
+"""A synthetic person from a seed: who it is (`describe`), and its mesh, materials, lights and build (`make_subject`).
+
+A description is a few numbers and takes milliseconds; thousands can be counted without building any geometry.
+"""
 
 import dataclasses
 
@@ -9,12 +12,97 @@ import numpy as np
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.people import anatomy as anatomy_module
-from humangs_jax.people import complexion, hair, poses, wardrobe
+from humangs_jax.people import complexion, hair, wardrobe
 from humangs_jax.people.anatomy import Anatomy
+from humangs_jax.people.complexion import Complexion, sample_complexion
 from humangs_jax.people.fabrics import Material
-from humangs_jax.people.person import Person, describe
-from humangs_jax.people.shading import Lights
+from humangs_jax.people.hair import Haircut, sample_haircut
+from humangs_jax.people.kinematics import LEFT_KNEE, Build, joint_positions
+from humangs_jax.people.outfits import Garment, sample_outfit
+from humangs_jax.people.shading import Lights, sample_lights
 from humangs_jax.people.surfaces import Surface, compact, join
+
+SHAPE_SPREAD = 0.55
+"""Standard deviation of the shape coefficients that have no rule of their own; beyond 2 of them nothing is drawn."""
+HEIGHTS = {True: (1.765, 0.085), False: (1.645, 0.08)}
+"""Mean and standard deviation of the stature in metres of men (True) and women."""
+HEIGHT_RANGE = (1.42, 2.08)
+TALLEST_WOMAN = 1.95
+YEARS = (15.0, 85.0)
+YOUNG, OLD = 25.0, 90.0
+"""Years at which the body's age coefficient is 0 and 1."""
+LENGTHS = ("height", "leg_length", "torso_length")
+"""Coefficients that share what is missing to the wanted stature."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Person:
+    """seed; betas: (s,) shape coefficients; male: dressed as a man; years; stature in metres, without shoes.
+
+    complexion: colours of skin, hair, eyes. haircut: hair and beard. garments: clothes, shoes and accessories, innermost first.
+    lights: what the person stands in.
+    """
+
+    seed: int
+    betas: Float[np.ndarray, " s"]
+    male: bool
+    years: float
+    stature: float
+    complexion: Complexion
+    haircut: Haircut
+    garments: tuple[Garment, ...]
+    lights: Lights
+
+
+def describe(seed: int, body: BodyModel) -> Person:
+    """The person of a seed, unbuilt."""
+    rng = np.random.default_rng([seed, 0])
+    male, years = bool(rng.random() < 0.5), float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS))
+    betas, stature = sample_shape(rng, body, male, years)
+    garments = sample_outfit(np.random.default_rng([seed, 11]), male, years)
+    colours = np.random.default_rng([seed, 12])
+    complexion = sample_complexion(colours, male, years)
+    haircut = sample_haircut(np.random.default_rng([seed, 13]), male, years, {g.kind for g in garments})
+    lights = sample_lights(np.random.default_rng([seed, 14]))
+    return Person(seed, betas, male, years, stature, complexion, haircut, garments, lights)
+
+
+def sample_shape(
+    rng: np.random.Generator, body: BodyModel, male: bool, years: float
+) -> tuple[Float[np.ndarray, " s"], float]:
+    """(s,) shape coefficients and the stature in metres that they give."""
+    names = body.shape_names
+    at = {name: i for i, name in enumerate(names)}
+    betas = np.clip(rng.normal(0, 1, len(names)), -2, 2) * SHAPE_SPREAD
+    betas[at["sex_male"]] = (1 if male else -1) * rng.uniform(0.55, 1.0)
+    betas[at["age"]] = (years - YOUNG) / (OLD - YOUNG) if years > YOUNG else 0.03 * (years - YOUNG)
+    heavier = 0.25 * np.clip((years - 20) / 30, 0, 1)
+    betas[at["weight"]] = np.clip(rng.normal(0.05 + heavier, 0.62), -1.0, 1.8)
+    betas[at["muscle"]] = np.clip(rng.normal(0.1 - 0.4 * (years > 60), 0.6), -1.0, 1.5)
+    mean, spread = HEIGHTS[male]
+    youth = 0.04 * np.clip(18 - years, 0, 3) / 3 + 0.03 * np.clip((years - 60) / 25, 0, 1)
+    tall = rng.standard_t(5) if rng.random() < 0.85 else rng.uniform(-2.6, 3.4)
+    wanted = np.clip(mean - youth + spread * tall, HEIGHT_RANGE[0], HEIGHT_RANGE[1] if male else TALLEST_WOMAN)
+    stature, gains = _stature(body)
+    share = np.asarray([gains[at[name]] for name in LENGTHS])
+    missing = wanted - (stature + gains @ betas)
+    betas[[at[name] for name in LENGTHS]] += missing * share / (share @ share)
+    return betas.astype(np.float32), float(wanted)
+
+
+_STATURES: dict[int, tuple] = {}
+
+
+def _stature(body):
+    """Height of the mean body and metres (s,) that a unit of each coefficient adds; kept for the body used last."""
+    if id(body) not in _STATURES:
+        template, directions = np.asarray(body.template), np.asarray(body.shape_directions)
+        top, bottom = np.argmax(template[:, 1]), np.argmin(template[:, 1])
+        gains = (directions[top, 1] - directions[bottom, 1]).astype(float)
+        _STATURES.clear()
+        _STATURES[id(body)] = (body, float(template[top, 1] - template[bottom, 1]), gains)
+    return _STATURES[id(body)][1:]
+
 
 UNDER_CLOTH = 0.003
 """Skin this far inside of a hem is meant to be covered, metres."""
@@ -36,7 +124,7 @@ class SyntheticSubject:
     face_materials: Int[np.ndarray, " f"]
     materials: tuple[Material, ...]
     lights: Lights
-    build: poses.Build
+    build: Build
     under_cloth: Bool[np.ndarray, " n"]
     cover: Float[np.ndarray, " n"]
     person: Person
@@ -51,7 +139,7 @@ class SyntheticSubject:
 
     def _transforms(self, rotations, translation):
         """(j, 4, 4) rest -> posed, by the pose prior's own kinematics: no compilation, the same on every backend."""
-        world, positions = poses.joint_positions(self.build, np.asarray(rotations, np.float64))
+        world, positions = joint_positions(self.build, np.asarray(rotations, np.float64))
         transforms = np.zeros((len(world), 4, 4))
         transforms[:, :3, :3] = world
         transforms[:, :3, 3] = positions - np.einsum("jab,jb->ja", world, self.build.joints) + translation
@@ -146,8 +234,8 @@ def _build(anatomy, surface):
     thigh = float(np.median(anatomy.legs[0].radii[(anatomy.legs[0].levels > -0.65) & (anatomy.legs[0].levels < -0.5)]))
     low = surface.vertices[(surface.vertices[:, 1] < -0.5) & (surface.vertices[:, 1] > -0.9)]
     spread = float(np.quantile(np.abs(low[:, 0]), 0.98)) if len(low) else 0.2  # wide skirts keep the hands away
-    leg_line = float(np.abs(anatomy.joints[poses.LEFT_KNEE, 0]))
-    return poses.Build(
+    leg_line = float(np.abs(anatomy.joints[LEFT_KNEE, 0]))
+    return Build(
         joints=anatomy.joints.astype(np.float64),
         parents=anatomy.parents,
         torso_radius=depth + 0.015,

@@ -27,9 +27,8 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
 from humangs_jax.people.manifest import begin_set, write_manifest
-from humangs_jax.people.maps import render_maps, write_depth, write_maps
 from humangs_jax.people.poses import sample_rotations
-from humangs_jax.people.rendering import PosedSubject, pose_subject, render_view
+from humangs_jax.people.rendering import PosedSubject, pose_subject, render_maps, render_view, write_depth, write_maps
 from humangs_jax.people.scans import export_scan
 from humangs_jax.people.seeds import SPLITS, seeds_of, split_of
 from humangs_jax.people.sequences import sample_sequence

@@ -18,7 +18,8 @@ import jax.numpy as jnp
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Float, Int
-from humangs_jax.rendering.projection import ProjectedGaussians
+from humangs_jax.rendering.projection import ProjectedGaussians, squared_reach
+from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.tiling import SUM_LIMIT, TileGrid, bits_for, expand, sort_keys, take
 
 SLACK = 2e-3
@@ -155,6 +156,19 @@ def square_footprints(projected: ProjectedGaussians, reach: Float[Array, " g"], 
     largest = middle + jnp.sqrt(jnp.maximum(middle * middle - p.determinant, INRIA_LEAST_SPREAD))
     radius = jnp.where(p.visible & (reach > 0), jnp.ceil(radius_sigma * jnp.sqrt(largest)), 0.0)
     return Squares(p.x, p.y, radius)
+
+
+def footprints_by(
+    projected: ProjectedGaussians, opacities: Float[Array, " g"], config: SplatConfig
+) -> Footprints | Squares:
+    """The footprints that a configuration asks for: ellipses that end at `alpha_min` or `radius_sigma`, or squares."""
+    reach = squared_reach(opacities, config.alpha_min)
+    reach = jnp.where(opacities >= config.opacity_min, reach, 0.0)
+    if config.radius_sigma is None:
+        return footprints(projected, reach)
+    if config.square:
+        return square_footprints(projected, reach, config.radius_sigma)
+    return footprints(projected, jnp.minimum(reach, config.radius_sigma**2))
 
 
 class Share(NamedTuple):

@@ -4,19 +4,21 @@ Covariance of a Gaussian: A R diag(s)^2 R^T A^T with R the rotation of its quate
 and A an optional linear deformation (blend skinning leaves it; identity if absent).
 """
 
+import dataclasses
 from typing import Literal
 
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.core.checks import FINITE, NOT_NEGATIVE, UNIT, Values
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.svd3 import left_singular_vectors
 
 
 @pytree_dataclass
-class Gaussians:
-    """A set of 3D Gaussians.
+class Gaussians(Batchable):
+    """A set of 3D Gaussians, or a batch of sets (leading axes on every field).
 
     means: (g, 3) metres. quats: (g, 4) wxyz, normalised where used. scales: (g, 3) standard deviations, metres.
     opacities: (g,) in [0, 1]. colors: (g, 3) linear RGB in [0, 1].
@@ -29,6 +31,16 @@ class Gaussians:
     opacities: Float[Array, " g"]
     colors: Float[Array, "g 3"]
     deformations: Float[Array, "g 3 3"] | None = None
+
+
+def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Values]]:
+    """What `core.checks.check_values` needs to check Gaussians.
+
+    Colours may be any finite numbers: splatting is linear in them, and people draw normals and labels as colours.
+    """
+    ranges = {"opacities": UNIT, "scales": NOT_NEGATIVE}
+    names = (field.name for field in dataclasses.fields(gaussians))
+    return {f"gaussians.{name}": (getattr(gaussians, name), ranges.get(name, FINITE)) for name in names}
 
 
 def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:

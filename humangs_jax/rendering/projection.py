@@ -23,23 +23,25 @@ import jax.numpy as jnp
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering import constants
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
 
 
 class ProjectedGaussians(NamedTuple):
-    """2D Gaussians on the image, planes of (g,).
+    """2D Gaussians on the image, planes of (g,). In gsplat's arrays: `means2d`, `depths`, `conics`.
 
-    x, y: centre, pixels. depth: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2, dilated.
-    determinant: of the covariance, pixels^4. r00, r01, r11: the Cholesky factor of half its inverse, 1 / pixels, finite
-    where not drawn. visible: whether it is drawn.
+    x, y: centre, pixels. depths: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2, eps2d included.
+    determinant: of the covariance, pixels^4. r00, r01, r11: the upper triangular r of r^T r = conic / 2, 1 / pixels,
+    finite where not drawn. visible: whether it is drawn.
     """
 
     x: Float[Array, " g"]
     y: Float[Array, " g"]
-    depth: Float[Array, " g"]
+    depths: Float[Array, " g"]
     xx: Float[Array, " g"]
     xy: Float[Array, " g"]
     yy: Float[Array, " g"]
@@ -48,6 +50,17 @@ class ProjectedGaussians(NamedTuple):
     r01: Float[Array, " g"]
     r11: Float[Array, " g"]
     visible: Bool[Array, " g"]
+
+    @property
+    def means2d(self) -> Float[Array, "g 2"]:
+        """Centres on the image, pixels."""
+        return jnp.stack([self.x, self.y], axis=-1)
+
+    @property
+    def conics(self) -> Float[Array, "g 3"]:
+        """Entries 00, 01, 11 of the inverse covariances, 1 / pixels^2."""
+        r00, r01, r11 = self.r00, self.r01, self.r11
+        return 2 * jnp.stack([r00 * r00, r00 * r01, r01 * r01 + r11 * r11], axis=-1)
 
 
 def project(
@@ -60,8 +73,8 @@ def project(
 ) -> ProjectedGaussians:
     """Projects every Gaussian.
 
-    near: metres. eps2d: pixels^2. jacobian_margin: None for the exact Jacobian; a number clamps where it is
-    evaluated to that fraction of the half field of view beyond the border (`INRIA_JACOBIAN_MARGIN`).
+    Arguments: near: metres. eps2d: pixels^2. jacobian_margin: None for the exact Jacobian; a number clamps the point
+    where it is evaluated, to that fraction of the half field of view beyond the border (`INRIA_JACOBIAN_MARGIN`).
     normalize_quats: False takes the quaternions as they are.
     """
     K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
@@ -91,7 +104,7 @@ def project(
     return ProjectedGaussians(
         x=fx * u + cx,
         y=fy * v + cy,
-        depth=Z,
+        depths=Z,
         xx=xx,
         xy=xy,
         yy=yy,
@@ -100,6 +113,21 @@ def project(
         r01=r01,
         r11=r11,
         visible=in_front & small & (determinant > 0),
+    )
+
+
+def drawn_camera(camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> Camera:
+    """The camera of the image that is drawn: `config.scale` times the size, at least one pixel."""
+    if config.scale == 1:
+        return camera
+    return camera.resized(*(max(1, round(size * config.scale)) for size in (camera.width, camera.height)))
+
+
+def project_gaussians(gaussians: Gaussians, camera: Camera, config: SplatConfig = DEFAULT_CONFIG) -> ProjectedGaussians:
+    """`project` on the image that `config` draws: the first half of `splatting.render`."""
+    gaussians, camera = at_least_float32((gaussians, drawn_camera(camera, config)))
+    return project(
+        gaussians, camera, config.near, config.eps2d, config.jacobian_margin, normalize_quats=config.normalize_quats
     )
 
 

@@ -16,26 +16,26 @@ import jax.numpy as jnp
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.constants import LARGEST_FOOTPRINT
+from humangs_jax.rendering.drawing import Rendering, with_background
 from humangs_jax.rendering.gaussians import Gaussians, covariance_factors
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
-from humangs_jax.rendering.splatting import Rendering
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def render_dense(
+def render_reference(
     gaussians: Gaussians,
     camera: Camera,
     config: SplatConfig = DEFAULT_CONFIG,
     background: Float[Array, "3"] | None = None,
 ) -> Rendering:
-    """Same arguments and meaning as `splatting.render`; of `config`, only what decides on what is drawn plays a part."""
-    if background is None:
-        background = jnp.ones(3, gaussians.means.dtype)
-    gaussians, camera, background = at_least_float32((gaussians, camera, background))
+    """The image of `splatting.render` by its definition, without tiles or buffers, in the precision of its arguments.
+
+    Arguments as `splatting.render`; of `config`, only what decides on what is drawn is read. Values are not checked.
+    """
+    gaussians, camera, background = with_background(gaussians, camera, background)
     centers, axes, depths, visible = _project(gaussians, camera, config)
     determinants = _determinant(axes, config.eps2d)
     order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
@@ -64,6 +64,10 @@ def render_dense(
     some = alpha > 0
     depth = jnp.where(some, distance / jnp.where(some, alpha, 1.0), 0.0)
     return Rendering(color + transmittance[..., None] * background, alpha, depth, jnp.int32(0))
+
+
+render_dense = render_reference
+"""The name by which other packages know such a renderer."""
 
 
 def _project(gaussians, camera, config):

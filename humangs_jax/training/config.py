@@ -6,8 +6,7 @@ from collections.abc import Collection
 
 from humangs_jax.data.loader import ViewSampling
 from humangs_jax.network import presets
-from humangs_jax.network.humangs import HumanGSConfig
-from humangs_jax.rendering.mesh.rasterizer import RasterConfig
+from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.training.optimizer import OptimizerConfig
 
@@ -47,7 +46,7 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """One run. Photographs enter at `model.image_size` pixels, targets are learnt at `target_size`.
+    """One run. Photos enter at `model.conventions.image_size` pixels, targets are learnt at `target_size`.
 
     steps: of the whole run, which the learning rate ends with. stages: in the order of their starts, for instance larger
     photographs for the last steps; before the first the fields here hold, see `at`.
@@ -64,7 +63,6 @@ class TrainConfig:
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
     optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
     splat: SplatConfig = dataclasses.field(default_factory=SplatConfig)
-    raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
     target_size: int = 128
     steps: int = 20_000
     batch_size: int = 1
@@ -108,10 +106,13 @@ class TrainConfig:
 
 
 def _changed(config, stage):
-    model = {"image_size": stage.image_size, "token_capacity": stage.token_capacity}
+    model = config.model
+    if stage.image_size is not None:
+        model = model.with_conventions(image_size=stage.image_size)
+    if stage.token_capacity is not None:
+        model = model.with_execution(token_capacity=stage.token_capacity)
     own = {"target_size": stage.target_size, "batch_size": stage.batch_size}
-    given = lambda fields: {name: value for name, value in fields.items() if value is not None}
-    return dataclasses.replace(config, model=dataclasses.replace(config.model, **given(model)), **given(own))
+    return dataclasses.replace(config, model=model, **{name: x for name, x in own.items() if x is not None})
 
 
 def small() -> TrainConfig:
@@ -146,10 +147,9 @@ def published() -> TrainConfig:
 
 def paper() -> TrainConfig:
     """The paper: 60,000 steps at 256 pixels with 8 subjects, then 10,000 at 512 with 4. Needs VGG-19."""
-    model = presets.paper()
     return dataclasses.replace(
         published(),
-        model=dataclasses.replace(model, image_size=256),
+        model=presets.paper().with_conventions(image_size=256),
         splat=SplatConfig(),
         loss=dataclasses.replace(published().loss, lpips=0.0),
         target_size=256,

@@ -7,27 +7,86 @@ For one process and device; needs the memory of a step that recomputes nothing. 
 accelerator has not.
 """
 
+import dataclasses
+import functools
 import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import flax.linen as nn
 import jax
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import Key, PyTree, Scalar
+from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.network.humangs import Variables
+from humangs_jax.network.parts import Variables
+from humangs_jax.network.stages import Named, Recorder, inexact_leaves
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training.checkpoint import Checkpoints, load_config
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.diagnosis import Diagnosis, StageReport, leaves
-from humangs_jax.training.observed import observe_subject
 from humangs_jax.training.sources import MakeSource, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
-from humangs_jax.training.step import NO_NETWORKS, subject_keys, train_step
+from humangs_jax.training.step import NO_NETWORKS, subject_keys, subject_loss, train_step
 
 FAILED = ("skipped", "nonfinite")
 """Events of a run's log that are worth a diagnosis."""
+
+
+@pytree_dataclass
+class ObservedStage:
+    """values: what a stage gives. cotangents: the gradients that it sends back to what it takes. gradients: of its parameters."""
+
+    name: str = static_field()
+    values: Named
+    cotangents: Named
+    gradients: Named
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def observe_subject(
+    params: PyTree,
+    batch_stats: PyTree,
+    body: BodyModel,
+    example: Example,
+    key: Key,
+    config: TrainConfig,
+    networks: LossNetworks,
+) -> tuple[Scalar, list[ObservedStage]]:
+    """The loss (`subject_loss`), and all its stages in the order of the forward pass.
+
+    Blocks are neither looped over nor recomputed, so that each can be watched, and everything is kept: this needs more
+    memory than a step (the published network at 512 pixels, 4 views each: 2.4 GB are kept).
+    """
+    config = dataclasses.replace(config, model=config.model.with_execution(scan=False, remat="none"))
+
+    def loss(params, probes, recorder):
+        recorder = recorder or Recorder(probes)
+        with nn.intercept_methods(recorder.watch):
+            value, _ = subject_loss(params, batch_stats, body, example, key, config, networks, stage=recorder)
+        return value, recorder.given
+
+    dry = Recorder()  # finds the stages and their shapes
+    jax.eval_shape(lambda params: loss(params, None, dry)[0], params)
+    differentiated = jax.value_and_grad(lambda *trees: loss(*trees, None), argnums=(0, 1), has_aux=True)
+    (value, given), (gradients, cotangents) = differentiated(params, dry.probes())
+    own: dict[str, Named] = {}
+    for name, gradient in inexact_leaves(gradients):
+        own.setdefault(parameter_stage(name), {})[name] = gradient
+    stages = [ObservedStage(name, given[name], cotangents.get(name, {}), own.get(name, {})) for name in dry.given]
+    return value, stages
+
+
+def parameter_stage(name: str) -> str:
+    """The stage that uses a parameter, by the parameter's path, as decoder.trunk_0.kernel."""
+    part, *inner = name.split(".")
+    if part != "encoder":
+        return {"reader": "vertex features", "decoder": "raw heads"}[part]
+    if inner[0] == "transformer":
+        return {"input_norm": "input norm", "norm": "final norm"}.get(inner[1], inner[1].replace("_", " "))
+    return {"tokenizer": "tokens", "class_token": "tokens", "upsampler": "maps"}.get(inner[0], "encoding")
 
 
 def diagnose_step(

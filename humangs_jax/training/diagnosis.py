@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from humangs_jax.core.array_types import PyTree
-from humangs_jax.training.probes import inexact_leaves
+from humangs_jax.network.stages import inexact_leaves
 
 AXES = {
     "images": "view row column",
@@ -27,6 +27,7 @@ AXES = {
     "block": "token",
     "final norm": "token",
     "maps": "view row column",
+    "encoding": "view row column",
     "global_token": "feature",
     "vertex features": "vertex",
     "raw heads": "vertex Gaussian",
@@ -34,7 +35,6 @@ AXES = {
     "tight_offsets": "vertex Gaussian",
     "posed Gaussians": "view Gaussian",
     "projected splats": "view Gaussian",
-    "pictures": "view row column",
 }
 """What the leading axes of an array count: by the last part of its name, or else by its stage."""
 

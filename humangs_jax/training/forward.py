@@ -1,20 +1,26 @@
-"""From an example to pictures: photographs -> canonical Gaussians -> posed as each target -> drawn."""
-
-import dataclasses
+"""From an example to images: photos -> canonical Gaussians -> posed as each target -> drawn."""
 
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.body.model import BodyModel, shape_body
-from humangs_jax.body.skinning import blend_transforms, joint_transforms
+from humangs_jax.avatar.animate import skin
+from humangs_jax.avatar.reconstruct import make_avatar
+from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews, prepare_inputs
-from humangs_jax.network.humangs import HumanGSConfig, HumanGSOutputs, Variables, apply_humangs
-from humangs_jax.network.vertex_decoder import corrected_skinning_weights
-from humangs_jax.rendering.gaussians import skin_gaussians
-from humangs_jax.rendering.splatting import Rendering, render
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.humangs import apply_humangs
+from humangs_jax.network.parts import HumanGSOutputs, Variables
+from humangs_jax.network.stages import Stage, call
+from humangs_jax.rendering.drawing import draw_projected
+from humangs_jax.rendering.projection import project_gaussians
+from humangs_jax.rendering.splatting import Rendering
 from humangs_jax.training.config import TrainConfig
+
+RASTERIZED = ("posed_vertices", "canonical_vertices", "position_maps", "depth_maps")
+"""What `prepare_inputs` computes, rather than copies."""
 
 
 def reconstruct_example(
@@ -24,22 +30,25 @@ def reconstruct_example(
     config: TrainConfig,
     train: bool = False,
     axis_name: str | tuple[str, ...] | None = None,
+    stage: Stage = call,
 ) -> tuple[HumanGSOutputs, Variables]:
     """Canonical Gaussians of one subject and the batch statistics, see `apply_humangs`."""
     model = token_share(config, len(inputs.images))
-    prepared = jax.lax.stop_gradient(prepare_inputs(body, inputs, model, config.raster))
-    return apply_humangs(variables, prepared, model, train, axis_name)
+    prepared = jax.lax.stop_gradient(prepare_inputs(body, inputs, model))
+    computed = stage("position maps", lambda: {name: getattr(prepared, name) for name in RASTERIZED})
+    return apply_humangs(variables, replace(prepared, **computed), model, train, axis_name, stage)
 
 
 def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
-    """The network with the token capacity of a step of so many photographs.
+    """The network with the token capacity of a step with that number of photos.
 
-    `model.token_capacity` is for the most of `views.input_counts`; fewer have their share, and a view's share more, as one
-    photograph may show more of a person than the others.
+    The configured capacity is for the largest of `views.input_counts`. Fewer photos get their share and a view's share more,
+    because one photo may show more of a person than the others.
     """
-    most = max(config.views.input_counts)
-    capacity = -(-config.model.token_capacity * (views + 1) // (most + 1))
-    return config.model if views >= most else dataclasses.replace(config.model, token_capacity=capacity)
+    most, capacity = max(config.views.input_counts), config.model.execution.token_capacity
+    if views >= most:
+        return config.model
+    return config.model.with_execution(token_capacity=-(-capacity * (views + 1) // (most + 1)))
 
 
 def draw_targets(
@@ -48,19 +57,32 @@ def draw_targets(
     targets: SubjectViews,
     backgrounds: Float[Array, "v 3"],
     config: TrainConfig,
+    stage: Stage = call,
 ) -> Rendering:
     """The Gaussians in the pose and before the camera of every target: a `Rendering` with a leading axis of v."""
-    rest = shape_body(body, targets.betas)
-    per_vertex = outputs.gaussians.means.shape[0] // body.template.shape[0]
-    weights = corrected_skinning_weights(body.skinning_weights, outputs.skinning_offsets, per_vertex)
+    poses = (targets.rotations, targets.translations)
 
-    def draw(arguments):
-        rotations, translation, camera, background = arguments
-        joints = joint_transforms(rest.joints, body.parents, rotations, translation)
-        posed = skin_gaussians(outputs.gaussians, blend_transforms(weights, joints), config.model.skinning)
-        return render(posed, camera, config.splat, background)
+    def pose_all(outputs):
+        avatar = make_avatar(outputs, body, targets.betas, config.model)
+        return jax.lax.map(lambda pose: skin(avatar, BodyPose(*pose)), poses)
 
-    return jax.lax.map(draw, (targets.rotations, targets.translations, targets.cameras, backgrounds))
+    def project_all(shapes):
+        return jax.lax.map(lambda x: project_gaussians(*x, config.splat), (shapes, targets.cameras))
+
+    def draw_all(projected, opacities, colors):
+        def draw(arguments):
+            one, opacity, color, camera, background = arguments
+            gaussians = replace(like, opacities=opacity, colors=color)
+            return draw_projected(one, gaussians, camera, config.splat, background)
+
+        return jax.lax.map(draw, (projected, opacities, colors, targets.cameras, backgrounds))
+
+    posed = stage("posed Gaussians", pose_all, outputs)
+    like = jax.tree.map(lambda x: x[0], posed)
+    shapes = replace(posed, opacities=None, colors=None)
+    opaque = lambda shapes: replace(shapes, opacities=posed.opacities, colors=posed.colors)
+    projected = stage("projected splats", lambda shapes: project_all(opaque(shapes)), shapes)
+    return stage("images", draw_all, projected, posed.opacities, posed.colors)
 
 
 def white_backgrounds(targets: SubjectViews) -> Float[Array, "v 3"]:

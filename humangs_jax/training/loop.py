@@ -17,7 +17,7 @@ import jax
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, Waiting
 from humangs_jax.data.views import gaussian_body
-from humangs_jax.network.humangs import Variables
+from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import save_weights
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training.checkpoint import Checkpoints, save_config

@@ -12,9 +12,7 @@ from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture, Source
-from humangs_jax.people.live import DEFAULT_CONFIG, LiveConfig
-from humangs_jax.people.live_bank import PeopleBank
-from humangs_jax.people.live_source import live_source
+from humangs_jax.people import ON_THE_FLY, OnTheFlyConfig, PeopleBank, on_the_fly_source
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.sharding import batch_sharding
 
@@ -33,10 +31,10 @@ def stage_loader(make_source: MakeSource, config: TrainConfig, step: int, mesh: 
 def captured_people(folders: Sequence[str | Path], body: BodyModel) -> MakeSource:
     """Capture folders whose parameters belong to `body`; pictures that are decoded once serve all stages."""
     cache = CaptureCache(folders, body)
-    return lambda config: CaptureSource(cache, config.views, config.model.image_size, config.target_size)
+    return lambda config: CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size)
 
 
-def live_people(bank: PeopleBank, settings: LiveConfig = DEFAULT_CONFIG) -> MakeSource:
+def live_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -> MakeSource:
     """People of a bank, drawn anew for every step on the device that trains; sizes and views are those of the run."""
 
     def make(config: TrainConfig) -> Source:
@@ -44,7 +42,7 @@ def live_people(bank: PeopleBank, settings: LiveConfig = DEFAULT_CONFIG) -> Make
         live = dataclasses.replace(
             settings,
             target_views=views.target_count,
-            input_size=config.model.image_size,
+            input_size=config.model.conventions.image_size,
             target_size=config.target_size,
             mixed_pose_share=views.mixed_pose_share,
             jitter=views.jitter,
@@ -53,7 +51,7 @@ def live_people(bank: PeopleBank, settings: LiveConfig = DEFAULT_CONFIG) -> Make
         if jax.default_backend() != "cpu":  # whole pictures, all views at once
             most = max(views.input_counts) + views.target_count
             live = dataclasses.replace(live, views_at_once=most, pixels_per_step=1 << 30)
-        return live_source(bank, live, views.input_counts, on_host=jax.device_count() > 1)
+        return on_the_fly_source(bank, live, views.input_counts, on_host=jax.device_count() > 1)
 
     return make
 

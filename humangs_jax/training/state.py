@@ -5,7 +5,8 @@ import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Int, PyTree
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.network.humangs import Variables, init_humangs
+from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.parts import Variables
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.optimizer import make_optimizer
 

@@ -1,6 +1,7 @@
 """One step of training: a pure function of state, batch and body, on one device or on a mesh of them."""
 
 import functools
+from collections.abc import Callable
 from typing import Any, cast
 
 import jax
@@ -13,7 +14,8 @@ from humangs_jax.core.array_types import Array, Float, Int, Key, PyTree, Scalar,
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
-from humangs_jax.network.humangs import HumanGSOutputs
+from humangs_jax.network.parts import HumanGSOutputs
+from humangs_jax.network.stages import Stage, call
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.losses import squared_error, tightness
 from humangs_jax.objectives.lpips import lpips
@@ -46,7 +48,7 @@ def random_backgrounds(key: Key, count: int, share: float) -> Float[Array, "v 3"
 
 
 def change_background(targets: SubjectViews, backgrounds: Float[Array, "v 3"]) -> Float[Array, "v h w 3"]:
-    """The target photographs, which are on white, as they would look on other colours."""
+    """The target photos, which are on white, as they would look on other colours."""
     uncovered = 1 - targets.masks[..., None]
     return targets.images + uncovered * (backgrounds[:, None, None, :] - 1)
 
@@ -58,25 +60,28 @@ def loss_terms(
     targets: SubjectViews,
     config: LossConfig,
     networks: LossNetworks = NO_NETWORKS,
+    stage: Stage = call,
 ) -> Metrics:
-    """The unweighted terms of `LossConfig` by name, for pictures drawn on the backgrounds of `images`.
+    """The unweighted terms of `LossConfig` by name, for renderings on the backgrounds of `images`.
 
     Raises: ValueError if a term has a weight but its network is missing.
     """
     dissimilarity = functools.partial(multiscale_structural_dissimilarity, scales=config.structural_scales)
-    terms = {
-        "squared": jnp.mean(squared_error(drawn.rgb, images)),
-        "structural": jnp.mean(jax.vmap(dissimilarity)(drawn.rgb, images)),
-        "silhouette": jnp.mean(squared_error(drawn.alpha, targets.masks)),
-        "tightness": jnp.mean(tightness(outputs.tight_offsets)),
+    terms: dict[str, Callable[..., Array]] = {
+        "squared": lambda rgb, alpha, tight: squared_error(rgb, images),
+        "structural": lambda rgb, alpha, tight: jax.vmap(dissimilarity)(rgb, images),
+        "silhouette": lambda rgb, alpha, tight: squared_error(alpha, targets.masks),
+        "tightness": lambda rgb, alpha, tight: tightness(tight),
     }
     if config.perceptual:
-        compare = functools.partial(perceptual_loss, _required(networks.perceptual, "perceptual", "VGG-19"))
-        terms["perceptual"] = jnp.mean(_each(compare, drawn.rgb, images))
+        features = functools.partial(perceptual_loss, _required(networks.perceptual, "perceptual", "VGG-19"))
+        terms["perceptual"] = lambda rgb, alpha, tight: _each(features, rgb, images)
     if config.lpips:
-        compare = functools.partial(lpips, _required(networks.lpips, "lpips", "LPIPS"))
-        terms["lpips"] = jnp.mean(_each(compare, drawn.rgb, images))
-    return terms
+        distance = functools.partial(lpips, _required(networks.lpips, "lpips", "LPIPS"))
+        terms["lpips"] = lambda rgb, alpha, tight: _each(distance, rgb, images)
+    learned = {"rgb": drawn.rgb, "alpha": drawn.alpha, "tight": outputs.tight_offsets}
+    mean = lambda term: lambda seen: jnp.mean(term(**seen))
+    return {name: stage(f"loss: {name}", mean(term), learned) for name, term in terms.items()}
 
 
 def _required(network, name, title):
@@ -104,17 +109,19 @@ def subject_loss(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
     axis_name: str | tuple[str, ...] | None = None,
+    stage: Stage = call,
 ) -> tuple[Scalar, tuple[PyTree, Metrics]]:
-    """Loss of one subject, with the updated batch statistics and what is worth knowing."""
+    """Loss of one subject, with the updated batch statistics and metrics. stage: see `network.stages`."""
     variables = {"params": params, "batch_stats": batch_stats}
-    outputs, batch_stats = reconstruct_example(variables, body, example.inputs, config, train=True, axis_name=axis_name)
+    outputs, batch_stats = reconstruct_example(variables, body, example.inputs, config, True, axis_name, stage)
     targets = example.targets
     backgrounds = random_backgrounds(key, len(targets.translations), config.loss.random_background)
     backgrounds = backgrounds.astype(targets.images.dtype)
     images = change_background(targets, backgrounds)
-    drawn = draw_targets(outputs, body, targets, backgrounds, config)
-    terms = loss_terms(drawn, outputs, images, targets, config.loss, networks)
-    loss = sum(getattr(config.loss, name) * term for name, term in terms.items())
+    drawn = draw_targets(outputs, body, targets, backgrounds, config, stage)
+    terms = loss_terms(drawn, outputs, images, targets, config.loss, networks, stage)
+    total = lambda terms: sum(getattr(config.loss, name) * term for name, term in terms.items())
+    loss = stage("loss", total, terms)
     metrics = {
         **terms,
         "psnr": jnp.mean(jax.vmap(psnr)(drawn.rgb, images)),

@@ -16,7 +16,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, ViewSampling
 from humangs_jax.io.images import write_png
-from humangs_jax.network.humangs import Variables
+from humangs_jax.network.parts import Variables
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import lpips
 from humangs_jax.objectives.metrics import masked_psnr, psnr
@@ -40,7 +40,7 @@ def validation_examples(cache: CaptureCache, config: TrainConfig, count: int) ->
         scattered_share=0.0,
         mixed_pose_share=0.0,
     )
-    source = CaptureSource(cache, views, config.model.image_size, config.model.image_size)
+    source = CaptureSource(cache, views, config.model.conventions.image_size, config.model.conventions.image_size)
     own = range(jax.process_index(), min(count, len(cache)), jax.process_count())
     return [jax.tree.map(jnp.asarray, source.example(0, i, views.input_counts[0])) for i in own]
 

@@ -73,33 +73,32 @@ class Case:
         """Tiny, otherwise as in training."""
         model = tiny()
         published = self.style == "published"
-        sampling = dataclasses.replace(
-            model.sampling,
-            pool=self.pool,
-            convention="mixed" if published else "half_pixel",
-            sample_rgb=not published,
-        )
+        encoder, reader, decoder = paper_parts(model.architecture)
+        transformer = dataclasses.replace(encoder.transformer, class_token=not self.bare)
         decoder = dataclasses.replace(
-            model.decoder,
+            decoder,
             residual_color=not published,
             offset_scale=None if published else 0.25,
             skinning_joints=JOINTS if self.bare else None,
         )
-        transformer = dataclasses.replace(
-            model.transformer, class_token=not self.bare, remat=self.remat, scan=self.scan
+        model = model.with_parts(
+            encoder=dataclasses.replace(
+                encoder, transformer=transformer, upsampler=None if self.bare else encoder.upsampler
+            ),
+            reader=dataclasses.replace(
+                reader, output_width=None if self.bare else reader.output_width, sample_rgb=not published
+            ),
+            decoder=decoder,
         )
-        model = dataclasses.replace(
-            model,
-            tokens=self.tokens,
-            token_capacity=40,
+        model = model.with_conventions(
+            pool=self.pool,
+            pixel_grid="mixed" if published else "half_pixel",
             skinning="rotation" if published else "affine",
             position_map="gouraud" if published else "plain",
             ray_origins="twice_normalized" if published else "normalized",
-            transformer=transformer,
-            upsampler=dataclasses.replace(model.upsampler, enabled=not self.bare),
-            sampling=sampling,
-            decoder=decoder,
         )
+        remat = "full" if self.remat else "none"
+        model = model.with_execution(tokens=self.tokens, token_capacity=40, remat=remat, scan=self.scan)
         return TrainConfig(model=model, loss=LossConfig(structural_scales=2), target_size=TARGET_SIZE)
 
 
@@ -182,7 +181,7 @@ def group_of(path):
         return "texture"
     if "class_token" in names:
         return "tokenizer"
-    return next({"readout": "upsampler"}.get(name, name) for name in names if name not in ("params", "encoder"))
+    return next({"reader": "upsampler"}.get(name, name) for name in names if name not in ("params", "encoder"))
 
 
 @functools.cache
@@ -230,7 +229,7 @@ def compiled(case, dtype):
     """f(point, fixed) -> ((loss, facts), gradients), a point, and what is fixed there."""
     config = case.config
     variables = random_variables(config.model)
-    inputs, targets = subject(config.model.position_map)
+    inputs, targets = subject(config.model.conventions.position_map)
     point = starting_point(inputs, targets, variables["params"])
     point, fixed, own_body = as_dtype((point, (inputs, targets, variables["batch_stats"]), body()), dtype)
 
@@ -336,7 +335,7 @@ def nobody_in_the_photographs(case, point, fixed):
 def subject_behind_the_cameras(case, point, fixed):
     """Photographs taken in the other direction, prepared like any."""
     inputs, *rest = fixed
-    position_map = case.config.model.position_map
+    position_map = case.config.model.conventions.position_map
     betas = point["target_pose"]["betas"].astype(np.float64)
     views = random_views(1, VIEWS, SIZE, jnp.asarray(betas))
     views = as_jax(replace(views, cameras=as_jax(turned_away(views.cameras)), masks=0 * views.masks))

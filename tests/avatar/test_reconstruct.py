@@ -1,5 +1,3 @@
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +25,7 @@ def body():
 
 @pytest.fixture(scope="module")
 def network():
-    config = dataclasses.replace(tiny(), token_capacity=48)
+    config = tiny().with_execution(token_capacity=48)
     return init_humangs(jax.random.key(0), config), config
 
 
@@ -124,7 +122,7 @@ def test_the_token_capacity_follows_the_photos(body, network):
     views = standardize(photos, SIZE)
     _, dropped = jax.jit(reconstruct_views, static_argnames="config")(variables, config, body, views)
     assert int(dropped) == 4 * 16 - 48
-    roomy = dataclasses.replace(config, token_capacity=64)
+    roomy = config.with_execution(token_capacity=64)
     expected, none_dropped = jax.jit(reconstruct_views, static_argnames="config")(variables, roomy, body, views)
     assert int(none_dropped) == 0
     avatar = reconstruct(variables, config, photos)
@@ -139,7 +137,9 @@ def test_no_photos_are_an_error(body, network):
 def test_the_body_is_decimated_to_what_the_weights_want(body, network):
     variables, config = network
     avatar = reconstruct(
-        variables, dataclasses.replace(config, body_vertices=300, token_capacity=64), capture(body, SIZE, SIZE)
+        variables,
+        config.with_conventions(body_vertices=300).with_execution(token_capacity=64),
+        capture(body, SIZE, SIZE),
     )
     per_vertex = config.decoder.gaussians_per_vertex
     assert len(avatar.rest_vertices) == 300 and len(avatar.gaussians.means) == 300 * per_vertex
@@ -175,7 +175,7 @@ def test_a_batch_of_people_with_different_numbers_of_views(body, network):
 @pytest.mark.slow
 def test_programs_are_compiled_once_per_bucket(body, network):
     variables, config = network
-    config = dataclasses.replace(config, tokens="all")
+    config = config.with_execution(tokens="all")
     before = _assemble_compiled._cache_size()
     for views in (17, 18, 19):
         reconstruct(variables, config, capture_of(body, 0, views))

@@ -2,10 +2,15 @@ import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import pose_body, rest_pose, shape_body
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splatting import Rendering
 
 
 def camera(width=4):
@@ -55,3 +60,47 @@ def test_defaults_of_static_fields():
         name: str = static_field(default="a")
 
     assert Scene(jnp.ones(2)).name == "a" and jax.tree.leaves(Scene(jnp.ones(2)))[0].shape == (2,)
+
+
+def batch(size=3):
+    K = jnp.arange(size)[:, None, None] + jnp.eye(3)
+    return replace(camera(), K=K, cam_from_world=jnp.broadcast_to(jnp.eye(4), (size, 4, 4)))
+
+
+def test_a_batch_can_be_indexed_counted_and_iterated_over():
+    cameras = batch()
+    assert len(cameras) == 3 and cameras.batch_shape == (3,)
+    assert [float(one.K[0, 1]) for one in cameras] == [0, 1, 2]
+    assert cameras[-1].K[0, 1] == 2 and cameras[-1].batch_shape == () and cameras[-1].width == 4
+    assert len(cameras[1:]) == 2 and len(cameras[jnp.asarray([True, False, False])]) == 1
+    assert cameras[jnp.asarray(2)].K[0, 1] == 2
+    assert jax.jit(lambda c, i: c[i].K)(cameras, 1)[0, 1] == 1
+    nested = jax.tree.map(lambda leaf: leaf[None], cameras)
+    assert nested.batch_shape == (1, 3) and nested[0].batch_shape == (3,)
+
+
+def test_an_index_out_of_range_is_refused_where_jax_would_clamp_it():
+    cameras = batch()
+    for index in (3, -4, np.int64(3), jnp.asarray(3)):
+        with pytest.raises(IndexError, match=rf"Camera: index {int(index)} is out of range for a batch of 3"):
+            cameras[index]
+    with pytest.raises(IndexError):
+        jax.jit(lambda c: c[3].K)(cameras)
+
+
+def test_one_example_is_not_a_batch_but_it_is_there():
+    for use in (len, iter, list, lambda c: c[0]):
+        with pytest.raises(TypeError, match="this Camera is not a batch"):
+            use(camera())
+    assert camera() and not list(batch(0)) and batch(0)
+
+
+def test_every_kind_of_batch_knows_its_axes():
+    body = load_body()
+    pose = rest_pose(body)
+    posed = pose_body(body, shape_body(body, jnp.zeros(2)), pose)
+    gaussians = Gaussians(*(jnp.ones(shape) for shape in ((5, 3), (5, 4), (5, 3), (5,), (5, 3))))
+    for one in (pose, posed, gaussians, Rendering(jnp.ones((2, 2, 3)), *[jnp.ones((2, 2))] * 2, jnp.int32(0))):
+        two = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), one)
+        assert one.batch_shape == () and two.batch_shape == (2,)
+        assert jax.tree.structure(two[1]) == jax.tree.structure(one) and two[1].batch_shape == ()

@@ -1,18 +1,16 @@
 """Random inputs and variables for tests of the network."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.network.humangs import HumanGSInputs
+from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables
 
 TINY = tiny()
-ALL_TOKENS = dataclasses.replace(TINY, tokens="all")
+ALL_TOKENS = TINY.with_execution(tokens="all")
 
 
 def random_inputs(seed=0, views=2, vertices=20, size=32):

@@ -6,15 +6,14 @@ from the project's golden data `golden_a` (computed in float64 by the authors' r
 `python tests/network/network_golden.py GOLDEN_DIRECTORY` makes the npz again.
 """
 
-import importlib.util
 import sys
 from pathlib import Path
 
 import numpy as np
 
+from experiments.paper import check_parity
 from humangs_jax.network.conversion import read_state_dict
 
-EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 DATA = Path(__file__).parent / "data"
 CHECKPOINT = DATA / "golden_a.pt"
 SUBJECT = DATA / "golden_a_subject_0.npz"
@@ -33,17 +32,6 @@ THINNED = {
     "posed_rotations": every(7),
 }
 """What the carried copy keeps of each stage."""
-
-
-def load_script(name):
-    """A script of experiments/ as a module."""
-    spec = importlib.util.spec_from_file_location(name, EXPERIMENTS / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-check_parity = load_script("check_parity")
 
 
 def load_subject():

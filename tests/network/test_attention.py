@@ -6,11 +6,11 @@ from jax.test_util import check_grads
 
 from humangs_jax.network.attention import (
     Attention,
-    AttentionConfig,
     attention,
     chunked_attention,
     resolve_implementation,
 )
+from humangs_jax.network.execution import Execution
 
 FLOAT32_TOLERANCE = 2e-6
 """Outputs are averages of numbers of order one; a dozen float32 roundings."""
@@ -91,7 +91,7 @@ def test_auto_follows_backend_length_and_precision(monkeypatch, backend, tokens,
 def test_query_key_norm_makes_attention_blind_to_their_lengths():
     tokens = jnp.asarray(np.random.default_rng(3).normal(size=(7, 8)), jnp.float32)
     for normed in (True, False):
-        module = Attention(AttentionConfig(head_width=4, qk_norm=normed), jax.nn.initializers.normal(0.5))
+        module = Attention(4, normed, Execution(), jax.nn.initializers.normal(0.5))
         variables = module.init(jax.random.key(0), tokens)
         kernel = variables["params"]["qkv"]["kernel"]
         longer = kernel.at[:, :16].multiply(3.0)  # queries and keys

@@ -1,4 +1,4 @@
-"""experiments/check_parity.py on made-up triples whose numbers come from an independent network (network_oracle.py)."""
+"""experiments/paper/check_parity.py on made-up triples whose numbers come from an independent network (network_oracle.py)."""
 
 import dataclasses
 import json
@@ -11,9 +11,10 @@ import network_golden as golden
 import network_oracle as oracle
 import numpy as np
 import pytest
-from network_golden import check_parity
 from network_oracle import Options
 from torch_writer import tensors, write_checkpoint
+
+from experiments.paper import check_parity
 
 GOLDEN = Path(__file__).parents[3] / "shared" / "golden"
 """The whole golden data, where a checkout has it beside it."""
@@ -51,7 +52,6 @@ def write_triple(folder, options, change=lambda arrays: None):
 def run(monkeypatch, *arguments):
     """Exit status of the script's main."""
     monkeypatch.setattr(sys, "argv", ["check_parity.py", *map(str, arguments)])
-    monkeypatch.syspath_prepend(golden.EXPERIMENTS)
     with pytest.raises(SystemExit) as exit_:
         check_parity.main()
     return exit_.value.code
@@ -199,7 +199,7 @@ def test_a_checkpoint_may_be_safetensors(tmp_path, monkeypatch, capsys):
 
 
 def test_help_imports_nothing_heavy():
-    script = golden.EXPERIMENTS / "check_parity.py"
+    script = check_parity.__file__
     code = "import sys, runpy; sys.argv = ['check_parity.py', '--help']\n"
     code += f"try: runpy.run_path({str(script)!r}, run_name='__main__')\n"
     code += "except SystemExit: pass\nassert 'jax' not in sys.modules and 'numpy' not in sys.modules"

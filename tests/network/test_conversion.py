@@ -14,6 +14,7 @@ from safetensors.numpy import save_file
 from torch_writer import FakeTensor, tensors, write_checkpoint
 
 from humangs_jax import cli
+from humangs_jax.network.config import paper_parts
 from humangs_jax.network.conversion import (
     describe,
     expected_shapes,
@@ -46,19 +47,19 @@ def test_the_configuration_is_read_off_the_shapes(options, tmp_path):
     state = oracle.random_state(options)
     converted = load_checkpoint(write(tmp_path, state))
     config = converted.config
-    transformer, decoder = config.transformer, config.decoder
+    encoder, reader, decoder = paper_parts(config.architecture)
+    transformer = encoder.transformer
     assert (transformer.width, transformer.layers, transformer.mlp_ratio) == (options.width, options.layers, 4)
-    assert transformer.attention.head_width == options.head and transformer.attention.qk_norm
-    assert transformer.class_token == options.class_token and config.upsampler.enabled == options.upsampler
-    assert config.patch_size == options.patch
-    assert (config.texture.resolution, config.texture.channels) == options.texture
+    assert transformer.head_width == options.head and transformer.qk_norm
+    assert transformer.class_token == options.class_token and (encoder.upsampler is not None) == options.upsampler
+    assert encoder.patch_size == options.patch
+    assert (encoder.texture.resolution, encoder.texture.channels) == options.texture
     assert (decoder.hidden, decoder.tight, decoder.free) == (8, 1, options.gaussians - 1)
     assert decoder.skinning_joints == (options.joints if options.skinning_head else None)
     if options.upsampler:
-        assert (config.upsampler.hidden, config.upsampler.out) == (8, options.width)
-    quirks = dataclasses.asdict(published())
-    told = {"image_size", "patch_size", "texture", "transformer", "upsampler", "decoder"}
-    assert all(x == quirks[name] for name, x in dataclasses.asdict(config).items() if name not in told)
+        assert (encoder.upsampler.hidden, reader.output_width) == (8, options.width)
+    size = config.conventions.image_size
+    assert config.conventions == published().with_conventions(image_size=size).conventions and size % options.patch == 0
     back = to_release(converted.variables) | {"tpose_lbs_weights": converted.skinning_weights}
     assert {key: x.shape for key, x in back.items()} == {key: x.shape for key, x in state.items()}
     for key, value in state.items():
@@ -69,7 +70,8 @@ def test_the_golden_checkpoint():
     converted = load_checkpoint(CHECKPOINT)
     assert converted.skipped == 4  # frozen loss networks
     assert converted.skinning_weights.shape == (300, 55)
-    assert (converted.config.transformer.width, converted.config.upsampler.hidden) == (64, 16)
+    encoder, _, _ = paper_parts(converted.config.architecture)
+    assert (encoder.transformer.width, encoder.upsampler.hidden) == (64, 16)
     line = describe(converted)
     assert "4 layers of 4 heads" in line and ", upsampler" in line and "no skinning head" in line
 
@@ -87,9 +89,9 @@ def test_shapes_of_the_published_network():
 
 
 def test_a_made_up_network_goes_there_and_back(tmp_path):
-    config = dataclasses.replace(
-        infer_config(oracle.random_state(Options())), transformer=TransformerConfig(width=128, layers=4)
-    )
+    config = infer_config(oracle.random_state(Options()))
+    sizes = TransformerConfig(width=128, layers=4)
+    config = config.with_parts(encoder=dataclasses.replace(config.architecture.encoder, transformer=sizes))
     variables = random_variables(config)
     state = to_release(variables) | {"tpose_lbs_weights": np.ones((2, 55), np.float32)}
     back = load_checkpoint(write(tmp_path, state))
@@ -101,8 +103,8 @@ def test_heads_without_norms_need_their_width(tmp_path):
     path = write(tmp_path, oracle.random_state(Options(qk_norm=False)))
     with pytest.raises(ValueError, match=r"a\.pt: no tensor .*q_norm.weight' tells the width of a head"):
         load_checkpoint(path)
-    attention = load_checkpoint(path, head_width=4).config.transformer.attention
-    assert attention.head_width == 4 and not attention.qk_norm
+    transformer = load_checkpoint(path, head_width=4).config.architecture.encoder.transformer
+    assert transformer.head_width == 4 and not transformer.qk_norm
     for wrong, message in ((5, "multiple of head_width 5"), (0, "at least 1")):
         with pytest.raises(ValueError, match=message):
             load_checkpoint(path, head_width=wrong)
@@ -242,8 +244,8 @@ def test_the_command_converts(tmp_path, monkeypatch, capsys):
     assert "skipped 2 tensors" in out and "loss_computer" in out and "4 layers of 4 heads" in out
     variables, config = load_weights(weights)
     converted = load_checkpoint(path, head_width=4)
-    assert config.sampling.pool == "visible" and converted.config.sampling.pool == "all"
-    assert dataclasses.replace(config, sampling=converted.config.sampling) == converted.config
+    assert config.conventions.pool == "visible" and converted.config.conventions.pool == "all"
+    assert config.with_conventions(pool="all") == converted.config.trained
     leaves = zip(*map(jax.tree.leaves, (variables, converted.variables)), strict=True)
     assert all(np.array_equal(*pair) for pair in leaves)
     code, _, error = convert(monkeypatch, capsys, weights, "--out", tmp_path / "again.safetensors")

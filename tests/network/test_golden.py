@@ -1,14 +1,12 @@
 """Every stage of the published network against its authors' numbers (see network_golden.py)."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import network_golden as golden
 import numpy as np
 import pytest
-from network_golden import check_parity
 
+from experiments.paper import check_parity
 from humangs_jax.network.conversion import load_checkpoint
 
 TOLERANCES = {"float32": 2e-5, "float64": 1e-6}
@@ -20,8 +18,8 @@ reference is stored as float32: half a rounding step is 6e-8."""
 def test_every_stage_agrees(dtype):
     with jax.enable_x64(dtype == "float64"):
         converted, arrays = load_checkpoint(golden.CHECKPOINT), golden.load_subject()
-        assert converted.config.sampling.pool == "all"  # as golden_a
-        config = dataclasses.replace(converted.config, dtype="float32")
+        assert converted.config.conventions.pool == "all"  # as golden_a
+        config = converted.config.with_execution(dtype="float32")
         variables = jax.tree.map(lambda x: jnp.asarray(x, dtype), converted.variables)
         inputs, weights, transforms = check_parity.subject_inputs(arrays, 0, dtype)
         compute = jax.jit(check_parity.compute_stages, static_argnames="config")

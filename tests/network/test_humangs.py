@@ -9,20 +9,16 @@ from network_cases import ALL_TOKENS, TINY, random_inputs, random_variables
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.network import presets
-from humangs_jax.network.humangs import (
-    Encoding,
-    HumanGSConfig,
-    apply_humangs,
-    dropped_tokens,
-    encode,
-    project_and_test,
-    read_vertices,
-    sample_vertices,
-    select_tokens,
-    subject_unit,
-)
-from humangs_jax.network.transformer import Block
-from humangs_jax.network.vertex_decoder import SHELL_WIDTH, VertexDecoder
+from humangs_jax.network.config import Architecture, paper_parts
+from humangs_jax.network.encoder import PatchTransformer, touched_patches
+from humangs_jax.network.execution import Execution
+from humangs_jax.network.humangs import apply_humangs, encode, needed_reads, needed_tokens, read
+from humangs_jax.network.inputs import subject_unit
+from humangs_jax.network.parts import Encoding, Pass
+from humangs_jax.network.reader import project_and_test
+from humangs_jax.network.tokenizer import pack_patches
+from humangs_jax.network.transformer import Block, TransformerConfig
+from humangs_jax.network.vertex_decoder import VertexDecoder
 from humangs_jax.network.weights import expected_variables
 
 FLOAT32_TOLERANCE = 1e-5
@@ -45,6 +41,9 @@ def close(a, b, tolerance=FLOAT32_TOLERANCE):
     return all(np.allclose(x, y, rtol=tolerance, atol=tolerance) for x, y in pairs)
 
 
+ENCODER, READER, DECODER = paper_parts(TINY.architecture)
+
+
 @functools.cache
 def variables_of(config):
     return random_variables(config)
@@ -57,15 +56,19 @@ def variables_of(config):
 def test_presets_have_the_shapes_they_promise(name):
     """Traced at full size, nothing is computed."""
     config = presets.PRESETS[name]()
-    views, vertices, size = 4, 37, config.image_size
+    views, vertices, size = 4, 37, config.conventions.image_size
     inputs = jax.eval_shape(lambda: jax.tree.map(jnp.asarray, random_inputs(0, views, vertices, size)))
     variables = expected_variables(config)
     encoding, outputs = jax.eval_shape(lambda v, x: run(v, x, config), variables, inputs)
-    side = size // config.patch_size * (4 if config.upsampler.enabled else 1)
-    width = config.upsampler.hidden // 2 if config.upsampler.enabled else config.transformer.width
+    encoder, _, decoder = paper_parts(config.architecture)
+    side = size // encoder.patch_size * (4 if encoder.upsampler else 1)
+    width = encoder.upsampler.hidden // 2 if encoder.upsampler else encoder.transformer.width
     assert encoding.maps.shape == (views, side, side, width)
-    assert encoding.maps.dtype == (jnp.bfloat16 if config.dtype == "bfloat16" else jnp.float32) or side == size // 8
-    assert outputs.gaussians.means.shape == (vertices * config.decoder.gaussians_per_vertex, 3)
+    assert (
+        encoding.maps.dtype == (jnp.bfloat16 if config.execution.dtype == "bfloat16" else jnp.float32)
+        or side == size // 8
+    )
+    assert outputs.gaussians.means.shape == (vertices * decoder.gaussians_per_vertex, 3)
     assert outputs.tight_offsets.shape == (vertices, 1, 3)
     assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves((outputs.gaussians, variables)))
 
@@ -79,8 +82,7 @@ def test_the_published_network_has_99_million_parameters():
     ("views", "vertices", "tight", "free", "joints"), [(1, 5, 1, 0, None), (3, 40, 0, 2, 7), (6, 1, 2, 3, 55)]
 )
 def test_any_number_of_views_vertices_and_gaussians(views, vertices, tight, free, joints):
-    decoder = dataclasses.replace(TINY.decoder, tight=tight, free=free, skinning_joints=joints)
-    config = dataclasses.replace(TINY, decoder=decoder)
+    config = TINY.with_parts(decoder=dataclasses.replace(DECODER, tight=tight, free=free, skinning_joints=joints))
     inputs = jax.eval_shape(lambda: random_inputs(0, views, vertices))
     _, outputs = jax.eval_shape(lambda v, x: run(v, x, config), expected_variables(config), inputs)
     count = vertices * (tight + free)
@@ -91,20 +93,22 @@ def test_any_number_of_views_vertices_and_gaussians(views, vertices, tight, free
 @pytest.mark.parametrize("class_token", [True, False])
 @pytest.mark.parametrize("sample_rgb", [True, False])
 def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
-    config = dataclasses.replace(
-        TINY,
-        transformer=dataclasses.replace(TINY.transformer, class_token=class_token),
-        upsampler=dataclasses.replace(TINY.upsampler, enabled=class_token),
-        sampling=dataclasses.replace(TINY.sampling, sample_rgb=sample_rgb),
-        decoder=dataclasses.replace(TINY.decoder, residual_color=sample_rgb),
+    config = TINY.with_parts(
+        encoder=dataclasses.replace(
+            ENCODER,
+            transformer=dataclasses.replace(ENCODER.transformer, class_token=class_token),
+            upsampler=ENCODER.upsampler if class_token else None,
+        ),
+        reader=dataclasses.replace(READER, output_width=8 if class_token else None, sample_rgb=sample_rgb),
+        decoder=dataclasses.replace(DECODER, residual_color=sample_rgb),
     )
     variables = expected_variables(config)
     assert bool(variables["batch_stats"]) == class_token
     encoding, _ = jax.eval_shape(lambda v: run(v, random_inputs(), config), variables)
     assert (encoding.global_token is not None) == class_token
     kernel = variables["params"]["decoder"]["trunk_0"]["kernel"]
-    local = TINY.upsampler.out if class_token else TINY.transformer.width
-    assert kernel.shape[0] == local + TINY.transformer.width * class_token + 39 + 4 * sample_rgb + 3 + 7 * SHELL_WIDTH
+    local, width = 8 if class_token else 16, ENCODER.transformer.width
+    assert kernel.shape[0] == local + width * class_token + 39 + 4 * sample_rgb + 3 + 7 * 6
 
 
 # values
@@ -113,16 +117,15 @@ def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
 def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
     inputs = random_inputs()
     inputs = replace(inputs, images=jnp.full_like(inputs.images, 0.7))
-    plain = dataclasses.replace(
-        TINY,
-        sampling=dataclasses.replace(TINY.sampling, shells=()),
-        decoder=dataclasses.replace(TINY.decoder, frame="canonical"),
+    plain = TINY.with_parts(
+        reader=dataclasses.replace(READER, shells=()), decoder=dataclasses.replace(DECODER, frame="canonical")
     )
-    decoder = jax.jit(VertexDecoder(plain.decoder).init)(jax.random.key(0), jnp.zeros((1, plain.decoder_width)))
     variables = variables_of(plain)
+    features = read(variables, encode(variables, inputs, plain), inputs, plain)
+    decoder = plain.architecture.decoder.init(jax.random.key(0), features, inputs, Pass(plain))
     variables = {**variables, "params": {**variables["params"], "decoder": decoder["params"]}}
     fresh = run(variables, inputs, plain)[1].gaussians
-    unit, k = subject_unit(inputs.canonical_vertices), plain.decoder.gaussians_per_vertex
+    unit, k = subject_unit(inputs.canonical_vertices), DECODER.gaussians_per_vertex
     assert np.abs(fresh.means - jnp.repeat(inputs.canonical_vertices, k, axis=0)).max() < 0.02
     assert np.allclose(fresh.scales, 0.0082 * unit, rtol=0.1)  # softplus(-4.8) = 8.2 mm
     assert np.allclose(fresh.opacities, jax.nn.sigmoid(-1.0), atol=0.01) and np.allclose(fresh.colors, 0.7, atol=0.01)
@@ -130,8 +133,10 @@ def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
 
 
 def test_deeper_blocks_begin_smaller():
-    config = presets.TransformerConfig(width=64, layers=4, attention=presets.AttentionConfig(head_width=32))
-    kernel = jax.jit(Block(config, 3).init)(jax.random.key(0), jnp.zeros((2, 64)))["params"]["mlp_in"]["kernel"]
+    config = TransformerConfig(width=64, layers=4, head_width=32)
+    kernel = jax.jit(Block(config, Execution(), 3).init)(jax.random.key(0), jnp.zeros((2, 64)))["params"]["mlp_in"][
+        "kernel"
+    ]
     assert np.isclose(kernel.std(), 0.02 / np.sqrt(2 * 4), rtol=0.05)
 
 
@@ -153,7 +158,7 @@ def test_the_order_of_the_views_does_not_matter():
 def test_foreground_tokens_are_all_tokens_when_everything_is_foreground():
     inputs = random_inputs()
     patches = 2 * (32 // 8) ** 2
-    config = dataclasses.replace(TINY, token_capacity=patches + 50)
+    config = TINY.with_execution(token_capacity=patches + 50)
     variables = variables_of(ALL_TOKENS)
     assert close(run(variables, inputs, config), run(variables, inputs, ALL_TOKENS))
 
@@ -164,7 +169,7 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     foreground[0, 8:24, 16:32] = foreground[1, 3, 9] = True  # four patches, and one
     inputs = replace(inputs, foreground=jnp.asarray(foreground))
     variables = variables_of(TINY)
-    roomy, exact, tight = TINY, *(dataclasses.replace(TINY, token_capacity=n) for n in (5, 3))
+    roomy, exact, tight = TINY, *(TINY.with_execution(token_capacity=n) for n in (5, 3))
     encoding, outputs = run(variables, inputs, roomy)
     assert outputs.dropped_tokens == 0 and close(
         (encoding, outputs), run(variables, inputs, exact)
@@ -173,13 +178,14 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     noise = jnp.where(touched[..., None], inputs.images, 0.123)
     assert close(encoding, run(variables, replace(inputs, images=noise), roomy)[0])
     assert not close(encoding, run(variables, replace(inputs, images=inputs.images.at[1, 0, 8].add(0.5)), roomy)[0])
-    packing = select_tokens(inputs, tight)
-    assert dropped_tokens(inputs, tight) == 2 and packing.count == 3 and np.array_equal(packing.indices, [6, 7, 10])
+    assert run(variables, inputs, tight)[1].dropped_tokens == 2 and needed_tokens(inputs, tight) == 5
+    packing = pack_patches(touched_patches(inputs, 8), 3)
+    assert packing.count == 3 and np.array_equal(packing.indices, [6, 7, 10])
 
 
 def test_bfloat16_is_close():
     variables, inputs = variables_of(ALL_TOKENS), random_inputs()
-    encoding, outputs = run(variables, inputs, dataclasses.replace(ALL_TOKENS, dtype="bfloat16"))
+    encoding, outputs = run(variables, inputs, ALL_TOKENS.with_execution(dtype="bfloat16"))
     exact_encoding, exact = run(variables, inputs, ALL_TOKENS)
     assert encoding.maps.dtype == jnp.bfloat16
     scale = jnp.abs(exact_encoding.maps).max()
@@ -190,15 +196,15 @@ def test_bfloat16_is_close():
 
 def test_unseen_vertices_are_grey_and_pool_nothing():
     inputs = replace(random_inputs(), depth_maps=jnp.full((2, 32, 32), -1.0))
-    encoding = Encoding(jnp.ones((2, 16, 16, 4)), jnp.ones(16))
+    encoding = Encoding(jnp.ones((2, 16, 16, 4)), jnp.ones(16), jnp.int32(0))
     variables = variables_of(TINY)
-    features = sample_vertices(variables, encoding, inputs, TINY)
+    features = read(variables, encoding, inputs, TINY)
     assert np.array_equal(features.local, np.zeros((20, 8))) and np.array_equal(
         features.photo_colors, np.full((20, 3), 0.5)
     )
     assert np.array_equal(features.visible_fraction, np.zeros(20))
-    every = dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, pool="all"))
-    assert np.abs(sample_vertices(variables, encoding, inputs, every).local).min(axis=1).max() > 0
+    every = TINY.with_conventions(pool="all")
+    assert np.abs(read(variables, encoding, inputs, every).local).min(axis=1).max() > 0
 
 
 # views that are padding, vertices that are not seen
@@ -221,14 +227,11 @@ def padded(inputs, views):
     )
 
 
-PUBLISHED_LIKE = dataclasses.replace(
-    ALL_TOKENS,
-    sampling=dataclasses.replace(ALL_TOKENS.sampling, pool="all", convention="mixed"),
-)
+PUBLISHED_LIKE = ALL_TOKENS.with_conventions(pool="all", pixel_grid="mixed")
 
 
 @pytest.mark.parametrize("train", [False, True])
-@pytest.mark.parametrize("config", [dataclasses.replace(TINY, token_capacity=64), PUBLISHED_LIKE])
+@pytest.mark.parametrize("config", [TINY.with_execution(token_capacity=64), PUBLISHED_LIKE])
 def test_padding_views_change_nothing(config, train):
     inputs, variables = random_inputs(), variables_of(PUBLISHED_LIKE)
     apply = jax.jit(lambda x: apply_humangs(variables, x, config, train))
@@ -251,10 +254,10 @@ def test_subjects_with_different_numbers_of_views_share_a_batch():
 def test_views_are_read_only_for_the_vertices_they_see():
     inputs = random_inputs()
     inputs = replace(inputs, depth_maps=inputs.depth_maps.at[0, :, :16].set(-1.0))
-    variables, needed = variables_of(TINY), int(read_vertices(inputs, TINY))
-    seen = project_and_test(inputs, TINY)[1].sum(axis=1)
+    variables, needed = variables_of(TINY), int(needed_reads(inputs, TINY))
+    seen = project_and_test(inputs, Pass(TINY))[1].sum(axis=1)
     assert needed == seen.max() and seen.min() < needed
-    of_capacity = lambda n: dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, vertex_capacity=n))
+    of_capacity = lambda n: TINY.with_execution(vertex_capacity=n)
     reference, exact, tight = (run(variables, inputs, of_capacity(n))[1] for n in (None, needed, needed - 1))
     assert close(exact, reference) and exact.dropped_reads == 0
     assert tight.dropped_reads == (seen == needed).sum() and not close(tight.gaussians, reference.gaussians)
@@ -283,7 +286,7 @@ def test_gradients_are_finite_and_reach_every_parameter():
     )  # in and behind the camera
     inputs = replace(inputs, depth_maps=inputs.depth_maps.at[:, :16].set(-1.0))  # some vertices are seen by none
     continuous = {"posed_vertices": posed, "images": inputs.images, "canonical_vertices": inputs.canonical_vertices}
-    config = dataclasses.replace(TINY, transformer=dataclasses.replace(TINY.transformer, remat=True))
+    config = TINY.with_execution(remat="full")
     of_params, of_inputs = gradients(variables_of(TINY), continuous, inputs, config)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((of_params, of_inputs)))
     silent = [path for path, leaf in jax.tree_util.tree_leaves_with_path(of_params) if not np.abs(leaf).max() > 0]
@@ -304,19 +307,20 @@ def test_a_vmap_over_subjects_is_a_loop():
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("make", "message"),
     [
-        ({"image_size": 100}, "no multiple of patch_size"),
-        ({"transformer": presets.TransformerConfig(width=100)}, "head_width"),
-        ({"sampling": dataclasses.replace(TINY.sampling, shells=(0.0, 0.1))}, "along the normals"),
-        ({"transformer": presets.TransformerConfig(layers=3)}, "layers"),
-        ({"decoder": presets.VertexDecoderConfig(residual_color=True)}, "sample_rgb"),
-        ({"decoder": presets.VertexDecoderConfig(tight=0, free=0)}, "tight"),
+        (lambda: TINY.with_conventions(image_size=100), "not a multiple of patch_size"),
+        (lambda: TransformerConfig(width=100), "head_width"),
+        (lambda: Architecture(reader=dataclasses.replace(READER, shells=(0.0, 0.1))), "along the normals"),
+        (lambda: dataclasses.replace(READER, shells=(0.1, 0.0)), "ascending"),
+        (lambda: PatchTransformer(transformer=TransformerConfig(layers=3)), "layers"),
+        (lambda: Architecture(decoder=VertexDecoder(residual_color=True)), "sample_rgb"),
+        (lambda: VertexDecoder(tight=0, free=0), "tight"),
     ],
 )
-def test_configurations_that_do_not_fit_are_refused(changes, message):
+def test_configurations_that_do_not_fit_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
-        HumanGSConfig(**changes)
+        make()
 
 
 def test_images_must_be_those_of_the_cameras():

@@ -7,9 +7,9 @@ from network_cases import random_like
 
 from humangs_jax.network.bilinear import sample_bilinear
 from humangs_jax.network.neighborhoods import sample_neighborhoods
-from humangs_jax.network.upsampler import MOMENTUM, Readout, UpConvolution, Upsampler, UpsamplerConfig
+from humangs_jax.network.upsampler import MOMENTUM, OutputConvolution, UpConvolution, Upsampler, UpsamplerConfig
 
-CONFIG = UpsamplerConfig(hidden=4, out=5)
+CONFIG = UpsamplerConfig(hidden=4)
 
 
 def random_maps(depths=4, views=2, side=3, width=6):
@@ -73,7 +73,7 @@ def test_what_vertices_read_is_what_the_convolved_map_says():
     rng = np.random.default_rng(2)
     stem = jnp.asarray(rng.normal(size=(1, 6, 8, 3)), jnp.float32)
     positions = jnp.asarray(rng.uniform(-1, 9, (50, 2)), jnp.float32)
-    readout = Readout(5, 3)
+    readout = OutputConvolution(5, 3)
     neighborhoods, coverages = sample_neighborhoods(stem[0], positions)
     variables = random_like(jax.eval_shape(readout.init, jax.random.key(0), neighborhoods, coverages))
     everywhere = readout.apply(variables, stem, method="everywhere")

@@ -5,14 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.geometry import quaternion
+from humangs_jax.network.reader import VertexFeatures
 from humangs_jax.network.shells import Shells
 from humangs_jax.network.vertex_decoder import (
     OBLIQUE,
-    SHELL_WIDTH,
+    DecoderModule,
     RawGaussians,
     VertexDecoder,
-    VertexDecoderConfig,
-    VertexFeatures,
     activate,
     corrected_skinning_weights,
     decoder_input,
@@ -20,7 +19,7 @@ from humangs_jax.network.vertex_decoder import (
     positional_encoding,
 )
 
-CONFIG = VertexDecoderConfig(tight=1, free=1)
+CONFIG = VertexDecoder(tight=1, free=1)
 NORMALS = jnp.asarray([[1.0, 0, 0], [0, 0.6, 0.8]])
 
 
@@ -107,7 +106,7 @@ def test_shells_enter_the_decoder_and_start_at_the_surface():
     entering = decoder_input(features, jnp.zeros((2, 3)))
     assert entering.shape == (2, 1 + 39 + 4 + 3 * SHELL_WIDTH)
     assert np.allclose(entering[0, -18:], [0.5] * 9 + [1] * 3 + [1, 1, 0] * 2)
-    decoder = VertexDecoder(CONFIG, shells=3)
+    decoder = DecoderModule(CONFIG, shells=3)
     raw = decoder.apply(decoder.init(jax.random.key(0), entering), entering)
     assert raw.shells.shape == (2, CONFIG.gaussians_per_vertex, 3)
     assert np.all(jax.nn.softmax(raw.shells)[..., 0] > 0.9)
@@ -120,7 +119,7 @@ def test_in_the_frame_of_the_normal_gaussians_lie_flat_on_the_surface():
     config = dataclasses.replace(CONFIG, frame="normal")
     entering = decoder_input(VertexFeatures(jnp.zeros((2, 1)), normals=NORMALS), jnp.zeros((2, 3)))
     assert np.array_equal(entering[:, -3:], NORMALS)
-    decoder = VertexDecoder(config)
+    decoder = DecoderModule(config)
     raw = decoder.apply(decoder.init(jax.random.key(0), entering), entering)
     placed = activate(raw, config, VertexFeatures(jnp.zeros((2, 1)), normals=NORMALS))
     thin = placed.scales[..., 2] / placed.scales[..., 0]

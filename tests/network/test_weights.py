@@ -1,4 +1,5 @@
 import dataclasses
+import functools
 import json
 import os
 
@@ -10,11 +11,15 @@ from safetensors.numpy import load_file, save_file
 
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.network import presets, weights
+from humangs_jax.network.config import paper_parts
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.weights import fit_variables, load_weights, save_weights
 
+ENCODER, READER, DECODER = paper_parts(TINY.architecture)
+PARTS = "humangs_jax.network"
 VARIABLES = random_variables(TINY)
-NO_RGB = dataclasses.replace(TINY.sampling, sample_rgb=False)
+NO_RGB = dataclasses.replace(READER, sample_rgb=False)
+encoder = functools.partial(dataclasses.replace, ENCODER)
 TEXTURE = "params/encoder/tokenizer/texture"
 
 
@@ -27,14 +32,19 @@ def file(tmp_path):
 def rewrite(file, change, **metadata):
     """The same file with other tensors or another header."""
     tensors = load_file(file)
-    header = {"format": weights.FORMAT, "version": weights.VERSION, "config": config_to_json(TINY)} | metadata
+    header = {
+        "format": weights.FORMAT,
+        "version": weights.VERSION,
+        "architecture": config_to_json(TINY.architecture),
+        "conventions": config_to_json(TINY.conventions),
+    } | metadata
     change(tensors)
     save_file(tensors, file, header)
 
 
 def test_round_trip(file):
     variables, config = load_weights(file)
-    assert config == TINY and jax.tree.structure(variables) == jax.tree.structure(VARIABLES)
+    assert config == TINY.trained and jax.tree.structure(variables) == jax.tree.structure(VARIABLES)
     assert all(np.array_equal(a, b) for a, b in zip(*map(jax.tree.leaves, (variables, VARIABLES)), strict=True))
     assert os.listdir(file.parent) == [file.name]
 
@@ -72,16 +82,18 @@ def test_tensors_that_do_not_fit_are_named(file, change, message):
     [
         ({"format": "other"}, "found format 'other'"),
         ({"version": "9"}, "version '9'"),
-        ({"config": "{"}, "no JSON"),
-        ({"config": "[]"}, "expected an object"),
-        (
-            {"config": json.dumps({"transformer": {"widht": 3}})},
-            "config.transformer.widht: TransformerConfig has no such",
-        ),
-        ({"config": json.dumps({"dtype": "float8"})}, "config.dtype: 'float8'"),
-        ({"config": json.dumps({"patch_size": 8.5})}, "config.patch_size"),
-        ({"config": json.dumps({"patch_size": True})}, "config.patch_size"),
-        ({"config": json.dumps({"image_size": 100})}, "no multiple of patch_size"),
+        ({"architecture": "{"}, "not JSON"),
+        ({"conventions": "[]"}, "expected an object"),
+        ({"conventions": json.dumps({"poll": "all"})}, "config.poll: Conventions has no such"),
+        ({"conventions": json.dumps({"pool": "some"})}, "config.pool: 'some'"),
+        ({"conventions": json.dumps({"image_size": True})}, "config.image_size"),
+        ({"conventions": json.dumps({"image_size": 100})}, "not a multiple of patch_size"),
+        ({"architecture": json.dumps({"encoder": {"patch_size": 8}})}, "config.encoder.kind"),
+        ({"architecture": json.dumps({"encoder": {"kind": "os.system"}})}, "config.encoder.kind"),
+        ({"architecture": json.dumps({"encoder": {"kind": "antigravity.Encoder"}})}, "import the module antigravity"),
+        ({"architecture": json.dumps({"encoder": {"kind": f"{PARTS}.encoder.EncoderModule"}})}, "config.encoder.kind"),
+        ({"architecture": json.dumps({"encoder": {"kind": f"{PARTS}.encoder.PatchTransformer", "a": 1}})}, "encoder.a"),
+        ({"version": "1", "config": json.dumps({"patch_size": 8})}, "config of version 1"),
     ],
 )
 def test_bad_headers_are_clear_errors(file, metadata, message):
@@ -95,7 +107,7 @@ def test_no_file_and_no_weights(tmp_path, monkeypatch):
         load_weights(tmp_path / "nowhere.safetensors")
     garbage = tmp_path / "garbage.safetensors"
     garbage.write_bytes(b"\x10\0\0\0\0\0\0\0not safetensors at all")
-    with pytest.raises(ValueError, match="no readable safetensors"):
+    with pytest.raises(ValueError, match="not a readable safetensors"):
         load_weights(garbage)
     monkeypatch.setattr(weights, "SHIPPED", "assets/nothing.safetensors")
     with pytest.raises(FileNotFoundError, match="ships no weights"):
@@ -103,7 +115,7 @@ def test_no_file_and_no_weights(tmp_path, monkeypatch):
 
 
 def test_nothing_is_written_that_could_not_be_read(tmp_path):
-    wrong = dataclasses.replace(TINY, texture=presets.TriplaneConfig(4, 2))
+    wrong = TINY.with_parts(encoder=dataclasses.replace(ENCODER, texture=presets.TriplaneConfig(4, 2)))
     with pytest.raises(ValueError, match=TEXTURE):
         save_weights(tmp_path / "w.safetensors", VARIABLES, wrong)
     assert os.listdir(tmp_path) == []
@@ -118,20 +130,21 @@ def test_configurations_survive_json(name):
 
 def grown(**decoder):
     """TINY without shells and in the canonical frame, and a network with shells and another number of Gaussians."""
-    plain = dataclasses.replace(TINY, sampling=dataclasses.replace(TINY.sampling, shells=()))
-    plain = dataclasses.replace(plain, decoder=dataclasses.replace(plain.decoder, frame="canonical"))
-    return plain, dataclasses.replace(TINY, decoder=dataclasses.replace(TINY.decoder, **decoder))
+    plain = TINY.with_parts(
+        reader=dataclasses.replace(READER, shells=()), decoder=dataclasses.replace(DECODER, frame="canonical")
+    )
+    return plain, TINY.with_parts(decoder=dataclasses.replace(DECODER, **decoder))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("more", [-1, 0, 2])
 def test_a_network_that_grows_keeps_the_opacities_and_colours_it_has_learnt(more):
-    old, new = grown(free=TINY.decoder.free + more)
+    old, new = grown(free=DECODER.free + more)
     variables, inputs = random_variables(old, 3), random_inputs()
     before, _ = apply_humangs(variables, inputs, old)
     after, _ = apply_humangs(fit_variables(variables, old, new), inputs, new)
     per_vertex = lambda outputs, config: np.asarray(outputs.gaussians.opacities).reshape(
-        -1, config.decoder.gaussians_per_vertex
+        -1, config.architecture.decoder.gaussians_per_vertex
     )
     a, b = per_vertex(before, old), per_vertex(after, new)
     both = min(a.shape[1], b.shape[1])
@@ -143,7 +156,7 @@ def test_geometry_starts_anew_in_another_frame_alone():
     variables = random_variables(old, 3)
     geometry = lambda tree: np.asarray(tree["params"]["decoder"]["geometry_out"]["kernel"])
     assert np.abs(geometry(fit_variables(variables, old, new))).max() < 0.01 < np.abs(geometry(variables)).max()
-    frame = dataclasses.replace(old, decoder=dataclasses.replace(old.decoder, frame="normal"))
+    frame = old.with_parts(decoder=dataclasses.replace(DECODER, frame="normal"))
     assert np.array_equal(
         geometry(fit_variables(random_variables(frame), frame, new)), geometry(random_variables(frame))
     )
@@ -157,14 +170,14 @@ def test_fitting_to_the_same_network_changes_nothing():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"sampling": dataclasses.replace(TINY.sampling, shells=(0.0, 0.2))}, "shells"),
-        ({"decoder": dataclasses.replace(TINY.decoder, tight=2)}, "decoder.tight 1"),
-        ({"decoder": dataclasses.replace(TINY.decoder, residual_color=False), "sampling": NO_RGB}, "sample_rgb True"),
-        ({"decoder": dataclasses.replace(TINY.decoder, hidden=24)}, "decoder/"),
-        ({"transformer": dataclasses.replace(TINY.transformer, layers=6)}, "block_4"),
-        ({"texture": dataclasses.replace(TINY.texture, resolution=4)}, "texture"),
+        ({"reader": dataclasses.replace(READER, shells=(0.0, 0.2))}, "shells"),
+        ({"decoder": dataclasses.replace(DECODER, tight=2)}, "decoder.tight 1"),
+        ({"decoder": dataclasses.replace(DECODER, residual_color=False), "reader": NO_RGB}, "sample_rgb True"),
+        ({"decoder": dataclasses.replace(DECODER, hidden=24)}, "decoder/"),
+        ({"encoder": encoder(transformer=dataclasses.replace(ENCODER.transformer, layers=6))}, "block_4"),
+        ({"encoder": encoder(texture=dataclasses.replace(ENCODER.texture, resolution=4))}, "texture"),
     ],
 )
 def test_networks_that_differ_more_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
-        fit_variables(VARIABLES, TINY, dataclasses.replace(TINY, **changes))
+        fit_variables(VARIABLES, TINY, TINY.with_parts(**changes))

@@ -1,29 +1,19 @@
 """The scripts that look at people: faults are found where they are made, sheets are drawn."""
 
 import dataclasses
-import importlib.util
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from experiments.people import check_people, contact_sheets
 from humangs_jax.body.library import load_body
 from humangs_jax.people import cameras
 from humangs_jax.people.seeds import DEMO
 from humangs_jax.people.subject import make_subject
 from humangs_jax.people.writer import sample_pose
 
-EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SIZE = 96
-
-
-def script(name):
-    spec = importlib.util.spec_from_file_location(name, EXPERIMENTS / f"{name}.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +34,8 @@ def camera(posed):
 
 
 def faults(body, posed, camera):
-    module = script("check_people")
-    pixels, *counts = module.count_faults(body, posed, camera)
-    return pixels, dict(zip(module.FAULTS, np.asarray(counts) / pixels, strict=True))
+    pixels, *counts = check_people.count_faults(body, posed, camera)
+    return pixels, dict(zip(check_people.FAULTS, np.asarray(counts) / pixels, strict=True))
 
 
 def test_a_dressed_person_has_hardly_any_fault(body, posed, camera):
@@ -77,13 +66,12 @@ def test_holes_in_cloth_are_counted(body, posed, camera):
 def test_a_sheet_is_drawn_twice_alike(tmp_path, monkeypatch):
     import imageio.v3 as iio
 
-    module = script("contact_sheets")
     files = []
     for name in ("one", "two"):
         out = tmp_path / name
         sizes = ["--subjects", "1", "--scale", "0.3", "--suffix", ".png", "--sheets", "front_back"]
         monkeypatch.setattr(sys, "argv", ["contact_sheets.py", "--out", str(out), *sizes])
-        module.main()
+        contact_sheets.main()
         files.append(out / "people_front_back.png")
     assert files[0].read_bytes() == files[1].read_bytes()
     picture = iio.imread(files[0])

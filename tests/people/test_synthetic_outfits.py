@@ -1,17 +1,18 @@
 """What people are and wear: descriptions, every kind of garment built, letters, light."""
 
-import dataclasses
-
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from humangs_jax.body.library import load_body
-from humangs_jax.people import lettering, outfits, shading, subject
+from humangs_jax.core.pytree import replace
+from humangs_jax.people import outfits, shading, subject
 from humangs_jax.people.anatomy import ARM_GIRTH, ARMHOLE, TRUNK_GIRTH
 from humangs_jax.people.fabrics import Material, Spots
-from humangs_jax.people.haircuts import BEARDS, CUTS
-from humangs_jax.people.person import HEIGHT_RANGE, YEARS, describe
+from humangs_jax.people.hair import BEARDS, CUTS
 from humangs_jax.people.seeds import DEMO
+from humangs_jax.people.subject import HEIGHT_RANGE, YEARS, describe
+from humangs_jax.people.trimmings import EMBLEMS, bitmap, emblem, written
 
 MILLIMETRES = 4e-3
 """The stature is set by two vertices of the mean body; another one may be the highest."""
@@ -104,21 +105,21 @@ def test_the_person_of_a_subject_is_its_description(body, people):
 
 
 def test_words_read_from_left_to_right():
-    cells = lettering.bitmap("L7")
+    cells = bitmap("L7")
     rows = ["".join("#" if c else "." for c in row) for row in cells]
     assert rows[0] == "#.....#####." and rows[6] == "#####..#....", rows
     x, y = np.meshgrid(np.arange(12) + 0.5, 6.5 - np.arange(7))
-    drawn = lettering.written(cells, x.ravel(), y.ravel()).reshape(7, 12)
+    drawn = written(cells, x.ravel(), y.ravel()).reshape(7, 12)
     np.testing.assert_array_equal(drawn > 0.5, cells)
-    assert lettering.written(cells, np.asarray([-3.0, 50.0]), np.asarray([3.0, 3.0])).max() == 0
+    assert written(cells, np.asarray([-3.0, 50.0]), np.asarray([3.0, 3.0])).max() == 0
 
 
-@pytest.mark.parametrize("kind", lettering.EMBLEMS)
+@pytest.mark.parametrize("kind", EMBLEMS)
 def test_emblems_are_closed_shapes(kind):
     angle = np.linspace(0, 2 * np.pi, 50)
-    assert (lettering.emblem(kind, 1.6 * np.sin(angle), 1.6 * np.cos(angle)) < 0).all()
+    assert (emblem(kind, 1.6 * np.sin(angle), 1.6 * np.cos(angle)) < 0).all()
     x, y = np.meshgrid(np.linspace(-1.2, 1.2, 60), np.linspace(-1.2, 1.2, 60))
-    assert 0.05 < (lettering.emblem(kind, x.ravel(), y.ravel()) > 0).mean() < 0.6
+    assert 0.05 < (emblem(kind, x.ravel(), y.ravel()) > 0).mean() < 0.6
 
 
 def test_a_chest_print_faces_the_viewer_and_a_sleeve_has_its_own_coordinates():
@@ -137,7 +138,8 @@ def test_shadows_fall_away_from_the_light():
     roof = np.stack([0.5 * grid[:, 0], np.full(len(grid), 0.3), 0.5 * grid[:, 1]], -1)
     vertices = np.concatenate([floor, roof]).astype(np.float32)
     normals = np.tile(np.asarray([0, 1, 0], np.float32), (len(vertices), 1))
-    lit = shading.lit_share(vertices, normals, np.asarray([0, 1, 0], np.float32))
+    up = jnp.asarray([0.0, 1.0, 0.0])
+    lit = np.asarray(shading.shaded_vertices(jnp.asarray(vertices), jnp.asarray(normals), up)[1])
     below = np.linalg.norm(floor, axis=1) < 0.1
     assert lit[: len(floor)][below].max() < 0.75 < 0.95 < lit[: len(floor)][np.abs(floor[:, 0]) > 0.37].min()
     assert lit[len(floor) :].min() > 0.95  # nothing above the roof
@@ -146,23 +148,22 @@ def test_shadows_fall_away_from_the_light():
 
 def test_exposure_and_white_balance_scale_the_picture():
     lights = shading.sample_lights(np.random.default_rng(0))
-    plain = dataclasses.replace(lights, gain=np.ones(3, np.float32))
-    warm = dataclasses.replace(lights, gain=np.asarray([1.2, 1.0, 0.8], np.float32))
-    one, zero = np.ones(1, np.float32), np.zeros(1, np.float32)
-    albedo, normal = np.full((1, 3), 0.2, np.float32), np.asarray([[0, 0, 1]], np.float32)
-    ratio = shading.shade(warm, albedo, normal, one, zero) / shading.shade(plain, albedo, normal, one, zero)
+    plain = replace(lights, gain=jnp.ones(3))
+    warm = replace(lights, gain=jnp.asarray([1.2, 1.0, 0.8]))
+    point = jnp.full((1, 3), 0.2), jnp.asarray([[0.0, 0.0, 1.0]]), jnp.ones(1), jnp.ones(1), jnp.zeros(1)
+    ratio = shading.shade(warm, *point) / shading.shade(plain, *point)
     np.testing.assert_allclose(ratio, [[1.2, 1.0, 0.8]], rtol=1e-5)
 
 
 def test_highlights_are_bent_not_cut():
-    bright = np.linspace(0, 3, 200)[:, None] * np.ones(3)
-    bent = shading.rolled_off(bright)
+    bright = np.linspace(0, 3, 200, dtype=np.float32)[:, None] * np.ones(3, np.float32)
+    bent = np.asarray(shading.rolled_off(jnp.asarray(bright)))
     np.testing.assert_allclose(bent[bright < shading.SHOULDER], bright[bright < shading.SHOULDER])
     assert (np.diff(bent, axis=0) > 0).all() and bent.max() < shading.WHITEST
 
 
 def test_fabrics_of_one_seed_are_one_fabric():
-    from humangs_jax.people.patterns import sample_fabric, weave
+    from humangs_jax.people.fabrics import sample_fabric, weave
 
     rng = np.random.default_rng(0)
     cloth = rng.uniform(-0.2, 0.2, (300, 4)).astype(np.float32)

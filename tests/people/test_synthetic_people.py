@@ -9,7 +9,9 @@ import pytest
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import load_capture
-from humangs_jax.people import cameras, fabrics, patterns, poses, rendering, seeds, subject, writer
+from humangs_jax.people import cameras, fabrics, rendering, seeds, subject, writer
+from humangs_jax.people.fabrics import PATTERNS
+from humangs_jax.people.kinematics import LEFT_HIP, LEFT_KNEE
 from humangs_jax.people.seeds import DEMO, SPLITS, split_of
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
@@ -120,7 +122,7 @@ def test_cloth_covers_and_leaves_the_body(body, people, posed):
         rng = np.random.default_rng(0)
         camera = cameras.cameras_around(rng, p.vertices, np.asarray([0.4]), SIZE)[0]
         skin = np.asarray(rasterize_mesh(naked.vertices, body.faces, camera).face_ids) >= 0
-        fragments = rasterize_mesh(*rendering._padded(p.vertices, person.surface.faces), camera)
+        fragments = rasterize_mesh(*rendering.padded(p.vertices, person.surface.faces), camera)
         ids = np.asarray(fragments.face_ids)
         dressed = ids >= 0
         assert (skin & dressed).sum() > 0.93 * skin.sum()  # the cloth is where the body is
@@ -132,7 +134,7 @@ def test_hardly_any_skin_pokes_through(people, posed, views):
     for person, p, (batch, _, _) in zip(people, posed, views, strict=True):
         faces = person.surface.faces
         for k in range(3):
-            fragments = rasterize_mesh(*rendering._padded(p.vertices, faces), batch[k])
+            fragments = rasterize_mesh(*rendering.padded(p.vertices, faces), batch[k])
             ids, weights = np.asarray(fragments.face_ids), np.asarray(fragments.barycentrics)
             seen = ids >= 0
             under = (person.under_cloth[faces[ids[seen]]] * weights[seen]).sum(-1)
@@ -145,12 +147,12 @@ def test_garments_move_with_the_pose(people):
     rotations = np.zeros((55, 3), np.float32)
     rest = person.posed_vertices(rotations, np.zeros(3))
     np.testing.assert_allclose(rest, person.surface.vertices, atol=1e-5)
-    rotations[poses.LEFT_HIP] = [-0.6, 0, 0]
+    rotations[LEFT_HIP] = [-0.6, 0, 0]
     moved = np.linalg.norm(person.posed_vertices(rotations, np.zeros(3)) - rest, axis=1)
     template = person.surface.attributes["template"]
     is_cloth = np.ones(len(rest), bool)
     is_cloth[np.unique(person.surface.faces[person.face_materials <= 1])] = False
-    knee = person.build.joints[poses.LEFT_KNEE]
+    knee = person.build.joints[LEFT_KNEE]
     near_knee = np.linalg.norm(rest - (knee + np.asarray([0, 0.1, 0])), axis=1) < 0.15
     assert np.median(moved[near_knee]) > 0.05
     assert moved[(template[:, 1] > 0.25) & ~is_cloth].max() < 1e-5
@@ -213,7 +215,7 @@ def test_patterns_stay_in_range_and_differ():
     cloth[:, 3] = 0.16
     spots = fabrics.Spots(cloth, cloth[:, :3])
     seen = []
-    for name, (_, make) in patterns.PATTERNS.items():
+    for name, (_, make) in PATTERNS.items():
         base, other = fabrics.colour(0.6, 0.7, 0.5), fabrics.colour(0.1, 0.6, 0.8)
         colours = make(np.random.default_rng(1), base, other)(spots)
         assert colours.shape == (500, 3) and np.isfinite(colours).all(), name

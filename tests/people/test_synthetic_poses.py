@@ -11,9 +11,11 @@ from hypothesis import strategies as st
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, rest_pose, shape_body
-from humangs_jax.people import arms, hands, kinematics, poses, stances
-from humangs_jax.people.kinematics import Foot
+from humangs_jax.people import arms
+from humangs_jax.people import kinematics as kin
+from humangs_jax.people.arms import pose_hand
 from humangs_jax.people.overlap import OverlapMeter, winding_numbers
+from humangs_jax.people.poses import STANCES, sample_rotations, take_stance
 
 CLOSE = 1e-4
 """Metres or radians after 10 chained float32 rotations against float64."""
@@ -26,7 +28,7 @@ INSIDE = 0.012
 def mean_build():
     body = load_body()
     joints = np.asarray(body.joint_regressor @ body.template, float)
-    return poses.Build(joints, body.parents, 0.13, 0.1, 0.08, 0.035)
+    return kin.Build(joints, body.parents, 0.13, 0.1, 0.08, 0.035)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +43,7 @@ def build():
 
 @pytest.fixture(scope="module")
 def drawn(build):
-    return np.stack([poses.sample_rotations(np.random.default_rng(seed), build) for seed in SEEDS])
+    return np.stack([sample_rotations(np.random.default_rng(seed), build) for seed in SEEDS])
 
 
 @pytest.fixture(scope="module")
@@ -55,15 +57,15 @@ def posed(body):
 @pytest.mark.parametrize("angle", [0.0, 1e-7, 1e-5, 0.3, 2.0, 3.0, np.pi - 1e-9])
 def test_rotation_vectors_round_trip(angle):
     vectors = angle * np.asarray([[1.0, 0, 0], [0, -0.6, 0.8], [0.48, 0.6, 0.64], [0, 0, -1.0]])
-    np.testing.assert_allclose(poses.rotation_vector(poses.rotation_matrix(vectors)), vectors, atol=1e-7)
+    np.testing.assert_allclose(kin.rotation_vector(kin.rotation_matrix(vectors)), vectors, atol=1e-7)
 
 
 @given(st.lists(st.floats(-1.7, 1.7), min_size=6, max_size=6), st.floats(0, 1))
 @settings(deadline=None, max_examples=30)
 def test_halfway_rotations_are_on_the_way(numbers, t):
     a, b = np.asarray(numbers[:3]), np.asarray(numbers[3:])
-    middle = kinematics.between(a, b, t)
-    angle = lambda x, y: np.linalg.norm(poses.rotation_vector(poses.rotation_matrix(x).T @ poses.rotation_matrix(y)))
+    middle = kin.between(a, b, t)
+    angle = lambda x, y: np.linalg.norm(kin.rotation_vector(kin.rotation_matrix(x).T @ kin.rotation_matrix(y)))
     np.testing.assert_allclose(
         [angle(a, middle), angle(middle, b)], [t * angle(a, b), (1 - t) * angle(a, b)], atol=1e-6
     )
@@ -71,21 +73,21 @@ def test_halfway_rotations_are_on_the_way(numbers, t):
 
 def test_all_joints_stay_within_their_limits(drawn):
     angles = np.linalg.norm(drawn, axis=-1)
-    for joint, limit in poses.LIMITS.items():
+    for joint, limit in kin.LIMITS.items():
         assert angles[:, joint].max() <= limit + 1e-9, joint
-    assert angles[:, poses.LEFT_HAND :].max() <= poses.FINGER_LIMIT + 1e-9
+    assert angles[:, kin.LEFT_HAND :].max() <= kin.FINGER_LIMIT + 1e-9
     assert (angles[:, 22:25] == 0).all()
     assert (angles.std(0)[:22] > 0.01).all()  # every joint of the body takes part
-    assert (angles.std(0)[poses.LEFT_HAND :] > 0.01).all()  # and every joint of the hands
+    assert (angles.std(0)[kin.LEFT_HAND :] > 0.01).all()  # and every joint of the hands
 
 
 def test_knees_and_elbows_bend_one_way(drawn):
-    assert (drawn[:, [poses.LEFT_KNEE, poses.RIGHT_KNEE], 0] >= -0.03).all()  # rest knees are not quite straight
-    assert (drawn[:, poses.LEFT_ELBOW, 1] < 0).all() and (drawn[:, poses.RIGHT_ELBOW, 1] > 0).all()
+    assert (drawn[:, [kin.LEFT_KNEE, kin.RIGHT_KNEE], 0] >= -0.03).all()  # rest knees are not quite straight
+    assert (drawn[:, kin.LEFT_ELBOW, 1] < 0).all() and (drawn[:, kin.RIGHT_ELBOW, 1] > 0).all()
 
 
 def test_fingers_bend_towards_the_palm(drawn):
-    first = {0: poses.LEFT_HAND, 1: poses.RIGHT_HAND}
+    first = {0: kin.LEFT_HAND, 1: kin.RIGHT_HAND}
     for side, sign in ((0, -1), (1, 1)):
         bends = sign * drawn[:, first[side] : first[side] + 12, 2]
         assert bends.min() > -0.12 and bends.max() > 1.0 and np.median(bends) > 0.1
@@ -93,7 +95,7 @@ def test_fingers_bend_towards_the_palm(drawn):
 
 def test_kinematics_are_those_of_the_body_model(body, build, drawn):
     rotations = drawn[3].astype(np.float32)
-    _, positions = poses.joint_positions(build, rotations)
+    _, positions = kin.joint_positions(build, rotations)
     rest = shape_body(body, np.zeros(1, np.float32) + rest_pose(body).translation[:1])
     pose = jax.jit(pose_body)(body, rest, BodyPose(rotations + rest_pose(body).rotations, rest_pose(body).translation))
     np.testing.assert_allclose(positions, pose.joints, atol=CLOSE)
@@ -106,39 +108,39 @@ def test_kinematics_are_those_of_the_body_model(body, build, drawn):
 def test_legs_put_the_feet_where_they_are_to_be(x, z, yaw, pitch, lift, sink):
     build = mean_build()
     joints = build.joints
-    feet = (Foot(0.12 + x, z, yaw, pitch, lift), Foot(-0.12, 0.05, 0.0))
-    rotations = np.zeros((poses.JOINTS, 3))
-    rotations[poses.PELVIS] = [0.1, 0.3, 0.05]
-    height = kinematics.highest_pelvis(build, poses.rotation_matrix(rotations[0]), 0.0, 0.0, feet) - sink
+    feet = (kin.Foot(0.12 + x, z, yaw, pitch, lift), kin.Foot(-0.12, 0.05, 0.0))
+    rotations = np.zeros((kin.JOINTS, 3))
+    rotations[kin.PELVIS] = [0.1, 0.3, 0.05]
+    height = kin.highest_pelvis(build, kin.rotation_matrix(rotations[0]), 0.0, 0.0, feet) - sink
     pelvis = np.asarray([0.0, height, 0.0])
-    assert kinematics.place_feet(build, rotations, pelvis, feet) < 1e-9
-    world, positions = poses.joint_positions(build, rotations)
-    positions = positions + pelvis - positions[poses.PELVIS]
+    assert kin.place_feet(build, rotations, pelvis, feet) < 1e-9
+    world, positions = kin.joint_positions(build, rotations)
+    positions = positions + pelvis - positions[kin.PELVIS]
     for side, foot in enumerate(feet):
-        ankle, orientation = kinematics.ankle_of(build, side, foot)
-        np.testing.assert_allclose(positions[poses.LEFT_ANKLE + side], ankle, atol=1e-9)
-        np.testing.assert_allclose(world[poses.LEFT_ANKLE + side], orientation, atol=1e-9)
+        ankle, orientation = kin.ankle_of(build, side, foot)
+        np.testing.assert_allclose(positions[kin.LEFT_ANKLE + side], ankle, atol=1e-9)
+        np.testing.assert_allclose(world[kin.LEFT_ANKLE + side], orientation, atol=1e-9)
         if foot.pitch >= 0:  # the ball is above its place, the toes are flat
-            ball = positions[poses.LEFT_FOOT + side]
+            ball = positions[kin.LEFT_FOOT + side]
             np.testing.assert_allclose(ball[[0, 2]], [foot.x, foot.z], atol=1e-9)
-            np.testing.assert_allclose(ball[1], foot.lift + joints[poses.LEFT_FOOT + side, 1] - build.sole, atol=1e-9)
-            np.testing.assert_allclose(world[poses.LEFT_FOOT + side][1], [0, 1, 0], atol=1e-9)
+            np.testing.assert_allclose(ball[1], foot.lift + joints[kin.LEFT_FOOT + side, 1] - build.sole, atol=1e-9)
+            np.testing.assert_allclose(world[kin.LEFT_FOOT + side][1], [0, 1, 0], atol=1e-9)
 
 
 def test_both_soles_are_on_the_ground(body, build, posed):
     """Whatever the stance, the lowest points of both feet are at one height, unless one leg is raised."""
     part = np.asarray(body.skinning_weights).argmax(1)
-    soles = [np.isin(part, (poses.LEFT_ANKLE + side, poses.LEFT_FOOT + side)) for side in (0, 1)]
+    soles = [np.isin(part, (kin.LEFT_ANKLE + side, kin.LEFT_FOOT + side)) for side in (0, 1)]
     gaps = {}
-    for name, (_, draw) in stances.STANCES.items():
+    for name, (_, draw) in STANCES.items():
         for seed in range(4):
-            rotations = np.zeros((poses.JOINTS, 3))
+            rotations = np.zeros((kin.JOINTS, 3))
             stance = draw(np.random.default_rng(seed), build.hip_width / build.leg)
-            _, missed = stances.take_stance(build, rotations, 0.3, stance)
+            _, missed = take_stance(build, rotations, 0.3, stance)
             if missed < 1e-6 and all(foot.lift == 0 for foot in stance.feet):
                 low = [posed(rotations)[sole, 1].min() for sole in soles]
                 gaps.setdefault(name, []).append(abs(low[0] - low[1]))
-    assert set(gaps) == set(stances.STANCES) - {"one leg"}
+    assert set(gaps) == set(STANCES) - {"one leg"}
     assert max(max(values) for values in gaps.values()) < 0.012  # a sole is round where the model of a foot has corners
     assert np.mean(gaps["stand"]) < 1e-3
 
@@ -164,15 +166,15 @@ def test_hardly_any_of_the_body_is_inside_itself(body, drawn):
     assert meter.at_rest.mean() < 0.02  # mouth and eyes
     inside = [meter.inside(rotations).mean() for rotations in drawn[:10]]
     assert np.mean(inside) < INSIDE and np.max(inside) < 0.04
-    folded = np.zeros((poses.JOINTS, 3))
-    folded[[poses.LEFT_HIP, poses.RIGHT_HIP], 2] = -0.3, 0.3  # legs through each other
+    folded = np.zeros((kin.JOINTS, 3))
+    folded[[kin.LEFT_HIP, kin.RIGHT_HIP], 2] = -0.3, 0.3  # legs through each other
     assert meter.inside(folded).mean() > 0.04
 
 
 def test_mirrored_goals_give_both_arms_the_same_freedom(build):
-    drawn = np.stack([poses.sample_rotations(np.random.default_rng(seed), build) for seed in range(60)])
-    left = drawn[:, poses.LEFT_SHOULDER] * poses.MIRROR
-    right = drawn[:, poses.RIGHT_SHOULDER]
+    drawn = np.stack([sample_rotations(np.random.default_rng(seed), build) for seed in range(60)])
+    left = drawn[:, kin.LEFT_SHOULDER] * kin.MIRROR
+    right = drawn[:, kin.RIGHT_SHOULDER]
     assert np.abs(left.mean(0) - right.mean(0)).max() < 0.35  # means of 60 draws of spread 0.6
 
 
@@ -180,16 +182,16 @@ def test_gestures_are_drawn_and_mirrored():
     for side, sign in ((0, 1), (1, -1)):
         drawn = []
         for seed in range(200):
-            rotations = np.zeros((poses.JOINTS, 3))
-            hands.pose_hand(np.random.default_rng(seed), rotations, side)
+            rotations = np.zeros((kin.JOINTS, 3))
+            pose_hand(np.random.default_rng(seed), rotations, side)
             drawn.append(rotations)
-            assert not rotations[: poses.LEFT_HAND].any()
-        curls = -sign * np.asarray(drawn)[:, (poses.LEFT_HAND, poses.RIGHT_HAND)[side] + np.arange(12), 2]
+            assert not rotations[: kin.LEFT_HAND].any()
+        curls = -sign * np.asarray(drawn)[:, (kin.LEFT_HAND, kin.RIGHT_HAND)[side] + np.arange(12), 2]
         index, others = curls[:, :3].mean(1), curls[:, 3:].mean(1)
         assert ((index < 0.3) & (others > 0.8)).any()  # pointing
         assert ((index > 0.9) & (others > 0.9)).any()  # fists
         assert ((index < 0.1) & (others < 0.1)).any()  # flat
-    same = [np.zeros((poses.JOINTS, 3)) for _ in range(2)]
+    same = [np.zeros((kin.JOINTS, 3)) for _ in range(2)]
     for side in (0, 1):
-        hands.pose_hand(np.random.default_rng(7), same[side], side)
-    np.testing.assert_allclose(same[0][25:40] * poses.MIRROR, same[1][40:55])
+        pose_hand(np.random.default_rng(7), same[side], side)
+    np.testing.assert_allclose(same[0][25:40] * kin.MIRROR, same[1][40:55])

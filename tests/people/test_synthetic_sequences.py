@@ -8,7 +8,7 @@ import pytest
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.motion import Motion, load_motion, save_motion
-from humangs_jax.people import kinematics, poses
+from humangs_jax.people import kinematics as kin
 from humangs_jax.people.arms import arm_clearance
 from humangs_jax.people.sequences import KINDS, sample_sequence
 
@@ -27,7 +27,7 @@ def body():
 
 @pytest.fixture(scope="module")
 def build(body):
-    return poses.Build(np.asarray(body.joint_regressor @ body.template, float), body.parents, 0.13, 0.1, 0.08, 0.035)
+    return kin.Build(np.asarray(body.joint_regressor @ body.template, float), body.parents, 0.13, 0.1, 0.08, 0.035)
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +75,8 @@ def test_planted_soles_are_on_the_ground_and_do_not_slide(drawn, feet, case):
 @pytest.mark.parametrize("case", CASES)
 def test_motions_are_smooth(drawn, case):
     sequence = drawn[case]
-    matrices = kinematics.rotation_matrix(sequence.rotations)
-    steps = np.linalg.norm(kinematics.rotation_vector(np.swapaxes(matrices[:-1], -1, -2) @ matrices[1:]), axis=-1)
+    matrices = kin.rotation_matrix(sequence.rotations)
+    steps = np.linalg.norm(kin.rotation_vector(np.swapaxes(matrices[:-1], -1, -2) @ matrices[1:]), axis=-1)
     assert steps.max() < np.deg2rad(22)  # a swinging shin makes 500 degrees a second
     assert steps.max() > np.deg2rad(3)  # it moves
     assert np.linalg.norm(np.diff(sequence.translations, 2, axis=0), axis=1).max() * 30**2 < 12  # m/s^2
@@ -85,17 +85,15 @@ def test_motions_are_smooth(drawn, case):
 @pytest.mark.parametrize("case", CASES)
 def test_legs_and_arms_keep_to_their_limits(build, drawn, case):
     for rotations in drawn[case].rotations:
-        assert kinematics.excess(rotations, tuple(range(1, 22))) < 0.05
-        assert (rotations[[poses.LEFT_KNEE, poses.RIGHT_KNEE], 0] > -0.03).all()
+        assert kin.excess(rotations, tuple(range(1, 22))) < 0.05
+        assert (rotations[[kin.LEFT_KNEE, kin.RIGHT_KNEE], 0] > -0.03).all()
     inside = [arm_clearance(build, rotations) < -0.03 for rotations in drawn[case].rotations]
     assert np.mean(inside) < 0.1
 
 
 def test_walks_get_on_and_turns_turn(drawn):
     way = lambda s: np.linalg.norm(s.translations[-1] - s.translations[0])
-    heading = lambda s: np.unwrap(
-        np.arctan2(*np.moveaxis(kinematics.rotation_matrix(s.rotations[:, 0])[:, [0, 2], 2], -1, 0))
-    )
+    heading = lambda s: np.unwrap(np.arctan2(*np.moveaxis(kin.rotation_matrix(s.rotations[:, 0])[:, [0, 2], 2], -1, 0)))
     for case, sequence in drawn.items():
         if case[0] == "walk":
             assert way(sequence) > 0.6

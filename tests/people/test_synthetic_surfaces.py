@@ -3,14 +3,17 @@
 import numpy as np
 import pytest
 
-from humangs_jax.people import slices
 from humangs_jax.people.surfaces import (
+    ANGLES,
+    Outlines,
     Surface,
     boundary_edges,
     compact,
     cut,
     grid_faces,
+    hanging,
     join,
+    outlines,
     smooth,
     turn_in_hems,
     vertex_normals,
@@ -111,7 +114,7 @@ def ellipse_points(a=0.2, b=0.1):
 
 def test_outlines_of_an_ellipse():
     along, across = ellipse_points()
-    found = slices.outlines(along, across, np.linspace(-0.4, 0.4, 9), np.zeros((9, 2)), 0.03)
+    found = outlines(along, across, np.linspace(-0.4, 0.4, 9), np.zeros((9, 2)), 0.03)
     angle = np.linspace(-3, 3, 31)
     expected = 1 / np.sqrt((np.sin(angle) / 0.2) ** 2 + (np.cos(angle) / 0.1) ** 2)
     chord = 0.04  # 48 angles: polygons instead of curves
@@ -121,14 +124,14 @@ def test_outlines_of_an_ellipse():
 def test_outlines_bridge_hollows():
     along, across = ellipse_points()
     hollow = np.linalg.norm(across - [0.0, 0.1], axis=1) < 0.06  # a dent in front
-    found = slices.outlines(along[~hollow], across[~hollow], np.asarray([-0.1, 0.0, 0.1]), np.zeros((3, 2)), 0.03)
+    found = outlines(along[~hollow], across[~hollow], np.asarray([-0.1, 0.0, 0.1]), np.zeros((3, 2)), 0.03)
     assert found.radius(np.zeros(1), np.zeros(1))[0] > 0.07
 
 
 def test_hanging_cloth_narrows_no_faster_than_its_slope():
-    radii = np.random.default_rng(0).uniform(0.05, 0.2, (9, slices.ANGLES))
-    shape = slices.Outlines(np.linspace(0, 0.8, 9), np.zeros((9, 2)), radii)
-    hung = slices.hanging(shape, slope=0.5)
+    radii = np.random.default_rng(0).uniform(0.05, 0.2, (9, ANGLES))
+    shape = Outlines(np.linspace(0, 0.8, 9), np.zeros((9, 2)), radii)
+    hung = hanging(shape, slope=0.5)
     assert (hung.radii >= radii).all()
     assert (hung.radii[:-1] - hung.radii[1:] >= -0.5 * 0.1 - ROUNDING).all()
     np.testing.assert_array_equal(hung.radii[-1], radii[-1])

@@ -21,11 +21,12 @@ from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSam
 from humangs_jax.data.motion import load_motion
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.exr import read_exr
-from humangs_jax.people import cameras, maps, seeds, writer
-from humangs_jax.people.live_bank import build_bank
+from humangs_jax.people import cameras, seeds, writer
+from humangs_jax.people.bank import build_bank
+from humangs_jax.people.manifest import find_people
+from humangs_jax.people.rendering import DEPTH_UNIT, padded, read_depth, render_maps, write_depth
 from humangs_jax.people.seeds import DEMO, SPLITS, seeds_of, split_of
 from humangs_jax.people.subject import make_subject
-from humangs_jax.people.written import find_people
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 SIZE = 32
@@ -78,8 +79,8 @@ def test_a_written_person_has_all_views_in_all_forms(folder, body):
             on_white = view.rgba[..., :3] + (1 - view.rgba[..., 3:])
             np.testing.assert_allclose(on_white, views.images[i], atol=EIGHT_BITS)
             np.testing.assert_allclose(view.rgba[..., 3], views.masks[i], atol=EIGHT_BITS)
-            depth = maps.read_depth(where / "depth" / f"{name}.png")
-            np.testing.assert_allclose(depth, view.depth, atol=0.51 * maps.DEPTH_UNIT)
+            depth = read_depth(where / "depth" / f"{name}.png")
+            np.testing.assert_allclose(depth, view.depth, atol=0.51 * DEPTH_UNIT)
             assert ((depth > 0) == (view.channels["position.X"] != 0)).mean() > 0.99
             assert ((depth > 0) & (views.masks[i] == 0)).sum() == 0  # what is hit in its middle is covered
             assert ((depth == 0) & (views.masks[i] == 1)).sum() <= 2  # a gap between four samples
@@ -92,12 +93,12 @@ def test_maps_agree_with_the_body_where_it_is_bare(body):
     person = make_subject(DEMO[1], body)
     posed = writer.sample_pose(person, 0)
     camera = cameras.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([0.3]), 64)[0]
-    shown = maps.render_maps(posed, camera)
+    shown = render_maps(posed, camera)
     pose = BodyPose(jnp.asarray(posed.rotations), jnp.asarray(posed.translation))
     rest = jax.jit(shape_body)(body, jnp.asarray(person.betas))
     naked = rasterize_mesh(jax.jit(pose_body)(body, rest, pose).vertices, body.faces, camera)
     expected = np.asarray(interpolate_attributes(naked, body.faces, rest.vertices, jnp.zeros(3)))
-    fragments = rasterize_mesh(*maps.padded(posed.vertices, person.surface.faces), camera)
+    fragments = rasterize_mesh(*padded(posed.vertices, person.surface.faces), camera)
     ids = np.asarray(fragments.face_ids)
     np.testing.assert_array_equal(shown.depth > 0, ids >= 0)
     skin = (ids >= 0) & (person.face_materials[ids] == 0) & (np.asarray(naked.depth) > 0)
@@ -155,12 +156,12 @@ def test_sequences_are_written_with_their_motion_and_a_scan(tmp_path, body):
 
 def test_depths_that_do_not_fit_are_an_error(tmp_path):
     with pytest.raises(ValueError, match="do not fit into 16 bits"):
-        maps.write_depth(tmp_path / "depth.png", np.full((2, 2), 7.0, np.float32))
+        write_depth(tmp_path / "depth.png", np.full((2, 2), 7.0, np.float32))
     from humangs_jax.io.images import write_png
 
     write_png(tmp_path / "eight.png", np.zeros((2, 2), np.float32))
     with pytest.raises(ValueError, match="expected a 16-bit grey PNG"):
-        maps.read_depth(tmp_path / "eight.png")
+        read_depth(tmp_path / "eight.png")
 
 
 def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):

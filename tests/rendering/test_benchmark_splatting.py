@@ -1,6 +1,5 @@
 """The benchmark script on a small scene whose reference is the dense oracle's, in float64."""
 
-import importlib
 import json
 import math
 import os
@@ -13,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.splatting import benchmark, scaling, scenes, tradeoff, work
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.reference import render_dense
+from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SplatConfig
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
@@ -68,7 +68,7 @@ def files(tmp_path_factory):
         gaussians = Gaussians(*(double[name] for name in PARAMETERS))
 
         def loss(gaussians):
-            image = render_dense(gaussians, camera, background=jnp.zeros(3)).rgb
+            image = render_reference(gaussians, camera, background=jnp.zeros(3)).rgb
             return jnp.mean((image - target) ** 2), image
 
         gradients, image = jax.jit(jax.grad(loss, has_aux=True))(gaussians)
@@ -119,42 +119,30 @@ def test_draws_in_float64_without_a_yardstick(files):
     assert all(error < STORED_AS_FLOAT32 for error in result["gradient_relative_l2"].values())
 
 
-@pytest.fixture
-def load(monkeypatch):
-    monkeypatch.syspath_prepend(EXPERIMENTS)
-    return importlib.import_module
-
-
-@pytest.fixture
-def script(load):
-    return load("benchmark_splatting")
-
-
-def test_without_a_reference_errors_are_null(script):
+def test_without_a_reference_errors_are_null():
     class Drawn:
         rgb = np.zeros((4, 4, 3))
 
-    found = script.errors({"forward": Drawn}, None)
+    found = benchmark.errors({"forward": Drawn}, None)
     assert found["psnr"] is None and found["gradient_cosine"] == dict.fromkeys(PARAMETERS)
 
 
-def test_errors_of_gradients_see_bias_and_gain(script):
+def test_errors_of_gradients_see_bias_and_gain():
     exact = np.random.default_rng(0).normal(size=1000)
-    found = script.gradient_errors(0.9 * exact + 0.01, exact)
+    found = benchmark.gradient_errors(0.9 * exact + 0.01, exact)
     mean = np.abs(exact).mean()
     assert found["signed_bias"] == pytest.approx((0.01 - 0.1 * exact.mean()) / mean)
     assert found["gain"] == pytest.approx(-0.1, abs=0.01)
     assert found["relative_l2"] == pytest.approx(math.hypot(0.1, 0.01), rel=0.05)
-    assert script.gradient_errors(-exact, exact)["cosine"] == pytest.approx(-1)
+    assert benchmark.gradient_errors(-exact, exact)["cosine"] == pytest.approx(-1)
 
 
-def test_work_needed_agrees_with_brute_force(load, files):
+def test_work_needed_agrees_with_brute_force(files):
     """Every pixel against every Gaussian, in float64."""
-    scenes, work = load("gaussian_scenes"), load("splatting_work")
     scene = scenes.load_scene(files / "scene.npz", SIZE)
     config = SplatConfig()
     projected, _ = work.projected_splats(scene, config)
-    order = np.argsort(projected.depth, kind="stable")
+    order = np.argsort(projected.depths, kind="stable")
     x, y, xx, xy, yy = (np.asarray(projected[i], np.float64)[order, None, None] for i in (0, 1, 3, 4, 5))
     dx, dy = np.arange(SIZE) + 0.5 - x, (np.arange(SIZE) + 0.5)[:, None] - y
     squared = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
@@ -175,31 +163,20 @@ def test_work_needed_agrees_with_brute_force(load, files):
     assert work.tiles_met(projected, *boxes, SIZE, 8) == met
 
 
-def test_blocks_work_as_long_as_their_neediest_tile(load):
-    steps = load("splatting_work").block_steps
+def test_blocks_work_as_long_as_their_neediest_tile():
+    steps = work.block_steps
     counts, used = np.array([0, 9, 3, 30, 5]), np.array([0, 9, 3, 12, 5])
     assert steps(counts, counts, 2, 8) == 2 * 32 + 2 * 8  # lists of 30 and 9, then of 5 and 3
     assert steps(counts, used, 2, 8) == 2 * 16 + 2 * 8
     assert steps(np.zeros(4, int), np.zeros(4, int), 2, 8) == 0
 
 
-def test_pareto_front_holds_what_nothing_beats(load):
-    tradeoff = load("splatting_tradeoff")
+def test_pareto_front_holds_what_nothing_beats():
     rows = [{"time": t, "psnr": p} for t, p in ((1, 100), (0.5, 40), (0.6, 39), (0.8, 60), (0.8, 55), (1.2, 99))]
     assert [(r["time"], r["psnr"]) for r in tradeoff.pareto(rows, "time")] == [(0.5, 40), (0.8, 60), (1, 100)]
     assert [tradeoff.short(v) for v in (1 / 64, 0.05, 1e-3, 8, 2.5)] == ["1/64", "0.05", "0.001", "8", "2.5"]
 
 
-def test_slope_of_linear_growth_is_one(load):
+def test_slope_of_linear_growth_is_one():
     rows = [{"size": n, "forward_cpu_ms": 3.0 * n} for n in (1, 2, 8)]
-    assert load("splatting_scaling").slope(rows, "forward") == pytest.approx(1)
-
-
-def test_sections_of_a_page_are_replaced(load, tmp_path):
-    reports, page = load("report_tables"), tmp_path / "page.md"
-    page.write_text("before\n<!-- x -->\nold\n<!-- end x -->\nafter\n")
-    for text in ("new", "newer"):
-        reports.write_section(page, "x", text)
-        assert page.read_text() == f"before\n<!-- x -->\n{text}\n<!-- end x -->\nafter\n"
-    with pytest.raises(ValueError, match="markers"):
-        reports.write_section(page, "y", "text")
+    assert scaling.slope(rows, "forward") == pytest.approx(1)

@@ -1,8 +1,6 @@
 """Every extreme of docs/numerics.md, and random scenes over many decades: finite, and float32 close to float64."""
 
-import importlib.util
 import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from experiments.splatting import numerics
+from experiments.splatting import numerics_cases as cases
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.splatting import SplatConfig, render
-
-EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 
 DECISION = 1e-5
 """An image error beyond rounding: somewhere an alpha at 1/255, a transmittance at the stop or two depths fell the other
@@ -32,19 +30,6 @@ SMALL = SplatConfig(block=4, chunk=4, max_pairs=256)
 """Quick to compile."""
 
 
-def load(name):
-    sys.path.insert(0, str(EXPERIMENTS))
-    try:
-        spec = importlib.util.spec_from_file_location(name, EXPERIMENTS / f"{name}.py")
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[name] = module  # dataclasses look themselves up there
-        spec.loader.exec_module(module)
-        return module
-    finally:
-        sys.path.remove(str(EXPERIMENTS))
-
-
-cases = load("numerics_cases")
 CASES = [pytest.param(case, id=name, marks=pytest.mark.slow if case.slow else ()) for name, case in cases.CASES.items()]
 
 
@@ -134,15 +119,14 @@ def test_narrow_gaussians_give_a_float32_image_eagerly(dtype):
 
 @pytest.mark.parametrize("status", [0, 1])
 def test_the_script_writes_its_table_and_fails_on_a_bound(tmp_path, monkeypatch, capsys, status):
-    script = load("check_numerics")
     page = tmp_path / "numerics.md"
-    page.write_text("before\n<!-- numerics -->\nold\n<!-- end numerics -->\nafter\n")
+    page.write_text("before\n<!-- table: splatting_numerics -->\nold\n<!-- end -->\nafter\n")
     case = cases.CASES["opacity: 0"]
     outcome = cases.Outcome(True, 2 * case.image if status else 0.0, 0.0, 0.0, "K", 0.0, 0)
     exact = cases.dataclasses.replace(outcome, image=0.0)
     monkeypatch.setattr(cases, "measure", lambda case, in_float64=False: exact if in_float64 else outcome)
-    monkeypatch.setattr(sys, "argv", ["check_numerics.py", "--only", "opacity: 0", "--table", str(page)])
-    assert script.main() == status
+    monkeypatch.setattr(sys, "argv", ["numerics.py", "--only", "opacity: 0", "--page", str(page)])
+    assert numerics.main() == status
     text = page.read_text()
     assert text.startswith("before") and text.endswith("after\n") and "old" not in text and "opacity: 0" in text
     assert ("FAILED" in text) == (status == 1)

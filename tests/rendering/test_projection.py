@@ -46,6 +46,9 @@ def test_covariance_is_that_of_the_linearised_camera(float64):
     exact = (centers[:, 0], centers[:, 1], xx, xy, yy, xx * yy - xy * xy)
     for plane, expected_plane in zip(planes, exact, strict=True):
         np.testing.assert_allclose(plane[seen], expected_plane[seen], rtol=FLOAT64)
+    np.testing.assert_array_equal(projected.means2d[:, 1], projected.y)
+    inverses = jnp.linalg.inv(expected)[:, (0, 0, 1), (0, 1, 1)]
+    np.testing.assert_allclose(projected.conics[seen], inverses[seen], rtol=FLOAT64, atol=FLOAT64)
 
 
 def test_moving_world_and_camera_together_changes_nothing(float64):

@@ -8,7 +8,7 @@ from splat_scenes import HEIGHT, WIDTH, camera, random_gaussians
 
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.reference import render_dense
+from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SplatConfig
 
 EXACT = 1e-12
@@ -45,7 +45,7 @@ def on_axis(depths, opacities, colors, scale=0.2):
 
 def test_one_isotropic_gaussian_is_a_round_blob():
     gaussians = on_axis([2.0], [0.8], [[1.0, 0.5, 0.0]])
-    rendering = render_dense(gaussians, axis_camera(), background=jnp.zeros(3))
+    rendering = render_reference(gaussians, axis_camera(), background=jnp.zeros(3))
     variance = (FOCAL * 0.2 / 2) ** 2 + 0.3
     y, x = np.mgrid[:SIZE, :SIZE] - 4.0
     alpha = 0.8 * np.exp(-(x * x + y * y) / (2 * variance))
@@ -58,7 +58,7 @@ def test_one_isotropic_gaussian_is_a_round_blob():
 
 def test_nearer_covers_farther_whatever_the_order():
     gaussians = on_axis([3.0, 2.0], [0.6, 0.5], [[1.0, 0, 0], [0, 1.0, 0]])
-    rendering = render_dense(gaussians, axis_camera())
+    rendering = render_reference(gaussians, axis_camera())
     np.testing.assert_allclose(rendering.rgb[4, 4], [0.3 + 0.2, 0.5 + 0.2, 0.2], atol=EXACT)  # on white
     np.testing.assert_allclose(rendering.alpha[4, 4], 0.8, atol=EXACT)
     np.testing.assert_allclose(rendering.depth[4, 4], (0.5 * 2 + 0.3 * 3) / 0.8, atol=EXACT)
@@ -71,13 +71,13 @@ def test_a_pixel_ends_before_the_splat_that_would_exhaust_it():
         0.6,
         0.5,
     ]  # T: 1e-2, 2e-4, then 8e-5 <= 1e-4: neither the third nor anything after it counts
-    rendering = render_dense(on_axis([1.0, 2.0, 3.0, 4.0], opacities, [[0.0] * 3] * 4), axis_camera())
+    rendering = render_reference(on_axis([1.0, 2.0, 3.0, 4.0], opacities, [[0.0] * 3] * 4), axis_camera())
     np.testing.assert_allclose(rendering.rgb[4, 4], 2e-4, atol=EXACT)
 
 
 def test_alpha_is_clamped_and_then_has_no_gradient():
     def middle(opacity):
-        return render_dense(on_axis([2.0], [opacity], [[0.0] * 3]), axis_camera()).alpha[4, 4]
+        return render_reference(on_axis([2.0], [opacity], [[0.0] * 3]), axis_camera()).alpha[4, 4]
 
     slope_at = jax.jit(jax.value_and_grad(middle))
     value, slope = slope_at(1.0)
@@ -88,9 +88,9 @@ def test_alpha_is_clamped_and_then_has_no_gradient():
 
 def test_a_clamped_jacobian_changes_only_what_lies_beyond_the_margin():
     gaussians, view = random_gaussians(3), camera()
-    exact = render_dense(gaussians, view, SplatConfig())
-    wide = render_dense(gaussians, view, SplatConfig(jacobian_margin=1e6))
-    narrow = render_dense(gaussians, view, SplatConfig(jacobian_margin=0.0))
+    exact = render_reference(gaussians, view, SplatConfig())
+    wide = render_reference(gaussians, view, SplatConfig(jacobian_margin=1e6))
+    narrow = render_reference(gaussians, view, SplatConfig(jacobian_margin=0.0))
     np.testing.assert_allclose(wide.rgb, exact.rgb, atol=EXACT)
     assert np.abs(narrow.rgb - exact.rgb).max() > 1e-3
     assert exact.rgb.shape == (HEIGHT, WIDTH, 3)

@@ -16,7 +16,7 @@ from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.rendering import binning
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import project, squared_reach
-from humangs_jax.rendering.reference import render_dense
+from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.splatting import plan_buffers, render, seen_from
 
@@ -38,7 +38,7 @@ def test_visibility_is_the_largest_weight():
     with jax.enable_x64(True):
         gaussians = random_gaussians(3)
         weights = jax.vmap(
-            lambda i: render_dense(
+            lambda i: render_reference(
                 replace(gaussians, colors=jnp.zeros((COUNT, 3)).at[i, 0].set(1.0)), camera(), background=jnp.zeros(3)
             ).rgb[..., 0]
         )(jnp.arange(COUNT))

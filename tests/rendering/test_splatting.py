@@ -1,4 +1,4 @@
-"""The tiled renderer against the dense one, and as a JAX function: jit, vmap, grad, checkpoint, export, its buffers."""
+"""The tiled renderer against the reference, and as a JAX function: jit, vmap, grad, checkpoint, export, its buffers."""
 
 import dataclasses
 import functools
@@ -14,16 +14,11 @@ from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.rendering.reference import render_dense
-from humangs_jax.rendering.splatting import (
-    SplatConfig,
-    default_pairs,
-    draw_projected,
-    plan_buffers,
-    project_gaussians,
-    render,
-    render_views,
-)
+from humangs_jax.rendering.buffers import default_pairs, plan_buffers
+from humangs_jax.rendering.drawing import draw_projected
+from humangs_jax.rendering.projection import project_gaussians
+from humangs_jax.rendering.reference import render_reference
+from humangs_jax.rendering.splatting import SplatConfig, render, render_views
 
 FLOAT64 = 1e-9
 """Relative to the largest entry; float64 rounding, grown by the 1 / (1 - alpha) <= 1000 of the gradient."""
@@ -64,7 +59,7 @@ def tiled(gaussians, view, background, config=CHUNKS):
 
 @jax.jit
 def dense(gaussians, view, background):
-    return evaluate(lambda g, c, b: render_dense(g, c, background=b), gaussians, view, background)
+    return evaluate(lambda g, c, b: render_reference(g, c, background=b), gaussians, view, background)
 
 
 def background(dtype=np.float64):
@@ -139,7 +134,7 @@ def test_every_knob_means_the_same_as_in_dense():
     )
     with jax.enable_x64(True):
         gaussians = random_gaussians(6)
-        ours, expected = (f(gaussians, camera(), config, background()) for f in (render, render_dense))
+        ours, expected = (f(gaussians, camera(), config, background()) for f in (render, render_reference))
         assert_close(ours, expected, FLOAT64)
 
 
@@ -282,7 +277,7 @@ def test_empty_scenes_show_the_background():
 def test_one_pixel():
     with jax.enable_x64(True):
         gaussians, view = random_gaussians(0), camera(width=1, height=1)
-        assert_close(render(gaussians, view), render_dense(gaussians, view), FLOAT64)
+        assert_close(render(gaussians, view), render_reference(gaussians, view), FLOAT64)
 
 
 @pytest.mark.parametrize("gradient", [False, True])

@@ -69,7 +69,7 @@ def a_training_step():
     with tempfile.TemporaryDirectory() as folder:
         write_subject(Path(folder) / "someone", body, 0)
         cache = CaptureCache(find_captures(folder), body)
-        source = CaptureSource(cache, config.views, config.model.image_size, config.target_size)
+        source = CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size)
 
         def result(fsdp, at_once):
             part, mesh = dataclasses.replace(config, microbatch_size=at_once), None

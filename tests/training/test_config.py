@@ -19,8 +19,8 @@ STAGED = dataclasses.replace(
 
 def test_a_stage_changes_what_it_names_until_the_next_adds_to_it():
     assert STAGED.at(3) == dataclasses.replace(STAGED, stages=())
-    assert (STAGED.at(4).model.image_size, STAGED.at(4).batch_size, STAGED.at(4).target_size) == (64, 2, 16)
-    assert (STAGED.at(9).model.image_size, STAGED.at(9).batch_size, STAGED.at(9).target_size) == (64, 2, 32)
+    assert (STAGED.at(4).model.conventions.image_size, STAGED.at(4).batch_size, STAGED.at(4).target_size) == (64, 2, 16)
+    assert (STAGED.at(9).model.conventions.image_size, STAGED.at(9).batch_size, STAGED.at(9).target_size) == (64, 2, 32)
     assert STAGED.spans(0, 10) == [(0, 4), (4, 8), (8, 10)]
     assert STAGED.spans(5, 7) == [(5, 7)] and STAGED.spans(4, 9) == [(4, 8), (8, 9)] and STAGED.spans(3, 3) == []
 

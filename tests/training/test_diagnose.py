@@ -8,23 +8,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from training_cases import without_upsampler
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, CaptureSource, ExampleSource
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import PRESETS
+from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.stages import Recorder, inexact_leaves
 from humangs_jax.network.transformer import Block
-from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.objectives.backbones import VGG16, channels, random_weights
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.objectives.perceptual import VGG19, Vgg19
-from humangs_jax.training import diagnose, observed
+from humangs_jax.training import diagnose, forward
 from humangs_jax.training.config import tiny
 from humangs_jax.training.diagnose import diagnose_run, diagnose_step, first_failed_step
 from humangs_jax.training.diagnosis import Diagnosis, Fault, Leaf, StageReport
 from humangs_jax.training.loop import train
-from humangs_jax.training.probes import Recorder, inexact_leaves
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
 
@@ -37,7 +38,7 @@ CONFIG = tiny()
 
 @pytest.fixture(scope="module")
 def batch(body, captures):
-    size = CONFIG.model.image_size
+    size = CONFIG.model.conventions.image_size
     source = ExampleSource(CaptureCache(captures, body), CONFIG.views, size, CONFIG.target_size, CONFIG.batch_size)
     return source.batch_at(0)
 
@@ -105,7 +106,7 @@ IN_PARAMETERS = {
     "encoder.transformer.block_2.mlp_in.kernel": "block 2",
     "encoder.transformer.norm.bias": "final norm",
     "encoder.upsampler.up1.kernel": "maps",
-    "readout.kernel": "vertex features",
+    "reader.kernel": "vertex features",
     "decoder.trunk_1.kernel": "raw heads",
     "decoder.geometry_out.bias": "raw heads",
 }
@@ -153,7 +154,7 @@ def test_moments_and_averages_are_looked_at(body, batch, variables):
 def test_every_parameter_of_every_preset_has_a_stage():
     for preset in PRESETS.values():
         variables = jax.eval_shape(lambda preset=preset: init_humangs(jax.random.key(0), preset()))
-        names = {observed.parameter_stage(name) for name, _ in inexact_leaves(variables["params"])}
+        names = {diagnose.parameter_stage(name) for name, _ in inexact_leaves(variables["params"])}
         assert {"tokens", "block 0", "final norm", "raw heads"} <= names
 
 
@@ -237,7 +238,9 @@ class Spoilt:
 @pytest.mark.slow
 def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, tmp_path):
     def source(at):
-        make = lambda config: CaptureSource(cache, config.views, config.model.image_size, config.target_size)
+        make = lambda config: CaptureSource(
+            cache, config.views, config.model.conventions.image_size, config.target_size
+        )
         return lambda config: Spoilt(make(config), at)
 
     cache = CaptureCache(captures, body)
@@ -253,7 +256,7 @@ def fresh(monkeypatch):
     """`observe_subject` traced anew, after something was exchanged; quick to compile."""
     options = {"xla_backend_optimization_level": 0}
     function = functools.partial(
-        inspect.unwrap(observed.observe_subject)
+        inspect.unwrap(diagnose.observe_subject)
     )  # another one, or it would come from the cache
     traced = jax.jit(function, static_argnames="config", compiler_options=options)
     monkeypatch.setattr(diagnose, "observe_subject", traced)
@@ -264,8 +267,8 @@ def spoil_vertex_features(monkeypatch):
         features = original(*arguments)
         return replace(features, local=nan_gradient(features.local))
 
-    original = observed.sample_vertices
-    monkeypatch.setattr(observed, "sample_vertices", spoilt)
+    original = PixelAlignedReader.apply
+    monkeypatch.setattr(PixelAlignedReader, "apply", spoilt)
 
 
 def spoil_block(monkeypatch):
@@ -277,16 +280,16 @@ def spoil_block(monkeypatch):
     monkeypatch.setattr(Block, "__call__", spoilt)
 
 
-def spoil_pictures(monkeypatch):
+def spoil_images(monkeypatch):
     def spoilt(*arguments):
         drawn = original(*arguments)
         return replace(drawn, rgb=nan_gradient(drawn.rgb))
 
-    original = observed.draw_projected
-    monkeypatch.setattr(observed, "draw_projected", spoilt)
+    original = forward.draw_projected
+    monkeypatch.setattr(forward, "draw_projected", spoilt)
 
 
-SPOILT = {"vertex features": spoil_vertex_features, "block 1": spoil_block, "pictures": spoil_pictures}
+SPOILT = {"vertex features": spoil_vertex_features, "block 1": spoil_block, "images": spoil_images}
 
 
 @pytest.mark.slow
@@ -311,7 +314,7 @@ def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(monkeypat
     heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))
     networks = LossNetworks(Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg"))
     loss = dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25)
-    config = dataclasses.replace(CONFIG, loss=loss, model=dataclasses.replace(CONFIG.model, dtype="bfloat16"))
+    config = dataclasses.replace(CONFIG, loss=loss, model=CONFIG.model.with_execution(dtype="bfloat16"))
     fresh(monkeypatch)
     whole = diagnose_step(init_state(config, variables), batch, body, config, networks)
     _, metrics = train_step(init_state(config, variables), batch, body, config, networks)
@@ -329,18 +332,13 @@ def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(monkeypat
 @pytest.mark.slow
 def test_networks_of_other_parts_have_the_same_stages(monkeypatch, body, batch):
     """Blocks in a loop and recomputed, all patches, no upsampler, corrected skinning weights, rotated quaternions."""
-    model = dataclasses.replace(
-        CONFIG.model,
-        tokens="all",
-        skinning="rotation",
-        transformer=dataclasses.replace(CONFIG.model.transformer, scan=True, remat=True),
-        upsampler=UpsamplerConfig(enabled=False),
-        decoder=dataclasses.replace(CONFIG.model.decoder, skinning_joints=2),
-    )
+    decoder = dataclasses.replace(CONFIG.model.architecture.decoder, skinning_joints=2)
+    model = without_upsampler(CONFIG.model).with_parts(decoder=decoder)
+    model = model.with_conventions(skinning="rotation").with_execution(tokens="all", scan=True, remat="full")
     config = dataclasses.replace(CONFIG, model=model)
     fresh(monkeypatch)
     whole = diagnose_step(init_state(config), batch, body, config)
     _, metrics = train_step(init_state(config), batch, body, config)
-    assert whole.fault is None and {"block 3", "maps", "loss"} <= {stage.name for stage in whole.stages}
+    assert whole.fault is None and {"block 3", "encoding", "loss"} <= {stage.name for stage in whole.stages}
     assert whole.loss == pytest.approx(float(metrics["loss"]), rel=FLOAT32)
     assert whole.gradient_norm == pytest.approx(float(metrics["grad_norm"]), rel=1e-3)  # without the compiler's fusions

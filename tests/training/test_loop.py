@@ -55,11 +55,11 @@ def test_what_a_run_leaves_behind(whole):
     assert all(np.isfinite(list(line.values())).all() and line["val_overflow"] == 0 for line in validations)
     from PIL import Image
 
-    side, shown = CONFIG.model.image_size, CONFIG.views.input_counts[0] + 2 * CONFIG.views.target_count
+    side, shown = CONFIG.model.conventions.image_size, CONFIG.views.input_counts[0] + 2 * CONFIG.views.target_count
     with Image.open(out / "sheets" / "0000004.png") as sheet:
         assert sheet.size == (shown * side, side)
     variables, model = load_weights(out / "weights.safetensors")
-    assert model == CONFIG.model
+    assert model == CONFIG.model.trained
     halved = jax.tree.map(lambda x: np.asarray(x).astype(np.float16).astype(np.float32), state.variables)
     assert jax.tree.all(jax.tree.map(lambda a, b: bool((np.asarray(a) == b).all()), variables, halved))
     checkpoints = Checkpoints(out / "checkpoints")

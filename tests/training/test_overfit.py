@@ -17,6 +17,7 @@ from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import gaussian_body, standardize
 from humangs_jax.network import presets
+from humangs_jax.network.config import paper_parts
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.people import write_subject
@@ -35,15 +36,15 @@ CPU_SECONDS = 600.0
 
 def configuration(free: int, longest_edge: float) -> TrainConfig:
     model = presets.small()
-    model = dataclasses.replace(
-        model,
-        image_size=SIZE,
-        token_capacity=288,
-        longest_edge=longest_edge,
-        transformer=TransformerConfig(width=128, layers=4),
-        upsampler=UpsamplerConfig(hidden=64, out=128),
-        decoder=dataclasses.replace(model.decoder, tight=1, free=free),
+    encoder, reader, decoder = paper_parts(model.architecture)
+    model = model.with_parts(
+        encoder=dataclasses.replace(
+            encoder, transformer=TransformerConfig(width=128, layers=4), upsampler=UpsamplerConfig(hidden=64)
+        ),
+        reader=dataclasses.replace(reader, output_width=128),
+        decoder=dataclasses.replace(decoder, tight=1, free=free),
     )
+    model = model.with_conventions(image_size=SIZE, longest_edge=longest_edge).with_execution(token_capacity=288)
     return TrainConfig(
         model=model,
         loss=LossConfig(structural=0.0, tightness=0.0, random_background=0.0),

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from training_cases import without_upsampler
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, ExampleSource, ViewSampling
@@ -112,8 +113,7 @@ def test_subjects_worked_on_at_once_or_one_after_the_other_give_the_same_gradien
     keys = jax.random.split(jax.random.key(0), 2)
     batch = jax.tree.map(lambda *x: jnp.concatenate(x), source.batch_at(0), source.batch_at(1))
     # without batch statistics, which are meant to differ
-    upsampler = dataclasses.replace(CONFIG.model.upsampler, enabled=False)
-    config = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, upsampler=upsampler))
+    config = dataclasses.replace(CONFIG, model=without_upsampler(CONFIG.model))
     variables = init_humangs(jax.random.key(0), config.model)
     results = [
         batch_gradients(variables["params"], {}, body, batch, keys, dataclasses.replace(config, microbatch_size=size))
@@ -143,7 +143,7 @@ def test_losses_of_networks_are_part_of_the_loss(body, source, variables, dtype)
     keys = jax.random.split(jax.random.key(0))
     heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))
     networks = LossNetworks(Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg"))
-    config = dataclasses.replace(WITH_NETWORKS, model=dataclasses.replace(CONFIG.model, dtype=dtype))
+    config = dataclasses.replace(WITH_NETWORKS, model=CONFIG.model.with_execution(dtype=dtype))
     state, metrics = train_step(init_state(config, variables), source.batch_at(0), body, config, networks)
     weights = dataclasses.asdict(config.loss)
     names = ("squared", "structural", "silhouette", "tightness", "perceptual", "lpips")
@@ -178,7 +178,7 @@ def test_the_share_of_random_backgrounds_is_kept():
 
 
 @pytest.mark.parametrize(("views", "capacity"), [(6, 70), (4, 50), (1, 20)])
-def test_fewer_photographs_have_their_share_of_the_token_capacity(views, capacity):
+def test_fewer_photos_have_their_share_of_the_token_capacity(views, capacity):
     config = dataclasses.replace(tiny(), views=ViewSampling(input_counts=(1, 4, 6)))
-    config = dataclasses.replace(config, model=dataclasses.replace(config.model, token_capacity=70))
-    assert token_share(config, views).token_capacity == capacity
+    config = dataclasses.replace(config, model=config.model.with_execution(token_capacity=70))
+    assert token_share(config, views).execution.token_capacity == capacity

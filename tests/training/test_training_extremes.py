@@ -19,7 +19,7 @@ OUTSIDE = 100.0
 
 
 def batch_of(body, captures, config, step=0):
-    size = config.model.image_size
+    size = config.model.conventions.image_size
     source = ExampleSource(CaptureCache(captures, body), config.views, size, config.target_size, config.batch_size)
     return source.batch_at(step)
 
@@ -136,7 +136,8 @@ def test_gaussians_of_no_size_and_of_any(body, batch, variables, log_scale):
 
 def decoder_of(**changes):
     return dataclasses.replace(
-        CONFIG, model=dataclasses.replace(CONFIG.model, decoder=dataclasses.replace(CONFIG.model.decoder, **changes))
+        CONFIG,
+        model=CONFIG.model.with_parts(decoder=dataclasses.replace(CONFIG.model.architecture.decoder, **changes)),
     )
 
 

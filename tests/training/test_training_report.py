@@ -2,26 +2,17 @@
 
 import dataclasses
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+from experiments.training.plot import joined, steps_of, validations_of
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.io.images import write_png
 from humangs_jax.training.config import tiny
 
-EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 STEPS, LOGGED, VALIDATED, SIZE = 40, 2, 10, 32
 MACHINE = {"cores": 2, "architecture": "x86_64", "device": "cpu", "jax": "0.0"}
-
-
-@pytest.fixture
-def report(monkeypatch):
-    monkeypatch.syspath_prepend(str(EXPERIMENTS))
-    import training_report
-
-    return training_report
 
 
 @pytest.fixture
@@ -74,9 +65,6 @@ def test_shown_validations_begin_dense_and_end_with_the_last(report):
 
 
 def test_logs_that_continue_each_other_are_joined(run, monkeypatch):
-    monkeypatch.syspath_prepend(str(EXPERIMENTS))
-    from plot_training import joined, steps_of, validations_of
-
     lines = joined([run / "log.jsonl"] * 2)
     assert [line["step"] for line in validations_of(lines)] == [10, 20, 30, 40, 50, 60, 70, 80]
     assert len(steps_of(lines)) == 2 * STEPS // LOGGED and all(line["loss"] for line in steps_of(lines))

@@ -15,7 +15,7 @@ CONFIG = dataclasses.replace(tiny(), views=dataclasses.replace(tiny().views, inp
 def test_the_middle_number_of_views_the_same_ones_again(body, captures, same):
     first, again = (validation_examples(CaptureCache(captures, body), CONFIG, 2) for _ in range(2))
     assert len(first) == 2 and same(first, again)
-    size = CONFIG.model.image_size
+    size = CONFIG.model.conventions.image_size
     for example in first:
         assert example.inputs.images.shape == (2, size, size, 3)
         assert example.targets.images.shape == (CONFIG.views.target_count, size, size, 3)
@@ -25,7 +25,7 @@ def test_the_middle_number_of_views_the_same_ones_again(body, captures, same):
 def test_a_row_of_the_sheet_is_inputs_and_then_pairs(body, captures):
     examples = validation_examples(CaptureCache(captures, body), CONFIG, 2)
     shown = [np.full(example.targets.images.shape, 0.25 * i) for i, example in enumerate(examples)]
-    picture, size = sheet(examples, shown), CONFIG.model.image_size
+    picture, size = sheet(examples, shown), CONFIG.model.conventions.image_size
     assert picture.shape == (2 * size, (2 + 2 * 2) * size, 3)
     row = jax.tree.map(np.asarray, examples[1])
     tiles = np.split(picture[size:], 6, axis=1)

@@ -1,13 +1,24 @@
 """A body of 64 vertices, made-up captures of it, and what runs on them: enough to train on in seconds."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import capture_from_arrays, save_capture
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.network.config import paper_parts
 
 SIDES, RINGS, SIZE, VIEWS, POSES = 8, 8, 32, 6, 2
+
+
+def without_upsampler(model):
+    """The network whose vertices read the token maps themselves."""
+    encoder, reader, _ = paper_parts(model.architecture)
+    return model.with_parts(
+        encoder=dataclasses.replace(encoder, upsampler=None), reader=dataclasses.replace(reader, output_width=None)
+    )
 
 
 def tube():

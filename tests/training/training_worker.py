@@ -14,13 +14,14 @@ import jax
 def configuration(checkpoint_every=1, batch_size=4, at_once=1, learning_rate=1e-4):
     """`tiny`, with a batch for several devices, and no upsampler: what stands before a batch norm has no gradient but
     rounding errors, which Adam makes large."""
-    from humangs_jax.network.upsampler import UpsamplerConfig
+    from training_cases import without_upsampler
+
     from humangs_jax.training.config import tiny
 
     config = tiny()
     return dataclasses.replace(
         config,
-        model=dataclasses.replace(config.model, upsampler=UpsamplerConfig(enabled=False)),
+        model=without_upsampler(config.model),
         optimizer=dataclasses.replace(config.optimizer, learning_rate=learning_rate),
         batch_size=batch_size,
         microbatch_size=at_once,

@@ -24,7 +24,7 @@ from humangs_jax.fitting.objective import robust
 from humangs_jax.fitting.refinement.rounds import DEVIATION, RoundConfig, moved_capture, start_of
 from humangs_jax.fitting.refinement.unknowns import moved_cameras, moved_poses, nothing_moved, root_turns
 from humangs_jax.fitting.solvers import Outcome, minimise
-from humangs_jax.network.humangs import HumanGSConfig
+from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.objectives.metrics import decibels
 from humangs_jax.rendering.gaussians import Gaussians, skin_gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
@@ -68,7 +68,7 @@ class Likeness:
 def likeness(variables: PyTree, network: HumanGSConfig, capture: Capture) -> Likeness:
     """Reconstruct the person of a capture and compare with its photographs."""
     avatar = reconstruct(variables, network, capture)
-    views = standardize(capture, network.image_size)
+    views = standardize(capture, network.conventions.image_size)
     splatting = _roomy(avatar, views)
     off = np.asarray(_draw(avatar, views.rotations, views.translations, views.cameras, splatting) - views.images)
     person = np.asarray(views.masks) > MASK_THRESHOLD

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Float, Int
-from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, owners
 
@@ -57,7 +57,7 @@ DEFAULT_CONFIG = RasterConfig()
 
 
 @pytree_dataclass
-class Fragments:
+class Fragments(Batchable):
     """What a camera sees of a mesh.
 
     face_ids: (h, w) index of the face, -1 where there is none.

@@ -1,0 +1,1 @@
+"""Scripts that measure, check and build; see README.md."""

@@ -1,0 +1,221 @@
+"""Author the walk that ships with the package: two strides on the spot with a wave of the right hand, a loop of 2 s.
+
+    python experiments/assets/build_motion.py --out humangs_jax/assets/walk.npz [--pictures folder]
+
+Joint angles over the gait cycle are drawn by hand after textbook curves (hip, knee and ankle flexion, pelvic list and
+rotation, arms against legs); the root is lowered in every frame until the lowest vertex of the default body touches y = 0.
+Takes about 20 s and writes 48 frames at 24 a second, less than 100 KB. With --pictures also a sheet of frames, front and side.
+"""
+
+import argparse
+from pathlib import Path
+
+FRAMES, FPS, STRIDES = 48, 24, 2
+"""24 frames a stride: 120 steps a minute, a usual pace."""
+
+# angles in degrees over one stride; a stride begins when the LEFT heel touches the ground
+HIP_FLEXION = {0.0: 27, 0.12: 23, 0.30: 6, 0.50: -11, 0.58: -7, 0.72: 16, 0.86: 30}
+KNEE_FLEXION = {0.0: 5, 0.13: 17, 0.38: 6, 0.50: 12, 0.60: 36, 0.71: 58, 0.84: 32, 0.95: 5}
+ANKLE_LIFT = {0.0: 1, 0.07: -5, 0.25: 4, 0.44: 10, 0.52: 2, 0.62: -17, 0.75: -4, 0.87: 3}
+TOE_LIFT = {0.0: 6, 0.12: 0, 0.40: 3, 0.54: 26, 0.64: 12, 0.75: 4, 0.90: 8}
+ARM_LAG = 0.04
+"""Arms follow the legs a little late, strides."""
+ARM_DOWN = 72.0
+FINGER_CURL = {"index": (10, 18, 10), "middle": (14, 22, 12), "ring": (18, 26, 14), "pinky": (20, 28, 16)}
+WAVE_BEGIN, WAVE_UP, WAVE_DOWN, WAVE_END = 4, 15, 32, 46
+"""Frames: the right arm starts to rise, is up, starts to sink, is down."""
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("humangs_jax/assets/walk.npz"), help="the motion to write")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures of the frames")
+    arguments = parser.parse_args()
+    motion = build()
+    from humangs_jax.data.motion import save_motion
+
+    save_motion(arguments.out, motion)
+    print(f"{arguments.out}: {len(motion.translations)} frames, {arguments.out.stat().st_size / 1024:.1f} KB")
+    if arguments.pictures:
+        draw(motion, arguments.pictures)
+
+
+def build():
+    """The motion: rotations by the curves above, translations by the ground."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from humangs_jax.body.joints import JOINT_NAMES
+    from humangs_jax.body.library import load_body
+    from humangs_jax.body.model import BodyPose, pose_body, shape_body
+    from humangs_jax.data.motion import Motion
+
+    body = load_body()
+    rest = shape_body(body, jnp.zeros(0))
+    rotations = np.zeros((FRAMES, len(JOINT_NAMES), 3))
+    for frame in range(FRAMES):
+        for name, matrix in frame_rotations(frame).items():
+            rotations[frame, JOINT_NAMES.index(name)] = _axis_angle(matrix)
+    stride = 2 * np.pi * STRIDES * np.arange(FRAMES) / FRAMES
+    translations = np.stack([0.018 * np.sin(stride), np.zeros(FRAMES), 0.006 * np.sin(2 * stride)], axis=-1)
+    lowest = jax.jit(lambda pose: pose_body(body, rest, pose).vertices[:, 1].min())
+    for frame in range(FRAMES):
+        pose = BodyPose(jnp.asarray(rotations[frame], jnp.float32), jnp.asarray(translations[frame], jnp.float32))
+        translations[frame, 1] = -float(lowest(pose))
+    return Motion(jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), float(FPS))
+
+
+def frame_rotations(frame: int) -> dict:
+    """Rotation matrices of the joints that move, by name.
+
+    The T-pose faces +z with its left at +x: a leg or a hanging arm swings forward about -x, a foot lifts about -x, the left
+    arm sinks about -z and its elbow bends forward about -y; the right side is the mirror image.
+    """
+    import numpy as np
+
+    phase = STRIDES * frame / FRAMES
+    turn = 2 * np.pi * phase
+    once = 2 * np.pi * frame / FRAMES  # what happens once in the whole loop
+    joints = {}
+
+    # pelvis: the side of the leading leg goes forward, the side of the swinging leg sinks
+    heading = 9 * np.sin(once)
+    pelvis_turn, pelvis_list = -5 * np.cos(turn), 3.5 * np.sin(turn + 0.5)
+    joints["pelvis"] = _y(heading + pelvis_turn) @ _z(pelvis_list) @ _x(2.5)
+    # the spine turns the shoulders against the pelvis and keeps them level; neck and head look ahead
+    for name, share in (("spine1", 0.3), ("spine2", 0.4), ("spine3", 0.3)):
+        joints[name] = _y(share * 11 * np.cos(turn - 0.2)) @ _z(-share * 1.25 * pelvis_list) @ _x(share * 2)
+    glance = 8 * np.sin(once + 0.6)
+    for name in ("neck", "head"):
+        joints[name] = _y(0.5 * (glance - 6 * np.cos(turn - 0.2))) @ _x(-1.5 + 0.8 * np.sin(2 * turn))
+
+    for side, mirror, own in (("left", 1, phase), ("right", -1, phase + 0.5)):
+        hip, knee = _curve(HIP_FLEXION, own), _curve(KNEE_FLEXION, own)
+        joints[f"{side}_hip"] = _x(-hip) @ _z(mirror * -1.5) @ _y(mirror * 4 + mirror * 3 * np.cos(2 * np.pi * own))
+        joints[f"{side}_knee"] = _x(knee)
+        joints[f"{side}_ankle"] = _x(-_curve(ANKLE_LIFT, own)) @ _y(mirror * 3)
+        joints[f"{side}_foot"] = _x(-_curve(TOE_LIFT, own))
+
+        forward = -np.cos(2 * np.pi * (own - ARM_LAG))  # 1: the arm is in front, against its own leg
+        swing = 17 * forward + 3
+        bend = 22 + 11 * forward
+        shoulder = _x(-swing) @ _z(-mirror * (ARM_DOWN + 1.5 * np.cos(2 * turn))) @ _x(-8)
+        collar = _y(-mirror * 3 * forward) @ _z(-mirror * 3)
+        elbow = _y(-mirror * bend)
+        wrist = _z(-mirror * 4) @ _y(mirror * 3 * np.sin(2 * np.pi * (own - 0.15)))
+        curl = 1.0
+        if side == "right":
+            shoulder, collar, elbow, wrist, curl = _waving(frame, shoulder, collar, elbow, wrist)
+        joints[f"{side}_shoulder"], joints[f"{side}_collar"] = shoulder, collar
+        joints[f"{side}_elbow"], joints[f"{side}_wrist"] = elbow, wrist
+        for finger, angles in FINGER_CURL.items():
+            for knuckle, angle in enumerate(angles, start=1):
+                joints[f"{side}_{finger}{knuckle}"] = _z(-mirror * curl * angle)
+        for knuckle, angle in ((1, 8), (2, 10), (3, 12)):
+            joints[f"{side}_thumb{knuckle}"] = _y(mirror * curl * angle) @ _z(-mirror * 4)
+    return joints
+
+
+def _waving(frame, shoulder, collar, elbow, wrist):
+    """The right arm on its way to and from a wave, and how far the fingers stay curled."""
+    import numpy as np
+
+    rise = _smooth((frame - WAVE_BEGIN) / (WAVE_UP - WAVE_BEGIN))
+    up = rise * (1 - _smooth((frame - WAVE_DOWN) / (WAVE_END - WAVE_DOWN)))
+    wave = np.sin(2 * np.pi * (frame - WAVE_UP) / 9.0)
+    raised = (
+        _y(24) @ _z(32) @ _x(-75),  # upper arm a little below the shoulder, to the side and forward
+        _z(-4),
+        _y(108 + 17 * wave),
+        _y(9 * wave),
+    )
+    blend = [_between(a, b, up) for a, b in zip((shoulder, collar, elbow, wrist), raised, strict=True)]
+    return (*blend, 1 - 0.85 * up)
+
+
+def _smooth(x: float) -> float:
+    """0 below 0, 1 above 1, without a kink in between."""
+    x = min(max(x, 0.0), 1.0)
+    return x * x * x * (x * (6 * x - 15) + 10)
+
+
+def _curve(keys: dict, phase: float) -> float:
+    """A periodic cubic spline through {phase: degrees}."""
+    from scipy.interpolate import CubicSpline
+
+    times, values = list(keys), list(keys.values())
+    return float(CubicSpline([*times, times[0] + 1], [*values, values[0]], bc_type="periodic")(phase % 1.0))
+
+
+def _rotation(axis: int, degrees: float):
+    import numpy as np
+
+    vector = np.zeros(3)
+    vector[axis] = np.radians(degrees)
+    return _matrix(vector)
+
+
+def _x(degrees: float):
+    return _rotation(0, degrees)
+
+
+def _y(degrees: float):
+    return _rotation(1, degrees)
+
+
+def _z(degrees: float):
+    return _rotation(2, degrees)
+
+
+def _matrix(axis_angle):
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_rotvec(axis_angle).as_matrix()
+
+
+def _axis_angle(matrix):
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(matrix).as_rotvec()
+
+
+def _between(a, b, share: float):
+    """From rotation a towards b, along the shortest way."""
+    return a @ _matrix(share * _axis_angle(a.T @ b))
+
+
+def draw(motion, folder: Path) -> None:
+    """A sheet of every fourth frame, seen from the front left and from the left."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from humangs_jax.apps.check import draw_body
+    from humangs_jax.avatar.pictures import contact_sheet
+    from humangs_jax.avatar.video import write_video
+    from humangs_jax.body.library import load_body
+    from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+
+    folder.mkdir(parents=True, exist_ok=True)
+    size = 256
+    cameras = orbit(
+        jnp.asarray([0.0, 0.85, 0.0]),
+        3.6,
+        jnp.radians(jnp.asarray([35.0, 90.0])),
+        0.05,
+        intrinsics_from_fov(0.55, size, size),
+        size,
+        size,
+    )
+    body = load_body()
+    white = np.ones((size, size, 3), np.float32)
+    for view, name in enumerate(("front", "side")):
+        pictures = [draw_body(body, jnp.zeros(0), motion.pose(i), cameras[view], white)[0] for i in range(FRAMES)]
+        frames = np.stack(pictures)
+        contact_sheet(frames[::3], folder / f"{name}.png", labels=[str(i) for i in range(0, FRAMES, 3)], columns=8)
+        write_video(folder / f"{name}.gif", frames, motion.fps)
+
+
+if __name__ == "__main__":
+    main()

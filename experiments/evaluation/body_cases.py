@@ -1,0 +1,121 @@
+"""Bodies that weights are tried on: the default one, one that is made up in SMPL-X's format, and decimated ones."""
+
+import dataclasses
+import tempfile
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.joints import JOINT_NAMES
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyModel
+from humangs_jax.body.smplx import EXPRESSION_COLUMNS, SHAPE_COLUMNS
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.network.config import HumanGSConfig
+
+SMPLX_SEED_VERTICES = 3493
+"""Vertices of the decimated body that the made-up one grows from: with a vertex for each of its faces about SMPL-X's 10,475."""
+FRACTIONS = {"1/4": 4, "1/16": 16}
+POSE_FEATURES = 9 * (len(JOINT_NAMES) - 1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class BodyCase:
+    """A body, and the one on whose vertices the Gaussians hang."""
+
+    body: BodyModel
+    carrier: BodyModel
+
+
+def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
+    """By name: the body, the made-up one in SMPL-X's format, and the body with a fraction of its vertices.
+
+    Decimated bodies are there as they are and, where the weights want long edges split, with these split.
+    """
+    wanted = {"default": body, "SMPL-X format": smplx_body(body)}
+    cases = {name: BodyCase(model, gaussian_body(model, config)) for name, model in wanted.items()}
+    for name, divisor in FRACTIONS.items():
+        small = decimate(body, len(body.template) // divisor)
+        cases[name] = BodyCase(small, small)
+    if config.conventions.longest_edge is not None:
+        for name in FRACTIONS:
+            small = cases[name].body
+            cases[f"{name}, edges split"] = BodyCase(small, gaussian_body(small, config))
+    return cases
+
+
+def as_it_is(config: HumanGSConfig) -> HumanGSConfig:
+    """The configuration for a body whose vertices carry the Gaussians as they are."""
+    return dataclasses.replace(config, body_vertices=None, longest_edge=None)
+
+
+def smplx_body(body: BodyModel) -> BodyModel:
+    """The same people on another mesh, written as an SMPL-X model file and read from it."""
+    made = turned_subdivision(decimate(body, min(SMPLX_SEED_VERTICES, len(body.template))))
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "SMPLX_MADE_UP.npz"
+        write_smplx(file, made)
+        return load_body(file, shape_count=body.shape_directions.shape[-1], expression_count=0)
+
+
+def turned_subdivision(body: BodyModel) -> BodyModel:
+    """Another mesh of the same body: a vertex in the middle of each face, and each edge turned to join two of them.
+
+    That is a step of sqrt(3)-subdivision (Kobbelt, 2000) without its smoothing; no inner edge of the old mesh is left, and the
+    old vertices have their numbers. Joints stay those of the old vertices in every shape. Texture coordinates are dropped.
+    """
+    faces = np.asarray(body.faces, np.int64)
+    n = len(body.template)
+    tails, heads = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    middles = n + np.repeat(np.arange(len(faces)), 3)
+    order = np.argsort(tails * n + heads)
+    opposite = heads * n + tails
+    place = np.minimum(np.searchsorted((tails * n + heads)[order], opposite), len(order) - 1)
+    twin = order[place]
+    inner = (tails * n + heads)[twin] == opposite
+    across = np.where(inner, middles[twin], heads)  # at a rim the face keeps its edge
+    # each side gives the triangle at its own tail; its twin gives the one at the other end
+    turned = np.stack([tails, across, middles], axis=-1)
+    names = ("template", "shape_directions", "pose_directions", "skinning_weights")
+    linear = {name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None}
+    grown = {name: np.concatenate([x, x[faces].mean(axis=1)]) for name, x in linear.items()}
+    return replace(
+        body,
+        **{name: jnp.asarray(x) for name, x in grown.items()},
+        faces=jnp.asarray(turned, body.faces.dtype),
+        joint_regressor=jnp.pad(body.joint_regressor, ((0, 0), (0, len(faces)))),
+        uvs=None,
+        uv_faces=None,
+        collapse_order=None,
+        collapse_into=None,
+    )
+
+
+def write_smplx(path: Path, body: BodyModel) -> None:
+    """A body with SMPL-X's joints as an SMPL-X model file: its shape directions, no expressions, no correctives if it has none.
+
+    Raises: ValueError if it has other joints, or more shape directions than the format holds.
+    """
+    count, n = body.shape_directions.shape[-1], len(body.template)
+    if body.joint_names != JOINT_NAMES:
+        raise ValueError(f"body '{body.name}' has other joints than SMPL-X")
+    if count > SHAPE_COLUMNS:
+        raise ValueError(f"body '{body.name}' has {count} shape directions, SMPL-X's format holds {SHAPE_COLUMNS}")
+    directions = np.zeros((n, 3, SHAPE_COLUMNS + EXPRESSION_COLUMNS), np.float32)
+    directions[..., :count] = body.shape_directions
+    correctives = np.zeros((n, 3, POSE_FEATURES), np.float32) if body.pose_directions is None else body.pose_directions
+    parents = np.asarray(body.parents, np.int64) % 2**32  # the root's as the format has it
+    arrays = {
+        "v_template": body.template,
+        "f": np.asarray(body.faces, np.uint32),
+        "shapedirs": directions,
+        "posedirs": correctives,
+        "J_regressor": body.joint_regressor,
+        "weights": body.skinning_weights,
+        "kintree_table": np.stack([parents, np.arange(len(parents))]).astype(np.uint32),
+    }
+    # no array is called allow_pickle, the stub's only other keyword
+    np.savez_compressed(path, **{key: np.asarray(x) for key, x in arrays.items()})  # ty: ignore[invalid-argument-type]

@@ -1,0 +1,94 @@
+"""Pictures of an evaluation: the best people beside the worst, and PSNR against the number of views."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments.evaluation.results import TASK_NAMES, TASKS, extremes
+from experiments.evaluation.subjects import Drawn, task_views
+from humangs_jax.avatar.pictures import GAP, tile, write_texts
+from humangs_jax.data.capture import Capture
+from humangs_jax.io.images import to_uint8, write_png
+
+TRIPLE = ("truth", "ours", "painted body")
+CROP = 0.75
+"""Share of the picture's width that is shown: cameras keep the whole height of a person in a square frame."""
+TITLE = 22
+"""Height of the letters of titles, pixels."""
+Strip = dict[str, np.ndarray]
+"""By task: truth, ours and the painted body of the first held-out view, (3, h, w, 3) of 8 bits."""
+
+
+def strip_of(drawn: Drawn, held_out: Capture) -> Strip:
+    """What a sheet shows of a person."""
+    strips = {}
+    for task, views in task_views(held_out).items():
+        if len(views):
+            triple = [pictures[views[0]] for pictures in (held_out.images, drawn.ours, drawn.painted)]
+            strips[task] = to_uint8(np.stack(triple))
+    return strips
+
+
+def write_sheet(path: Path, report: dict[str, Any], strips: Mapping[int, Strip]) -> None:
+    """The best people on the left, the worst on the right: one row each, both tasks, PSNR of the person's views above.
+
+    strips: by seed, of at least the people of `extremes`.
+    """
+    best, worst = extremes(report)
+    half = {"best": best, "worst": worst} if worst else {"best": best}
+    sheets = [_half(name, people, str(report["views"]), strips) for name, people in half.items()]
+    gap = np.ones((sheets[0].shape[0], 6 * GAP, 3))
+    write_png(path, np.concatenate([x for sheet in sheets for x in (sheet, gap)][:-1], axis=1))
+
+
+def _half(name: str, people: Sequence[dict[str, Any]], count: str, strips: Mapping[int, Strip]) -> np.ndarray:
+    tasks = [task for task in TASKS if task in strips[people[0]["seed"]]]
+    images, labels = [], []
+    for row in people:
+        for task in tasks:
+            scores = row["by_views"][count][task]
+            images += [cropped(image) for image in strips[row["seed"]][task]]
+            labels += [
+                f"seed {row['seed']}",
+                f"ours {scores['psnr']:.1f} dB",
+                f"painted {scores['baseline_psnr']:.1f} dB",
+            ]
+    sheet = tile(np.stack(images) / 255, labels=labels, columns=len(TRIPLE) * len(tasks))
+    strip = np.ones((TITLE + 2 * GAP, sheet.shape[1], 3))
+    width = sheet.shape[1] // len(tasks)
+    titles = [(f"{name}: {TASK_NAMES[task]}", GAP + i * width, GAP, width - GAP) for i, task in enumerate(tasks)]
+    return np.concatenate([write_texts(strip, titles, TITLE), sheet])
+
+
+def cropped(image: np.ndarray) -> np.ndarray:
+    """The middle of a picture's width."""
+    width = image.shape[1]
+    left = round(0.5 * (1 - CROP) * width)
+    return image[:, left : width - left]
+
+
+def plot_views(path: Path, report: dict[str, Any]) -> None:
+    """Mean PSNR of the whole picture and of the person alone against the number of photos, ours and the painted body."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    counts = list(report["by_views"])
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.4))
+    for axis, key, title in zip(axes, ("psnr", "psnr_foreground"), ("whole picture", "on the person"), strict=True):
+        for task, color in zip(TASKS, ("C0", "C1"), strict=True):
+            for prefix, style, name in (("", "o-", "ours"), ("baseline_", "s--", "painted body")):
+                if all(task in report["by_views"][count] for count in counts):
+                    values = [report["by_views"][count][task][prefix + key] for count in counts]
+                    label = f"{name}: {TASK_NAMES[task]}"
+                    axis.plot([int(count) for count in counts], values, style, ms=4, color=color, label=label)
+        axis.set(xlabel="photos", ylabel="PSNR, dB", title=title, xticks=[int(count) for count in counts])
+        axis.grid(alpha=0.3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    figure.tight_layout(rect=(0, 0.15, 1, 1))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

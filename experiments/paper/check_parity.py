@@ -1,0 +1,430 @@
+"""Run a checkpoint of the published network on stored inputs and compare every stage with the stored numbers.
+
+    python experiments/paper/check_parity.py CKPT.pt ARRAYS.npz CONFIG.json [--dtype float32|float64|bfloat16] [--json OUT]
+
+CKPT is in the released format (or its state dict as .safetensors), CONFIG the release's configuration: sizes must agree
+with the checkpoint's, and it says what shapes do not tell (pooling, width of a head). ARRAYS holds b subjects of v views:
+
+    in_image (b,v,3,h,w) in [0,1], in_c2w (b,v,4,4), in_fxfycxcy (b,v,4), in_smpl_canonical_vertices and
+    in_smpl_posed_vertices (b,v,n,3), in_joint_transforms (b,j,4,4), in_lbs_weights (n,j), metric; in_position_map
+    (b,v,h,w,3) and in_depth_map (b,v,1,h,w) in normalised units
+    out_ray_d (b,v,3,h,w), out_pose_feature (b,v,c,h,w), mid_tokens (b*v,p,d), mid_block_0 and mid_encoder_out (b,l,d),
+    mid_feature_map_stride4 (b*v,d,h',w'), mid_decoder_input (b,n,c), mid_raw_geometry (b,n,k,10), mid_raw_appearance
+    (b,n,k,4), asset_{means3D,rotations,scales,colors,opacity} (b,n*k,.), asset_lbs_weights (every fifth of n*k),
+    posed_means3D, posed_rotations (b,n*k,.; the sign of a quaternion is free)
+
+Prints, per stage, the largest error over all subjects relative to the stage's largest magnitude. Exit status 1 if one
+exceeds 2e-5 (float32), 1e-6 (float64) or 5e-2 (bfloat16), or if an array of a stage (any that is not in_*) could not be
+compared; 2 if an input is unusable. --json writes {"dtype", "bound", "stages": {array: relative error, or null if it was
+not compared}, "passed"}. Seconds for small networks. Expected on golden_a and golden_b: see docs/parity.md.
+
+A blended transform is no rotation, and the quaternion that the release makes of it jumps where two of its four candidates
+tie. Where ours tie to within the bound, the nearer one counts: rounding decides there, in the release as here.
+"""
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+BOUNDS = {"float32": 2e-5, "float64": 1e-6, "bfloat16": 5e-2}
+STAGES = {
+    "rays": ("out_ray_d",),
+    "pose features": ("out_pose_feature",),
+    "tokens": ("mid_tokens",),
+    "first block": ("mid_block_0",),
+    "encoder": ("mid_encoder_out",),
+    "feature map": ("mid_feature_map_stride4",),
+    "decoder input": ("mid_decoder_input",),
+    "raw heads": ("mid_raw_geometry", "mid_raw_appearance"),
+    "canonical Gaussians": tuple(
+        f"asset_{name}" for name in ("means3D", "rotations", "scales", "colors", "opacity", "lbs_weights")
+    ),
+    "skinned Gaussians": ("posed_means3D", "posed_rotations"),
+}
+INPUTS = {  # name: axes
+    "in_image": "b v 3 h w",
+    "in_c2w": "b v 4 4",
+    "in_fxfycxcy": "b v 4",
+    "in_smpl_canonical_vertices": "b v n 3",
+    "in_smpl_posed_vertices": "b v n 3",
+    "in_position_map": "b v h w 3",
+    "in_depth_map": "b v 1 h w",
+    "in_joint_transforms": "b j 4 4",
+    "in_lbs_weights": "n j",
+}
+PER_VIEW = ("mid_tokens", "mid_feature_map_stride4")
+"""Stages whose first axis is subjects times views."""
+TIES, TIE_LEVELS = "candidates of posed_rotations", "their q_abs"
+"""What `compute_stages` gives beside the stages: see `nearest_candidates`."""
+RENDER_SIZE = 256
+"""Pixels a side of the pictures that --render compares."""
+MAP_STRIDE, WEIGHTS_STRIDE = 4, 5
+"""Which pixels of the feature map and which Gaussians' skinning weights are stored."""
+
+
+def load_arrays(path: Path) -> dict[str, Any]:
+    """The arrays of a file, inputs checked: all there, finite, and of shapes that fit each other."""
+    import zipfile
+
+    import numpy as np
+
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except (zipfile.BadZipFile, ValueError, AttributeError) as error:  # AttributeError: a bare .npy
+        raise ValueError(f"{path} is no readable .npz of numbers: {error}") from error
+    sizes: dict[str, int] = {}
+    for name, axes in INPUTS.items():
+        if name not in arrays:
+            raise ValueError(f"{path}: array {name!r} is missing")
+        shape, axes = arrays[name].shape, axes.split()
+        wanted = tuple(int(a) if a.isdigit() else sizes.setdefault(a, n) for a, n in zip(axes, shape, strict=False))
+        if len(shape) != len(axes) or shape != wanted or 0 in shape:
+            raise ValueError(f"{path}: {name} has shape {shape}, expected ({', '.join(axes)}) with {sizes}")
+        if not np.isfinite(arrays[name]).all():
+            raise ValueError(f"{path}: {name} holds numbers that are not finite")
+    if all(name.startswith("in_") for name in arrays):
+        raise ValueError(f"{path}: holds no stage to compare with")
+    return arrays
+
+
+def read_release_config(path: Path) -> dict[str, Any]:
+    """The settings of a release's configuration that bear on the forward pass, under their names there; None: not said.
+
+    Raises: ValueError if it is no JSON object, or asks for what does not exist here.
+    """
+    try:
+        content = json.loads(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"{path} is no JSON: {error}") from error
+
+    def setting(*keys):
+        value = content
+        for key in keys:
+            value = value.get(key) if isinstance(value, dict) else None
+        return value
+
+    if not isinstance(setting("model"), dict):
+        raise ValueError(f"{path}: expected an object with 'model'")
+    if setting("training", "use_canonical_maps"):
+        raise ValueError(
+            f"{path}: training.use_canonical_maps: the variant with canonical target maps is not supported"
+        )
+    if setting("training", "target_height") not in (None, 1.8):
+        raise ValueError(f"{path}: training.target_height must be 1.8, got {setting('training', 'target_height')!r}")
+    names = {
+        "neural_texture": ("resolution", "dim"),
+        "image_tokenizer": ("patch_size",),
+        "transformer": (
+            "d",
+            "d_head",
+            "n_layer",
+            "use_qk_norm",
+            "use_cls_token",
+            "use_upsampler",
+            "project_all_vertices",
+        ),
+        "vertex_decoder": ("hidden_dim", "num_tight_gaussians", "num_free_gaussians", "learnable_lbs_weights"),
+    }
+    return {f"{part}.{name}": setting("model", part, name) for part, keys in names.items() for name in keys}
+
+
+def complete_config(config: Any, release: dict[str, Any], dtype: str, image_size: int) -> Any:
+    """A checkpoint's configuration with what the release's one adds to it.
+
+    Raises: ValueError naming a setting that does not agree with the checkpoint's shapes.
+    """
+    from humangs_jax.network.config import paper_parts
+
+    encoder, _, decoder = paper_parts(config.architecture)
+    transformer = encoder.transformer
+    found = {
+        "neural_texture.resolution": encoder.texture.resolution,
+        "neural_texture.dim": encoder.texture.channels,
+        "image_tokenizer.patch_size": encoder.patch_size,
+        "transformer.d": transformer.width,
+        "transformer.d_head": transformer.head_width,
+        "transformer.n_layer": transformer.layers,
+        "transformer.use_qk_norm": transformer.qk_norm,
+        "transformer.use_cls_token": transformer.class_token,
+        "transformer.use_upsampler": encoder.upsampler is not None,
+        "vertex_decoder.hidden_dim": decoder.hidden,
+        "vertex_decoder.learnable_lbs_weights": decoder.skinning_joints is not None,
+    }
+    for name, value in found.items():
+        if release[name] not in (None, value):
+            raise ValueError(f"model.{name} is {release[name]!r} in the configuration, but {value!r} in the checkpoint")
+    tight, free = (release[f"vertex_decoder.num_{kind}_gaussians"] for kind in ("tight", "free"))
+    if tight is not None and free is not None:
+        if tight + free != decoder.gaussians_per_vertex:
+            raise ValueError(
+                f"model.vertex_decoder: {tight} tight and {free} free Gaussians in the configuration, but "
+                f"{decoder.gaussians_per_vertex} a vertex in the checkpoint"
+            )
+        decoder = dataclasses.replace(decoder, tight=tight, free=free)
+    pool = "visible" if release["transformer.project_all_vertices"] is False else "all"
+    config = config.with_parts(decoder=decoder).with_conventions(image_size=image_size, pool=pool)
+    return config.with_execution(dtype="bfloat16" if dtype == "bfloat16" else "float32")
+
+
+def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
+    """The network's inputs of one subject, and its skinning weights (n, j) and joint transforms (j, 4, 4)."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from humangs_jax.core.pytree import replace
+    from humangs_jax.geometry.camera import Camera
+    from humangs_jax.network.inputs import HumanGSInputs
+
+    own = lambda name: jnp.asarray(arrays[name][index], dtype)
+    images = jnp.moveaxis(own("in_image"), 1, -1)
+    height, width = images.shape[1:3]
+    fx, fy, cx, cy = np.moveaxis(arrays["in_fxfycxcy"][index].astype(np.float64), -1, 0)
+    K = np.zeros((*fx.shape, 3, 3))
+    K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = fx, fy, cx, cy, 1
+    one = Camera(jnp.eye(3, dtype=dtype), jnp.eye(4, dtype=dtype), width, height)
+    cam_from_world = np.linalg.inv(arrays["in_c2w"][index].astype(np.float64))
+    cameras = replace(one, K=jnp.asarray(K, dtype), cam_from_world=jnp.asarray(cam_from_world, dtype))
+    inputs = HumanGSInputs(
+        images=images,
+        cameras=cameras,
+        posed_vertices=own("in_smpl_posed_vertices"),
+        canonical_vertices=own("in_smpl_canonical_vertices")[0],
+        position_maps=own("in_position_map"),
+        depth_maps=own("in_depth_map")[:, 0],
+        foreground=jnp.ones(images.shape[:3], bool),
+    )
+    return inputs, jnp.asarray(arrays["in_lbs_weights"], dtype), own("in_joint_transforms")
+
+
+def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: Any, joint_transforms: Any) -> dict:
+    """Every stage of one subject, by its array's name and in its layout; jittable with `config` static.
+
+    And TIES (g, 4, 4), TIE_LEVELS (g, 4): all readings of the posed rotations, see `nearest_candidates`.
+    """
+    import flax.linen as nn
+    import jax.numpy as jnp
+
+    from humangs_jax.geometry import quaternion
+    from humangs_jax.network.config import paper_parts
+    from humangs_jax.network.humangs import apply_humangs, part_variables
+    from humangs_jax.network.parts import Pass
+    from humangs_jax.network.stages import Recorder
+    from humangs_jax.network.triplane import sample_triplane
+    from humangs_jax.network.vertex_decoder import corrected_skinning_weights
+    from humangs_jax.rendering.gaussians import skin_gaussians
+
+    channels_first = lambda x: jnp.moveaxis(x, -1, 1)
+    config = config.with_execution(scan=False, remat="none")
+    encoder, reader, _ = paper_parts(config.architecture)
+    recorder = Recorder()
+    with nn.intercept_methods(recorder.watch):
+        outputs, _ = apply_humangs(variables, inputs, config, stage=recorder)
+    stages = recorder.outputs
+    (encoding, _), features, gaussians = stages["encoding"], stages["vertex features"], outputs.gaussians
+    maps = encoding.maps
+    if (
+        encoder.upsampler is not None
+    ):  # vertices read the last convolution only where they need it; here it is everywhere
+        convolution = reader.output(maps.shape[-1], Pass(config))
+        maps = convolution.apply(part_variables(variables, "reader"), maps, method="everywhere")
+    pixels, texture = stages["pixels"], variables["params"]["encoder"]["tokenizer"]["texture"]
+    entering = [features.local]
+    if features.global_token is not None:
+        entering.append(jnp.broadcast_to(features.global_token, (len(features.local), *features.global_token.shape)))
+    weights = corrected_skinning_weights(
+        skinning_weights, outputs.skinning_offsets, config.architecture.decoder.gaussians_per_vertex
+    )
+    transforms = jnp.einsum("gj,jab->gab", weights, joint_transforms)
+    posed = skin_gaussians(gaussians, transforms, config.conventions.skinning)
+    rotations = quaternion.to_matrix(quaternion.normalize(gaussians.quats))
+    candidates, q_abs = quaternion.candidates_from_matrix(transforms[:, :3, :3] @ rotations)
+    return {
+        "out_ray_d": channels_first(pixels[..., 6:9]),
+        "out_pose_feature": channels_first(sample_triplane(texture, pixels[..., 9:])),
+        "mid_tokens": stages["tokens"].reshape(len(inputs.images), -1, stages["tokens"].shape[-1]),
+        "mid_block_0": stages["block 0"],
+        "mid_encoder_out": stages["final norm"],
+        "mid_feature_map_stride4": channels_first(maps)[:, :, ::MAP_STRIDE, ::MAP_STRIDE],
+        "mid_decoder_input": jnp.concatenate(entering, axis=-1),
+        "mid_raw_geometry": stages["raw heads"].geometry,
+        "mid_raw_appearance": stages["raw heads"].appearance,
+        "asset_means3D": gaussians.means,
+        "asset_rotations": gaussians.quats,
+        "asset_scales": gaussians.scales,
+        "asset_colors": gaussians.colors,
+        "asset_opacity": gaussians.opacities[:, None],
+        "asset_lbs_weights": weights[::WEIGHTS_STRIDE],
+        "posed_means3D": posed.means,
+        "posed_rotations": posed.quats,
+        TIES: candidates,
+        TIE_LEVELS: q_abs,
+    }
+
+
+def nearest_candidates(found: dict[str, Any], reference: Any, bound: float) -> Any:
+    """Ours of the posed rotations; where candidates tie to within `bound`, the one nearest to the reference."""
+    import numpy as np
+
+    ours = np.asarray(found["posed_rotations"], np.float64)
+    if TIES not in found or ours.shape != reference.shape:
+        return ours
+    readings, levels = np.asarray(found[TIES], np.float64), np.asarray(found[TIE_LEVELS], np.float64)
+    tied = levels >= levels.max(-1, keepdims=True) - bound
+    distances = [np.abs(readings - sign * reference[..., None, :]).max(-1) for sign in (1, -1)]
+    best = np.argmin(np.where(tied, np.minimum(*distances), np.inf), axis=-1)
+    nearest = np.take_along_axis(readings, best[..., None, None], axis=-2)[..., 0, :]
+    return np.where(tied.sum(-1, keepdims=True) > 1, nearest, ours)
+
+
+def relative_errors(found: dict[str, Any], expected: dict[str, Any], bound: float = 0.0) -> dict[str, float | None]:
+    """Largest error of each expected stage over its largest magnitude; None where none was found in its shape.
+
+    bound: within which candidates of posed rotations tie.
+    """
+    import numpy as np
+
+    errors: dict[str, float | None] = {}
+    for name, reference in expected.items():
+        ours, reference = np.asarray(found.get(name, np.nan), np.float64), np.asarray(reference, np.float64)
+        if ours.shape != reference.shape or not (np.isfinite(ours).all() and np.isfinite(reference).all()):
+            errors[name] = None
+            continue
+        if name == "posed_rotations":
+            ours = nearest_candidates(found, reference, bound)
+            ours = ours * np.where(np.sum(ours * reference, axis=-1, keepdims=True) < 0, -1, 1)
+        error, largest = np.abs(ours - reference).max(initial=0), np.abs(reference).max(initial=0)
+        errors[name] = float(error / largest) if largest > 0 else float(error)
+    return errors
+
+
+def check(checkpoint: Path, arrays: Path, config: Path, dtype: str, render: bool = False) -> dict[str, Any]:
+    """The result that --json writes. For float64 `jax_enable_x64` must be set."""
+    found, expected = run_checkpoint(checkpoint, arrays, config, dtype)
+    bound = BOUNDS[dtype]
+    errors = relative_errors(found, {name: x for name, x in expected.items() if not name.startswith("in_")}, bound)
+    passed = all(error is not None and error <= bound for error in errors.values())
+    result = {"dtype": dtype, "bound": bound, "stages": errors, "passed": passed}
+    if render:
+        reference, _ = run_checkpoint(checkpoint, arrays, config, "float32")
+        result["render_psnr"] = render_psnr(found, reference, expected)
+    return result
+
+
+def run_checkpoint(checkpoint: Path, arrays: Path, config: Path, dtype: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(what `compute_stages` gives for all subjects, the arrays of the file)."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from humangs_jax.network.conversion import load_checkpoint
+
+    release, expected = read_release_config(config), load_arrays(arrays)
+    converted = load_checkpoint(checkpoint, head_width=_head_width(release))
+    settings = complete_config(converted.config, release, dtype, expected["in_image"].shape[-2])
+    if expected["in_lbs_weights"].shape != converted.skinning_weights.shape:
+        raise ValueError(
+            f"{arrays}: in_lbs_weights has shape {expected['in_lbs_weights'].shape}, the checkpoint's "
+            f"{converted.skinning_weights.shape}"
+        )
+    working = jnp.float64 if dtype == "float64" else jnp.float32  # bfloat16: products only, see `network.execution`
+    variables = jax.tree.map(lambda x: jnp.asarray(x, working), converted.variables)
+    compute = jax.jit(compute_stages, static_argnames="config")
+    with jax.default_matmul_precision("highest"):  # GPUs and TPUs multiply float32 in fewer bits otherwise
+        subjects = []
+        for index in range(len(expected["in_image"])):
+            inputs, weights, transforms = subject_inputs(expected, index, working)
+            subjects.append(jax.tree.map(np.asarray, compute(variables, inputs, settings, weights, transforms)))
+    found = {
+        name: (np.concatenate if name in PER_VIEW else np.stack)([subject[name] for subject in subjects])
+        for name in subjects[0]
+    }
+    return found, expected
+
+
+def render_psnr(found: dict[str, Any], reference: dict[str, Any], arrays: dict[str, Any]) -> float:
+    """The lowest PSNR, dB, of pictures of the posed Gaussians to those of the reference, as all input cameras see them.
+
+    Drawn as the release draws, RENDER_SIZE pixels high.
+    """
+    import jax.numpy as jnp
+    import numpy as np
+
+    from humangs_jax.rendering.gaussians import Gaussians
+    from humangs_jax.rendering.splat_config import SPLAT_PRESETS
+    from humangs_jax.rendering.splatting import render
+
+    names = ("posed_means3D", "posed_rotations", "asset_scales", "asset_opacity", "asset_colors")
+    worst = np.inf
+    for index in range(len(arrays["in_image"])):
+        cameras = subject_inputs(arrays, index, jnp.float32)[0].cameras
+        cameras = cameras.resized(RENDER_SIZE * cameras.width // cameras.height, RENDER_SIZE)
+        pictures = []
+        for stages in (found, reference):
+            means, quats, scales, opacities, colors = (jnp.asarray(stages[n][index], jnp.float32) for n in names)
+            gaussians = Gaussians(means, quats, scales, opacities[:, 0], colors)
+            draw = lambda camera, drawn=gaussians: render(drawn, camera, SPLAT_PRESETS["inria"]).rgb
+            pictures.append(np.stack([np.asarray(draw(cameras[i])) for i in range(len(cameras.K))]))
+        mean_square = np.mean((np.clip(pictures[0], 0, 1) - np.clip(pictures[1], 0, 1)) ** 2, axis=(1, 2, 3))
+        worst = min(worst, -10 * np.log10(max(mean_square.max(), 1e-30)))
+    return float(worst)
+
+
+def _head_width(release: dict[str, Any]) -> int | None:
+    """Only needed where the checkpoint does not tell it; there a disagreement is reported by `complete_config`."""
+    return None if release["transformer.use_qk_norm"] is not False else release["transformer.d_head"]
+
+
+def report(result: dict[str, Any]) -> str:
+    """A table of the stages in their order, and a verdict."""
+    errors, bound = dict(result["stages"]), result["bound"]
+    lines = []
+    rows = [(stage, name) for stage, names in STAGES.items() for name in names if name in errors]
+    rows += [("unknown stage", name) for name in errors if name not in {name for _, name in rows}]
+    for stage, name in rows:
+        error = errors[name]
+        verdict = "NOT COMPARED" if error is None else f"{error:12.2e}" + ("" if error <= bound else "  TOO LARGE")
+        lines.append(f"{stage:20s} {name:24s} {verdict}")
+    uncompared = sum(error is None for error in errors.values())
+    largest = max((error for error in errors.values() if error is not None), default=float("nan"))
+    verdict = f"{result['dtype']}: largest {largest:.2e}, allowed {bound:.0e}"
+    verdict += f", {uncompared} not compared" if uncompared else ""
+    if "render_psnr" in result:
+        lines.append(f"drawn, against float32: at least {result['render_psnr']:.1f} dB")
+    return "\n".join([*lines, f"{verdict}: {'ok' if result['passed'] else 'FAILED'}"])
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoint", type=Path, metavar="CKPT.pt", help="checkpoint in the released format")
+    parser.add_argument("arrays", type=Path, metavar="ARRAYS.npz", help="inputs and the numbers of every stage")
+    parser.add_argument("config", type=Path, metavar="CONFIG.json", help="the release's configuration")
+    parser.add_argument("--dtype", choices=list(BOUNDS), default="float32", help="to compute in")
+    parser.add_argument("--json", type=Path, metavar="OUT", help="write the errors here")
+    parser.add_argument("--render", action="store_true", help="also draw the result and compare it with float32's")
+    arguments = parser.parse_args()
+
+    import jax
+
+    from experiments.common.results import write_json
+
+    jax.config.update("jax_enable_x64", arguments.dtype == "float64")
+    try:
+        result = check(arguments.checkpoint, arguments.arrays, arguments.config, arguments.dtype, arguments.render)
+        if arguments.json:
+            write_json(arguments.json, result)
+    except (ValueError, OSError) as error:
+        print(f"check_parity: error: {error}", file=sys.stderr)
+        sys.exit(2)
+    print(report(result))
+    sys.exit(not result["passed"])
+
+
+if __name__ == "__main__":
+    main()

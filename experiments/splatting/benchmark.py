@@ -1,0 +1,287 @@
+"""Time and error of the splatting renderer on one scene, beside a compiled yardstick where there is one.
+
+    python experiments/splatting/benchmark.py --scene S.npz --reference R.npz --size 512 [--yardstick DIR] --json OUT
+    python experiments/splatting/benchmark.py --scene demo --size 512
+
+Files: see `splatting/scenes.py`. DIR holds a `yardstick.py` with `Scene` and `Yardstick` (its `forward()` and
+`forward_backward(target)` take turns with ours in this process). The loss is the mean squared error against a target of
+noise; black background. Half a minute at 512. `--float64` draws the scene in float64 instead and compares that.
+An image is shared between two of XLA's host devices where there are two cores (`--devices 1`: not).
+
+Prints a table and writes {"forward_ms", "forward_backward_ms", "forward_cpu_ms", "forward_backward_cpu_ms" (medians),
+"yardstick": {the same} or null, "ratio": ours / yardstick, "compile_s", "peak_rss_mb", "psnr", "max_abs_error",
+"fraction_above_2e-4", "gradient_relative_l2", "gradient_cosine", "gradient_signed_bias", "gradient_gain": {parameter:
+number}, "work", "config", "devices", ...}; what needs a reference that is not given is null.
+
+Expected: psnr at least 95 dB (90 where a head's tiles are crowded), gradients within 1e-3, cosine above 0.99999, and in
+float64 no error above 1e-6. On 2 cores of an AMD EPYC (Zen 4), 52,375 Gaussians at 512: see docs/performance.md.
+"""
+
+import argparse
+import dataclasses
+import importlib.util
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
+from experiments.common.results import markdown_table, publish, write_json
+from experiments.splatting.scenes import (
+    PARAMETERS,
+    Reference,
+    Scene,
+    gradient_errors,
+    image_errors,
+    load_reference,
+    load_scene,
+    make_target,
+)
+
+TABLE = "splatting_benchmark"
+DIRECTIONS = ("forward", "forward_backward")
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", required=True, help="npz of a scene, or 'demo'")
+    parser.add_argument("--reference", type=Path, help="npz of its image and gradients")
+    parser.add_argument("--size", type=int, default=512, help="side of the image, pixels")
+    parser.add_argument("--yardstick", type=Path, help="folder of a compiled yardstick")
+    parser.add_argument("--json", type=Path, help="write the numbers here")
+    parser.add_argument("--page", type=Path, help=f"page whose table {TABLE} gets this run's rows")
+    parser.add_argument("--repeats", type=int, default=15, help="timed rounds; 0: errors only")
+    parser.add_argument("--preset", default="exact", help="name in SPLAT_PRESETS")
+    parser.add_argument("--config", type=json.loads, default={}, help="JSON of SplatConfig fields over the preset")
+    parser.add_argument("--margin", type=float, default=1.0, help="room in the buffers; 1 is what eager calls take")
+    parser.add_argument(
+        "--devices",
+        type=int,
+        default=min(2, os.cpu_count() or 1),
+        help="devices that share the image; on a CPU, how many to make",
+    )
+    parser.add_argument("--float64", action="store_true", help="draw in float64")
+    arguments = parser.parse_args()
+    prepare_process()
+    result = benchmark(arguments)
+    print(printed(result))
+    if arguments.json:
+        write_json(arguments.json, result)
+    if arguments.page:
+        tables = [table for table in (times_table([result]), errors_table([result])) if table]
+        publish(arguments.page, TABLE, "\n\n".join(tables), result, name_of(result))
+
+
+def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Everything that the JSON holds."""
+    import jax
+
+    jax.config.update("jax_enable_compilation_cache", False)  # compile times are of a first run
+    jax.config.update("jax_enable_x64", arguments.float64)
+    jax.config.update("jax_num_cpu_devices", arguments.devices)
+    devices = jax.devices()[: arguments.devices]
+    mesh = jax.sharding.Mesh(np.array(devices), ("rows",)) if len(devices) > 1 else None
+    dtype = np.float64 if arguments.float64 else np.float32
+    scene = load_scene(arguments.scene, arguments.size)
+    reference = load_reference(arguments.reference, arguments.size) if arguments.reference else None
+    target = make_target(arguments.size, reference.seed if reference else 1)
+    config = planned(scene, arguments.preset, arguments.config, arguments.margin, dtype, mesh)
+    programs, facts = compiled(scene, target, config, dtype, mesh)
+
+    runs = dict(programs)
+    if arguments.yardstick:
+        runs |= {f"yardstick {name}": run for name, run in yardstick_runs(arguments.yardstick, scene, target).items()}
+    load = os.getloadavg()[0]
+    times = medians(runs, arguments.repeats) if arguments.repeats else {}
+    result: dict[str, Any] = milliseconds(times, "")
+    result["yardstick"] = milliseconds(times, "yardstick ") if arguments.yardstick else None
+    result["ratio"] = result["yardstick"] and {
+        key: result[key] / theirs if theirs else None for key, theirs in result["yardstick"].items()
+    }
+    each = {key: {name: fact[key] for name, fact in facts.items()} for key in ("compile_s", "temporary_mb")}
+    result |= {"compile_s": max(each["compile_s"].values()), "compile_s_each": each["compile_s"]}
+    result |= {"peak_rss_mb": peak_rss_mb(), "temporary_mb": each["temporary_mb"]}
+    result |= errors(programs, reference)
+    result |= {"work": work(scene, config, dtype), "config": dataclasses.asdict(config)}
+    result |= {
+        "scene": scene.kind,
+        "size": scene.size,
+        "gaussians": len(scene.means),
+        "dtype": np.dtype(dtype).name,
+        "preset": arguments.preset,
+        "repeats": arguments.repeats,
+        "load_average": load,
+        "devices": [device.device_kind for device in devices],
+        "jax": jax.__version__,
+    }
+    return result
+
+
+def planned(
+    scene: Scene, preset: str, fields: Mapping[str, Any], margin: float, dtype: type = np.float32, mesh: Any = None
+) -> Any:
+    """A preset with some fields replaced, and buffers that fit the scene."""
+    from humangs_jax.rendering.splat_config import SPLAT_PRESETS
+    from humangs_jax.rendering.splatting import plan_buffers
+
+    config = dataclasses.replace(SPLAT_PRESETS[preset], **fields)
+    return plan_buffers(scene.gaussians(dtype), scene.camera(dtype), config, margin, mesh)
+
+
+def compiled(
+    scene: Scene, target: np.ndarray, config: Any, dtype: type = np.float32, mesh: Any = None
+) -> tuple[dict[str, Callable[[], Any]], dict[str, dict[str, float]]]:
+    """Our two programs, bound to the scene, and for each how long it took to compile and how much it holds while it runs.
+
+    forward() -> Rendering. forward_backward() -> (loss, gradients as Gaussians). Both wait for their results.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, render
+
+    gaussians, camera = scene.gaussians(dtype), scene.camera(dtype)
+    goal, black = jnp.asarray(target, dtype), jnp.zeros(3, dtype)
+
+    def forward(gaussians):
+        return render(gaussians, camera, config, black, mesh)
+
+    def loss(gaussians):
+        return jnp.mean((forward(gaussians).rgb - goal) ** 2)
+
+    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    programs, facts = {}, {}
+    for name, function in zip(DIRECTIONS, (forward, jax.value_and_grad(loss)), strict=True):
+        started = time.perf_counter()
+        program = jax.jit(function, compiler_options=options).lower(gaussians).compile()
+        memory = program.memory_analysis()
+        facts[name] = {
+            "compile_s": time.perf_counter() - started,
+            "temporary_mb": memory.temp_size_in_bytes / 2**20 if memory else float("nan"),
+        }
+        programs[name] = lambda program=program: jax.block_until_ready(program(gaussians))
+    return programs, facts
+
+
+def yardstick_runs(folder: Path, scene: Scene, target: np.ndarray) -> dict[str, Callable[[], Any]]:
+    """The yardstick's two programs, bound to the scene."""
+    spec = importlib.util.spec_from_file_location("yardstick", folder / "yardstick.py")
+    if spec is None or spec.loader is None:
+        raise ValueError(f"{folder}: holds no yardstick.py that can be loaded")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["yardstick"] = module
+    spec.loader.exec_module(module)
+    yardstick = module.Yardstick(module.Scene(*scene))
+    return {"forward": yardstick.forward, "forward_backward": lambda: yardstick.forward_backward(target)}
+
+
+def milliseconds(times: Mapping[str, np.ndarray], prefix: str) -> dict[str, float | None]:
+    """The four numbers of one competitor; null if nothing was timed."""
+    out = {}
+    for kind, column in (("ms", 0), ("cpu_ms", 1)):
+        for name in DIRECTIONS:
+            taken = times.get(prefix + name)
+            out[f"{name}_{kind}"] = None if taken is None else float(taken[column])
+    return out
+
+
+def errors(programs: Mapping[str, Callable[[], Any]], reference: Reference | None) -> dict[str, Any]:
+    """Errors of image and gradients; None where the reference lacks them."""
+    image = np.asarray(programs["forward"]().rgb)
+    found: dict[str, Any] = dict.fromkeys(("psnr", "max_abs_error", "fraction_above_2e-4"))
+    measures = ("relative_l2", "cosine", "signed_bias", "gain")
+    found |= {f"gradient_{measure}": dict.fromkeys(PARAMETERS) for measure in measures}
+    if reference is None:
+        return found
+    found |= image_errors(image, reference.image)
+    if reference.gradients:
+        gradients = programs["forward_backward"]()[1]
+        for name, expected in reference.gradients.items():
+            for measure, value in gradient_errors(getattr(gradients, name), expected).items():
+                found[f"gradient_{measure}"][name] = value
+    return found
+
+
+def work(scene: Scene, config: Any, dtype: type) -> dict[str, float]:
+    """What the scene asks for: see `splatting/work.py`."""
+    from experiments.splatting.work import tile_work
+
+    return tile_work(scene, config, dtype)
+
+
+def printed(result: Mapping[str, Any]) -> str:
+    """What is printed."""
+    number = lambda value, form: "-" if value is None else format(value, form)
+    theirs, ratio = result["yardstick"] or {}, result["ratio"] or {}
+    lines = [
+        f"{result['scene']} {result['size']}, {result['gaussians']:,} Gaussians, {result['dtype']}, preset "
+        f"{result['preset']}, {', '.join(result['devices'])}, load {result['load_average']:.1f}",
+        f"{'median ms':24}{'ours':>10}{'yardstick':>11}{'ratio':>8}",
+    ]
+    for direction in DIRECTIONS:
+        for kind, label in (("ms", "wall"), ("cpu_ms", "CPU")):
+            key = f"{direction}_{kind}"
+            cells = number(result[key], "10.1f"), number(theirs.get(key), "11.1f"), number(ratio.get(key), "8.2f")
+            lines.append(f"{direction.replace('_', '+') + ' ' + label:24}{cells[0]:>10}{cells[1]:>11}{cells[2]:>8}")
+    each = ", ".join(f"{name.replace('_', '+')} {s:.1f} s" for name, s in result["compile_s_each"].items())
+    lines.append(f"compile: {each}; peak memory {result['peak_rss_mb']:.0f} MiB")
+    lines.append(
+        f"image: {number(result['psnr'], '.1f')} dB, largest error {number(result['max_abs_error'], '.1e')}, "
+        f"{number(result['fraction_above_2e-4'], '.4%')} of the pixels off by more than 2e-4"
+    )
+    lines.append(f"{'gradient of':12}" + "".join(f"{name:>12}" for name in PARAMETERS))
+    for measure, form in (("relative_l2", ".1e"), ("cosine", ".8f"), ("signed_bias", ".1e"), ("gain", ".1e")):
+        row = result[f"gradient_{measure}"]
+        lines.append(f"{measure:12}" + "".join(f"{number(row[name], form):>12}" for name in PARAMETERS))
+    lines.append("work: " + ", ".join(f"{name.replace('_', ' ')} {value:,}" for name, value in result["work"].items()))
+    return "\n".join(lines)
+
+
+def name_of(run: Mapping[str, Any]) -> str:
+    """Scene, size and how many devices shared the image."""
+    devices = len(run["devices"])
+    return f"{run['scene']} {run['size']}" + (f", {devices} devices" if devices > 1 else "")
+
+
+def times_table(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Wall and CPU ms, and their ratios to the yardstick's."""
+    rows = []
+    for run in runs:
+        if run["forward_ms"] is None:
+            continue
+        cells = [name_of(run)]
+        for name in DIRECTIONS:
+            cells.append(f"{run[f'{name}_ms']:.0f}, {run[f'{name}_cpu_ms']:.0f}")
+            ratio = run["ratio"]
+            cells.append(f"{ratio[f'{name}_ms']:.2f}, {ratio[f'{name}_cpu_ms']:.2f}" if ratio else "-")
+        cells.append(", ".join(f"{seconds:.1f}" for seconds in run["compile_s_each"].values()))
+        rows.append([*cells, f"{run['peak_rss_mb']:.0f}"])
+    header = ["wall, CPU", "forward, ms", "/ yardstick", "forward+backward, ms", "/ yardstick"]
+    return markdown_table([*header, "compile each, s", "peak memory, MiB"], rows)
+
+
+def errors_table(runs: Sequence[Mapping[str, Any]]) -> str:
+    """Errors of images and gradients; empty where no run had a reference."""
+    rows = []
+    for run in runs:
+        if run["psnr"] is None:
+            continue
+        cells = [f"{name_of(run)}, {run['dtype']}", f"{run['psnr']:.1f}", f"{run['max_abs_error']:.1e}"]
+        cells.append(f"{run['fraction_above_2e-4']:.4%}")
+        for measure, worst, form in (("relative_l2", max, ".1e"), ("cosine", min, ".8f"), ("signed_bias", max, ".0e")):
+            values = [abs(value) for value in run[f"gradient_{measure}"].values() if value is not None]
+            cells.append(format(worst(values), form) if values else "-")
+        rows.append(cells)
+    header = ["error to float64", "PSNR, dB", "largest", "pixels off by > 2e-4"]
+    return markdown_table([*header, "gradients: relative L2", "cosine", "signed bias"], rows) if rows else ""
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,300 @@
+"""What each knob of the splatting renderer gains in time and costs in accuracy, and the Pareto front of their settings.
+
+    python experiments/splatting/tradeoff.py --scene S.npz --size 512 [--json OUT] [--picture OUT.png]
+        [--page docs/performance.md]
+    python experiments/splatting/tradeoff.py --scene demo --picture docs/images/splatting_tradeoff.png
+
+Every setting takes turns with the exact one, call by call, in one process; its time is the median of the quotients. Its
+error is that of the image to the exact one, drawn in float64, on black; of gradients (mean squared error against noise)
+the relative L2 error, the worst of the five parameters'. Knobs that only say in which order the work is done (tile size,
+block, chunks) are measured too: their error is rounding. Dropping the hidden: the Gaussians that weigh less than a
+threshold on every pixel from all of 24 cameras around are left out (of gradients, they count as 0).
+
+About 8 minutes for a scene of 52,375 Gaussians at 512; `--only radius_sigma scale` measures some knobs. Expected: the preset
+near_exact above 50 dB at 0.8 of the time, fast at about 40 dB and 0.6 of it (docs/performance.md).
+"""
+
+import argparse
+import dataclasses
+import gc
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.interleaved import prepare_process, timed
+from experiments.common.results import add_outputs, markdown_table, write_outputs
+from experiments.splatting.benchmark import DIRECTIONS, compiled
+from experiments.splatting.scenes import (
+    PARAMETERS,
+    Scene,
+    gradient_errors,
+    image_errors,
+    load_scene,
+    make_target,
+    orbiting,
+)
+
+KNOBS: dict[str, tuple[Any, ...]] = {
+    "tile_size": (4, 16),
+    "block": (16, 64),
+    "chunk": (4, 16),
+    "chunk_backward": (4, 16),
+    "matmul_precision": ("bfloat16",),
+    "alpha_min": (1 / 192, 1 / 128, 1 / 64, 1 / 32, 1 / 16),
+    "transmittance_stop": (1e-3, 1e-2, 3e-2, 1e-1),
+    "radius_sigma": (3.33, 3.0, 2.5, 2.0, 1.5),
+    "opacity_min": (0.05, 0.1, 0.2, 0.4),
+    "scale": (0.75, 0.5, 0.25),
+}
+SCHEDULE = ("tile_size", "block", "chunk", "chunk_backward", "matmul_precision")
+"""Knobs of the exact image: not drawn in the picture."""
+
+HIDDEN = (1 / 255, 0.01, 0.03, 0.1)
+"""Weights on any pixel of any camera below which a Gaussian is dropped (`splatting.seen_from`)."""
+
+VIEWS = 24
+"""Cameras that ask what is hidden, besides the one that is drawn."""
+
+COMBINED: tuple[dict[str, Any], ...] = (
+    {"alpha_min": 1 / 128, "transmittance_stop": 1e-3},
+    {"alpha_min": 1 / 32, "transmittance_stop": 1e-2},
+    {"radius_sigma": 2.75, "transmittance_stop": 1e-3},
+    {"radius_sigma": 2.25, "transmittance_stop": 1e-3},
+    {"radius_sigma": 2.0, "transmittance_stop": 3e-3},
+    {"radius_sigma": 1.5, "transmittance_stop": 3e-3},
+    {"radius_sigma": 1.25, "transmittance_stop": 1e-2},
+    {"radius_sigma": 2.0, "alpha_min": 1 / 64, "transmittance_stop": 3e-3},
+    {"radius_sigma": 1.75, "transmittance_stop": 3e-3, "scale": 0.5},
+    {"hidden": 0.01, "radius_sigma": 2.75, "transmittance_stop": 1e-3},
+    {"hidden": 0.03, "radius_sigma": 2.5, "transmittance_stop": 1e-3},
+    {"hidden": 0.03, "radius_sigma": 2.0, "transmittance_stop": 3e-3},
+    {"hidden": 0.1, "radius_sigma": 1.75, "transmittance_stop": 3e-3},
+)
+"""Several knobs at once; "hidden" as in `HIDDEN`."""
+
+SHORT_NAMES = {"alpha_min": "alpha", "transmittance_stop": "stop"}
+
+
+class Setting(NamedTuple):
+    """A point of the trade-off. knob: of which it is a value, "preset" or "combined". dropped: (g,) left out, or None."""
+
+    knob: str
+    label: str
+    config: Any
+    dropped: np.ndarray | None = None
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", help="npz of a scene, or 'demo'")
+    parser.add_argument("--measured", type=Path, help="JSON of an earlier run, instead of a scene")
+    parser.add_argument("--size", type=int, default=512, help="side of the image, pixels")
+    parser.add_argument("--repeats", type=int, default=9, help="timed rounds")
+    parser.add_argument("--only", nargs="+", help="knobs to measure (also: hidden, combined, preset)")
+    add_outputs(parser, "splatting_tradeoff")
+    parser.add_argument("--picture", type=Path, help="draw the Pareto front here")
+    parser.add_argument("--section", default="splatting_tradeoff", help="the page's section")
+    arguments = parser.parse_args()
+    if bool(arguments.scene) == bool(arguments.measured):
+        parser.error("give either --scene or --measured")
+    if arguments.measured:
+        result = json.loads(arguments.measured.read_text())
+    else:
+        prepare_process()
+        result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats, arguments.only)
+    write_outputs(arguments, arguments.section, table(result), result)
+    if arguments.picture:
+        draw(result, arguments.picture)
+
+
+def settings(scene: Scene, only: Sequence[str] | None) -> list[Setting]:
+    """All points to measure but the exact one."""
+    from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
+
+    weights = largest_weights(scene) if only is None or {"hidden", "combined"} & set(only) else None
+    found = [Setting("preset", name, config) for name, config in SPLAT_PRESETS.items() if name != "exact"]
+    for knob, values in KNOBS.items():
+        found += [Setting(knob, f"{knob} {short(v)}", SplatConfig(**{knob: v})) for v in values]
+    if weights is not None:
+        found += [Setting("hidden", f"hidden {short(t)}", SplatConfig(), weights < t) for t in HIDDEN]
+        for fields in COMBINED:
+            label = ", ".join(f"{SHORT_NAMES.get(name, name)} {short(value)}" for name, value in fields.items())
+            dropped = weights < fields["hidden"] if "hidden" in fields else None
+            config = SplatConfig(**{name: value for name, value in fields.items() if name != "hidden"})
+            found.append(Setting("combined", label, config, dropped))
+    return [s for s in found if only is None or s.knob in only]
+
+
+def short(value: Any) -> str:
+    """1/64 rather than 0.015625."""
+    if isinstance(value, float) and 2e-3 < value < 0.1 and float(1 / value).is_integer() and (1 / value) % 10:
+        return f"1/{1 / value:.0f}"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def largest_weights(scene: Scene) -> np.ndarray:
+    """(g,) the largest weight of each Gaussian on any pixel of any of the cameras around the scene, and of its own."""
+    from humangs_jax.rendering.splat_config import SplatConfig
+    from humangs_jax.rendering.splatting import render, render_views
+
+    gaussians, config = scene.gaussians(), SplatConfig(visibility=True)
+    own = render(gaussians, scene.camera(), config).visibility
+    turns = np.linspace(0, 2 * np.pi, VIEWS, endpoint=False)
+    cameras = orbiting(scene, turns, np.resize([0.0, 0.4, -0.4], VIEWS))
+    others = render_views(gaussians, cameras, config).visibility
+    return np.maximum(np.asarray(own), np.asarray(others).max(axis=0))
+
+
+def measure(scene: Scene, repeats: int, only: Sequence[str] | None = None) -> dict[str, Any]:
+    """{"scene", "size", "exact": milliseconds and errors, "settings": [one dict each]}."""
+    import jax
+
+    from humangs_jax.rendering.splat_config import DEFAULT_CONFIG
+    from humangs_jax.rendering.splatting import plan_buffers
+
+    target = make_target(scene.size)
+    fitted = lambda scene, config, dtype: plan_buffers(scene.gaussians(dtype), scene.camera(dtype), config, 1.0)
+    with jax.enable_x64(True):
+        config = fitted(scene, DEFAULT_CONFIG, np.float64)
+        truth = outputs(compiled(scene, target, config, np.float64)[0], None)
+    exact = compiled(scene, target, fitted(scene, DEFAULT_CONFIG, np.float32))[0]
+    times = {name: np.median([timed(exact[name]) for _ in range(repeats + 1)], axis=0) for name in DIRECTIONS}
+    rows = []
+    for setting in settings(scene, only):
+        kept = ~setting.dropped if setting.dropped is not None else np.ones(len(scene.means), bool)
+        part = scene._replace(**{name: getattr(scene, name)[kept] for name in PARAMETERS})
+        config = fitted(part, setting.config, np.float32)
+        programs = compiled(part, target, config)[0]
+        row: dict[str, Any] = {"knob": setting.knob, "label": setting.label, "gaussians": len(part.means)}
+        row |= ratios(exact, programs, repeats) | differences(outputs(programs, kept), truth)
+        rows.append(row | {"config": dataclasses.asdict(config)})
+        print(
+            f"{setting.label:48} {row['forward_cpu']:.2f} {row['forward_backward_cpu']:.2f} {row['psnr']:.1f} dB",
+            flush=True,
+        )
+        del programs
+        gc.collect()
+    return {
+        "scene": scene.kind,
+        "size": scene.size,
+        "gaussians": len(scene.means),
+        "exact": {name: {"wall_ms": t[0], "cpu_ms": t[1]} for name, t in times.items()}
+        | differences(outputs(exact, None), truth),
+        "settings": rows,
+    }
+
+
+def outputs(programs: dict, kept: np.ndarray | None) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Image and gradients; those of Gaussians that were left out are 0."""
+    image, gradients = np.asarray(programs["forward"]().rgb), {}
+    found = programs["forward_backward"]()[1]
+    for name in PARAMETERS:
+        gradient = np.asarray(getattr(found, name))
+        if kept is not None:
+            gradients[name] = np.zeros((len(kept), *gradient.shape[1:]), gradient.dtype)
+            gradients[name][kept] = gradient
+        else:
+            gradients[name] = gradient
+    return image, gradients
+
+
+def ratios(exact: dict, programs: dict, repeats: int) -> dict[str, float]:
+    """Times relative to the exact ones, {forward, forward_backward} x {wall, cpu}: medians of quotients of neighbours."""
+    found = {}
+    for name in DIRECTIONS:
+        exact[name](), programs[name]()
+        pairs = np.asarray([(timed(exact[name]), timed(programs[name])) for _ in range(repeats)])
+        found[f"{name}_wall"], found[f"{name}_cpu"] = np.median(pairs[:, 1] / pairs[:, 0], axis=0).tolist()
+    return found
+
+
+def differences(found: tuple, truth: tuple) -> dict[str, float]:
+    """Errors of the image, and the worst relative L2 error of a gradient."""
+    worst = max(gradient_errors(found[1][name], truth[1][name])["relative_l2"] for name in PARAMETERS)
+    return image_errors(found[0], truth[0]) | {"gradient_relative_l2": worst}
+
+
+def pareto(rows: Sequence[dict[str, Any]], time: str) -> list[dict[str, Any]]:
+    """The settings that no other beats in both time and PSNR, fastest first."""
+    front, best = [], -np.inf
+    for row in sorted(rows, key=lambda row: (row[time], -row["psnr"])):
+        if row["psnr"] > best:
+            front.append(row)
+            best = row["psnr"]
+    return front
+
+
+def table(result: dict[str, Any]) -> str:
+    """Markdown."""
+    header = ["setting", "forward: CPU, wall", "forward+backward: CPU, wall", "PSNR, dB", "largest error", "gradients"]
+    exact = result["exact"]
+    milliseconds = (f"{exact[name]['cpu_ms']:.0f}, {exact[name]['wall_ms']:.0f} ms" for name in DIRECTIONS)
+    error = lambda row: [f"{row['psnr']:.1f}", f"{row['max_abs_error']:.1g}", f"{row['gradient_relative_l2']:.1g}"]
+    rows = [["exact", *milliseconds, *error(exact)]]
+    for row in result["settings"]:
+        label = f"**{row['label']}**" if row["knob"] == "preset" else row["label"]
+        times = (f"{row[f'{name}_cpu']:.2f}, {row[f'{name}_wall']:.2f}" for name in DIRECTIONS)
+        rows.append([label, *times, *error(row)])
+    title = (
+        f"{result['scene']}, {result['gaussians']:,} Gaussians at {result['size']}; times relative to the exact ones."
+    )
+    return f"{title}\n\n{markdown_table(header, rows)}"
+
+
+def draw(result: dict[str, Any], path: Path) -> None:
+    """Time relative to exact against PSNR, forward and forward+backward, with the front."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    exact = {**result["exact"], "label": "exact", "knob": "preset"} | {f"{name}_cpu": 1.0 for name in DIRECTIONS}
+    rows = [exact] + [r for r in result["settings"] if r["knob"] not in SCHEDULE and r["label"] != "inria"]
+    figure, axes = plt.subplots(1, 2, figsize=(13, 6), sharex=True, sharey=True)
+    for axis, name in zip(axes, DIRECTIONS, strict=True):
+        _draw_panel(axis, rows, f"{name}_cpu")
+        axis.set(xlabel=f"{name.replace('_', ' + ')}: CPU time relative to exact")
+        axis.grid(alpha=0.25)
+    axes[0].set_ylabel("PSNR to the exact image, dB")
+    axes[1].legend(fontsize=8, loc="upper left")
+    axes[1].set_xlim(right=1.1)
+    figure.suptitle(
+        f"{result['gaussians']:,} Gaussians, {result['size']} x {result['size']} pixels. Stars: presets. "
+        "Grey: the fronts, with and without leaving hidden Gaussians out",
+        fontsize=10,
+    )
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _draw_panel(axis, rows, time):
+    whole = [row for row in rows if "hidden" not in row["label"]]
+    for some, color in ((rows, "0.85"), (whole, "0.65")):
+        steps = zip(*((r[time], r["psnr"]) for r in pareto(some, time)), strict=True)
+        axis.step(*steps, where="post", color=color, lw=2.5)
+    labelled = pareto(rows, time) + pareto(whole, time)
+    knobs = dict.fromkeys(row["knob"] for row in rows if row["knob"] != "preset")
+    for i, knob in enumerate(knobs):
+        points = [(row[time], row["psnr"]) for row in rows if row["knob"] == knob]
+        style = "s" if knob == "combined" else "o-"
+        axis.plot(*zip(*points, strict=True), style, ms=4, lw=0.8, color=f"C{i}", label=knob)
+    for row in rows:
+        point = row[time], row["psnr"]
+        if row["knob"] == "preset":
+            axis.plot(*point, "*", ms=14, color="black", zorder=3)
+            axis.annotate(row["label"], point, (8, 4), textcoords="offset points", weight="bold")
+        elif row in labelled or row["knob"] != "combined":
+            text = row["label"].removeprefix(row["knob"]).strip()
+            axis.annotate(text, point, (5, -8), textcoords="offset points", fontsize=6.5, color="0.35")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

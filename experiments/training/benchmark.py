@@ -1,0 +1,214 @@
+"""Time, arithmetic and memory of one step of training, in turns with plain matrix products, which give the floor.
+
+    python experiments/training/benchmark.py --json OUT                       # all cases: half an hour on 2 idle cores
+    python experiments/training/benchmark.py --json OUT --only "small 256" --stages --variants
+    python experiments/training/benchmark.py --json OUT --page docs/performance_training.md
+
+A synthetic person is made and read by the loader; weights are random, of loss networks, too: they cost what trained ones
+cost. Operations and bytes are counted from the compiled step, loops included (`common/compiled_costs.py`). The floor is the time
+that these operations take as plain products in the same turns. `--stages` compiles parts of a step by themselves and times
+them: gradients of a part include the part itself. `--variants` times the step with one thing changed at a time. Results are
+added to OUT, so cases can be run one by one; `--page` writes them into a page and runs nothing.
+
+Numbers: docs/performance_training.md.
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.compiled_costs import compiled_costs
+from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
+from experiments.common.results import markdown_table, publish, write_json
+from experiments.training.cases import CASES, Case, compiler_options
+from experiments.training.variants import stage_numbers, variant_numbers
+
+MEBI = 1 / 2**20
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=CASES, nargs="+", default=list(CASES)[:3], help="cases to run")
+    parser.add_argument("--views", type=int, help="input views, instead of the case's")
+    parser.add_argument("--targets", type=int, help="target views, instead of the case's")
+    parser.add_argument(
+        "--dtype", choices=("auto", "float32", "bfloat16"), default="auto", help="auto: float32 on a CPU"
+    )
+    parser.add_argument("--repeats", type=int, default=3, help="timed rounds")
+    parser.add_argument("--warm-up", type=int, default=1, help="rounds before these")
+    parser.add_argument("--stages", action="store_true", help="also time parts of the step")
+    parser.add_argument(
+        "--variants", nargs="*", help="also time the step with one thing changed at a time (all, or these)"
+    )
+    parser.add_argument("--json", type=Path, help="add the numbers to this file")
+    parser.add_argument("--page", type=Path, help="write the tables into this page from --json; nothing is run")
+    arguments = parser.parse_args()
+    result = json.loads(arguments.json.read_text()) if arguments.json and arguments.json.exists() else {}
+    if arguments.page and not result:
+        parser.error("--page writes the numbers of --json: there are none yet")
+    if not arguments.page:
+        prepare_process()
+        for name in arguments.only:
+            preset, size, views, targets = CASES[name]
+            views, targets = arguments.views or views, arguments.targets or targets
+            key = f"{name}, {views} + {targets} views"
+            for numbers in benchmark(Case(preset, size, views, targets, arguments.dtype), arguments):
+                result[key] = result.get(key, {}) | numbers
+                print(key, json.dumps(numbers), flush=True)
+                if arguments.json:
+                    write_json(arguments.json, result)
+    for name, make in TABLES.items():
+        text = make(result)
+        print(text, end="\n\n")
+        if arguments.page:
+            publish(arguments.page, name, text, result)
+
+
+def benchmark(case: Case, arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    """What the JSON holds of a case, part by part."""
+    import jax
+
+    jax.config.update("jax_enable_compilation_cache", False)
+    with tempfile.TemporaryDirectory() as folder:
+        case.prepare(Path(folder))
+        yield step_numbers(case, arguments)
+        if arguments.stages:
+            yield {"stages": stage_numbers(case, arguments.repeats, arguments.warm_up)}
+        if arguments.variants is not None:
+            done = {}
+            for name, numbers in variant_numbers(case, arguments.variants, arguments.repeats, arguments.warm_up):
+                yield {"variants": done | {name: numbers}}
+                done[name] = numbers
+
+
+def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
+    """Of the whole step."""
+    import jax
+
+    from experiments.reconstruction.cases import matmul_program
+
+    program, compile_s = case.compiled(compiler_options())
+    case.program = program
+    costs = compiled_costs(program)
+    product, product_flops = matmul_program(case.config.model.execution.dtype)
+    load = os.getloadavg()[0]
+    times = medians({"matmul": product, "step": lambda: case.run(program)}, arguments.repeats, arguments.warm_up)
+    wall, cpu = map(float, times["step"])
+    floor = costs.matrix_flops / product_flops * times["matmul"]
+    return {
+        "ms": wall,
+        "cpu_ms": cpu,
+        "samples_per_s": 1e3 * case.config.batch_size / wall,
+        "flops": costs.matrix_flops,
+        "bytes": costs.bytes_accessed,
+        "unknown_trips": costs.unknown_trips,
+        "uncounted": list(costs.uncounted),
+        "matmul_gflops": product_flops / times["matmul"][0] / 1e6,
+        "matmul_gflops_cpu": product_flops / times["matmul"][1] / 1e6,
+        "share_of_floor": float(floor[0]) / wall,
+        "share_of_floor_cpu": float(floor[1]) / max(cpu, 1e-9),
+        "temporary_mb": MEBI * costs.temporary_bytes,
+        "argument_mb": MEBI * costs.argument_bytes,
+        "peak_rss_mb": peak_rss_mb(),
+        "compile_cpu_s": compile_s,
+        "tokens": token_count(case.config),
+        "gaussians": len(case.body.template) * case.config.model.architecture.decoder.gaussians_per_vertex,
+        "parameters": sum(x.size for x in jax.tree.leaves(case.state.params)),
+        "losses": case.metrics,
+        "dtype": case.config.model.execution.dtype,
+        "repeats": arguments.repeats,
+        "load_average": load,
+        "device": jax.devices()[0].device_kind,
+        "jax": jax.__version__,
+    }
+
+
+def token_count(config: Any) -> int:
+    """Slots for tokens."""
+    model = config.model
+    patches = (
+        config.views.input_counts[0] * (model.conventions.image_size // model.architecture.encoder.patch_size) ** 2
+    )
+    return model.execution.token_capacity if model.tokens == "foreground" else patches
+
+
+def steps_table(result: dict[str, Any]) -> str:
+    """One line per case. The share is of CPU time on a CPU, which others use, too, and of wall time elsewhere."""
+    header = [
+        "one subject a step",
+        "tokens",
+        "Gaussians",
+        "wall, CPU s",
+        "samples/s",
+        "TFLOP",
+        "GB",
+        "share of floor",
+    ]
+    header += ["MiB temporaries", "peak MiB", "compile, CPU s"]
+    rows = [
+        [
+            name,
+            row["tokens"],
+            row["gaussians"],
+            f"{row['ms'] / 1e3:.1f}, {row['cpu_ms'] / 1e3:.2f}",
+            f"{row['samples_per_s']:.3f}",
+            f"{row['flops'] / 1e12:.2f}",
+            f"{row['bytes'] / 1e9:.0f}",
+            f"{row['share_of_floor_cpu' if row['device'] == 'cpu' else 'share_of_floor']:.2f}",
+            f"{row['temporary_mb']:.0f}",
+            f"{row['peak_rss_mb']:.0f}",
+            f"{row['compile_cpu_s']:.0f}",
+        ]
+        for name, row in result.items()
+    ]
+    machines = "; ".join(
+        f"{name}: {row['dtype']}, {row['device']}, jax {row['jax']}, products {row['matmul_gflops']:.0f} GFLOP/s (wall), "
+        f"load {row['load_average']:.1f}, {row['repeats']} timed"
+        for name, row in result.items()
+    )
+    return markdown_table(header, rows) + f"\n\n{machines}."
+
+
+def stages_table(result: dict[str, Any]) -> str:
+    """One column per case, CPU ms."""
+    cases = {name: row["stages"] for name, row in result.items() if "stages" in row}
+    if not cases:
+        return ""
+    names = list(next(iter(cases.values())))
+    rows = [[name, *(f"{case[name][1]:.0f}" for case in cases.values())] for name in names]
+    step = ["the step", *(f"{result[name]['cpu_ms']:.0f}" for name in cases)]
+    return markdown_table(["CPU ms", *cases], [*rows, step])
+
+
+def variants_table(result: dict[str, Any]) -> str:
+    """What one change does to the step."""
+    rows = []
+    for name, row in result.items():
+        for variant, numbers in row.get("variants", {}).items():
+            ratio = numbers["cpu_ms"] / numbers["as_it_is_cpu_ms"]
+            cells = (numbers["cpu_ms"], ratio, numbers["ms"], numbers["flops"] / 1e9)
+            rows.append(
+                [f"{name}: {variant}", f"{cells[0]:.0f}", f"{cells[1]:.2f}", f"{cells[2]:.0f}", f"{cells[3]:.0f}"]
+            )
+            rows[-1] += [f"{numbers['temporary_mb']:.0f}", f"{numbers['compile_cpu_s']:.0f}"]
+    header = ["step", "CPU ms", "/ as it is", "wall ms", "GFLOP", "MiB temporaries", "compile, CPU s"]
+    return markdown_table(header, rows) if rows else ""
+
+
+TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
+    "training_steps": steps_table,
+    "training_stages": stages_table,
+    "training_variants": variants_table,
+}
+"""Section of the page: what makes its table from all of the JSON."""
+
+
+if __name__ == "__main__":
+    main()

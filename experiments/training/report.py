@@ -1,0 +1,303 @@
+"""A training run from nothing, and the page that tells of it: people, training, curve, validation pictures, numbers.
+
+    python experiments/training/report.py --out runs/report
+
+makes 64 synthetic people of the training seeds and 8 of the validation seeds in runs/report, trains the preset `small` for 500
+steps and writes docs/training_run.md with its pictures in docs/images. Ctrl-C saves; the same command goes on where it
+stopped, and run again after the end it writes the page anew. On 2 CPU cores about 5 minutes for the people and 15 for the
+run; expected: 22 dB on the validation people, no step skipped. Needs matplotlib (the `notebooks` extra).
+
+`--config tiny --people 3 --validation 2 --steps 10` tries all of it in two minutes.
+"""
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import textwrap
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.interleaved import peak_rss_mb, prepare_process
+from experiments.common.results import markdown_table, write_json, write_text
+from experiments.training.plot import draw_curve, read_lines, steps_of, validations_of
+
+SIZE, POSES, VIEWS = 256, 2, 12
+"""Pictures of a person."""
+COLUMNS = 5
+"""Validations that are shown."""
+AVERAGED = 20
+"""Log lines that a number of the table averages, at most those since the validation before."""
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the run")
+    parser.add_argument("--config", default="small", help="preset")
+    parser.add_argument("--steps", type=int, default=500, help="length of the run")
+    parser.add_argument("--people", type=int, default=64, help="people to train on")
+    parser.add_argument("--validation", type=int, default=8, help="people to look at")
+    parser.add_argument("--page", type=Path, default=Path("docs/training_run.md"), help="page to write")
+    parser.add_argument("--images", type=Path, default=Path("docs/images"), help="folder for its pictures")
+    arguments = parser.parse_args()
+    if min(arguments.steps, arguments.people, arguments.validation) < 1:
+        parser.error("--steps, --people and --validation must be at least 1")
+    prepare_process()
+    if train(arguments):
+        write_report(arguments.out, arguments.page, arguments.images)
+        print(f"{arguments.page}: written")
+    else:
+        print("interrupted: the same command goes on")
+
+
+def train(arguments: argparse.Namespace) -> bool:
+    """Make people, train until the end or an interruption; whether it is the end. Facts go to out/report.json."""
+    from experiments.training.data_loading import machine
+    from humangs_jax.body.library import load_body
+    from humangs_jax.people.manifest import find_people
+    from humangs_jax.people.writer import Layout, write_set
+    from humangs_jax.training.config import PRESETS
+    from humangs_jax.training.loop import train as run
+
+    config = reported(PRESETS[arguments.config](), arguments.steps)
+    people, others = arguments.out / "people", arguments.out / "validation"
+    facts = read_facts(arguments.out)
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    began = time.perf_counter()
+    for folder, count, split in ((people, arguments.people, "train"), (others, arguments.validation, "validation")):
+        write_set(folder, count, Layout(SIZE, POSES, VIEWS), split, workers=cores)
+    if (seconds := time.perf_counter() - began) > 1:  # or they were there already
+        facts["people_s"] = facts.get("people_s", 0.0) + seconds
+    facts |= {name: getattr(arguments, name) for name in ("config", "people", "validation")}
+    facts |= {"machine": machine(), "sessions": facts.get("sessions", 0) + 1}
+    write_json(arguments.out / "report.json", facts)
+
+    state = run(config, load_body(), find_people(people), arguments.out, validation=find_people(others, None))
+    facts["peak_mb"] = max(facts.get("peak_mb", 0.0), peak_rss_mb())
+    facts["load"] = os.getloadavg()[2]  # of the last quarter of an hour
+    write_json(arguments.out / "report.json", facts)
+    return int(state.step) == config.steps
+
+
+def reported(config: Any, steps: int) -> Any:
+    """The preset for a run of so many steps: ten validations, a hundred log lines, a warm-up of a tenth at most."""
+    warmup = min(config.optimizer.warmup_steps, steps // 10)
+    tenth = max(1, steps // 10)
+    return dataclasses.replace(
+        config,
+        steps=steps,
+        optimizer=dataclasses.replace(config.optimizer, warmup_steps=warmup),
+        log_every=max(1, steps // 100),
+        validate_every=tenth,
+        checkpoint_every=tenth,
+    )
+
+
+def read_facts(out: Path) -> dict[str, Any]:
+    """What earlier sessions noted; nothing at first."""
+    path = out / "report.json"
+    return json.loads(path.read_text()) if path.is_file() else {}
+
+
+def write_report(out: Path, page: Path, images: Path) -> None:
+    """The page and its pictures from a run's log, sheets, configuration and report.json."""
+    lines, facts = read_lines(out / "log.jsonl"), read_facts(out)
+    config = json.loads((out / "config.json").read_text())
+    validated = [line["step"] for line in validations_of(lines)]
+    images.mkdir(parents=True, exist_ok=True)
+    draw_curve(lines, images / "training_run.png")
+    draw_progress(out / "sheets", shown_steps(validated), config, images / "training_run_progress.jpg")
+    draw_sheet(out / "sheets", validated[-1], images / "training_run_sheet.jpg")
+    link = lambda name: Path(os.path.relpath(images / name, page.parent)).as_posix()
+    pictures = {name: link(f"training_run{name}") for name in (".png", "_progress.jpg", "_sheet.jpg")}
+    write_text(page, page_text(lines, facts, config, pictures))
+
+
+def shown_steps(validated: Sequence[int]) -> list[int]:
+    """Some of the validations: the first, the last, and between them ever fewer."""
+    count = len(validated)
+    chosen = {round((count - 1) * (i / (COLUMNS - 1)) ** 2) for i in range(COLUMNS)}
+    return [validated[i] for i in sorted(chosen)]
+
+
+def draw_progress(sheets: Path, steps: Sequence[int], config: dict[str, Any], path: Path) -> None:
+    """For every validation person a photo that the network was not shown, and what it makes of it at some steps."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    import numpy as np
+
+    pictures = [read_picture(sheets, step) for step in steps]
+    inputs = validated_count(config)
+    targets = config["views"]["target_count"]
+    side = pictures[0].shape[1] // (inputs + 2 * targets)
+    column = lambda picture, i: picture[:, i * side : (i + 1) * side]
+    strip = np.concatenate([column(pictures[0], inputs), *(column(x, inputs + 1) for x in pictures)], axis=1)
+    width = len(steps) + 1
+    figure, axis = plt.subplots(figsize=(1.7 * width, 1.7 * len(strip) / side + 0.3))
+    axis.imshow(strip, extent=(0, width, len(strip) / side, 0), interpolation="lanczos")
+    axis.set_xticks(np.arange(width) + 0.5, ["photo", *(f"step {step}" for step in steps)])
+    axis.set_yticks([])
+    axis.xaxis.tick_top()
+    axis.tick_params(length=0)
+    axis.set_frame_on(False)
+    figure.tight_layout(pad=0.2)
+    figure.savefig(path, dpi=130, pil_kwargs={"quality": 85})
+    plt.close(figure)
+
+
+def validated_count(config: dict[str, Any]) -> int:
+    """Photos of a validation, see `validation.validation_examples`."""
+    counts = sorted(config["views"]["input_counts"])
+    return counts[len(counts) // 2]
+
+
+def draw_sheet(sheets: Path, step: int, path: Path) -> None:
+    """A validation sheet as JPEG, not wider than the page."""
+    from PIL import Image
+
+    picture = Image.fromarray(read_picture(sheets, step))
+    width = min(picture.width, 1400)
+    picture.resize((width, picture.height * width // picture.width), Image.Resampling.LANCZOS).save(path, quality=85)
+
+
+def read_picture(sheets: Path, step: int) -> Any:
+    """The sheet of a step, (h, w, 3) bytes."""
+    import numpy as np
+    from PIL import Image
+
+    with Image.open(sheets / f"{step:07d}.png") as picture:
+        return np.asarray(picture.convert("RGB"))
+
+
+def page_text(
+    lines: Sequence[dict[str, Any]], facts: dict[str, Any], config: dict[str, Any], pictures: dict[str, str]
+) -> str:
+    """The page in Markdown. pictures: links by the end of their names."""
+    views, optimizer, size = config["views"], config["optimizer"], config["model"]["conventions"]["image_size"]
+    counts = " or ".join(str(count) for count in sorted(set(views["input_counts"])))
+    other = ("structural_scales", "random_background")
+    terms = [f"{value:g} {name}" for name, value in config["loss"].items() if value and name not in other]
+    parts = [
+        f"# A training run of {config['steps']} steps",
+        "Written by one command, which also makes the people and trains:",
+        "```sh\npython experiments/training/report.py --out runs/report\n```",
+        paragraph(
+            f"The preset `{facts['config']}` from fresh weights: {facts['people']} synthetic people to learn from, {POSES} poses",
+            f"x {VIEWS} views each, and {facts['validation']} of the validation seeds to look at. A step takes",
+            f"{config['batch_size']} of them: {counts} photos of {size} pixels go in, {views['target_count']}",
+            f"other views of {config['target_size']} pixels are compared. Loss: {' + '.join(terms)}. Peak learning rate",
+            f"{optimizer['learning_rate']:g} after {optimizer['warmup_steps']} steps of warm-up, then a cosine to",
+            f"0{average_text(config)}. So short a run shows that training works and what it costs; the shipped weights had a",
+            "longer one ([training](training.md)).",
+        ),
+        f"![Training loss, PSNR of training and validation views]({pictures['.png']})",
+        "A view of the first validation people that the network was not shown, and what it makes of it on the way:",
+        f"![Validation people at some steps]({pictures['_progress.jpg']})",
+        "All that is in a validation picture, here the last: input photos, then each target beside the network's view.",
+        f"![The last validation picture]({pictures['_sheet.jpg']})",
+        "## Numbers",
+        paragraph(
+            f"Training numbers are means over the log lines since the row before, {AVERAGED} at most: of views that change, half",
+            f"of them on random backgrounds. Validation numbers are of the same views of the same {facts['validation']} people",
+            "every time, on white.",
+        ),
+        markdown_table(*table_of_steps(lines)),
+        f"| | |\n|---|---|\n{facts_of_run(lines, facts, config)}",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def paragraph(*pieces: str) -> str:
+    """Wrapped text."""
+    return textwrap.fill(" ".join(pieces), 130, break_long_words=False, break_on_hyphens=False)
+
+
+def average_text(config: dict[str, Any]) -> str:
+    """What is validated, if it is an average."""
+    decay = config["ema_decay"]
+    return "" if decay is None else f"; averaged weights ({decay:g}) are validated"
+
+
+def table_of_steps(lines: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """Header and rows: one per validation."""
+    header = [
+        "step",
+        "loss",
+        "PSNR, training views",
+        "gradient norm",
+        "validation PSNR",
+        "on the person",
+        "SSIM",
+        "LPIPS",
+    ]
+    rows, before = [], 0
+    for validation in validations_of(lines):
+        step = validation["step"]
+        own = [line for line in steps_of(lines) if before < line["step"] <= step][-AVERAGED:]
+        mean = lambda name, own=own: average([line[name] for line in own if line[name] is not None])
+        lpips = validation.get("val_lpips")
+        rows.append(
+            [
+                str(step),
+                f"{mean('loss'):.4f}",
+                f"{mean('psnr'):.2f} dB",
+                f"{mean('grad_norm'):.3f}",
+                f"{validation['val_psnr']:.2f} dB",
+                f"{validation['val_psnr_mask']:.2f} dB",
+                f"{validation['val_ssim']:.4f}",
+                "no weights" if lpips is None else f"{lpips:.4f}",
+            ]
+        )
+        before = step
+    return header, rows
+
+
+def facts_of_run(lines: Sequence[dict[str, Any]], facts: dict[str, Any], config: dict[str, Any]) -> str:
+    """Rows of the table: machine, times, what went wrong."""
+    steps, validated = steps_of(lines), {line["step"] for line in validations_of(lines)}
+    total, plain, before = 0.0, [], 0
+    for line in steps:
+        # lines after a validation, and the first of a session, hold more than steps
+        if "seconds_per_step" in line:
+            total += line["seconds_per_step"] * (line["step"] - before)
+            if before > 0 and before not in validated:
+                plain.append((line["seconds_per_step"], line["data_seconds_per_step"]))
+        before = line["step"]
+    step_s, data_s = (median(values) for values in (zip(*plain, strict=True) if plain else ((), ())))
+    machine, last = facts["machine"], steps[-1]
+    dropped = {name: max(line[name] for line in steps) for name in ("dropped_tokens", "dropped_reads", "overflow")}
+    made = f" in {facts['people_s'] / 60:.1f} min" if "people_s" in facts else ""
+    cores = f"{machine['cores']} cores of {machine['architecture']} (load average {facts['load']:.1f})"
+    rows = {
+        "machine": f"{cores}, {machine['device']}, JAX {machine['jax']}",
+        "people made": f"{facts['people'] + facts['validation']}{made}",
+        "a step": f"{step_s:.2f} s, {config['batch_size'] / step_s:.2f} subjects a second (median)",
+        "of that, waiting for data": f"{data_s * 1e3:.0f} ms, {data_s / step_s:.1%}",
+        "all steps with compilation, validations and checkpoints": f"{total / 60:.1f} min in {facts['sessions']} session(s)",
+        "most memory of the process": f"{facts['peak_mb'] / 1024:.1f} GiB",
+        "steps skipped": f"{last['skipped']:.0f}",
+        "steps with anything not finite": f"{last.get('nonfinite', 0):.0f}",
+        "patches, vertices, splats without room in any logged step": ", ".join(f"{x:.0f}" for x in dropped.values()),
+    }
+    return "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+
+
+def average(values: Sequence[float]) -> float:
+    """Mean, NaN of nothing."""
+    return sum(values) / len(values) if values else float("nan")
+
+
+def median(values: Sequence[float]) -> float:
+    """The upper middle value, NaN of nothing."""
+    return sorted(values)[len(values) // 2] if values else float("nan")
+
+
+if __name__ == "__main__":
+    main()

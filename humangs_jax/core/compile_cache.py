@@ -1,0 +1,79 @@
+"""Compiled programs kept on disk between runs: a program of this package takes seconds to a minute to compile.
+
+JAX has the cache; here is where it lies, for whom, and how large it may grow.
+"""
+
+import contextlib
+import hashlib
+import os
+import platform
+import sys
+import tempfile
+from importlib.metadata import version
+from pathlib import Path
+
+VARIABLE, OF_JAX = "HUMANGS_COMPILE_CACHE", "JAX_COMPILATION_CACHE_DIR"
+LARGEST = 2 << 30
+"""Bytes; the files that were not used for longest are deleted beyond. JAX's own limit needs the package `filelock`."""
+
+
+def enable_compile_cache(folder: str | os.PathLike | None = None) -> Path | None:
+    """Turns on JAX's persistent compilation cache, in a folder of its own for each version of JAX and kind of processor.
+
+    Programs call it once, before the first computation; the library never does. Where JAX is not imported yet, it is not
+    imported here: it finds the folder in its environment variable, as do the programs that this one starts.
+
+    Arguments: folder: where the cache lies; None: what the environment variable `HUMANGS_COMPILE_CACHE` names, else
+    `humangs_jax` in the user's cache folder (`XDG_CACHE_HOME`, or what the platform has in its place).
+    Returns: the folder in use, or None where there is none: `HUMANGS_COMPILE_CACHE=0` turns the cache off, and a folder that
+    cannot be written to is no error. A cache that JAX has been given already (`JAX_COMPILATION_CACHE_DIR`) stays.
+    """
+    wish = os.environ.get(VARIABLE, "")
+    if wish == "0":
+        return None
+    if given := _folder_of_jax():
+        return Path(given)
+    try:
+        root = Path(folder or wish or _user_cache() / "humangs_jax").expanduser()
+        cache = root / f"jax-{version('jax')}-{version('jaxlib')}-{_processor()}"
+        cache.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=cache).close()
+        _delete_oldest(root, LARGEST)
+    except (OSError, RuntimeError):  # RuntimeError: no home
+        return None
+    os.environ[OF_JAX] = str(cache)
+    if "jax" in sys.modules:
+        sys.modules["jax"].config.update("jax_compilation_cache_dir", str(cache))
+    return cache
+
+
+def _folder_of_jax():
+    return sys.modules["jax"].config.jax_compilation_cache_dir if "jax" in sys.modules else os.environ.get(OF_JAX)
+
+
+def _user_cache():
+    if folder := os.environ.get("XDG_CACHE_HOME"):
+        return Path(folder)
+    if sys.platform == "win32" and (folder := os.environ.get("LOCALAPPDATA")):
+        return Path(folder)
+    return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache")
+
+
+def _processor():
+    """A short mark of the processor and its instructions: machines of a cluster share a home, not their programs."""
+    about = platform.machine() + platform.processor()
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        about += next((line for line in lines if line.startswith(("flags", "Features"))), "")
+    return hashlib.sha256(about.encode()).hexdigest()[:8]
+
+
+def _delete_oldest(root: Path, largest: int) -> None:
+    """Deletes the cached programs under `root`, of all versions, that were not used for longest, beyond `largest` bytes."""
+    files = [(file, file.stat()) for file in root.glob("jax-*/*-cache")]
+    total = sum(stat.st_size for _, stat in files)
+    for file, stat in sorted(files, key=lambda item: max(item[1].st_atime, item[1].st_mtime)):
+        if total <= largest:
+            break
+        file.unlink(missing_ok=True)  # another program may be doing the same
+        total -= stat.st_size

@@ -1,0 +1,106 @@
+"""The configuration of a network, in three: what its weights are, what they were trained with, and how it runs.
+
+Weights files record `Architecture` and `Conventions`. `Execution` belongs to the user and the machine.
+"""
+
+import dataclasses
+from typing import Any, Literal
+
+from humangs_jax.network.bilinear import PixelGrid
+from humangs_jax.network.encoder import PatchTransformer
+from humangs_jax.network.execution import Execution, TokenSelection
+from humangs_jax.network.parts import Decoder, Encoder, Reader
+from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.vertex_decoder import VertexDecoder
+
+
+@dataclasses.dataclass(frozen=True)
+class Architecture:
+    """What the weights are: the parts of the network with their sizes. It fixes the shape of every tensor."""
+
+    encoder: Encoder = dataclasses.field(default_factory=PatchTransformer)
+    reader: Reader = dataclasses.field(default_factory=PixelAlignedReader)
+    decoder: Decoder = dataclasses.field(default_factory=VertexDecoder)
+
+    def __post_init__(self):
+        """Raises ValueError for parts that do not fit together."""
+        reader, decoder = self.reader, self.decoder
+        if isinstance(reader, PixelAlignedReader) and isinstance(decoder, VertexDecoder):
+            if decoder.residual_color and not reader.sample_rgb:
+                raise ValueError("decoder.residual_color needs reader.sample_rgb: there is no photo colour to correct")
+            if reader.shells and decoder.frame != "normal":
+                raise ValueError('reader.shells lie along the normals: they need decoder.frame = "normal"')
+
+
+def paper_parts(architecture: Architecture) -> tuple[PatchTransformer, PixelAlignedReader, VertexDecoder]:
+    """The three parts of the paper's network. Raises: ValueError if one has been exchanged, naming its class."""
+    encoder, reader, decoder = architecture.encoder, architecture.reader, architecture.decoder
+    if (
+        isinstance(encoder, PatchTransformer)
+        and isinstance(reader, PixelAlignedReader)
+        and isinstance(decoder, VertexDecoder)
+    ):
+        return encoder, reader, decoder
+    names = ", ".join(type(part).__name__ for part in (encoder, reader, decoder))
+    raise ValueError(f"expected the parts of the paper's network, got {names}")
+
+
+@dataclasses.dataclass(frozen=True)
+class Conventions:
+    """What the weights were trained with. No tensor's shape depends on it; with other values the answers are worse.
+
+    image_size: side of the photos, pixels (the network takes any multiple of the patch size). tokens: patches that became
+    tokens. position_map: its shading. ray_origins: the release divides camera centres by s, and the ray origins taken from them
+    once more, so that the moments of its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex
+    (paper) or over all (release). pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn.
+    body_vertices, longest_edge: number of vertices to which bodies are decimated, and metres to which their edges are split
+    afterwards; None for neither.
+    """
+
+    image_size: int = 512
+    tokens: TokenSelection = "all"
+    position_map: Literal["plain", "gouraud"] = "plain"
+    ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
+    pool: Literal["visible", "all"] = "visible"
+    pixel_grid: PixelGrid = "half_pixel"
+    skinning: Literal["affine", "rotation"] = "affine"
+    rendering: Literal["exact", "inria"] = "exact"
+    body_vertices: int | None = None
+    longest_edge: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class HumanGSConfig:
+    """A network: see `Architecture`, `Conventions`, `Execution`, and `network.presets`."""
+
+    architecture: Architecture = dataclasses.field(default_factory=Architecture)
+    conventions: Conventions = dataclasses.field(default_factory=Conventions)
+    execution: Execution = dataclasses.field(default_factory=Execution)
+
+    def __post_init__(self):
+        """Raises ValueError for photos that the encoder cannot cut into patches."""
+        patch = getattr(self.architecture.encoder, "patch_size", 1)
+        if self.conventions.image_size % patch:
+            raise ValueError(f"image_size {self.conventions.image_size} is not a multiple of patch_size {patch}")
+
+    @property
+    def tokens(self) -> TokenSelection:
+        """The selection of tokens in force."""
+        return self.execution.tokens or self.conventions.tokens
+
+    @property
+    def trained(self) -> "HumanGSConfig":
+        """What a weights file records: this network with default execution."""
+        return dataclasses.replace(self, execution=Execution())
+
+    def with_execution(self, **changes: Any) -> "HumanGSConfig":
+        """The same network, run in another way."""
+        return dataclasses.replace(self, execution=dataclasses.replace(self.execution, **changes))
+
+    def with_conventions(self, **changes: Any) -> "HumanGSConfig":
+        """The same parts under other conventions."""
+        return dataclasses.replace(self, conventions=dataclasses.replace(self.conventions, **changes))
+
+    def with_parts(self, **changes: Any) -> "HumanGSConfig":
+        """Another network: parts exchanged."""
+        return dataclasses.replace(self, architecture=dataclasses.replace(self.architecture, **changes))

@@ -1,0 +1,136 @@
+"""Photos -> patches -> tokens of all views -> transformer -> feature maps and a global token."""
+
+import dataclasses
+from typing import Any, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
+from humangs_jax.geometry.rays import plucker_rays
+from humangs_jax.network.execution import Execution
+from humangs_jax.network.inputs import HumanGSInputs, subject_unit
+from humangs_jax.network.parts import Encoding, Pass, Variables
+from humangs_jax.network.tokenizer import Packing, Tokenizer, pack_patches, patchify, unpack_tokens
+from humangs_jax.network.transformer import INIT_STD, Transformer, TransformerConfig
+from humangs_jax.network.triplane import TriplaneConfig
+from humangs_jax.network.upsampler import Upsampler, UpsamplerConfig
+
+
+@dataclasses.dataclass(frozen=True)
+class PatchTransformer:
+    """The paper's encoder: one token per patch of every view, attention over all of them, an upsampler.
+
+    patch_size: side of a token's patch, pixels. texture: the neural texture. upsampler: None: the maps are those of the last
+    layer (ablation).
+    """
+
+    patch_size: int = 8
+    texture: TriplaneConfig = dataclasses.field(default_factory=TriplaneConfig)
+    transformer: TransformerConfig = dataclasses.field(default_factory=TransformerConfig)
+    upsampler: UpsamplerConfig | None = dataclasses.field(default_factory=UpsamplerConfig)
+
+    def __post_init__(self):
+        """Raises ValueError for sizes that do not fit together."""
+        if self.patch_size < 1:
+            raise ValueError(f"patch_size {self.patch_size}: expected at least 1")
+        layers = self.transformer.layers
+        quarters = self.upsampler is not None and self.upsampler.features == "intermediate"
+        if quarters and (layers < 4 or layers % 2):
+            raise ValueError(f"layers must be even and at least 4, to have quarters; got {layers}")
+
+    def init(self, key: Key, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{"params", "batch_stats"} of `EncoderModule`; the latter only with an upsampler."""
+        pixels = jnp.zeros((1, 2 * self.patch_size, 2 * self.patch_size, 12))
+        return cast(Variables, EncoderModule(self, run.config.execution).init(key, pixels))
+
+    def apply(self, variables: Variables, inputs: HumanGSInputs, run: Pass) -> tuple[Encoding, Variables]:
+        """See `parts.Encoder`. Raises: ValueError if images and cameras differ in size, or are not made of whole patches."""
+        pixels = run.stage("pixels", lambda: encoder_pixels(inputs, run))
+        packing, dropped = None, jnp.zeros((), jnp.int32)
+        if run.config.tokens == "foreground":
+            touched = touched_patches(inputs, self.patch_size)
+            packing = pack_patches(touched, min(run.config.execution.token_capacity or len(touched), len(touched)))
+            dropped = jnp.sum(touched, dtype=jnp.int32) - packing.count
+
+        statistics = variables.get("batch_stats", {})
+        module = EncoderModule(self, run.config.execution, run.axis_name)
+        update = run.train and bool(statistics)
+        result = module.apply(
+            variables, pixels, packing, inputs.view_count, run.train, mutable=["batch_stats"] if update else False
+        )
+        if update:
+            result, updated = cast(tuple[Any, Variables], result)
+            statistics = updated["batch_stats"]
+        maps, global_token = cast(tuple[Array, Array | None], result)
+        return Encoding(maps, global_token, dropped), statistics
+
+
+def encoder_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]:
+    """What the encoder sees of every pixel: rgb, ray (moment, direction), canonical position.
+
+    Raises ValueError if images and cameras differ in size.
+    """
+    height, width = inputs.images.shape[1:3]
+    if (inputs.cameras.width, inputs.cameras.height) != (width, height):
+        raise ValueError(
+            f"images are {width} x {height} but their cameras say {inputs.cameras.width} x {inputs.cameras.height}"
+        )
+    unit = subject_unit(inputs.canonical_vertices)
+    cameras = inputs.cameras.in_units(unit)
+    twice = run.config.conventions.ray_origins == "twice_normalized"
+    rays = jax.vmap(plucker_rays)(cameras.in_units(unit) if twice else cameras).astype(inputs.images.dtype)
+    return jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
+
+
+def touched_patches(inputs: HumanGSInputs, patch_size: int) -> Bool[Array, " p"]:
+    """Which patches of all views the foreground touches."""
+    foreground = inputs.foreground & inputs.present[:, None, None]
+    return jnp.any(patchify(foreground[..., None].astype(jnp.float32), patch_size) > 0, axis=(1, 2))
+
+
+class EncoderModule(nn.Module):
+    """Pixels of all views (v, h, w, 12: rgb, rays, canonical position) -> maps (v, h', w', d), global token."""
+
+    config: PatchTransformer
+    execution: Execution
+    axis_name: str | tuple[str, ...] | None = None
+
+    @nn.compact
+    def __call__(
+        self,
+        pixels: Float[Array, "v h w 12"],
+        packing: Packing | None = None,
+        view_count: Int[Array, ""] | None = None,
+        train: bool = False,
+    ) -> tuple[Float[Array, "v i j d"], Float[Array, " e"] | None]:
+        config, dtype = self.config, self.execution.compute_dtype
+        width, class_token = config.transformer.width, config.transformer.class_token
+        patches = patchify(pixels, config.patch_size)
+        patch_count = len(patches)
+        grid = (pixels.shape[0], pixels.shape[1] // config.patch_size, pixels.shape[2] // config.patch_size)
+        if packing is not None:
+            patches = patches.at[packing.indices].get(mode="fill", fill_value=0)
+        tokens = Tokenizer(width, config.texture, dtype, name="tokenizer")(patches)
+        count = None if view_count is None else view_count * (grid[1] * grid[2])
+        if packing is not None:
+            count = packing.count
+        if class_token:
+            first = self.param("class_token", nn.initializers.truncated_normal(INIT_STD), (1, width))
+            tokens = jnp.concatenate([first.astype(tokens.dtype), tokens])
+            count = None if count is None else count + 1
+
+        depths = Transformer(config.transformer, self.execution, name="transformer")(tokens, count)
+        global_token = depths[-1][0] if class_token else None
+        if class_token:
+            depths = [x[1:] for x in depths]
+        if config.upsampler is None or config.upsampler.features == "final":
+            depths = depths[-1:]
+        if packing is not None:
+            depths = [unpack_tokens(x, packing, patch_count) for x in depths]
+        maps = [x.reshape(*grid, width) for x in depths]
+        if config.upsampler is None:
+            return maps[0], global_token
+        present = None if view_count is None else jnp.arange(grid[0]) < view_count
+        return Upsampler(config.upsampler, dtype, self.axis_name, name="upsampler")(maps, train, present), global_token

@@ -1,0 +1,74 @@
+"""How the network runs: changes time and memory, and the result only as each field says. No weights file records it."""
+
+import dataclasses
+from typing import Any, Literal
+
+import jax.numpy as jnp
+
+from humangs_jax.core.configuration import knob
+from humangs_jax.rendering.mesh.rasterizer import RasterConfig
+
+TokenSelection = Literal["all", "foreground"]
+AttentionKernel = Literal["xla", "cudnn", "chunked"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Execution:
+    """How the network runs.
+
+    tokens: patches that become tokens: "all", those that the "foreground" touches, or None: as the weights were trained.
+    token_capacity: slots for foreground tokens over all views, 0: room for all patches (`reconstruct` fits it to the photos;
+    in training it is for the largest number of photos, see `training.forward.token_share`).
+    dtype: of the encoder's products; parameters, norms, softmax statistics and the decoder stay float32 at least.
+    attention: see `network.attention`. attention_chunk: queries per block of the chunked kernel.
+    scan: run the blocks as one compiled loop. Their parameters are copied side by side in every call (12 layers of 768: 340 MB).
+    remat: what a block recomputes in the backward pass instead of keeping it: nothing, all ("full"), or all but the results of
+    attention and of products with weights ("dots"). On a CPU only a `scan` recomputes: XLA merges what is computed twice
+    outside of loops.
+    vertex_capacity: vertices for which a view is read at most, None: all.
+    raster: buffers of the mesh rasterizer.
+    """
+
+    tokens: TokenSelection | None = knob(
+        None,
+        cost="no background in the attention: exact only for weights that were trained so",
+        gain="5 x in time at a foreground share of 0.2",
+        measured="performance_reconstruction.md",
+    )
+    token_capacity: int = knob(
+        0,
+        cost="tokens beyond it are dropped and counted",
+        gain="time and memory",
+        measured="performance_reconstruction.md",
+    )
+    dtype: Literal["float32", "bfloat16"] = knob(
+        "float32", cost="1e-2 of relative error", gain="time on accelerators; none on CPUs", measured="parity.md"
+    )
+    attention: Literal["auto"] | AttentionKernel = knob(
+        "auto",
+        cost="none",
+        gain="chunked: a third of the time on CPUs, memory linear in tokens",
+        measured="performance_reconstruction.md",
+    )
+    attention_chunk: int = knob(1024, cost="none", gain="memory", measured="performance_reconstruction.md")
+    scan: bool = knob(
+        False,
+        cost="a copy of the blocks' parameters",
+        gain="compile time on TPU and GPU",
+        measured="performance_reconstruction.md",
+    )
+    remat: Literal["none", "full", "dots"] = knob(
+        "none", cost="a third more arithmetic", gain="memory of training", measured="performance_reconstruction.md"
+    )
+    vertex_capacity: int | None = knob(
+        None,
+        cost="vertices beyond it are dropped and counted",
+        gain="none measured in a reconstruction",
+        measured="performance_reconstruction.md",
+    )
+    raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
+
+    @property
+    def compute_dtype(self) -> Any:
+        """For Linen modules; None promotes inputs and parameters, so that float64 stays float64."""
+        return jnp.bfloat16 if self.dtype == "bfloat16" else None

@@ -1,0 +1,142 @@
+"""The paper's reader: posed vertices projected into the photos, features read there, views pooled.
+
+Vertices can also read the photos themselves, at the surface and at distances along their normals (`network.shells`).
+"""
+
+import dataclasses
+import itertools
+import math
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
+from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.network.bilinear import sample_bilinear, texel_indices
+from humangs_jax.network.inputs import HumanGSInputs, subject_unit
+from humangs_jax.network.neighborhoods import KERNEL, sample_neighborhoods
+from humangs_jax.network.parts import Encoding, Pass, Variables
+from humangs_jax.network.pixel_aligned import (
+    COUNT_EPSILON,
+    dropped_reads,
+    photo_colors,
+    project_vertices,
+    sum_over_views,
+    visible_vertices,
+)
+from humangs_jax.network.shells import Shells, sample_shells
+from humangs_jax.network.upsampler import OutputConvolution
+
+
+@pytree_dataclass
+class VertexFeatures:
+    """What the photos show of each vertex.
+
+    local: (n, d) pooled feature. global_token: (e,) or None. photo_colors: (n, 3) and visible_fraction: (n,), or None.
+    shells: points off the surface, or None. normals: (n, 3) unit, of the canonical body, or None.
+    dropped_reads: vertices, summed over views, for which the vertex capacity had no room.
+    """
+
+    local: Float[Array, "n d"]
+    global_token: Float[Array, " e"] | None = None
+    photo_colors: Float[Array, "n 3"] | None = None
+    visible_fraction: Float[Array, " n"] | None = None
+    shells: Shells | None = None
+    normals: Float[Array, "n 3"] | None = None
+    dropped_reads: Int[Array, ""] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class PixelAlignedReader:
+    """What vertices read.
+
+    output_width: features of a last 3x3 convolution, evaluated only where vertices read the maps; None: the maps are read as they
+    are. sample_rgb: also read the photo colour at each vertex, averaged over the views that see it, and their fraction.
+    shells: ascending distances along the vertex normals, normalised units, at which the photos are read too; (): none.
+    """
+
+    output_width: int | None = 768
+    sample_rgb: bool = False
+    shells: tuple[float, ...] = ()
+
+    def __post_init__(self):
+        """Raises ValueError for distances that are not ascending."""
+        ascending = all(a < b for a, b in itertools.pairwise(self.shells))
+        if not (ascending and all(0 <= x < math.inf for x in self.shells)):
+            raise ValueError(f"shells {self.shells}: expected ascending distances, finite and at least 0")
+
+    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{"params"} of the output convolution; {} without one."""
+        if self.output_width is None:
+            return {}
+        channels = encoding.maps.shape[-1]
+        return cast(Variables, self.output(channels, run).init(key, jnp.zeros((1, KERNEL**2 * channels)), jnp.zeros(1)))
+
+    def output(self, channels: int, run: Pass) -> OutputConvolution:
+        """The last convolution, of maps with that many channels."""
+        assert self.output_width is not None
+        return OutputConvolution(self.output_width, channels, run.config.execution.compute_dtype)
+
+    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
+        """Features of the n vertices. Raises ValueError for shells without posed normals."""
+        conventions, capacity = run.config.conventions, run.config.execution.vertex_capacity
+        pixels, visible = project_and_test(inputs, run)
+        weights = view_weights(visible, inputs, run).astype(pixels.dtype)
+        size = (inputs.cameras.width, inputs.cameras.height)
+        maps = encoding.maps
+        indices = texel_indices(pixels, size, (maps.shape[2], maps.shape[1]), conventions.pixel_grid)
+        read = sample_bilinear if self.output_width is None else sample_neighborhoods
+        sums = sum_over_views(read, maps, indices, weights, capacity)
+        counts = jnp.sum(weights, axis=0) + COUNT_EPSILON
+        local = jax.tree.map(lambda x: jnp.einsum("n...,n->n...", x, 1 / counts), sums)
+        if self.output_width is not None:
+            local = self.output(maps.shape[-1], run).apply(variables, *local)
+        colors = fraction = None
+        if self.sample_rgb:
+            colors = photo_colors(inputs.images, pixels, visible, conventions.pixel_grid)
+            fraction = (jnp.sum(visible, axis=0) / jnp.sum(inputs.present)).astype(pixels.dtype)
+        return VertexFeatures(
+            cast(Array, local),
+            encoding.global_token,
+            photo_colors=colors,
+            visible_fraction=fraction,
+            shells=read_shells(inputs, self.shells, run) if self.shells else None,
+            normals=inputs.canonical_normals,
+            dropped_reads=dropped_reads(weights, capacity),
+        )
+
+
+def read_shells(inputs: HumanGSInputs, distances: tuple[float, ...], run: Pass) -> Shells:
+    """The photos at points off the surface. Raises ValueError if the inputs have no posed normals."""
+    if inputs.posed_normals is None:
+        raise ValueError("reader.shells needs posed_normals of the inputs, see `prepare_inputs`")
+    unit = subject_unit(inputs.canonical_vertices)
+    return sample_shells(
+        inputs.images,
+        inputs.foreground,
+        inputs.depth_maps,
+        inputs.cameras.in_units(unit),
+        inputs.posed_vertices / unit,
+        inputs.posed_normals,
+        distances,
+        inputs.present,
+        run.config.conventions.pixel_grid,
+    )
+
+
+def project_and_test(inputs: HumanGSInputs, run: Pass) -> tuple[Float[Array, "v n 2"], Bool[Array, "v n"]]:
+    """Pixel positions of the posed vertices in every view, and which of them it sees; padding sees none."""
+    unit = subject_unit(inputs.canonical_vertices)
+    cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
+    pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
+    size, grid = (cameras.width, cameras.height), run.config.conventions.pixel_grid
+    see = lambda p, z, surface: visible_vertices(p, z, surface, size, grid)
+    return pixels, jax.vmap(see)(pixels, depths, inputs.depth_maps) & inputs.present[:, None]
+
+
+def view_weights(visible: Bool[Array, "v n"], inputs: HumanGSInputs, run: Pass) -> Bool[Array, "v n"]:
+    """Which views are pooled at each vertex."""
+    if run.config.conventions.pool == "visible":
+        return visible
+    return jnp.broadcast_to(inputs.present[:, None], visible.shape)

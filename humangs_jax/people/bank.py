@@ -1,0 +1,246 @@
+"""Banks of dressed people, ready for a device: made on the host once, all of one shape, drawn from by `live.on_the_fly_example`.
+
+A bank holds people of ONE range of seeds (see `seeds`): what is drawn from a bank for training is nobody of the test range,
+whatever the key. About 3 MB a person at 512 texels a side.
+"""
+
+import concurrent.futures
+import functools
+import multiprocessing
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
+from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.npz import read_npz
+from humangs_jax.people.baking import BakedSubject, bake_subject
+from humangs_jax.people.kinematics import joint_positions
+from humangs_jax.people.poses import sample_rotations
+from humangs_jax.people.seeds import GENERATOR_VERSION, split_of
+from humangs_jax.people.subject import SyntheticSubject, make_subject
+
+FORMAT, VERSION = "humangs-people", 1
+POSE_STREAM = 20
+"""Stream of a seed that draws the poses of the bank; others than the ones of written sets."""
+UV_STEPS = 65535
+"""Texture coordinates are stored in steps of one part of this."""
+PAD_VERTICES, PAD_FACES = 1024, 2048
+"""Meshes are padded to the largest of the bank, rounded up to a multiple of these."""
+MOST_MATERIALS = 32
+
+
+@pytree_dataclass
+class PeopleBank:
+    """Dressed people p, padded to one size and stacked. Padding repeats a vertex, and faces without area.
+
+    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts, face_counts: (p,) without padding.
+    vertices: (p, n, 3) at rest, metres. normals: (p, n, 3) unit. joint_ids, joint_weights: (p, n, k).
+    faces: (p, f, 3). uvs: (p, f, 3, 2) texture coordinates of the corners, steps of 1 / `UV_STEPS`, v DOWN.
+    face_pieces: (p, f) piece of each face; of the pieces m: sheen (p, m), groups (p, m): pieces of one number are dyed
+    alike, dyeable (p, m): 1 where a piece is cloth that may have another colour.
+    texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `baking.BakedSubject`).
+    rotations: (p, q, j, 3) poses; nearest: (p, q) the pose that is most like each.
+    parents, mirrored_joints: static; the joint that is each one's mirror image. split: static, the range of the seeds. generator:
+    static, `seeds.GENERATOR_VERSION` of who made the people.
+    """
+
+    seeds: Int[Array, " p"]
+    betas: Float[Array, "p s"]
+    joints: Float[Array, "p j 3"]
+    vertex_counts: Int[Array, " p"]
+    face_counts: Int[Array, " p"]
+    vertices: Float[Array, "p n 3"]
+    normals: Float[Array, "p n 3"]
+    joint_ids: UInt8[Array, "p n k"]
+    joint_weights: Float[Array, "p n k"]
+    faces: UInt[Array, "p f 3"]
+    uvs: UInt[Array, "p f 3 2"]
+    face_pieces: UInt8[Array, "p f"]
+    sheen: Float[Array, "p m"]
+    groups: UInt8[Array, "p m"]
+    dyeable: Float[Array, "p m"]
+    texture: UInt8[Array, "p t t 6"]
+    rotations: Float[Array, "p q j 3"]
+    nearest: Int[Array, "p q"]
+    parents: tuple[int, ...] = static_field(default=())
+    mirrored_joints: tuple[int, ...] = static_field(default=())
+    split: str = static_field(default="")
+    generator: int = static_field(default=GENERATOR_VERSION)
+
+    @property
+    def people(self) -> int:
+        """How many people there are."""
+        return self.betas.shape[0]
+
+    @property
+    def size_bytes(self) -> int:
+        """Memory that the arrays take."""
+        return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(self))
+
+
+def build_bank(
+    seeds: list[int] | range,
+    body: BodyModel,
+    split: str,
+    *,
+    texture_size: int = 512,
+    pose_count: int = 16,
+    processes: int = 1,
+    progress: bool = False,
+) -> PeopleBank:
+    """The people of some seeds, which must all lie in the range `split` of `seeds.SPLITS`.
+
+    texture_size: texels a side, a multiple of 128; 512 suits pictures up to 256 pixels, 1024 those of 512.
+    processes: how many work at once; with more than one, each loads the shipped body itself.
+    Raises: ValueError if there are no seeds, a seed lies in another range, or the body is not the package's own.
+    """
+    seeds = list(seeds)
+    if not seeds:
+        raise ValueError("no seeds")
+    for seed in seeds:
+        if split_of(seed) != split:
+            raise ValueError(f"seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
+    from tqdm import tqdm
+
+    make = functools.partial(_person, texture_size=texture_size, pose_count=pose_count)
+    bar = functools.partial(tqdm, total=len(seeds), desc="bank", disable=not progress)
+    if processes == 1:
+        people = list(bar(make(seed, body) for seed in seeds))
+    else:
+        context = multiprocessing.get_context("spawn")  # a forked process may hang in jax's threads
+        with concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
+            people = list(bar(pool.map(make, seeds)))
+    return _stacked(people, body, split)
+
+
+def save_bank(path: str | Path, bank: PeopleBank) -> None:
+    """Write one .npz, whole or not at all."""
+    fields = {name: np.asarray(getattr(bank, name)) for name in _ARRAYS}
+    fields |= {"parents": np.asarray(bank.parents), "mirrored_joints": np.asarray(bank.mirrored_joints)}
+    fields |= {"format": np.asarray(FORMAT), "version": np.asarray(VERSION), "split": np.asarray(bank.split)}
+    fields |= {"generator": np.asarray(bank.generator)}
+    replace_file(path, lambda temporary: np.savez_compressed(temporary, **fields))  # ty: ignore[invalid-argument-type]
+
+
+def load_bank(path: str | Path) -> PeopleBank:
+    """Read a bank. Raises: FileNotFoundError; OSError if it is no archive; ValueError if it holds no bank."""
+    arrays, _ = read_npz(path)
+    if str(arrays.get("format")) != FORMAT:
+        raise ValueError(f"{path}: not a bank of people")
+    if int(arrays["version"]) != VERSION:
+        raise ValueError(f"{path}: a bank of version {int(arrays['version'])}; this program reads version {VERSION}")
+    if missing := {*_ARRAYS, *_STATIC} - set(arrays):
+        raise ValueError(f"{path}: a bank without {sorted(missing)}")
+    split = str(arrays["split"])
+    for seed in arrays["seeds"].tolist():
+        if split_of(seed) != split:
+            raise ValueError(f"{path}: seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
+    return PeopleBank(
+        **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
+        parents=tuple(arrays["parents"].tolist()),
+        mirrored_joints=tuple(arrays["mirrored_joints"].tolist()),
+        split=split,
+        generator=int(arrays["generator"]),
+    )
+
+
+_STATIC = ("parents", "mirrored_joints", "split", "generator")
+_ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in _STATIC)
+
+_shipped_body: list[BodyModel] = []
+
+
+def _person(seed, body=None, *, texture_size, pose_count):
+    """One subject's share of the bank, unpadded: name -> array."""
+    if body is None:  # in a process of its own
+        if not _shipped_body:
+            from humangs_jax.body.library import load_body
+
+            _shipped_body.append(load_body())
+        body = _shipped_body[0]
+    subject = make_subject(seed, body)
+    samples = 2 if texture_size <= 512 else 1  # fine patterns are averaged where texels are coarse
+    return _arrays(subject, bake_subject(subject, texture_size, samples), pose_count)
+
+
+def _arrays(subject: SyntheticSubject, baked: BakedSubject, pose_count):
+    if len(subject.materials) > MOST_MATERIALS or len(baked.vertices) > np.iinfo(np.uint16).max:
+        raise ValueError(
+            f"seed {subject.seed}: {len(subject.materials)} pieces, {len(baked.vertices)} vertices: too many"
+        )
+    uvs = baked.atlas.uvs[baked.atlas.faces]
+    uvs = np.round(UV_STEPS * np.stack([uvs[..., 0], 1 - uvs[..., 1]], -1)).astype(np.uint16)
+    pad = lambda values: np.pad(np.asarray(values), (0, MOST_MATERIALS - len(subject.materials)))
+    identities = [id(material) for material in subject.materials]
+    rotations = sample_poses(subject, pose_count)
+    return {
+        "seeds": np.int32(subject.seed),
+        "betas": baked.betas,
+        "joints": subject.build.joints.astype(np.float32),
+        "vertex_counts": np.int32(len(baked.vertices)),
+        "face_counts": np.int32(len(baked.faces)),
+        "vertices": baked.vertices.astype(np.float32),
+        "normals": baked.normals.astype(np.float16),
+        "joint_ids": baked.joint_ids,
+        "joint_weights": baked.joint_weights.astype(np.float16),
+        "faces": baked.faces.astype(np.uint16),
+        "uvs": uvs,
+        "face_pieces": baked.face_materials.astype(np.uint8),
+        "sheen": pad([material.sheen for material in subject.materials]).astype(np.float32),
+        "groups": pad([identities.index(i) for i in identities]).astype(np.uint8),
+        "dyeable": pad([material.wrinkles > 0 for material in subject.materials]).astype(np.float32),
+        "texture": np.concatenate([baked.albedo, baked.slopes], axis=-1),
+        "rotations": rotations,
+        "nearest": _nearest(subject.build, rotations),
+    }
+
+
+def sample_poses(subject: SyntheticSubject, count: int) -> Float[np.ndarray, "q j 3"]:
+    """(q, j, 3) poses of a subject by the prior."""
+    generators = (np.random.default_rng([subject.seed, POSE_STREAM, i]) for i in range(count))
+    return np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(np.float32)
+
+
+def _nearest(build, rotations):
+    """(q,) for each pose the other one whose joints are nearest to its own."""
+    places = np.stack([joint_positions(build, r.astype(np.float64))[1] for r in rotations])
+    away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(-1) + 1e9 * np.eye(len(places))
+    return np.argmin(away, axis=1).astype(np.int32)
+
+
+def _stacked(people, body: BodyModel, split) -> PeopleBank:
+    vertices = -(-max(len(p["vertices"]) for p in people) // PAD_VERTICES) * PAD_VERTICES
+    faces = -(-max(len(p["faces"]) for p in people) // PAD_FACES) * PAD_FACES
+    lengths = {"vertices": vertices, "normals": vertices, "joint_ids": vertices, "joint_weights": vertices}
+    lengths |= {"faces": faces, "uvs": faces, "face_pieces": faces}
+
+    def padded(name, array):
+        if name not in lengths:
+            return array
+        extra = lengths[name] - len(array)
+        if name in ("faces", "uvs", "face_pieces"):
+            return np.pad(array, [(0, extra)] + [(0, 0)] * (array.ndim - 1))
+        return np.concatenate([array, np.repeat(array[:1], extra, axis=0)])
+
+    fields: dict[str, Any] = {}
+    for name in _ARRAYS:
+        fields[name] = jnp.asarray(np.stack([padded(name, p[name]) for p in people]))
+    return PeopleBank(
+        **fields,
+        parents=body.parents,
+        mirrored_joints=mirrored_joints(body.joint_names),
+        split=split,
+    )
+
+
+def mirrored_joints(names: tuple[str, ...]) -> tuple[int, ...]:
+    """For each joint the one on the other side; joints in the middle are their own."""
+    other = {"left": "right", "right": "left"}
+    swapped = [f"{other[n.split('_')[0]]}_{n.split('_', 1)[1]}" if n.split("_")[0] in other else n for n in names]
+    return tuple(names.index(name) for name in swapped)

@@ -1,0 +1,351 @@
+"""People on the fly: a pure, jittable function of a key, from a bank of dressed people to views to learn from.
+
+A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two similar poses of the
+person's own), light and cameras, and draws the views with the project's rasterizer. The same key gives the same bits on the
+same platform; only jax.numpy runs, on CPU, GPU and TPU. Differences from `rendering.render_view`: colours come from baked
+textures, normals are skinned instead of measured, vertices follow a few joints each.
+
+    bank = load_bank("people.npz")
+    example = jax.jit(on_the_fly_example, static_argnames="config")(bank, key, OnTheFlyConfig())
+    batch = jax.vmap(on_the_fly_example, in_axes=(None, 0, None))(bank, keys, OnTheFlyConfig())
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from humangs_jax.body.skinning import joint_transforms
+from humangs_jax.core.array_types import Array, Float, Int, Key, UInt8
+from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.data.loading.examples import Example
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.people.baking import SLOPE_STEP, SLOPE_ZERO
+from humangs_jax.people.bank import UV_STEPS, PeopleBank
+from humangs_jax.people.cameras import CAMERA_NUMBERS, azimuths_from, camera_from, pick
+from humangs_jax.people.kinematics import MIRROR
+from humangs_jax.people.shading import (
+    LIGHT_NUMBERS,
+    Lights,
+    dyes_from,
+    light_points,
+    lights_from,
+    seen_from_behind,
+    shaded_vertices,
+)
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.rendering.tiling import cumsum
+
+MIXING = 0.5
+"""Farthest that a pose is moved towards the nearest one: everything between the two is then reached from one of them."""
+
+
+def rotations_from(u: Float[Array, "2"], bank: PeopleBank, person: Int[Array, ""]) -> Float[Array, "j 3"]:
+    """(j, 3) rotation vectors of a pose of a person; u in [0, 1) says which and how far on the way to the next."""
+    pose = pick(u[0], bank.rotations.shape[1])
+    other = bank.nearest[person, pose]
+    return between(bank.rotations[person, pose], bank.rotations[person, other], MIXING * u[1])
+
+
+def between(a: Float[Array, "j 3"], b: Float[Array, "j 3"], amount: Float[Array, ""] | float) -> Float[Array, "j 3"]:
+    """Rotation vectors on the shortest way from a (amount 0) to b (amount 1), joint by joint (slerp)."""
+    p, q = quaternion.from_axis_angle(a), quaternion.from_axis_angle(b)
+    cosine = jnp.sum(p * q, -1, keepdims=True)
+    q = jnp.where(cosine < 0, -q, q)
+    angle = jnp.arccos(jnp.clip(jnp.abs(cosine), 0, 1))
+    near = angle < 1e-3
+    sine = jnp.where(near, 1.0, jnp.sin(angle))
+    mixed = (
+        jnp.where(near, 1 - amount, jnp.sin((1 - amount) * angle) / sine) * p
+        + jnp.where(near, amount, jnp.sin(amount * angle) / sine) * q
+    )
+    return quaternion.to_axis_angle(mixed)
+
+
+def pose_person(
+    bank: PeopleBank, person: Int[Array, ""], rotations: Float[Array, "j 3"]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "3"]]:
+    """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the translation (3,)."""
+    nowhere = jnp.zeros(3, rotations.dtype)
+    transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[:, :3].reshape(-1, 12)
+    blended = _blend(transforms, bank.joint_ids[person], bank.joint_weights[person].astype(rotations.dtype))
+    x, y, z = jnp.split(bank.vertices[person], 3, axis=-1)
+    nx, ny, nz = jnp.split(bank.normals[person].astype(rotations.dtype), 3, axis=-1)
+    # written out: matrix products are of low precision on GPU and TPU
+    vertices = blended[:, 0::4] * x + blended[:, 1::4] * y + blended[:, 2::4] * z + blended[:, 3::4]
+    normals = blended[:, 0::4] * nx + blended[:, 1::4] * ny + blended[:, 2::4] * nz
+    translation = nowhere.at[1].set(-vertices[:, 1].min())
+    return vertices + translation, normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9), translation
+
+
+def _blend(transforms: Float[Array, "j 12"], ids: UInt8[Array, "n k"], weights: Float[Array, "n k"]):
+    """(n, 12) rows of the vertices' blended transforms. Weights are stored in few bits: their sum is made 1 again."""
+    weights = weights / weights.sum(-1, keepdims=True)
+    return sum(weights[:, i : i + 1] * transforms[ids[:, i].astype(jnp.int32)] for i in range(ids.shape[1]))
+
+
+BACKGROUND = 1.0
+DARKEST_ALBEDO = 0.01
+
+
+@dataclasses.dataclass(frozen=True)
+class OnTheFlyConfig:
+    """What an example shows.
+
+    input_views, target_views; input_size, target_size: pixels a side. poses: poses per example; targets show any of them.
+    mixed_pose_share: share of examples whose inputs show any of the poses too, each; otherwise all show the first.
+    jitter, scattered_share: see `live_camera.azimuths_from`. close_share: share of close cameras among the targets.
+    mirrored_share, dyed_share: of examples. supersampling: samples a side of each pixel.
+    views_at_once: views drawn side by side: 1 suits CPUs, all of them accelerators. pixels_per_step: of the person, that are
+    coloured at a time: few suit CPUs, whole pictures accelerators.
+    """
+
+    input_views: int = 4
+    target_views: int = 3
+    input_size: int = 256
+    target_size: int = 256
+    poses: int = 2
+    mixed_pose_share: float = 0.3
+    jitter: float = 0.7
+    scattered_share: float = 0.2
+    close_share: float = 0.2
+    mirrored_share: float = 0.5
+    dyed_share: float = 0.7
+    supersampling: int = 2
+    views_at_once: int = 1
+    pixels_per_step: int = 1 << 14
+
+
+ON_THE_FLY = OnTheFlyConfig()
+
+
+@pytree_dataclass
+class Scene:
+    """A person as a key has them stand there, in several poses o; what all views of an example share.
+
+    person: () index in the bank. rotations: (o, j, 3). translations: (o, 3). vertices: (o, n, 3) metres.
+    corners: (o, f, 15) of every face's corners normal, openness and share of the key light that arrives.
+    dyes: (m, 3, 3) what turns the colours of every piece. lights.
+    """
+
+    person: Int[Array, ""]
+    rotations: Float[Array, "o j 3"]
+    translations: Float[Array, "o 3"]
+    vertices: Float[Array, "o n 3"]
+    corners: Float[Array, "o f 15"]
+    dyes: Float[Array, "m 3 3"]
+    lights: Lights
+
+
+def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
+    """Views of somebody of the bank: some shown, others asked for."""
+    numbers = _draw_numbers(bank, key, config)
+    scene = scene_from(numbers, bank, config)
+    plans = _input_plan(numbers, config), _target_plan(numbers, config)
+    if config.input_size == config.target_size:  # one loop over all views: half of the compilation
+        both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *plans)
+        views = _views(bank, scene, both, config, config.input_size)
+        parts = [_some(views, part) for part in (slice(config.input_views), slice(config.input_views, None))]
+    else:
+        sizes = config.input_size, config.target_size
+        parts = [_views(bank, scene, plan, config, size) for plan, size in zip(plans, sizes, strict=True)]
+    flipped = numbers["mirrored"] < config.mirrored_share
+    choose = lambda a, b: jnp.where(flipped, a, b)
+    return Example(*(jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts))
+
+
+def draw_scene(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Scene:
+    """What the views of `on_the_fly_example` of this key show."""
+    return scene_from(_draw_numbers(bank, key, config), bank, config)
+
+
+def _draw_numbers(bank, key, config):
+    """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
+    inputs, targets = config.input_views, config.target_views
+    shapes = {
+        "person": (),
+        "poses": (config.poses, 2),
+        "lights": (LIGHT_NUMBERS,),
+        "dyed": (),
+        "dyes": (4, bank.groups.shape[1]),
+        "mirrored": (),
+        "mixed": (),
+        "input_azimuths": (2 + 2 * inputs,),
+        "input_poses": (inputs,),
+        "input_cameras": (inputs, CAMERA_NUMBERS),
+        "target_azimuths": (2 + 2 * targets,),
+        "target_poses": (targets,),
+        "target_cameras": (targets, CAMERA_NUMBERS),
+    }
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
+    parts = jnp.split(jax.random.uniform(key, (ends[-1],)), ends[:-1])
+    return {name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
+
+
+def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: OnTheFlyConfig) -> Scene:
+    """Who, in which poses, colours and light; numbers in [0, 1) by name."""
+    person = pick(numbers["person"], bank.people)
+    rotations = jax.vmap(lambda u: rotations_from(u, bank, person))(numbers["poses"])
+    dyes = dyes_from(numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
+    dyes = jnp.where(numbers["dyed"] < config.dyed_share, dyes, jnp.eye(3))
+    return make_scene(bank, person, rotations, lights_from(numbers["lights"]), dyes)
+
+
+def make_scene(
+    bank: PeopleBank,
+    person: Int[Array, ""],
+    rotations: Float[Array, "o j 3"],
+    lights: Lights,
+    dye: Float[Array, "m 3 3"],
+) -> Scene:
+    """A person of the bank in given poses, light and dyes."""
+    faces = bank.faces[person].astype(jnp.int32)
+
+    def pose(rotations):
+        vertices, normals, translation = pose_person(bank, person, rotations)
+        openness, lit = shaded_vertices(vertices, normals, lights.directions[0], faces)
+        values = jnp.concatenate([normals, openness[:, None], lit[:, None]], axis=-1)
+        return vertices, translation, values[faces].reshape(faces.shape[0], 15)
+
+    vertices, translations, corners = lax.map(pose, rotations)
+    return Scene(person, rotations, translations, vertices, corners, dye, lights)
+
+
+class _Plan(NamedTuple):
+    """Views to draw (v,): numbers for their cameras (v, c), azimuths, numbers of poses, shares of close cameras."""
+
+    cameras: Float[Array, "v c"]
+    azimuths: Float[Array, " v"]
+    poses: Int[Array, " v"]
+    close_shares: Float[Array, " v"]
+
+
+def _input_plan(numbers, config):
+    azimuths = azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share)
+    mixed = numbers["mixed"] < config.mixed_pose_share
+    poses = jnp.where(mixed, pick(numbers["input_poses"], config.poses), 0)
+    return _Plan(numbers["input_cameras"], azimuths, poses, jnp.zeros(config.input_views))
+
+
+def _target_plan(numbers, config):
+    azimuths = azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
+    close_shares = jnp.full(config.target_views, config.close_share)
+    return _Plan(numbers["target_cameras"], azimuths, pick(numbers["target_poses"], config.poses), close_shares)
+
+
+def _views(bank, scene, plan: _Plan, config, size):
+    """Views of some of the scene's poses."""
+
+    def view(plan):
+        vertices, count = scene.vertices[plan.poses], bank.vertex_counts[scene.person]
+        camera = camera_from(plan.cameras, vertices, count, plan.azimuths, plan.close_shares, size)
+        return *draw_view(bank, scene, plan.poses, camera, config), camera
+
+    images, masks, cameras = lax.map(view, plan, batch_size=_batch(config, len(plan.poses)))
+    return SubjectViews(
+        images, masks, cameras, scene.rotations[plan.poses], scene.translations[plan.poses], bank.betas[scene.person]
+    )
+
+
+def _some(views, part):
+    """Views of a range; betas have no axis of views."""
+    chosen = jax.tree.map(lambda x: x[part], replace(views, betas=None))
+    return replace(chosen, betas=views.betas)
+
+
+def _batch(config, count):
+    return None if config.views_at_once == 1 else min(config.views_at_once, count)
+
+
+def draw_view(
+    bank: PeopleBank, scene: Scene, pose: Int[Array, ""], camera: Camera, config: OnTheFlyConfig = ON_THE_FLY
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
+    """(h, w, 3) picture on white and (h, w) coverage of one of the scene's poses, both in [0, 1]."""
+    s = config.supersampling
+    fine = camera.resized(camera.width * s, camera.height * s)
+    vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
+    fragments = rasterize_mesh(vertices, faces, fine)
+    behind = seen_from_behind(vertices, faces, camera.center)
+    colors = _light_pixels(bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step)
+    covered = (fragments.face_ids >= 0).reshape(-1, 1).astype(colors.dtype)
+    return _box_average(colors, camera, s), _box_average(covered, camera, s)[..., 0]
+
+
+def _box_average(samples, camera, s):
+    """Means (h, w, c) of s x s samples (h s w s, c); added one by one: XLA's CPU backend reduces two axes slowly."""
+    samples = samples.reshape(camera.height, s, camera.width, s, -1)
+    return sum(samples[:, i, :, j] for i in range(s) for j in range(s)) / (s * s)
+
+
+def _light_pixels(bank, scene, corners, behind, fragments, step):
+    """(h w, 3) colours of all pixels, white where nobody is; covered ones `step` at a time, as many steps as it takes."""
+    ids, weights = fragments.face_ids.reshape(-1), fragments.barycentrics.reshape(-1, 3)
+    covered = ids >= 0
+    count = ids.shape[0]
+    step = min(step, count)
+    place = jnp.where(covered, cumsum(covered.astype(jnp.int32)) - 1, count)
+    # the numbers of the covered pixels in order; steps may reach beyond their end, where "no pixel" is
+    listed = jnp.full(-(-count // step) * step, count, jnp.int32).at[place].set(jnp.arange(count), mode="drop")
+    total = jnp.sum(covered, dtype=jnp.int32)
+
+    def light(state):
+        start, colors = state
+        pixels = lax.dynamic_slice_in_dim(listed, start, step)
+        face, weight = jnp.maximum(ids.at[pixels].get(mode="fill", fill_value=0), 0), weights[pixels]
+        lit = _color_points(bank, scene, corners[face], face, weight, behind[face])
+        return start + step, colors.at[pixels].set(lit, mode="drop")
+
+    blank = jnp.full((count, 3), BACKGROUND, weights.dtype)
+    return lax.while_loop(lambda state: state[0] < total, light, (jnp.zeros((), jnp.int32), blank))[1]
+
+
+def _color_points(bank, scene, corners, faces, weights, behind):
+    """(p, 3) colours of points on faces (p,): corners (p, 15), see `Scene`; their weights (p, 3); inner sides (p,)."""
+    person = scene.person
+    wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
+    uv = bank.uvs[person, faces].astype(weights.dtype)
+    painted = _sample(bank.texture, person, (wa * uv[:, 0] + wb * uv[:, 1] + wc * uv[:, 2]) / UV_STEPS)
+    pieces = bank.face_pieces[person, faces].astype(jnp.int32)
+    dye = scene.dyes[pieces]
+    albedo = sum(painted[:, i : i + 1] * dye[:, :, i] for i in range(3)) / 255
+    slopes = (painted[:, 3:] - SLOPE_ZERO) * SLOPE_STEP
+    albedo, sheen = jnp.clip(albedo, DARKEST_ALBEDO, None), bank.sheen[person, pieces]
+    return light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
+
+
+def _sample(texture, person, at):
+    """(p, 6) texture of a person at (p, 2) places in [0, 1], v down, bilinear; bytes as floats."""
+    size = texture.shape[1]
+    at = jnp.clip(at * size - 0.5, 0, size - 1)
+    low = jnp.floor(at)
+    along = at - low
+    column, row = low[:, 0].astype(jnp.int32), low[:, 1].astype(jnp.int32)
+    right, below = jnp.minimum(column + 1, size - 1), jnp.minimum(row + 1, size - 1)
+    texel = lambda r, c: texture[person, r, c].astype(at.dtype)
+    x, y = along[:, :1], along[:, 1:]
+    upper = texel(row, column) * (1 - x) + texel(row, right) * x
+    lower = texel(below, column) * (1 - x) + texel(below, right) * x
+    return upper * (1 - y) + lower * y
+
+
+def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
+    """The views of a world with left and right exchanged; joints: each one's mirror image. Batched cameras."""
+    flip = jnp.asarray(MIRROR, views.images.dtype)
+    side = jnp.asarray([-1.0, 1.0, 1.0], views.images.dtype)
+    camera = views.cameras
+    K = camera.K.at[..., 0, 2].set(camera.width - camera.K[..., 0, 2])
+    signs = jnp.concatenate([side, jnp.ones(1, side.dtype)])
+    return replace(
+        views,
+        images=views.images[..., :, ::-1, :],
+        masks=views.masks[..., :, ::-1],
+        cameras=replace(camera, K=K, cam_from_world=camera.cam_from_world * signs[:, None] * signs),
+        rotations=views.rotations[..., jnp.asarray(joints), :] * flip,
+        translations=views.translations * side,
+    )

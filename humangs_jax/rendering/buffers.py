@@ -1,0 +1,110 @@
+"""Capacities of the renderer's buffers: shapes are static, so how many pairs fit is decided before drawing.
+
+A call outside of transformations measures what its scene needs. A traced call cannot measure: it takes `default_pairs`, or
+what `plan_buffers` has measured on a scene like its own. What does not fit is counted (`Rendering.overflow`), and eager
+calls raise `BufferOverflowError`.
+"""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.sharding import Mesh
+
+from humangs_jax.core.array_types import Array, Int
+from humangs_jax.core.numerics import at_least_float32
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering import binning
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.projection import drawn_camera, project_gaussians
+from humangs_jax.rendering.sharing import device_count
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
+from humangs_jax.rendering.tiling import TileGrid
+
+PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
+"""Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024
+x 1024, where its 16,384 tiles add another 5 each."""
+
+STEPS_PER_OCTAVE = 4
+"""Sizes that `round_up` knows per power of two."""
+
+
+class BufferOverflowError(ValueError):
+    """A view needs larger buffers than its configuration has."""
+
+
+def round_up(size: int, smallest: int = 64) -> int:
+    """The next (4, 5, 6 or 7) 2^i, at least `smallest`: similar scenes share one compilation, at most a fifth is spare."""
+    size = max(size, smallest)
+    unit = 1 << max(0, (size - 1).bit_length() - STEPS_PER_OCTAVE.bit_length())
+    return -(-size // unit) * unit
+
+
+def default_pairs(g: int, width: int, height: int, tile_size: int = 8) -> int:
+    """`max_pairs` of a traced call that gives None: enough for a person, never more than can be needed.
+
+    g: Gaussians. width, height, tile_size: pixels.
+    """
+    tiles = TileGrid(width, height, tile_size).tiles
+    return max(1, min(g * tiles, PAIRS_PER_GAUSSIAN * g + PAIRS_PER_TILE * tiles))
+
+
+def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConfig) -> SplatConfig:
+    """`config`, with `default_pairs` if it leaves `max_pairs` open; for traced calls."""
+    if config.max_pairs is not None:
+        return config
+    drawn = drawn_camera(camera, config)
+    pairs = default_pairs(gaussians.means.shape[0], drawn.width, drawn.height, config.tile_size)
+    return dataclasses.replace(config, max_pairs=pairs)
+
+
+def plan_buffers(
+    gaussians: Gaussians,
+    cameras: Camera,
+    config: SplatConfig = DEFAULT_CONFIG,
+    margin: float = 1.25,
+    mesh: Mesh | None = None,
+) -> SplatConfig:
+    """`config` with buffers for one camera, or for the most demanding one of a batch, times `margin`.
+
+    Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. Measures concrete arrays:
+    call it outside of transformations. mesh: the one that `render` will be given, if any.
+    """
+    rows, pairs = (round_up(int(most * margin)) for most in _needed(gaussians, cameras, config, mesh))
+    return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
+
+
+def raise_on_overflow(
+    overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig, mesh: Mesh | None
+) -> None:
+    """Raises BufferOverflowError, which says what is needed, if a view has overflowed."""
+    if missing := int(jnp.max(overflow, initial=0)):
+        rows, pairs = _needed(gaussians, cameras, config, mesh)
+        raise BufferOverflowError(
+            f"{missing} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs} "
+            f"and max_rows >= {rows}, got max_pairs = {config.max_pairs}, max_rows = {config.max_rows}"
+        )
+
+
+def _needed(gaussians, cameras, config, mesh):
+    """Most rows and most pairs that any of the views needs, on any of the devices that share them."""
+    gaussians, cameras = at_least_float32((gaussians, cameras))
+    config = dataclasses.replace(config, max_pairs=None, max_rows=None)  # they play no part: one program for all
+    return [int(most) for most in _count(gaussians, cameras, config, device_count(mesh))]
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def _count(gaussians, cameras, config, shares):
+    def one(camera):
+        projected = project_gaussians(gaussians, camera, config)
+        camera = drawn_camera(camera, config)
+        footprints = binning.footprints_by(projected, gaussians.opacities, config)
+        grid = TileGrid(camera.width, camera.height, config.tile_size)
+        counts = (binning.count_pairs(footprints, grid, binning.Share(i, shares)) for i in range(shares))
+        return [jnp.max(jnp.stack(most)) for most in zip(*counts, strict=True)]
+
+    if not cameras.batch_shape:
+        return one(cameras)
+    return [jnp.max(most, initial=0) for most in lax.map(one, cameras)]

@@ -1,0 +1,92 @@
+"""The cache of compiled programs: where it lies, what turns it off, and how it stays small."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import pytest
+
+from humangs_jax.core import compile_cache
+from humangs_jax.core.compile_cache import OF_JAX, VARIABLE, enable_compile_cache
+
+USE = """
+import sys
+from humangs_jax.core.compile_cache import enable_compile_cache
+print(enable_compile_cache(), "jax" in sys.modules)
+import jax, jax.numpy as jnp
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+jax.jit(lambda x: jnp.sin(x) @ x)(jnp.ones((8, 8))).block_until_ready()
+"""
+
+
+@pytest.fixture(autouse=True)
+def no_cache(monkeypatch, tmp_path):
+    """As in a program that has not heard of a cache; the tests' own comes back."""
+    before = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", None)
+    for name in (VARIABLE, OF_JAX):
+        monkeypatch.setenv(name, "")  # so that it is put back even if it was not there
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "home"))
+    yield
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_it_lies_in_the_users_cache_folder_by_version(tmp_path):
+    folder = enable_compile_cache()
+    assert folder is not None and folder.parent == tmp_path / "home" / "humangs_jax" and folder.is_dir()
+    assert jax.__version__ in folder.name and jax.config.jax_compilation_cache_dir == str(folder)
+    assert not list(folder.iterdir())
+
+
+def test_the_environment_turns_it_off_or_moves_it(tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, "0")
+    assert enable_compile_cache() is None and enable_compile_cache(tmp_path) is None
+    assert jax.config.jax_compilation_cache_dir is None and not (tmp_path / "home").exists()
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "there"))
+    folder = enable_compile_cache()
+    assert folder is not None and folder.parent == tmp_path / "there"
+
+
+def test_an_argument_comes_before_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv(VARIABLE, str(tmp_path / "there"))
+    folder = enable_compile_cache(tmp_path / "here")
+    assert folder is not None and folder.parent == tmp_path / "here"
+
+
+def test_a_cache_that_jax_has_already_stays(tmp_path):
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    assert enable_compile_cache() == tmp_path and jax.config.jax_compilation_cache_dir == str(tmp_path)
+
+
+def test_a_folder_that_cannot_be_written_is_no_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    assert enable_compile_cache(tmp_path / "file") is None
+    assert jax.config.jax_compilation_cache_dir is None
+
+
+def test_the_programs_used_last_are_kept(tmp_path, monkeypatch):
+    old = tmp_path / "jax-0.1" / "a-cache"
+    old.parent.mkdir()
+    files = [old, *(enable_compile_cache(tmp_path) / f"{name}-cache" for name in "bc")]
+    for age, file in zip((30, 10, 20), files, strict=True):
+        file.write_bytes(bytes(100))
+        os.utime(file, (1e9 - age, 1e9 - age))
+    other = tmp_path / "jax-0.1" / "notes.txt"
+    other.write_bytes(bytes(1000))
+    jax.config.update("jax_compilation_cache_dir", None)
+    monkeypatch.setattr(compile_cache, "LARGEST", 150)
+    enable_compile_cache(tmp_path)
+    assert [file.exists() for file in (*files, other)] == [False, True, False, True]
+
+
+def test_a_second_program_finds_what_the_first_one_compiled(tmp_path):
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
+    environment |= {VARIABLE: str(tmp_path), "JAX_PLATFORMS": "cpu"}
+    seen = []
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", USE], env=environment, capture_output=True, text=True, check=True)
+        seen.append({file.name: file.stat().st_mtime_ns for file in tmp_path.glob("jax-*/*-cache")})
+    assert done.stdout.startswith(str(tmp_path)) and done.stdout.endswith(" False\n") and done.stderr == ""
+    assert len(seen[0]) > 0 and seen[0] == seen[1]

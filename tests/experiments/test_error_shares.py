@@ -1,0 +1,41 @@
+"""Where errors are, of pictures whose errors are known."""
+
+import numpy as np
+import pytest
+
+from experiments.evaluation import error_shares
+
+
+def picture(size=48, half=12):
+    """A grey square on white: colours, coverage."""
+    alpha = np.zeros((size, size))
+    alpha[size // 2 - half : size // 2 + half, size // 2 - half : size // 2 + half] = 1
+    return np.where(alpha[..., None] > 0, 0.4, 1.0) * np.ones(3), alpha
+
+
+NAMES = ("share at the outline", "share in holes", "share in colours", "share around the person")
+
+
+@pytest.mark.parametrize("place", NAMES)
+def test_an_error_is_counted_where_it_is(place):
+    image, mask = picture()
+    rgb, alpha = image.copy(), mask.copy()
+    if place == "share at the outline":
+        rgb, alpha = picture(half=11)
+    elif place == "share in holes":
+        rgb[24, 24], alpha[24, 24] = 1, 0
+    elif place == "share in colours":
+        rgb[24, 24] = 0.9
+    else:
+        rgb[2, 2], alpha[2, 2] = 0.4, 1
+    found = error_shares.shares(rgb, alpha, image, mask)
+    assert found["squared error"] > 0 and np.isclose(found[place], found["squared error"])
+    assert all(found[name] == 0 for name in NAMES if name != place)
+
+
+def test_under_the_true_coverage_only_the_colours_count():
+    image, mask = picture()
+    rgb, alpha = picture(half=11)
+    rgb[24, 24] = 0.5  # so that the PSNR is finite
+    found = error_shares.shares(rgb, alpha, image, mask)
+    assert found["psnr under the true coverage"] > found["psnr"] + 20

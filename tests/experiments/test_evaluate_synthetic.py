@@ -1,0 +1,151 @@
+"""The evaluation scripts as commands: one person for all numbers of photos, rows kept, LPIPS missing without weights.
+
+What they draw is made up here, but for the slow tests; the rest is the package's, tested there.
+"""
+
+import json
+import sys
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from experiments.evaluation import bodies, body_cases, results, subjects, synthetic
+from humangs_jax.network.presets import tiny
+from humangs_jax.network.weights import expected_variables, save_weights
+from humangs_jax.objectives.backbones import channels, random_weights
+from humangs_jax.objectives.lpips import BACKBONES, Lpips, lpips
+
+SMALL = ("--held-out", "1", "--poses", "1", "--pose-views", "1", "--size", "48")
+
+
+@pytest.fixture
+def weights(tmp_path):
+    zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), expected_variables(tiny()))
+    save_weights(tmp_path / "weights.safetensors", zeros, tiny())
+    return tmp_path / "weights.safetensors"
+
+
+def run(script, monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", [f"{script.__name__}.py", *map(str, arguments)])
+    script.main()
+
+
+def test_lpips_is_missing_without_weights():
+    assert subjects.lpips_scorer(None)(np.zeros((1, 8, 8, 3)), np.ones((1, 8, 8, 3))) is None
+    row = {key: None if "lpips" in key else 0.5 for key in results.COLUMNS}
+    assert results.table_row(row).split().count("-") == 2
+
+
+def test_lpips_is_the_mean_over_views_of_clipped_pictures():
+    heads = tuple(jnp.ones(count) for count in channels(BACKBONES["alex"]))
+    weights = Lpips(random_weights(jax.random.key(0), BACKBONES["alex"]), heads, "alex")
+    truth, predicted = np.random.default_rng(0).random((2, 2, 32, 32, 3)).astype(np.float32)
+    predicted += 0.5
+    found = subjects.lpips_scorer(weights)(predicted, truth)
+    expected = [float(jax.jit(lpips)(weights, *pair)) for pair in zip(np.clip(predicted, 0, 1), truth, strict=True)]
+    assert np.isclose(found, np.mean(expected), rtol=1e-6) and found > 0
+
+
+@pytest.mark.parametrize("script", [synthetic, bodies])
+def test_wrong_arguments_are_one_line(script, tmp_path, monkeypatch, capsys):
+    (tmp_path / "a.pth").write_bytes(b"something")
+    wrong = {
+        "a.pth": (["--lpips-backbone", tmp_path / "a.pth"], ["--lpips-heads", tmp_path / "a.pth"]),
+        "--views": (["--views", "5"],),
+        "--subjects": (["--subjects", "0"],),
+        "reach beyond": (["--first", "999999"],),
+    }
+    for said, cases in wrong.items():
+        for arguments in cases:
+            with pytest.raises(SystemExit) as exit_:
+                run(script, monkeypatch, *arguments)
+            assert exit_.value.code == 2 and said in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch):
+    made, drawn = [], []
+    make = subjects.make_evaluation_subject
+
+    def draw(variables, config, subject, count):
+        drawn.append((subject.seed, count))
+        truth = np.asarray(subject.held_out.images)
+        return subjects.Drawn(truth + 0.1 / count, np.clip(truth, 0, 0.8))
+
+    monkeypatch.setattr(subjects, "make_evaluation_subject", lambda *a: made.append(a[0]) or make(*a))
+    monkeypatch.setattr(subjects, "draw_person", draw)
+    page, out, pictures = tmp_path / "page.md", tmp_path / "a.json", tmp_path / "sheet.png"
+    page.write_text("Before\n<!-- table: evaluation_views -->\nold\n<!-- end -->\nAfter\n")
+    options = ("--weights", weights, "--json", out, *SMALL)
+    run(synthetic, monkeypatch, "--subjects", 2, "--views", 2, 1, *options)
+    first, second = 2_000_000, 2_000_001
+    assert made == [first, second] and drawn == [(first, 1), (first, 2), (second, 1), (second, 2)]
+    report = json.loads(out.read_text())
+    novel = report["by_views"]["2"]["novel"]
+    assert report["views"] == 2 and report["psnr"] == novel["psnr"] > novel["baseline_psnr"] and report["lpips"] is None
+    assert novel["psnr"] > report["by_views"]["1"]["novel"]["psnr"] and set(report["by_views"]["1"]) == {
+        "novel",
+        "animation",
+    }
+    assert report["subjects"][1]["seed"] == second and report["subjects"][1]["psnr"] > 10
+
+    made.clear(), drawn.clear()
+    run(synthetic, monkeypatch, "--subjects", 2, "--views", 1, 2, 4, *options, "--page", page, "--pictures", pictures)
+    assert made == [first, second] and drawn == [(first, 4), (second, 4)]
+    assert "| new views, same pose | 4 |" in page.read_text() and page.read_text().endswith("After\n")
+    made.clear(), drawn.clear()
+    pictures.unlink()
+    run(synthetic, monkeypatch, "--subjects", 1, "--views", 4, *options, "--pictures", pictures)
+    assert drawn == [(first, 4)] and pictures.is_file()  # for its pictures alone
+    report = json.loads(out.read_text())
+    assert [person["seed"] for person in report["others"]] == [second] and len(report["subjects"]) == 1
+
+
+def test_bodies_see_the_same_photos_and_what_they_cost_is_noted(weights, tmp_path, monkeypatch):
+    seen = []
+
+    def reconstructed(variables, config, capture):
+        assert config.body_vertices is None and config.longest_edge is None
+        seen.append((len(capture.body.template), capture.images))
+        return SimpleNamespace(gaussians=SimpleNamespace(means=np.zeros((3 * len(capture.body.template), 3))))
+
+    monkeypatch.setattr(body_cases, "SMPLX_SEED_VERTICES", 600)
+    monkeypatch.setattr("humangs_jax.avatar.reconstruct.reconstruct", reconstructed)
+    monkeypatch.setattr(subjects, "draw_avatar", lambda avatar, views: np.clip(views.images + 0.1, 0, 1))
+    monkeypatch.setattr("humangs_jax.avatar.evaluate.painted_body", lambda inputs: None)
+    monkeypatch.setattr("humangs_jax.avatar.evaluate.draw_painted_body", lambda colors, views: 0.5 * views.images)
+    page, out, pictures = tmp_path / "page.md", tmp_path / "a.json", tmp_path / "bodies.png"
+    page.write_text("<!-- table: evaluation_bodies -->\n<!-- end -->\n")
+    options = ("--subjects", 1, "--views", 1, "--weights", weights, "--json", out, "--page", page, *SMALL)
+    run(bodies, monkeypatch, *options)
+    assert [count for count, _ in seen] == [13380, 13380, 1796, 1796, 3345, 3345, 836, 836]  # once to compile
+    assert all(np.array_equal(images, seen[0][1]) for _, images in seen)
+    costs = json.loads(out.read_text())["bodies"]
+    assert costs["1/16"]["vertices"] == 836 and costs["1/4"]["costs"]["gaussians"] == 3 * 3345
+    assert costs["default"]["animation"]["psnr"] > costs["painted default body"]["animation"]["psnr"]
+    assert page.read_text().count("\n| ") == len(costs) + 2
+
+    seen.clear()
+    run(bodies, monkeypatch, *options, "--pictures", pictures)
+    assert len(seen) == 8 and pictures.is_file()  # for the pictures alone
+
+
+@pytest.mark.slow  # a person made, reconstructed and drawn
+def test_the_shipped_weights_beat_the_painted_body(tmp_path, monkeypatch):
+    options = ["--subjects", "1", "--held-out", "1", "--poses", "1", "--pose-views", "1", "--size", "128"]
+    run(
+        synthetic,
+        monkeypatch,
+        *options,
+        "--json",
+        tmp_path / "a.json",
+        "--plot",
+        tmp_path / "plot.png",
+    )
+    report = json.loads((tmp_path / "a.json").read_text())
+    assert report["lpips"] is None and report["lpips_net"] is None and report["subjects"][0]["lpips"] is None
+    assert report["psnr"] > report["baseline_psnr"] > 10 and (tmp_path / "plot.png").is_file()
+    animation = report["by_views"]["4"]["animation"]
+    assert animation["psnr"] > animation["baseline_psnr"]

@@ -1,0 +1,45 @@
+"""How far float32 results may be apart: bounds from error analysis, and one switch that tightens them all.
+
+The rule for a sum (Higham, Accuracy and Stability of Numerical Algorithms, section 4.2): computed in any order, with any
+width of vectors and with or without fused multiplications, a sum of n terms is off by at most n u sum |term|, u = 2^-24;
+if every term has been rounded r times on its way, by at most (n + r) u sum |term|. So the bound is relative to the sum of
+the magnitudes of the terms, which cancellation does not make smaller, and not to the result.
+
+`HUMANGS_TOLERANCE_SCALE=0.33` multiplies every bound made here, and (see conftest.py) every rtol and atol with which
+numpy compares float32 arrays: a run with it finds the tests whose error is close to their bound.
+"""
+
+import os
+
+import numpy as np
+
+SCALE = float(os.environ.get("HUMANGS_TOLERANCE_SCALE", "1"))
+
+UNIT = 2.0**-24
+"""Largest relative error of one float32 operation."""
+
+
+def bound(value: float) -> float:
+    """A float32 tolerance, under the switch."""
+    return SCALE * value
+
+
+def sum_bound(terms: int, magnitudes: np.ndarray, roundings: int = 0) -> np.ndarray:
+    """Bound on the difference of two float32 sums of `terms` terms, each term rounded `roundings` times.
+
+    magnitudes: sums of the magnitudes of the terms, in float64. Both sums may be off, in opposite directions.
+    """
+    return SCALE * 2 * (terms + roundings) * UNIT * np.asarray(magnitudes, np.float64)
+
+
+def scaled_comparison(compare):
+    """`np.testing.assert_allclose`, `np.allclose` or `np.isclose` with the switch applied where an array is float32."""
+    if SCALE == 1:
+        return compare
+    defaults = {"rtol": 1e-7, "atol": 0.0} if compare is np.testing.assert_allclose else {"rtol": 1e-5, "atol": 1e-8}
+
+    def scaled(actual, desired, rtol=defaults["rtol"], atol=defaults["atol"], **options):
+        factor = SCALE if any(getattr(a, "dtype", None) == np.float32 for a in (actual, desired)) else 1.0
+        return compare(actual, desired, rtol=factor * rtol, atol=factor * atol, **options)
+
+    return scaled
