@@ -72,7 +72,7 @@ def write_manifest(folder: str | Path, split: str, settings: dict[str, Any]) -> 
         "subjects": sorted(file.parent.name for file in folder.glob("[0-9]*/capture.json")),
     }
     text = json.dumps(content, indent=1) + "\n"
-    replace_file(folder / MANIFEST, lambda temporary: temporary.write_text(text, encoding="utf-8"))  # ty: ignore[invalid-argument-type]
+    replace_file(folder / MANIFEST, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
