@@ -50,7 +50,7 @@ def main(
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import find_captures
     from humangs_jax.network.weights import fit_variables, load_weights
-    from humangs_jax.people import SPLITS, synthesize
+    from humangs_jax.people import Layout, write_set
     from humangs_jax.training.launch import training_people
     from humangs_jax.training.loop import train
 
@@ -61,10 +61,10 @@ def main(
         variables = fit_variables(variables, model, config.model)
     if people is None and subjects:
         people = out / "people"
-        synthesize(people, subjects, SPLITS["train"].start)
+        write_set(people, subjects, Layout(256, poses=2, views=12))
     if validation is None:
         validation = out / "validation"
-        synthesize(validation, VALIDATION_SUBJECTS, SPLITS["validation"].start)
+        write_set(validation, VALIDATION_SUBJECTS, Layout(256, poses=2, views=12), "validation")
     training = training_people(people, live, out, body)
     train(config, body, training, out, validation=find_captures(validation), variables=variables)
 
