@@ -109,7 +109,7 @@ def fit_photos(photos, body, seed, arguments):
     from humangs_jax.body.landmarks import landmark_model, pose_landmarks
     from humangs_jax.data.keypoints.keypoints import Keypoints
     from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
-    from humangs_jax.data.photographs import Photographs
+    from humangs_jax.data.photos import Photos
     from humangs_jax.fitting.fit_capture import fit_photographs
 
     kind = KEYPOINT_SETS[arguments.set]
@@ -122,7 +122,7 @@ def fit_photos(photos, body, seed, arguments):
     points = detect(case, seed, arguments.noise_px * SIZE / 512, arguments.outliers, 100 * SIZE / 512)[0]
     confidences = np.broadcast_to(np.asarray(model.known, np.float32), points.shape[:-1])
     keypoints = Keypoints(points.astype(np.float32), confidences, kind)
-    seen = Photographs(photos.images, photos.masks, photos.cameras, photos.frames, photos.names)
+    seen = Photos(photos.images, photos.masks, photos.cameras, photos.frames, photos.names)
     fitted = fit_photographs(seen, keypoints, body)
     error = np.linalg.norm(np.asarray(fitted.fit.joints)[0] - np.asarray(joints), axis=-1)
     return fitted.capture, float(1000 * error.mean())

@@ -26,7 +26,7 @@ def demo_avatar() -> tuple[Any, Any]:
     """(avatar, capture) of the demo."""
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.data.capture import load_capture
-    from humangs_jax.data.photographs import DEMO_CAPTURE
+    from humangs_jax.data.photos import DEMO_CAPTURE
     from humangs_jax.network.weights import load_weights
 
     capture = load_capture(DEMO_CAPTURE)

@@ -145,7 +145,7 @@ def _demo_scene(size: int) -> Scene:
     from humangs_jax.avatar.animate import animate
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.data.capture import load_capture
-    from humangs_jax.data.photographs import DEMO_CAPTURE
+    from humangs_jax.data.photos import DEMO_CAPTURE
     from humangs_jax.network.weights import load_weights
 
     capture = load_capture(DEMO_CAPTURE)

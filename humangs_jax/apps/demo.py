@@ -4,8 +4,6 @@ import dataclasses
 import json
 import os
 import platform
-import shutil
-import tempfile
 import time
 from collections.abc import Callable
 from importlib import metadata
@@ -25,7 +23,8 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.video import write_video
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
-from humangs_jax.data.photographs import DEMO_CAPTURE
+from humangs_jax.data.photos import DEMO_CAPTURE
+from humangs_jax.io.atomic import add_files
 from humangs_jax.network.weights import load_weights
 
 VERSIONS = ("humangs_jax", "jax", "jaxlib", "flax", "numpy")
@@ -38,18 +37,14 @@ def run_demo(out: str | os.PathLike, weights: str | os.PathLike | None = None, f
     report.json. All of them appear at the end together; nothing is left behind by a run that fails.
     """
     out = Path(out)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    started = time.perf_counter()
-    scratch = Path(tempfile.mkdtemp(prefix=".humangs_demo_", dir=out.parent))
-    try:
-        report = _write_products(scratch, weights, frame_size)
+    started, report = time.perf_counter(), {}
+
+    def write(folder: Path):
+        report.update(_write_products(folder, weights, frame_size))
         report["total_seconds"] = round(time.perf_counter() - started, 3)
-        (scratch / "report.json").write_text(json.dumps(report, indent=2) + "\n")
-        out.mkdir(exist_ok=True)
-        for file in scratch.iterdir():
-            os.replace(file, out / file.name)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
+        (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+
+    add_files(out, write)
     print(
         f"{out}: PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.3f}, foreground PSNR "
         f"{report['psnr_foreground']:.2f} dB on {report['views']['held_out']} views that the network has not seen "

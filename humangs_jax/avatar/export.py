@@ -5,10 +5,10 @@ logit opacity, log scales, quaternion wxyz. Lengths in metres, y up, as everywhe
 """
 
 import os
-from pathlib import Path
 
 import numpy as np
 
+from humangs_jax.io.atomic import replace_file
 from humangs_jax.rendering.gaussians import Gaussians, factored
 
 SH_C0 = 0.28209479177387814
@@ -20,7 +20,7 @@ SMALLEST_SCALE = 1e-9
 
 
 def write_ply(path: str | os.PathLike, gaussians: Gaussians, spherical_harmonics_rest: bool = False) -> None:
-    """Write a 3DGS `.ply`, under a temporary name first.
+    """Write a 3DGS `.ply`; the file appears whole or not at all.
 
     spherical_harmonics_rest: add the 45 zero `f_rest_*` fields that some importers (Unity) insist on.
     """
@@ -46,10 +46,5 @@ def write_ply(path: str | os.PathLike, gaussians: Gaussians, spherical_harmonics
     vertices = np.empty(len(means), dtype=[(name, "<f4") for name in columns])
     for name, values in columns.items():
         vertices[name] = values
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(temporary))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    content = plyfile.PlyData([plyfile.PlyElement.describe(vertices, "vertex")], byte_order="<")
+    replace_file(path, lambda temporary: content.write(str(temporary)))

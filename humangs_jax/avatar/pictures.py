@@ -1,6 +1,6 @@
 """Pictures for looking at: sheets of labelled images, and comparisons with the error in colour.
 
-Images are (h, w, 3) float arrays in [0, 1]. Nothing here needs more than Pillow, which comes with imageio.
+Images are (h, w, 3) float arrays in [0, 1]. Nothing here needs more than Pillow, which io.images needs too.
 """
 
 from collections.abc import Sequence

@@ -1,15 +1,14 @@
 """Frames -> a video file: .mp4 (H.264, plays everywhere) or .gif (256 colours for all frames, endless loop)."""
 
 import contextlib
-import os
 import subprocess
-import uuid
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.io.atomic import replace_file
 from humangs_jax.io.images import to_uint8
 
 CONSTANT_RATE_FACTOR = 17
@@ -41,14 +40,7 @@ def write_video(path: str | Path, frames: Float[np.ndarray, "m h w 3"], fps: flo
     writers = {".mp4": _write_mp4, ".gif": _write_gif}
     if path.suffix.lower() not in writers:
         raise ValueError(f"{path}: expected a name ending in .mp4 or .gif")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent}: no such folder")
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix.lower()}")
-    try:
-        writers[path.suffix.lower()](temporary, frames, float(fps))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    replace_file(path, lambda temporary: writers[path.suffix.lower()](temporary, frames, float(fps)))
 
 
 def _write_mp4(path, frames, fps):

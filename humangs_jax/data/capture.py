@@ -1,18 +1,16 @@
-"""A capture: photographs of one person, their calibrated cameras, and the body pose of each frame; a folder on disk.
+"""A capture: photos of one person, their calibrated cameras, and the body pose of each frame; a folder on disk.
 
     me/capture.json       {"format": "humangs-capture", "version": 1, "body": "body.npz", "views": [...]}
     me/body.npz           body (name or file of the model), betas (s,), rotations (m, j, 3), translations (m, 3)
     me/images/*.png ...   one photo per view, all of one size; masks likewise
 
-docs/capture_format.md tells the format in full. Whatever is wrong in a folder is a `CaptureError`: one line that names
+docs/capture_format.md describes the format in full. Whatever is wrong in a folder is a `CaptureError`: one line that names
 the file, the field and what was expected. In memory the images have a white background wherever masks are known.
 """
 
 import dataclasses
 import json
 import os
-import shutil
-import uuid
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,25 +24,32 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import (
     CaptureError,
     body_parameters,
-    check_before_writing,
     check_names,
+    check_place,
     check_range,
     checked_camera,
     checked_frame,
     numbers,
 )
-from humangs_jax.data.capture_reading import (
-    BACKGROUNDS,
-    DEFAULT_BODY,
+from humangs_jax.data.photos import (
     FORMAT,
     VERSION,
+    Photos,
+    capture_folder,
+    check_background,
+    check_keys,
     on_white_background,
     read_description,
-    read_parameters,
+    read_photos,
 )
-from humangs_jax.data.photographs import Photographs, capture_folder, read_photographs
 from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import write_png
+from humangs_jax.io.npz import read_npz
+
+DEFAULT_BODY = "makehuman"
+"""Name of the body that comes with the package; any other `body` in body.npz is the path of a model file."""
+BODY_KEYS = {"body", "betas", "rotations", "translations"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -148,12 +153,11 @@ def capture_from_arrays(
     frames = [checked_frame(x.item(), len(rotations), source, f"frames[{i}]") for i, x in enumerate(np.asarray(frames))]
     names = tuple(f"{i:03d}" for i in range(v)) if names is None else tuple(names)
     check_names(names, v, source)
-    if background not in BACKGROUNDS:
-        raise CaptureError(source, "background", f"expected one of {', '.join(BACKGROUNDS)}, got {background!r}")
+    check_background(background, source)
     if masks is not None and background == "photo":
         images = on_white_background(images, masks)
-    photographs = Photographs(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names)
-    return _assemble(photographs, body, betas, rotations, translations, body_file)
+    photos = Photos(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names)
+    return _assemble(photos, body, betas, rotations, translations, body_file)
 
 
 def load_capture(
@@ -162,10 +166,10 @@ def load_capture(
     """Read and check a capture folder.
 
     Arguments:
-        path: the folder that holds capture.json. "demo_capture", where no such folder is, stands for the one that comes
-            with the package (and "demo_capture/held_out" for its held-out views).
+        path: the folder that holds capture.json. "demo_capture", if there is no such folder, means the one that comes
+            with the package (and "demo_capture/held_out" its held-out views).
         body: a model to use in place of the one that body.npz names.
-        views: read these views only, in this order; the photographs of others are not looked at.
+        views: read these views only, in this order; the photos of others are not opened.
 
     Raises: CaptureError, one line naming file and field.
     """
@@ -176,10 +180,10 @@ def load_capture(
     if body is None:
         body = _load_model(parameter_file, body_file, folder)
     betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
-    photographs = read_photographs(folder, description, views, len(rotations))
+    photos = read_photos(folder, description, views, len(rotations))
     if body_file != DEFAULT_BODY:
         body_file = str(folder / body_file)
-    return _assemble(photographs, body, betas, rotations, translations, body_file)
+    return _assemble(photos, body, betas, rotations, translations, body_file)
 
 
 def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False) -> None:
@@ -191,37 +195,14 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
     folder is no capture. An overwritten folder is replaced as a whole, sub-folders included.
     """
     path = Path(path)
-    check_before_writing(capture)
-    if path.is_file():
-        raise CaptureError(path, "", "is a file: expected a folder name")
-    occupied = path.is_dir() and any(path.iterdir())
-    if occupied and not overwrite:
-        raise CaptureError(path, "", "the folder is not empty: choose another one or ask to overwrite it")
-    if occupied and not (path / "capture.json").is_file():
-        raise CaptureError(path, "", "the folder holds no capture.json: refusing to overwrite what is no capture")
-    target = path.resolve()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}"
-    try:
-        _write_folder(temporary, capture, target)
-        if target.is_dir():
-            aside = temporary.with_name(temporary.name + ".old")
-            target.rename(aside)
-            try:
-                temporary.rename(target)
-            except OSError:
-                aside.rename(target)
-                raise
-            shutil.rmtree(aside)
-        else:
-            temporary.rename(target)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    _check_before_writing(capture)
+    check_place(path, overwrite)
+    replace_folder(path, lambda folder: _write_folder(folder, capture, path))
 
 
-def _assemble(photographs, body, betas, rotations, translations, body_file):
+def _assemble(photos, body, betas, rotations, translations, body_file):
     return Capture(
-        **vars(photographs),
+        **vars(photos),
         body=body,
         betas=betas,
         poses=jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray(translations)),
@@ -243,7 +224,47 @@ def _load_model(file, name, folder=None):
         raise CaptureError(file, "body", f"{model_file} cannot be used as a body: {error}") from error
 
 
+def read_parameters(file: Path) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
+    """Model name, betas, rotations and translations of body.npz, unchecked but for their presence."""
+    try:
+        values, pickled = read_npz(file)
+    except FileNotFoundError:
+        raise CaptureError(file, "", "no such file (capture.json: body names it); `humangs fit` makes one") from None
+    except OSError as error:
+        raise CaptureError(file, "", error.strerror or error) from error
+    if pickled:
+        raise CaptureError(file, pickled[0], "expected numbers, got a pickled object")
+    check_keys(values, BODY_KEYS, BODY_KEYS, file)
+    name = values["body"]
+    if name.shape != () or name.dtype.kind not in "US" or not str(name.item()):
+        problem = f"expected the string {DEFAULT_BODY!r} or the path of a model file, got {name!r}"
+        raise CaptureError(file, "body", problem)
+    return str(name.astype(str)), values["betas"], values["rotations"], values["translations"]
+
+
 # Writing -------------------------------------------------------------------------------------------------------------
+
+
+def _check_before_writing(capture):
+    """Everything that reading would check, of a `Capture` made by hand."""
+    source, v = "capture", len(capture.images)
+    check_names(capture.names, v, source)
+    for field in ("images", "masks"):
+        if (array := getattr(capture, field)) is not None:
+            check_range(numbers(array, source, field), source, field)
+    K, cam_from_world = np.asarray(capture.cameras.K), np.asarray(capture.cameras.cam_from_world)
+    if len(K) != v:
+        raise CaptureError(source, "cameras", f"expected {v}, one per image, got {len(K)}")
+    height, width = capture.images.shape[1:3]
+    if (capture.cameras.width, capture.cameras.height) != (width, height):
+        got = f"{capture.cameras.width} x {capture.cameras.height}"
+        raise CaptureError(source, "cameras", f"expected the image size {width} x {height}, got {got}")
+    for i in range(v):
+        checked_camera(K[i], cam_from_world[i], width, height, source, f"view {i}")
+    poses = capture.poses
+    body_parameters(capture.body, capture.betas, np.asarray(poses.rotations), np.asarray(poses.translation), source)
+    for i, frame in enumerate(capture.frames):
+        checked_frame(int(frame), capture.frame_count, source, f"frames[{i}]")
 
 
 def _write_folder(folder, capture, target):

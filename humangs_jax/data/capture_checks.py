@@ -1,7 +1,8 @@
-"""What must hold of a capture, field by field; whatever does not is a `CaptureError` of one line."""
+"""Values of capture, camera and keypoint files, checked one by one; every fault is a `CaptureError` of one line."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,11 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.atomic import check_replaceable
+from humangs_jax.io.text import parse_json, read_text
 
 COLOUR_SLACK = 1e-3
-"""Resampled images overshoot [0, 1] a little; what exceeds it by more is not in this range at all (0..255, say)."""
+"""Resampled images overshoot [0, 1] a little; values further outside have another range, for instance 0 to 255."""
 
 
 class CaptureError(ValueError):
@@ -20,6 +23,53 @@ class CaptureError(ValueError):
     def __init__(self, file: object, field: str, problem: object):
         parts = [str(part) for part in (file, field, problem) if part]
         super().__init__(" ".join(": ".join(parts).split()))
+
+
+# Files ---------------------------------------------------------------------------------------------------------------
+
+
+def checked_text(file: Path, missing: str = "no such file") -> str:
+    """The text of a file. missing: what is said of one that does not exist."""
+    try:
+        return read_text(file)
+    except FileNotFoundError:
+        raise CaptureError(file, "", missing) from None
+    except OSError as error:
+        raise CaptureError(file, "", f"cannot be read: {error.strerror or error}") from error
+
+
+def checked_json(file: Path, text: str | None = None, missing: str = "no such file") -> Any:
+    """The value in a JSON file, or in its text where that is known."""
+    try:
+        return parse_json(checked_text(file, missing) if text is None else text)
+    except CaptureError:
+        raise
+    except ValueError as error:
+        raise CaptureError(file, "", error) from error
+
+
+def check_place(folder: Path, overwrite: bool) -> None:
+    """Whether a capture may be written to a folder: a new or an empty one, or with `overwrite` another capture."""
+    try:
+        check_replaceable(folder)
+    except ValueError as error:
+        raise CaptureError("", "", error) from error
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not overwrite:
+        raise CaptureError(folder, "", "the folder is not empty: choose another one or ask to overwrite it")
+    if not (folder / "capture.json").is_file():
+        raise CaptureError(folder, "", "the folder holds no capture.json: refusing to overwrite what is no capture")
+
+
+def required(mapping: Mapping[str, Any], key: str, file: object, prefix: str = "") -> Any:
+    """mapping[key]."""
+    if key not in mapping:
+        raise CaptureError(file, f"{prefix}{key}", "missing")
+    return mapping[key]
+
+
+# Numbers -------------------------------------------------------------------------------------------------------------
 
 
 def numbers(value: Any, file: object, field: str, shape: tuple[int, ...] | None = None) -> np.ndarray:
@@ -40,11 +90,23 @@ def numbers(value: Any, file: object, field: str, shape: tuple[int, ...] | None 
     return array
 
 
+def floats(value: Any, file: object, field: str, shape: tuple[int, ...]) -> Float[np.ndarray, "*shape"]:
+    """Finite float64 numbers, however nested, reshaped to `shape` in row-major order."""
+    array = numbers(value, file, field)
+    if array.size != np.prod(shape):
+        wanted = " x ".join(map(str, shape)) or "one"
+        raise CaptureError(file, field, f"expected {wanted} numbers, got shape {array.shape}")
+    return np.asarray(value, np.float64).reshape(shape)
+
+
 def check_range(array: np.ndarray, file: object, field: str) -> None:
     """Colours and coverage lie in [0, 1]."""
     low, high = float(array.min()), float(array.max())
     if low < -COLOUR_SLACK or high > 1 + COLOUR_SLACK:
         raise CaptureError(file, field, f"expected values in [0, 1], got {low:.4g} to {high:.4g}")
+
+
+# Parts of a capture --------------------------------------------------------------------------------------------------
 
 
 def checked_camera(
@@ -90,25 +152,3 @@ def check_names(names: Sequence[str], count: int, file: object) -> None:
     for name in names:
         if not isinstance(name, str) or not re.fullmatch(r"[\w-][\w.-]*", name):
             raise CaptureError(file, "names", f"expected letters, digits, '.', '_' and '-' only, got {name!r}")
-
-
-def check_before_writing(capture: Any) -> None:
-    """Everything that reading would check, of a `Capture` made by hand."""
-    source, v = "capture", len(capture.images)
-    check_names(capture.names, v, source)
-    for field in ("images", "masks"):
-        if (array := getattr(capture, field)) is not None:
-            check_range(numbers(array, source, field), source, field)
-    K, poses = np.asarray(capture.cameras.K), capture.poses
-    cam_from_world = np.asarray(capture.cameras.cam_from_world)
-    if len(K) != v:
-        raise CaptureError(source, "cameras", f"expected {v}, one per image, got {len(K)}")
-    height, width = capture.images.shape[1:3]
-    if (capture.cameras.width, capture.cameras.height) != (width, height):
-        got = f"{capture.cameras.width} x {capture.cameras.height}"
-        raise CaptureError(source, "cameras", f"expected the image size {width} x {height}, got {got}")
-    for i in range(v):
-        checked_camera(K[i], cam_from_world[i], width, height, source, f"view {i}")
-    body_parameters(capture.body, capture.betas, np.asarray(poses.rotations), np.asarray(poses.translation), source)
-    for i, frame in enumerate(capture.frames):
-        checked_frame(int(frame), capture.frame_count, source, f"frames[{i}]")

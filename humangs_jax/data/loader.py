@@ -1,6 +1,6 @@
 """The loader: which views of whom come when is a pure function of (seed, step); a run that resumes sees the same batches.
 
-A `Source` has examples by number: `CaptureSource` (folders of photographs, written synthetic sets), `GeneratedSource` (people
+A `Source` has examples by number: `CaptureSource` (folders of photos, written synthetic sets), `GeneratedSource` (people
 made on the fly from keys) and `Mixture` (several of these by weight). `Loader` makes batches of one: each process the rows
 of its devices, some batches ahead, by grain where it is installed and by plain threads where it is not.
 """
@@ -9,6 +9,7 @@ from humangs_jax.data.loading.batches import ExampleSource, Loader
 from humangs_jax.data.loading.captures import CaptureCache, CaptureSource, find_captures, store_capture
 from humangs_jax.data.loading.examples import (
     Example,
+    Source,
     StoredSubject,
     ViewSampling,
     draw_views,
@@ -16,11 +17,8 @@ from humangs_jax.data.loading.examples import (
     shrink,
     subject_views,
 )
-from humangs_jax.data.loading.mixture import Mixture
-from humangs_jax.data.loading.order import subject_order
-from humangs_jax.data.loading.prefetch import Waiting
-from humangs_jax.data.loading.reading import has_grain
-from humangs_jax.data.loading.source import Source
+from humangs_jax.data.loading.order import Mixture, subject_order
+from humangs_jax.data.loading.threads import Waiting, has_grain
 
 __all__ = [
     "CaptureCache",

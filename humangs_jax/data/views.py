@@ -1,4 +1,4 @@
-"""Photographs of one subject with the body parameters of each, and what the network needs to know of them."""
+"""Photos of one subject with the body parameters of each, and the inputs that the network computes from them."""
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +24,8 @@ class SubjectViews:
     """Views of one subject; each has a pose of its own, so that inputs of varying poses are nothing special.
 
     images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) coverage in [0, 1]. cameras: a batch of v, metric.
-    rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients. view_count: views beyond the
-    first so many are padding (see `pad_views`); None: none is.
+    rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients. view_count: how many are
+    views, those after them are padding (see `pad_views`); None: all are.
     """
 
     images: Float[Array, "v h w 3"]
@@ -38,7 +38,7 @@ class SubjectViews:
 
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
-    """The same views and copies of the last one that count for nothing, so that subjects with fewer views share a batch.
+    """The views, then ignored copies of the last one, so that subjects with fewer views can share a batch.
 
     Raises: ValueError if there are no views, or more than `count`.
     """

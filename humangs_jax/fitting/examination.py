@@ -14,7 +14,7 @@ from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.photographs import Photographs
+from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.findings import ViewFit, Violation, limit_violations, listed, open_joints, warnings
 from humangs_jax.fitting.fit_record import FitRecord
 from humangs_jax.fitting.landmark_fit import NOISE_RANGE, RAYLEIGH_MEDIAN
@@ -96,7 +96,7 @@ def examine(
     """
     if len(keypoints.points) != capture.view_count:
         raise ValueError(f"keypoints of {len(keypoints.points)} views, but the capture has {capture.view_count}")
-    photographs = Photographs(capture.images, capture.masks, capture.cameras, capture.frames, capture.names)
+    photographs = Photos(capture.images, capture.masks, capture.cameras, capture.frames, capture.names)
     observations, views = group_by_moment(photographs, keypoints)
     expected, poses = np.asarray(observations.noise), jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
     model = landmark_model(capture.body, keypoints.set.names)

@@ -9,11 +9,10 @@ import numpy as np
 
 from humangs_jax.body.landmarks import landmark_model
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.capture import Capture, parameter_arrays
+from humangs_jax.data.capture import DEFAULT_BODY, Capture, parameter_arrays
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.capture_reading import DEFAULT_BODY, read_description
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.photographs import Photographs, capture_folder
+from humangs_jax.data.photos import Photos, capture_folder, read_description
 from humangs_jax.fitting.fit_record import FIT_FILE, FitRecord, write_fit_record
 from humangs_jax.fitting.landmark_fit import STAGES, FitConfig, LandmarkFit, fit_landmarks
 from humangs_jax.fitting.observations import group_by_moment
@@ -47,7 +46,7 @@ class FittedCapture:
 
 
 def fit_photographs(
-    photographs: Photographs,
+    photographs: Photos,
     keypoints: Keypoints,
     body: BodyModel,
     *,

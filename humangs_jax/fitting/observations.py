@@ -7,7 +7,7 @@ import numpy as np
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.photographs import Photographs
+from humangs_jax.data.photos import Photos
 
 
 @pytree_dataclass
@@ -33,7 +33,7 @@ OUTER = (0.03, 0.97)
 """Quantiles of coordinates that tell a person's size: a few wild points do not."""
 
 
-def group_by_moment(photographs: Photographs, keypoints: Keypoints) -> tuple[Observations, np.ndarray]:
+def group_by_moment(photographs: Photos, keypoints: Keypoints) -> tuple[Observations, np.ndarray]:
     """Observations with a leading axis of moments (m, c, ...), and the view (m, c) of each, -1 where there is none."""
     frames, count = np.asarray(photographs.frames), photographs.frame_count
     members = [np.flatnonzero(frames == frame) for frame in range(count)]

@@ -7,8 +7,6 @@ onto black.
 """
 
 import dataclasses
-import os
-import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,6 +14,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.atomic import replace_file
 
 RGBA = ("R", "G", "B", "A")
 DEPTH = "Z"
@@ -66,18 +65,15 @@ def write_exr(path: str | Path, views: ExrView | Sequence[ExrView]) -> None:
     if len({view.rgba.shape for view in views}) > 1:  # parts of a file share one display window
         raise ValueError(f"views: expected one image size, got {sorted({view.rgba.shape[:2] for view in views})}")
     parts = [_to_part(view, name) for view, name in zip(views, names, strict=True)]
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent}: no such folder")
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-    try:
+
+    def write(temporary: Path):
         with OpenEXR.File(parts) as file:
             file.write(str(temporary))
-        os.replace(temporary, path)
+
+    try:
+        replace_file(path, write)
     except RuntimeError as error:
         raise OSError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_exr(path: str | Path) -> list[ExrView]:

@@ -1,20 +1,22 @@
-"""Photographs on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel) and JPEG, values as stored, no gamma.
+"""Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel) and JPEG, values as stored, no gamma.
 
 The orientation flag that phones write into JPEG files (EXIF) is ignored: a calibration speaks of the stored pixels.
 """
 
-import os
 import subprocess
-import uuid
 from pathlib import Path
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.io.atomic import replace_file
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOUR_TYPES = {2: "rgb", 4: "grey and alpha", 6: "rgba"}
 """Colour types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
+
+_BROKEN = (SyntaxError, ValueError, EOFError)
+"""What Pillow raises for broken files, besides OSError and DecompressionBombError."""
 
 
 def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
@@ -47,18 +49,39 @@ def write_png(path: str | Path, image: Float[np.ndarray, "h w 3"] | Float[np.nda
     """
     from PIL import Image
 
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}")
-    try:
-        Image.fromarray(to_uint8(image)).save(temporary, format="PNG")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    replace_file(path, lambda temporary: Image.fromarray(to_uint8(image)).save(temporary, format="PNG"))
 
 
 def to_uint8(image: Float[np.ndarray, "*shape"]) -> np.ndarray:
     """[0, 1] -> 0..255, rounded to nearest and clipped; NaN becomes 0."""
     return np.rint(255 * np.clip(np.nan_to_num(np.asarray(image)), 0, 1)).astype(np.uint8)
+
+
+def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
+    """((width, height), whether there is an alpha channel). PNG files are checked by their checksums, others by decoding.
+
+    Raises: OSError if the file cannot be read as an image.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            found = image.size, "A" in image.getbands() or "transparency" in image.info
+            image.verify() if image.format == "PNG" else image.load()
+    except (*_BROKEN, Image.DecompressionBombError) as error:
+        raise OSError(str(error)) from error
+    return found
+
+
+def image_size(path: str | Path) -> tuple[int, int]:
+    """Width and height in pixels, from the head of the file. Raises: OSError if it is not an image."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            return image.size
+    except (*_BROKEN, Image.DecompressionBombError) as error:
+        raise OSError(str(error)) from error
 
 
 def _read_pixels(path):
@@ -75,7 +98,7 @@ def _read_pixels(path):
                 return np.asarray(image, np.float32)[..., None] / np.float32(65535)
             has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
             pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
-    except (SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:  # Pillow's ways to say "broken"
+    except (*_BROKEN, Image.DecompressionBombError) as error:
         raise OSError(str(error)) from error
     return pixels.astype(np.float32) / np.float32(255)
 

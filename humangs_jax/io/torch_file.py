@@ -1,21 +1,25 @@
-"""Tensors of a file that `torch.save` wrote, without torch and without running anything in it (see `torch_pickle`).
+"""Tensors of a file that `torch.save` wrote, without torch and without running anything in it.
+
+The unpickler knows the calls which rebuild the tensors of a state dict and refuses every other name. What those calls return
+is immutable, so that no later instruction of the pickle can change it. A tensor comes out as a description: a view of a
+storage, whose numbers lie elsewhere in the file. Only the storages of wanted tensors are read.
 
 Both formats are read. Since torch 1.6 it is a zip archive of the pickle and one member per storage. Before (and in what
 the lpips wheel ships) it is a stream: three pickles of a magic number, a version and the byte order; the pickle itself;
-a pickled list of the storages' names; then of each storage the count of its numbers and the numbers. Only the storages
-of wanted tensors are read.
+a pickled list of the storages' names; then of each storage the count of its numbers and the numbers.
 """
 
+import collections
+import math
 import os
+import pickle
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
-
-from humangs_jax.io.torch_pickle import StateDictUnpickler, Storage, Tensor, read_tensor, state_dict_tensors
 
 ZIP_START = b"PK\x03\x04"
 PICKLE_START = b"\x80"
@@ -29,6 +33,149 @@ BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, Runtime
 
 Wanted = Callable[[str], bool]
 Tensors = dict[str, np.ndarray]
+STORAGE_DTYPES = {
+    "DoubleStorage": np.dtype("<f8"),
+    "FloatStorage": np.dtype("<f4"),
+    "HalfStorage": np.dtype("<f2"),
+    "BFloat16Storage": np.dtype("<u2"),  # widened after reading
+    "LongStorage": np.dtype("<i8"),
+    "IntStorage": np.dtype("<i4"),
+    "ShortStorage": np.dtype("<i2"),
+    "CharStorage": np.dtype("i1"),
+    "ByteStorage": np.dtype("u1"),
+    "BoolStorage": np.dtype("?"),
+}
+STATE_DICTS = ("model", "state_dict")
+"""Keys under which training scripts keep the state dict; what lies under others (the optimizer's state) is never read."""
+
+
+# The pickle -----------------------------------------------------------------------------------------------------------
+
+
+class _StorageType(NamedTuple):
+    """Stands for a `torch.*Storage` class."""
+
+    name: str
+
+
+class _Storage(NamedTuple):
+    """Which numbers: their type, the name of the storage that holds them, how many of its numbers come before."""
+
+    kind: str
+    name: str
+    start: int = 0
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Of the numbers as they are stored."""
+        return STORAGE_DTYPES[self.kind]
+
+
+class _Tensor(NamedTuple):
+    """A tensor that is not read yet: a view of a storage, offset and strides in elements."""
+
+    storage: _Storage
+    offset: int
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+
+
+def _counts(x: Any) -> bool:
+    return type(x) is tuple and all(type(n) is int and n >= 0 for n in x)
+
+
+class _RebuildTensor:
+    __slots__ = ()
+
+    def __call__(self, storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _Tensor:
+        if not (isinstance(storage, _Storage) and _counts((offset,)) and _counts(shape) and _counts(strides)):
+            raise pickle.UnpicklingError("a tensor without a storage, or whose offset, shape or strides are no counts")
+        if len(shape) != len(strides):
+            raise pickle.UnpicklingError(f"a tensor with {len(shape)} axes and {len(strides)} strides")
+        return _Tensor(storage, offset, shape, strides)
+
+
+class _RebuildParameter:
+    __slots__ = ()
+
+    def __call__(self, tensor: Any, *_: Any) -> Any:
+        return tensor
+
+
+_ALLOWED = {
+    ("torch._utils", "_rebuild_tensor"): _RebuildTensor(),
+    ("torch._utils", "_rebuild_tensor_v2"): _RebuildTensor(),
+    ("torch._utils", "_rebuild_parameter"): _RebuildParameter(),
+    ("collections", "OrderedDict"): collections.OrderedDict,
+    **{("torch", name): _StorageType(name) for name in STORAGE_DTYPES},
+}
+
+
+class _StateDictUnpickler(pickle.Unpickler):
+    """Knows tensors, ordered dicts and storages; `kinds` tells the type of each storage that it met."""
+
+    def __init__(self, file: Any) -> None:
+        super().__init__(file)
+        self.kinds: dict[str, str] = {}
+
+    def find_class(self, module: str, name: str) -> Any:
+        """What stands for a name of the pickle."""
+        if (module, name) not in _ALLOWED:
+            module = "builtins" if module == "__builtin__" else module  # its name in protocol 2, which torch writes
+            raise pickle.UnpicklingError(f"refused to load {module}.{name}: no part of a state dict")
+        return _ALLOWED[module, name]
+
+    def persistent_load(self, pid: Any) -> _Storage:
+        """A storage. The older format adds None, or says which part of another storage this one is."""
+        known = isinstance(pid, tuple) and len(pid) in (5, 6) and pid[0] == "storage"
+        if not (known and isinstance(pid[1], _StorageType) and isinstance(pid[2], str)):
+            raise pickle.UnpicklingError("refused to load a persistent object that is no storage")
+        if self.kinds.setdefault(pid[2], pid[1].name) != pid[1].name:
+            raise pickle.UnpicklingError(f"storage {pid[2]} is of two types")
+        part = pid[5] if len(pid) == 6 else None
+        if part is None:
+            return _Storage(pid[1].name, pid[2])
+        if not (type(part) is tuple and len(part) == 3 and _counts(part[1:])):
+            raise pickle.UnpicklingError("a part of a storage whose place is no count")
+        return _Storage(pid[1].name, pid[2], part[1])
+
+
+def _state_dict_tensors(content: Any, wanted: Callable[[str], bool]) -> tuple[dict[str, _Tensor], int]:
+    """The wanted tensors of the state dict in what was unpickled, and how many others it has.
+
+    The state dict is what lies under one of `STATE_DICTS`, or else the content itself. Raises: ValueError.
+    """
+    label = next((key for key in STATE_DICTS if isinstance(content, dict) and isinstance(content.get(key), dict)), None)
+    model = content if label is None else content[label]
+    if not isinstance(model, dict) or (label is None and not any(isinstance(x, _Tensor) for x in model.values())):
+        names = " or ".join(map(repr, STATE_DICTS))
+        raise ValueError(f"expected a state dict, or a dict with one under {names}")
+    if not all(isinstance(key, str) for key in model):
+        raise ValueError("the state dict has a key that is no string")
+    chosen = {key: x for key, x in model.items() if wanted(key)}
+    for key, value in chosen.items():
+        if not isinstance(value, _Tensor):
+            raise ValueError(f"{label or 'state_dict'}[{key!r}] is no tensor but {type(value).__name__}")
+    return chosen, len(model) - len(chosen)
+
+
+def _read_tensor(data: np.ndarray, key: str, tensor: _Tensor) -> np.ndarray:
+    """The numbers of a tensor from those of its storage, bounds checked. bfloat16 becomes float32. Raises: ValueError."""
+    storage, offset, shape, strides = tensor
+    offset += storage.start
+    last = offset + sum((n - 1) * stride for n, stride in zip(shape, strides, strict=True))
+    count = math.prod(shape)  # views of parameters never repeat numbers: a larger one is a bomb
+    if count > len(data) or (count and last >= len(data)):
+        raise ValueError(f"{key}: shape {shape} does not fit storage {storage.name} of {len(data)} numbers")
+    if not count:
+        return np.zeros(shape, data.dtype)
+    steps = tuple(stride * data.itemsize for stride in strides)
+    view = np.lib.stride_tricks.as_strided(data[offset:], shape, steps, writeable=False)
+    array = np.ascontiguousarray(view).reshape(shape)
+    return (array.astype(np.uint32) << 16).view(np.float32) if storage.kind == "BFloat16Storage" else array
+
+
+# The file -------------------------------------------------------------------------------------------------------------
 
 
 def everything(key: str) -> bool:
@@ -59,7 +206,7 @@ def read_torch_file(path: str | os.PathLike, wanted: Wanted = everything) -> tup
             raise ValueError(f"{path}: {error}") from error
 
 
-def _unpickle(unpickler: StateDictUnpickler) -> Any:
+def _unpickle(unpickler: "_StateDictUnpickler") -> Any:
     try:
         return unpickler.load()
     except BROKEN:
@@ -79,9 +226,9 @@ def _read_archive(archive: zipfile.ZipFile, size: int, wanted: Wanted) -> tuple[
     if f"{root}byteorder" in names and archive.read(f"{root}byteorder").strip() != b"little":
         raise ValueError("only little-endian checkpoints are supported")
     with archive.open(pickles[0]) as file:
-        tensors, skipped = state_dict_tensors(_unpickle(StateDictUnpickler(file)), wanted)
+        tensors, skipped = _state_dict_tensors(_unpickle(_StateDictUnpickler(file)), wanted)
 
-    def read(key: str, storage: Storage) -> np.ndarray:
+    def read(key: str, storage: _Storage) -> np.ndarray:
         try:
             return np.frombuffer(archive.read(f"{root}data/{storage.name}"), storage.dtype)
         except (KeyError, ValueError, *BROKEN) as error:
@@ -91,18 +238,18 @@ def _read_archive(archive: zipfile.ZipFile, size: int, wanted: Wanted) -> tuple[
 
 
 def _read_stream(file: BinaryIO, size: int, wanted: Wanted) -> tuple[Tensors, int]:
-    if _unpickle(StateDictUnpickler(file)) != MAGIC_NUMBER:
+    if _unpickle(_StateDictUnpickler(file)) != MAGIC_NUMBER:
         raise ValueError("a pickle, but neither of the formats that torch.save writes")
-    if (version := _unpickle(StateDictUnpickler(file))) != STREAM_VERSION:
+    if (version := _unpickle(_StateDictUnpickler(file))) != STREAM_VERSION:
         raise ValueError(f"version {version!r} of the older format, expected {STREAM_VERSION}")
-    machine = _unpickle(StateDictUnpickler(file))
+    machine = _unpickle(_StateDictUnpickler(file))
     if not (isinstance(machine, dict) and machine.get("little_endian") is True):
         raise ValueError("only little-endian checkpoints are supported")
-    unpickler = StateDictUnpickler(file)
-    tensors, skipped = state_dict_tensors(_unpickle(unpickler), wanted)
+    unpickler = _StateDictUnpickler(file)
+    tensors, skipped = _state_dict_tensors(_unpickle(unpickler), wanted)
     places = _storage_places(file, size, unpickler.kinds)
 
-    def read(key: str, storage: Storage) -> np.ndarray:
+    def read(key: str, storage: _Storage) -> np.ndarray:
         if storage.name not in places:
             raise ValueError(f"{key}: storage {storage.name} is missing")
         start, count = places[storage.name]
@@ -114,13 +261,13 @@ def _read_stream(file: BinaryIO, size: int, wanted: Wanted) -> tuple[Tensors, in
 
 def _storage_places(file: BinaryIO, size: int, kinds: dict[str, str]) -> dict[str, tuple[int, int]]:
     """Where in the stream the numbers of each storage begin, and how many they are."""
-    names, places = _unpickle(StateDictUnpickler(file)), {}
+    names, places = _unpickle(_StateDictUnpickler(file)), {}
     if not (isinstance(names, list) and all(isinstance(name, str) and name in kinds for name in names)):
         raise ValueError("its list of storages names one that no tensor has")
     for name in names:
         (count,) = struct.unpack("<q", file.read(8))
         start = file.tell()
-        end = start + count * Storage(kinds[name], name).dtype.itemsize
+        end = start + count * _Storage(kinds[name], name).dtype.itemsize
         if count < 0 or end > size:
             raise ValueError(f"storage {name} of {count} numbers does not fit the file: truncated?")
         places[name] = start, count
@@ -128,5 +275,5 @@ def _storage_places(file: BinaryIO, size: int, kinds: dict[str, str]) -> dict[st
     return places
 
 
-def _read_tensors(tensors: dict[str, Tensor], read: Callable[[str, Storage], np.ndarray]) -> Tensors:
-    return {key: read_tensor(read(key, tensor.storage), key, tensor) for key, tensor in tensors.items()}
+def _read_tensors(tensors: dict[str, _Tensor], read: Callable[[str, _Storage], np.ndarray]) -> Tensors:
+    return {key: _read_tensor(read(key, tensor.storage), key, tensor) for key, tensor in tensors.items()}

@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import json
 import logging
-import os
 from collections.abc import Generator
 from pathlib import Path
 
@@ -19,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.configuration import config_from_file, config_to_json
+from humangs_jax.io.atomic import write_text
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.state import TrainState
 
@@ -128,9 +128,7 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
                 )
     if not write:
         return
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(json.dumps(fields, indent=1))
-    temporary.replace(path)
+    write_text(path, json.dumps(fields, indent=1))
 
 
 def load_config(out: str | Path) -> TrainConfig:

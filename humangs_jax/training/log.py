@@ -7,7 +7,6 @@ out/tensorboard/    the numbers and the validation pictures, if tensorboardX is 
 
 import json
 import math
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.data.loader import Waiting
+from humangs_jax.io.atomic import write_text
 
 FLUSH_SECONDS = 10
 
@@ -108,9 +108,7 @@ def forget_after(path: Path, step: int) -> None:
                 kept.append(line)
         except (json.JSONDecodeError, KeyError, TypeError):
             continue
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text("".join(f"{line}\n" for line in kept))
-    temporary.replace(path)
+    write_text(path, "".join(f"{line}\n" for line in kept))
 
 
 def _tensorboard(folder, step):

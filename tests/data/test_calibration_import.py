@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from humangs_jax.data.calibration.calibration import CONVENTIONS, WORLD_FROM_CAM_OPENGL
-from humangs_jax.data.calibration.distortion import distort, undistort
+from humangs_jax.data.calibration.calibration import CONVENTIONS, WORLD_FROM_CAM_OPENGL, distort, undistort
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.capture_reading import read_description, read_view
+from humangs_jax.data.photos import read_description, read_view
 from humangs_jax.io.images import read_grey, read_image
 from tests.data import calibration_files as written
 

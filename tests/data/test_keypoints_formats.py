@@ -5,10 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.keypoints.keypoints import Keypoints, save_keypoints
 from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, OPENPOSE_67
-from humangs_jax.data.keypoints.storage import save_keypoints
 
 NAMES, SIZE = ("front", "back", "left"), (320, 240)
 CAMERA_NAMES = ("images_cam0_000000", "images_cam0_000001", "images_cam1_000000", "images_cam1_000001")

@@ -1,6 +1,6 @@
 import pytest
 
-from humangs_jax.data.keypoints.matching import match_views
+from humangs_jax.data.keypoints.reading import match_views
 
 CAMERAS = ("images_cam0_000000", "images_cam0_000012", "images_cam1_000000", "images_cam1_000012")
 

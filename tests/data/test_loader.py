@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data import capture_reading
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.loader import (
     CaptureCache,
@@ -27,7 +26,8 @@ from humangs_jax.data.loader import (
     store_capture,
     subject_order,
 )
-from humangs_jax.data.loading.outlines import read_outline
+from humangs_jax.data.loading.captures import read_outline
+from humangs_jax.data.photos import read_view
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import write_png
 
@@ -220,9 +220,9 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder,
     def reading(*arguments):
         if threading.current_thread() is threading.main_thread():  # threads of tests before this one may still be at it
             read.append(arguments)
-        return capture_reading.read_view(*arguments)
+        return read_view(*arguments)
 
-    monkeypatch.setattr("humangs_jax.data.photographs.read_view", reading)
+    monkeypatch.setattr("humangs_jax.data.photos.read_view", reading)
     examples = lambda cache: [
         ExampleSource(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(s) for s in range(6)
     ]
@@ -258,9 +258,9 @@ def test_a_picture_that_only_decoding_finds_broken_costs_its_examples_alone(fold
     def reading(path, view, on_white):
         if path == tmp_path / "s2" and view["image"].endswith("003.png"):
             raise OSError("003.png: bad bytes with a right checksum")
-        return capture_reading.read_view(path, view, on_white)
+        return read_view(path, view, on_white)
 
-    monkeypatch.setattr("humangs_jax.data.photographs.read_view", reading)
+    monkeypatch.setattr("humangs_jax.data.photos.read_view", reading)
     new = lambda: ExampleSource(CaptureCache(folders, small_body()), SAMPLING, SIZE, SIZE)
     whole = new()
     examples = [whole.example_at(i, 2) for i in range(40)]
@@ -273,7 +273,7 @@ def test_a_picture_that_only_decoding_finds_broken_costs_its_examples_alone(fold
 
 
 def test_outlines_find_every_fault_without_decoding(folder, tmp_path, monkeypatch):
-    monkeypatch.setattr("humangs_jax.data.photographs.read_view", None)
+    monkeypatch.setattr("humangs_jax.data.photos.read_view", None)
     whole = read_outline(folder / "s1", small_body())
     assert whole.images.shape == (0, SIZE, SIZE, 3) and whole.frames.tolist() == [0, 1, 0, 1, 0, 1]
 
@@ -325,3 +325,45 @@ def test_some_views_of_a_capture(folder):
 def test_a_folder_without_captures_is_named(tmp_path):
     with pytest.raises(ValueError, match="no capture folder here"):
         find_captures(tmp_path)
+
+
+# The release's rule ---------------------------------------------------------------------------------------------------
+
+
+def views_around(count):
+    """A subject of `count` views without images."""
+    azimuths = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    frames = np.zeros(count, int)
+    return StoredSubject(*[np.zeros(0)] * 4, frames, azimuths, *[np.zeros(0)] * 3)
+
+
+WINDOW = ViewSampling(input_counts=(4,), target_count=4, rule="window")
+
+
+def test_the_window_rule_is_the_release_s():
+    """Of 60 views: the ends of a window come first, 25 to 59 views apart, then views inside of it; all are different."""
+    distances, subject = set(), views_around(60)
+    for seed in range(3000):
+        inputs, targets = draw_views(np.random.default_rng(seed), subject, 4, WINDOW)
+        first, last, *inside = inputs + targets
+        distances.add(last - first)
+        assert len(inputs) == len(targets) == 4 and len({*inputs, *targets}) == 8
+        assert all(first < view < last for view in inside) and first >= 0 and last < 60
+    assert distances == set(range(25, 60))
+
+
+@pytest.mark.parametrize("count", [8, 9, 12, 24, 120])
+def test_the_window_rule_scales_with_the_number_of_views(count):
+    for seed in range(200):
+        inputs, targets = draw_views(np.random.default_rng(seed), views_around(count), 4, WINDOW)
+        assert len({*inputs, *targets}) == 8 and min(inputs) >= 0 and max(inputs) < count
+        assert max(7, round(25 * count / 60)) <= inputs[1] - inputs[0] <= max(7, round(59 * count / 60))
+    with pytest.raises(ValueError, match="7 views, but inputs and targets need 8"):
+        draw_views(np.random.default_rng(0), views_around(7), 4, WINDOW)
+
+
+def test_the_window_rule_is_a_function_of_seed_and_step(folder):
+    sampling = ViewSampling(input_counts=(2,), target_count=2, rule="window")
+    source = lambda: ExampleSource(CaptureCache(find_captures(folder), small_body()), sampling, SIZE, SIZE)
+    assert all(same(source().example_at(i, 2), source().example_at(i, 2)) for i in range(5))
+    assert not same(source().example_at(0, 2), source().example_at(3, 2))

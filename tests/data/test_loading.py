@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from humangs_jax.data.loader import Example, Loader, Mixture, Source, Waiting, has_grain
 from humangs_jax.data.loading.order import MIX_BLOCK, block_counts, source_at
-from humangs_jax.data.loading.reading import read_in_order
+from humangs_jax.data.loading.threads import read_in_order
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.people.manifest import begin_set, find_people

@@ -10,7 +10,7 @@ from humangs_jax.data.capture import capture_from_arrays, load_capture, save_cap
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
-from humangs_jax.data.photographs import load_photographs
+from humangs_jax.data.photos import load_photos
 from humangs_jax.fitting.fit_capture import check_place, fit_photographs, write_fitted
 from humangs_jax.fitting.fit_record import read_fit_record
 
@@ -38,7 +38,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(folder):
-    return fit_photographs(load_photographs(folder[0]), folder[1], default_body())
+    return fit_photographs(load_photos(folder[0]), folder[1], default_body())
 
 
 def test_views_are_sorted_by_their_moments(folder, fitted):
@@ -75,7 +75,7 @@ def test_written_elsewhere_with_its_pictures_and_new_cameras(folder, fitted, tmp
     write_fitted(folder[0], target, capture, None)
     again = load_capture(target)
     np.testing.assert_array_equal(again.cameras.cam_from_world, moved)
-    np.testing.assert_array_equal(again.images, load_photographs(folder[0]).images)
+    np.testing.assert_array_equal(again.images, load_photos(folder[0]).images)
     assert not (target / "fit.npz").exists() and not (folder[0] / "body.npz").exists()
     with pytest.raises(ValueError, match="not empty; --overwrite"):
         check_place(folder[0], target, overwrite=False)
@@ -91,10 +91,10 @@ def test_written_elsewhere_with_its_pictures_and_new_cameras(folder, fitted, tmp
 
 def test_moments_that_views_hardly_show_are_named(folder):
     points, confidences = folder[1].points, folder[1].confidences.copy()
-    frames = load_photographs(folder[0]).frames
+    frames = load_photos(folder[0]).frames
     confidences[frames == 1] = 0
     confidences[np.flatnonzero(frames == 3)[1:]] = 0
-    found = fit_photographs(load_photographs(folder[0]), Keypoints(points, confidences, folder[1].set), default_body())
+    found = fit_photographs(load_photos(folder[0]), Keypoints(points, confidences, folder[1].set), default_body())
     assert len(found.warnings) == 2
     assert found.warnings[0].startswith("moment 1: 0 keypoints are seen")
     assert found.warnings[1].startswith("moment 3: seen by one view")
@@ -110,7 +110,7 @@ def test_moments_that_views_hardly_show_are_named(folder):
 def test_what_cannot_be_fitted_is_one_error(folder, change, message):
     keypoints = Keypoints(*change(folder[1].points, folder[1].confidences), folder[1].set)
     with pytest.raises(ValueError, match=message):
-        fit_photographs(load_photographs(folder[0]), keypoints, default_body())
+        fit_photographs(load_photos(folder[0]), keypoints, default_body())
 
 
 @pytest.mark.parametrize(
@@ -138,7 +138,7 @@ def test_a_body_whose_root_is_not_first_is_refused(folder):
     body = default_body()
     strange = replace(body, parents=(1, -1, *body.parents[2:]))
     with pytest.raises(ValueError, match="root to be its first joint, got joint 1"):
-        fit_photographs(load_photographs(folder[0]), folder[1], strange)
+        fit_photographs(load_photos(folder[0]), folder[1], strange)
 
 
 def copied(folder, tmp_path):

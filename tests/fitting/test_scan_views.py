@@ -5,7 +5,7 @@ import trimesh
 
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
-from humangs_jax.data.photographs import load_photographs
+from humangs_jax.data.photos import load_photos
 from humangs_jax.fitting.scans.views import joints_from_views, render_scan_views
 from humangs_jax.geometry.camera import project
 
@@ -25,7 +25,7 @@ def blocks(path, up=2):
 @pytest.mark.parametrize("up", [2, 0])
 def test_pictures_show_the_scan_upright_and_in_its_colours(tmp_path, up):
     blocks(tmp_path / "scan.ply", up)
-    photographs = load_photographs(render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=2, size=64))
+    photographs = load_photos(render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=2, size=64))
     rows, columns = np.nonzero(photographs.masks[0])
     assert np.ptp(rows) > 35 and np.ptp(rows) > 2.5 * np.ptp(columns)
     inside = photographs.images[0][photographs.masks[0] > 0.9]
@@ -35,7 +35,7 @@ def test_pictures_show_the_scan_upright_and_in_its_colours(tmp_path, up):
 def test_what_a_detector_sees_comes_back_as_joints_of_the_scan(tmp_path):
     vertices = blocks(tmp_path / "scan.ply")
     folder = render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=4, size=64)
-    photographs = load_photographs(folder)
+    photographs = load_photos(folder)
     true = vertices[np.random.default_rng(0).integers(0, len(vertices), 17)]
     import json
 

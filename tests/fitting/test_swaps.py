@@ -8,7 +8,7 @@ from seen_people import person
 
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, hand_names
-from humangs_jax.data.photographs import Photographs
+from humangs_jax.data.photos import Photos
 from humangs_jax.fitting import swaps as module
 from humangs_jax.fitting.landmark_fit import FitConfig
 from humangs_jax.fitting.observations import group_by_moment
@@ -18,7 +18,7 @@ MIRROR = list(COCO_17.mirror)
 
 
 def seen(capture, keypoints):
-    photographs = Photographs(capture.images, None, capture.cameras, capture.frames, capture.names)
+    photographs = Photos(capture.images, None, capture.cameras, capture.frames, capture.names)
     return (*group_by_moment(photographs, keypoints)[:1], keypoints.set, group_by_moment(photographs, keypoints)[1])
 
 

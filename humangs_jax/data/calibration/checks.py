@@ -15,8 +15,8 @@ from humangs_jax.data.calibration.calibration import (
     ROTATION_TO_Y_UP,
     WORLD_FROM_CAM_OPENGL,
     Calibration,
+    distort,
 )
-from humangs_jax.data.calibration.distortion import distort
 
 REPROJECTION_LIMIT = 2.0
 """Pixels; calibrations are usually good to less than one."""

@@ -11,10 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration, Observations
-from humangs_jax.data.calibration.distortion import UNDISTORT_BEFORE, brown_conrady
-from humangs_jax.data.calibration.values import floats, image_size, intrinsics, pose_matrix, read_text
-from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.calibration.calibration import (
+    UNDISTORT_BEFORE,
+    CalibratedCamera,
+    Calibration,
+    Observations,
+    brown_conrady,
+    image_size,
+    intrinsics,
+    pose_matrix,
+)
+from humangs_jax.data.capture_checks import CaptureError, checked_text, floats
 
 PARAMETERS = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -70,7 +77,7 @@ def _read_cameras(file):
 
 def _read_images(file):
     """(line number, cam_from_world, name, camera id, (n, 3) points as x y id) of each image."""
-    lines = [(i, line) for i, line in enumerate(read_text(file).splitlines(), 1) if not line.startswith("#")]
+    lines = [(i, line) for i, line in enumerate(checked_text(file).splitlines(), 1) if not line.startswith("#")]
     at = 0
     while at < len(lines):
         number, line = lines[at]
@@ -109,7 +116,7 @@ def _observations(seen, file):
 
 
 def _data_lines(file):
-    lines = enumerate(read_text(file).splitlines(), 1)
+    lines = enumerate(checked_text(file).splitlines(), 1)
     return [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
 
 

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.data.calibration.values import parse_json
-from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.capture_checks import CaptureError, checked_json
 
 MATRIX = "opencv-matrix"
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -23,7 +22,7 @@ ENTRY = re.compile(r"""("[^"]*"|'[^']*'|[^\s:"'\[{][^:]*?)\s*:(?:\s+(.*))?$""")
 def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
     """The values of a FileStorage text; matrices are (rows, cols) arrays. Raises: CaptureError naming the line."""
     if text.lstrip().startswith("{"):
-        values = _matrices(parse_json(text, file), file, "")
+        values = _matrices(checked_json(file, text), file, "")
     else:
         lines = _logical_lines(text, file)
         values, rest = _block(lines, file) if lines else ({}, [])

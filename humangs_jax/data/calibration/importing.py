@@ -15,13 +15,13 @@ from humangs_jax.data.calibration.calibration import (
     CalibratedCamera,
     Calibration,
     in_capture_convention,
+    undistort,
 )
 from humangs_jax.data.calibration.checks import Checks, check_calibration
-from humangs_jax.data.calibration.detection import read_calibration
-from humangs_jax.data.calibration.distortion import undistort
+from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.calibration.photos import Photo, find_photo, find_photos, photo_size
-from humangs_jax.data.capture_checks import CaptureError, check_names, checked_camera
-from humangs_jax.data.capture_reading import FORMAT, VERSION, names_from_paths
+from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera
+from humangs_jax.data.photos import FORMAT, VERSION, names_from_paths, read_checked
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import read_grey, read_image, write_png
 
@@ -113,7 +113,7 @@ def import_cameras(
         checks = dataclasses.replace(checks, warnings=(*checks.warnings, NO_COMMON_FRAME))
     names = names_from_paths([photo.key + ".png" for photo in photos])
     check_names(names, len(photos), images)
-    replace_folder(out.resolve(), lambda folder: _write(folder, converted, photos, names))
+    replace_folder(out, lambda folder: _write(folder, converted, photos, names))
     return ImportReport(
         out=out,
         format=calibration.format,
@@ -145,14 +145,7 @@ def _check_folders(source, images, masks, out, overwrite):
     for folder in (images, masks):
         if folder is not None and not folder.is_dir():
             raise CaptureError(folder, "", "no such folder")
-    if out.exists() and not out.is_dir():
-        raise CaptureError(out, "", "is a file: expected a folder name")
-    if not out.is_dir() or not any(out.iterdir()):
-        return
-    if not overwrite:
-        raise CaptureError(out, "", "the folder is not empty: choose another one or ask to overwrite it")
-    if not (out / "capture.json").is_file():
-        raise CaptureError(out, "", "the folder holds no capture.json: refusing to overwrite what is no capture")
+    check_place(out, overwrite)
     for path in (source, images, masks):
         if path is not None and path.resolve().is_relative_to(out.resolve()):
             raise CaptureError(path, "", f"lies in {out}, which would be overwritten: expected another place")
@@ -222,9 +215,9 @@ def _copy(folder, photo, name):
 
 def _undistort(folder, photo, name, camera):
     """Photo and mask (its alpha, if that is all there is) as a pinhole sees them; what it does not see is white and no person."""
-    image, mask = _read(read_image, photo.image)
+    image, mask = read_checked(read_image, photo.image)
     if photo.mask is not None:
-        mask = _read(read_grey, photo.mask)
+        mask = read_checked(read_grey, photo.mask)
     if camera.distortion is not None:
         image = undistort(image, camera.K, camera.distortion, fill=1.0)
         mask = None if mask is None else undistort(mask, camera.K, camera.distortion, fill=0.0)
@@ -235,12 +228,3 @@ def _undistort(folder, photo, name, camera):
         (folder / "masks").mkdir(exist_ok=True)
         write_png(folder / files["mask"], mask)
     return files
-
-
-def _read(reader, file):
-    try:
-        return reader(file)
-    except OSError as error:
-        raise CaptureError(file, "", f"not a readable image: {error.strerror or error}") from error
-    except ValueError as error:
-        raise CaptureError(file, "", error) from error

@@ -7,6 +7,8 @@ from pathlib import Path, PurePosixPath
 
 from humangs_jax.data.calibration.calibration import Calibration
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.photos import read_checked
+from humangs_jax.io.images import image_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 """Of the photos that a capture may have."""
@@ -62,13 +64,7 @@ def _any_suffix(path):
 
 def photo_size(path: Path) -> tuple[int, int]:
     """Width and height in pixels, of the file's head alone. Raises: CaptureError if it is no image."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow's ways to say "broken"
-        raise CaptureError(path, "", f"not a readable image: {error}") from error
+    return read_checked(image_size, path)
 
 
 def _of_images(images, names, file):

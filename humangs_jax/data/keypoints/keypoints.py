@@ -1,11 +1,18 @@
-"""Keypoints of the views of a capture, in memory."""
+"""Keypoints of the views of a capture in memory, and our own file of them.
+
+The file is an npz of points (v, k, 2), confidences (v, k), the set's name, and the names of the v views. Unlike in all
+other formats the centre of the first pixel is at (0.5, 0.5).
+"""
 
 import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.keypoints.sets import KeypointSet
+from humangs_jax.io.atomic import replace_file
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -26,3 +33,25 @@ class Keypoints:
     missing: tuple[str, ...] = ()
     not_finite: int = 0
     far_outside: int = 0
+
+
+def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:
+    """Write our own format (.npz). names: of the views, as in the capture. `read_keypoints` reads exactly these back.
+
+    Raises: ValueError if the path does not end in .npz, or there is not one name per view.
+    """
+    if Path(path).suffix != ".npz":
+        raise ValueError(f"{path}: expected a name ending in .npz")
+    if len(names) != len(keypoints.points):
+        raise ValueError(f"names: expected one for each of {len(keypoints.points)} views, got {len(names)}")
+
+    def write(temporary: Path) -> None:
+        np.savez_compressed(
+            temporary,
+            points=np.asarray(keypoints.points, np.float32),
+            confidences=np.asarray(keypoints.confidences, np.float32),
+            set=np.asarray(keypoints.set.name),
+            names=np.asarray(list(names), np.str_),
+        )
+
+    replace_file(path, write)

@@ -1,39 +1,37 @@
-"""Keypoints of a capture's views from the files that people have; which format it is, the content tells.
+"""Keypoints of a capture's views: from a detector's file, the image of each view and the one person in it."""
 
-===================================  ==========================================================  ====================
-from                                 file                                                        points
-===================================  ==========================================================  ====================
-OpenPose, --write_json               NAME_keypoints.json: {people: [{pose_keypoints_2d, ...}]}   BODY_25, hands
-MMPose, inferencer or demo scripts   NAME.json: a list of instances, or frames of instances      17 or 133
-COCO results, AlphaPose              one file: [{image_id or file_name, keypoints, ...}]         17 or 133
-COCO annotations, COCO-WholeBody     one file: {images, annotations}                             17 or 133
-ours, `save_keypoints`               one .npz                                                    any
-===================================  ==========================================================  ====================
-
-A folder, with its sub-folders, is all of its JSON files together.
-"""
-
+import re
 from collections.abc import Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.keypoints.coco import annotated_images, result_images
-from humangs_jax.data.keypoints.detections import DetectedImage, Detections, common_set, read_json
+from humangs_jax.data.keypoints.formats import DetectedImage, Detections, read_detections
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.matching import match_views
-from humangs_jax.data.keypoints.mmpose import mmpose_images
-from humangs_jax.data.keypoints.openpose import openpose_image
-from humangs_jax.data.keypoints.people import Person, chosen_person
-from humangs_jax.data.keypoints.sets import OPENPOSE_67, KeypointSet
-from humangs_jax.data.keypoints.storage import saved_detections
+from humangs_jax.data.keypoints.sets import KeypointSet
 
-UNDERSTOOD = (
-    "OpenPose's people, MMPose's instances, COCO's results (AlphaPose's too), COCO's images and annotations, or our npz"
-)
 NORMALIZED = 2.0
 """If no coordinate of any view reaches this many pixels, they are no pixels but shares of the image."""
+LARGEST_CONFIDENCE = 2.0
+"""Heat maps overshoot 1 a little (1.02 is common) and undershoot 0; what is beyond 2 or -1 is on another scale."""
+SMALLEST_CONFIDENCE = -1.0
+CLEAR_CONFIDENCE, CLEAR_SHARE = 0.3, 0.25
+"""A detection of more than this mean confidence and share of the points is a person, others are a detector's ghosts."""
+FAR_OUTSIDE = 0.5
+"""Detectors extrapolate a little beyond the image. Points further out than this share of its size mean nothing."""
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+
+
+class Person(NamedTuple):
+    """points: (k, 2) pixels, centres at +0.5, finite. confidences: (k,) in [0, 1]. Counts as in `Keypoints`."""
+
+    points: Float[np.ndarray, "k 2"]
+    confidences: Float[np.ndarray, " k"]
+    not_finite: int
+    far_outside: int
 
 
 def read_keypoints(
@@ -42,7 +40,7 @@ def read_keypoints(
     """Keypoints of one person in the views of a capture.
 
     Arguments:
-        path: a file or folder of one of the formats above.
+        path: a file or folder of one of the formats in `formats`.
         names: of the capture's views. Images of the file are matched by name, or by the number in the name where the file
             has only numbers; images of no view are passed over.
         width, height: pixels of the capture's photos, which the keypoints have to be of.
@@ -56,12 +54,12 @@ def read_keypoints(
     path = Path(path)
     if person is not None and person < 0:
         raise ValueError(f"--person {person}: expected 0 for the first person, 1 for the second, ...")
-    detections = _detections(path)
+    detections = read_detections(path)
     if detections.set is None:
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
     images = _images_of_views(path, detections, names, width, height)
     people = [
-        None if image is None else chosen_person(image, name, person, detections.offset, width, height)
+        None if image is None else _chosen_person(image, name, person, detections.offset, width, height)
         for image, name in zip(images, names, strict=True)
     ]
     if person is not None and not any(people):
@@ -70,46 +68,6 @@ def read_keypoints(
     keypoints = _assemble(people, detections.set, names)
     _check_pixels(path, keypoints)
     return keypoints
-
-
-def _detections(path: Path) -> Detections:
-    if path.is_dir():
-        files = sorted(file for file in path.rglob("*.json") if not file.name.startswith("."))
-        if not files:
-            raise CaptureError(path, "", f"no JSON file in this folder: expected {UNDERSTOOD}")
-        names = [file.relative_to(path).with_suffix("").as_posix() for file in files]
-    elif not path.is_file():
-        raise CaptureError(path, "", "no such file or folder")
-    elif path.suffix == ".npz":
-        return saved_detections(path)
-    else:
-        files, names = [path], [path.stem]
-    read = [_read_file(file, name, len(files) == 1) for file, name in zip(files, names, strict=True)]
-    images = [image for _, each in read for image in each]
-    openpose = [is_openpose for is_openpose, _ in read]
-    if any(openpose) and not all(openpose):
-        problem = f"not OpenPose's, but {files[openpose.index(True)].name} is: expected files of one tool"
-        raise CaptureError(files[openpose.index(False)], "", problem)
-    anybody = any(image.people for image in images)
-    return Detections((OPENPOSE_67 if anybody else None) if all(openpose) else common_set(images), tuple(images))
-
-
-def _read_file(file: Path, name: str, alone: bool) -> tuple[bool, list[DetectedImage]]:
-    """Whether a JSON file is OpenPose's, and its images."""
-    content = read_json(file)
-    if isinstance(content, dict):
-        if "people" in content:
-            return True, [openpose_image(content, file, name)]
-        if "annotations" in content:
-            return False, annotated_images(content, file)
-        content = content.get("instance_info")  # MMPose's demo scripts
-    if isinstance(content, list):
-        keys = {key for entry in content if isinstance(entry, dict) for key in entry}
-        if keys & {"image_id", "file_name"}:
-            return False, result_images(content, file)
-        if keys & {"keypoint_scores", "frame_id"} or not content:
-            return False, mmpose_images(content, file, name, alone)
-    raise CaptureError(file, "", f"no keypoints: expected {UNDERSTOOD}")
 
 
 def _images_of_views(
@@ -163,3 +121,140 @@ def _check_pixels(path: Path, keypoints: Keypoints) -> None:
     if np.abs(seen).max() < NORMALIZED:
         problem = f"no coordinate exceeds {NORMALIZED:g}: expected pixels, not shares of the image"
         raise CaptureError(path, "", f"{problem} (OpenPose: --keypoint_scale 0)")
+
+
+# Which person ---------------------------------------------------------------------------------------------------------
+
+
+def _chosen_person(
+    image: DetectedImage, view: str, person: int | None, offset: float, width: int, height: int
+) -> Person | None:
+    """The one person of a view, or the one asked for by number; None if there is none.
+
+    Raises: CaptureError if there are several and no number was given, or if confidences are not in [0, 1].
+    """
+    field = f"view {view}"
+    people = [_usable(each, offset, width, height, image, field) for each in image.people]
+    if person is not None:
+        return people[person] if person < len(people) else None
+    clear = sum(_is_clear(each.confidences) for each in people)
+    if clear > 1:
+        raise CaptureError(
+            image.file,
+            field,
+            f"{clear} people: expected one. --person I takes the I-th of each view, counted from 0 in the order of the "
+            "file; or crop the photos, or delete the others from the file",
+        )
+    return _most_confident(people)
+
+
+def _most_confident(people: Sequence[Person]) -> Person | None:
+    return max(people, key=lambda each: each.confidences.sum(), default=None)
+
+
+def _is_clear(confidences: Float[np.ndarray, " k"]) -> bool:
+    present = confidences[confidences > 0]
+    return len(present) > CLEAR_SHARE * len(confidences) and float(present.mean()) > CLEAR_CONFIDENCE
+
+
+def _usable(
+    values: Float[np.ndarray, "k 3"], offset: float, width: int, height: int, image: DetectedImage, field: str
+) -> Person:
+    confidences = values[:, 2]
+    finite = np.logical_and.reduce(np.isfinite(values), axis=1)
+    known = confidences[np.isfinite(confidences)]
+    if known.size and (known.min() < SMALLEST_CONFIDENCE or known.max() > LARGEST_CONFIDENCE):
+        got = f"{known.min():.4g} to {known.max():.4g}"
+        raise CaptureError(image.file, field, f"expected confidences in [0, 1], got {got}")
+    points = np.where(finite[:, None], values[:, :2], 0.0) + offset
+    confidences = np.where(finite, np.clip(confidences, 0.0, 1.0), 0.0)
+    far = (np.abs(points / (width, height) - 0.5) > 0.5 + FAR_OUTSIDE).any(axis=1) & (confidences > 0)
+    return Person(
+        points.astype(np.float32),
+        np.where(far, 0.0, confidences).astype(np.float32),
+        int((~finite).sum()),
+        int(far.sum()),
+    )
+
+
+# Which view -----------------------------------------------------------------------------------------------------------
+
+
+def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int | None]:
+    """For each image the index of its view, None for images that are of no view.
+
+    Views have names like "front", "000012" or, where that would be ambiguous, "images_cam0_000012" (folders joined by _).
+    Images of keypoint files have names like "front.jpg", "cam0/000012.png" and "cam0_000000000012" (OpenPose counts a video's
+    frames in twelve digits), or are mere numbers (COCO's image ids, the frames of a video).
+
+    Raises: ValueError if two images are of one view, or a number could mean two views.
+    """
+    numbered = _match_numbers([image for image in images if isinstance(image, int)], names)
+    views = [numbered.get(image) if isinstance(image, int) else _match_path(image, names) for image in images]
+    owner: dict[int, str | int] = {}
+    for image, view in zip(images, views, strict=True):
+        if view is None:
+            continue
+        if view in owner:
+            raise ValueError(
+                f"{owner[view]!r} and {image!r} are both for view {names[view]!r}: expected one entry a view"
+            )
+        owner[view] = image
+    return views
+
+
+def _match_path(image: str, names: Sequence[str]) -> int | None:
+    """By the file name with as many of its folders as fit; then with numbers compared as numbers."""
+    path = PurePosixPath(image.replace("\\", "/"))
+    path = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+    keys = [_as_name("_".join(path.parts[i:])) for i in range(len(path.parts))]
+    plain = [_plain(name) for name in names]
+    for key in keys:
+        if key in names:
+            return names.index(key)
+        if (view := _only([i for i, name in enumerate(plain) if name == _plain(key)])) is not None:
+            return view
+        ends = [i for i, name in enumerate(plain) if "_" in key and name.endswith("_" + _plain(key))]
+        if (view := _only(ends)) is not None:
+            return view
+    return None
+
+
+def _match_numbers(numbers: Sequence[int], names: Sequence[str]) -> dict[int, int]:
+    """By the last number in the names of the views.
+
+    Where a video's frames are counted from 0 and the photos from 1 (ffmpeg), or the other way round, there are as many of
+    either, without gaps, and they are matched in order.
+    """
+    of_view = {i: int(found[-1]) for i, name in enumerate(names) if (found := re.findall(r"\d+", name))}
+    shift = _shift(sorted(set(numbers)), sorted(of_view.values()), len(names))
+    matched = {}
+    for number in set(numbers):
+        views = [i for i, value in of_view.items() if value == number + shift]
+        if len(views) > 1:
+            both = " and ".join(repr(names[i]) for i in views[:2])
+            raise ValueError(f"image number {number} could be view {both}: expected file names instead of numbers")
+        if views:
+            matched[number] = views[0]
+    return matched
+
+
+def _shift(numbers: list[int], of_views: list[int], views: int) -> int:
+    if not numbers or len(numbers) != views or len(of_views) != views:
+        return 0
+    without_gaps = all(each == list(range(each[0], each[0] + views)) for each in (numbers, of_views))
+    return of_views[0] - numbers[0] if without_gaps else 0
+
+
+def _as_name(text: str) -> str:
+    """As the names of views are made from paths."""
+    return re.sub(r"[^\w.-]", "_", text).lstrip("._")
+
+
+def _plain(name: str) -> str:
+    """Without zeros before numbers."""
+    return re.sub(r"(?<!\d)0+(?=\d)", "", name)
+
+
+def _only(found: list[int]) -> int | None:
+    return found[0] if len(found) == 1 else None

@@ -8,11 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.data.loading.captures import CaptureCache, CaptureSource
-from humangs_jax.data.loading.examples import Example, ViewSampling
+from humangs_jax.data.loading.examples import Example, Source, ViewSampling
 from humangs_jax.data.loading.order import input_count_at
-from humangs_jax.data.loading.prefetch import Waiting, prefetched
-from humangs_jax.data.loading.reading import Reader, read_in_order
-from humangs_jax.data.loading.source import Source
+from humangs_jax.data.loading.threads import Reader, Waiting, prefetched, read_in_order
 
 AHEAD = 2
 """Batches prepared while one is worked on."""

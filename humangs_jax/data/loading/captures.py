@@ -1,4 +1,4 @@
-"""Capture folders as a source: pictures are kept decoded as bytes; a folder that cannot be used is left out, and named."""
+"""Capture folders as a source: images are kept decoded as bytes; a folder that cannot be used is left out, and reported."""
 
 import dataclasses
 import logging
@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.capture import load_capture
+from humangs_jax.data.capture import load_capture, read_parameters
+from humangs_jax.data.capture_checks import CaptureError, body_parameters, checked_camera
 from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_views, shrink, subject_views
 from humangs_jax.data.loading.order import subject_order, view_generator
-from humangs_jax.data.loading.outlines import read_outline
-from humangs_jax.io.images import to_uint8
+from humangs_jax.data.photos import read_checked, read_description, read_frames_and_matrices
+from humangs_jax.io.images import check_image, to_uint8
 
 logger = logging.getLogger("humangs_jax.data.loader")
 
@@ -36,6 +37,55 @@ def store_capture(path: str | Path, body: BodyModel) -> StoredSubject:
     cache = CaptureCache([path], body)
     outline = read_outline(path, body)
     return cache.some_views(0, range(len(outline.frames)))
+
+
+def read_outline(path: str | Path, body: BodyModel) -> StoredSubject:
+    """All of a capture but its pixels: parameters that belong to `body`, images and masks of no views but of the right size.
+
+    Images are opened and their sizes compared; PNG files are checked by their checksums, others by decoding them.
+    Raises: ValueError naming file and field; without masks a capture cannot be learned from.
+    """
+    folder = Path(path)
+    file = folder / "capture.json"
+    description = read_description(file)
+    parameter_file = folder / description["body"]
+    _, betas, rotations, translations = read_parameters(parameter_file)
+    betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
+    views, size = description["views"], None
+    for view in views:
+        image, mask = folder / view["image"], folder / view.get("mask", "")
+        shape, has_alpha = _check_image(image)
+        size = size or shape
+        if shape != size:
+            raise CaptureError(image, "size", f"{shape}, but the first view has {size}: expected one size")
+        if "mask" not in view and not has_alpha:
+            raise CaptureError(folder, "", "no masks: training needs to know where the person is")
+        if "mask" in view and (masked := _check_image(mask)[0]) != size:
+            raise CaptureError(mask, "size", f"{masked}, but its image has {size}: expected the same")
+    assert size is not None  # a description has views
+    width, height = size
+    frames, K, cam_from_world = read_frames_and_matrices(views, len(rotations), file)
+    for i in range(len(views)):
+        checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]")
+    centers = -np.einsum("vji,vj->vi", cam_from_world[:, :3, :3], cam_from_world[:, :3, 3])
+    offsets = centers - centers.mean(axis=0)
+    return StoredSubject(
+        images=np.zeros((0, height, width, 3), np.uint8),
+        masks=np.zeros((0, height, width), np.uint8),
+        K=K,
+        cam_from_world=cam_from_world,
+        frames=frames,
+        azimuths=np.arctan2(offsets[:, 0], offsets[:, 2]),
+        rotations=rotations,
+        translations=translations,
+        # coefficients that a capture leaves out are 0: one length for all, so that subjects stack
+        betas=np.pad(betas, (0, body.shape_directions.shape[-1] - len(betas))),
+    )
+
+
+def _check_image(file):
+    """((width, height), whether there is an alpha channel)."""
+    return read_checked(check_image, file)
 
 
 class CaptureCache:

@@ -1,8 +1,8 @@
-"""An example to learn from: some views of a stored subject are shown, others are asked for. Everything here is numpy."""
+"""Examples to learn from: some views of a subject are the input, others the targets. Everything here is numpy."""
 
 import dataclasses
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -11,16 +11,23 @@ from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 
+WINDOW = (25, 59)
+"""Rule "window": least and greatest distance of the two ends of a window, in views of a subject that has `WINDOW_OF`."""
+WINDOW_OF = 60
+
 
 @dataclasses.dataclass(frozen=True)
 class ViewSampling:
-    """Which views of a subject are shown and which are asked for.
+    """Which views of a subject are input and which are targets.
 
-    input_counts: numbers of input views; one is drawn per step (each compiles once). target_count: views asked for.
+    rule: "random": inputs stand around the subject, targets are drawn from all other views, of whatever pose.
+        "window": the release's. Of a random window in the order of the views, whose ends are 25 to 59 views apart where a
+        subject has 60 (in proportion for other counts), take the two ends, then random views inside; the first of these
+        are input, the last targets. jitter, scattered_share and mixed_pose_share are not used.
+    input_counts: numbers of input views; one is drawn per step (each compiles once). target_count: target views.
     jitter: inputs stand evenly around the subject, each off by up to half this share of the spacing.
     scattered_share: share of examples whose inputs stand anywhere instead.
     mixed_pose_share: share of examples whose inputs may each show another pose (frame).
-    Targets are drawn from all other views of the subject, of whatever pose.
     """
 
     input_counts: tuple[int, ...] = (4,)
@@ -28,6 +35,7 @@ class ViewSampling:
     jitter: float = 0.7
     scattered_share: float = 0.2
     mixed_pose_share: float = 0.3
+    rule: Literal["random", "window"] = "random"
 
 
 class StoredSubject(NamedTuple):
@@ -51,10 +59,40 @@ class StoredSubject(NamedTuple):
 
 @pytree_dataclass
 class Example:
-    """One subject to learn from: the views shown and the views asked for, possibly at another image size."""
+    """One subject to learn from: input views and target views, possibly at another image size."""
 
     inputs: SubjectViews
     targets: SubjectViews
+
+
+@runtime_checkable
+class Source(Protocol):
+    """Examples by number: capture folders, written sets, people made on the fly, and mixtures of these.
+
+    `example` is a pure function of its arguments and of the files behind the source: the same on every host, in every thread,
+    in any order. Its leaves are numpy arrays, or arrays on a device if they were made there.
+    """
+
+    @property
+    def input_counts(self) -> tuple[int, ...]:
+        """Numbers of input views that a step may draw."""
+        ...
+
+    @property
+    def broken(self) -> Mapping[str, str]:
+        """What was left out so far: name -> what is wrong with it."""
+        ...
+
+    def __len__(self) -> int:
+        """Examples in one pass (subjects)."""
+        ...
+
+    def example(self, seed: int, index: int, input_count: int) -> Example:
+        """The index-th example that a run of this seed takes from this source, with `input_count` input views.
+
+        Raises: ValueError if nothing of the source can be used.
+        """
+        ...
 
 
 def nearest_view(subject: StoredSubject, azimuth: float, allowed: np.ndarray) -> int:
@@ -74,6 +112,9 @@ def draw_views(
     count, needed = len(subject.frames), max(sampling.input_counts) + sampling.target_count
     if count < needed:
         raise ValueError(f"{count} views, but inputs and targets need {needed}")
+    if sampling.rule == "window":
+        drawn = _draw_from_window(generator, count, input_count + sampling.target_count)
+        return drawn[:input_count], drawn[input_count:]
     spacing = 2 * np.pi / input_count
     azimuths = generator.uniform(0, 2 * np.pi) + spacing * (
         np.arange(input_count) + sampling.jitter * generator.uniform(-0.5, 0.5, input_count)
@@ -90,6 +131,15 @@ def draw_views(
         inputs.append(nearest_view(subject, azimuth, allowed if allowed.any() else free))
         free[inputs[-1]] = False
     return inputs, generator.choice(np.flatnonzero(free), sampling.target_count, replace=False).tolist()
+
+
+def _draw_from_window(generator, count, wanted):
+    """The two ends of a random window and random views inside, `wanted` in all."""
+    smallest, largest = (min(count - 1, round(count * views / WINDOW_OF)) for views in WINDOW)
+    distance = int(generator.integers(max(smallest, wanted - 1), max(largest, wanted - 1) + 1))
+    first = int(generator.integers(count - distance))
+    inside = first + 1 + generator.choice(distance - 1, wanted - 2, replace=False)
+    return [first, first + distance, *inside.tolist()]
 
 
 def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray, "v size size *c"]:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.data.capture_reading import DEFAULT_BODY
+from humangs_jax.data.capture import DEFAULT_BODY
 from humangs_jax.fitting.scans.result import ScanFit, body_in_scan
 from humangs_jax.io.atomic import replace_folder
 

@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.capture_reading import FORMAT, VERSION
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.photographs import load_photographs
+from humangs_jax.data.photos import FORMAT, VERSION, load_photos
 from humangs_jax.fitting.observations import group_by_moment
 from humangs_jax.fitting.scans.joints import SCAN_LANDMARKS
 from humangs_jax.fitting.scans.reading import read_mesh
@@ -70,7 +69,7 @@ def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Flo
         raise ValueError(f"{folder / SCAN_FILE}: expected what render_scan_views writes: {error}") from error
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     align = Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
-    observations, _ = group_by_moment(load_photographs(folder), keypoints)
+    observations, _ = group_by_moment(load_photos(folder), keypoints)
     moment = type(observations)(*(getattr(observations, name)[0] for name in vars(observations)))
     points, counts, _ = triangulate_robustly(moment)
     points = align.inverse()(np.asarray(points, np.float64))

@@ -1,0 +1,159 @@
+"""`humangs demo`, `reconstruct`, `animate`, `render`, `export`: from photos to an avatar, and what to do with one."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from humangs_jax.cli.options import require_at_least, require_parent, require_suffix
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Reconstruct the person that comes with the package from four photos, render new views, animate the avatar."""
+
+    out: Path = Path("demo_out")
+    """Folder for the images, the video, the avatar and report.json."""
+    weights: Path | None = None
+    """Network weights (.safetensors). Default: the shipped ones."""
+    size: int = 256
+    """Side of the animation's frames in pixels."""
+
+    def run(self) -> None:
+        """Run the demonstration."""
+        from humangs_jax.apps.demo import run_demo
+
+        run_demo(self.out, weights=self.weights, frame_size=self.size)
+
+
+@dataclasses.dataclass(frozen=True)
+class Reconstruct:
+    """Reconstruct an avatar from a capture folder (photos, cameras, body poses: docs/capture_format.md)."""
+
+    capture: Positional[Path]
+    """Folder with capture.json."""
+    out: Path = Path("avatar.npz")
+    """The avatar file to write."""
+    weights: Path | None = None
+    """Network weights (.safetensors). Default: the shipped ones."""
+    tokens: Literal["as_trained", "all", "foreground"] = "as_trained"
+    """The patches of the photos that the network reads: all, or those that show the person, which is several times
+    faster. For weights trained with the other setting it is an approximation (docs/performance_reconstruction.md)."""
+    dtype: Literal["float32", "bfloat16"] = "float32"
+    """Of the encoder's matrix products. bfloat16 is faster on GPU and TPU."""
+
+    def run(self) -> None:
+        """Write the avatar."""
+        from humangs_jax.avatar.reconstruct import reconstruct
+        from humangs_jax.data.capture import load_capture
+        from humangs_jax.network.weights import load_weights
+
+        photos = load_capture(self.capture)
+        require_parent(self.out)
+        variables, config = load_weights(self.weights)
+        tokens = None if self.tokens == "as_trained" else self.tokens
+        config = config.with_execution(tokens=tokens, dtype=self.dtype)
+        avatar = reconstruct(variables, config, photos)
+        avatar.save(self.out)
+        print(f"{self.out}: {len(avatar.gaussians.means):,} Gaussians from {len(photos.images)} photos")
+
+
+@dataclasses.dataclass(frozen=True)
+class Animate:
+    """Animate an avatar with a motion of SMPL-X poses and write a video (.mp4 or .gif)."""
+
+    avatar: Positional[Path]
+    """File written by `humangs reconstruct`."""
+    motion: Path | None = None
+    """.npz (ours, AMASS, AIST++, THuman4.0, AvatarReX) or LHM's .json. Default: the shipped walk."""
+    out: Path = Path("animation.mp4")
+    """The video to write."""
+    size: int = 512
+    """Side of the frames in pixels."""
+    azimuth: float = 20.0
+    """Degrees; 0 looks at the avatar's front."""
+    turn: float = 0.0
+    """Degrees that the camera travels around the avatar during the motion."""
+
+    def run(self) -> None:
+        """Write the video."""
+        from humangs_jax.avatar.avatar import Avatar
+        from humangs_jax.avatar.frames import motion_frames
+        from humangs_jax.avatar.video import write_video
+        from humangs_jax.data.motion import load_motion
+
+        require_parent(self.out)
+        require_suffix(self.out, (".mp4", ".gif"))
+        require_at_least(1, size=self.size)
+        avatar, motion = Avatar.load(self.avatar), load_motion(self.motion)
+        frames = motion_frames(avatar, motion, self.size, azimuth=self.azimuth, turn=self.turn)
+        write_video(self.out, frames, motion.fps)
+        print(f"{self.out}: {len(frames)} frames at {motion.fps:g} frames per second")
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Render an avatar in its T-pose from a circle of cameras, or in the poses and from the cameras of a capture."""
+
+    avatar: Positional[Path]
+    """File written by `humangs reconstruct`."""
+    out: Path = Path("views")
+    """Folder for view_000.png and so on."""
+    views: int = 8
+    """Number of cameras on the circle."""
+    size: int = 512
+    """Side of the images in pixels (circle only)."""
+    capture: Path | None = None
+    """Take cameras and poses from this capture folder instead."""
+    exr: bool = False
+    """Also write views.exr: float32 RGBA, depth Z and camera matrices, one part per view."""
+
+    def run(self) -> None:
+        """Write the images."""
+        from humangs_jax.avatar.avatar import Avatar
+        from humangs_jax.avatar.frames import capture_renderings, turntable_renderings, write_renderings
+        from humangs_jax.data.capture import load_capture
+
+        avatar = Avatar.load(self.avatar)
+        if self.capture is not None:
+            cameras, renderings = capture_renderings(avatar, load_capture(self.capture))
+        else:
+            cameras, renderings = turntable_renderings(avatar, self.views, self.size)
+        written = write_renderings(self.out, cameras, renderings, exr=self.exr)
+        print(f"{self.out}: {written} views")
+
+
+@dataclasses.dataclass(frozen=True)
+class Export:
+    """Export an avatar as a 3DGS .ply that Gaussian viewers open, in the T-pose or in one frame of a motion."""
+
+    avatar: Positional[Path]
+    """File written by `humangs reconstruct`."""
+    out: Path = Path("avatar.ply")
+    """The .ply to write."""
+    motion: Path | None = None
+    """Pose it by this motion."""
+    frame: int = 0
+    """Which frame of the motion."""
+    rest: bool = False
+    """Add the 45 zero f_rest fields that some importers (Unity) require."""
+
+    def run(self) -> None:
+        """Write the Gaussians."""
+        from humangs_jax.avatar.animate import animate
+        from humangs_jax.avatar.avatar import Avatar
+        from humangs_jax.avatar.export import write_ply
+        from humangs_jax.data.motion import load_motion
+
+        require_parent(self.out)
+        require_suffix(self.out, (".ply",))
+        avatar = Avatar.load(self.avatar)
+        gaussians = avatar.gaussians
+        if self.motion is not None:
+            motion = load_motion(self.motion)
+            if not 0 <= self.frame < len(motion.translations):
+                raise ValueError(f"--frame {self.frame}: {self.motion} has {len(motion.translations)} frames, from 0")
+            gaussians = animate(avatar, motion.pose(self.frame))
+        write_ply(self.out, gaussians, spherical_harmonics_rest=self.rest)
+        print(f"{self.out}: {len(gaussians.means):,} Gaussians")

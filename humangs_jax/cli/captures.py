@@ -1,0 +1,120 @@
+"""`humangs import` and `humangs synth`: capture folders from calibrated photos, and of synthetic people."""
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import OmitArgPrefixes, Positional
+
+from humangs_jax.cli.options import require_at_least
+
+
+@dataclasses.dataclass(frozen=True)
+class ImportCameras:
+    """Make a capture folder from calibrated cameras: COLMAP text, OpenCV YAML or JSON, calibration_full.json, transforms.json.
+
+    Then `humangs fit` finds the body. Conventions of every format: docs/cameras.md.
+    """
+
+    what: Positional[Literal["cameras"]]
+    """"cameras"."""
+    source: Positional[Path]
+    """File or folder with the calibration; its format is detected."""
+    images: Path
+    """Folder of the photos."""
+    out: Path
+    """The capture folder to write."""
+    masks: Path | None = None
+    """Folder of masks, named like the photos."""
+    scale: float | None = None
+    """Metres per unit of the source. Default: 1."""
+    up: str | None = None
+    """Axis of the source's world that points up, like --up=+z or --up=-y. Default: the format's."""
+    pixel_centers: Literal["integer", "half"] | None = None
+    """Where the source has the centre of the first pixel: at 0 (integer) or 0.5 (half). Default: the format's."""
+    overwrite: bool = False
+    """Replace the capture folder."""
+
+    def run(self) -> None:
+        """Write the capture folder."""
+        from humangs_jax.data.calibration.importing import import_cameras
+
+        options = {name: value for name, value in vars(self).items() if name != "what"}
+        print(import_cameras(**options))
+
+
+@dataclasses.dataclass(frozen=True)
+class Extras:
+    """Besides the photos."""
+
+    held_out: int = 0
+    """Views of the first pose from other cameras, in the sub-folder held_out/."""
+    depth: bool = False
+    """Also write 16-bit depth maps, depth/NAME.png (steps of 0.1 mm)."""
+    maps: bool = False
+    """Also write maps/NAME.exr: float32 colours, coverage, depth, positions in T-pose, the camera in the header."""
+    scans: bool = False
+    """Also write scan/: the first pose as a textured mesh, OBJ and GLB."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Synth:
+    """Make synthetic clothed people and write them as capture folders. Can be interrupted and resumed, or added to."""
+
+    extras: OmitArgPrefixes[Extras]
+    out: Path = Path("synthetic_people")
+    """Folder for one capture folder per subject and manifest.json."""
+    subjects: int = 8
+    """How many."""
+    split: Literal["train", "validation", "test", "demo"] = "train"
+    """The seeds of the splits never overlap."""
+    first: int = 0
+    """Number of the first subject within the split."""
+    size: int = 512
+    """Side of the photos in pixels: 128, 256, 512 (a set of 512 can be read at all three)."""
+    views: int = 60
+    """Photos of each pose, around the person, 1.8 to 2.2 bounding radii away."""
+    close_views: int = 12
+    """Further photos of each pose, 0.8 to 1.7 radii away, of parts of the person."""
+    poses: int = 1
+    """Poses per subject."""
+    sequences: bool = False
+    """The poses are frames of a walk, a turn or a reach, which is written as motion.npz."""
+    frames: int = 60
+    """Length of that motion, 30 frames per second."""
+    for_training: bool = False
+    """Short for 2 poses x 12 views at 256 pixels and no others, enough for `humangs train`."""
+    workers: int | None = None
+    """Processes. Default: as many as cores."""
+
+    def run(self) -> None:
+        """Write the people."""
+        from humangs_jax.people import Layout, write_set
+
+        extras = self.extras
+        counts = {name: getattr(self, name) for name in ("subjects", "size", "views", "poses", "frames")}
+        require_at_least(1, **counts)
+        require_at_least(0, first=self.first, close_views=self.close_views, held_out=extras.held_out)
+        if self.sequences and self.poses > self.frames:
+            raise ValueError(f"--poses {self.poses}: expected at most --frames {self.frames}, the length of the motion")
+        layout = Layout(
+            self.size,
+            self.poses,
+            self.views,
+            self.close_views,
+            extras.held_out,
+            frames=self.frames if self.sequences else 0,
+            depth=extras.depth,
+            maps=extras.maps,
+            scan_texture=2048 if extras.scans else 0,
+        )
+        if self.for_training:
+            layout = Layout(256, poses=2, views=12)
+        workers = _cores() if self.workers is None else self.workers
+        folders = write_set(self.out, self.subjects, layout, self.split, self.first, workers=workers)
+        print(f"{self.out}: {len(folders)} people")
+
+
+def _cores():
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

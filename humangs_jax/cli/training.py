@@ -1,0 +1,160 @@
+"""`humangs train` and `humangs convert`: weights of one's own, and the authors'."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import OmitArgPrefixes, Positional
+
+from humangs_jax.cli.options import require_at_least, require_parent, require_suffix
+
+
+@dataclasses.dataclass(frozen=True)
+class LossNetworkFiles:
+    """Networks under perceptual losses (docs/loss_networks.md)."""
+
+    vgg19: Path | None = None
+    """Weights of VGG-19 for the perceptual loss. Default: the loss is left out."""
+    lpips_backbone: Path | None = None
+    """Weights of the network under LPIPS, for the loss and for validation. Default: LPIPS is left out."""
+    lpips_heads: Path | None = None
+    """The linear heads of LPIPS, if the backbone's file does not have them."""
+    lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg"
+    """Which network LPIPS is on."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Processes:
+    """Training in several processes (docs/scaling.md)."""
+
+    distributed: bool = False
+    """This is one of several processes; which one, SLURM or a TPU pod says, or the following options."""
+    coordinator: str | None = None
+    """HOST:PORT of process 0."""
+    processes: int | None = None
+    """How many there are."""
+    process: int | None = None
+    """Which one this is."""
+
+    def join(self) -> None:
+        """Join the other processes, if there are any. Raises: see `join_processes`."""
+        from humangs_jax.training.processes import join_processes
+
+        if self.distributed or self.coordinator is not None:
+            join_processes(self.coordinator, self.processes, self.process)
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train a network on capture folders (`humangs synth --for-training`), on all devices. Continues the run in --out."""
+
+    networks: OmitArgPrefixes[LossNetworkFiles]
+    processes: OmitArgPrefixes[Processes]
+    data: Positional[Path | None] = None
+    """Folder of capture folders."""
+    out: Path = Path("runs/train")
+    """Checkpoints, log, TensorBoard curves, validation images and weights.safetensors."""
+    config: str = "small"
+    """small, paper, published or tiny, or a JSON file of settings like the config.json of a run."""
+    live: int = 0
+    """Also (or without DATA only) train on this number of synthetic people who are rendered anew for every step."""
+    validation: Path | None = None
+    """Folder of capture folders of other people, evaluated now and then."""
+    steps: int | None = None
+    """Length of the run. Default: that of the configuration."""
+    init_weights: Path | None = None
+    """Start from these weights, and their network, instead of random ones."""
+    fsdp: int | None = None
+    """How many devices share one copy of parameters and moments. Default: all."""
+    diagnose: bool = False
+    """Do not train, but repeat the first step of the run that failed (or the next one) and name the first stage whose
+    numbers are not finite."""
+
+    def run(self) -> None:
+        """Train, or diagnose."""
+        require_at_least(0, live=self.live)
+        self.processes.join()  # before anything asks for devices
+        from humangs_jax.body.library import load_body
+        from humangs_jax.network.weights import load_weights
+        from humangs_jax.objectives.loss_networks import load_loss_networks
+        from humangs_jax.people import find_people
+        from humangs_jax.training.diagnose import diagnose_run
+        from humangs_jax.training.launch import fitting_losses, read_config, training_people
+        from humangs_jax.training.loop import train
+
+        files = self.networks
+        networks = load_loss_networks(files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net)
+        settings = fitting_losses(read_config(self.config), networks)
+        if self.steps is not None:
+            settings = dataclasses.replace(settings, steps=self.steps)
+        variables = None
+        if self.init_weights is not None:
+            variables, model = load_weights(self.init_weights)
+            model = dataclasses.replace(model, execution=settings.model.execution)
+            settings = dataclasses.replace(settings, model=model)
+        body = load_body()
+        people = training_people(self.data, self.live, self.out, body)
+        if self.diagnose:
+            print(diagnose_run(self.out, body, people, networks=networks, variables=variables))
+            return
+        others = find_people(self.validation, None) if self.validation is not None else ()
+        train(
+            settings,
+            body,
+            people,
+            self.out,
+            validation=others,
+            variables=variables,
+            networks=networks,
+            fsdp=self.fsdp,
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Convert:
+    """Convert a checkpoint of the published network (.pt, read without torch, or .safetensors) into our weights.
+
+    Sizes and parts of the network are read off the shapes; everything else is as in the preset `published`.
+    """
+
+    checkpoint: Positional[Path]
+    """.pt with a state dict under 'model', or that state dict as .safetensors."""
+    out: Path = Path("weights.safetensors")
+    """The weights file to write."""
+    losses: Path | None = None
+    """Also write the loss networks that the checkpoint carries (VGG-19, LPIPS), for training and evaluation."""
+    head_width: int | None = None
+    """Features per attention head, needed if no shape tells it (networks without q_norm and k_norm)."""
+    pool: Literal["all", "visible"] = "all"
+    """Average a vertex's features over all views (as released) or over those that see it."""
+    dtype: Literal["float32", "float16"] = "float32"
+    """To store; float16 halves the file."""
+
+    def run(self) -> None:
+        """Write the weights."""
+        from safetensors.numpy import save_file
+
+        from humangs_jax.io.atomic import replace_file
+        from humangs_jax.network.conversion import LOSS_PREFIX, describe, load_checkpoint
+        from humangs_jax.network.weights import save_weights
+        from humangs_jax.objectives.loss_networks import collect_loss_networks
+
+        out, losses, checkpoint = self.out, self.losses, self.checkpoint
+        for option, path in (("--out", out), ("--losses", losses)):
+            if path is None:
+                continue
+            require_parent(path, option)
+            require_suffix(path, (".safetensors",), option)
+            if path.exists() and checkpoint.exists() and path.samefile(checkpoint):
+                raise ValueError(f"{option} {path} is the checkpoint itself")
+        if losses is not None and losses.resolve() == out.resolve():
+            raise ValueError(f"--losses {losses}: the same file as --out")
+        networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)
+        converted = load_checkpoint(checkpoint, self.head_width)
+        save_weights(out, converted.variables, converted.config.with_conventions(pool=self.pool), self.dtype)
+        print(f"{out}: {describe(converted)}")
+        if losses is None:
+            print(f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*); --losses keeps them")
+        else:
+            replace_file(losses, lambda path: save_file(networks, path))
+            print(f"{losses}: {' and '.join(names)}")

@@ -1,0 +1,226 @@
+"""The photos of a capture folder: capture.json, then images, masks and cameras, and the frame that each view shows.
+
+No body is needed for these: it is what `humangs import cameras` writes and `humangs fit` finds the body for. Every fault
+is a `CaptureError`, one line with file and field. docs/capture_format.md describes the format.
+"""
+
+import dataclasses
+import re
+from collections.abc import Callable, Iterable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float, Int
+from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_frame, checked_json, numbers
+from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.io.images import read_grey, read_image
+
+FORMAT = "humangs-capture"
+VERSION = 1
+DEMO_CAPTURE = "demo_capture"
+"""Name of the capture of a synthetic person that comes with the package."""
+TOP_KEYS = {"format", "version", "body", "background", "views"}
+VIEW_KEYS = {"image", "mask", "K", "cam_from_world", "frame"}
+BACKGROUNDS = ("photo", "white")
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Photos:
+    """Photos of one person (numpy on the host).
+
+    images: (v, h, w, 3) in [0, 1], white behind the masks. masks: (v, h, w) coverage in [0, 1], or None.
+    cameras: a batch of v, metres. frames: (v,) the frame that each view shows. names: one per view.
+    """
+
+    images: Float[np.ndarray, "v h w 3"]
+    masks: Float[np.ndarray, "v h w"] | None
+    cameras: Camera
+    frames: Int[np.ndarray, " v"]
+    names: tuple[str, ...]
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames: one more than the last that a view shows."""
+        return int(self.frames.max()) + 1
+
+
+def load_photos(path: str | Path) -> Photos:
+    """Read the photos of a capture folder, whose body.npz need not exist.
+
+    Raises: CaptureError, one line naming file and field.
+    """
+    folder = capture_folder(path)
+    return read_photos(folder, read_description(folder / "capture.json"))
+
+
+def capture_folder(path: str | Path) -> Path:
+    """The folder; "demo_capture", if there is no such folder, means the one that comes with the package."""
+    folder = Path(path)
+    if not folder.exists() and folder.parts[:1] == (DEMO_CAPTURE,):
+        return Path(str(resources.files("humangs_jax"))) / "assets" / folder
+    return folder
+
+
+# capture.json --------------------------------------------------------------------------------------------------------
+
+
+def read_description(file: Path) -> dict[str, Any]:
+    """capture.json with all keys and types checked, except the matrices."""
+    description = checked_json(file, missing="no such file: a capture is a folder with a capture.json")
+    if not isinstance(description, dict):
+        raise CaptureError(file, "", f"expected a JSON object, got {type(description).__name__}")
+    if description.get("format") != FORMAT:
+        raise CaptureError(file, "format", f"expected {FORMAT!r}, got {description.get('format')!r}")
+    if description.get("version") != VERSION:
+        raise CaptureError(file, "version", f"expected {VERSION}, got {description.get('version')!r}")
+    check_keys(description, TOP_KEYS, TOP_KEYS - {"background"}, file)
+    if not isinstance(description["body"], str):
+        raise CaptureError(file, "body", f"expected the name of an npz file, got {description['body']!r}")
+    check_background(description.get("background", "photo"), file)
+    views = description["views"]
+    if not isinstance(views, list) or not views:
+        raise CaptureError(file, "views", "expected a list of at least one view")
+    for i, view in enumerate(views):
+        if not isinstance(view, dict):
+            raise CaptureError(file, f"views[{i}]", f"expected a JSON object, got {view!r}")
+        check_keys(view, VIEW_KEYS, VIEW_KEYS - {"mask", "frame"}, file, f"views[{i}].")
+        for key in ("image", "mask"):
+            if key in view and not (isinstance(view[key], str) and view[key]):
+                raise CaptureError(file, f"views[{i}].{key}", f"expected the path of a file, got {view[key]!r}")
+    return description
+
+
+def check_keys(mapping: Iterable[str], known: set[str], required: set[str], file: Path, prefix: str = "") -> None:
+    """Unknown keys are errors: most are misspelt optional ones, which would otherwise be ignored in silence."""
+    for key in mapping:
+        if key not in known:
+            raise CaptureError(file, f"{prefix}{key}", f"unknown key: expected only {', '.join(sorted(known))}")
+    for key in sorted(required):
+        if key not in mapping:
+            raise CaptureError(file, f"{prefix}{key}", "missing")
+
+
+def check_background(background: Any, file: object) -> None:
+    """One of `BACKGROUNDS`."""
+    if background not in BACKGROUNDS:
+        raise CaptureError(file, "background", f"expected one of {', '.join(BACKGROUNDS)}, got {background!r}")
+
+
+def read_frames_and_matrices(
+    views: Sequence[dict[str, Any]], poses: int, file: Path
+) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "v 3 3"], Float[np.ndarray, "v 4 4"]]:
+    """The frame of each view of a description, and K and cam_from_world as written.
+
+    poses: how many frames there are. A view may leave its frame out where there is one.
+    """
+    frames, matrices = [], []
+    for i, view in enumerate(views):
+        field = f"views[{i}]"
+        if "frame" not in view and poses > 1:
+            problem = f"missing: body.npz has {poses} poses, which one does the photo show?"
+            raise CaptureError(file, f"{field}.frame", problem)
+        frames.append(checked_frame(view.get("frame", 0), poses, file, f"{field}.frame"))
+        shapes = (("K", (3, 3)), ("cam_from_world", (4, 4)))
+        matrices.append([numbers(view[key], file, f"{field}.{key}", shape) for key, shape in shapes])
+    K, cam_from_world = (np.stack(column) for column in zip(*matrices, strict=True))
+    return np.asarray(frames, np.int32), K, cam_from_world
+
+
+# Images --------------------------------------------------------------------------------------------------------------
+
+
+def read_photos(
+    folder: Path,
+    description: dict[str, Any],
+    chosen: Sequence[int] | Int[np.ndarray, " any"] | None = None,
+    poses: int | None = None,
+) -> Photos:
+    """Photos and cameras that a checked capture.json describes.
+
+    Arguments: chosen: read these views only, in this order. poses: how many frames there are; None: as many as views say.
+    Raises: CaptureError.
+    """
+    file, views = folder / "capture.json", description["views"]
+    if poses is None:
+        frames = [view.get("frame", 0) for view in views]
+        for i, frame in enumerate(frames):
+            if isinstance(frame, bool) or not isinstance(frame, int) or frame < 0:
+                raise CaptureError(file, f"views[{i}].frame", f"expected an integer of at least 0, got {frame!r}")
+        poses = 1 + max(frames)
+    views = views if chosen is None else [views[i] for i in chosen]
+    with_mask = ["mask" in view for view in views]
+    if any(with_mask) and not all(with_mask):
+        first = with_mask.index(False)
+        raise CaptureError(file, f"views[{first}].mask", "missing, but other views have one: give all or none")
+    frames, K, cam_from_world = read_frames_and_matrices(views, poses, file)
+    images, masks = _read_images(folder, views, description.get("background", "photo") == "white")
+    height, width = images.shape[1:3]
+    cameras = [checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]") for i in range(len(views))]
+    names = names_from_paths([view["image"] for view in views])
+    return Photos(images, masks, stack_cameras(cameras), frames, names)
+
+
+def _read_images(folder, views, on_white):
+    """Images and masks (or None), all of one size."""
+    images, masks = zip(*[read_view(folder, view, on_white) for view in views], strict=True)
+    height, width = images[0].shape[:2]
+    for view, image, mask in zip(views, images, masks, strict=True):
+        file = folder / view["image"]
+        if image.shape != images[0].shape:
+            size = f"{image.shape[1]} x {image.shape[0]}"
+            raise CaptureError(file, "size", f"{size}, but the first view has {width} x {height}: expected one size")
+        if (mask is None) != (masks[0] is None):
+            raise CaptureError(file, "alpha", "expected an alpha channel in all images or in none")
+    return np.stack(images), None if masks[0] is None else np.stack(masks)
+
+
+def read_view(
+    folder: Path, view: dict[str, Any], on_white: bool
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
+    """Image on white where a mask or alpha is known, and the mask or None."""
+    image, alpha = read_checked(read_image, folder / view["image"])
+    if alpha is not None:
+        image = on_white_background(image, alpha)
+    if "mask" not in view:
+        return image, alpha
+    file = folder / view["mask"]
+    mask = read_checked(read_grey, file)
+    if mask.shape != image.shape[:2]:
+        sizes = f"{mask.shape[1]} x {mask.shape[0]}, but its image has {image.shape[1]} x {image.shape[0]}"
+        raise CaptureError(file, "size", f"{sizes}: expected the same")
+    if 0 < mask.max() < 1.5 / 255:
+        raise CaptureError(file, "values", "0 and 1: expected 0 (background) to 255 (person)")
+    # where alpha has composited the image already, the mask file only says what the person is
+    return (image if on_white or alpha is not None else on_white_background(image, mask)), mask
+
+
+def read_checked(reader: Callable[[Path], Any], file: Path) -> Any:
+    """What a function of `io.images` reads from a file."""
+    try:
+        return reader(file)
+    except FileNotFoundError:
+        raise CaptureError(file, "", "no such image file (capture.json names it)") from None
+    except OSError as error:
+        raise CaptureError(file, "", f"not a readable image: {error.strerror or error}") from error
+    except ValueError as error:
+        raise CaptureError(file, "", error) from error
+
+
+def on_white_background(
+    image: Float[np.ndarray, "*v h w 3"], mask: Float[np.ndarray, "*v h w"]
+) -> Float[np.ndarray, "*v h w 3"]:
+    """The masked part over white."""
+    return image * mask[..., None] + (1 - mask[..., None])
+
+
+def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:
+    """File names without folder and suffix; with their folders where that alone is ambiguous."""
+    names = [Path(path).stem for path in paths]
+    if len(set(names)) < len(names):
+        names = ["_".join(Path(path).with_suffix("").parts) for path in paths]
+    if len(set(names)) < len(names):
+        names = [f"{i:03d}_{name}" for i, name in enumerate(names)]  # one photo used twice
+    return tuple(re.sub(r"[^\w.-]", "_", name).lstrip(".") or f"{i:03d}" for i, name in enumerate(names))

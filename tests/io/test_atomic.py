@@ -1,0 +1,138 @@
+"""Files and folders appear whole or not at all, and what was there before is never lost."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from humangs_jax.io import atomic
+
+
+class Interrupted(BaseException):
+    pass
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def folder_with(path, text):
+    path.mkdir(parents=True)
+    (path / "a.txt").write_text(text)
+    return path
+
+
+def writes(text):
+    return lambda temporary: folder_with(temporary, text)
+
+
+@pytest.fixture
+def dead_process():
+    """The id of a process that has ended."""
+    process = subprocess.Popen([sys.executable, "-c", ""])
+    process.wait()
+    return process.pid
+
+
+def leftover(path, kind, pid, machine=atomic.MACHINE, suffix=""):
+    return path.with_name(f".{path.name}.{kind}-{machine}-{pid}-0123abcd{suffix}")
+
+
+@pytest.mark.parametrize("error", [OSError, Interrupted])
+def test_a_failed_write_changes_nothing(tmp_path, error):
+    (tmp_path / "file.txt").write_text("old")
+    folder_with(tmp_path / "folder", "old")
+
+    def fail_file(temporary):
+        temporary.write_text("half")
+        raise error
+
+    def fail_folder(temporary):
+        folder_with(temporary, "half")
+        raise error
+
+    with pytest.raises(error):
+        atomic.replace_file(tmp_path / "file.txt", fail_file)
+    with pytest.raises(error):
+        atomic.replace_folder(tmp_path / "folder", fail_folder)
+    with pytest.raises(error):
+        atomic.add_files(tmp_path / "folder", lambda temporary: fail_file(temporary / "a.txt"))
+    assert names(tmp_path) == ["file.txt", "folder"]
+    assert (tmp_path / "file.txt").read_text() == (tmp_path / "folder" / "a.txt").read_text() == "old"
+
+
+def test_writes_replace_and_leave_nothing_temporary(tmp_path):
+    for text in ("one", "two"):
+        atomic.write_text(tmp_path / "file.txt", text)
+        atomic.replace_folder(tmp_path / "deep" / "folder", writes(text))
+        assert (tmp_path / "file.txt").read_text() == (tmp_path / "deep" / "folder" / "a.txt").read_text() == text
+    (tmp_path / "deep" / "folder" / "mine.txt").write_text("kept")
+    atomic.add_files(tmp_path / "deep" / "folder", lambda temporary: atomic.write_text(temporary / "a.txt", "three"))
+    assert (tmp_path / "deep" / "folder" / "a.txt").read_text() == "three"
+    assert names(tmp_path) == ["deep", "file.txt"] and names(tmp_path / "deep") == ["folder"]
+    assert names(tmp_path / "deep" / "folder") == ["a.txt", "mine.txt"]
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        atomic.write_text(tmp_path / "none" / "file.txt", "text")
+
+
+@pytest.mark.parametrize("renames", [0, 1])
+def test_an_interrupt_between_the_renames_loses_nothing(tmp_path, monkeypatch, renames):
+    """Interrupted before the `renames`-th rename, the old folder is in its place again."""
+    folder, calls, rename = folder_with(tmp_path / "folder", "old"), [], Path.rename
+
+    def interrupted(self, target):
+        calls.append(self)
+        if len(calls) == renames + 1:
+            raise Interrupted
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", interrupted)
+    with pytest.raises(Interrupted):
+        atomic.replace_folder(folder, writes("new"))
+    assert names(tmp_path) == ["folder"] and (folder / "a.txt").read_text() == "old"
+
+
+def test_what_killed_processes_left_is_swept(tmp_path, dead_process):
+    target = tmp_path / "folder"
+    folder_with(leftover(target, "new", dead_process), "half")
+    leftover(tmp_path / "file", "new", dead_process, suffix=".npz").write_text("half")
+    folder_with(leftover(target, "new", os.getpid()), "of this process")
+    folder_with(leftover(target, "new", dead_process, machine="00000000"), "of another machine")
+    old = folder_with(leftover(target, "new", dead_process, machine="00000001"), "of another machine, long ago")
+    os.utime(old, (0, 0))
+    (tmp_path / ".hidden").write_text("not ours")
+    atomic.replace_folder(target, writes("new"))
+    assert len(names(tmp_path)) == 4
+    assert ".hidden" in names(tmp_path) and leftover(target, "new", os.getpid()).is_dir()
+    assert leftover(target, "new", dead_process, machine="00000000").is_dir()
+
+
+def test_a_folder_that_a_killed_process_moved_aside_is_put_back(tmp_path, dead_process):
+    target = tmp_path / "folder"
+    folder_with(leftover(target, "old", dead_process), "old")
+
+    def fail(temporary):
+        raise OSError("disk full")
+
+    with pytest.raises(OSError, match="disk full"):
+        atomic.replace_folder(target, fail)
+    assert names(tmp_path) == ["folder"] and (target / "a.txt").read_text() == "old"
+
+
+def test_links_files_and_the_working_folder_are_refused_before_the_work(tmp_path, monkeypatch):
+    folder_with(tmp_path / "real", "old")
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    monkeypatch.chdir(tmp_path / "real")
+    never = lambda temporary: pytest.fail("the work has begun")
+    for folder, problem in (
+        (tmp_path / "link", "symbolic link"),
+        (tmp_path / "real" / "a.txt", "is a file"),
+        (Path("."), "working folder"),
+        (Path(".."), "working folder"),
+        (tmp_path / "real", "working folder"),
+    ):
+        with pytest.raises(ValueError, match=problem):
+            atomic.replace_folder(folder, never)
+    assert (tmp_path / "real" / "a.txt").read_text() == "old"

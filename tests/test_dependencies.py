@@ -1,0 +1,38 @@
+"""pyproject.toml declares what the package and its tests import, and no dependency that the package does not import."""
+
+import ast
+import re
+import sys
+import tomllib
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+NAMES = {"PIL": "pillow", "skimage": "scikit-image", "orbax": "orbax-checkpoint", "jaxlib": "jax"}
+"""Distributions that are not called like their module."""
+UNTESTED = {"torch"}
+"""Imported by scripts in tests/ that made stored references, not by tests."""
+
+
+def imported(folder):
+    """Distributions of all modules that the files of a folder import, also inside of functions."""
+    found = set()
+    for file in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Import):
+                found |= {alias.name.split(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+                found.add(node.module.split(".")[0])
+    return {plain(NAMES.get(module, module)) for module in found - sys.stdlib_module_names - {"humangs_jax", "tests"}}
+
+
+def plain(requirement):
+    return re.sub(r"[-_.]+", "-", re.split(r"[ \[<>=!~;]", requirement)[0]).lower()
+
+
+def test_imports_are_declared_and_dependencies_imported():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    required, extras = {plain(each) for each in project["dependencies"]}, project["optional-dependencies"]
+    assert imported(ROOT / "humangs_jax") == required
+    tools = {plain(each) for name in ("dev", "notebooks", "grain") for each in extras[name]}
+    own = {plain(path.stem) for folder in ("tests", "experiments") for path in (ROOT / folder).rglob("*.py")}
+    assert imported(ROOT / "tests") - own - required - tools == UNTESTED
