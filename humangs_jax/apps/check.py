@@ -1,8 +1,8 @@
-"""Looking at a capture before using it: the posed body over each photo, and numbers that tell what is wrong.
+"""A look at a capture before its use: the posed body over each photo, and numbers that show what is wrong.
 
-Blue is the person's left side, red the right, the green line the outline of the body; what was photographed and what the
-parameters say should lie on each other. Most captures that fail are of a wrong convention, so that a view in which the body
-is not where the mask is, is tried again with the usual mistakes undone, and the one that helps is named.
+Blue is the person's left side, red the right, the green line the outline of the body; photo and body
+should coincide. Most captures that fail have a wrong convention: a view whose body is not where the mask is, is tried again
+with each usual mistake undone, and the mistake that explains it is named.
 """
 
 import dataclasses
@@ -63,7 +63,7 @@ MISTAKES = {
 
 
 @pytree_dataclass
-class BodyPicture:
+class BodyImage:
     """The posed body as one camera sees it.
 
     shaded: (h, w, 3) lit from the camera, black outside. covered: (h, w). inside, before: shares of the vertices that fall
@@ -108,7 +108,7 @@ class CheckReport:
         lines += [f"warning: {view.name}: {warning}" for view in self.views for warning in view.warnings]
         if self.ok:
             lines.append(
-                "no warnings; look at the picture all the same: left and right cannot be told from silhouettes"
+                "no warnings; look at the sheet all the same: silhouettes do not show whether left and right are exchanged"
             )
         return "\n".join(lines)
 
@@ -116,41 +116,41 @@ class CheckReport:
 def check_capture(capture: Capture, out: str | Path) -> CheckReport:
     """Draw the posed body over every photo, write the sheet as a PNG, and report how well they agree.
 
-    Raises: OSError if the picture cannot be written.
+    Raises: OSError if the sheet cannot be written.
     """
     cameras, images, masks = _shrunk(capture)
     vertices = _posed_frames(capture)
     tints = side_tints(capture.body)
-    pictures, views = [], []
+    overlays, views = [], []
     for i, name in enumerate(capture.names):
         posed = vertices[int(capture.frames[i])]
-        picture = _picture(posed, capture.body.faces, tints, cameras[i])
+        drawn = _body_image(posed, capture.body.faces, tints, cameras[i])
         mask = None if masks is None else masks[i] > 0.5
-        view = _judge(name, picture, mask)
+        view = _judge(name, drawn, mask)
         if view.warnings:
             translation = np.asarray(capture.poses.translation[int(capture.frames[i])], float)
-            draw = functools.partial(_picture, posed, capture.body.faces, tints)
-            cause = _mistake_in_picture(picture, mask) or _mistake_in_space(draw, cameras[i], translation, mask)
+            draw = functools.partial(_body_image, posed, capture.body.faces, tints)
+            cause = _mistake_in_image(drawn, mask) or _mistake_in_space(draw, cameras[i], translation, mask)
             explained = f"it would fit if {cause}"
             view = dataclasses.replace(view, warnings=view.warnings + ((explained,) if cause else ()))
-        pictures.append(overlay(images[i], picture))
+        overlays.append(overlay(images[i], drawn))
         views.append(view)
-    contact_sheet(np.stack(pictures), out, labels=[_label(view) for view in views])
+    contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
     return CheckReport(tuple(views))
 
 
 def draw_body(
     body: BodyModel, betas: Float[Array, " s"], pose: BodyPose, camera: Camera, photo: Float[np.ndarray, "h w 3"]
-) -> tuple[Float[np.ndarray, "h w 3"], BodyPicture]:
-    """The posed body over a photo of one camera, and the body's picture alone."""
-    picture = _picture(_pose(body, betas, pose), body.faces, side_tints(body), camera)
-    return overlay(photo, picture), picture
+) -> tuple[Float[np.ndarray, "h w 3"], BodyImage]:
+    """The posed body over a photo of one camera, and the body alone."""
+    drawn = _body_image(_pose(body, betas, pose), body.faces, side_tints(body), camera)
+    return overlay(photo, drawn), drawn
 
 
-def overlay(photo: Float[np.ndarray, "h w 3"], picture: BodyPicture) -> Float[np.ndarray, "h w 3"]:
+def overlay(photo: Float[np.ndarray, "h w 3"], drawn: BodyImage) -> Float[np.ndarray, "h w 3"]:
     """Half-transparent body over a photo, with its outline."""
-    covered = np.asarray(picture.covered)
-    blended = photo + OPACITY * covered[..., None] * (np.asarray(picture.shaded) - photo)
+    covered = np.asarray(drawn.covered)
+    blended = photo + OPACITY * covered[..., None] * (np.asarray(drawn.shaded) - photo)
     return np.where(_outline(covered)[..., None], np.asarray(OUTLINE), blended)
 
 
@@ -174,7 +174,7 @@ def _pose(body, betas, pose):
 
 
 @jax.jit
-def _picture(vertices, faces, tints, camera) -> BodyPicture:
+def _body_image(vertices, faces, tints, camera) -> BodyImage:
     points = vertices @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     before = points[:, 2] > 0
     xy = points[:, :2] / jnp.where(before, points[:, 2], 1.0)[:, None] * jnp.diagonal(camera.K)[:2] + camera.K[:2, 2]
@@ -184,7 +184,7 @@ def _picture(vertices, faces, tints, camera) -> BodyPicture:
     normals = vertex_normals(vertices, faces) @ camera.cam_from_world[:3, :3].T
     light = AMBIENT + (1 - AMBIENT) * jnp.abs(jnp.sum(normals * rays, axis=-1, keepdims=True))
     fragments = rasterize_mesh(vertices, faces, camera)
-    return BodyPicture(
+    return BodyImage(
         shaded=interpolate_attributes(fragments, faces, tints * light, jnp.zeros(3)),
         covered=fragments.face_ids >= 0,
         inside=inside.mean(dtype=jnp.float32),
@@ -214,15 +214,15 @@ def _shrunk(capture):
     return capture.cameras.resized(*size), images, masks
 
 
-def _iou(picture, mask):
-    covered = np.asarray(picture.covered)
+def _iou(drawn, mask):
+    covered = np.asarray(drawn.covered)
     union = (covered | mask).sum()
     return float((covered & mask).sum() / union) if union else 0.0
 
 
-def _judge(name, picture, mask) -> ViewCheck:
-    inside, before, height = float(picture.inside), float(picture.before), float(picture.height)
-    iou = None if mask is None else _iou(picture, mask)
+def _judge(name, drawn, mask) -> ViewCheck:
+    inside, before, height = float(drawn.inside), float(drawn.before), float(drawn.height)
+    iou = None if mask is None else _iou(drawn, mask)
     warnings = []
     if before == 0:
         warnings.append("the body is behind the camera")
@@ -239,11 +239,11 @@ def _judge(name, picture, mask) -> ViewCheck:
     return ViewCheck(name, iou, inside, tuple(warnings))
 
 
-def _mistake_in_picture(picture, mask):
+def _mistake_in_image(drawn, mask):
     """An inverted mask, or a mirrored photo."""
     if mask is None or not mask.any():
         return None
-    covered = np.asarray(picture.covered)
+    covered = np.asarray(drawn.covered)
     tried = {"the mask is inverted": (covered, ~mask), "the photo is mirrored": (covered[:, ::-1], mask)}
     shares = {mistake: (a & b).sum() / max((a | b).sum(), 1) for mistake, (a, b) in tried.items()}
     best = max(shares, key=lambda mistake: shares[mistake])

@@ -97,7 +97,7 @@ def _write_products(out: Path, weights: str | os.PathLike | None, frame_size: in
 
 
 def _timed(timings: dict, stage: str, run: Callable[[], Any], twice: bool = False) -> Any:
-    """Run a stage and note its seconds; `twice` tells compiling (first run less second) from running (second)."""
+    """Run a stage and record its seconds; `twice`: separately for compiling (first run less second) and running (second)."""
     start = time.perf_counter()
     result = jax.block_until_ready(run())
     first = time.perf_counter() - start

@@ -1,4 +1,4 @@
-"""How well an avatar matches photographs that it has not seen, and the simplest baseline that it must beat."""
+"""Scores of an avatar on photos of new views, and the simplest baseline to compare with."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ class Scores:
 
 
 def score(predicted: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
-    """Compare pictures with a capture's photos, view by view. Raises ValueError if the capture has no masks."""
+    """Compare images with a capture's photos, view by view. Raises ValueError if the capture has no masks."""
     if truth.masks is None:
         raise ValueError("the foreground PSNR needs a mask for every view")
     views = range(truth.view_count)

@@ -1,4 +1,4 @@
-"""Pictures of an avatar: along a motion, from a circle of cameras, or as a capture's cameras saw the person."""
+"""Images of an avatar: along a motion, from a circle of cameras, or as a capture's cameras saw the person."""
 
 import os
 from collections.abc import Iterator

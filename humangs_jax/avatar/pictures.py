@@ -1,6 +1,6 @@
-"""Pictures for looking at: sheets of labelled images, and comparisons with the error in colour.
+"""Sheets of labelled images, and comparisons with the error in colour.
 
-Images are (h, w, 3) float arrays in [0, 1]. Nothing here needs more than Pillow, which io.images needs too.
+Images are (h, w, 3) float arrays in [0, 1].
 """
 
 from collections.abc import Sequence
@@ -16,8 +16,8 @@ GAP = 4
 TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT = 1 / 14, 10, 22
 """Height of the letters: a share of the width of a tile, within limits, pixels."""
 ERROR_COLORS = ((1, 1, 1), (1, 0.87, 0.35), (0.93, 0.38, 0.13), (0.6, 0.04, 0.2), (0.12, 0, 0.12))
-"""Colours of errors from none to the largest, evenly spaced: white first, as the background of pictures is, then darker
-at every step, so that the order also survives a grey printer."""
+"""Colours of errors from none to the largest, evenly spaced: white first, like the background, then darker
+at every step, so that the order is also visible in grey."""
 
 
 def contact_sheet(
@@ -105,19 +105,19 @@ def write_texts(
 
     if not any(text for text, *_ in texts):
         return sheet
-    picture = Image.fromarray(to_uint8(sheet))
-    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(text_height)
+    canvas = Image.fromarray(to_uint8(sheet))
+    pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(text_height)
     for text, x, y, room in texts:
         shown = text
         while shown and pen.textlength(shown, font=font) > room:
             shown = shown[:-2] + "…" if len(shown) > 2 else ""
         pen.text((x, y), shown, fill=(0, 0, 0), font=font)
     # only what was written on is rounded to 8 bits
-    return np.where(np.asarray(picture) == to_uint8(sheet), sheet, np.asarray(picture) / 255)
+    return np.where(np.asarray(canvas) == to_uint8(sheet), sheet, np.asarray(canvas) / 255)
 
 
 def error_colors(errors: Float[np.ndarray, "*shape"], largest: float | int) -> Float[np.ndarray, "*shape 3"]:
-    """Colours of non-negative errors: `ERROR_COLORS`, linear in between; whatever exceeds `largest` gets the last."""
+    """Colours of non-negative errors: `ERROR_COLORS`, linear in between; errors above `largest` get the last."""
     if not largest > 0:
         raise ValueError(f"largest error: expected a positive number, got {largest}")
     stops = np.linspace(0, largest, len(ERROR_COLORS))

@@ -16,7 +16,7 @@ CONSTANT_RATE_FACTOR = 17
 LARGEST_GIF_FPS = 50
 """Viewers slow down frames that are shorter than 2/100 s."""
 PALETTE_FRAMES = 16
-"""Frames, spread evenly, that the palette of a GIF is chosen from."""
+"""The palette of a GIF is chosen from this number of frames, evenly spaced."""
 
 
 def write_video(path: str | Path, frames: Float[np.ndarray, "m h w 3"], fps: float | int) -> None:
@@ -78,9 +78,9 @@ def _write_gif(path, frames, fps):
     chosen = frames[np.unique(np.linspace(0, len(frames) - 1, PALETTE_FRAMES).round().astype(int))]
     # one palette for all frames: with one each, still surfaces flicker
     palette = Image.fromarray(np.concatenate([to_uint8(x) for x in chosen])).quantize(256, Image.Quantize.MEDIANCUT)
-    pictures = [Image.fromarray(to_uint8(x)).quantize(palette=palette, dither=Image.Dither.NONE) for x in frames]
+    images = [Image.fromarray(to_uint8(x)).quantize(palette=palette, dither=Image.Dither.NONE) for x in frames]
     # durations are whole hundredths of a second; rounding the times, not the durations, keeps the speed
-    times = np.rint(np.arange(len(pictures) + 1) * 100 / fps).astype(int)
+    times = np.rint(np.arange(len(images) + 1) * 100 / fps).astype(int)
     durations = [10 * int(x) for x in np.diff(times)]
-    first, *rest = pictures
+    first, *rest = images
     first.save(path, format="GIF", save_all=True, append_images=rest, duration=durations, loop=0, optimize=False)

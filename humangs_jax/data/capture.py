@@ -45,7 +45,7 @@ from humangs_jax.data.photos import (
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import write_png
-from humangs_jax.io.npz import read_npz
+from humangs_jax.io.npz import read_npz, write_npz
 
 DEFAULT_BODY = "makehuman"
 """Name of the body that comes with the package; any other `body` in body.npz is the path of a model file."""
@@ -284,7 +284,7 @@ def _write_folder(folder, capture, target):
         views.append(view)
     background = "photo" if capture.masks is None else "white"
     description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": background, "views": views}
-    np.savez(folder / "body.npz", **parameter_arrays(capture, target))  # ty: ignore[invalid-argument-type]
+    write_npz(folder / "body.npz", parameter_arrays(capture, target), compressed=False)
     (folder / "capture.json").write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
 
 

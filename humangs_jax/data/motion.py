@@ -12,11 +12,10 @@ LHM (.json, or a   root_pose (3,), body_pose (21, 3), trans (3,), and if there a
 folder of them)    jaw_pose, leye_pose, reye_pose (3,), lhand_pose, rhand_pose (15, 3)
 =================  =====================================================================  =======================
 
-In memory: SMPL-X's 55 joints, axis-angle in radians, metres, y up. What a file does not tell (fingers, eyes) is 0.
+In memory: SMPL-X's 55 joints, axis-angle in radians, metres, y up. What a file does not have (fingers, eyes) is 0.
 """
 
 import functools
-import json
 import re
 from collections.abc import Mapping
 from importlib import resources
@@ -34,8 +33,9 @@ from humangs_jax.body.smplx import HandBasis
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
-from humangs_jax.io.npz import read_npz
+from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
+from humangs_jax.io.text import read_json
 
 WALK = "walk.npz"
 BODY_NUMBERS = 3 * len(BODY_NAMES)  # 66
@@ -80,7 +80,7 @@ class Motion:
         return BodyPose(self.rotations[frame], self.translations[frame])
 
     def at_rate(self, fps: float | int) -> "Motion":
-        """The motion at another frame rate, by the nearest frames (no blending: captured motions are dense)."""
+        """The motion at another frame rate, by the nearest frames (no blending: captured motions have many frames)."""
         count = max(1, round(len(self.translations) * fps / self.fps))
         frames = np.clip(np.rint(np.arange(count) * self.fps / fps).astype(int), 0, len(self.translations) - 1)
         return replace(self, rotations=self.rotations[frames], translations=self.translations[frames], fps=float(fps))
@@ -94,14 +94,14 @@ def load_motion(
     hands: HandBasis | None = None,
     flat_hand_mean: bool = True,
 ) -> Motion:
-    """Read a motion; the format is told by the keys.
+    """Read a motion; the keys decide the format.
 
     Arguments:
         path: None for the walk that comes with the package; else a file, or a folder of LHM's JSON files.
         up: axis of the file's world that points up ("y", "-y", "z", ...); the motion is turned so that y does. "auto"
             asks the poses: the axis along which the pelvis stands upright on average, and if none is clear the format's
             own (AMASS z, others y). Our own format and AIST++ are y-up and never turned by "auto".
-        fps: frames per second in place of what the file tells.
+        fps: frames per second in place of those in the file.
         hands: hand basis of an SMPL-X model, needed for hands of fewer than 45 numbers (principal coefficients) and for
             `flat_hand_mean` False, which adds the mean hand (only to files that have hands).
 
@@ -117,12 +117,12 @@ def load_motion(
     file = _MotionFile(path, hands, flat_hand_mean)
     for key, read in _FORMATS.items():
         if key in file.values:
-            rotations, translations, told_fps, usual_up = read(file)
+            rotations, translations, file_fps, usual_up = read(file)
             break
     else:
         keys = ", ".join(sorted(file.values)) or "none"
         raise MotionError(path, "", f"no motion: expected one of the keys {', '.join(_FORMATS)}, got {keys}")
-    rate = told_fps if fps is None else float(fps)
+    rate = file_fps if fps is None else float(fps)
     if not (np.isfinite(rate) and rate > 0):
         raise MotionError(path, "fps", f"expected a positive number of frames per second, got {rate}")
     if up == "auto":
@@ -132,9 +132,8 @@ def load_motion(
 
 
 def save_motion(path: str | Path, motion: Motion) -> None:
-    """Write our own format, compressed."""
-    rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
-    np.savez_compressed(path, rotations=rotations, translations=translations, fps=np.asarray(motion.fps))
+    """Write our own format, compressed; the file appears whole or not at all."""
+    write_npz(path, {"rotations": motion.rotations, "translations": motion.translations, "fps": motion.fps})
 
 
 def grounded(motion: Motion, rest: RestBody, parents: tuple[int, ...]) -> Motion:
@@ -314,7 +313,7 @@ def _read_json_frames(path):
     frames = []
     for file in files:
         try:
-            frame = json.loads(file.read_text(encoding="utf-8"))
+            frame = read_json(file)
         except (OSError, ValueError) as error:
             raise MotionError(file, "", f"not readable as JSON: {error}") from error
         if not isinstance(frame, dict):

@@ -1,6 +1,6 @@
 """Rendered views as OpenEXR files: float32, lossless ZIP, cameras in the header; several views are parts of one file.
 
-Channels R, G, B, A and Z (depth along the optical axis, metres, 0 where nothing was hit), and whatever others are given
+Channels R, G, B, A and Z (depth along the optical axis, metres, 0 for background), and further channels
 under their own names (`position.X`). Header of each part: `K` (3x3, pixels) and `cam_from_world` (4x4, OpenCV, metres),
 float32, exact. Colours are linear and stored as given; compositing programs expect them premultiplied, that is rendered
 onto black.
@@ -41,7 +41,7 @@ class ExrView:
 
     @property
     def camera(self) -> Camera:
-        """The camera that the header tells. Raises: ValueError if it tells none, or what is no camera."""
+        """The camera in the header. Raises: ValueError if there is none or it is not a camera."""
         if self.K is None or self.cam_from_world is None:
             raise ValueError(f"view {self.name!r}: no camera: expected K and cam_from_world")
         return Camera.from_opencv(self.K, self.cam_from_world, self.rgba.shape[1], self.rgba.shape[0])
@@ -87,7 +87,7 @@ def read_exr(path: str | Path) -> list[ExrView]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
-    if not OpenEXR.isOpenExrFile(str(path)):  # asked first: the reader prints to stderr before it raises
+    if not OpenEXR.isOpenExrFile(str(path)):  # checked first: the reader prints to stderr before it raises
         raise OSError(f"{path}: not an OpenEXR file")
     try:
         with OpenEXR.File(str(path), header_only=True) as file:

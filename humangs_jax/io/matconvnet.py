@@ -2,7 +2,7 @@
 
 Such a file has a cell array `layers` of structures with a `type`; a convolution ("conv") keeps its numbers under `weights`
 (filters and biases) or, in older files, under `filters` and `biases`. Filters are (rows, columns, in, out). The layers
-are numbered as in torchvision's `features`. Fully connected layers are convolutions there too; nobody asks for them.
+are numbered as in torchvision's `features`. Fully connected layers are convolutions there too, and not used.
 """
 
 import os
@@ -13,7 +13,7 @@ START = b"MATLAB "
 
 
 def is_matlab_file(path: str | os.PathLike) -> bool:
-    """Whether a file begins as MATLAB's do."""
+    """Whether a file begins like MATLAB's."""
     with open(path, "rb") as file:
         return file.read(len(START)) == START
 

@@ -1,9 +1,13 @@
-"""npz archives from strangers: read without pickle, file handles closed, every kind of damage one exception."""
+"""npz archives: written whole or not at all, read without pickle, every kind of damage one exception."""
 
 import threading
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+
+from humangs_jax.io.atomic import replace_file
 
 _ONE_AT_A_TIME = threading.Lock()
 """numpy reads the header of an array through Python's syntax trees, and CPython 3.11 counts the depth of these for all
@@ -35,3 +39,13 @@ def read_npz(path: str | Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     except Exception as error:  # zipfile, zlib, struct and numpy raise seven different types for a damaged archive
         raise OSError(f"not a readable npz archive: {' '.join(str(error).split())}") from error
     return arrays, tuple(pickled)
+
+
+def write_npz(path: str | Path, arrays: Mapping[str, Any], compressed: bool = True) -> None:
+    """Write an npz archive of array-likes by name. Raises: ValueError if the path does not end in .npz; OSError."""
+    if Path(path).suffix != ".npz":  # numpy would add it
+        raise ValueError(f"{path}: expected a name ending in .npz")
+    save = np.savez_compressed if compressed else np.savez
+    converted = {name: np.asarray(value) for name, value in arrays.items()}
+    # no array is called allow_pickle, the stub's only other keyword
+    replace_file(path, lambda temporary: save(temporary, **converted))  # ty: ignore[invalid-argument-type]

@@ -30,9 +30,9 @@ class _Sparse(_StandIn):
 
     def to_array(self) -> np.ndarray:
         shape, data = self.__dict__["_shape"], np.asarray(self.__dict__["data"])
-        dense = np.zeros(shape, data.dtype)
-        np.add.at(dense, self.coordinates(), data)
-        return dense
+        full = np.zeros(shape, data.dtype)
+        np.add.at(full, self.coordinates(), data)
+        return full
 
 
 class _SparseColumns(_Sparse):
@@ -93,7 +93,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def as_array(value: Any) -> np.ndarray:
-    """A dense array from what `read_pickle` left: array, number or stand-in. Raises: ValueError for anything else."""
+    """A full array from what `read_pickle` returned: array, number or stand-in. Raises: ValueError for anything else."""
     if isinstance(value, _Sparse | _Chumpy | _ChumpySelection):
         try:
             return value.to_array()

@@ -112,7 +112,7 @@ _ALLOWED = {
 
 
 class _StateDictUnpickler(pickle.Unpickler):
-    """Knows tensors, ordered dicts and storages; `kinds` tells the type of each storage that it met."""
+    """Knows tensors, ordered dicts and storages; `kinds` is the type of each storage that it read."""
 
     def __init__(self, file: Any) -> None:
         super().__init__(file)

@@ -10,19 +10,19 @@ MEASURED = "performance.md"
 
 @dataclasses.dataclass(frozen=True)
 class SplatConfig:
-    """What is drawn, in which buffers, on which schedule. docs/performance.md has what each knob costs and gains.
+    """What is drawn, in which buffers, on which schedule. docs/performance.md gives what each knob costs and gains.
 
     What is drawn (see `constants` for reasons and for the numbers of other rasterizers):
         near: metres; nearer Gaussians are not drawn. eps2d: pixels^2 added to the projected variances.
         alpha_min: alphas below are skipped. alpha_max: alphas are clamped to it.
         transmittance_stop: a pixel ends before its transmittance would fall to this.
         jacobian_margin: None for the exact Jacobian, 0.3 for the clamped one of INRIA and gsplat.
-        normalize_quats: False: quaternions are used as they are, as INRIA's rasterizer does.
-        opacity_min: fainter Gaussians are not drawn at all.
+        normalize_quats: False: quaternions are not normalised, as in INRIA's rasterizer.
+        opacity_min: Gaussians of lower opacity are not drawn at all.
 
     Where footprints end. A splat is drawn on whole tiles, all that its footprint meets.
-        radius_sigma: standard deviations; None: only where alpha falls below alpha_min, so that nothing is lost. Less draws
-        faster, and cuts splats off at the borders of tiles: then the image depends on tile_size.
+        radius_sigma: standard deviations; None: where alpha falls below alpha_min, so that nothing is lost. Smaller values draw
+        faster and cut splats off at the borders of tiles: the image then depends on tile_size.
         square: INRIA's footprint: the square around the splat whose half side is `radius_sigma` times the larger standard
         deviation, rounded up to pixels, at tiles as INRIA counts them.
 
@@ -32,8 +32,8 @@ class SplatConfig:
 
     Buffers: capacities for (splat, tile) pairs, `max_pairs`, and for (splat, row of tiles) pairs, `max_rows`.
         None: an eager call measures its need. A traced call (under jit, grad or vmap) cannot, and takes
-        `splatting.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and
-        `splatting.plan_buffers` measures a capacity for such calls. `max_rows` None: as many as pairs, always enough in
+        `buffers.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and
+        `buffers.plan_buffers` measures a capacity for such calls. `max_rows` None: as many as pairs, always enough in
         practice; smaller is a little faster.
 
     Schedule: changes the time, not the image (but for rounding).
@@ -104,7 +104,7 @@ class SplatConfig:
         if self.radius_sigma is not None and not self.radius_sigma > 0:
             raise ValueError(f"SplatConfig: radius_sigma must be positive or None, got {self.radius_sigma}")
         if self.square and self.radius_sigma is None:
-            raise ValueError("SplatConfig: a square footprint needs an radius_sigma")
+            raise ValueError("SplatConfig: a square footprint needs a radius_sigma")
         if self.matmul_precision not in MATMUL_PRECISIONS:
             raise ValueError(
                 f"SplatConfig: matmul_precision must be one of {MATMUL_PRECISIONS}, got {self.matmul_precision!r}"

@@ -205,5 +205,5 @@ def test_drawing_compiles_once_per_image_size():
     body, counts = boxes(), []
     for i in range(3):
         draw_body(body, jnp.zeros(0), rest_pose(body), cameras()[i], np.ones((SIZE, SIZE, 3), np.float32))
-        counts.append(module._picture._cache_size())
+        counts.append(module._body_image._cache_size())
     assert counts[0] == counts[1] == counts[2]

@@ -1,4 +1,4 @@
-"""A calibration in memory, whatever its format: cameras, conversion to the convention of captures, lens distortion.
+"""A calibration in memory, independent of its format: cameras, conversion to the convention of captures, lens distortion.
 
 Readers return a `Calibration`: OpenCV axes (x right, y down, z forward), but lengths, the world's up axis and the place of
 pixel centres still those of the source. `in_capture_convention` makes metres, y up and pixel centres at +0.5 of them.
@@ -73,7 +73,7 @@ class Calibration:
     """Everything that a calibration says.
 
     format: what it was read as. file: the one that errors name. cameras: at least one. per_image: one camera for each
-    image, not one for each camera. pixel_centers, up: what the format means unless told otherwise.
+    image, not one for each camera. pixel_centers, up: what the format means by default.
     observations: None where the format has none. convention: what the matrices in the file mean, of `CONVENTIONS`.
     """
 
@@ -222,7 +222,7 @@ def undistort(
 
 
 def _squared_reach(coefficients):
-    """r^2 up to which r (1 + k1 r^2 + ..) grows. Beyond it the formula folds the picture back over itself."""
+    """r^2 up to which r (1 + k1 r^2 + ..) grows. Beyond it the formula folds the image back over itself."""
     k1, k2, _, _, k3 = coefficients
     roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1])
     real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real

@@ -1,7 +1,7 @@
 """Whether imported cameras make sense: reprojection, axes that meet before the cameras, which side is up, distances.
 
-A wrong convention gives numbers that look like any others; what it cannot give is cameras around a person that all look at
-them. These checks only warn: there are captures whose cameras do stand otherwise.
+A wrong convention gives plausible numbers, but not cameras around a person that all look at the person. These checks only
+warn: the cameras of some captures do stand otherwise.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ REPROJECTION_LIMIT = 2.0
 DISTANCES = (0.3, 30.0)
 """Metres between which cameras stand from a person."""
 NEARLY_PARALLEL = np.sin(np.radians(2.0)) ** 2
-"""Axes that spread less than about 2 degrees meet nowhere in particular."""
+"""Axes within about 2 degrees of each other do not define a point where they meet."""
 MISS = 0.5
 """Axes of cameras around a person pass within this share of the distance: some look at the feet, others at the face."""
 TILT_LIMIT = 45.0

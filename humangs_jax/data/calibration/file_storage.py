@@ -34,7 +34,7 @@ def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
 
 
 def _logical_lines(text, file):
-    """(indentation, line number, content), comments gone, and flow values joined to one line each."""
+    """(indentation, line number, content), without comments, flow values joined to one line each."""
     lines, depth = [], 0
     for number, line in enumerate(text.splitlines(), 1):
         content = re.sub(r"(^|\s)#.*", "", line).rstrip()

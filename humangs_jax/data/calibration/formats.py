@@ -1,4 +1,4 @@
-"""The calibration in a file or folder; its content tells the format. COLMAP's text models are read by `colmap`.
+"""The calibration in a file or folder; its content decides the format. COLMAP's text models are read by `colmap`.
 
 transforms.json of NeRF, instant-ngp and nerfstudio: camera-to-world matrices with OpenGL axes.
 Intrinsics are the file's or, where a frame has its own, that frame's: fl_x fl_y cx cy w h, or camera_angle_x (the field of

@@ -1,6 +1,6 @@
 """`import_cameras`: photos and the calibration that another tool made of their cameras -> a capture folder without body.
 
-docs/cameras.md tells the formats and their conventions. Photos are copied as they are, or undistorted where the lens
+docs/cameras.md describes the formats and their conventions. Photos are copied as they are, or undistorted where the lens
 asks for it; capture.json names body.npz, which `humangs fit` makes.
 """
 
@@ -25,7 +25,7 @@ from humangs_jax.data.photos import FORMAT, VERSION, names_from_paths, read_chec
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import read_grey, read_image, write_png
 
-NO_COMMON_FRAME = "no two cameras have a photo of the same frame: photos of one moment must have the same file name"
+NO_COMMON_FRAME = "no two cameras have a photo of the same frame: photos of one frame must have the same file name"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,7 @@ def import_cameras(
     """Write a capture folder (all of it or nothing) of photos and their calibration; body.npz is still to be made.
 
     Arguments:
-        source: file or folder of any format in docs/cameras.md; which one is seen from what is in it.
+        source: file or folder of any format in docs/cameras.md; its content decides which one.
         images: folder of the photos. masks: folder of their masks, named alike.
         out: the capture folder. With `overwrite` a capture that is there is replaced as a whole.
         scale: metres per unit of the source; 1 if None.

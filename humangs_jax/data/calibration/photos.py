@@ -1,4 +1,4 @@
-"""Which photo belongs to which camera and to which moment, by the names of files."""
+"""Which photo belongs to which camera and to which frame, by file names."""
 
 import dataclasses
 import os

@@ -1,1 +1,1 @@
-"""2D keypoints of photographs, read from the files that detectors write."""
+"""2D keypoints of photos, read from the files that detectors write."""

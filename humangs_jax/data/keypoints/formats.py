@@ -1,4 +1,4 @@
-"""What detectors write: people per image, before it is known which view and whose they are. The content tells the format.
+"""What detectors write: people per image, not yet matched to views and persons. The content decides the format.
 
 ===================================  ==========================================================  ====================
 from                                 file                                                        points
@@ -67,7 +67,7 @@ class Detections:
 
 
 def read_detections(path: Path) -> Detections:
-    """The people in the images of a file or folder; its content tells the format.
+    """The people in the images of a file or folder; its content decides the format.
 
     Raises: CaptureError.
     """
@@ -189,7 +189,7 @@ def _result_images(entries: list[Any], file: Path) -> list[DetectedImage]:
 
 
 def _annotated_images(content: dict[str, Any], file: Path) -> list[DetectedImage]:
-    """Images of an annotation file. Crowds, and annotations without keypoints, are passed over.
+    """Images of an annotation file. Crowds, and annotations without keypoints, are ignored.
 
     Raises: CaptureError.
     """
@@ -241,7 +241,7 @@ def _coco_person(entry: dict[str, Any], file: Path, field: str, whole: bool) -> 
 
 
 def _by_visibility(person: Float[np.ndarray, "k 3"], file: Path, field: str) -> Float[np.ndarray, "k 3"]:
-    """Confidences from visibilities. Fractions occur in COCO-WholeBody, which says that above 0 they are reliable."""
+    """Confidences from visibilities. Fractions occur in COCO-WholeBody, where any value above 0 means reliable."""
     visibility = person[:, 2]
     if not np.isnan(visibility).all() and (np.nanmin(visibility) < 0 or np.nanmax(visibility) > LARGEST_VISIBILITY):
         raise CaptureError(file, field, f"expected visibilities 0, 1 or 2, got {np.nanmax(np.abs(visibility)):g}")
@@ -250,7 +250,7 @@ def _by_visibility(person: Float[np.ndarray, "k 3"], file: Path, field: str) -> 
 
 
 def _stated_size(image: dict[str, Any]) -> tuple[int, int] | None:
-    """What the file states; placeholders of 0 are no statement."""
+    """What the file states; 0 is a placeholder for unknown."""
     width, height = image.get("width"), image.get("height")
     return (int(width), int(height)) if width and height else None
 
@@ -286,7 +286,7 @@ def _openpose_person(person: Any, file: Path, field: str) -> Float[np.ndarray, "
 
 
 def _openpose_part(values: Any, file: Path, field: str, count: int) -> Float[np.ndarray, "k 3"]:
-    """The points of the body or of a hand; an empty list says that it was not looked for."""
+    """The points of the body or of a hand; an empty list means that it was not detected."""
     if not _expect(values, list, file, field):
         return np.zeros((count, 3))
     other = _OTHER_MODELS.get(len(values) // 3)

@@ -12,17 +12,17 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.keypoints.sets import KeypointSet
-from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.npz import write_npz
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Keypoints:
     """One person's keypoints in each of v views (numpy on the host).
 
-    points: (v, k, 2) float32 pixels, x right and y down, the centre of the first pixel at (0.5, 0.5); finite, and without
-        meaning where the confidence is 0.
+    points: (v, k, 2) float32 pixels, x right and y down, the centre of the first pixel at (0.5, 0.5); finite, and to be
+        ignored where the confidence is 0.
     confidences: (v, k) float32 in [0, 1]; 0: the point is missing.
-    set: what the k points are. missing: names of the views of which the file has nothing.
+    set: what the k points are. missing: names of the views that the file has nothing for.
     not_finite: points that were NaN or infinite in the file. far_outside: points more than half an image outside of it.
         Both kinds have confidence 0.
     """
@@ -40,18 +40,12 @@ def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str])
 
     Raises: ValueError if the path does not end in .npz, or there is not one name per view.
     """
-    if Path(path).suffix != ".npz":
-        raise ValueError(f"{path}: expected a name ending in .npz")
     if len(names) != len(keypoints.points):
         raise ValueError(f"names: expected one for each of {len(keypoints.points)} views, got {len(names)}")
-
-    def write(temporary: Path) -> None:
-        np.savez_compressed(
-            temporary,
-            points=np.asarray(keypoints.points, np.float32),
-            confidences=np.asarray(keypoints.confidences, np.float32),
-            set=np.asarray(keypoints.set.name),
-            names=np.asarray(list(names), np.str_),
-        )
-
-    replace_file(path, write)
+    arrays = {
+        "points": np.asarray(keypoints.points, np.float32),
+        "confidences": np.asarray(keypoints.confidences, np.float32),
+        "set": keypoints.set.name,
+        "names": np.asarray(list(names), np.str_),
+    }
+    write_npz(path, arrays)

@@ -42,7 +42,7 @@ def read_keypoints(
     Arguments:
         path: a file or folder of one of the formats in `formats`.
         names: of the capture's views. Images of the file are matched by name, or by the number in the name where the file
-            has only numbers; images of no view are passed over.
+            has only numbers; images of no view are ignored.
         width, height: pixels of the capture's photos, which the keypoints have to be of.
         person: which one to take where several people are seen, counted from 0 in the order of the file.
 
@@ -64,7 +64,9 @@ def read_keypoints(
     ]
     if person is not None and not any(people):
         most = max(len(image.people) for image in images if image is not None)
-        raise CaptureError(path, f"--person {person}", f"no view has so many: expected 0 to {max(most - 1, 0)}")
+        raise CaptureError(
+            path, f"--person {person}", f"no view has this many people: expected 0 to {max(most - 1, 0)}"
+        )
     keypoints = _assemble(people, detections.set, names)
     _check_pixels(path, keypoints)
     return keypoints

@@ -84,7 +84,7 @@ COCO_WHOLEBODY_133 = _keypoint_set(
 """COCO-WholeBody: 17 of the body as in COCO, 6 of the feet, 68 of the face, 21 of the left and 21 of the right hand."""
 
 OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
-"""OpenPose's BODY_25 with its left and right hand. Its 70 points of the face are read over: they are not in this set."""
+"""OpenPose's BODY_25 with its left and right hand. Its 70 points of the face are ignored: they are not in this set."""
 
 KEYPOINT_SETS = {each.name: each for each in (COCO_17, COCO_WHOLEBODY_133, OPENPOSE_67)}
 """The sets by name, as our npz files name them."""

@@ -89,9 +89,9 @@ def _check_image(file):
 
 
 class CaptureCache:
-    """Capture folders: each is checked when first asked for; pictures are decoded when wanted, and kept as bytes up to a limit.
+    """Capture folders: each is checked when first asked for; images are decoded when needed, and kept as bytes up to a limit.
 
-    Several threads may ask at once. broken: folder -> what is wrong with it, in the order of discovery.
+    Several threads may ask at once. broken: folder -> what is wrong with it, in the order in which it was found.
     """
 
     def __init__(self, folders: Sequence[str | Path], body: BodyModel, limit_bytes: int = 4 << 30):
@@ -102,14 +102,14 @@ class CaptureCache:
         self._body, self._free_bytes = body, limit_bytes
         self._left_out: set[Path] = set()
         self._outlines: dict[Path, StoredSubject] = {}
-        self._pictures: dict[tuple[Path, int], tuple[np.ndarray, np.ndarray]] = {}
+        self._images: dict[tuple[Path, int], tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self.folders)
 
     def outline(self, index: int) -> StoredSubject | None:
-        """The subject of folder `index` without pictures, see `read_outline`; None if it is broken, which is told once."""
+        """The subject of folder `index` without images, see `read_outline`; None if it is broken, which is reported once."""
         folder = self.folders[index]
         with self._lock:
             if folder in self._left_out:
@@ -129,22 +129,22 @@ class CaptureCache:
         folder = self.folders[index]
         with self._lock:
             outline = self._outlines.get(folder)
-            pictures = {view: self._pictures[folder, view] for view in views if (folder, view) in self._pictures}
+            decoded = {view: self._images[folder, view] for view in views if (folder, view) in self._images}
         outline = read_outline(folder, self._body) if outline is None else outline
-        if missing := [view for view in views if view not in pictures]:
+        if missing := [view for view in views if view not in decoded]:
             capture = load_capture(folder, body=self._body, views=missing)
             assert capture.masks is not None  # the outline has seen them
             images, masks = to_uint8(capture.images), to_uint8(capture.masks)
             for view, image, mask in zip(missing, images, masks, strict=True):
-                pictures[view] = image, mask
+                decoded[view] = image, mask
                 self._keep(folder, view, image, mask)
         chosen = np.asarray(views)
-        images, masks = (np.stack(column) for column in zip(*(pictures[view] for view in views), strict=True))
+        images, masks = (np.stack(column) for column in zip(*(decoded[view] for view in views), strict=True))
         of_views = {name: getattr(outline, name)[chosen] for name in ("K", "cam_from_world", "frames", "azimuths")}
         return outline._replace(images=images, masks=masks, **of_views)
 
     def load(self, index: int) -> StoredSubject | None:
-        """The whole subject of folder `index`; None if it is broken, which is told once."""
+        """The whole subject of folder `index`; None if it is broken, which is reported once."""
         outline = self.outline(index)
         if outline is None:
             return None
@@ -155,7 +155,7 @@ class CaptureCache:
             return None
 
     def note(self, index: int, problem: str) -> None:
-        """Name folder `index` as broken, in the log the first time; what is not wrong with it is still used."""
+        """Record folder `index` as broken, and log it the first time; its other views are still used."""
         folder = self.folders[index]
         with self._lock:
             known = folder in self.broken
@@ -165,7 +165,7 @@ class CaptureCache:
             logger.warning("left out %s (%d of %d folders so far): %s", folder, count, len(self), problem)
 
     def report(self, index: int, problem: str) -> None:
-        """Leave folder `index` out from now on. That must depend on the folder alone, never on when or for what it is asked.
+        """Leave folder `index` out from now on. The reason must depend on the folder alone, so that the order stays reproducible.
 
         Raises: ValueError, naming the last problem, once every folder is left out.
         """
@@ -179,9 +179,9 @@ class CaptureCache:
     def _keep(self, folder, view, image, mask):
         size = image.nbytes + mask.nbytes
         with self._lock:
-            if (folder, view) not in self._pictures and size <= self._free_bytes:
+            if (folder, view) not in self._images and size <= self._free_bytes:
                 # copies: a slice would keep the memory of all views that were read with it
-                self._pictures[folder, view] = image.copy(), mask.copy()
+                self._images[folder, view] = image.copy(), mask.copy()
                 self._free_bytes -= size
 
 
@@ -221,7 +221,7 @@ class CaptureSource:
             try:
                 inputs, targets = draw_views(view_generator(seed, index), outline, input_count, self.sampling)
                 for size in (self.input_size, self.target_size):
-                    shrink(outline.images, size)  # of no views: can pictures of this size be shrunk so?
+                    shrink(outline.images, size)  # without views: whether images of this size can be shrunk so
             except ValueError as error:
                 self.cache.report(subject_index, f"{self.cache.folders[subject_index]}: {error}")
                 continue

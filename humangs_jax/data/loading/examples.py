@@ -20,7 +20,7 @@ WINDOW_OF = 60
 class ViewSampling:
     """Which views of a subject are input and which are targets.
 
-    rule: "random": inputs stand around the subject, targets are drawn from all other views, of whatever pose.
+    rule: "random": inputs stand around the subject, targets are drawn from all other views, of any pose.
         "window": the release's. Of a random window in the order of the views, whose ends are 25 to 59 views apart where a
         subject has 60 (in proportion for other counts), take the two ends, then random views inside; the first of these
         are input, the last targets. jitter, scattered_share and mixed_pose_share are not used.

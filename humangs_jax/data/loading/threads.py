@@ -40,8 +40,8 @@ class Waiting:
 def prefetched(make: Callable[[], Iterator[T]], ahead: int, waiting: Waiting | None = None) -> Generator[T, None, None]:
     """The items of the iterator that `make()` returns, up to `ahead` of them prepared by a thread.
 
-    The iterator lives in the thread, and is closed there. Its errors are raised here. Closing the generator (or leaving the
-    loop over it) ends the thread. waiting: what the loop waited is added to it.
+    The iterator is used and closed in the thread. Its errors are raised here. Closing the generator (or leaving the
+    loop over it) ends the thread. waiting: the time that the loop waited is added to it.
     """
     ready: queue.Queue = queue.Queue(maxsize=max(1, ahead))
     stopped = threading.Event()
@@ -63,7 +63,7 @@ def prefetched(make: Callable[[], Iterator[T]], ahead: int, waiting: Waiting | N
                     return
                 put((item, None, False))
             put((None, None, True))
-        except BaseException as error:  # a thread must hand over whatever ends it
+        except BaseException as error:  # the error is raised in the loop
             put((None, error, True))
         finally:
             close = getattr(iterator, "close", None)
@@ -99,9 +99,9 @@ def has_grain() -> bool:
 def read_in_order(
     make: Callable[[int], T], count: int, threads: int, ahead: int, reader: Reader = "auto"
 ) -> Generator[T, None, None]:
-    """make(0), make(1), ..., make(count - 1), up to `ahead` of them begun before they are asked for.
+    """make(0), make(1), ..., make(count - 1), up to `ahead` of them started before they are needed.
 
-    Raises: ImportError if reader is "grain" and there is none; whatever `make` raises, when its turn comes.
+    Raises: ImportError if reader is "grain" and it is not installed; what `make` raises, in its turn.
     """
     if count <= 0:
         return
