@@ -15,6 +15,10 @@ from humangs_jax.objectives.lpips import BACKBONES, Lpips, lpips, lpips_distance
 DATA = Path(__file__).parent / "data"
 SIZES = {"vgg": (37, 32), "alex": (37, 43), "squeeze": (40, 33)}
 FLOAT32 = 1e-5  # relative; sums of some thousand products, a dozen times over, and differences of unit vectors
+GRADIENT = 3e-5
+"""Relative L2 in float32. A sum of n terms of either sign, one after the other, rounds by u sqrt(n) / 2.4 of itself: 1.7e-6 for
+the 9 x 512 of VGG's widest layers. Thirteen layers forward and backward: 9e-6 in quadrature; differences of unit vectors
+triple it. Measured with AVX-512, whose vectors shorten the sums: 4e-6."""
 FLOAT64 = 1e-12
 STORED = 1e-7  # the gradients are stored as float32
 BFLOAT16 = 0.05  # relative; features keep 8 bits
@@ -52,7 +56,7 @@ def test_the_numbers_and_gradients_of_torch(net):
     (_, parts), gradient = with_gradient(made_up(net), *pair(net))
     assert gradient.dtype == jnp.float32
     np.testing.assert_allclose(parts, expected[f"{net}_parts"], rtol=FLOAT32)
-    assert relative(gradient, expected[f"{net}_gradient"]) < bound(FLOAT32)
+    assert relative(gradient, expected[f"{net}_gradient"]) < bound(GRADIENT)
 
 
 slow = lambda net: pytest.param(net, marks=pytest.mark.slow)
