@@ -1,4 +1,4 @@
-"""How much refinement mends cameras and poses that are a little off, on synthetic people of unseen seeds.
+"""How much refinement mends cameras and poses that are a little off, on synthetic people of the fitting seeds.
 
     python experiments/evaluate_refine.py --subjects 4 --views 6 --json refine.json [--docs docs/fitting_refinement.md]
 
@@ -38,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--subjects", type=int, default=4, help="how many people")
     parser.add_argument("--first", type=int, default=0, help="index of the first within the split")
-    parser.add_argument("--split", choices=("validation", "test"), default="test", help="whom to look at")
+    parser.add_argument("--split", choices=("validation", "test", "fitting"), default="fitting", help="whom to look at")
     parser.add_argument("--views", type=int, default=6, help="photos of each")
     parser.add_argument("--size", type=int, default=512, help="side of the photos, pixels")
     parser.add_argument("--noise-px", type=float, default=2.0, help="standard deviation of keypoints")

@@ -2,7 +2,7 @@
 
     python experiments/evaluate_scan_fit.py --subjects 32 --json scans.json [--without-joints] [--pictures scans.png]
 
-People of unseen seeds in random poses. A scan is the posed mesh of the dressed person, or of the bare body; each is turned by a
+People of the fitting seeds in random poses. A scan is the posed mesh of the dressed person, or of the bare body; each is turned by a
 random rotation, scaled by 0.1 to 100 and moved. Given joints are the 17 of COCO with errors of --noise-mm (before the scaling).
 The fitted body is put back into the scan's coordinates, from there by the true similarity into metres, and compared with the true
 body: a scan has no metric, so that neither has the error one of its own. Two distances: of equal vertices, and of the fitted
@@ -34,7 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--subjects", type=int, default=32)
     parser.add_argument("--first", type=int, default=0, help="first person of the split")
-    parser.add_argument("--split", default="test", choices=("validation", "test"))
+    parser.add_argument("--split", default="fitting", choices=("validation", "test", "fitting"))
     parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
     parser.add_argument(
         "--noise-mm", type=float, default=5.0, help="standard deviation of given joints in each direction"

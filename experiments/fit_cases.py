@@ -1,4 +1,4 @@
-"""Synthetic people whose keypoints are known: unseen seeds, plausible poses, cameras all around, and detections with errors."""
+"""Synthetic people whose keypoints are known: the fitting seeds, plausible poses, cameras all around, and detections with errors."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ class FitCase:
 
 
 def make_case(seed, body, model, frames, views, size=512) -> FitCase:
-    """The person of a test seed in random poses, each with cameras of its own, as of the published protocol."""
+    """The person of a seed in random poses, each with cameras of its own, as of the published protocol."""
     import jax
     import jax.numpy as jnp
 

@@ -1,4 +1,4 @@
-"""People of unseen seeds in photographs whose cameras and poses are a little off: what refinement is measured on."""
+"""People of the fitting seeds in photographs whose cameras and poses are a little off: what refinement is measured on."""
 
 import dataclasses
 from typing import Any
@@ -19,7 +19,7 @@ class Errors:
 
 
 def true_captures(seed: int, body: Any, views: int, size: int = 512) -> tuple[Any, Any]:
-    """The person of a test seed in a random pose from cameras all around, with true parameters: (in clothes, the bare body)."""
+    """The person of a seed in a random pose from cameras all around, with true parameters: (in clothes, the bare body)."""
     from humangs_jax.people.cameras import cameras_around, spread_azimuths
     from humangs_jax.people.poses import sample_rotations
     from humangs_jax.people.subject import make_subject
