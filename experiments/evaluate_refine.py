@@ -85,7 +85,7 @@ def refine_subject(seed: int, body: Any, arguments: argparse.Namespace) -> dict[
     """The rows of one person, by case."""
     from refine_cases import disturbed, noisy_keypoints, true_captures
 
-    from humangs_jax.fitting.refinement.refine import refine_capture
+    from humangs_jax.fitting.refine import refine_capture
 
     clothed, bare = true_captures(seed, body, arguments.views, arguments.size)
     keypoints = noisy_keypoints(clothed, seed, arguments.noise_px)
@@ -100,9 +100,10 @@ def refine_subject(seed: int, body: Any, arguments: argparse.Namespace) -> dict[
         )
         seconds = time.perf_counter() - begun
         rows[case] = scores(start, refined.capture, truth, bare.masks)
-        rows[case] |= {"seconds": seconds, "refined": float(refined.kept == "refined")}
-        if "avatar_psnr" in refined.before:
-            rows[case] |= {f"psnr_{when}": getattr(refined, when)["avatar_psnr"] for when in ("before", "after")}
+        rows[case] |= {"seconds": seconds, "refined": float(refined.report.kept)}
+        if "avatar_psnr" in refined.report.errors:
+            psnr = refined.report.errors["avatar_psnr"]
+            rows[case] |= {"psnr_before": float(psnr.before or 0), "psnr_after": psnr.after}
         if arguments.pictures:
             draw(arguments.pictures / f"{seed}_{case}.png", start, refined.capture)
     return rows

@@ -245,7 +245,7 @@ def check(
     from humangs_jax.apps.check import check_capture
     from humangs_jax.data.capture import load_capture
     from humangs_jax.data.photographs import capture_folder
-    from humangs_jax.fitting.fit_record import FIT_FILE, read_fit_record
+    from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
     photos = load_capture(capture)
     _require_parent(out)
@@ -265,7 +265,7 @@ def check(
         examination, found = examine_record(photos, record, found)
         sheet = out.with_name(f"{out.stem}_fit{out.suffix}")
         fit_sheet(photos, found, examination, sheet)
-        print(f"\n{examination}\n{sheet}: the keypoints over the photos")
+        print(f"\n{examination.report}\n{sheet}: the keypoints over the photos")
 
 
 def fit(
