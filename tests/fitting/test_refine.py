@@ -18,7 +18,8 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.views import SubjectViews
-from humangs_jax.fitting.refine import RefineConfig, by_colors, refine_capture
+from humangs_jax.fitting.refine import by_colors, refine_capture
+from humangs_jax.fitting.refine_rounds import RefineConfig
 from humangs_jax.fitting.residuals.colors import Likeness, draw
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
