@@ -15,7 +15,7 @@ from humangs_jax.fitting.fit_capture import fit_photographs
 from humangs_jax.fitting.landmark_fit import FitConfig
 
 NAMED = 5
-"""At most so many views are listed by name."""
+"""Views that are listed by name, at most."""
 
 
 def fit_from_keypoints(

@@ -69,7 +69,7 @@ class RefineConfig:
     shape, where the capture has fewer. rounds: number of matchings; steps: of the solver in each. points: of an outline.
     independent: number of independent equations that all points of a view count for. reach: how far points look in the first and
     the last round, shares of the person's height in the image. robust_scales: multiples of the reach, outwards and inwards of
-    the mask. longest_side: larger photos are shrunk to so many pixels. color_steps: of L-BFGS. independent_colors: as
+    the mask. longest_side: larger photos are shrunk to this many pixels. color_steps: of L-BFGS. independent_colors: as
     independent, of the pixels of a view.
     """
 
@@ -169,7 +169,7 @@ def evidence_residuals(
 def solve_round(
     model: LandmarkModel, origin: Origin, evidence: Evidence, state: FitState, independent: float, steps: int
 ) -> tuple[FitState, Outcome]:
-    """The state after at most so many steps with fixed matches."""
+    """The state after at most `steps` steps with fixed matches."""
 
     def residuals(y):
         clothing = jnp.where(y.clothing < 0, BARE * y.clothing, y.clothing)
@@ -227,7 +227,7 @@ class Scene:
         return state, jax.tree.map(lambda *leaves: jnp.stack(leaves), *outcomes), move
 
     def look(self, state: FitState, reach: float) -> Evidence:
-        """What the views show, matched within `reach` pixels of the body as it is now."""
+        """What the views show, matched within `reach` pixels of the body in this state."""
         count = self.config.points
         moved = moved_capture(self.capture, self.origin, state)
         outlines = [body_outline(view, self.faces, self.edges, count) for view in self.body_views(moved)]
@@ -296,7 +296,7 @@ def _noise(outlines, matches):
 
 
 def _shrunk(capture, longest):
-    """Cameras and masks with a longest side of at most so many pixels; empty masks if the capture has none."""
+    """Cameras and masks with a longest side of at most `longest` pixels; empty masks if the capture has none."""
     height, width = capture.images.shape[1:3]
     masks = np.zeros((capture.view_count, height, width), np.float32) if capture.masks is None else capture.masks
     share = longest / max(height, width)

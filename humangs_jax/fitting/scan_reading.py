@@ -26,7 +26,7 @@ BEHIND = 1.0
 OCCLUDERS = 5
 """Points that fill the cells, for each that is kept: with 30,000 points of a person, cells are 1.5 cm wide."""
 LEAST_FACES = 50
-"""A surface of a person has at least so many."""
+"""A surface of a person has at least this many."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -114,7 +114,7 @@ def run_rounds(
 def improve(
     problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState, steps: int
 ) -> tuple[FitState, Outcome]:
-    """At most so many steps with these pairs."""
+    """At most `steps` steps with these pairs."""
     return solve(lambda y: scan_residuals(problem, matches, given, tolerances, y), state, steps, method="lm")
 
 

@@ -20,7 +20,7 @@ NEAR = 0.05
 LESS_CERTAIN = {"hip": 2.0, "shoulder": 1.5, "neck": 1.5, "mid_hip": 1.5, "ear": 1.5}
 """Multiples of the noise for landmarks on whose position annotators disagree."""
 NOISE, LEAST_NOISE = 0.005, 0.3
-"""Expected std of detections: a share of the person's height in the photo (2 pixels of 400), and at least so many pixels."""
+"""Expected std of detections: a share of the person's height in the photo (2 pixels of 400), and a lower bound, pixels."""
 OUTER = (0.03, 0.97)
 """Quantiles of the coordinates between which a person's size is measured, so that outliers do not count."""
 NOISE_RANGE = (0.5, 8.0)

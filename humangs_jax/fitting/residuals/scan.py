@@ -116,7 +116,7 @@ class ScanProblem:
 
 
 def scan_problem(surface: BodySurface, names: tuple[str, ...], coefficients: int | None = None) -> ScanProblem:
-    """With the joints of these names free, and at most so many shape coefficients (default: all)."""
+    """With the joints of these names free, and at most `coefficients` of the shape (default: all)."""
     model, available = surface.landmarks, surface.points.directions.shape[-1]
     joints = tuple(j for j, name in enumerate(model.joint_names) if j > 0 and name in names)
     origin = usual_origin(pose_prior(model.joint_names), joints, min(available, coefficients or available))
@@ -218,7 +218,7 @@ class Target:
     def matches(
         self, problem: ScanProblem, state: FitState, gate: float, robust_scale: float, tolerances: Tolerances
     ) -> ScanMatches:
-        """The pairs of a body as it is: first those that scan points found, `count` of them, then those that vertices found.
+        """The pairs of a body in a state: first those that scan points found, `count` of them, then those that vertices found.
 
         Arguments: gate: pairs that are farther apart, in units of the frame, have no weight. robust_scale: distance along the
         normal at which weights have fallen to a quarter.
