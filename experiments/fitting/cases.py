@@ -1,4 +1,4 @@
-"""Synthetic people whose keypoints are known: unseen seeds, plausible poses, cameras all around, and detections with errors."""
+"""Synthetic people whose keypoints are known: plausible poses, cameras all around, detections with errors."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ class FitCase:
 
 
 def make_case(seed, body, model, frames, views, size=512) -> FitCase:
-    """The person of a test seed in random poses, each with cameras of its own, as of the published protocol."""
+    """The person of a seed in random poses, each with cameras of its own, as of the published protocol."""
     import jax
     import jax.numpy as jnp
 
@@ -80,7 +80,7 @@ def observe(people, seed, noise_px, outliers, model):
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.fitting.observations import Observations, expected_noise
+    from humangs_jax.fitting.residuals.keypoints import Observations, expected_noise
 
     points = np.stack([detect(case, seed + i, noise_px, outliers) for i, case in enumerate(people)])
     confidences = np.broadcast_to(np.asarray(model.known, np.float32), points.shape[:-1])

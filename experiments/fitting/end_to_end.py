@@ -2,7 +2,7 @@
 
     python experiments/fitting/end_to_end.py --people 4 --json end_to_end.json --docs
 
-People of the test seeds, four photographs of 256 pixels each. Keypoints are the true ones with noise and outliers, at the
+People of the fitting seeds, four photographs of 256 pixels each. Keypoints are the true ones with noise and outliers, at the
 accuracy of a detector that sees 512 pixels; cameras are true. Each reconstruction is drawn with the parameters it was made
 from, fitted or true, and compared with held-out photographs. About 20 seconds a person after a minute of compilation.
 """
@@ -14,13 +14,13 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "fitting.md"
-FIRST, VIEWS, SIZE = 2_000_000, 4, 256
+FIRST, VIEWS, SIZE = 4_000_000, 4, 256
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--people", type=int, default=4, help="of the test seeds")
+    parser.add_argument("--people", type=int, default=4, help="of the fitting seeds")
     parser.add_argument("--noise-px", type=float, default=2.0, help="standard deviation of detections, pixels of 512")
     parser.add_argument(
         "--outliers", type=float, default=0.0, help="share of points displaced by up to 100 pixels of 512"

@@ -1,4 +1,4 @@
-"""How exactly a body is found from 2D keypoints: synthetic people of the test seeds, random poses, detections with errors.
+"""How exactly a body is found from 2D keypoints: synthetic people of the fitting seeds, random poses, detections with errors.
 
     python experiments/fitting/keypoints.py --frames 16 --views 4 --noise-px 2 --outliers 0.2 --json fit.json
     python experiments/fitting/keypoints.py --frames 16 --views 4 --curves --json fit.json
@@ -21,14 +21,14 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "fitting.md"
 VIEWS, NOISES = (1, 2, 3, 4, 8), (0.0, 1.0, 2.0, 5.0, 10.0)
 ALL = "wholebody133"
-FIRST = 2_000_000
+FIRST = 4_000_000
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--frames", type=int, default=16, help="moments of each person")
-    parser.add_argument("--people", type=int, default=4, help="of the test seeds")
+    parser.add_argument("--people", type=int, default=4, help="of the fitting seeds")
     parser.add_argument("--views", type=int, default=4, help="cameras of each moment")
     parser.add_argument("--noise-px", type=float, default=2.0, help="standard deviation of detections, pixels of 512")
     parser.add_argument("--outliers", type=float, default=0.2, help="share of points displaced by up to 100 pixels")

@@ -1,4 +1,4 @@
-"""How much refinement mends cameras and poses that are a little off, on synthetic people of unseen seeds.
+"""How much refinement mends cameras and poses that are a little off, on synthetic people of the fitting seeds.
 
     python experiments/fitting/refine.py --subjects 4 --views 6 --json refine.json [--page docs/fitting_refinement.md]
 
@@ -41,7 +41,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--subjects", type=int, default=4, help="how many people")
     parser.add_argument("--first", type=int, default=0, help="index of the first within the split")
-    parser.add_argument("--split", choices=("validation", "test"), default="test", help="whom to look at")
+    parser.add_argument("--split", choices=("validation", "test", "fitting"), default="fitting", help="whom to look at")
     parser.add_argument("--views", type=int, default=6, help="photos of each")
     parser.add_argument("--size", type=int, default=512, help="side of the photos, pixels")
     parser.add_argument("--noise-px", type=float, default=2.0, help="standard deviation of keypoints")
@@ -87,7 +87,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
 def refine_subject(seed: int, body: Any, arguments: argparse.Namespace) -> dict[str, dict[str, float]]:
     """The rows of one person, by case."""
     from experiments.fitting.refine_cases import disturbed, noisy_keypoints, true_captures
-    from humangs_jax.fitting.refinement.refine import refine_capture
+    from humangs_jax.fitting.refine import refine_capture
 
     clothed, bare = true_captures(seed, body, arguments.views, arguments.size)
     keypoints = noisy_keypoints(clothed, seed, arguments.noise_px)
@@ -102,9 +102,10 @@ def refine_subject(seed: int, body: Any, arguments: argparse.Namespace) -> dict[
         )
         seconds = time.perf_counter() - begun
         rows[case] = scores(start, refined.capture, truth, bare.masks)
-        rows[case] |= {"seconds": seconds, "refined": float(refined.kept == "refined")}
-        if "avatar_psnr" in refined.before:
-            rows[case] |= {f"psnr_{when}": getattr(refined, when)["avatar_psnr"] for when in ("before", "after")}
+        rows[case] |= {"seconds": seconds, "refined": float(refined.report.kept)}
+        if "avatar_psnr" in refined.report.errors:
+            psnr = refined.report.errors["avatar_psnr"]
+            rows[case] |= {"psnr_before": float(psnr.before or 0), "psnr_after": psnr.after}
         if arguments.pictures:
             draw(arguments.pictures / f"{seed}_{case}.png", start, refined.capture)
     return rows

@@ -1,4 +1,4 @@
-"""People of unseen seeds in photographs whose cameras and poses are a little off: what refinement is measured on."""
+"""People of the fitting seeds in photographs whose cameras and poses are a little off: what refinement is measured on."""
 
 import dataclasses
 from typing import Any
@@ -19,7 +19,7 @@ class Errors:
 
 
 def true_captures(seed: int, body: Any, views: int, size: int = 512) -> tuple[Any, Any]:
-    """The person of a test seed in a random pose from cameras all around, with true parameters: (in clothes, the bare body)."""
+    """The person of a seed in a random pose from cameras all around, with true parameters: (in clothes, the bare body)."""
     from humangs_jax.people.cameras import cameras_around, spread_azimuths
     from humangs_jax.people.poses import sample_rotations
     from humangs_jax.people.subject import make_subject
@@ -37,7 +37,7 @@ def bare_masks(capture: Any) -> np.ndarray:
     """(v, h, w) coverage by the posed body, without clothes."""
     import jax.numpy as jnp
 
-    from humangs_jax.fitting.refinement.score import posed_vertices
+    from humangs_jax.fitting.refine_rounds import posed_vertices
     from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
     vertices = posed_vertices(capture.body, jnp.asarray(capture.betas), capture.poses)
@@ -95,7 +95,7 @@ def noisy_keypoints(truth: Any, seed: int, noise_px: float) -> Any:
 
 def mean_overlap(capture: Any, masks: Any) -> float:
     """Mean intersection over union of the posed body and masks (v, h, w) of the views."""
-    from humangs_jax.fitting.refinement.score import overlap
+    from humangs_jax.fitting.refine_rounds import overlap
 
     covered = bare_masks(capture) > 0.5
     return float(np.mean([overlap(body, mask) for body, mask in zip(covered, masks, strict=True)]))

@@ -2,10 +2,10 @@
 
     python experiments/fitting/scans.py --subjects 32 --json scans.json [--without-joints] [--pictures scans.png]
 
-People of unseen seeds in random poses. A scan is the posed mesh of the dressed person, or of the bare body; each is turned by a
-random rotation, scaled by 0.1 to 100 and moved. Given joints are the 17 of COCO with errors of --noise-mm (before the scaling).
-The fitted body is put back into the scan's coordinates, from there by the true similarity into metres, and compared with the true
-body: a scan has no metric, so that neither has the error one of its own. Two distances: of equal vertices, and of the fitted
+People of the fitting seeds in random poses. A scan is the posed mesh of the dressed person, or of the bare body; each is
+turned by a random rotation, scaled by 0.1 to 100 and moved. Given joints are the 17 of COCO with errors of --noise-mm
+(before the scaling). The fitted body is put back into the scan's coordinates, from there by the true similarity into metres,
+and compared with the true body: a scan has no unit of its own. Two distances: of equal vertices, and of the fitted
 vertices from the true surface. A fit has succeeded if its vertices are within 50 mm on average.
 
 --json writes {"bare" and "clothed": {"mean_vertex_mm", "mean_surface_mm", "worst_surface_mm", "success", "seconds_per_scan"},
@@ -38,7 +38,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--subjects", type=int, default=32)
     parser.add_argument("--first", type=int, default=0, help="first person of the split")
-    parser.add_argument("--split", default="test", choices=("validation", "test"))
+    parser.add_argument("--split", default="fitting", choices=("validation", "test", "fitting"))
     parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
     parser.add_argument(
         "--noise-mm", type=float, default=5.0, help="standard deviation of given joints in each direction"
@@ -88,9 +88,8 @@ def fit_one(seed, kind, body, arguments):
     """Scores of one scan, and what a picture of it needs."""
     import jax.numpy as jnp
 
-    from humangs_jax.fitting.scans.fit import fit_scan_points
-    from humangs_jax.fitting.scans.reading import sample_scan
-    from humangs_jax.fitting.scans.result import body_in_scan
+    from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan_points
+    from humangs_jax.fitting.scan_reading import sample_scan
 
     true, landmarks, vertices, faces = person(seed, kind, body)
     place, rng = random_place(seed), np.random.default_rng([seed, JOINT_STREAM])
@@ -105,7 +104,7 @@ def fit_one(seed, kind, body, arguments):
     surface = 1000 * distances_to_surface(fitted, true, np.asarray(body.faces))
     row = {"seed": seed, "kind": kind, "vertex_mm": float(vertex.mean()), "surface_mm": float(surface.mean())}
     row |= {"surface_p95_mm": float(np.quantile(surface, 0.95)), "seconds": seconds}
-    row |= {"scale_ratio": fit.world_from_scan.scale * place.scale, "converged": fit.converged}
+    row |= {"scale_ratio": fit.world_from_scan.scale * place.scale, "converged": bool(fit.report.stages[-1].converged)}
     return row, (f"{kind} {seed}: {row['surface_mm']:.1f} mm", vertices, jnp.asarray(faces), fitted, body.faces)
 
 
@@ -132,7 +131,7 @@ def person(seed, kind, body):
 
 def random_place(seed):
     """A random similarity: any rotation, scale 0.1 to 100 by its logarithm, centre up to ten metres off before the scaling."""
-    from humangs_jax.fitting.scans.similarity import Similarity
+    from humangs_jax.fitting.similarity import Similarity
 
     rng = np.random.default_rng([seed, PLACE_STREAM])
     w, x, y, z = (q := rng.normal(size=4)) / np.linalg.norm(q)

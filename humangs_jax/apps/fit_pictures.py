@@ -1,7 +1,7 @@
-"""A fit as a picture: the body over each photo with the keypoints that it should meet, and how the error goes over time.
+"""A fit as an image: the body over each photo with the keypoints of the fit, and the error over time.
 
-A disc is a keypoint, the person's left blue, right red, middle white; an outlier is only a ring. A line leads from it to the
-cross of the body's landmark: where the body fits, disc and cross are at one place.
+A disc is a keypoint: the person's left blue, right red, middle white. An outlier is a ring. A line leads to the cross of the
+body's landmark; where the body fits, disc and cross coincide.
 """
 
 import itertools
@@ -22,7 +22,7 @@ from humangs_jax.io.images import to_uint8, write_png
 VIEWS = 24
 """At most on a sheet."""
 FINE = 2
-"""Drawn so many times larger and shrunk, for smooth lines."""
+"""Factor by which sheets are drawn larger and then shrunk, for smooth lines."""
 RADIUS, SMALL = 4, 2
 """Of discs on body and on hands and face, pixels of a tile."""
 WHITE, BLACK, CROSS = (255, 255, 255), (0, 0, 0), (255, 0, 230)
@@ -33,30 +33,30 @@ LINES = 10
 
 
 def fit_sheet(capture: Capture, keypoints: Keypoints, examination: Examination, out: str | Path) -> None:
-    """Write a sheet of up to 24 views, evenly chosen, as a PNG; below it the error over time if there are several moments.
+    """Write a sheet of up to 24 views, evenly chosen, as a PNG; below it the error over time if there are several frames.
 
-    Arguments: examination: of this capture by these keypoints. Raises: OSError if the picture cannot be written.
+    Arguments: examination: of this capture by these keypoints. Raises: OSError if the image cannot be written.
     """
     count = capture.view_count
     chosen = np.unique(np.linspace(0, count - 1, min(count, VIEWS)).round().astype(int)).tolist()
-    pictures = [_with_keypoints(_overlay(capture, view), capture, keypoints, examination, view) for view in chosen]
-    sheet = tile(np.stack(pictures), labels=[_label(examination, view) for view in chosen])
-    if len(examination.moments) > 1:
-        sheet = np.concatenate([sheet, plot_over_time(examination.moments, sheet.shape[1])])
+    drawn = [_with_keypoints(_overlay(capture, view), capture, keypoints, examination, view) for view in chosen]
+    sheet = tile(np.stack(drawn), labels=[_label(examination, view) for view in chosen])
+    if len(examination.frames) > 1:
+        sheet = np.concatenate([sheet, plot_over_time(examination.frames, sheet.shape[1])])
     write_png(out, sheet)
 
 
 def plot_over_time(errors: Float[np.ndarray, " m"], width: int) -> Float[np.ndarray, "height width 3"]:
-    """A plot of the median error of each of two moments or more, pixels; moments that are NaN leave a gap."""
+    """A plot of the median error of each of at least two frames, pixels; NaN leaves a gap."""
     from PIL import Image, ImageDraw, ImageFont
 
     text = int(np.clip(width * TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT))
-    picture = Image.new("RGB", (width, LINES * text), WHITE)
-    pen, font = ImageDraw.Draw(picture), ImageFont.load_default(text)
+    plot = Image.new("RGB", (width, LINES * text), WHITE)
+    pen, font = ImageDraw.Draw(plot), ImageFont.load_default(text)
     left, right, top, bottom = 3 * text, width - 2 * text, 2 * text, (LINES - 2) * text
     finite = errors[np.isfinite(errors)]
     highest = 1.05 * float(finite.max(initial=0.0)) or 1.0
-    x = lambda moment: left + (right - left) * moment / (len(errors) - 1)
+    x = lambda frame: left + (right - left) * frame / (len(errors) - 1)
     y = lambda error: bottom - (bottom - top) * error / highest
     for tick in _ticks(highest, 4):
         pen.line([(left, y(tick)), (right, y(tick))], fill=(225, 225, 225))
@@ -65,7 +65,7 @@ def plot_over_time(errors: Float[np.ndarray, " m"], width: int) -> Float[np.ndar
         pen.line([(x(tick), bottom), (x(tick), bottom + 4)], fill=BLACK)
         pen.text((x(tick), bottom + 6), f"{tick:g}", fill=BLACK, font=font, anchor="mt")
     pen.line([(left, top), (left, bottom), (right, bottom)], fill=BLACK)
-    pen.text((left, top - 6), "median error of each moment, pixels", fill=BLACK, font=font, anchor="lb")
+    pen.text((left, top - 6), "median error of each frame, pixels", fill=BLACK, font=font, anchor="lb")
     points = [(x(i), y(error)) if np.isfinite(error) else None for i, error in enumerate(errors)]
     color = tuple(to_uint8(np.asarray(LEFT)).tolist())
     for a, b in itertools.pairwise(points):
@@ -74,7 +74,7 @@ def plot_over_time(errors: Float[np.ndarray, " m"], width: int) -> Float[np.ndar
     for point in points:
         if point:
             pen.circle(point, 2, fill=color)
-    return np.asarray(picture) / 255
+    return np.asarray(plot) / 255
 
 
 def _overlay(capture, view):
@@ -87,20 +87,20 @@ def _overlay(capture, view):
     method = Image.Resampling.BOX if share < 1 else Image.Resampling.BICUBIC
     channels = [np.asarray(Image.fromarray(capture.images[view, ..., c]).resize(size, method)) for c in range(3)]
     pose, camera = capture.pose(int(capture.frames[view])), capture.cameras[view].resized(*size)
-    picture, _ = draw_body(capture.body, jnp.asarray(capture.betas), pose, camera, np.stack(channels, axis=-1))
-    return picture
+    drawn, _ = draw_body(capture.body, jnp.asarray(capture.betas), pose, camera, np.stack(channels, axis=-1))
+    return drawn
 
 
-def _with_keypoints(picture, capture, keypoints, examination, view):
-    """A picture with discs, crosses, and the lines between them."""
+def _with_keypoints(image, capture, keypoints, examination, view):
+    """An image with discs, crosses, and the lines between them."""
     from PIL import Image, ImageDraw
 
-    height, width = picture.shape[:2]
-    canvas = Image.fromarray(to_uint8(picture)).resize((FINE * width, FINE * height), Image.Resampling.BILINEAR)
+    height, width = image.shape[:2]
+    canvas = Image.fromarray(to_uint8(image)).resize((FINE * width, FINE * height), Image.Resampling.BILINEAR)
     pen = ImageDraw.Draw(canvas)
     scale = FINE * np.asarray([width / capture.images.shape[2], height / capture.images.shape[1]])
     within = lambda points: np.clip(points * scale, -FINE * width, 2 * FINE * width)
-    discs, crosses = within(keypoints.points[view]), within(examination.seen[view])
+    discs, crosses = within(keypoints.points[view]), within(examination.landmarks[view])
     shown = np.flatnonzero(examination.compared[view])
     radii = [FINE * (SMALL if _is_small(name) else RADIUS) for name in keypoints.set.names]
     for k in shown:
@@ -131,7 +131,7 @@ def _color(name):
 
 
 def _label(examination, view):
-    fit = examination.views[view]
+    fit = examination.report.views[view]
     return f"{fit.name}  {f'{fit.median:.1f} px' if fit.keypoints else 'no keypoints'}"
 
 

@@ -61,13 +61,13 @@ class LandmarkModel:
 
 
 def landmark_model(body: BodyModel, names: tuple[str, ...]) -> LandmarkModel:
-    """The landmarks of a body by name; those that it does not have get rows of zeros.
+    """The landmarks of a body by name; those that it does not have get rows of zeros. No names: the joints alone.
 
     Raises: ValueError if it has none of them, which is so when its joints have other names than SMPL-X's.
     """
     finder = _Finder(body)
     sources = [finder.find(name) for name in names]
-    if not any(sources):
+    if names and not any(sources):
         raise ValueError(
             f"body '{body.name}' has none of these landmarks: are its joints named like SMPL-X's (left_hip, ...)? They are "
             f"{', '.join(body.joint_names[:4]) or 'not named'}"

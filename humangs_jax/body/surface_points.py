@@ -1,4 +1,4 @@
-"""Some points of a body's surface, posed without the rest of it: what fits ask for thousands of times."""
+"""Some points of a body's surface, posed without the rest of it, as fits do thousands of times."""
 
 import jax.numpy as jnp
 
@@ -34,7 +34,7 @@ def pose_points(
     features: Float[Array, " q"] | None,
     transforms: Float[Array, "j 4 4"],
 ) -> Float[Array, "p 3"]:
-    """Where the points of a person are, metres. features: of the pose, of no use to bodies without correctives."""
+    """Where the points of a person are, metres. features: of the pose; ignored by bodies without correctives."""
     rest = shaped(points.rest, points.directions, betas)
     if points.corrections is not None:
         rest = rest + jnp.einsum("paq,q->pa", points.corrections, features, precision=skinning.EXACT)

@@ -115,8 +115,8 @@ class Fit:
         from humangs_jax.body.library import load_body
         from humangs_jax.data.capture import DEFAULT_BODY
         from humangs_jax.data.photos import load_photos
-        from humangs_jax.fitting.examination import examine
-        from humangs_jax.fitting.fit_capture import check_place, fit_photographs, write_fitted
+        from humangs_jax.fitting.files import check_place, write_fitted
+        from humangs_jax.fitting.fit_capture import fit_photographs
         from humangs_jax.fitting.landmark_fit import FitConfig
 
         assert self.capture is not None  # `run` has checked it
@@ -129,31 +129,27 @@ class Fit:
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
         config = dataclasses.replace(FitConfig(), smoothness=self.smoothness)
         fitted = fit_photographs(photos, keypoints, load_body(self.body), body_file=body_file, config=config)
-        record = fitted.record
-        known = {name: getattr(record, name) for name in ("deviations", "determined", "noise")}
-        examination = examine(fitted.capture, keypoints, **known, mirrored=fitted.mirrored)
-        write_fitted(self.capture, target, fitted.capture, record)
-        print(fitted.convergence())
-        print(f"\n{examination}")
-        for warning in (*_reading_warnings(keypoints), *fitted.warnings):
-            print(f"warning: {warning}")
-        print(f"{target}: body.npz and fit.npz; `humangs check {target}` shows them")
+        warnings = (*fitted.report.warnings, *_reading_warnings(keypoints))
+        report = dataclasses.replace(fitted.report, warnings=warnings)
+        write_fitted(self.capture, target, fitted.capture, report, fitted.record)
+        print(report)
+        print(f"{target}: body.npz, fit.npz and fit.json; `humangs check {target}` shows them")
 
     def _refine(self):
         from humangs_jax.data.capture import load_capture
-        from humangs_jax.fitting.fit_capture import check_place, write_fitted
-        from humangs_jax.fitting.refinement.refine import refine_capture
+        from humangs_jax.fitting.files import check_place, write_fitted
+        from humangs_jax.fitting.refine import refine_capture
 
         assert self.capture is not None  # `run` has checked it
         target = check_place(self.capture, self.out, self.overwrite)
         start = load_capture(self.capture)
         keypoints = self.detections.read(start)
         refinement = refine_capture(start, keypoints=keypoints, photometric=self.refinement.photometric)
-        print(refinement)
-        if refinement.kept == "start":
+        print(refinement.report)
+        if not refinement.report.kept:
             print("nothing was written: refinement did not improve the capture")
             return
-        write_fitted(self.capture, target, refinement.capture, None)
+        write_fitted(self.capture, target, refinement.capture, refinement.report)
         print(f"{target}: refined cameras and body; `humangs check {target}` shows them")
 
     def _fit_scan(self):
@@ -165,10 +161,10 @@ class Fit:
         from humangs_jax.body.library import load_body
         from humangs_jax.data.capture import DEFAULT_BODY
         from humangs_jax.data.photos import load_photos
-        from humangs_jax.fitting.scans.files import check_folder, save_scan_fit
-        from humangs_jax.fitting.scans.fit import fit_scan
-        from humangs_jax.fitting.scans.joints import read_joints
-        from humangs_jax.fitting.scans.views import joints_from_views, render_scan_views
+        from humangs_jax.fitting.files import check_scan_folder, save_scan_fit
+        from humangs_jax.fitting.scan_fit import fit_scan
+        from humangs_jax.fitting.scan_reading import read_joints
+        from humangs_jax.fitting.scan_views import joints_from_views, render_scan_views
 
         assert scan.scan is not None  # `run` has checked it
         if scan.views is not None and keypoints is None:
@@ -178,7 +174,7 @@ class Fit:
             return
         if self.out is None:
             raise ValueError("--out FOLDER is missing: where the body of the scan goes")
-        check_folder(self.out, self.overwrite)
+        check_scan_folder(self.out, self.overwrite)
         joints = None if scan.joints is None else read_joints(scan.joints)
         if scan.views is not None:
             joints = joints_from_views(scan.views, self.detections.read(load_photos(scan.views)))
@@ -186,7 +182,7 @@ class Fit:
         fitted = fit_scan(scan.scan, body=body, joints=joints, clothed=not scan.bare, height=scan.height)
         body_file = DEFAULT_BODY if self.body is None else os.path.relpath(self.body.resolve(), self.out.resolve())
         save_scan_fit(self.out, fitted, body_file, overwrite=self.overwrite)
-        print(fitted)
+        print(fitted.report)
         print(f"{self.out}: body.npz, scan_fit.json and body_in_scan.ply")
 
 
@@ -219,7 +215,7 @@ class Check:
         from humangs_jax.apps.check import check_capture
         from humangs_jax.data.capture import load_capture
         from humangs_jax.data.photos import capture_folder
-        from humangs_jax.fitting.fit_record import FIT_FILE, read_fit_record
+        from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
         capture = load_capture(self.capture)
         require_parent(self.out)
@@ -235,4 +231,4 @@ class Check:
             examination, keypoints = examine_record(capture, record, keypoints)
             sheet = self.out.with_name(f"{self.out.stem}_fit{self.out.suffix}")
             fit_sheet(capture, keypoints, examination, sheet)
-            print(f"\n{examination}\n{sheet}: the keypoints over the photos")
+            print(f"\n{examination.report}\n{sheet}: the keypoints over the photos")

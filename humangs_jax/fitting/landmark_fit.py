@@ -1,16 +1,18 @@
-"""A body through keypoints: rigid, body, hands, then all moments together with one shape. Pure; vmap it over people.
+"""A body through keypoints: rigid, points, body, hands, then all frames together with one shape. Pure; vmap it over people.
 
-    rigid   place and heading of a resting body, from the best of several starts
-    points  body joints and shape against triangulated points; skipped by moments that have none
+    rigid   position and orientation of a resting body, from the best of several starts
+    points  body joints and shape against triangulated points; skipped by frames without any
     body    the same against the keypoints of every view
-    hands   all joints that a keypoint depends on, outliers cut off closer
-    person  all moments at once: one shape, the noise that was found, and smooth motion where asked for
+    hands   all joints that a keypoint depends on, with a smaller robust scale
+    person  all frames at once: one shape, the noise that was found, and smooth motion where requested
 
-The first four are one program that runs with other weights and other unknowns held still: compiling is what takes time here.
+The first four are one program that runs with other weights and other free unknowns, because compilation dominates the time.
 """
 
 import dataclasses
 import functools
+import itertools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -21,13 +23,23 @@ from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
-from humangs_jax.fitting.body_state import BodyState, pose_of, state_of
-from humangs_jax.fitting.objective import Problem, Targets, keypoint_errors, residuals
-from humangs_jax.fitting.observations import Observations
-from humangs_jax.fitting.pose_prior import pose_prior
-from humangs_jax.fitting.rigid import rigid_starts, trunk_weights
-from humangs_jax.fitting.solvers import Outcome, minimise
+from humangs_jax.fitting.residuals.keypoints import (
+    KeypointProblem,
+    Observations,
+    Targets,
+    focal_lengths,
+    found_noise,
+    frame_residuals,
+    in_cameras,
+    keypoint_errors,
+    keypoint_residuals,
+    trunk_weights,
+)
+from humangs_jax.fitting.residuals.priors import pose_prior
+from humangs_jax.fitting.solve import Outcome, solve
+from humangs_jax.fitting.state import FREE, FitState, betas_of, frame_axes, pose_of, usual_origin, zero_state
 from humangs_jax.fitting.triangulation import triangulate_robustly
+from humangs_jax.geometry import quaternion
 
 STAGES = ("rigid", "points", "body", "hands")
 
@@ -36,16 +48,15 @@ STAGES = ("rigid", "points", "body", "hands")
 class FitConfig:
     """Static settings of a fit.
 
-    pose_weight, shape_weight: of the priors, 1: one standard deviation of them counts like one of a keypoint. cuts: standard
-    deviations at which a keypoint, in the stages rigid, points, body, hands and person, is an outlier. smoothness: expected
-    acceleration of joints, metres per moment squared; 0: moments are independent. steps, person_steps: most iterations of a
-    stage. starts: headings that are followed up, for one view and for several. tolerance: of the unknowns, which are of unit
-    size, at which a stage has converged.
+    pose_weight, shape_weight: of the priors; 1: a standard deviation of them counts like one of a keypoint. robust_scales: of
+    keypoint errors in the stages rigid, points, body, hands and person, standard deviations. smoothness: expected acceleration of
+    joints, metres per frame squared; 0: frames are independent. steps, person_steps: of the solver in a stage, at most. starts:
+    orientations that are followed, for one view and for several. tolerance: of the unknowns, which are of unit size.
     """
 
     pose_weight: float = 1.0
     shape_weight: float = 1.0
-    cuts: tuple[float, float, float, float, float] = (30.0, 15.0, 15.0, 10.0, 5.0)
+    robust_scales: tuple[float, float, float, float, float] = (30.0, 15.0, 15.0, 10.0, 5.0)
     smoothness: float = 0.0
     steps: int = 150
     person_steps: int = 150
@@ -55,10 +66,10 @@ class FitConfig:
 
 @pytree_dataclass
 class LandmarkFit:
-    """A person in m moments. betas: (s,). poses: a batch of m. landmarks: (m, k, 3), joints: (m, j, 3) metres.
+    """A person in m frames. betas: (s,). poses: a batch of m. landmarks: (m, k, 3), joints: (m, j, 3) metres.
 
-    noise: (m,) standard deviation of the detections as the fit found it, pixels.
-    outcomes: what the solver did, by stage; of each moment, but of "person", which has all moments.
+    noise: (m,) std of the detections as the fit found it, pixels. state: in units of the problem's origin.
+    outcomes: what the solver did, by stage; one per frame, except for "person", which has all frames.
     """
 
     betas: Float[Array, " s"]
@@ -66,6 +77,7 @@ class LandmarkFit:
     landmarks: Float[Array, "m k 3"]
     joints: Float[Array, "m j 3"]
     noise: Float[Array, " m"]
+    state: FitState
     outcomes: dict[str, Outcome]
 
 
@@ -73,138 +85,193 @@ class LandmarkFit:
 def fit_landmarks(model: LandmarkModel, observations: Observations, config: FitConfig = FitConfig()) -> LandmarkFit:
     """Shape and poses of one person.
 
-    Arguments: observations: a batch of m moments. Returns a fit without numbers that are not finite, whatever the
-    observations are; moments without any keypoint rest where the prior has them.
+    Arguments: observations: a batch of m frames. The result is finite for all finite observations; frames without keypoints
+    rest in the prior's usual pose.
     """
-    problem = fit_problem(model, config)
-    states, outcomes = jax.vmap(lambda seen: _fit_moment(problem, seen, config))(observations)
+    problem = keypoint_problem(model, config)
+    states, outcomes = jax.vmap(lambda seen: _fit_frame(problem, seen, config))(observations)
     observations = replace(observations, noise=_noise_found(problem, observations, states))
-    betas, states, outcomes["person"] = _fit_person(problem, observations, states, config)
-    poses = jax.vmap(lambda state: pose_of(problem.prior, problem.joints, state))(states)
+    state, outcomes["person"] = _fit_person(problem, observations, states, config)
+    betas = betas_of(problem.origin, state)
+    poses = jax.vmap(lambda own: pose_of(problem.origin, own), in_axes=(frame_axes(state),))(state)
     landmarks, joints = jax.vmap(lambda pose: pose_landmarks(model, betas, pose))(poses)
-    return LandmarkFit(betas, poses, landmarks, joints, observations.noise, outcomes)
+    return LandmarkFit(betas, poses, landmarks, joints, observations.noise, state, outcomes)
 
 
-def fit_problem(model: LandmarkModel, config: FitConfig = FitConfig()) -> Problem:
-    """The problem in which all joints are free that move a landmark; the others rest as is usual."""
-    joints = np.asarray([j for j in model.movers if j > 0], int)
-    return Problem(model, pose_prior(model.joint_names), joints, config.pose_weight, config.shape_weight)
+def keypoint_problem(model: LandmarkModel, config: FitConfig = FitConfig()) -> KeypointProblem:
+    """The problem in which every joint is free that moves a landmark; the others rest in the usual pose."""
+    prior, joints = pose_prior(model.joint_names), tuple(j for j in model.movers if j > 0)
+    origin = usual_origin(prior, joints, model.joint_directions.shape[-1])
+    return KeypointProblem(model, prior, origin, config.pose_weight, config.shape_weight)
 
 
-def _fit_moment(problem, seen, config):
-    """Stages rigid to hands of one moment, from several starts; the best by its keypoints."""
+def _fit_frame(problem, seen, config):
+    """Stages rigid to hands of one frame, from several starts; the best by its keypoints."""
     several = seen.points.shape[0] > 1
     points, counts, weights = triangulate_robustly(seen)
-    betas = jnp.zeros(problem.model.joint_directions.shape[-1])
-    resting = state_of(problem.prior, problem.joints, betas, BodyPose(jnp.asarray(problem.prior.usual), jnp.zeros(3)))
-    starts = rigid_starts(problem, seen, points, counts, resting, config.starts[several])
-    stages = _stages(problem, resting, config, Targets(points, counts >= 2, _metres_per_pixel(seen, points, weights)))
+    starts = _rigid_starts(problem, seen, points, counts, config.starts[several])
+    targets = Targets(points, counts >= 2, _metres_per_pixel(seen, points, weights))
+    stages = _stages(problem, config, targets)
     states, outcomes = jax.vmap(lambda start: _run_stages(problem, seen, start, stages, config))(starts)
     best = jnp.argmin(outcomes.after[:, -1])
     state, outcomes = jax.tree.map(lambda leaf: leaf[best], (states, outcomes))
     return state, {name: jax.tree.map(lambda leaf, i=i: leaf[i], outcomes) for i, name in enumerate(STAGES)}
 
 
+# The start of a frame ------------------------------------------------------------------------------------------------
+
+COARSE = 30.0
+"""Robust scale of keypoints while the body rests, standard deviations."""
+
+
+def _rigid_starts(problem, observations, points, counts, kept) -> FitState:
+    """The `kept` best positions and orientations of a resting body, a batch.
+
+    The trunk of a resting body is turned onto triangulated points (Kabsch 1976); the 24 orientations of a cube compete with it.
+    The position for an orientation solves linear equations. The best by keypoints are kept.
+
+    Arguments: points, counts: triangulated landmarks (k, 3) and how many views agree with each (k,), 0: unknown.
+    """
+    resting = zero_state(problem.origin)
+    landmarks, joints = problem.landmarks_and_joints(resting)
+    pelvis = joints[0]
+    weights = trunk_weights(problem.model.names) * problem.known
+    turned = _kabsch(landmarks, points, weights * (counts >= 2))
+    rotations = jnp.concatenate([turned[None], jnp.asarray(cube_rotations(), jnp.float32)])
+    positions = jax.vmap(lambda r: _position(observations, (landmarks - pelvis) @ r.T, weights))(rotations)
+    vectors = quaternion.to_axis_angle(quaternion.from_matrix(rotations))
+    start = lambda vector, position: replace(
+        resting, global_orient=vector / math.radians(FREE.global_orient), transl=(position - pelvis) / FREE.transl
+    )
+    starts = jax.vmap(start)(vectors, positions)
+
+    def cost(state):
+        errors = keypoint_residuals(problem.model, observations, problem.landmarks_and_joints(state)[0], COARSE)
+        return 0.5 * jnp.sum(weights[:, None] * jnp.square(errors))
+
+    best = jnp.argsort(jax.vmap(cost)(starts))[:kept]
+    return jax.tree.map(lambda leaf: leaf[best], starts)
+
+
+def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
+    """(24, 3, 3) the rotations that map the axes to each other."""
+    signed = (
+        np.eye(3)[list(order)] * np.asarray(signs)[:, None]
+        for order in itertools.permutations(range(3))
+        for signs in itertools.product((1, -1), repeat=3)
+    )
+    return np.stack([m for m in signed if np.linalg.det(m) > 0])
+
+
+def _kabsch(a, b, weights):
+    """The rotation about weighted centres that takes points a to b best; the identity where nothing is known."""
+    share = weights / jnp.maximum(jnp.sum(weights), 1e-9)
+    centered_a, centered_b = (x - jnp.sum(share[:, None] * x, axis=0) for x in (a, b))
+    u, _, vt = jnp.linalg.svd(jnp.einsum("k,ka,kb->ab", share, centered_b, centered_a) + 1e-9 * jnp.eye(3))
+    sign = jnp.sign(jnp.linalg.det(u @ vt))
+    return (u * jnp.stack([jnp.ones(()), jnp.ones(()), sign])) @ vt
+
+
+def _position(observations, offsets, weights):
+    """The point from which landmarks at `offsets` (k, 3) project to their detections: with (x, y) a detection over the focal
+    length, x (z + t_z) = X + t_x and likewise y, linear in t.
+    """
+    rotation = observations.cam_from_world[:, :3, :3]
+    xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
+    known = in_cameras(observations, offsets)
+    rows = rotation[:, None, :2] - xy[..., None] * rotation[:, None, 2:]
+    right = xy * known[..., 2:] - known[..., :2]
+    w = observations.confidences * weights
+    matrix = jnp.einsum("ck,ckia,ckib->ab", w, rows, rows)
+    vector = jnp.einsum("ck,ckia,cki->a", w, rows, right)
+    scale = jnp.maximum(jnp.trace(matrix), 1e-9)
+    return jnp.linalg.solve(matrix / scale + 1e-7 * jnp.eye(3), vector / scale)
+
+
+def _metres_per_pixel(seen, points, weights):
+    """At the person's distance."""
+    centers = -jnp.einsum("cba,cb->ca", seen.cam_from_world[:, :3, :3], seen.cam_from_world[:, :3, 3])
+    distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
+    each = distance / seen.K[:, :1, 0]
+    return jnp.sum(weights * each) / jnp.maximum(jnp.sum(weights), 1e-6) + 1e-4
+
+
+# Stages --------------------------------------------------------------------------------------------------------------
+
+
 @pytree_dataclass
 class _Stage:
-    """One run of the solver. views: (k,) weights of keypoints. targets: triangulated points and theirs. free: what moves."""
+    """One run of the solver. views: (k,) weights of keypoints. targets: triangulated points with weights. free: what moves."""
 
     views: Float[Array, " k"]
     targets: Targets
-    cut: Float[Array, ""]
-    free: BodyState
-
-
-def _stages(problem, resting, config, targets):
-    """A batch of the four stages."""
-    joints, model = problem.joints, problem.model
-    trunk = jnp.asarray(trunk_weights(model.names))
-    body = np.asarray([model.joint_names[j] in BODY for j in joints])[:, None]
-    ones, none = jnp.ones_like(trunk), jnp.zeros_like(trunk)
-    moved = lambda shape, bends: replace(
-        resting,
-        betas=jnp.full(resting.betas.shape, shape),
-        heading=jnp.ones(3, bool),
-        place=jnp.ones(3, bool),
-        bends=jnp.broadcast_to(jnp.asarray(bends), resting.bends.shape),
-    )
-    triangulated = jnp.any(targets.known)
-    in_space = lambda share: replace(targets, known=targets.known * share)
-    cut = lambda stage: jnp.asarray(config.cuts[stage])
-    stages = [
-        _Stage(trunk, in_space(0.0), cut(0), moved(False, False)),
-        _Stage(jnp.where(triangulated, none, ones), in_space(1.0), cut(1), moved(True, body)),
-        _Stage(ones, in_space(0.0), cut(2), moved(True, body)),
-        _Stage(ones, in_space(0.0), cut(3), moved(True, True)),
-    ]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stages)
+    scale: Float[Array, ""]
+    free: FitState
 
 
 BODY = (*BODY_NAMES, "jaw")
 """Joints that move before the hands do."""
 
 
+def _stages(problem, config, targets):
+    """A batch of the four stages."""
+    model, resting = problem.model, zero_state(problem.origin)
+    trunk = jnp.asarray(trunk_weights(model.names))
+    body = np.asarray([model.joint_names[j] in BODY for j in problem.origin.joints])[:, None]
+    ones, none = jnp.ones_like(trunk), jnp.zeros_like(trunk)
+    free = lambda shape, joints: replace(
+        resting,
+        betas=jnp.full(resting.betas.shape, shape),
+        global_orient=jnp.ones(3, bool),
+        transl=jnp.ones(3, bool),
+        body_pose=jnp.broadcast_to(jnp.asarray(joints), resting.body_pose.shape),
+    )
+    triangulated = jnp.any(targets.known)
+    in_space = lambda share: replace(targets, known=targets.known * share)
+    scale = lambda stage: jnp.asarray(config.robust_scales[stage])
+    stages = [
+        _Stage(trunk, in_space(0.0), scale(0), free(False, False)),
+        _Stage(jnp.where(triangulated, none, ones), in_space(1.0), scale(1), free(True, body)),
+        _Stage(ones, in_space(0.0), scale(2), free(True, body)),
+        _Stage(ones, in_space(0.0), scale(3), free(True, True)),
+    ]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stages)
+
+
 def _run_stages(problem, seen, start, stages, config):
-    """All stages one after the other, each from where the last ended. Returns the state and outcomes of each."""
+    """All stages, each from the end of the one before. Returns the state and outcomes of each."""
 
     def run(state, stage):
-        still = state
-        hold = lambda y: jax.tree.map(jnp.where, stage.free, y, still)
         weighted = replace(seen, confidences=seen.confidences * stage.views)
-        objective = lambda y: residuals(problem, weighted, hold(y), stage.cut, stage.targets)
-        state, outcome = minimise(objective, state, config.steps, tolerance=config.tolerance)
-        return hold(state), outcome
+        residuals = lambda y: frame_residuals(problem, weighted, y, stage.scale, stage.targets)
+        return solve(residuals, state, config.steps, method="lbfgs", tolerance=config.tolerance, free=stage.free)
 
     return jax.lax.scan(run, start, stages)
 
 
 def _noise_found(problem, observations, states):
-    """(m,) pixels, from the median error, which outliers hardly touch; within bounds about what was expected."""
+    """(m,) pixels."""
 
-    def moment(seen, state):
-        landmarks, _ = pose_landmarks(problem.model, state.betas, pose_of(problem.prior, problem.joints, state))
-        lengths = jnp.linalg.norm(keypoint_errors(seen, landmarks), axis=-1)
-        found = jnp.nanmedian(jnp.where(seen.confidences * problem.known > 0, lengths, jnp.nan)) / RAYLEIGH_MEDIAN
-        return jnp.clip(jnp.nan_to_num(found, nan=seen.noise), NOISE_RANGE[0] * seen.noise, NOISE_RANGE[1] * seen.noise)
+    def of_frame(seen, state):
+        lengths = jnp.linalg.norm(keypoint_errors(seen, problem.landmarks_and_joints(state)[0]), axis=-1)
+        median = jnp.nanmedian(jnp.where(seen.confidences * problem.known > 0, lengths, jnp.nan))
+        return found_noise(median, seen.noise)
 
-    return jax.vmap(moment)(observations, states)
-
-
-RAYLEIGH_MEDIAN = 1.1774
-"""Median length of a vector whose two components have a standard deviation of 1."""
-NOISE_RANGE = (0.5, 8.0)
-"""Multiples of the expected noise."""
+    return jax.vmap(of_frame)(observations, states)
 
 
 def _fit_person(problem, observations, states, config):
-    """All moments at once with one shape, and smooth motion."""
-    parts = lambda state: {name: getattr(state, name) for name in ("heading", "place", "bends")}
+    """All frames at once with one shape, and smooth motion."""
     m = len(observations.noise)
 
-    def all_residuals(y):
-        shape, poses = y
-        each = jax.vmap(lambda seen, own: residuals(problem, seen, BodyState(betas=shape, **own), config.cuts[-1]))
-        found = each(observations, poses)
-        found["shape"] = problem.shape_weight * shape  # one person has one shape, whatever the number of moments
+    def residuals(state):
+        of_frame = lambda seen, own: frame_residuals(problem, seen, own, config.robust_scales[-1])
+        found = jax.vmap(of_frame, in_axes=(0, frame_axes(state)))(observations, state)
+        found["shape"] = problem.shape_weight * state.betas  # once, whatever the number of frames
         if config.smoothness and m > 2:
-            found["motion"] = _acceleration(problem, shape, poses) / config.smoothness
+            joints = jax.vmap(lambda own: problem.landmarks_and_joints(own)[1], in_axes=(frame_axes(state),))(state)
+            found["motion"] = (joints[2:] - 2 * joints[1:-1] + joints[:-2]) / config.smoothness
         return found
 
-    start = (jnp.median(states.betas, axis=0), parts(states))
-    (betas, free), outcome = minimise(all_residuals, start, config.person_steps, tolerance=config.tolerance)
-    return betas, replace(states, betas=jnp.broadcast_to(betas, (m, *betas.shape)), **free), outcome
-
-
-def _acceleration(problem, betas, poses):
-    """(m - 2, j, 3) second differences of the joints over moments, metres."""
-    pose = lambda own: pose_of(problem.prior, problem.joints, BodyState(betas=betas, **own))
-    joints = jax.vmap(lambda own: pose_landmarks(problem.model, betas, pose(own))[1])(poses)
-    return joints[2:] - 2 * joints[1:-1] + joints[:-2]
-
-
-def _metres_per_pixel(seen, points, weights):
-    """How large a pixel is where the person is."""
-    centers = -jnp.einsum("cba,cb->ca", seen.cam_from_world[:, :3, :3], seen.cam_from_world[:, :3, 3])
-    distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
-    each = distance / seen.K[:, :1, 0]
-    return jnp.sum(weights * each) / jnp.maximum(jnp.sum(weights), 1e-6) + 1e-4
+    start = replace(states, betas=jnp.median(states.betas, axis=0))
+    return solve(residuals, start, config.person_steps, method="lbfgs", tolerance=config.tolerance)

@@ -1,70 +1,75 @@
-"""Mistakes of bookkeeping that keypoints give away: sides, or cameras, that were exchanged.
+"""Bookkeeping errors that keypoints reveal: exchanged sides, or exchanged cameras.
 
-Views of one moment that are right agree: the rays of a landmark meet. Each exchange that people and detectors make is undone on
-trial, the clearest first, and reported if the views agree clearly better without it:
+Views of one frame that are right agree: the rays of a landmark meet. Each exchange that people and detectors make is undone on
+trial, the clearest first, and reported if the views then agree clearly better:
 
-    sides     left and right of the keypoints of one view; from two views on, of which either may be the wrong one
-    cameras   of two views, which is the same as their photos; from three views on: two agree as well the other way round
+    sides     left and right of the keypoints of one view; needs two views, of which either may be the wrong one
+    cameras   of two views, which is the same as their photos; needs three views
     hands     left and right keypoints of the hands alone, in one view
 
-Left and right exchanged in all views meet as well: only a body that has to fit tells (`find_mirrored`).
+Left and right exchanged in all views agree as well. Only a fit of the body finds that (`find_mirrored`).
+
+A view agrees with a landmark by how near its keypoint is to the best of the points that pairs of views propose
+(`triangulation.triangulate_robustly`), so that outliers count little.
 """
 
 import dataclasses
 import itertools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.landmarks import LandmarkModel
-from humangs_jax.core.array_types import Bool, Float, Int
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import KeypointSet
-from humangs_jax.fitting.agreement import Order, agreement, arranged, attainable
 from humangs_jax.fitting.landmark_fit import FitConfig, LandmarkFit, fit_landmarks
-from humangs_jax.fitting.observations import Observations
+from humangs_jax.fitting.residuals.keypoints import Observations
+from humangs_jax.fitting.triangulation import MARGIN, reprojection_errors, triangulate_robustly
 
 LEAST_GAIN, CHANCE = 0.1, 0.8
-"""Agreement of n keypoints has to grow by LEAST_GAIN + CHANCE / sqrt(n) of what is attainable. Chance: without an exchange, 17
-keypoints with 20 % of outliers and three times the expected noise gain up to 0.26, 67 less than nothing.
+"""Agreement of n keypoints has to grow by LEAST_GAIN + CHANCE / sqrt(n) of what is attainable. By chance, without an exchange, 17
+keypoints with 20 % of outliers and three times the expected noise gain up to 0.26; 67 keypoints gain nothing.
 """
 MANY = 5
-"""Of so many views or more, those that are right outvote one exchange: only what then looks better at once is tried."""
+"""With this many views or more the right ones outvote an exchange: only exchanges that look better at once are tried."""
 ALIKE = 0.9
-"""Share of the gain from which another exchange explains as much: in a ring of evenly spaced cameras several are the same one."""
+"""Another exchange with this share of the gain explains as much: in a ring of evenly spaced cameras several are equivalent."""
 SAME_CAMERA = 1e-3
-"""Share of the focal length, and metres, by which a camera that stands still may differ between moments."""
+"""Share of the focal length, and metres, by which a camera that stands still may differ between frames."""
 HANDS_SHARE = 0.3
-"""Of the distance of the hands' roots from their own wrists: if they are so much nearer to the other ones, they are theirs."""
+"""Hands are exchanged if their roots are nearer to the other wrists than this share of the distance from their own."""
 MIRRORED_SHARE, MIRRORED_GAIN = 0.6, 60.0
-"""A mirrored person is meant if it costs less than this share of the given one, or so much less: outliers cost both the same."""
+"""The mirrored person is right if its cost is less than this share of the given one's, or lower by this much."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Swap:
-    """One exchange that explains what does not agree; `str()` is a sentence about it.
+    """One exchange that explains a disagreement; `str()` is a sentence about it.
 
-    kind: "sides", "cameras", "all sides" or "hands". views: names of those concerned. instead: of those that would explain it as
-    well, of cameras pairs ("a and b"). gain: how much more the views agree without it, as a share of what is attainable; of "all
-    sides": by which share the cost of the fit falls. moments: of cameras, in how many; the views are those of the first.
+    kind: "sides", "cameras", "all sides" or "hands". views: names of the views. instead: alternatives that explain it as well;
+    for cameras pairs ("a and b"). gain: how much better the views agree without it, as a share of what is attainable; for "all
+    sides": the share by which the cost of the fit falls. frames: for cameras, in how many; the views are those of the first.
     """
 
     kind: str
     views: tuple[str, ...]
     gain: float
     instead: tuple[str, ...] = ()
-    moments: int = 1
+    frames: int = 1
 
     def __str__(self) -> str:
-        """What seems to be wrong."""
+        """One sentence."""
         if self.kind == "all sides":
             return "left and right of the keypoints seem exchanged in all views: the mirrored person fits much better"
         if self.kind == "hands":
             return f"view {self.views[0]}: the keypoints of the hands seem exchanged: each lies at the other wrist"
         if self.kind == "cameras":
-            moments = f", as in {self.moments} moments" if self.moments > 1 else ""
+            frames = f", as in {self.frames} frames" if self.frames > 1 else ""
             other = f" (or those of {' or '.join(self.instead)} instead)" if self.instead else ""
-            return f"the cameras (or the photos) of views {' and '.join(self.views)} seem exchanged{other}{moments}"
+            return f"the cameras (or the photos) of views {' and '.join(self.views)} seem exchanged{other}{frames}"
         other = f" (or in {' and '.join(self.instead)} instead)" if self.instead else ""
         return f"view {self.views[0]}: left and right of the keypoints seem exchanged{other}"
 
@@ -72,9 +77,9 @@ class Swap:
 def find_swaps(
     observations: Observations, kind: KeypointSet, views: Int[np.ndarray, "m c"], names: tuple[str, ...]
 ) -> tuple[Swap, ...]:
-    """Exchanged sides and cameras, the clearest first; none where a moment has one view, and no cameras where it has two.
+    """Exchanged sides and cameras, the clearest first. Frames need two views for sides and three for cameras.
 
-    Arguments: observations: a batch of m moments. views: which of `names` each view is, -1: none, as `group_by_moment` has it.
+    Arguments: observations: a batch of m frames. views: index into `names` of each view, -1: none, see `group_by_frame`.
     """
     rig = _Rig(observations, np.asarray(kind.mirror), views, _camera_numbers(observations, views))
     order, exchanges, shares = Order.given(*views.shape), [], np.zeros(views.shape)
@@ -83,19 +88,19 @@ def find_swaps(
         flips = _clear_flips(rig, state)
         tried = _clear_exchanges(rig, state)
         best = max(tried, key=lambda each: each.gain, default=None)
-        if best is not None and best.gain >= sum(flips[m].gain for m in best.moments if m in flips):
+        if best is not None and best.gain >= sum(flips[m].gain for m in best.frames if m in flips):
             exchanges.append(_cameras(best, tried, views, names))
-            order = order.exchanged(best.moments, best.a, best.b)
+            order = order.exchanged(best.frames, best.a, best.b)
         elif flips:
-            moments, slots = (np.concatenate([getattr(x, key) for x in flips.values()]) for key in ("moments", "a"))
-            shares[moments, order.source[moments, slots]] = [flip.share for flip in flips.values()]
-            order = order.sides_exchanged(moments, slots)
+            frames, slots = (np.concatenate([getattr(x, key) for x in flips.values()]) for key in ("frames", "a"))
+            shares[frames, order.source[frames, slots]] = [flip.share for flip in flips.values()]
+            order = order.sides_exchanged(frames, slots)
         else:
             return tuple(sorted([*exchanges, *_sides(rig, state, shares, names)], key=lambda swap: -swap.gain))
 
 
 def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[Swap, ...]:
-    """Views in which the hands' keypoints are at each other's wrists, as of hand detectors that are run on the wrong crops."""
+    """Views in which the hands' keypoints are at each other's wrists, as hand detectors on exchanged crops leave them."""
     wanted = ("left_hand_root", "right_hand_root", "left_wrist", "right_wrist")
     if not set(wanted) <= set(keypoints.set.names):
         return ()
@@ -117,20 +122,108 @@ def find_mirrored(
 ) -> tuple[Swap, ...]:
     """Left and right exchanged in all views: the keypoints are mirrored and fitted once more.
 
-    Arguments: fit: of these observations by this configuration, so that nothing has to be compiled.
+    Arguments: fit: of these observations with this configuration (nothing is compiled again).
     """
     given = Order.given(observations.points.shape[0], observations.points.shape[1])
     everywhere = dataclasses.replace(given, mirrored=~given.mirrored)
     mirrored = arranged(observations, np.asarray(kind.mirror), everywhere)
-    # of the last stage whose unit is the expected noise: the person's is the noise that each fit found for itself
+    # the last stage in units of the expected noise: stage "person" has the noise that each fit found for itself
     cost, other = (float(x.outcomes["hands"].after.sum()) for x in (fit, fit_landmarks(model, mirrored, config)))
     better = other < MIRRORED_SHARE * cost or other < cost - MIRRORED_GAIN
     return (Swap("all sides", (), 1 - other / cost),) if better else ()
 
 
+# How well views agree --------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Order:
+    """Which keypoints the c cameras of m frames get.
+
+    source: (m, c) camera that they come from. mirrored: (m, c) by source, whether left and right are exchanged.
+    """
+
+    source: Int[np.ndarray, "m c"]
+    mirrored: Bool[np.ndarray, "m c"]
+
+    @classmethod
+    def given(cls, frames: int, views: int) -> "Order":
+        """Every camera has its own keypoints."""
+        return cls(np.tile(np.arange(views), (frames, 1)), np.zeros((frames, views), bool))
+
+    def exchanged(self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"]) -> "Order":
+        """With the keypoints of cameras a and b exchanged in some frames."""
+        source = self.source.copy()
+        source[frames, a], source[frames, b] = self.source[frames, b], self.source[frames, a]
+        return dataclasses.replace(self, source=source)
+
+    def sides_exchanged(self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"]) -> "Order":
+        """With left and right of camera a's keypoints exchanged in some frames."""
+        mirrored = self.mirrored.copy()
+        mirrored[frames, self.source[frames, a]] ^= True
+        return dataclasses.replace(self, mirrored=mirrored)
+
+
+def arranged(observations: Observations, mirror: Int[np.ndarray, " k"], order: Order) -> Observations:
+    """The keypoints of m frames in an order. mirror: index of each keypoint's mirror image."""
+    rows = np.arange(len(order.source))[:, None]
+    columns = np.where(order.mirrored[rows, order.source, None], mirror, np.arange(len(mirror)))
+    pick = lambda values: jnp.asarray(np.asarray(values)[rows[..., None], order.source[..., None], columns])
+    return replace(observations, points=pick(observations.points), confidences=pick(observations.confidences))
+
+
+@pytree_dataclass
+class Agreement:
+    """Of c views with the points that they agree on best: confidences summed over keypoints, less for larger errors.
+
+    own: (c,) with the keypoints as they are. crossed: (c, c) if the first view had the second's keypoints, and mirrored: (c,)
+    with left and right exchanged, both without new triangulation.
+    """
+
+    own: Float[Array, " c"]
+    crossed: Float[Array, "c c"]
+    mirrored: Float[Array, " c"]
+
+
+@jax.jit
+def agreement(observations: Observations, mirror: Int[Array, " k"] | Int[np.ndarray, " k"]) -> Agreement:
+    """How well the views of each frame agree, a batch of m. mirror: index of each keypoint's mirror image."""
+    return jax.lax.map(lambda seen: _of_frame(seen, mirror), observations)
+
+
+def _of_frame(seen, mirror):
+    points, counts, weights = triangulate_robustly(seen)
+
+    def near(keypoints, confidences):
+        """Agreement (c,) of all views if each had these keypoints (k, 2)."""
+        given = replace(
+            seen,
+            points=jnp.broadcast_to(keypoints, seen.points.shape),
+            confidences=jnp.broadcast_to(confidences, seen.confidences.shape),
+        )
+        share = 1 - jnp.square(reprojection_errors(given, points) / (MARGIN * seen.noise))
+        return jnp.sum((counts >= 2) * given.confidences * jnp.maximum(share, 0.0), axis=-1)
+
+    crossed = jax.vmap(near, out_axes=1)(seen.points, seen.confidences)
+    mirrored = jnp.diagonal(jax.vmap(near, out_axes=1)(seen.points[:, mirror], seen.confidences[:, mirror]))
+    return Agreement(jnp.sum(weights, axis=-1), crossed, mirrored)
+
+
+def attainable(
+    confidences: Float[np.ndarray, "m c k"], of: Bool[np.ndarray, " k"]
+) -> tuple[Float[np.ndarray, "m c"], Int[np.ndarray, "m c"]]:
+    """Agreement (m, c) if every keypoint in `of` that another view sees agreed, and the number of these keypoints (m, c)."""
+    seen = (confidences > 0) & of
+    shared = seen & (seen.sum(axis=1, keepdims=True) > 1)
+    return (confidences * shared).sum(-1), shared.sum(-1)
+
+
+# Trials --------------------------------------------------------------------------------------------------------------
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Rig:
-    """What is given. cameras: (m, c) equal numbers for one camera that stands still, -1: no view."""
+    """The input. cameras: (m, c) equal numbers for one camera that stands still, -1: no view."""
 
     observations: Observations
     mirror: Int[np.ndarray, " k"]
@@ -142,7 +235,7 @@ class _Rig:
 class _State:
     """An order and how well the views agree in it.
 
-    total: (m,). views: (m, c) that have keypoints. sides: (m, c) and pairs: (m, c, c) that are worth a trial.
+    total: (m,). views: (m, c) with keypoints. sides: (m, c) and pairs: (m, c, c) to be tried.
     """
 
     order: Order
@@ -169,15 +262,15 @@ class _State:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Trial:
-    """An exchange in some moments, of cameras a and b, or (b is None) of the sides of camera a.
+    """An exchange in some frames: of cameras a and b, or of the sides of camera a if b is None.
 
-    gain: agreement that it adds; share: of what is attainable, of `count` keypoints.
+    gain: agreement that it adds; share: gain over what `count` keypoints can attain.
     """
 
     gain: float
     share: float
     count: int
-    moments: Int[np.ndarray, " e"]
+    frames: Int[np.ndarray, " e"]
     a: Int[np.ndarray, " e"]
     b: Int[np.ndarray, " e"] | None = None
 
@@ -191,42 +284,42 @@ def _gains(rig, state, order):
     return np.asarray(agreement(arranged(rig.observations, rig.mirror, order), rig.mirror).own).sum(-1) - state.total
 
 
-def _trial(gains, most, count, moments, a, b=None):
-    """The trial of an exchange with these gains (e,) in e moments, of what is attainable most (m, c) and count (m, c)."""
-    total = lambda values: values[moments, a].sum() + (0 if b is None else values[moments, b].sum())
+def _trial(gains, most, count, frames, a, b=None):
+    """A trial from gains (e,) in e frames, attainable agreement most (m, c) and numbers of keypoints count (m, c)."""
+    total = lambda values: values[frames, a].sum() + (0 if b is None else values[frames, b].sum())
     gain = float(gains.sum())
-    return _Trial(gain, gain / max(float(total(most)), 1e-6), int(total(count)), moments, a, b)
+    return _Trial(gain, gain / max(float(total(most)), 1e-6), int(total(count)), frames, a, b)
 
 
 def _clear_flips(rig, state):
-    """By moment, the view whose sides are exchanged most clearly."""
+    """By frame, the view whose sides are exchanged most clearly."""
     most, count = attainable(state.confidences, rig.mirror != np.arange(len(rig.mirror)))
     found: dict[int, _Trial] = {}
     for slot in np.flatnonzero(state.sides.any(0)):
-        moments = np.flatnonzero(state.sides[:, slot])
-        gains = _gains(rig, state, state.order.sides_exchanged(moments, np.full(len(moments), slot)))
-        for moment in moments:
-            trial = _trial(gains[[moment]], most, count, np.asarray([moment]), np.asarray([slot]))
-            if trial.clear and (moment not in found or trial.gain > found[moment].gain):
-                found[moment] = trial
+        frames = np.flatnonzero(state.sides[:, slot])
+        gains = _gains(rig, state, state.order.sides_exchanged(frames, np.full(len(frames), slot)))
+        for frame in frames:
+            trial = _trial(gains[[frame]], most, count, np.asarray([frame]), np.asarray([slot]))
+            if trial.clear and (frame not in found or trial.gain > found[frame].gain):
+                found[frame] = trial
     return found
 
 
 def _clear_exchanges(rig, state):
-    """Exchanges of two cameras in all of their moments together, and in each alone."""
+    """Exchanges of two cameras in all of their frames together, and in each alone."""
     most, count = attainable(state.confidences, np.ones(len(rig.mirror), bool))
     several = state.views & (state.views.sum(-1, keepdims=True) > 2)
-    cameras = lambda moment, a, b: tuple(sorted(rig.cameras[moment, [a, b]].tolist()))
+    cameras = lambda frame, a, b: tuple(sorted(rig.cameras[frame, [a, b]].tolist()))
     suspected = {cameras(*at) for at in np.argwhere(state.pairs)}
     tried: dict[tuple[int, ...], list[tuple[float, int, int, int]]] = {}
     for a, b in itertools.combinations(range(most.shape[1]), 2):
-        moments = np.flatnonzero(several[:, a] & several[:, b])
-        moments = np.asarray([moment for moment in moments if cameras(moment, a, b) in suspected], int)
-        if len(moments):
-            of = [np.full(len(moments), slot) for slot in (a, b)]
-            gains = _gains(rig, state, state.order.exchanged(moments, *of))
-            for moment in moments:
-                tried.setdefault(cameras(moment, a, b), []).append((gains[moment], moment, a, b))
+        frames = np.flatnonzero(several[:, a] & several[:, b])
+        frames = np.asarray([frame for frame in frames if cameras(frame, a, b) in suspected], int)
+        if len(frames):
+            of = [np.full(len(frames), slot) for slot in (a, b)]
+            gains = _gains(rig, state, state.order.exchanged(frames, *of))
+            for frame in frames:
+                tried.setdefault(cameras(frame, a, b), []).append((gains[frame], frame, a, b))
     alone = [[each] for of in tried.values() if len(of) > 1 for each in of]
     columns = [map(np.asarray, zip(*group, strict=True)) for group in (*tried.values(), *alone)]
     trials = [_trial(gains, most, count, *where) for gains, *where in columns]
@@ -234,15 +327,15 @@ def _clear_exchanges(rig, state):
 
 
 def _cameras(best, tried, views, names):
-    """The swap of the best exchange, and the others of the same moments that gain as much."""
-    name = lambda trial: tuple(names[v] for v in sorted(views[trial.moments[0], [trial.a[0], trial.b[0]]]))
+    """The swap of the best exchange, and the others of the same frames that gain as much."""
+    name = lambda trial: tuple(names[v] for v in sorted(views[trial.frames[0], [trial.a[0], trial.b[0]]]))
     alike = [each for each in tried if each is not best and each.gain > ALIKE * best.gain]
-    others = [" and ".join(name(each)) for each in alike if np.array_equal(each.moments, best.moments)]
-    return Swap("cameras", name(best), best.share, tuple(others), len(best.moments))
+    others = [" and ".join(name(each)) for each in alike if np.array_equal(each.frames, best.frames)]
+    return Swap("cameras", name(best), best.share, tuple(others), len(best.frames))
 
 
 def _sides(rig, state, shares, names):
-    """A swap of each view whose sides are exchanged in the end; where that is half of the views, it may be the other half."""
+    """A swap for each view whose sides are exchanged; if these are half of the views, it may be the other half."""
     found = []
     seen = np.any(np.asarray(rig.observations.confidences) > 0, axis=-1)
     for views, mirrored, exists, gains in zip(rig.views, state.order.mirrored, seen, shares, strict=True):
@@ -261,9 +354,9 @@ def _camera_numbers(observations, views):
     flat = lambda matrices: np.asarray(matrices).reshape(*views.shape, -1)
     cameras = np.concatenate([np.log(focal), flat(observations.K) / focal, flat(observations.cam_from_world)], axis=-1)
     numbers, known = np.full(views.shape, -1), np.empty((0, cameras.shape[-1]))
-    for moment, slot in np.argwhere(views >= 0):
-        same = np.flatnonzero(np.abs(known - cameras[moment, slot]).max(axis=-1) < SAME_CAMERA)
-        numbers[moment, slot] = same[0] if len(same) else len(known)
+    for frame, slot in np.argwhere(views >= 0):
+        same = np.flatnonzero(np.abs(known - cameras[frame, slot]).max(axis=-1) < SAME_CAMERA)
+        numbers[frame, slot] = same[0] if len(same) else len(known)
         if not len(same):
-            known = np.concatenate([known, cameras[moment, slot][None]])
+            known = np.concatenate([known, cameras[frame, slot][None]])
     return numbers

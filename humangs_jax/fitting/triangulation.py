@@ -1,7 +1,7 @@
-"""Points in space from their pictures in several views: plain, by least squares, or robustly, from the pair most agree with.
+"""Points in space from several views: plain least squares, or robustly from the pair of views that most views agree with.
 
-A pixel is a ray; a point is sought whose squared distances to the rays, weighted, are least (3 x 3 equations). Weighting by
-the focal length over the distance makes them squares of pixels (Hartley and Zisserman, Multiple View Geometry, 12.2).
+A pixel is a ray. The point with the least weighted sum of squared distances to the rays solves 3 x 3 equations. Weights of
+focal length over distance turn metres into pixels (Hartley and Zisserman, Multiple View Geometry, 12.2).
 """
 
 import jax
@@ -10,14 +10,14 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.numerics import safe_normalize
-from humangs_jax.fitting.observations import Observations
+from humangs_jax.fitting.residuals.keypoints import Observations, focal_lengths, in_cameras
 
 RIDGE = 1e-6
-"""Of the weights: rays that are parallel leave the distance open, and the point near the cameras."""
+"""Of the weights: parallel rays leave the distance open; the point is then near the cameras."""
 REWEIGHTED = 3
 """Rounds of weighting the rays by the distance of the last point."""
 MARGIN = 6.0
-"""Views within so many standard deviations of the noise agree with a point."""
+"""A view agrees with a point within this many standard deviations of the noise."""
 
 
 def triangulate(
@@ -25,7 +25,7 @@ def triangulate(
 ) -> tuple[Float[Array, "k 3"], Float[Array, " k"]]:
     """Least squares over all views: points (k, 3) in metres and how many views see each (k,).
 
-    Arguments: weights: of the views of each point; the confidences if not given.
+    Arguments: weights: of the views of each point; default: the confidences.
     """
     weights = observations.confidences if weights is None else weights
     origins, directions = _rays(observations)
@@ -69,22 +69,18 @@ def triangulate_robustly(
 
 def reprojection_errors(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k"]:
     """Distance in pixels between points as the views would show them and the detections; huge behind a camera."""
-    seen = (
-        points @ jnp.swapaxes(observations.cam_from_world[:, :3, :3], -1, -2)
-        + observations.cam_from_world[:, None, :3, 3]
-    )
+    seen = in_cameras(observations, points)
     depth = seen[..., 2]
     before = depth > 0.01
-    focal = jnp.stack([observations.K[:, 0, 0], observations.K[:, 1, 1]], axis=-1)[:, None]
-    pixels = seen[..., :2] / jnp.where(before, depth, 1.0)[..., None] * focal + observations.K[:, None, :2, 2]
+    pixels = seen[..., :2] / jnp.where(before, depth, 1.0)[..., None] * focal_lengths(observations)
+    pixels += observations.K[:, None, :2, 2]
     return jnp.where(before, jnp.linalg.norm(pixels - observations.points, axis=-1), 1e6)
 
 
 def _rays(observations):
     """Camera centres (c, 3) and unit directions (c, k, 3) of the detections in the world."""
     rotation, translation = observations.cam_from_world[:, :3, :3], observations.cam_from_world[:, :3, 3]
-    focal = jnp.stack([observations.K[:, 0, 0], observations.K[:, 1, 1]], axis=-1)[:, None]
-    xy = (observations.points - observations.K[:, None, :2, 2]) / focal
+    xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
     local = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
     directions = safe_normalize(jnp.einsum("cba,ckb->cka", rotation, local), jnp.asarray([0.0, 0.0, 1.0]))
     return -jnp.einsum("cba,cb->ca", rotation, translation), directions
@@ -92,7 +88,7 @@ def _rays(observations):
 
 def _nearest(origins, directions, weights):
     """The points (k, 3) nearest to weighted rays."""
-    center = jnp.mean(origins, axis=0)  # far from the world's origin nothing is lost to rounding
+    center = jnp.mean(origins, axis=0)  # against rounding far from the world's origin
     across = jnp.eye(3) - directions[..., :, None] * directions[..., None, :]
     scale = weights / jnp.maximum(jnp.sum(weights, axis=0), 1e-12)
     matrix = jnp.einsum("ck,ckab->kab", scale, across) + RIDGE * jnp.eye(3)

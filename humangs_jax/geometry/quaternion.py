@@ -13,6 +13,9 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 SMALL_ANGLE_SQUARED = 1e-4
 """Below this the Taylor series of sin(t)/t and (1-cos t)/t^2, cut after t^4, are exact to float32 rounding (t^6/5040 < 2e-16)."""
 
+SMALLEST_SQUARE = 1e-30
+"""Of a sine: below it the sine is the angle, and derivatives of its root would overflow in float32."""
+
 OPPOSITE = 1e-12
 """Unit vectors whose product is less than this above -1 count as opposite: their cross product is rounding."""
 
@@ -127,8 +130,9 @@ def from_axis_angle(axis_angle: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
 
 
 def to_axis_angle(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
-    """The rotation vector, no longer than pi, of a unit quaternion. Not meant to be differentiated at the zero rotation."""
+    """The rotation vector, no longer than pi, of a unit quaternion, with exact derivatives at the zero rotation."""
     q = jnp.where(q[..., :1] < 0, -q, q)
-    sine = jnp.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
-    angle = 2 * jnp.arctan2(sine, q[..., :1])
-    return q[..., 1:] * jnp.where(sine > 0, angle / jnp.where(sine > 0, sine, 1.0), 2.0)
+    squared = jnp.sum(jnp.square(q[..., 1:]), axis=-1, keepdims=True)
+    turned = squared > SMALLEST_SQUARE
+    sine = jnp.sqrt(jnp.where(turned, squared, 1.0))
+    return q[..., 1:] * jnp.where(turned, 2 * jnp.arctan2(sine, q[..., :1]) / sine, 2.0)

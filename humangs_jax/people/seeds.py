@@ -20,8 +20,10 @@ TEST = range(2_000_000, 2_001_000)
 """Held out of training and of every choice made on the validation people."""
 DEMO = range(3_000_000, 3_001_000)
 """People of the documentation and the tests."""
+FITTING = range(4_000_000, 4_001_000)
+"""People that fitting and refinement are tuned and measured on: no other result sees them."""
 
-SPLITS = {"train": TRAIN, "validation": VALIDATION, "test": TEST, "demo": DEMO}
+SPLITS = {"train": TRAIN, "validation": VALIDATION, "test": TEST, "demo": DEMO, "fitting": FITTING}
 
 KEY_KIND = "threefry2x32"
 """Implementation of all keys of people: the words of such a key are its seed."""

@@ -11,8 +11,8 @@ from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
 from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
-from humangs_jax.fitting.observations import Observations, expected_noise
-from humangs_jax.fitting.pose_prior import MIRROR
+from humangs_jax.fitting.residuals.keypoints import make_observations
+from humangs_jax.fitting.residuals.priors import MIRROR
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 SIZE = 512
@@ -85,14 +85,4 @@ def observe(poses, *, seed=0, views=VIEWS, noise=0.0, outliers=0.0, model=None):
     wild = rng.random(pixels.shape[:-1]) < outliers
     pixels += wild[..., None] * rng.uniform(-100, 100, pixels.shape)
     confidences = np.broadcast_to(np.asarray(model.known, np.float32), pixels.shape[:-1]).copy()
-    return np.asarray(joints), betas, observations(pixels, confidences, K, pose)
-
-
-def observations(pixels, confidences, K, pose):
-    return jax.vmap(Observations)(
-        jnp.asarray(pixels, jnp.float32),
-        jnp.asarray(confidences, jnp.float32),
-        jnp.asarray(K),
-        jnp.asarray(pose),
-        jnp.asarray(expected_noise(pixels, confidences)),
-    )
+    return np.asarray(joints), betas, make_observations(pixels, confidences, K, pose)

@@ -12,7 +12,7 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
-from humangs_jax.fitting.pose_prior import pose_prior
+from humangs_jax.fitting.residuals.priors import pose_prior
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 SIZE, NOISE = 256, 1.0
@@ -29,42 +29,42 @@ def _landmarks(names):
     return jax.jit(jax.vmap(lambda pose: pose_landmarks(model, jnp.zeros(4), pose)[0]))
 
 
-def person(seed, moments, views, *, still=False, even=False, outliers=0.0, kind=COCO_17):
-    """A capture and noisy keypoints of it, views of a moment one after the other, named m0v0, m0v1, ...
+def person(seed, frames, views, *, still=False, even=False, outliers=0.0, kind=COCO_17):
+    """A capture and noisy keypoints of it, views of a frame one after the other, named m0v0, m0v1, ...
 
-    still: cameras are the same for all moments. even: evenly spaced around the person.
+    still: cameras are the same for all frames. even: evenly spaced around the person.
     """
     rng = np.random.default_rng(seed)
     prior = pose_prior(body().joint_names)
-    rotations = prior.usual + prior.spread * rng.normal(0, 0.7, (moments, *prior.usual.shape))
-    rotations = np.clip(rotations, prior.least, prior.greatest)
-    rotations[:, 0] = [[0, angle, 0] for angle in rng.uniform(-np.pi, np.pi, moments)]
-    poses = jax.vmap(BodyPose)(jnp.asarray(rotations, jnp.float32), jnp.zeros((moments, 3)))
-    cameras = _cameras(rng, moments, views, still, even)
+    rotations = prior.mean + prior.std * rng.normal(0, 0.7, (frames, *prior.mean.shape))
+    rotations = np.clip(rotations, prior.lower, prior.upper)
+    rotations[:, 0] = [[0, angle, 0] for angle in rng.uniform(-np.pi, np.pi, frames)]
+    poses = jax.vmap(BodyPose)(jnp.asarray(rotations, jnp.float32), jnp.zeros((frames, 3)))
+    cameras = _cameras(rng, frames, views, still, even)
     landmarks = np.asarray(_landmarks(kind.names)(poses))
-    frames = np.repeat(np.arange(moments), views)
+    frame_of = np.repeat(np.arange(frames), views)
     matrices = np.asarray(cameras.cam_from_world)
-    local = np.einsum("vab,vkb->vka", matrices[:, :3, :3], landmarks[frames]) + matrices[:, None, :3, 3]
+    local = np.einsum("vab,vkb->vka", matrices[:, :3, :3], landmarks[frame_of]) + matrices[:, None, :3, 3]
     points = local[..., :2] / local[..., 2:] * np.asarray(cameras.K)[0, 0, 0] + SIZE / 2
     points += rng.normal(0, NOISE, points.shape)
     wild = rng.random(points.shape[:2]) < outliers
     points[wild] += rng.uniform(-SIZE / 4, SIZE / 4, points[wild].shape)
     capture = Capture(
-        images=np.ones((len(frames), SIZE, SIZE, 3), np.float32),
+        images=np.ones((len(frame_of), SIZE, SIZE, 3), np.float32),
         masks=None,
         cameras=cameras,
-        frames=frames.astype(np.int32),
+        frames=frame_of.astype(np.int32),
         body=body(),
         betas=np.zeros(4, np.float32),
         poses=poses,
-        names=tuple(f"m{m}v{v}" for m in range(moments) for v in range(views)),
+        names=tuple(f"m{m}v{v}" for m in range(frames) for v in range(views)),
     )
     return capture, Keypoints(points.astype(np.float32), np.ones(points.shape[:2], np.float32), kind)
 
 
-def _cameras(rng, moments, views, still, even):
+def _cameras(rng, frames, views, still, even):
     K = intrinsics_from_fov(0.8, SIZE, SIZE)
-    starts = np.full(moments, 0.3) if still else rng.uniform(0, 2 * np.pi, moments)
+    starts = np.full(frames, 0.3) if still else rng.uniform(0, 2 * np.pi, frames)
     uneven = 0 if even else rng.uniform(-0.3, 0.3, views)
     azimuths = (starts[:, None] + (np.arange(views) + uneven) * 2 * np.pi / views).ravel()
     return orbit(jnp.asarray([0.0, -0.3, 0.0]), 2.8, jnp.asarray(azimuths, jnp.float32), 0.1, K, SIZE, SIZE)

@@ -9,13 +9,22 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.sets import COCO_17
-from humangs_jax.fitting.examination import ROWS, examine, examine_record
-from humangs_jax.fitting.findings import NAMED, UNDECIDED, UNSURE, ViewFit, listed, open_joints, warnings
-from humangs_jax.fitting.fit_record import FitRecord
+from humangs_jax.fitting.examination import examine, examine_record
+from humangs_jax.fitting.files import FitRecord
+from humangs_jax.fitting.report import (
+    NAMED,
+    ROWS,
+    UNDECIDED,
+    UNSURE,
+    ViewReport,
+    keypoint_warnings,
+    listed,
+    undetermined_joints,
+)
 from humangs_jax.fitting.swaps import Swap
 from humangs_jax.geometry.camera import Camera
 
-MOMENTS, VIEWS = 4, 4
+FRAMES, VIEWS = 4, 4
 NOSE, LEFT_WRIST = COCO_17.names.index("nose"), COCO_17.names.index("left_wrist")
 RAYLEIGH = {0.5: 1.177, 0.9: 2.146}
 """Quantiles of the length of a vector whose two components have a standard deviation of 1."""
@@ -23,11 +32,11 @@ RAYLEIGH = {0.5: 1.177, 0.9: 2.146}
 
 @pytest.fixture(scope="module")
 def good() -> tuple:
-    return person(20, MOMENTS, VIEWS)
+    return person(20, FRAMES, VIEWS)
 
 
-def turned(capture: Capture, joint: str, moment: int, vector: tuple[float, float, float]) -> Capture:
-    rotations = capture.poses.rotations.at[moment, JOINT_NAMES.index(joint)].set(jnp.asarray(vector))
+def turned(capture: Capture, joint: str, frame: int, vector: tuple[float, float, float]) -> Capture:
+    rotations = capture.poses.rotations.at[frame, JOINT_NAMES.index(joint)].set(jnp.asarray(vector))
     return dataclasses.replace(capture, poses=replace(capture.poses, rotations=rotations))
 
 
@@ -39,18 +48,18 @@ def with_points(keypoints, change):
 
 def test_a_good_fit(good):
     examination = examine(*good)
-    assert examination.ok and examination.swaps == () and examination.undetermined == ()
-    assert [view.name for view in examination.views] == list(good[0].names)
-    assert [view.moment for view in examination.views] == good[0].frames.tolist()
-    assert all(view.keypoints == 17 and view.outliers == 0 for view in examination.views)
+    assert examination.report.ok and examination.report.swaps == () and examination.report.undetermined == ()
+    assert [view.name for view in examination.report.views] == list(good[0].names)
+    assert [view.frame for view in examination.report.views] == good[0].frames.tolist()
+    assert all(view.keypoints == 17 and view.outliers == 0 for view in examination.report.views)
     for field, share in (("median", 0.5), ("high", 0.9)):
-        mean = np.mean([getattr(view, field) for view in examination.views])
+        mean = np.mean([getattr(view, field) for view in examination.report.views])
         assert mean == pytest.approx(RAYLEIGH[share] * NOISE, rel=0.12)
     np.testing.assert_allclose(examination.noise, NOISE, rtol=0.25)
-    np.testing.assert_allclose(examination.moments, RAYLEIGH[0.5] * NOISE, rtol=0.25)
-    errors = np.linalg.norm(examination.seen - good[1].points, axis=-1)
+    np.testing.assert_allclose(examination.frames, RAYLEIGH[0.5] * NOISE, rtol=0.25)
+    errors = np.linalg.norm(examination.landmarks - good[1].points, axis=-1)
     np.testing.assert_allclose(
-        [np.median(own) for own in errors], [view.median for view in examination.views], rtol=1e-5
+        [np.median(own) for own in errors], [view.median for view in examination.report.views], rtol=1e-5
     )
 
 
@@ -66,8 +75,8 @@ def test_outliers_are_those_that_were_displaced(good):
     examination = examine(capture, with_points(keypoints, displace))
     assert np.argwhere(examination.outliers).tolist() == [[5, NOSE], [9, LEFT_WRIST]]
     assert not examination.compared[9, NOSE] and examination.compared.sum() == examination.compared.size - 1
-    assert examination.views[9].keypoints == 16 and examination.views[9].outliers == pytest.approx(1 / 16)
-    assert examination.ok  # a detector may err at times
+    assert examination.report.views[9].keypoints == 16 and examination.report.views[9].outliers == pytest.approx(1 / 16)
+    assert examination.report.ok  # a detector may err at times
 
 
 def test_a_camera_that_was_moved(good):
@@ -75,11 +84,11 @@ def test_a_camera_that_was_moved(good):
     matrices = capture.cameras.cam_from_world.at[6, 0, 3].add(0.3)
     moved = dataclasses.replace(capture, cameras=replace(capture.cameras, cam_from_world=matrices))
     examination = examine(moved, keypoints)
-    assert not examination.ok
-    (warning,) = examination.warnings
-    assert warning.startswith("the body is not where the keypoints are in view m1v2: ") and "px off" in warning
-    assert np.argmax([view.median for view in examination.views]) == 6
-    assert f"warning: {warning}" in str(examination)
+    assert not examination.report.ok
+    (warning,) = examination.report.warnings
+    assert warning.startswith("body and keypoints disagree in view m1v2: ") and "px" in warning
+    assert np.argmax([view.median for view in examination.report.views]) == 6
+    assert f"warning: {warning}" in str(examination.report)
 
 
 def test_exchanged_sides_are_named_before_what_they_cause(good):
@@ -89,57 +98,55 @@ def test_exchanged_sides_are_named_before_what_they_cause(good):
         points[6] = points[6][list(COCO_17.mirror)]
 
     examination = examine(capture, with_points(keypoints, mirror))
-    assert examination.swaps[0].views == ("m1v2",)
-    assert examination.warnings[0] == "view m1v2: left and right of the keypoints seem exchanged"
-    assert examination.warnings[1].startswith("the body is not where the keypoints are in view m1v2")
+    assert examination.report.swaps[0].views == ("m1v2",)
+    assert examination.report.warnings[0] == "view m1v2: left and right of the keypoints seem exchanged"
+    assert examination.report.warnings[1].startswith("body and keypoints disagree in view m1v2")
 
 
 def test_what_a_refit_found_is_told_too(good):
     mirrored = (Swap("all sides", (), 0.5),)
     examination = examine(*good, mirrored=mirrored)
-    assert examination.swaps == mirrored and "in all views" in examination.warnings[0]
+    assert examination.report.swaps == mirrored and "in all views" in examination.report.warnings[0]
 
 
 def test_joints_that_turn_too_far(good):
     capture, keypoints = good
     bent = turned(turned(capture, "left_knee", 2, (-0.9, 0.0, 0.0)), "right_elbow", 0, (0.0, -0.27, 0.0))
     examination = examine(bent, keypoints)
-    found = {(v.moment, v.joint, v.axis): v.degrees for v in examination.violations}
+    found = {(v.frame, v.joint, v.axis): v.degrees for v in examination.report.violations}
     assert found[2, "left_knee", "x"] == pytest.approx(np.rad2deg(0.9 - 0.15), abs=0.01)
     assert found[0, "right_elbow", "y"] == pytest.approx(np.rad2deg(0.27 - 0.15), abs=0.01)
-    (warning,) = [warning for warning in examination.warnings if "turns" in warning]
-    assert (
-        warning == "left_knee turns 43 degrees further about x than joints do, in moment 2"
-    )  # the elbow by 7 is no matter
+    (warning,) = [warning for warning in examination.report.warnings if "beyond" in warning]
+    assert warning == "left_knee is 43 degrees beyond its limit about x, in frame 2"  # the elbow by 7 is no matter
 
 
-def test_moments_and_views_without_keypoints(good):
+def test_frames_and_views_without_keypoints(good):
     capture, keypoints = good
 
     def hide(_, confidences):
         confidences[[1, 8, 9, 10, 11]] = 0
 
     examination = examine(capture, with_points(keypoints, hide))
-    assert np.isnan(examination.moments[2]) and np.isfinite(examination.moments[[0, 1, 3]]).all()
+    assert np.isnan(examination.frames[2]) and np.isfinite(examination.frames[[0, 1, 3]]).all()
     assert np.isfinite(examination.noise).all()
-    assert examination.views[1].keypoints == 0 and np.isnan(examination.views[1].median)
-    assert examination.warnings == ("no keypoints in view m0v1, m2v0, m2v1, m2v2, m2v3",)
-    assert "nan" not in str(examination)
+    assert examination.report.views[1].keypoints == 0 and np.isnan(examination.report.views[1].median)
+    assert examination.report.warnings == ("no keypoints in view m0v1, m2v0, m2v1, m2v2, m2v3",)
+    assert "nan" not in str(examination.report)
     nothing = examine(capture, with_points(keypoints, lambda _, confidences: confidences.fill(0)))
-    assert not nothing.ok and "nan" not in str(nothing)
+    assert not nothing.report.ok and "nan" not in str(nothing.report)
 
 
-def test_moments_without_views(good):
+def test_frames_without_views(good):
     """A capture may have more poses than its views show, before the last and after it."""
     capture, keypoints = good
     some = [0, 1, 2, 3, 8, 9, 10, 11]
     chosen = with_points(keypoints, lambda points, confidences: None)
     chosen = dataclasses.replace(chosen, points=chosen.points[some], confidences=chosen.confidences[some])
-    every = np.full((MOMENTS, len(JOINT_NAMES)), 0.001)
-    examination = examine(capture.select(some), chosen, deviations=every, noise=np.ones(MOMENTS))
-    assert np.isnan(examination.moments).tolist() == [False, True, False]
-    assert [view.moment for view in examination.views] == [0] * 4 + [2] * 4
-    assert examination.ok and examination.undetermined == ()
+    every = np.full((FRAMES, len(JOINT_NAMES)), 0.001)
+    examination = examine(capture.select(some), chosen, joint_std=every, noise=np.ones(FRAMES))
+    assert np.isnan(examination.frames).tolist() == [False, True, False]
+    assert [view.frame for view in examination.report.views] == [0] * 4 + [2] * 4
+    assert examination.report.ok and examination.report.undetermined == ()
 
 
 def test_the_table_is_of_the_views_that_fit_worst():
@@ -149,11 +156,11 @@ def test_the_table_is_of_the_views_that_fit_worst():
         points[13] += 8
         confidences[26] = 0
 
-    text = str(examine(capture, with_points(keypoints, displace)))
+    text = str(examine(capture, with_points(keypoints, displace)).report)
     rows = [line for line in text.splitlines() if line[:1] == "m" and line[2:3] == "v"]
     assert len(rows) == ROWS and "... " in text and "3 more that fit better" in text
     assert any(row.startswith("m4v1") for row in rows) and any(row.startswith("m8v2") and "0" in row for row in rows)
-    assert "worst in moment 4" in text
+    assert "worst in frame 4" in text
 
 
 def test_wrong_number_of_views(good):
@@ -165,29 +172,29 @@ def test_wrong_number_of_views(good):
 # Findings ------------------------------------------------------------------------------------------------------------
 
 
-def test_joints_that_are_open_are_named_in_groups():
+def test_undetermined_joints_are_named_in_groups():
     index = JOINT_NAMES.index
-    deviations = np.full((3, len(JOINT_NAMES)), 0.5 * UNSURE)
+    joint_std = np.full((3, len(JOINT_NAMES)), 0.5 * UNSURE)
     determined = np.full((3, len(JOINT_NAMES)), 2 * UNDECIDED)
     for joint, name in enumerate(JOINT_NAMES):
         if name.startswith("left_") and name[-1] in "123":
             determined[:, joint] = 0
     determined[1, [index("right_index1"), index("left_eye")]] = 0
-    deviations[:2, index("left_ankle")] = 2 * UNSURE
+    joint_std[:2, index("left_ankle")] = 2 * UNSURE
     shown = np.array([True, True, False])
-    found = open_joints(JOINT_NAMES, shown, deviations, determined)
-    assert found == ("left hand", "left_ankle", "left_eye (in 1 of 2 moments)", "right_index1 (in 1 of 2 moments)")
-    assert open_joints(JOINT_NAMES, shown, None, None) == ()
-    assert "left_ankle" not in open_joints(JOINT_NAMES, shown, None, determined)
+    found = undetermined_joints(JOINT_NAMES, shown, joint_std, determined)
+    assert found == ("left hand", "left_ankle", "left_eye (in 1 of 2 frames)", "right_index1 (in 1 of 2 frames)")
+    assert undetermined_joints(JOINT_NAMES, shown, None, None) == ()
+    assert "left_ankle" not in undetermined_joints(JOINT_NAMES, shown, None, determined)
 
 
 def test_warnings_stay_few():
-    fits = [ViewFit(f"v{i}", 0, 17, 1.0 + i, 9.0, 0.5 * (i % 2)) for i in range(30)]
+    fits = [ViewReport(f"v{i}", 0, 17, 1.0 + i, 9.0, 0.5 * (i % 2)) for i in range(30)]
     swaps = [Swap("sides", (f"v{i}",), 0.9) for i in range(12)]
-    found = warnings(fits, np.full(1, 5.0), [], swaps)
+    found = keypoint_warnings(fits, np.full(1, 5.0), [], swaps)
     assert len(found) == NAMED + 3
     assert found[NAMED] == "7 more views or pairs of views seem exchanged"
-    assert found[NAMED + 1].endswith("in view v20, v21, v22, v23, v24 and 5 more: 21 to 30 px off")
+    assert found[NAMED + 1].endswith("in view v20, v21, v22, v23, v24 and 5 more: median error 21 to 30 px")
     assert found[NAMED + 2] == "many keypoints are outliers in view v1, v3, v5, v7, v9 and 5 more: 50%"
     assert listed(["a", "b"]) == "a, b"
 
@@ -196,8 +203,8 @@ def test_warnings_stay_few():
 
 
 def record_of(capture, keypoints, order, **changes):
-    shape = (MOMENTS, len(body().joint_names))
-    values: dict = dict(noise=np.full(MOMENTS, 2.0), deviations=np.full(shape, 0.001), determined=np.ones(shape))
+    shape = (FRAMES, len(body().joint_names))
+    values: dict = dict(noise=np.full(FRAMES, 2.0), joint_std=np.full(shape, 0.001), determined=np.ones(shape))
     values |= {"shape_covariance": np.eye(4)} | changes
     names = tuple(capture.names[i] for i in order)
     shuffled = dataclasses.replace(keypoints, points=keypoints.points[order], confidences=keypoints.confidences[order])
@@ -206,21 +213,21 @@ def record_of(capture, keypoints, order, **changes):
 
 def test_a_record_is_brought_into_the_order_of_the_views(good):
     capture, keypoints = good
-    deviations = np.full((MOMENTS, len(body().joint_names)), 0.001)
-    deviations[:, JOINT_NAMES.index("jaw")] = 1.0
-    record = record_of(capture, keypoints, np.arange(MOMENTS * VIEWS)[::-1], deviations=deviations)
+    joint_std = np.full((FRAMES, len(body().joint_names)), 0.001)
+    joint_std[:, JOINT_NAMES.index("jaw")] = 1.0
+    record = record_of(capture, keypoints, np.arange(FRAMES * VIEWS)[::-1], joint_std=joint_std)
     examination, found = examine_record(capture, record)
     np.testing.assert_array_equal(found.points, keypoints.points)
-    assert examination.ok and examination.undetermined == ("jaw",)
+    assert examination.report.ok and examination.report.undetermined == ("jaw",)
     np.testing.assert_array_equal(examination.noise, 2.0)
-    assert "left open by the views, so as is usual: jaw" in str(examination)
+    assert "not determined by the views, taken from the prior: jaw" in str(examination.report)
 
 
 def test_keypoints_are_preferred_to_the_record(good):
     capture, keypoints = good
     others = with_points(keypoints, lambda points, _: points.__iadd__(30))
     examination, found = examine_record(capture, record_of(capture, keypoints, np.arange(16)), others)
-    assert found is others and not examination.ok
+    assert found is others and not examination.report.ok
 
 
 def test_records_of_something_else(good):
@@ -229,8 +236,8 @@ def test_records_of_something_else(good):
         examine_record(capture, None)
     with pytest.raises(ValueError, match="knows no view m3v3: fit it again"):
         examine_record(capture, record_of(capture, keypoints, np.arange(15)))
-    with pytest.raises(ValueError, match="of 2 moments and 55 joints, but the capture has 4 and 55"):
-        some = {"noise": np.ones(2), "deviations": np.ones((2, 55)), "determined": np.ones((2, 55))}
+    with pytest.raises(ValueError, match="of 2 frames and 55 joints, but the capture has 4 and 55"):
+        some = {"noise": np.ones(2), "joint_std": np.ones((2, 55)), "determined": np.ones((2, 55))}
         examine_record(capture, record_of(capture, keypoints, np.arange(16), **some))
 
 

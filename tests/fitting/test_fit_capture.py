@@ -11,23 +11,23 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
 from humangs_jax.data.photos import load_photos
-from humangs_jax.fitting.fit_capture import check_place, fit_photographs, write_fitted
-from humangs_jax.fitting.fit_record import read_fit_record
+from humangs_jax.fitting.files import check_place, read_fit_record, write_fitted
+from humangs_jax.fitting.fit_capture import fit_photographs
 
 SIZE = 16
-MOMENTS = NAMES_WITHIN_LIMITS
+FRAMES = NAMES_WITHIN_LIMITS
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """A capture folder without body.npz; five moments, four views each, in no order."""
-    joints, _, seen = observe(MOMENTS, noise=2.0)
-    order = np.random.default_rng(0).permutation(len(MOMENTS) * 4)
+    """A capture folder without body.npz; five frames, four views each, in no order."""
+    joints, _, seen = observe(FRAMES, noise=2.0)
+    order = np.random.default_rng(0).permutation(len(FRAMES) * 4)
     frames, views = order // 4, order % 4
     path = tmp_path_factory.mktemp("photos") / "me"
     K, pose = np.asarray(seen.K)[frames, views], np.asarray(seen.cam_from_world)[frames, views]
     images = np.full((len(order), SIZE, SIZE, 3), 0.5, np.float32)
-    rest = np.zeros((len(MOMENTS), 55, 3)), np.zeros((len(MOMENTS), 3))
+    rest = np.zeros((len(FRAMES), 55, 3)), np.zeros((len(FRAMES), 3))
     save_capture(
         path, capture_from_arrays(images, K, pose, *rest, frames=[int(f) for f in frames], body=default_body())
     )
@@ -41,12 +41,15 @@ def fitted(folder):
     return fit_photographs(load_photos(folder[0]), folder[1], default_body())
 
 
-def test_views_are_sorted_by_their_moments(folder, fitted):
+def test_views_are_sorted_by_their_frames(folder, fitted):
     errors = 1000 * np.linalg.norm(np.asarray(fitted.fit.joints) - folder[2], axis=-1)
     assert errors.mean() < 10
-    assert fitted.capture.frame_count == len(MOMENTS) and fitted.warnings == ()
-    table = fitted.convergence().splitlines()
-    assert [row.split()[0] for row in table[1:]] == ["rigid", "points", "body", "hands", "person"]
+    report = fitted.report
+    assert fitted.capture.frame_count == len(FRAMES) and report.ok and len(report.views) == 4 * len(FRAMES)
+    assert [stage.name for stage in report.stages] == ["rigid", "points", "body", "hands", "person"]
+    assert all(stage.after <= stage.before and stage.steps > 0 for stage in report.stages)
+    assert report.errors["keypoint_error_px"].after == pytest.approx(1.1774 * 2.0, rel=0.1)
+    assert json.loads(json.dumps(report.to_json()))["views"][0]["name"] == fitted.capture.names[0]
 
 
 def test_written_in_place_and_read_again(folder, fitted, tmp_path):
@@ -54,25 +57,36 @@ def test_written_in_place_and_read_again(folder, fitted, tmp_path):
     described = (path / "capture.json").read_text()
     with pytest.raises(CaptureError, match="humangs fit"):
         load_capture(path)
-    write_fitted(path, check_place(path, None, overwrite=False), fitted.capture, fitted.record)
+    write_fitted(path, check_place(path, None, overwrite=False), fitted.capture, fitted.report, fitted.record)
     again = load_capture(path)
     np.testing.assert_array_equal(again.poses.rotations, fitted.capture.poses.rotations)
     np.testing.assert_array_equal(again.betas, fitted.capture.betas)
     assert json.loads((path / "capture.json").read_text()) == json.loads(described)
     record = read_fit_record(path / "fit.npz")
     np.testing.assert_array_equal(record.keypoints.points, folder[1].points)
-    np.testing.assert_allclose(record.deviations, fitted.record.deviations, rtol=1e-6)
+    np.testing.assert_allclose(record.joint_std, fitted.record.joint_std, rtol=1e-6)
     assert record.names == again.names
     with pytest.raises(ValueError, match=r"body\.npz exists: --overwrite"):
         check_place(path, None, overwrite=False)
     check_place(path, None, overwrite=True)
 
 
+def test_records_of_earlier_versions_are_read(folder, fitted, tmp_path):
+    path = copied(folder[0], tmp_path)
+    write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
+    with np.load(path / "fit.npz") as file:
+        arrays = dict(file)
+    np.savez(path / "fit.npz", deviations=arrays.pop("joint_std"), **arrays)
+    np.testing.assert_array_equal(
+        read_fit_record(path / "fit.npz").joint_std, fitted.record.joint_std.astype(np.float32)
+    )
+
+
 def test_written_elsewhere_with_its_pictures_and_new_cameras(folder, fitted, tmp_path):
     moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
     capture = dataclasses.replace(fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved))
     target = check_place(folder[0], tmp_path / "out", overwrite=False)
-    write_fitted(folder[0], target, capture, None)
+    write_fitted(folder[0], target, capture, fitted.report)
     again = load_capture(target)
     np.testing.assert_array_equal(again.cameras.cam_from_world, moved)
     np.testing.assert_array_equal(again.images, load_photos(folder[0]).images)
@@ -84,20 +98,21 @@ def test_written_elsewhere_with_its_pictures_and_new_cameras(folder, fitted, tmp
     with pytest.raises(ValueError, match="no capture"):
         check_place(folder[0], tmp_path / "other", overwrite=True)
     inside = target / "held_out"
-    write_fitted(folder[0], inside, capture, None)
+    write_fitted(folder[0], inside, capture, fitted.report)
     with pytest.raises(ValueError, match="lies inside of it"):
         check_place(inside, target, overwrite=True)
 
 
-def test_moments_that_views_hardly_show_are_named(folder):
+def test_frames_that_views_hardly_show_are_named(folder):
     points, confidences = folder[1].points, folder[1].confidences.copy()
     frames = load_photos(folder[0]).frames
     confidences[frames == 1] = 0
     confidences[np.flatnonzero(frames == 3)[1:]] = 0
     found = fit_photographs(load_photos(folder[0]), Keypoints(points, confidences, folder[1].set), default_body())
-    assert len(found.warnings) == 2
-    assert found.warnings[0].startswith("moment 1: 0 keypoints are seen")
-    assert found.warnings[1].startswith("moment 3: seen by one view")
+    blind, single = found.report.warnings[-2:]
+    assert blind.startswith("frame 1: 0 keypoints are seen")
+    assert single.startswith("frame 3: seen by one view")
+    assert [v.keypoints > 0 for v in found.report.views if v.frame == 3] == [True, False, False, False]
 
 
 @pytest.mark.parametrize(
@@ -126,7 +141,7 @@ def test_what_cannot_be_fitted_is_one_error(folder, change, message):
 )
 def test_a_damaged_record_is_one_error(folder, fitted, tmp_path, change, message):
     path = copied(folder[0], tmp_path)
-    write_fitted(path, path, fitted.capture, fitted.record)
+    write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
     with np.load(path / "fit.npz") as file:
         arrays = {**file, **change}
     np.savez(path / "fit.npz", **{name: value for name, value in arrays.items() if value is not None})

@@ -10,7 +10,7 @@ from humangs_jax.apps.fit_pictures import fit_sheet, plot_over_time
 from humangs_jax.avatar.pictures import GAP
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.fitting.examination import examine
-from humangs_jax.fitting.findings import ViewFit
+from humangs_jax.fitting.report import FitReport, ViewReport
 from humangs_jax.io.images import read_image
 
 SIDE = 128
@@ -58,7 +58,7 @@ def test_outliers_are_hollow(sheet):
 def test_lines_lead_to_the_body(sheet):
     picture, examination = sheet
     top = picture.shape[0] - 512 - GAP
-    x, y = 2 * examination.seen[0, LEFT_WRIST] + [GAP, top]
+    x, y = 2 * examination.landmarks[0, LEFT_WRIST] + [GAP, top]
     cross = np.asarray(module.CROSS) / 255
     near = picture[int(y) - 6 : int(y) + 7, int(x) - 6 : int(x) + 7]
     assert (np.abs(near - cross).max(-1) < 0.3).sum() >= 5
@@ -71,20 +71,20 @@ def test_many_views_and_moments(tmp_path, monkeypatch):
     keypoints.confidences[26] = 0
     examination = examine(capture, keypoints)
     names = []
-    monkeypatch.setattr(module, "_label", lambda found, view: names.append(found.views[view].name) or "")
+    monkeypatch.setattr(module, "_label", lambda found, view: names.append(found.report.views[view].name) or "")
     overlays = []
     monkeypatch.setattr(module, "_overlay", lambda capture, view: overlays.append(view) or np.ones((SIDE, SIDE, 3)))
     fit_sheet(capture, keypoints, examination, tmp_path / "fit.png")
     picture, _ = read_image(tmp_path / "fit.png")
     assert len(overlays) == module.VIEWS == len(names) and names[0] == "m0v0" and names[-1] == "m8v2"
     assert np.diff(overlays).max() <= 2
-    plot = plot_over_time(examination.moments, picture.shape[1])
+    plot = plot_over_time(examination.frames, picture.shape[1])
     np.testing.assert_allclose(picture[-len(plot) :], plot, atol=1 / 255)
 
 
 def test_labels(sheet):
-    views = (ViewFit("a", 0, 17, 2.06, 4.0, 0.0), ViewFit("b", 0, 0, np.nan, np.nan, 0.0))
-    examination = dataclasses.replace(sheet[1], views=views)
+    views = (ViewReport("a", 0, 17, 2.06, 4.0, 0.0), ViewReport("b", 0, 0, np.nan, np.nan, 0.0))
+    examination = dataclasses.replace(sheet[1], report=FitReport("keypoints", views=views))
     assert [module._label(examination, i) for i in (0, 1)] == ["a  2.1 px", "b  no keypoints"]
 
 

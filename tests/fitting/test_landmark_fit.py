@@ -6,7 +6,7 @@ from fit_people import POSES, model_of, observe
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.fitting.landmark_fit import STAGES, FitConfig, fit_landmarks
-from humangs_jax.fitting.pose_prior import pose_prior, violations
+from humangs_jax.fitting.residuals.priors import pose_prior, violations
 from humangs_jax.fitting.uncertainty import fit_uncertainty
 
 CONFIG = FitConfig()
@@ -65,14 +65,14 @@ def test_a_view_without_keypoints_is_left_out(noisy):
     assert mean_mm(fit, joints) < 1.5 * NOISY_MM
 
 
-def test_a_moment_without_keypoints_is_as_the_prior_has_it_and_the_others_do_not_mind(noisy):
+def test_a_frame_without_keypoints_is_as_the_prior_has_it_and_the_others_do_not_mind(noisy):
     joints, _, seen, whole = noisy
     blind = replace(seen, confidences=seen.confidences.at[2].set(0.0))
     fit = fit_landmarks(model_of(), blind, CONFIG)
     others = [0, 1, 3, 4]
     assert mean_mm(fit, joints, others) < NOISY_MM
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(fit))
-    usual = pose_prior(model_of().joint_names).usual
+    usual = pose_prior(model_of().joint_names).mean
     np.testing.assert_allclose(np.asarray(fit.poses.rotations)[2, 1:], usual[1:], atol=1e-3)
     assert not np.allclose(np.asarray(whole.poses.rotations)[2, 1:], usual[1:], atol=0.1)
 
@@ -87,7 +87,7 @@ def test_predicted_deviations_are_of_the_size_of_the_errors(noisy):
     joints, _, seen, fit = noisy
     found = fit_uncertainty(model_of(), seen, fit, CONFIG)
     errors = np.linalg.norm(np.asarray(fit.joints) - joints, axis=-1)
-    ratio = np.sqrt((errors**2).mean() / (found.joint_deviations**2).mean())
+    ratio = np.sqrt((errors**2).mean() / (found.joint_std**2).mean())
     assert 0.3 < ratio < 1.5  # landmarks of hips and shoulders are trusted less than these true ones deserve
     names = model_of().joint_names
     share = {name: found.determined[:, names.index(name)].mean() for name in ("left_eye", "left_knee", "left_shoulder")}
@@ -98,7 +98,7 @@ def test_predicted_deviations_are_of_the_size_of_the_errors(noisy):
 
 @pytest.fixture(scope="module")
 def still():
-    """Somebody who stands still, six moments of one view, 4 pixels of noise: joints (j, 3), what is seen, the fit."""
+    """Somebody who stands still, six frames of one view, 4 pixels of noise: joints (j, 3), what is seen, the fit."""
     joints, _, seen = observe(["standing"], views=1)
     noise = np.random.default_rng(0).normal(0, 4, (6, *seen.points.shape[1:]))
     seen = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[0], (6, *leaf.shape[1:])), seen)

@@ -3,25 +3,25 @@ import pytest
 from fit_people import NAMES_WITHIN_LIMITS, rotations_of
 
 from humangs_jax.body.joints import JOINT_NAMES
-from humangs_jax.fitting.pose_prior import MIRROR, RANGES, pose_prior, violations
+from humangs_jax.fitting.residuals.priors import MIRROR, RANGES, pose_prior, violations
 
 PRIOR = pose_prior(JOINT_NAMES)
 
 
 def test_every_joint_has_a_range_that_holds_its_usual_value():
     assert set(RANGES) == {name for name in JOINT_NAMES if not name.startswith("right_")}
-    assert (PRIOR.least <= PRIOR.usual).all() and (PRIOR.usual <= PRIOR.greatest).all()
-    assert (PRIOR.spread > 0).all()
+    assert (PRIOR.lower <= PRIOR.mean).all() and (PRIOR.mean <= PRIOR.upper).all()
+    assert (PRIOR.std > 0).all()
 
 
 def test_right_is_the_mirror_image_of_left():
     for j, name in enumerate(JOINT_NAMES):
         if name.startswith("left_"):
             other = JOINT_NAMES.index(name.replace("left_", "right_"))
-            np.testing.assert_array_equal(PRIOR.usual[other], MIRROR * PRIOR.usual[j])
-            both = np.stack([MIRROR * PRIOR.least[j], MIRROR * PRIOR.greatest[j]])
-            np.testing.assert_array_equal(PRIOR.least[other], both.min(0))
-            np.testing.assert_array_equal(PRIOR.greatest[other], both.max(0))
+            np.testing.assert_array_equal(PRIOR.mean[other], MIRROR * PRIOR.mean[j])
+            both = np.stack([MIRROR * PRIOR.lower[j], MIRROR * PRIOR.upper[j]])
+            np.testing.assert_array_equal(PRIOR.lower[other], both.min(0))
+            np.testing.assert_array_equal(PRIOR.upper[other], both.max(0))
 
 
 @pytest.mark.parametrize("pose", NAMES_WITHIN_LIMITS)
@@ -49,4 +49,4 @@ def test_what_no_joint_does_is_found(joint, vector, axis):
 
 def test_unknown_joints_rest_freely():
     prior = pose_prior(("pelvis", "tail"))
-    assert (prior.usual[1] == 0).all() and (prior.greatest[1] > 3).all()
+    assert (prior.mean[1] == 0).all() and (prior.upper[1] > 3).all()

@@ -1,4 +1,4 @@
-"""Refinement from end to end on small pictures of the bare body, and what it says of starts that it cannot help."""
+"""Refinement from end to end on small images of the bare body, and its report on starts that it cannot improve."""
 
 import dataclasses
 import functools
@@ -18,9 +18,9 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.views import SubjectViews
-from humangs_jax.fitting.refinement.photometric import Likeness, PhotometricConfig, _draw, by_colors
-from humangs_jax.fitting.refinement.refine import RefineConfig, refine_capture
-from humangs_jax.fitting.refinement.rounds import RoundConfig
+from humangs_jax.fitting.refine import by_colors, refine_capture
+from humangs_jax.fitting.refine_rounds import RefineConfig
+from humangs_jax.fitting.residuals.colors import Likeness, draw
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
 from humangs_jax.rendering.gaussians import Gaussians
@@ -29,7 +29,7 @@ from humangs_jax.rendering.splat_config import SplatConfig
 from tests.fitting.fit_people import default_body, rotations_of
 
 SIZE, VIEWS = 192, 3
-CONFIG = RefineConfig(RoundConfig(rounds=6, points=120))
+CONFIG = RefineConfig(rounds=6, points=120)
 
 
 @functools.cache
@@ -96,40 +96,44 @@ def keypoints(confidence=1.0):
 
 def test_silhouettes_mend_cameras_focal_length_and_pose():
     refined = refine_capture(disturbed(), config=CONFIG)
-    assert refined.kept == "refined" and refined.before["silhouette_iou"] < 0.75
-    assert refined.after["silhouette_iou"] > 0.95
+    report = refined.report
+    assert report.kept and report.errors["silhouette_iou"].before < 0.75
+    assert report.errors["silhouette_iou"].after > 0.95
     assert aligned_error(refined.capture) < 0.5 * aligned_error(disturbed())
     focal = np.asarray(refined.capture.cameras.K[:, 0, 0] / truth().cameras.K[:, 0, 0])
     np.testing.assert_allclose(focal, 1.0, atol=0.025)
-    assert refined.moved.turn == pytest.approx(2.0, abs=0.5)
-    before = {name: pair[0] for name, pair in refined.views.items()}
-    assert np.mean(list(before.values())) == pytest.approx(refined.before["silhouette_iou"])
-    text = str(refined)
+    assert report.moved["camera_degrees"] == pytest.approx(2.0, abs=0.5)
+    before = [view.iou_before for view in report.views]
+    assert np.mean(before) == pytest.approx(report.errors["silhouette_iou"].before)
+    assert report.stages[0].runs == CONFIG.rounds and report.stages[0].after <= report.stages[0].before
+    text = str(report)
     assert "kept: refined" in text and "focal length x 0.9" in text and "front" in text
 
 
 def test_keypoints_alone_mend_them_too_and_with_masks_both_errors_fall():
     alone = refine_capture(dataclasses.replace(disturbed(), masks=None), keypoints=keypoints(), config=CONFIG)
-    assert alone.kept == "refined" and "silhouette_iou" not in alone.after
-    assert alone.after["keypoint_error_px"] < 0.2 * alone.before["keypoint_error_px"]
+    assert alone.report.kept and "silhouette_iou" not in alone.report.errors
+    error = alone.report.errors["keypoint_error_px"]
+    assert error.after < 0.2 * error.before
     assert aligned_error(alone.capture) < 0.6 * aligned_error(disturbed())
-    assert "no mask" in str(alone)
+    assert "no mask" in str(alone.report)
     both = refine_capture(disturbed(), keypoints=keypoints(), config=CONFIG)
-    assert both.after["silhouette_iou"] > 0.95 and both.after["keypoint_error_px"] < 1.0
+    errors = both.report.errors
+    assert errors["silhouette_iou"].after > 0.95 and errors["keypoint_error_px"].after < 1.0
 
 
 def test_a_start_that_is_right_stays():
     refined = refine_capture(truth(), config=CONFIG)
-    assert refined.kept == "start" and refined.capture is truth()
-    assert refined.before == refined.after
-    assert "no improvement" in str(refined) and "moved:" not in str(refined)
+    assert not refined.report.kept and refined.capture is truth()
+    assert all(change.before == change.after for change in refined.report.errors.values())
+    assert "no sufficient improvement" in str(refined.report) and "moved:" not in str(refined.report)
 
 
 def test_a_single_view_with_a_mask_is_enough_and_the_others_stay():
     masks = np.zeros_like(truth().masks)
     masks[0] = truth().masks[0]
     refined = refine_capture(dataclasses.replace(disturbed(), masks=masks), config=CONFIG)
-    assert refined.kept == "refined" and refined.after["silhouette_iou"] > 0.92
+    assert refined.report.kept and refined.report.errors["silhouette_iou"].after > 0.92
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
 
 
@@ -137,8 +141,8 @@ def test_a_view_with_an_empty_mask_takes_no_part():
     masks = np.array(truth().masks)
     masks[1] = 0
     refined = refine_capture(dataclasses.replace(disturbed(), masks=masks), config=CONFIG)
-    assert refined.kept == "refined" and np.isnan(refined.views["left"]).all()
-    assert refined.after["silhouette_iou"] > 0.93
+    assert refined.report.kept and np.isnan(refined.report.views[1].iou_after)
+    assert refined.report.errors["silhouette_iou"].after > 0.93
     moved = refined.capture.cameras.cam_from_world - disturbed().cameras.cam_from_world
     assert np.abs(moved[1]).max() < 1e-4 < np.abs(moved[0]).max(), "nothing is known of its camera"
 
@@ -146,15 +150,15 @@ def test_a_view_with_an_empty_mask_takes_no_part():
 def test_cameras_that_look_the_other_way_are_told_and_left():
     away = turned(truth(), 180.0)
     refined = refine_capture(away, config=CONFIG)
-    assert refined.kept == "start" and refined.capture is away
-    assert refined.after["silhouette_iou"] == 0
-    assert "the start was too far off" in str(refined)
+    assert not refined.report.kept and refined.capture is away
+    assert refined.report.errors["silhouette_iou"].after == 0
+    assert "the start was too far off" in str(refined.report)
 
 
 @pytest.mark.slow  # compiles once more
 def test_one_view_is_refined_by_its_outline():
     refined = refine_capture(disturbed().select([0]), config=CONFIG)
-    assert refined.kept == "refined" and refined.after["silhouette_iou"] > 0.92
+    assert refined.report.kept and refined.report.errors["silhouette_iou"].after > 0.92
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
 
 
@@ -165,7 +169,7 @@ def test_nothing_to_refine_by_is_an_error(masks):
         refine_capture(blind)
     with pytest.raises(CaptureError, match="no keypoints"):
         refine_capture(blind, keypoints=keypoints(confidence=0.0))
-    with pytest.raises(CaptureError, match="expected with colours"):
+    with pytest.raises(CaptureError, match="needed for colours"):
         refine_capture(blind, keypoints=keypoints(), photometric=True)
 
 
@@ -189,12 +193,14 @@ def test_colours_alone_turn_cameras_and_poses_back():
     )
     small = dataclasses.replace(capture, cameras=capture.cameras.resized(size, size))
     config = SplatConfig(max_pairs=1 << 14)
-    per_view = lambda c: (jnp.repeat(c.poses.rotations, VIEWS, 0), jnp.repeat(c.poses.translation, VIEWS, 0))
-    images = _draw(avatar, *per_view(small), small.cameras, config)
+    per_view = lambda c: jax.tree.map(lambda leaf: jnp.repeat(leaf, VIEWS, 0), c.poses)
+    images = draw(avatar, per_view(small), small.cameras, config)
     start = turned(small, 1.0)
-    views = SubjectViews(images, jnp.ones((VIEWS, size, size)), start.cameras, *per_view(start), jnp.zeros(3))
+    views = SubjectViews(
+        images, jnp.ones((VIEWS, size, size)), start.cameras, *jax.tree.leaves(per_view(start)), jnp.zeros(3)
+    )
     likeness = Likeness(avatar, views, 0.0, 0.05, config)
-    moved, outcome = by_colors(likeness, start, PhotometricConfig(steps=30, independent=1000.0), RoundConfig())
+    moved, outcome = by_colors(likeness, start, RefineConfig(color_steps=30, independent_colors=1000.0))
     assert float(outcome.after) < 0.2 * float(outcome.before)
-    off = lambda c: float(jnp.mean(jnp.square(_draw(avatar, *per_view(c), c.cameras, config) - images)))
+    off = lambda c: float(jnp.mean(jnp.square(draw(avatar, per_view(c), c.cameras, config) - images)))
     assert off(moved) < 0.2 * off(start)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from humangs_jax.fitting.refinement.outlines import BodyPicture, body_outline, body_picture, mask_outline, mesh_edges
-from humangs_jax.fitting.refinement.silhouettes import MaskView, distances, match, silhouette_residuals
+from humangs_jax.fitting.residuals.outlines import BodyView, body_outline, mask_outline, mesh_edges, view_body
+from humangs_jax.fitting.residuals.silhouettes import MaskView, distances, match, silhouette_residuals
 from humangs_jax.geometry.camera import Camera
 
 SIZE, FOCAL, DISTANCE, RADIUS = 128, 160.0, 3.0, 0.8
@@ -29,7 +29,7 @@ def sphere():
 def outline_of(sphere, camera):
     vertices, faces = sphere
     return body_outline(
-        body_picture(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera), faces, mesh_edges(faces), COUNT
+        view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera), faces, mesh_edges(faces), COUNT
     )
 
 
@@ -80,9 +80,9 @@ def test_an_edge_before_the_body_is_no_outline():
     square = np.asarray([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     vertices = np.concatenate([square, 0.3 * square - [0, 0, 0.5]]).astype(np.float32)
     faces = np.asarray([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
-    picture = body_picture(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera())
-    outwards = np.concatenate([square[:, :2]] * 2) / np.sqrt(2)  # flat normals say nothing of a border: give them
-    picture = BodyPicture(picture.pixels, picture.depths, outwards.astype(np.float32), picture.covered)
+    picture = view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera())
+    outwards = np.concatenate([square[:, :2]] * 2) / np.sqrt(2)  # normals of a flat mesh do not show its border
+    picture = BodyView(picture.pixels, picture.depths, outwards.astype(np.float32), picture.covered)
     outline = body_outline(picture, faces, mesh_edges(faces), COUNT)
     assert len(outline.positions) == COUNT and outline.ends.max() < 4
 

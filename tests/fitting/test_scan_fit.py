@@ -10,17 +10,15 @@ from scipy.spatial.transform import Rotation
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.fitting.pose_prior import pose_prior
-from humangs_jax.fitting.scans.body_surface import body_surface, vertex_normals
-from humangs_jax.fitting.scans.config import ScanFitConfig
-from humangs_jax.fitting.scans.files import save_scan_fit
-from humangs_jax.fitting.scans.fit import fit_scan
-from humangs_jax.fitting.scans.joints import checked_joints, read_joints
-from humangs_jax.fitting.scans.reading import sample_scan
-from humangs_jax.fitting.scans.result import body_in_scan
-from humangs_jax.fitting.scans.similarity import Similarity
-from humangs_jax.fitting.scans.start import Start, facing_back, search_starts
+from humangs_jax.fitting.files import save_scan_fit
+from humangs_jax.fitting.residuals.priors import pose_prior
+from humangs_jax.fitting.residuals.scan import body_surface
+from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan
+from humangs_jax.fitting.scan_reading import checked_joints, read_joints, sample_scan
+from humangs_jax.fitting.scan_search import ScanFitConfig, Start, facing_back, search_starts
+from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.io.npz import read_npz
+from humangs_jax.rendering.mesh.position_map import vertex_normals
 
 LIMBS = ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 NAMES = ("nose", "left_ear", "right_ear", *(f"{side}_{part}" for part in LIMBS for side in ("left", "right")))
@@ -37,7 +35,7 @@ def truth(body):
     """A person's vertices in a pose, normals and landmarks, metres; and the similarity to the scan's coordinates."""
     rng = np.random.default_rng(5)
     prior = pose_prior(body.joint_names)
-    rotations = np.clip(prior.usual + 0.4 * prior.spread * rng.normal(size=(55, 3)), prior.least, prior.greatest)
+    rotations = np.clip(prior.mean + 0.4 * prior.std * rng.normal(size=(55, 3)), prior.lower, prior.upper)
     rotations[0] = 0
     pose = BodyPose(jnp.asarray(rotations, jnp.float32), jnp.zeros(3))
     betas = jnp.asarray(rng.normal(0, 0.4, 22), jnp.float32)
@@ -78,8 +76,10 @@ def bare(tmp_path_factory, body, truth):
 def test_a_bare_body_is_found_whatever_its_scale_turn_and_place(bare, truth):
     assert off(bare, truth).mean() < 8
     assert np.quantile(np.abs(bare.distances), 0.9) < 0.003
-    assert bare.covered > 0.97
-    assert "given joints" in str(bare)
+    report = bare.report
+    assert report.errors["scan_near_body"].after > 0.97 and report.ok and report.stages[-1].converged
+    assert abs(report.errors["scan_outside_median_mm"].after) < 1.5
+    assert "given joints" in str(report)
 
 
 def test_the_result_stands_in_our_world(bare, truth):
@@ -108,6 +108,7 @@ def test_results_are_written_whole(bare, truth, tmp_path):
     assert arrays["rotations"].shape == (1, 55, 3) and arrays["translations"].shape == (1, 3) and not pickled
     report = json.loads((tmp_path / "fit" / "scan_fit.json").read_text())
     np.testing.assert_allclose(report["world_from_scan"], bare.world_from_scan.matrix())
+    assert report["fitted"] == "scan" and report["errors"] == bare.report.to_json()["errors"]
     mesh = trimesh.load(tmp_path / "fit" / "body_in_scan.ply", process=False)
     np.testing.assert_allclose(mesh.vertices, body_in_scan(bare), rtol=1e-4)
     with pytest.raises(ValueError, match="not empty"):
@@ -167,7 +168,7 @@ def test_the_search_has_the_turn_and_the_scale_among_its_starts(body, truth):
 def test_facing_back_twice_is_facing_forward(body):
     surface = body_surface(body, ("nose",), 1500)
     prior = pose_prior(body.joint_names)
-    rotations, pelvis = np.clip(0 * prior.usual, prior.least, prior.greatest), np.asarray(surface.landmarks.joints[0])
+    rotations, pelvis = np.clip(0 * prior.mean, prior.lower, prior.upper), np.asarray(surface.landmarks.joints[0])
     start = Start(Similarity(2.0, np.eye(3), np.asarray([0.1, 0.2, 0.3])), rotations, 0.0)
     once = facing_back(surface, start, rotations, pelvis, 1.0)
     twice = facing_back(surface, once, rotations, pelvis, 1.0)

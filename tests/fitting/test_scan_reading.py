@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from humangs_jax.fitting.scans.reading import directions_around, read_mesh, read_scan, sample_scan
+from humangs_jax.fitting.scan_reading import directions_around, read_mesh, read_scan, sample_scan
 
 
 def sphere(radius=1.0, subdivisions=3):

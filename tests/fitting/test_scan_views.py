@@ -6,7 +6,7 @@ import trimesh
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.photos import load_photos
-from humangs_jax.fitting.scans.views import joints_from_views, render_scan_views
+from humangs_jax.fitting.scan_views import joints_from_views, render_scan_views
 from humangs_jax.geometry.camera import project
 
 

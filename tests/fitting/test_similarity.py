@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.fitting.scans.similarity import Similarity, align_points, align_robustly
+from humangs_jax.fitting.similarity import Similarity, align_points, align_robustly
 
 
 def random_similarity(seed):

@@ -11,7 +11,7 @@ from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, hand_na
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting import swaps as module
 from humangs_jax.fitting.landmark_fit import FitConfig
-from humangs_jax.fitting.observations import group_by_moment
+from humangs_jax.fitting.residuals.keypoints import group_by_frame
 from humangs_jax.fitting.swaps import find_exchanged_hands, find_mirrored, find_swaps
 
 MIRROR = list(COCO_17.mirror)
@@ -19,7 +19,7 @@ MIRROR = list(COCO_17.mirror)
 
 def seen(capture, keypoints):
     photographs = Photos(capture.images, None, capture.cameras, capture.frames, capture.names)
-    return (*group_by_moment(photographs, keypoints)[:1], keypoints.set, group_by_moment(photographs, keypoints)[1])
+    return (*group_by_frame(photographs, keypoints)[:1], keypoints.set, group_by_frame(photographs, keypoints)[1])
 
 
 def found(capture, keypoints):
@@ -45,7 +45,7 @@ def test_nothing_is_found_where_nothing_is_wrong(views):
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
 def test_sides_of_single_views(views, outliers):
     capture, keypoints = person(10, 4, views, outliers=outliers)
-    swapped = [1, views, 3 * views + 2]  # in moments 0, 1 and 3
+    swapped = [1, views, 3 * views + 2]  # in frames 0, 1 and 3
     swaps = found(capture, changed(keypoints, flipped=swapped))
     assert {(swap.kind, swap.views, swap.instead) for swap in swaps} == {
         ("sides", (capture.names[view],), ()) for view in swapped
@@ -81,7 +81,7 @@ def test_cameras_of_two_views(views):
     order = np.arange(4 * views)
     order[[0, 2]] = [2, 0]
     (swap,) = found(capture, changed(keypoints, order))
-    assert (swap.kind, swap.views, swap.instead, swap.moments) == ("cameras", ("m0v0", "m0v2"), (), 1)
+    assert (swap.kind, swap.views, swap.instead, swap.frames) == ("cameras", ("m0v0", "m0v2"), (), 1)
     assert str(swap) == "the cameras (or the photos) of views m0v0 and m0v2 seem exchanged"
 
 
@@ -104,16 +104,16 @@ def test_cameras_that_stand_still_are_reported_once():
     capture, keypoints = person(15, 4, 4, still=True, outliers=0.1)
     order = (np.arange(16).reshape(4, 4)[:, [0, 3, 2, 1]]).ravel()
     (swap,) = found(capture, changed(keypoints, order))
-    assert (swap.kind, swap.views, swap.moments) == ("cameras", ("m0v1", "m0v3"), 4)
-    assert str(swap).endswith("seem exchanged, as in 4 moments")
+    assert (swap.kind, swap.views, swap.frames) == ("cameras", ("m0v1", "m0v3"), 4)
+    assert str(swap).endswith("seem exchanged, as in 4 frames")
 
 
-def test_photos_of_one_moment_are_exchanged_under_cameras_that_stand_still():
+def test_photos_of_one_frame_are_exchanged_under_cameras_that_stand_still():
     capture, keypoints = person(16, 4, 4, still=True)
     order = np.arange(16)
     order[[5, 6]] = [6, 5]
     (swap,) = found(capture, changed(keypoints, order))
-    assert (swap.kind, swap.views, swap.moments) == ("cameras", ("m1v1", "m1v2"), 1)
+    assert (swap.kind, swap.views, swap.frames) == ("cameras", ("m1v1", "m1v2"), 1)
 
 
 def test_both_at_once():
@@ -132,7 +132,7 @@ def test_one_view_and_views_that_are_missing():
     capture, keypoints = person(18, 4, 3)
     alone = capture.select([0, 3, 6, 9])
     assert found(alone, changed(keypoints, [0, 3, 6, 9], flipped=[1])) == ()
-    some = [0, 1, 2, 4, 5, 6, 7, 8, 9]  # moment 1 has two views, moment 3 has one
+    some = [0, 1, 2, 4, 5, 6, 7, 8, 9]  # frame 1 has two views, frame 3 has one
     swaps = found(capture.select(some), changed(changed(keypoints, flipped=[8]), some))
     assert [swap.views for swap in swaps] == [("m2v2",)]
     blind = dataclasses.replace(keypoints, confidences=np.zeros_like(keypoints.confidences))

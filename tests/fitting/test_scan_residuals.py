@@ -7,10 +7,18 @@ import pytest
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
-from humangs_jax.fitting.scans.body_surface import body_surface, pose_surface, pose_vertices
-from humangs_jax.fitting.scans.config import ScanFitConfig
-from humangs_jax.fitting.scans.objective import Given, Matches, Tolerances, one_sided, scan_problem, scan_residuals
-from humangs_jax.fitting.scans.search import start_state
+from humangs_jax.fitting.residuals.scan import (
+    Given,
+    ScanMatches,
+    Tolerances,
+    body_surface,
+    one_sided,
+    pose_surface,
+    pose_vertices,
+    scan_problem,
+    scan_residuals,
+)
+from humangs_jax.fitting.scan_search import start_state
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +38,7 @@ def case(problem):
     rows = rng.integers(0, 1500, 600)
     normals = rng.normal(size=(600, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    matches = Matches(
+    matches = ScanMatches(
         jnp.asarray(rows, jnp.int32),
         number(rng.normal(size=(600, 3))),
         number(normals),
@@ -38,7 +46,7 @@ def case(problem):
         jnp.ones(600),
     )
     given = Given(jnp.zeros((2, 3)), jnp.ones(2), number(0.1), number(1.8), number(1))
-    state = start_state(problem, problem.prior.usual, ScanFitConfig())
+    state = start_state(problem, problem.prior.mean)
     return matches, given, Tolerances(number(0.01), number(0.02), number(1.0)), state
 
 
@@ -82,10 +90,10 @@ def test_a_smaller_scan_is_no_nearer(problem, case):
     """Shrinking body and scan together changes no distance: in the body's own metres it would."""
     matches, given, tolerances, state = case
     away = lambda s, m: np.asarray(scan_residuals(problem, m, given, tolerances, s)["surface"])
-    posed, _ = pose_surface(problem.surface, state.body.betas, problem.pose(state))
+    posed, _ = pose_surface(problem.surface, *problem.body(state))
     exact = dataclasses.replace(matches, points=posed[matches.rows])
     assert np.abs(away(state, exact)).max() < 1e-3
-    half = dataclasses.replace(state, size=jnp.float32(np.log(0.5) / 0.05))  # metres per unit of the frame
+    half = dataclasses.replace(state, log_scale=jnp.float32(np.log(0.5) / 0.05))  # metres per unit of the frame
     twice = dataclasses.replace(matches, points=2 * posed[matches.rows] + 0.01 * matches.normals)
     np.testing.assert_allclose(away(half, twice), 0.01 / 0.02, atol=1e-3)
 

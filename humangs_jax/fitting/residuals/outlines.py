@@ -1,10 +1,10 @@
-"""Outlines in pictures: of a posed body, by the edges at which its surface turns away from the camera, and of a mask.
+"""Outlines in images: of a posed body, by the edges at which its surface turns away from the camera, and of a mask.
 
-A body's outline is exact to rounding: it consists of mesh edges between a face that looks at the camera and one that looks away
-(Sander et al. 2000, "Silhouette clipping"), of which only those are kept outside of which the picture shows no body. Points of it
-lie on edges, so that they are known functions of the pose. A mask's outline is where its coverage crosses one half.
+A body's outline is exact to rounding. It consists of mesh edges between a face that looks at the camera and one that looks away
+(Sander et al. 2000, "Silhouette clipping"), as far as the image shows no body outside of them. Its points lie on edges, so
+they are known functions of the pose. A mask's outline is where its coverage crosses one half.
 
-NumPy on the host: what is found here is held fixed while a solver moves the body.
+NumPy on the host: outlines are held fixed while a solver moves the body.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ PROBE = 1.5
 NEAR = 0.05
 """Metres: edges of faces nearer to the camera than this, or behind it, are no outline."""
 BORDER = 1.0
-"""Pixels from the edge of a picture within which nothing is an outline: the picture ends there, not the person."""
+"""Pixels from the image border within which nothing is an outline: the image ends there, not the person."""
 SPECK = 0.03
 """Contours shorter than this share of a mask's longest are noise."""
 SMOOTHING = 1.5
@@ -39,9 +39,9 @@ class MeshEdges:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class BodyPicture:
-    """A posed body as a camera sees it. pixels: (n, 2) and depths: (n,) of its vertices. normals: (n, 2), of the surface at a
-    vertex as directions in the picture, unit. covered: (h, w).
+class BodyView:
+    """A posed body as a camera sees it. pixels: (n, 2) and depths: (n,) of its vertices. normals: (n, 2) of the surface at the
+    vertices as unit directions in the image. covered: (h, w).
     """
 
     pixels: Float[np.ndarray, "n 2"]
@@ -54,8 +54,8 @@ class BodyPicture:
 class Outline:
     """Points of an outline, evenly spread over it. positions: (p, 2) pixels. normals: (p, 2) unit, outwards.
 
-    ends: (p, 2) and shares: (p,): of a body's, each lies on an edge, at so much of the way from one vertex to the other.
-    An outline of nothing has no points.
+    ends: (p, 2), shares: (p,): for a body, the vertices of each point's edge and its position between them in [0, 1].
+    An outline may be empty.
     """
 
     positions: Float[np.ndarray, "p 2"]
@@ -65,7 +65,7 @@ class Outline:
 
 
 def mesh_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
-    """All edges of a mesh; where more than two faces share one, two of them."""
+    """All edges of a mesh; of more than two faces that share an edge, two are kept."""
     sides = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
     ends, edge = np.unique(sides, axis=0, return_inverse=True)
     edge, owner = edge.reshape(-1), np.repeat(np.arange(len(faces)), 3)
@@ -76,9 +76,9 @@ def mesh_edges(faces: Int[np.ndarray, "f 3"]) -> MeshEdges:
     return MeshEdges(ends, beside)
 
 
-def body_picture(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> BodyPicture:
+def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera) -> BodyView:
     """Project and rasterize a posed body."""
-    return BodyPicture(*(np.asarray(x) for x in _look(vertices, faces, camera)))
+    return BodyView(*(np.asarray(x) for x in _look(vertices, faces, camera)))
 
 
 @jax.jit
@@ -87,35 +87,35 @@ def _look(vertices, faces, camera):
     seen = vertices @ rotation.T + camera.cam_from_world[:3, 3]
     depths = seen[:, 2]
     pixels = seen[:, :2] / jnp.where(depths > NEAR, depths, 1.0)[:, None] * focal + camera.K[:2, 2]
-    # a plane through the camera with normal n is the line n . (x / fx, y / fy, 1) = 0 of the picture
+    # a plane through the camera with normal n is the line n . (x / fx, y / fy, 1) = 0 of the image
     normals = (vertex_normals(vertices, faces) @ rotation.T)[:, :2] / focal
     normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     return pixels, depths, normals, rasterize_mesh(vertices, faces, camera).face_ids >= 0
 
 
-def body_outline(picture: BodyPicture, faces: Int[np.ndarray, "f 3"], edges: MeshEdges, count: int) -> Outline:
-    """`count` points of the body's outline, or none if there is none in the picture."""
-    corners = picture.pixels[faces]
+def body_outline(view: BodyView, faces: Int[np.ndarray, "f 3"], edges: MeshEdges, count: int) -> Outline:
+    """`count` points of the body's outline, or none if the image shows none."""
+    corners = view.pixels[faces]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     towards = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
-    before = (picture.depths > NEAR)[faces].all(axis=1)
+    before = (view.depths > NEAR)[faces].all(axis=1)
     first, second = edges.faces.T
     turns = (towards[first] != towards[second]) | (second < 0)
     chosen = np.flatnonzero(turns & before[first] & (before[second] | (second < 0)))
     ends = edges.ends[chosen]
-    normals = _unit(picture.normals[ends].sum(axis=1))
-    middles = picture.pixels[ends].mean(axis=1)
-    outside = ~_covered(picture.covered, middles + PROBE * normals) & inside_picture(middles, picture.covered.shape)
+    normals = _unit(view.normals[ends].sum(axis=1))
+    middles = view.pixels[ends].mean(axis=1)
+    outside = ~_covered(view.covered, middles + PROBE * normals) & inside_image(middles, view.covered.shape)
     ends, normals = ends[outside], normals[outside]
-    lengths = np.linalg.norm(picture.pixels[ends[:, 1]] - picture.pixels[ends[:, 0]], axis=1)
+    lengths = np.linalg.norm(view.pixels[ends[:, 1]] - view.pixels[ends[:, 0]], axis=1)
     edge, shares = _spread(lengths, count)
     ends, shares = ends[edge], shares.astype(np.float32)
-    positions = picture.pixels[ends[:, 0]] * (1 - shares[:, None]) + picture.pixels[ends[:, 1]] * shares[:, None]
+    positions = view.pixels[ends[:, 0]] * (1 - shares[:, None]) + view.pixels[ends[:, 1]] * shares[:, None]
     return Outline(positions, normals[edge], ends, shares)
 
 
 def mask_outline(mask: Float[np.ndarray, "h w"], count: int) -> Outline:
-    """`count` points where coverage crosses one half, or none. Where the mask meets the picture's edge is no outline."""
+    """`count` points where coverage crosses one half, or none. The image border is no outline."""
     from skimage.filters import gaussian
     from skimage.measure import find_contours
 
@@ -126,9 +126,7 @@ def mask_outline(mask: Float[np.ndarray, "h w"], count: int) -> Outline:
     none = np.zeros((0, 2))
     starts = np.concatenate([none, *(contours[i][:-1] for i in kept)])
     ends = np.concatenate([none, *(contours[i][1:] for i in kept)])
-    lengths = (
-        np.linalg.norm(ends - starts, axis=1) * inside_picture(starts, mask.shape) * inside_picture(ends, mask.shape)
-    )
+    lengths = np.linalg.norm(ends - starts, axis=1) * inside_image(starts, mask.shape) * inside_image(ends, mask.shape)
     segment, shares = _spread(lengths, count)
     positions = starts[segment] + shares[:, None] * (ends - starts)[segment]
     down, right = np.gradient(gaussian(mask, SMOOTHING, mode="nearest"))
@@ -136,8 +134,8 @@ def mask_outline(mask: Float[np.ndarray, "h w"], count: int) -> Outline:
     return Outline(positions.astype(np.float32), _unit(-np.stack([right[row, column], down[row, column]], axis=-1)))
 
 
-def inside_picture(positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]) -> Bool[np.ndarray, "*p"]:
-    """Which positions are further than `BORDER` inside of a picture of (height, width)."""
+def inside_image(positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]) -> Bool[np.ndarray, "*p"]:
+    """Which positions are further than `BORDER` inside of an image of (height, width)."""
     size = np.asarray([shape[1], shape[0]])
     return np.all((positions > BORDER) & (positions < size - BORDER), axis=-1)
 
@@ -149,9 +147,7 @@ def _covered(covered, positions):
 
 
 def _spread(lengths, count):
-    """Points evenly along pieces of a line: (count,) the piece of each and how far along it in [0, 1]; none if it has no
-    length.
-    """
+    """Points evenly along pieces of a line: (count,) the piece of each and its position there in [0, 1]; none without length."""
     ends = np.cumsum(lengths)
     if len(ends) == 0 or ends[-1] <= 0:
         return np.zeros(0, int), np.zeros(0)

@@ -1,28 +1,32 @@
-"""A scan from a file: points of its outside, spread evenly, with the direction that is outwards at each.
+"""A scan and its known landmarks, from files.
 
-Any format that trimesh reads; parts of a scene are put together where the scene has them. Of millions of faces a fixed number of
-random points is used. Points that cannot be seen from outside (the inside of a mouth, skin under cloth,
-lining) are left out, as a scanner would leave them out, whatever the mesh contains.
+Any mesh format that trimesh reads; parts of a scene are put together where the scene has them. A fixed number of random points
+with outward normals is taken from the surface. Points that cannot be seen from outside (inside of a mouth, skin under cloth,
+lining) are left out, as by a scanner.
 """
 
 import dataclasses
+import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.data.keypoints.sets import FINGER_JOINTS, FINGERS
+from humangs_jax.io.npz import read_npz
 
 VIEWS = 48
-"""Directions that a point may be seen from."""
+"""Directions from which points are looked at."""
 PER_CELL = 20
-"""Points of the surface in a cell of the depth buffers, on average: then hardly any cell is empty by chance."""
+"""Points per cell of the depth buffers, on average, so that hardly any cell is empty by chance."""
 BEHIND = 1.0
-"""Cells that a point may lie behind the nearest one of its cell."""
+"""A visible point lies at most this many cells behind the nearest point of its cell."""
 OCCLUDERS = 5
-"""As many points, for each that is kept, fill the cells: with 30,000 of a person, cells are a centimetre and a half wide."""
+"""Points that fill the cells, for each that is kept: with 30,000 points of a person, cells are 1.5 cm wide."""
 LEAST_FACES = 50
-"""No surface of a person has fewer."""
+"""A surface of a person has at least this many."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -30,7 +34,7 @@ class Scan:
     """Points of a scan in the file's own coordinates, float64.
 
     points: (p, 3). normals: (p, 3) unit, outwards. turned: whether the file's faces were inside out. hidden: share of the
-    surface that was left out since nobody sees it.
+    surface that is left out because it cannot be seen.
     """
 
     points: Float[np.ndarray, "p 3"]
@@ -50,7 +54,7 @@ def read_mesh(path: str | Path) -> Any:
     if not path.is_file():
         raise ValueError(f"{path}: no such file: expected a mesh (OBJ, PLY, GLB, ...)")
     try:
-        scene = trimesh.load_scene(path, process=False)  # processing would drop what is not finite in silence
+        scene = trimesh.load_scene(path, process=False)  # processing would silently drop what is not finite
     except Exception as error:  # every reader of trimesh has its own errors
         raise ValueError(f"{path}: not a mesh that can be read: {' '.join(str(error).split())}") from error
     parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
@@ -75,9 +79,9 @@ def read_scan(path: str | Path, count: int = 30_000, seed: int = 0) -> Scan:
 
 
 def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: int = 30_000, seed: int = 0) -> Scan:
-    """Random points of a surface, as many per area everywhere.
+    """Random points of a surface, uniform over its area.
 
-    Arguments: vertices (n, 3), faces (f, 3) counter-clockwise seen from outside; if all of them are clockwise this is noticed.
+    Arguments: vertices (n, 3), faces (f, 3) counter-clockwise seen from outside; reversed faces are detected.
     Raises: ValueError if the surface has no area.
     """
     center = vertices[np.unique(faces)].mean(axis=0)
@@ -103,7 +107,7 @@ def sample_scan(vertices: Float[np.ndarray, "n 3"], faces: np.ndarray, count: in
 
 
 def seen_from_outside(points: Float[np.ndarray, "p 3"], cell: float) -> Bool[np.ndarray, " p"]:
-    """Which of the points (p, 3) of a surface are the nearest ones from one of many directions, on a grid of cells."""
+    """Which points (p, 3) of a surface are the nearest of their cell in at least one of many depth buffers."""
     seen = np.zeros(len(points), bool)
     for forward in directions_around(VIEWS):
         right = np.linalg.svd(forward[None])[2][1]
@@ -122,3 +126,61 @@ def directions_around(count: int) -> Float[np.ndarray, "d 3"]:
     y, turn = 1 - 2 * i / count, np.pi * (3 - np.sqrt(5)) * i
     radius = np.sqrt(1 - y * y)
     return np.stack([radius * np.cos(turn), y, radius * np.sin(turn)], axis=1)
+
+
+# Known landmarks ------------------------------------------------------------------------------------------------------
+
+SIDES = ("left", "right")
+PARTS = ("eye", "ear", "shoulder", "elbow", "wrist", "hip", "knee", "ankle", "big_toe", "small_toe", "heel")
+SCAN_LANDMARKS = (
+    *("nose", "neck", "mid_hip"),
+    *(f"{side}_{part}" for part in PARTS for side in SIDES),
+    *(f"{side}_{finger}_{joint}" for side in SIDES for finger in FINGERS for joint in FINGER_JOINTS),
+)
+"""Names that joints of a scan may have: the landmarks of `body/landmarks.py` without duplicates and the face."""
+
+
+def checked_joints(joints: Mapping[str, Any]) -> tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, " k"]]:
+    """Points (k, 3) in the order of `SCAN_LANDMARKS` and which of them are known (k,).
+
+    Raises: ValueError for unknown names and points that are not three finite numbers.
+    """
+    if unknown := sorted(set(joints) - set(SCAN_LANDMARKS)):
+        raise ValueError(
+            f"joint '{unknown[0]}' is no landmark of ours: expected names such as {', '.join(SCAN_LANDMARKS[:6])}"
+        )
+    points, known = np.zeros((len(SCAN_LANDMARKS), 3)), np.zeros(len(SCAN_LANDMARKS))
+    for name, point in joints.items():
+        values = np.asarray(point)
+        if values.shape != (3,) or values.dtype.kind not in "fiu" or not np.isfinite(values).all():
+            raise ValueError(f"joint '{name}': expected three finite numbers, got {point}")
+        points[SCAN_LANDMARKS.index(name)], known[SCAN_LANDMARKS.index(name)] = values, 1
+    return points, known
+
+
+def read_joints(path: str | Path) -> dict[str, Float[np.ndarray, "3"]]:
+    """Landmarks by name in a scan's coordinates: JSON {"left_hip": [x, y, z], ...}, or npz with names (k,) and points (k, 3).
+
+    Raises: ValueError, naming the file, if it is neither, or a name or a point is not one.
+    """
+    path = Path(path)
+    try:
+        joints = _joints_of_npz(path) if path.suffix == ".npz" else json.loads(path.read_text())
+        if not isinstance(joints, dict):
+            raise ValueError('expected {"left_hip": [x, y, z], ...}')
+        if not joints:
+            raise ValueError("no joints: expected three at least")
+        checked_joints(joints)
+    except (ValueError, OSError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    return {name: np.asarray(point, np.float64) for name, point in joints.items()}
+
+
+def _joints_of_npz(path):
+    arrays, _ = read_npz(path)
+    if missing := {"names", "points"} - set(arrays):
+        raise ValueError(f"{min(missing)}: missing: expected names (k,) and points (k, 3)")
+    names, points = [str(name) for name in arrays["names"]], arrays["points"]
+    if len(names) != len(points):
+        raise ValueError(f"points: {len(points)}, but {len(names)} names: expected one for each")
+    return dict(zip(names, points, strict=True))

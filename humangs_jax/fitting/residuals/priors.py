@@ -1,32 +1,35 @@
-"""What is known of a pose before anything is seen: where joints rest, how far they turn, and how far they can.
+"""Priors of poses: the usual rotation of every joint, its standard deviation, and its limits.
 
 Rotation vectors of SMPL-X's joints, by name, in radians about the axes of the T-pose: x to the person's left, y up, z forward.
-Ranges are of rotation vectors, component by component: boxes, generous where axes mix (hips, shoulders). Written for the left
-side; the right is its mirror image (x, -y, -z). Signs: a knee bends about +x, the left elbow about -y, left fingers about -z; the
-left arm hangs at z = -1.4 and is above the head at z = +1.4.
+Limits are boxes of rotation vectors, generous where axes mix (hips, shoulders). Written for the left side; the right is its
+mirror image (x, -y, -z). Signs: a knee bends about +x, the left elbow about -y, left fingers about -z; the left arm hangs at
+z = -1.4 and is above the head at z = +1.4.
 """
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.joints import FINGERS
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Array, Float
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
 """The rotation vector of the mirrored rotation."""
 FREE = np.pi
 """Radians: a component without a limit of its own."""
+LIMIT_STIFFNESS = 20.0
+"""Standard deviations per radian beyond a joint's limit: 3 degrees count as much as one."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """Of a joint's rotation vector: usual value and spread (standard deviation), least and greatest value. (3,) each."""
+    """Of a joint's rotation vector, (3,) each: mean, standard deviation, lower and upper limit."""
 
-    usual: tuple[float, float, float]
-    spread: tuple[float, float, float]
-    least: tuple[float, float, float]
-    greatest: tuple[float, float, float]
+    mean: tuple[float, float, float]
+    std: tuple[float, float, float]
+    lower: tuple[float, float, float]
+    upper: tuple[float, float, float]
 
 
 _SPINE = Range((0.03, 0.0, 0.0), (0.2, 0.15, 0.15), (-0.5, -0.5, -0.5), (0.8, 0.5, 0.5))
@@ -61,33 +64,41 @@ RANGES = {
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PosePrior:
-    """Arrays (j, 3) in the order of a body's joints, radians. The spread of the root is none: any heading is as good."""
+    """Arrays (j, 3) in the order of a body's joints, radians. The root's are not used: every orientation is as likely."""
 
-    usual: Float[np.ndarray, "j 3"]
-    spread: Float[np.ndarray, "j 3"]
-    least: Float[np.ndarray, "j 3"]
-    greatest: Float[np.ndarray, "j 3"]
+    mean: Float[np.ndarray, "j 3"]
+    std: Float[np.ndarray, "j 3"]
+    lower: Float[np.ndarray, "j 3"]
+    upper: Float[np.ndarray, "j 3"]
 
 
 def pose_prior(joint_names: tuple[str, ...]) -> PosePrior:
-    """The prior of a body. Joints of other names than SMPL-X's rest at 0 with a spread of 0.3 rad, free of limits."""
+    """The prior of a body. Joints with other names than SMPL-X's have mean 0, std 0.3 rad and no limits."""
     unknown = Range((0.0, 0.0, 0.0), (0.3, 0.3, 0.3), (-FREE, -FREE, -FREE), (FREE, FREE, FREE))
     rows = [_range_of(name, unknown) for name in joint_names]
     return PosePrior(*(np.stack([row[i] for row in rows]).astype(np.float32) for i in range(4)))
 
 
+def limit_residuals(prior: PosePrior, joints: tuple[int, ...], rotations: Float[Array, "j 3"]) -> Float[Array, "a 3"]:
+    """How far joints turn beyond their limits, in standard deviations."""
+    rows = np.asarray(joints, int)
+    turned = rotations[rows]
+    beyond = jnp.maximum(prior.lower[rows] - turned, turned - prior.upper[rows])
+    return LIMIT_STIFFNESS * jnp.maximum(beyond, 0.0)
+
+
 def violations(
     prior: PosePrior, rotations: Float[np.ndarray, "j 3"], slack: float = 0.05
 ) -> list[tuple[int, int, float]]:
-    """(joint, axis, radians beyond the range) of all components that leave their range by more than `slack` radians."""
-    beyond = np.maximum(prior.least - rotations, rotations - prior.greatest)
+    """(joint, axis, radians beyond the limit) of all components that exceed their limit by more than `slack` radians."""
+    beyond = np.maximum(prior.lower - rotations, rotations - prior.upper)
     return [(int(j), int(a), float(beyond[j, a])) for j, a in np.argwhere(beyond > slack)]
 
 
 def _range_of(name, unknown):
     if not name.startswith("right_"):
         own = RANGES.get(name, unknown)
-        return [np.asarray(x, float) for x in (own.usual, own.spread, own.least, own.greatest)]
-    usual, spread, least, greatest = _range_of(name.replace("right_", "left_", 1), unknown)
-    ends = np.sort(np.stack([MIRROR * least, MIRROR * greatest]), axis=0)
-    return [MIRROR * usual, spread, ends[0], ends[1]]
+        return [np.asarray(x, float) for x in (own.mean, own.std, own.lower, own.upper)]
+    mean, std, lower, upper = _range_of(name.replace("right_", "left_", 1), unknown)
+    ends = np.sort(np.stack([MIRROR * lower, MIRROR * upper]), axis=0)
+    return [MIRROR * mean, std, ends[0], ends[1]]

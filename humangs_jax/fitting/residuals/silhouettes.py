@@ -1,29 +1,33 @@
-"""Outlines of a body against masks: which point belongs to which line, and how far off it is.
+"""Silhouettes as evidence: outlines of a body against outlines of masks.
 
-Like edge trackers (Harris and Stennett 1990, "RAPiD"): each point of the body's outline looks along its normal for the
-nearest place where the mask ends, and each point of the mask's outline for the nearest point of the body's that faces the
-same way. Both give one equation n . x = n . q: x, a point of the body in the picture, may slide along the mask's outline.
+As in edge trackers (Harris and Stennett 1990, "RAPiD"): each point of the body's outline looks along its normal for the
+nearest end of the mask, and each point of the mask's outline for the nearest point of the body's that faces the same way. Both
+give an equation n . x = n . q: x, a point of the body in the image, may slide along the mask's outline.
 
-A person wears clothes: the body may end inside of the mask (hair, cloth), but not outside. So distances outwards count in
-full, and inwards less and less the larger they are.
+People wear clothes and hair: the body may end inside of the mask, but not outside. So distances outwards count in full, and
+distances inwards count less and less the larger they are.
 """
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.model import BodyModel
+from humangs_jax.body.surface_points import SurfacePoints
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.fitting.objective import robust
-from humangs_jax.fitting.refinement.outlines import Outline, inside_picture
+from humangs_jax.fitting.residuals.outlines import Outline, inside_image
+from humangs_jax.fitting.solve import robust
 from humangs_jax.network.bilinear import sample_bilinear
 
 LOOKS = 129
-"""Places at which a line is looked at: half a pixel apart at first, less later."""
+"""Samples along a normal: half a pixel apart in the first round, less later."""
 FACING = 0.5
-"""Cosine: points of two outlines belong together if their normals are no further apart than this (60 degrees)."""
+"""Least cosine between the normals of two points that belong together (60 degrees)."""
 
 
 @pytree_dataclass
@@ -48,7 +52,7 @@ class MaskView:
 
 
 def match(body: Outline, view: MaskView, reach: float, count: int) -> Matches:
-    """At most 2 `count` equations, filled up with ones of weight 0. reach: pixels, how far points look."""
+    """At most 2 `count` equations, padded with weight 0. reach: pixels, how far points look."""
     own = _ends_of_mask(body, view.mask, reach)
     other = _nearest(body, view.outline, reach)
     rows = [np.concatenate(pair) for pair in zip(own, other, strict=True)]
@@ -64,7 +68,7 @@ def _ends_of_mask(body, mask, reach):
     steps = np.linspace(-reach, reach, LOOKS)
     places = body.positions[:, None] + steps[:, None] * body.normals[:, None]
     covered = np.asarray(_coverage(mask, places))
-    seen = inside_picture(places, mask.shape)
+    seen = inside_image(places, mask.shape)
     ends = (covered[:, :-1] >= 0.5) & (covered[:, 1:] < 0.5) & seen[:, :-1] & seen[:, 1:]
     nearest = np.argmin(np.where(ends, np.abs(steps[:-1]), np.inf), axis=1)
     rows = np.arange(len(nearest))
@@ -94,7 +98,7 @@ def _nearest(body, mask, reach):
 def distances(matches: Matches, pixels: Float[Array, "p 2"]) -> Float[Array, " e"]:
     """How far points of the body are outside of their lines, pixels; negative inside."""
     along = matches.normals * pixels[matches.points]
-    return along[:, 0] + along[:, 1] - matches.offsets  # not `jnp.sum`: see `scans.objective.scan_residuals`
+    return along[:, 0] + along[:, 1] - matches.offsets  # not `jnp.sum`: see `scan.scan_residuals`
 
 
 def silhouette_residuals(
@@ -102,17 +106,42 @@ def silhouette_residuals(
     pixels: Float[Array, "p 2"],
     clothes: Float[Array, " p"],
     noise: Float[Array, ""],
-    cuts: tuple[Float[Array, ""], Float[Array, ""]],
+    scales: tuple[Float[Array, ""], Float[Array, ""]],
     independent: float,
 ) -> Float[Array, " e"]:
     """In standard deviations.
 
-    Arguments: clothes: pixels by which the mask reaches beyond the body. noise: of an outline, pixels. cuts: pixels outwards
-    and inwards at which the loss flattens. independent: how many independent equations all of a view count for; neighbours on
+    Arguments: clothes: pixels by which the mask reaches beyond the body. noise: std of an outline, pixels. scales: robust scales
+    outwards and inwards, pixels. independent: number of independent equations that all of a view count for, because neighbours on
     an outline err together.
     """
     off = distances(matches, pixels) + clothes[matches.points]
-    cut = jnp.where(off > 0, *cuts)
+    scale = jnp.where(off > 0, *scales)
     share = independent / jnp.maximum(jnp.sum(matches.weights), 1.0)
-    bounded = jax.vmap(robust)((off / noise)[:, None], cut / noise)[:, 0]
+    bounded = jax.vmap(robust)((off / noise)[:, None], scale / noise)[:, 0]
     return jnp.sqrt(matches.weights * jnp.minimum(share, 1.0)) * bounded
+
+
+# Points of outlines on the body --------------------------------------------------------------------------------------
+
+
+def outline_points(body: BodyModel, outlines: Sequence[Outline], count: int, coefficients: int) -> SurfacePoints:
+    """The points of v outlines as functions of shape and pose, (v, count, ...), padded with points that no equation uses."""
+    fill = lambda x: np.pad(x, ((0, count - len(x)),) + ((0, 0),) * (x.ndim - 1))
+    ends = jnp.asarray(np.stack([fill(outline.ends) for outline in outlines]))
+    shares = jnp.asarray(np.stack([fill(outline.shares) for outline in outlines]))
+    return _between(body, ends, shares, coefficients)
+
+
+@functools.partial(jax.jit, static_argnames="coefficients")
+def _between(body, ends, shares, coefficients):
+    def one(ends, shares):
+        def of(values):
+            share = shares.reshape(-1, *(1,) * (values.ndim - 1))
+            return (1 - share) * values[ends[:, 0]] + share * values[ends[:, 1]]
+
+        corrections = None if body.pose_directions is None else of(body.pose_directions)
+        directions = body.shape_directions[..., :coefficients]
+        return SurfacePoints(of(body.template), of(directions), corrections, of(body.skinning_weights))
+
+    return jax.vmap(one)(ends, shares)

@@ -1,4 +1,4 @@
-"""Similarities x -> scale R x + translation, in float64 on the host, and the one that takes points to points best."""
+"""Similarities x -> scale R x + translation, in float64 on the host, and the best one between given points."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ import numpy as np
 from humangs_jax.core.array_types import Float
 
 ROUNDS = 10
-"""Of reweighting by the distance of the points."""
+"""Rounds of reweighting by the distances."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -19,17 +19,17 @@ class Similarity:
     translation: Float[np.ndarray, "3"]
 
     def __call__(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
-        """The points (..., 3) where it takes them."""
+        """Transformed points (..., 3)."""
         return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
     def after(self, first: "Similarity") -> "Similarity":
-        """This one of what `first` makes."""
+        """The composition: first `first`, then this one."""
         return Similarity(
             self.scale * first.scale, self.rotation @ first.rotation, self(np.asarray(first.translation, np.float64))
         )
 
     def inverse(self) -> "Similarity":
-        """The one that takes back."""
+        """The inverse."""
         back = self.rotation.T
         return Similarity(1 / self.scale, back, -(back @ self.translation) / self.scale)
 
@@ -50,8 +50,8 @@ def align_points(
     share = weights / max(weights.sum(), 1e-30)
     mean_source, mean_target = share @ source, share @ target
     x, y = source - mean_source, target - mean_target
-    spread = np.linalg.svd(np.sqrt(share)[:, None] * x, compute_uv=False)
-    if (weights > 0).sum() < 3 or spread[1] < 1e-6 * spread[0]:
+    extent = np.linalg.svd(np.sqrt(share)[:, None] * x, compute_uv=False)
+    if (weights > 0).sum() < 3 or extent[1] < 1e-6 * extent[0]:
         raise ValueError("expected at least three points that are not on one line")
     u, values, vt = np.linalg.svd(y.T @ (share[:, None] * x))
     signs = np.asarray([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
@@ -61,14 +61,14 @@ def align_points(
 
 
 def align_robustly(
-    source: Float[np.ndarray, "k 3"], target: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"], spread: float
+    source: Float[np.ndarray, "k 3"], target: Float[np.ndarray, "k 3"], weights: Float[np.ndarray, " k"], std: float
 ) -> Similarity:
-    """The same, points that end up farther off than `spread` (in target's units) counting less and less (Cauchy).
+    """The same with Cauchy weights: points farther off than `std`, in units of the target, count less.
 
     Raises: see `align_points`.
     """
     found = align_points(source, target, weights)
     for _ in range(ROUNDS):
-        away = np.linalg.norm(found(source) - target, axis=1) / spread
+        away = np.linalg.norm(found(source) - target, axis=1) / std
         found = align_points(source, target, weights / (1 + away * away))
     return found

@@ -1,4 +1,4 @@
-"""Pictures of a scan for a keypoint detector, and what the detector saw in them back as joints of the scan.
+"""Images of a scan for a keypoint detector, and its keypoints as joints of the scan.
 
 render_scan_views("scan.obj", "views")          a capture folder without a body; run a detector on views/images
 joints = joints_from_views("views", keypoints)  then fit_scan("scan.obj", joints=joints, ...)
@@ -8,16 +8,16 @@ import json
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import FORMAT, VERSION, load_photos
-from humangs_jax.fitting.observations import group_by_moment
-from humangs_jax.fitting.scans.joints import SCAN_LANDMARKS
-from humangs_jax.fitting.scans.reading import read_mesh
-from humangs_jax.fitting.scans.similarity import Similarity
+from humangs_jax.fitting.residuals.keypoints import group_by_frame
+from humangs_jax.fitting.scan_reading import SCAN_LANDMARKS, read_mesh
+from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.io.atomic import replace_folder
@@ -25,9 +25,9 @@ from humangs_jax.io.images import write_png
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 SCAN_FILE = "scan.json"
-"""In the folder, beside capture.json: where the scan is in the world of the pictures."""
+"""Beside capture.json: where the scan is in the world of the images."""
 HEIGHT = 1.7
-"""Metres: the scan's longest side in that world; any number would do."""
+"""Metres: the scan's longest side in that world (arbitrary)."""
 DISTANCE, FIELD_OF_VIEW = 4.0, np.radians(36.0)
 """Of the cameras: metres, and vertical."""
 AXES = {f"{sign}{axis}": (s, i) for s, sign in ((1, "+"), (-1, "-")) for i, axis in enumerate("xyz")}
@@ -36,10 +36,10 @@ AXES = {f"{sign}{axis}": (s, i) for s, sign in ((1, "+"), (-1, "-")) for i, axis
 def render_scan_views(
     mesh_path: str | Path, out: str | Path, views: int = 8, size: int = 512, up: str | None = None
 ) -> Path:
-    """Write pictures of a scan from all around as a capture folder without a body.
+    """Write images of a scan from all around as a capture folder without a body.
 
     Arguments: up: which axis of the file is up for the person, "+y", "-z", ...; None: the positive one along which the scan is
-    longest. Detectors know people who stand: look at the pictures.
+    longest. Detectors expect standing people: look at the images.
     Raises: ValueError for a mesh that cannot be used (see `read_mesh`), an unknown axis, or a folder that is not empty.
     """
     out = Path(out)
@@ -57,10 +57,10 @@ def render_scan_views(
 
 
 def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Float[np.ndarray, "3"]]:
-    """Landmarks by name, in the scan's coordinates, that two views or more agree on.
+    """Landmarks by name, in the scan's coordinates, on which at least two views agree.
 
-    Arguments: keypoints: of the pictures that `render_scan_views` wrote to the folder.
-    Raises: ValueError if the folder is not one of these, or fewer than three landmarks can be told.
+    Arguments: keypoints: of the images that `render_scan_views` wrote to the folder.
+    Raises: ValueError if the folder is not one of these, or fewer than three landmarks are found.
     """
     folder = Path(folder)
     try:
@@ -69,14 +69,13 @@ def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Flo
         raise ValueError(f"{folder / SCAN_FILE}: expected what render_scan_views writes: {error}") from error
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     align = Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
-    observations, _ = group_by_moment(load_photos(folder), keypoints)
-    moment = type(observations)(*(getattr(observations, name)[0] for name in vars(observations)))
-    points, counts, _ = triangulate_robustly(moment)
+    observations, _ = group_by_frame(load_photos(folder), keypoints)
+    points, counts, _ = triangulate_robustly(jax.tree.map(lambda leaf: leaf[0], observations))
     points = align.inverse()(np.asarray(points, np.float64))
     names = keypoints.set.names
     found = {name: points[i] for i, name in enumerate(names) if counts[i] >= 2 and name in SCAN_LANDMARKS}
     if len(found) < 3:
-        raise ValueError(f"{folder}: views agree on {len(found)} landmarks only: expected at least three")
+        raise ValueError(f"{folder}: views agree on {len(found)} landmarks: expected at least three")
     return found
 
 

@@ -1,0 +1,217 @@
+"""What fits write: fit.npz and fit.json beside the body.npz of a capture, and the folder of a fit to a scan.
+
+fit.npz, the input of a fit to keypoints and how well its result is known:
+
+    set, names (v,), points (v, k, 2), confidences (v, k)    the keypoints, as `humangs_jax.data.keypoints` stores them
+    noise (m,)               std of the detections, pixels
+    joint_std (m, j)         of the joints' positions, metres ("deviations" in files of earlier versions)
+    determined (m, j)        share of the joints' rotations that the views determine
+    shape_covariance (s, s)
+
+fit.json is the report (`FitReport.to_json`). The folder of a scan holds body.npz, scan_fit.json (the report and where the scan
+is) and body_in_scan.ply.
+"""
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float
+from humangs_jax.data.capture import DEFAULT_BODY, Capture, parameter_arrays
+from humangs_jax.data.capture_checks import CaptureError, numbers
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
+from humangs_jax.data.photos import capture_folder, read_description
+from humangs_jax.fitting.report import FitReport
+from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
+from humangs_jax.io.atomic import replace_file, replace_folder
+from humangs_jax.io.npz import read_npz
+
+FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
+SCAN_BODY_FILE, SCAN_REPORT_FILE, SCAN_MESH_FILE = "body.npz", "scan_fit.json", "body_in_scan.ply"
+KEYS = ("set", "names", "points", "confidences", "noise", "joint_std", "determined", "shape_covariance")
+FORMER = {"joint_std": "deviations"}
+"""Keys of earlier versions."""
+
+
+# fit.npz -------------------------------------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FitRecord:
+    """Contents of fit.npz, see the module."""
+
+    keypoints: Keypoints
+    names: tuple[str, ...]
+    noise: Float[np.ndarray, " m"]
+    joint_std: Float[np.ndarray, "m j"]
+    determined: Float[np.ndarray, "m j"]
+    shape_covariance: Float[np.ndarray, "s s"]
+
+
+def write_fit_record(path: str | Path, record: FitRecord) -> None:
+    """Write fit.npz, whole or not at all."""
+    arrays = {
+        "set": np.asarray(record.keypoints.set.name),
+        "names": np.asarray(record.names),
+        "points": record.keypoints.points.astype(np.float32),
+        "confidences": record.keypoints.confidences.astype(np.float32),
+        **{key: np.asarray(getattr(record, key), np.float32) for key in KEYS[4:]},
+    }
+    replace_file(path, lambda temporary: np.savez(temporary, **arrays))  # ty: ignore[invalid-argument-type]
+
+
+def read_fit_record(path: str | Path) -> FitRecord:
+    """Read fit.npz, of earlier versions too. Raises: CaptureError naming file and key."""
+    path = Path(path)
+    try:
+        values, pickled = read_npz(path)
+    except OSError as error:
+        raise CaptureError(path, "", error.strerror or error) from error
+    if pickled:
+        raise CaptureError(path, pickled[0], "expected plain arrays, got a pickled object")
+    values |= {new: values[old] for new, old in FORMER.items() if new not in values and old in values}
+    for key in KEYS:
+        if key not in values:
+            raise CaptureError(path, key, "missing: expected a file that `humangs fit` wrote")
+    name = str(values["set"])
+    if name not in KEYPOINT_SETS:
+        raise CaptureError(path, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}")
+    names, kind = tuple(str(x) for x in values["names"]), KEYPOINT_SETS[name]
+    v, k = len(names), len(kind.names)
+    points = numbers(values["points"], path, "points", (v, k, 2))
+    confidences = numbers(values["confidences"], path, "confidences", (v, k))
+    noise = numbers(values["noise"], path, "noise")
+    joint_std = numbers(values["joint_std"], path, "joint_std")
+    determined = numbers(values["determined"], path, "determined", joint_std.shape)
+    if noise.shape != joint_std.shape[:1]:
+        raise CaptureError(path, "noise", f"expected {joint_std.shape[:1]} frames, got {noise.shape}")
+    covariance = numbers(values["shape_covariance"], path, "shape_covariance")
+    return FitRecord(Keypoints(points, confidences, kind), names, noise, joint_std, determined, covariance)
+
+
+# Captures ------------------------------------------------------------------------------------------------------------
+
+
+def check_place(source: str | Path, out: str | Path | None, overwrite: bool) -> Path:
+    """The folder that a fit of the capture `source` is written to, checked before the work begins.
+
+    Arguments: out: None: the capture folder itself. Raises: ValueError if something would be overwritten without `overwrite`.
+    """
+    source = capture_folder(source)
+    target = source if out is None else Path(out)
+    filled = target.is_dir() and any(target.iterdir())
+    if target.resolve() == source.resolve():
+        body = target / read_description(source / "capture.json")["body"]
+        if body.exists() and not overwrite:
+            raise ValueError(f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere")
+    elif (target.is_file() or filled) and not overwrite:
+        raise ValueError(f"--out {target}: exists and is not empty; --overwrite replaces it")
+    elif filled and not (target / "capture.json").is_file():
+        raise ValueError(f"--out {target}: holds no capture.json: refusing to overwrite what is no capture")
+    if target.resolve() in source.resolve().parents:
+        raise ValueError(f"--out {target}: {source} lies inside of it, and would be lost")
+    return target
+
+
+def write_fitted(
+    source: str | Path, target: str | Path, capture: Capture, report: FitReport, record: FitRecord | None = None
+) -> None:
+    """Write cameras and body of a capture: into the capture folder `source` itself, or with its photos into another folder.
+
+    Arguments: record: of a fit to keypoints. None: a fit.npz of the source no longer holds; it is left out or removed.
+    """
+    source, target = capture_folder(source), Path(target)
+    description = read_description(source / "capture.json")
+    texts = {
+        "capture.json": json.dumps(_with_cameras(description, capture), indent=1) + "\n",
+        REPORT_FILE: json.dumps(report.to_json(), indent=1) + "\n",
+    }
+    name, arrays = description["body"], parameter_arrays(capture, target)
+    if target.resolve() == source.resolve():
+        if record is None:
+            (target / FIT_FILE).unlink(missing_ok=True)
+        else:
+            write_fit_record(target / FIT_FILE, record)
+        replace_file(target / name, lambda path: np.savez(path, **arrays))  # ty: ignore[invalid-argument-type]
+        for file, text in texts.items():
+            replace_file(target / file, lambda path, text=text: _write_text(path, text))
+        return
+
+    def write(folder: Path):
+        folder.mkdir()
+        for file in sorted({view[key] for view in description["views"] for key in ("image", "mask") if key in view}):
+            _copy(source, folder, file)
+        np.savez(folder / name, **arrays)  # ty: ignore[invalid-argument-type]
+        for file, text in texts.items():
+            _write_text(folder / file, text)
+        if record is not None:
+            write_fit_record(folder / FIT_FILE, record)
+
+    replace_folder(target, write)
+
+
+def _write_text(path, text):
+    path.write_text(text, encoding="utf-8")
+
+
+def _with_cameras(description, capture):
+    """capture.json with the cameras of the capture where they have changed."""
+    views = []
+    for i, view in enumerate(description["views"]):
+        new = {name: np.asarray(getattr(capture.cameras, name)[i], float) for name in ("K", "cam_from_world")}
+        same = {name: np.array_equal(np.asarray(view[name], np.float32), value) for name, value in new.items()}
+        views.append(view | {name: value.tolist() for name, value in new.items() if not same[name]})
+    return description | {"views": views}
+
+
+def _copy(source, folder, file):
+    target = folder / file
+    if not target.resolve().is_relative_to(folder.resolve()):
+        raise CaptureError(
+            source / "capture.json", file, "lies outside of the capture folder: fit it in place, without --out"
+        )
+    target.parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source / file, target)
+
+
+# Scans ---------------------------------------------------------------------------------------------------------------
+
+
+def save_scan_fit(folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BODY, *, overwrite: bool = False) -> None:
+    """Write body.npz (as in captures), scan_fit.json and body_in_scan.ply; all or nothing.
+
+    Arguments: body_file: what body.npz calls the model. Raises: see `check_scan_folder`.
+    """
+    check_scan_folder(Path(folder), overwrite)
+    pose, align = fit.pose, fit.world_from_scan
+    arrays = {"betas": fit.betas, "rotations": np.asarray(pose.rotations)[None]}
+    arrays["translations"] = np.asarray(pose.translation)[None]
+    place = {"world_from_scan": align.matrix().tolist(), "scale": align.scale, "rotation": align.rotation.tolist()}
+    place |= {"translation": align.translation.tolist(), "up": fit.up}
+
+    def write(temporary: Path):
+        import trimesh
+
+        temporary.mkdir()
+        np.savez(temporary / SCAN_BODY_FILE, body=body_file, **arrays)  # ty: ignore[invalid-argument-type]
+        mesh = trimesh.Trimesh(body_in_scan(fit), np.asarray(fit.body.faces), process=False)
+        mesh.export(temporary / SCAN_MESH_FILE)
+        _write_text(temporary / SCAN_REPORT_FILE, json.dumps(place | fit.report.to_json(), indent=2) + "\n")
+
+    replace_folder(folder, write)
+
+
+def check_scan_folder(folder: Path, overwrite: bool) -> None:
+    """Raises: ValueError if it is a file, not empty without `overwrite`, or holds something other than a fit to a scan."""
+    if folder.is_file():
+        raise ValueError(f"{folder}: is a file: expected a folder")
+    if not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not overwrite:
+        raise ValueError(f"{folder}: the folder is not empty: choose another one or ask to overwrite it")
+    if not (folder / SCAN_REPORT_FILE).is_file():
+        raise ValueError(f"{folder}: holds no {SCAN_REPORT_FILE}: refusing to overwrite what is no fit to a scan")

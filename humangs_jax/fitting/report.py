@@ -1,0 +1,279 @@
+"""One report for every fit: what was fitted, errors by evidence, convergence, limits, uncertainty and warnings.
+
+`str(report)` is what the command line prints, `report.to_json()` what is stored beside the result.
+"""
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.body.joints import FINGERS
+from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.fitting.residuals.priors import pose_prior, violations
+from humangs_jax.fitting.solve import Outcome
+from humangs_jax.fitting.swaps import Swap
+
+ROWS = 24
+"""Views in the printed table; of more, those that fit worst."""
+NAMED = 5
+"""Items that are listed by name; the others are counted."""
+LABELS = {
+    "keypoint_error_px": ("keypoints, median error", "{:.2f} px"),
+    "silhouette_iou": ("silhouette IoU", "{:.3f}"),
+    "avatar_psnr": ("avatar against the photos", "{:.2f} dB"),
+    "loss": ("loss", "{:.4f}"),
+    "scan_outside_median_mm": ("scan outside of the skin, median", "{:.1f} mm"),
+    "scan_outside_5_mm": ("scan outside of the skin, 5 % below", "{:.1f} mm"),
+    "scan_outside_95_mm": ("scan outside of the skin, 95 % below", "{:.1f} mm"),
+    "scan_near_body": ("share of the scan near the body", "{:.0%}"),
+}
+"""How errors are printed."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """An error of the result, and of the start where there was one."""
+
+    after: float
+    before: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewReport:
+    """One view. keypoints: that were compared. median, high: their median error and 90th percentile, pixels (NaN: none).
+    outliers: share. iou_before, iou_after: of silhouettes, NaN without a mask, None if masks are not part of the fit.
+    """
+
+    name: str
+    frame: int
+    keypoints: int = 0
+    median: float = float("nan")
+    high: float = float("nan")
+    outliers: float = 0.0
+    iou_before: float | None = None
+    iou_after: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """Runs of the solver in one stage: how many, how many converged, and means of steps and of the cost before and after."""
+
+    name: str
+    runs: int
+    converged: int
+    steps: float
+    before: float
+    after: float
+
+    @classmethod
+    def of(cls, name: str, outcome: Outcome) -> "Stage":
+        """From one outcome or a batch."""
+        done, *means = (np.atleast_1d(getattr(outcome, key)) for key in ("converged", "steps", "before", "after"))
+        return cls(name, done.size, int(done.sum()), *(float(values.mean()) for values in means))
+
+
+@dataclasses.dataclass(frozen=True)
+class Violation:
+    """A joint that exceeds its limit about an axis of the T-pose."""
+
+    frame: int
+    joint: str
+    axis: str
+    degrees: float
+
+
+@dataclasses.dataclass(frozen=True)
+class FitReport:
+    """What came of a fit.
+
+    fitted: "keypoints", "refinement" or "scan". kept: False if the start was better and stays. errors: by name, see `LABELS`.
+    moved: how far parameters moved, by name. violations: of joint limits. swaps: what seems exchanged. undetermined: joints, or
+    groups of joints, that the views do not determine. notes: further results. warnings: what points to a mistake.
+    """
+
+    fitted: str
+    kept: bool = True
+    errors: dict[str, Change] = dataclasses.field(default_factory=dict)
+    views: tuple[ViewReport, ...] = ()
+    stages: tuple[Stage, ...] = ()
+    moved: dict[str, float] = dataclasses.field(default_factory=dict)
+    violations: tuple[Violation, ...] = ()
+    swaps: tuple[Swap, ...] = ()
+    undetermined: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is no warning."""
+        return not self.warnings
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; numbers that are not finite are None."""
+        return _plain(dataclasses.asdict(self))
+
+    def __str__(self) -> str:
+        """Tables of stages and views, then errors, notes and warnings."""
+        lines = [*_stage_rows(self.stages), ""] if self.stages else []
+        lines += _view_rows(self.views) if self.views else []
+        for key, change in self.errors.items():
+            label, form = LABELS[key]
+            start = "" if change.before is None else f"{form.format(change.before)} -> "
+            lines.append(f"{label}: {start}{form.format(change.after)}")
+        lines += self.notes
+        if self.undetermined:
+            lines.append(f"not determined by the views, taken from the prior: {', '.join(self.undetermined)}")
+        return "\n".join([*lines, *(f"warning: {warning}" for warning in self.warnings)])
+
+
+def _plain(value):
+    if isinstance(value, dict):
+        return {key: _plain(own) for key, own in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(own) for own in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _stage_rows(stages):
+    rows = ["stage        converged  steps  cost before -> after"]
+    for stage in stages:
+        converged = f"{stage.converged} of {stage.runs}"
+        rows.append(f"{stage.name:<12} {converged:>9}  {stage.steps:>5.0f}  {stage.before:.4g} -> {stage.after:.4g}")
+    return rows
+
+
+def _view_rows(views):
+    """A table with the columns that are known."""
+    by_keypoints, by_masks = any(v.keypoints for v in views), any(v.iou_after is not None for v in views)
+    shown = views
+    if len(views) > ROWS:
+        error = lambda view: np.nan_to_num(view.median if by_keypoints else 1 - (view.iou_after or 0.0), nan=np.inf)
+        worst = np.argsort([-error(view) for view in views], kind="stable")[:ROWS]
+        shown = [views[i] for i in sorted(worst)]
+    width = max(4, *(len(view.name) for view in shown))
+    header = f"{'view':<{width}}"
+    header += "  keypoints  median error  90 % below  outliers" if by_keypoints or not by_masks else ""
+    header += "  IoU before  after" if by_masks else ""
+    rows = [header]
+    for view in shown:
+        row = f"{view.name:<{width}}"
+        if by_keypoints or not by_masks:
+            errors = f"{view.median:>9.1f} px  {view.high:>7.1f} px" if view.keypoints else f"{'-':>12}  {'-':>10}"
+            row += f"  {view.keypoints:>9}  {errors}  {view.outliers:>8.0%}"
+        if by_masks:
+            known = view.iou_before is not None and np.isfinite(view.iou_before)
+            row += f"  {view.iou_before:>10.3f}  {view.iou_after:.3f}" if known else f"  {'no mask':>10}"
+        rows.append(row)
+    if len(views) > ROWS:
+        rows.append(f"{'...':<{width}}  {len(views) - ROWS} more that fit better")
+    return rows
+
+
+# What points to a mistake --------------------------------------------------------------------------------------------
+
+MANY_OUTLIERS = 0.3
+"""Share of the keypoints of a view: fits tolerate more, but a detector that errs this often saw something else."""
+OFF = 4.0
+"""Multiple of the expected noise: a view with this median error, 2 % of the person's height, shows another pose or camera."""
+FAR_BEYOND = 10.0
+"""Degrees beyond a joint's limit from which there is a warning: limits are boxes of rotation vectors, and rough."""
+UNSURE, UNDECIDED = 0.03, 0.1
+"""A joint is undetermined if its std exceeds this, metres, or a smaller share of its rotation is determined: a mean over axes, of
+which knees and fingers have one that turns."""
+
+_FINGERS = {side: [f"{side}_{finger}{i}" for finger in FINGERS for i in (1, 2, 3)] for side in ("left", "right")}
+GROUPS = {
+    "left hand": _FINGERS["left"],
+    "right hand": _FINGERS["right"],
+    "eyes": ["left_eye", "right_eye"],
+    "feet": ["left_foot", "right_foot"],
+    "spine": ["spine1", "spine2", "spine3"],
+    "collars": ["left_collar", "right_collar"],
+}
+"""Joints that are named together if all of them are undetermined."""
+
+
+def limit_violations(joint_names: tuple[str, ...], poses: BodyPose) -> tuple[Violation, ...]:
+    """Of a batch of poses, by frame."""
+    prior, rotations = pose_prior(joint_names), np.asarray(poses.rotations)
+    return tuple(
+        Violation(frame, joint_names[j], "xyz"[axis], float(np.rad2deg(beyond)))
+        for frame, own in enumerate(rotations)
+        for j, axis, beyond in violations(prior, own)
+    )
+
+
+def undetermined_joints(
+    joint_names: tuple[str, ...],
+    shown: Bool[np.ndarray, " m"],
+    joint_std: Float[np.ndarray, "m j"] | None,
+    determined: Float[np.ndarray, "m j"] | None,
+) -> tuple[str, ...]:
+    """Joints that the views do not determine in the frames `shown`; fingers and other groups as one.
+
+    Arguments: joint_std: metres. determined: shares. None: ignored.
+    """
+    unknown = np.zeros((len(shown), len(joint_names)), bool)
+    if joint_std is not None:
+        unknown |= joint_std > UNSURE
+    if determined is not None:
+        unknown |= determined < UNDECIDED
+    counts = dict(zip(joint_names, unknown[shown].sum(0).tolist(), strict=True))
+    counts = {name: count for name, count in counts.items() if count}
+    found = []
+    for group, members in GROUPS.items():
+        if all(name in counts for name in members):
+            found.append((group, max(counts.pop(name) for name in members)))
+    found += counts.items()
+    total = int(shown.sum())
+    return tuple(name if count == total else f"{name} (in {count} of {total} frames)" for name, count in found)
+
+
+def keypoint_warnings(
+    views: Sequence[ViewReport],
+    expected: Float[np.ndarray, " m"],
+    violations: Sequence[Violation],
+    swaps: Sequence[Swap],
+) -> tuple[str, ...]:
+    """What points to a mistake. expected: noise of the keypoints of each frame, pixels."""
+    found = [str(swap) for swap in swaps[:NAMED]]
+    if len(swaps) > NAMED:
+        found.append(f"{len(swaps) - NAMED} more views or pairs of views seem exchanged")
+    blind = [view for view in views if not view.keypoints]
+    off = [view for view in views if view.keypoints and view.median > OFF * expected[view.frame]]
+    wild = [view for view in views if view not in off and view.outliers > MANY_OUTLIERS]
+    if blind:
+        found.append(f"no keypoints in {_names(blind)}")
+    if off:
+        found.append(f"body and keypoints disagree in {_names(off)}: median error {_span(off, 'median', '{:.0f}')} px")
+    if wild:
+        found.append(f"many keypoints are outliers in {_names(wild)}: {_span(wild, 'outliers', '{:.0%}')}")
+    far: dict[tuple[str, str], list[Violation]] = {}
+    for each in violations:
+        if each.degrees > FAR_BEYOND:
+            far.setdefault((each.joint, each.axis), []).append(each)
+    for (joint, axis), of in far.items():
+        worst = max(each.degrees for each in of)
+        frames = listed([str(each.frame) for each in of])
+        found.append(f"{joint} is {worst:.0f} degrees beyond its limit about {axis}, in frame {frames}")
+    return tuple(found)
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names, and how many more there are."""
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _names(views):
+    return f"view {listed([view.name for view in views])}"
+
+
+def _span(views, field, form):
+    """The least and the greatest value of a field, or the one value if they are equal."""
+    ends = [form.format(of(getattr(view, field) for view in views)) for of in (min, max)]
+    return ends[0] if ends[0] == ends[1] else " to ".join(ends)

@@ -1,0 +1,186 @@
+"""Keypoints as evidence: observations of fixed shapes, so that frames and people can be vmapped, and their residuals."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
+from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.photos import Photos
+from humangs_jax.fitting.residuals.priors import PosePrior, limit_residuals
+from humangs_jax.fitting.solve import robust
+from humangs_jax.fitting.state import FitState, Origin, betas_of, pose_of
+
+NEAR = 0.05
+"""Metres: depths are clamped to at least this."""
+LESS_CERTAIN = {"hip": 2.0, "shoulder": 1.5, "neck": 1.5, "mid_hip": 1.5, "ear": 1.5}
+"""Multiples of the noise for landmarks on whose position annotators disagree."""
+NOISE, LEAST_NOISE = 0.005, 0.3
+"""Expected std of detections: a share of the person's height in the photo (2 pixels of 400), and a lower bound, pixels."""
+OUTER = (0.03, 0.97)
+"""Quantiles of the coordinates between which a person's size is measured, so that outliers do not count."""
+NOISE_RANGE = (0.5, 8.0)
+"""Bounds of the noise that a fit finds, multiples of the expected noise."""
+RAYLEIGH_MEDIAN = 1.1774
+"""Median length of a vector whose two components have a std of 1."""
+
+
+@pytree_dataclass
+class Observations:
+    """Keypoints of one frame in c views; a missing view has confidence 0.
+
+    points: (c, k, 2) pixels, centres at +0.5. confidences: (c, k) in [0, 1]; 0: not seen. K: (c, 3, 3) pixels.
+    cam_from_world: (c, 4, 4), metres. noise: () std of the detections, pixels.
+    """
+
+    points: Float[Array, "c k 2"]
+    confidences: Float[Array, "c k"]
+    K: Float[Array, "c 3 3"]
+    cam_from_world: Float[Array, "c 4 4"]
+    noise: Float[Array, ""]
+
+
+def make_observations(points, confidences, K, cam_from_world) -> Observations:
+    """A batch of m frames from arrays (m, c, ...), with the noise that is expected of them."""
+    noise = expected_noise(np.asarray(points), np.asarray(confidences))
+    return jax.vmap(Observations)(
+        *(jnp.asarray(x, jnp.float32) for x in (points, confidences, K, cam_from_world, noise))
+    )
+
+
+def group_by_frame(photographs: Photos, keypoints: Keypoints) -> tuple[Observations, Int[np.ndarray, "m c"]]:
+    """Observations with a leading axis of frames (m, c, ...), and the view (m, c) of each, -1 where there is none."""
+    frames, count = np.asarray(photographs.frames), photographs.frame_count
+    members = [np.flatnonzero(frames == frame) for frame in range(count)]
+    views = np.full((count, max(len(own) for own in members)), -1)
+    for row, own in zip(views, members, strict=True):
+        row[: len(own)] = own
+    confidences = np.where(views[..., None] < 0, 0.0, keypoints.confidences[views])
+    points = np.where(confidences[..., None] > 0, keypoints.points[views], 0.0)
+    cameras = photographs.cameras
+    return make_observations(points, confidences, cameras.K[views], cameras.cam_from_world[views]), views
+
+
+def expected_noise(
+    points: Float[np.ndarray, "m c k 2"], confidences: Float[np.ndarray, "m c k"]
+) -> Float[np.ndarray, " m"]:
+    """Pixels, from the size of the person in the views of a frame; 1 where nothing is seen."""
+
+    def of_frame(points, seen):
+        sizes = [
+            np.ptp(np.quantile(p[s], OUTER, axis=0), axis=0).max() for p, s in zip(points, seen, strict=True) if s.any()
+        ]
+        return max(NOISE * float(np.median(sizes)), LEAST_NOISE) if sizes else 1.0
+
+    return np.asarray([of_frame(p, seen) for p, seen in zip(points, confidences > 0, strict=True)], np.float32)
+
+
+def found_noise(median: Array, expected: Array) -> Array:
+    """Pixels, from the median error, which outliers hardly change; the expected noise where that is NaN."""
+    found = jnp.where(jnp.isnan(median), expected, median / RAYLEIGH_MEDIAN)
+    return jnp.clip(found, NOISE_RANGE[0] * expected, NOISE_RANGE[1] * expected)
+
+
+def in_cameras(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k 3"]:
+    """Points of the world in the coordinates of every camera."""
+    rotation, translation = observations.cam_from_world[:, :3, :3], observations.cam_from_world[:, :3, 3]
+    return jnp.einsum("cab,kb->cka", rotation, points) + translation[:, None]
+
+
+def focal_lengths(observations: Observations) -> Float[Array, "c 1 2"]:
+    """fx and fy of every view, pixels."""
+    return jnp.stack([observations.K[:, 0, 0], observations.K[:, 1, 1]], axis=-1)[:, None]
+
+
+def keypoint_errors(observations: Observations, landmarks: Float[Array, "k 3"]) -> Float[Array, "c k 2"]:
+    """Projected landmarks minus detections, pixels."""
+    seen = in_cameras(observations, landmarks)
+    pixels = seen[..., :2] / jnp.maximum(seen[..., 2:], NEAR) * focal_lengths(observations)
+    return pixels + observations.K[:, None, :2, 2] - observations.points
+
+
+def landmark_certainty(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
+    """(k,) the weight of a landmark's error in (0, 1], see `LESS_CERTAIN`."""
+    return np.asarray([1 / LESS_CERTAIN.get(_kind(name), 1.0) for name in names], np.float32)
+
+
+TRUNK = ("shoulder", "hip", "neck", "mid_hip", "nose", "eye", "ear")
+"""Landmarks that hardly depend on the pose."""
+LIMBS = 0.02
+"""Weight of the others: they count where the trunk is not seen."""
+
+
+def trunk_weights(names: tuple[str, ...]) -> Float[np.ndarray, " k"]:
+    """(k,) 1 for landmarks of the trunk, `LIMBS` for others."""
+    return np.asarray([1.0 if _kind(name) in TRUNK else LIMBS for name in names], np.float32)
+
+
+def _kind(name):
+    return name.split("_", 1)[1] if name.startswith(("left_", "right_")) else name
+
+
+def keypoint_residuals(
+    model: LandmarkModel, observations: Observations, landmarks: Float[Array, "k 3"], scale: Float[Array, ""] | float
+) -> Float[Array, "c k 2"]:
+    """In standard deviations; scale: robust scale, in standard deviations."""
+    certainty = landmark_certainty(model.names)[:, None]
+    errors = keypoint_errors(observations, landmarks) / observations.noise * certainty
+    weights = observations.confidences * np.asarray(model.known, np.float32)
+    return jnp.where(weights > 0, jnp.sqrt(jnp.where(weights > 0, weights, 1.0)), 0.0)[..., None] * robust(
+        errors, scale
+    )
+
+
+@pytree_dataclass
+class Targets:
+    """Triangulated landmarks: points (k, 3) metres; known: (k,) their weights; pixel: () metres per pixel there."""
+
+    points: Float[Array, "k 3"]
+    known: Float[Array, " k"] | Bool[Array, " k"]
+    pixel: Float[Array, ""]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class KeypointProblem:
+    """What stays the same in a fit to keypoints: landmarks, prior, origin, weights of the priors of pose and shape."""
+
+    model: LandmarkModel
+    prior: PosePrior
+    origin: Origin
+    pose_weight: float = 1.0
+    shape_weight: float = 1.0
+
+    @property
+    def known(self) -> Float[np.ndarray, " k"]:
+        """(k,) 1 for landmarks that the body has."""
+        return np.asarray(self.model.known, np.float32)
+
+    def landmarks_and_joints(self, state: FitState) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
+        """Of a state, metres."""
+        return pose_landmarks(self.model, betas_of(self.origin, state), pose_of(self.origin, state))
+
+
+def frame_residuals(
+    problem: KeypointProblem,
+    observations: Observations,
+    state: FitState,
+    scale: Float[Array, ""] | float,
+    targets: Targets | None = None,
+) -> dict[str, Float[Array, "..."]]:
+    """All residuals of one frame, by kind; half their square sum is the negative log posterior."""
+    betas, pose = betas_of(problem.origin, state), pose_of(problem.origin, state)
+    landmarks, _ = pose_landmarks(problem.model, betas, pose)
+    found = {
+        "keypoints": keypoint_residuals(problem.model, observations, landmarks, scale),
+        "pose": problem.pose_weight * state.body_pose,
+        "limits": limit_residuals(problem.prior, problem.origin.joints, pose.rotations),
+        "shape": problem.shape_weight * state.betas,
+    }
+    if targets is not None:
+        known = (targets.known * problem.known)[:, None]
+        found["points"] = known * robust((landmarks - targets.points) / (targets.pixel * observations.noise), scale)
+    return found

@@ -1,0 +1,274 @@
+"""A scan as evidence: pairs of scan points and body vertices, and the residuals of a body against fixed pairs.
+
+Pairs are nearest points with like normals, searched from either side with k-d trees of positions and normals: a difference of
+normals counts like some centimetres, so that a sleeve is not paired with the waist behind it. Pairs that are far apart, or face
+different ways, have no weight; others fade with distance.
+
+Of a pair, d = n . (scan point - body vertex) is the distance by which the scan is outside of the skin, n the normal of the
+surface that was searched. On a bare person d is noise on both sides. Clothes are outside: d > 0 is usual and counts little;
+d < 0 means that the body pokes out of its clothes, and counts in full. Hands are usually bare and count in full on both sides.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.joints import FINGERS
+from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints
+from humangs_jax.body.model import BodyModel, BodyPose, pose_features
+from humangs_jax.body.surface_points import SurfacePoints, pose_points
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.fitting.residuals.priors import PosePrior, limit_residuals, pose_prior
+from humangs_jax.fitting.scan_reading import Scan
+from humangs_jax.fitting.similarity import Similarity
+from humangs_jax.fitting.solve import robust
+from humangs_jax.fitting.state import FitState, Origin, betas_of, pose_of, scale_of, usual_origin
+from humangs_jax.rendering.mesh.position_map import vertex_normals
+
+VERTICES = 7000
+"""Evenly spread, nearly all visible from outside: 1.6 cm apart."""
+JOINT_SCALE = 4.0
+"""Robust scale of given joints, standard deviations."""
+HEIGHT_STD = 0.01
+"""Metres: how well people know their height."""
+LIKE = 0.3
+"""Least cosine between the normals of a pair."""
+
+
+# The body ------------------------------------------------------------------------------------------------------------
+
+
+@pytree_dataclass
+class BodySurface:
+    """n vertices of a body with j joints.
+
+    points: the vertices. faces: (f, 3). order: (n,) vertices with a number below m are a mesh of m vertices, evenly spread.
+    covered: (n,) 0 on hands, 1 where clothes may be. landmarks: of the same body, with its joints.
+    """
+
+    points: SurfacePoints
+    faces: Int[Array, "f 3"]
+    order: Int[Array, " n"]
+    covered: Float[Array, " n"]
+    landmarks: LandmarkModel
+
+
+def body_surface(body: BodyModel, names: tuple[str, ...], vertices: int = VERTICES) -> BodySurface:
+    """The surface of a body by `vertices` of its vertices (all, if it has fewer), with the landmarks of these names.
+
+    Raises: ValueError if its joints have other names than SMPL-X's.
+    """
+    small = decimate(body, min(vertices, body.template.shape[0]))
+    is_hand = lambda name: name.endswith("_wrist") or any(finger in name for finger in FINGERS)
+    hands = [j for j, name in enumerate(small.joint_names) if is_hand(name)]
+    bare = np.asarray(small.skinning_weights)[:, hands].sum(axis=1)
+    return BodySurface(
+        points=SurfacePoints(small.template, small.shape_directions, small.pose_directions, small.skinning_weights),
+        faces=small.faces,
+        order=jnp.asarray(np.argsort(np.argsort(np.asarray(small.collapse_order))), jnp.int32),
+        covered=1 - jnp.asarray(bare, jnp.float32),
+        landmarks=landmark_model(body, names),
+    )
+
+
+def pose_vertices(
+    surface: BodySurface, rows: Int[Array, " r"], betas: Float[Array, " s_used"], pose: BodyPose
+) -> tuple[Float[Array, "r 3"], Float[Array, "k 3"], Float[Array, "j 3"]]:
+    """Some vertices (r, 3), the landmarks (k, 3) and the joints (j, 3) of a person in a pose, metres."""
+    model, count = surface.landmarks, rows.shape[0]
+    transforms, joints = pose_joints(model, betas, pose)
+    wanted = jax.tree.map(lambda own, marks: jnp.concatenate([own[rows], marks]), surface.points, model.points)
+    posed = pose_points(wanted, betas, pose_features(pose.rotations), transforms)
+    return posed[:count], landmarks_from(model, joints, posed[count:]), joints
+
+
+@jax.jit
+def pose_surface(
+    surface: BodySurface, betas: Float[Array, " s_used"], pose: BodyPose
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"]]:
+    """All vertices (n, 3), metres, and their unit normals (n, 3), outwards."""
+    vertices, _, _ = pose_vertices(surface, jnp.arange(surface.points.rest.shape[0]), betas, pose)
+    return vertices, vertex_normals(vertices, surface.faces)
+
+
+# Residuals -----------------------------------------------------------------------------------------------------------
+
+
+@pytree_dataclass
+class ScanProblem:
+    """What stays the same. surface: of the body. origin: of the state. ends: static, highest and lowest vertex at rest."""
+
+    surface: BodySurface
+    origin: Origin
+    ends: tuple[int, int] = static_field(default=(0, 0))
+
+    @property
+    def prior(self) -> PosePrior:
+        """Of the body's joints."""
+        return pose_prior(self.surface.landmarks.joint_names)
+
+    @jax.jit
+    def body(self, state: FitState) -> tuple[Float[Array, " s"], BodyPose]:
+        """Shape and pose in the scan's frame."""
+        return betas_of(self.origin, state), pose_of(self.origin, state)
+
+
+def scan_problem(surface: BodySurface, names: tuple[str, ...], coefficients: int | None = None) -> ScanProblem:
+    """With the joints of these names free, and at most `coefficients` of the shape (default: all)."""
+    model, available = surface.landmarks, surface.points.directions.shape[-1]
+    joints = tuple(j for j, name in enumerate(model.joint_names) if j > 0 and name in names)
+    origin = usual_origin(pose_prior(model.joint_names), joints, min(available, coefficients or available))
+    height = np.asarray(surface.points.rest)[:, 1]
+    return ScanProblem(surface, origin, (int(height.argmax()), int(height.argmin())))
+
+
+@pytree_dataclass
+class ScanMatches:
+    """r pairs. rows: (r,) vertices of the body. points, normals: (r, 3) in the scan's frame. outside: (r,) std of positive
+    distances. weights: (r,), 0: no pair.
+    """
+
+    rows: Int[Array, " r"]
+    points: Float[Array, "r 3"]
+    normals: Float[Array, "r 3"]
+    outside: Float[Array, " r"]
+    weights: Float[Array, " r"]
+
+    @classmethod
+    def none(cls) -> "ScanMatches":
+        """One pair without weight."""
+        return cls(jnp.zeros(1, jnp.int32), jnp.zeros((1, 3)), jnp.zeros((1, 3)), jnp.ones(1), jnp.zeros(1))
+
+
+@pytree_dataclass
+class Given:
+    """Known landmarks and height. points: (k, 3) in the scan's frame. weights: (k,) 0: not known. std: () metres. height: ()
+    metres, and height_weight: () 1 if it is known, else 0.
+    """
+
+    points: Float[Array, "k 3"]
+    weights: Float[Array, " k"]
+    std: Float[Array, ""]
+    height: Float[Array, ""]
+    height_weight: Float[Array, ""]
+
+
+@pytree_dataclass
+class Tolerances:
+    """Each (). inside, outside: std of d on either side, in units of the frame, about metres; outside holds where the skin is
+    usually covered. prior: weight of the pose prior.
+    """
+
+    inside: Float[Array, ""]
+    outside: Float[Array, ""]
+    prior: Float[Array, ""]
+
+
+def scan_residuals(
+    problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState
+) -> dict[str, Float[Array, "..."]]:
+    """All residuals by kind, in standard deviations."""
+    betas, pose = problem.body(state)
+    vertices, landmarks, _ = pose_vertices(problem.surface, matches.rows, betas, pose)
+    # in the scan's frame: in metres, a smaller scan would be nearer
+    apart = matches.points - vertices / scale_of(state)
+    # term by term: XLA's CPU compiler (jaxlib 0.10.2) makes wrong Jacobians of `jnp.sum(normals * apart, axis=-1)` under jacfwd
+    along = matches.normals * apart
+    away = along[:, 0] + along[:, 1] + along[:, 2]
+    off = (landmarks / scale_of(state) - given.points) / given.std
+    return {
+        "surface": jnp.sqrt(matches.weights) * one_sided(away, matches.outside, tolerances.inside),
+        "joints": jnp.sqrt(given.weights)[:, None] * robust(off, JOINT_SCALE),
+        "pose": tolerances.prior * state.body_pose,
+        "limits": limit_residuals(problem.prior, problem.origin.joints, pose.rotations),
+        "shape": state.betas,
+        "height": given.height_weight * (_height(problem, betas) - given.height) / HEIGHT_STD,
+    }
+
+
+def one_sided(away: Float[Array, " r"], outside: Float[Array, " r"], inside: Float[Array, ""]) -> Float[Array, " r"]:
+    """Distances (r,), positive outside, in standard deviations of either side."""
+    return away / jnp.where(away > 0, outside, inside)
+
+
+def _height(problem, betas):
+    points = problem.surface.points
+    top, bottom = (points.rest[i, 1] + points.directions[i, 1, : betas.shape[0]] @ betas for i in problem.ends)
+    return top - bottom
+
+
+# Pairs ---------------------------------------------------------------------------------------------------------------
+
+
+class Target:
+    """A scan in a frame about as large as a person in metres, ready to be searched.
+
+    Arguments: align: to the frame. count: how many points, and body vertices, look for partners. effective: weight of all pairs
+    together. normal: metres that a difference of 1 between normals counts like.
+    """
+
+    def __init__(self, scan: Scan, align: Similarity, count: int, effective: float, normal: float) -> None:
+        self.points, self.normals = align(scan.points), scan.normals @ align.rotation.T
+        self.count, self.effective = min(count, len(self.points)), effective
+        self.normal = normal
+        self.tree = _tree(self.points, normal * self.normals)
+
+    def matches(
+        self, problem: ScanProblem, state: FitState, gate: float, robust_scale: float, tolerances: Tolerances
+    ) -> ScanMatches:
+        """The pairs of a body in a state: first those that scan points found, `count` of them, then those that vertices found.
+
+        Arguments: gate: pairs that are farther apart, in units of the frame, have no weight. robust_scale: distance along the
+        normal at which weights have fallen to a quarter.
+        """
+        vertices, normals = self._posed(problem, state)
+        looking = np.flatnonzero(np.asarray(problem.surface.order) < self.count)
+        of_body = _nearest(self.tree, vertices[looking], self.normal * normals[looking])
+        some, like = self.points[: self.count], self.normals[: self.count]
+        of_scan = _nearest(_tree(vertices, self.normal * normals), some, self.normal * like)
+        rows = np.concatenate([of_scan, looking])
+        points = np.concatenate([some, self.points[of_body]])
+        facing = np.concatenate([normals[of_scan], self.normals[of_body]])
+        other = np.concatenate([like, normals[looking]])
+        apart = points - vertices[rows]
+        good = (np.einsum("ra,ra->r", facing, other) > LIKE) & (np.linalg.norm(apart, axis=1) < gate)
+        away = np.einsum("ra,ra->r", facing, apart)
+        fading = np.square(1 / (1 + np.square(away / robust_scale)))  # Geman and McClure's loss, as weights
+        inside, outside = float(tolerances.inside), float(tolerances.outside)
+        covered = np.asarray(problem.surface.covered)[rows]
+        number = lambda x: jnp.asarray(x, jnp.float32)
+        return ScanMatches(
+            rows=jnp.asarray(rows, jnp.int32),
+            points=number(points),
+            normals=number(facing),
+            outside=number(inside + (outside - inside) * covered),
+            weights=number(good * fading * (self.effective / len(rows))),
+        )
+
+    def distances(self, problem: ScanProblem, state: FitState, gate: float) -> tuple[Float[np.ndarray, " r"], float]:
+        """By how much scan points are outside of the skin (r,), in units of the frame; the share of them that has a partner."""
+        one = jnp.float32(1.0)
+        matches = self.matches(problem, state, gate, np.inf, Tolerances(one, one, one))
+        vertices, _ = self._posed(problem, state)
+        rows, points, normals, weights = (
+            np.asarray(x)[: self.count] for x in (matches.rows, matches.points, matches.normals, matches.weights)
+        )
+        away = np.einsum("ra,ra->r", normals, points - vertices[rows])
+        return away[weights > 0], float((weights > 0).mean())
+
+    def _posed(self, problem, state):
+        """Vertices (n, 3) in units of the frame and normals (n, 3)."""
+        vertices, normals = pose_surface(problem.surface, *problem.body(state))
+        return np.asarray(vertices, np.float64) / float(scale_of(state)), np.asarray(normals, np.float64)
+
+
+def _tree(points, normals):
+    from scipy.spatial import KDTree
+
+    return KDTree(np.concatenate([points, normals], axis=1))
+
+
+def _nearest(tree, points, normals):
+    return tree.query(np.concatenate([points, normals], axis=1))[1]

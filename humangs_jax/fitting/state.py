@@ -1,0 +1,248 @@
+"""One state for every fit: shape, poses and, where a fit moves them, cameras, clothing and the scale of a scan.
+
+A state holds deviations from an `Origin` in units of their expected size, so that zeros are the origin, solvers take steps of
+one length in all directions, and the square of a number is its prior.
+
+    keypoints    betas, the pose of every frame               origin: the mean shape in its usual pose
+    scan         betas, one pose, log_scale                   origin: likewise
+    refinement   betas, poses, cameras, clothing              origin: a capture
+
+The root turns by global_orient after the origin's rotation, because sums of rotation vectors near half a turn are no measure of
+small turns.
+"""
+
+import dataclasses
+import math
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyPose
+from humangs_jax.body.skinning import EXACT
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
+from humangs_jax.fitting.residuals.priors import PosePrior
+from humangs_jax.geometry import quaternion, transform
+from humangs_jax.geometry.camera import Camera
+
+LOG_SCALE_STD = 0.05
+"""Unit of `FitState.log_scale`."""
+SAME = 1e-4
+"""Relative difference of focal lengths, and radians and metres of cameras, below which two are the same."""
+
+
+@dataclasses.dataclass(frozen=True)
+class StateStd:
+    """Expected size of the deviations, standard deviations.
+
+    focal: share. camera_rotation, global_orient, body_pose (each joint): degrees, by axis. camera_center, transl: metres, by
+    axis. betas: of coefficients. clothing: thickness of clothes and hair on each segment of the body, metres.
+    """
+
+    focal: float = 0.05
+    camera_rotation: float = 2.0
+    camera_center: float = 0.05
+    global_orient: float = 3.0
+    transl: float = 0.05
+    body_pose: float = 4.0
+    betas: float = 0.3
+    clothing: float = 0.03
+
+
+FREE = StateStd(global_orient=math.degrees(0.3), transl=0.1, betas=1.0)
+"""Without a start: steps of the solver for orientation and position, which have no prior then, and the shape's own std."""
+
+
+@pytree_dataclass
+class CameraState:
+    """Deviations of c cameras with g focal lengths. rotations, centers: (c, 3). log_focals: (g,)."""
+
+    rotations: Float[Array, "c 3"]
+    centers: Float[Array, "c 3"]
+    log_focals: Float[Array, " g"]
+
+
+@pytree_dataclass
+class FitState:
+    """What a fit moves, in units of `StateStd`; parts that it does not move are None.
+
+    betas: (s,). global_orient, transl: (3,), or (m, 3) of m frames. body_pose: (a, 3) or (m, a, 3) of a free joints.
+    clothing: (a + 1,) of the segments of the root and the free joints. log_scale: () of the metres per unit of a scan.
+    """
+
+    betas: Float[Array, " s"]
+    global_orient: Float[Array, "*m 3"]
+    transl: Float[Array, "*m 3"]
+    body_pose: Float[Array, "*m a 3"]
+    cameras: CameraState | None = None
+    clothing: Float[Array, " b"] | None = None
+    log_scale: Float[Array, ""] | None = None
+
+
+@pytree_dataclass
+class CameraOrigin:
+    """v views. K: (v, 3, 3). cam_from_world: (v, 4, 4). camera, focal, frame: (v,) which ones of the state a view has."""
+
+    K: Float[Array, "v 3 3"]
+    cam_from_world: Float[Array, "v 4 4"]
+    camera: Int[Array, " v"]
+    focal: Int[Array, " v"]
+    frame: Int[Array, " v"]
+
+
+@pytree_dataclass
+class Origin:
+    """Where zeros are, and the unit of each number.
+
+    betas: (s,). pose: of one frame or a batch of m. body_pose_std: (a, 3) radians. segment: (j,) which number of
+    `FitState.clothing` covers what a joint moves. Static: joints, the a free ones besides the root (joint 0); std.
+    """
+
+    betas: Float[Array, " s"]
+    pose: BodyPose
+    body_pose_std: Float[Array, "a 3"]
+    cameras: CameraOrigin | None = None
+    segment: Int[Array, " j"] | None = None
+    joints: tuple[int, ...] = static_field(default=())
+    std: StateStd = static_field(default=FREE)
+
+    @property
+    def views(self) -> CameraOrigin:
+        """The cameras. Raises: ValueError if there are none."""
+        if self.cameras is None:
+            raise ValueError("expected an origin with cameras")
+        return self.cameras
+
+
+def usual_origin(prior: PosePrior, joints: tuple[int, ...], coefficients: int) -> Origin:
+    """The mean shape in its usual pose at the world's origin."""
+    pose = BodyPose(jnp.asarray(prior.mean), jnp.zeros(3))
+    std = jnp.asarray(prior.std[np.asarray(joints, int)])
+    return Origin(betas=jnp.zeros(coefficients), pose=pose, body_pose_std=std, joints=joints)
+
+
+def zero_state(origin: Origin, *, scaled: bool = False) -> FitState:
+    """The state of the origin. scaled: with the scale of a scan."""
+    frames, a = origin.pose.translation.shape[:-1], len(origin.joints)
+    cameras = None
+    if (views := origin.cameras) is not None:
+        count = int(views.camera.max()) + 1
+        cameras = CameraState(jnp.zeros((count, 3)), jnp.zeros((count, 3)), jnp.zeros(int(views.focal.max()) + 1))
+    return FitState(
+        betas=jnp.zeros(len(origin.betas)),
+        global_orient=jnp.zeros((*frames, 3)),
+        transl=jnp.zeros((*frames, 3)),
+        body_pose=jnp.zeros((*frames, a, 3)),
+        cameras=cameras,
+        clothing=None if origin.segment is None else jnp.zeros(a + 1),
+        log_scale=jnp.zeros(()) if scaled else None,
+    )
+
+
+def frame_axes(state: FitState) -> FitState:
+    """`in_axes` of `jax.vmap` for a state with one shape and a batch of frames."""
+    return replace(
+        state, betas=None, global_orient=0, transl=0, body_pose=0, cameras=None, clothing=None, log_scale=None
+    )
+
+
+def betas_of(origin: Origin, state: FitState) -> Float[Array, " s"]:
+    """Shape coefficients."""
+    return origin.betas + origin.std.betas * state.betas
+
+
+def pose_of(origin: Origin, state: FitState) -> BodyPose:
+    """The pose, or the batch of poses; differentiable everywhere. Joints that are not free are as in the origin."""
+    rotations = origin.pose.rotations
+    rotations = rotations.at[..., np.asarray(origin.joints, int), :].add(origin.body_pose_std * state.body_pose)
+    turn = quaternion.from_axis_angle(math.radians(origin.std.global_orient) * state.global_orient)
+    root = quaternion.multiply(turn, quaternion.from_axis_angle(origin.pose.rotations[..., 0, :]))
+    rotations = rotations.at[..., 0, :].set(quaternion.to_axis_angle(root))
+    translation = origin.pose.translation + origin.std.transl * state.transl
+    return replace(origin.pose, rotations=rotations, translation=translation)
+
+
+def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitState:
+    """The state of a shape and a pose, whose other joints are taken to be as in the origin. No cameras, clothing or scale."""
+    joints, start = np.asarray(origin.joints, int), origin.pose
+    conjugate = quaternion.from_axis_angle(-start.rotations[..., 0, :])
+    turn = quaternion.multiply(quaternion.from_axis_angle(pose.rotations[..., 0, :]), conjugate)
+    bends = pose.rotations[..., joints, :] - start.rotations[..., joints, :]
+    return FitState(
+        betas=(betas - origin.betas) / origin.std.betas,
+        global_orient=quaternion.to_axis_angle(turn) / math.radians(origin.std.global_orient),
+        transl=(pose.translation - start.translation) / origin.std.transl,
+        body_pose=bends / origin.body_pose_std,
+    )
+
+
+def cameras_of(origin: Origin, state: FitState) -> tuple[Float[Array, "v 3 3"], Float[Array, "v 4 4"]]:
+    """K and cam_from_world of every view: a camera turns about its centre, in its own axes, and the centre moves.
+
+    Raises: ValueError if origin or state is without cameras.
+    """
+    start, moved, std = origin.views, state.cameras, origin.std
+    if moved is None:
+        raise ValueError("expected a state with cameras")
+    turn = quaternion.matrix_from_axis_angle(math.radians(std.camera_rotation) * moved.rotations[start.camera])
+    center = transform.invert_rigid(start.cam_from_world)[:, :3, 3] + std.camera_center * moved.centers[start.camera]
+    rotation = jnp.matmul(turn, start.cam_from_world[:, :3, :3], precision=EXACT)
+    translation = -jnp.einsum("vab,vb->va", rotation, center, precision=EXACT)
+    zoom = jnp.exp(std.focal * moved.log_focals)[start.focal]
+    factors = jnp.stack([zoom, zoom, jnp.ones_like(zoom)], axis=-1)
+    K = start.K * (jnp.eye(3) * factors[:, None] + (1 - jnp.eye(3)))
+    return K, transform.make(rotation, translation)
+
+
+def clothing_thickness(origin: Origin, state: FitState, weights: Float[Array, "*p j"]) -> Float[Array, "*p"]:
+    """Metres by which masks reach beyond the body, at points with these skinning weights; 0 without clothing."""
+    if origin.segment is None or state.clothing is None:
+        return jnp.zeros(weights.shape[:-1])
+    return origin.std.clothing * jnp.matmul(weights, state.clothing[origin.segment])
+
+
+def scale_of(state: FitState) -> Float[Array, ""]:
+    """Metres per unit of a scan's frame; 1 if the state has no scale."""
+    return jnp.ones(()) if state.log_scale is None else jnp.exp(LOG_SCALE_STD * state.log_scale)
+
+
+def segments(parents: tuple[int, ...], joints: tuple[int, ...]) -> Int[np.ndarray, " j"]:
+    """(j,) 0 for the root, 1 + i for joint `joints[i]`, and for other joints the number of their nearest such ancestor."""
+    number = {joint: i + 1 for i, joint in enumerate(joints)} | {parents.index(-1): 0}
+
+    def of(joint):
+        return number[joint] if joint in number else of(parents[joint])
+
+    return np.asarray([of(j) for j in range(len(parents))], np.int32)
+
+
+def camera_origin(cameras: Camera, frames: Int[np.ndarray, " v"], shared_focal: bool) -> CameraOrigin:
+    """Cameras as they are: views of equal K and cam_from_world are of one camera that stood still.
+
+    Arguments: shared_focal: focal lengths that are equal stay equal; otherwise each camera has its own.
+    """
+    K, matrices = np.asarray(cameras.K, float), np.asarray(cameras.cam_from_world, float)
+    camera = _numbered(
+        len(K),
+        lambda i, j: (
+            np.allclose(K[i], K[j], rtol=SAME, atol=SAME) and np.allclose(matrices[i], matrices[j], rtol=0, atol=SAME)
+        ),
+    )
+    same_focal = lambda i, j: np.allclose(K[i, [0, 1], [0, 1]], K[j, [0, 1], [0, 1]], rtol=SAME)
+    focal = _numbered(len(K), same_focal) if shared_focal else camera
+    return CameraOrigin(cameras.K, cameras.cam_from_world, *map(jnp.asarray, (camera, focal, frames)))
+
+
+def with_cameras(origin: Origin, cameras: Camera) -> Origin:
+    """The same origin with the K of photos of another size."""
+    return replace(origin, cameras=replace(origin.views, K=cameras.K))
+
+
+def _numbered(count, equal):
+    """Numbers from 0: items that equal an earlier one have its number."""
+    firsts, numbers = [], []
+    for i in range(count):
+        found = next((k for k, first in enumerate(firsts) if equal(first, i)), len(firsts))
+        firsts += [i] * (found == len(firsts))
+        numbers.append(found)
+    return np.asarray(numbers, np.int32)
