@@ -33,39 +33,33 @@ RING = 40
 
 def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float) -> list[tuple[Surface, Material]]:
     """Surfaces and materials of an accessory. ease: distance of the outermost layer from the trunk, metres."""
-    kind, sizes = garment.kind, garment.sizes
-    cloth = weave(garment.fabric)
-    knit = Material(cloth, wrinkles=0.3)
+    kind, sizes, cloth = garment.kind, garment.sizes, weave(garment.fabric)
+    knit, felt = Material(cloth, wrinkles=0.3), lambda colours: Material(colours, wrinkles=0.05)
+    hat = lambda thickness, bumps, crown: hair.scalp_shell(
+        rng, anatomy, thickness, bumps, hair.CAP_LINE, rim=0.011, crown=crown
+    )
     if kind == "scarf":
         return [(scarf(rng, anatomy, sizes["thickness"], sizes["tails"], ease), knit)]
     if kind == "beanie":
-        return [
-            (
-                hair.scalp_shell(
-                    rng, anatomy, rng.uniform(0.014, 0.019), 0.04, hair.CAP_LINE, rim=0.011, crown=rng.uniform(0, 0.03)
-                ),
-                knit,
-            )
-        ]
+        return [(hat(rng.uniform(0.014, 0.019), 0.04, crown=rng.uniform(0, 0.03)), knit)]
     if kind == "cap":
-        crown = hair.scalp_shell(rng, anatomy, 0.016, 0.0, hair.CAP_LINE, rim=0.011, crown=0.008)
-        return [
-            (
-                join([crown, peak(anatomy, sizes["brim"], sizes["backwards"] > 0)]),
-                Material(_panelled(cloth), wrinkles=0.05),
-            )
-        ]
+        parts = [hat(0.016, 0.0, crown=0.008), peak(anatomy, sizes["brim"], sizes["backwards"] > 0)]
+        return [(join(parts), felt(_panelled(cloth)))]
     if kind == "brim_hat":
-        crown = hair.scalp_shell(rng, anatomy, 0.017, 0.0, hair.CAP_LINE, rim=0.011, crown=0.05)
-        ribbon = _ribboned(cloth, garment.fabric.other)
-        return [(join([crown, brim(rng, anatomy, sizes["brim"])]), Material(ribbon, wrinkles=0.05))]
+        parts = [hat(0.017, 0.0, crown=0.05), brim(rng, anatomy, sizes["brim"])]
+        return [(join(parts), felt(_ribboned(cloth, garment.fabric.other)))]
     if kind == "headscarf":
         return [(headscarf(rng, anatomy), knit)]
     if kind in ("glasses", "sunglasses"):
-        return glasses(
-            anatomy, sizes["size"], sizes["squareness"], sizes["wire"], kind == "sunglasses", garment.fabric.base
-        )
-    return [(necklace(anatomy, sizes["length"]), Material(_metal(garment.fabric.rng(2)), sheen=0.6))]
+        shape = sizes["size"], sizes["squareness"], sizes["wire"]
+        return glasses(anatomy, *shape, kind == "sunglasses", garment.fabric.base)
+    metal = colour(0.12, 0.5, 0.75) if garment.fabric.rng(2).random() < 0.5 else colour(0.6, 0.04, 0.72)
+    return [(necklace(anatomy, sizes["length"]), Material(_painted(metal), sheen=0.6))]
+
+
+def _painted(dye):
+    """One colour everywhere."""
+    return lambda s: np.broadcast_to(np.asarray(dye, np.float32), (len(s.cloth), 3)).astype(np.float32)
 
 
 def neck_ring(anatomy: Anatomy, lift: float) -> tuple[np.ndarray, np.ndarray]:
@@ -237,11 +231,6 @@ def _ribboned(cloth, ink):
     return albedo
 
 
-def _metal(rng):
-    base = colour(0.12, 0.5, 0.75) if rng.random() < 0.5 else colour(0.6, 0.04, 0.72)
-    return lambda s: np.broadcast_to(base, (len(s.cloth), 3)).astype(np.float32)
-
-
 def glasses(
     anatomy: Anatomy, size: float, squareness: float, wire: float, dark: bool, ink: np.ndarray
 ) -> list[tuple[Surface, Material]]:
@@ -284,13 +273,10 @@ def glasses(
     )
     parts.append(sweep(bridge, np.tile([0.0, 1.0, 0.0], (7, 1)), np.full((7, 2), wire), 6))
 
-    def painted(dye):
-        return lambda s: np.broadcast_to(np.asarray(dye, np.float32), (len(s.cloth), 3)).astype(np.float32)
-
-    result = [(join([_on_head(anatomy, v, f, v - middle) for v, f in parts]), Material(painted(ink), sheen=0.4))]
+    result = [(join([_on_head(anatomy, v, f, v - middle) for v, f in parts]), Material(_painted(ink), sheen=0.4))]
     if dark:
         lens = join([_on_head(anatomy, v, f, v - middle) for v, f in lenses])
-        result.append((lens, Material(painted(colour(0.08, 0.3, 0.06)), sheen=0.7)))
+        result.append((lens, Material(_painted(colour(0.08, 0.3, 0.06)), sheen=0.7)))
     return result
 
 

@@ -113,10 +113,7 @@ def measure(
     template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
     vertices = np.asarray(vertices, np.float32)
     skin = Surface(
-        vertices,
-        faces,
-        weights,
-        {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth},
+        vertices, faces, weights, {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}
     )
     levels = np.arange(-1.3, 0.5, 0.02) * 1.0
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)

@@ -11,6 +11,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.people import kinematics as kin
+from humangs_jax.people.surfaces import Field, Points
 
 CANDIDATES = 400
 HAND_LENGTH = 0.6
@@ -67,7 +68,7 @@ def draw_goal(rng: np.random.Generator) -> str:
 def bend_arm(
     rng: np.random.Generator,
     build: kin.Build,
-    rotations: Float[np.ndarray, "j 3"],
+    rotations: kin.Rotations,
     goal: str,
     side: int,
     *,
@@ -115,7 +116,7 @@ def bend_arm(
     return float(clear[best])
 
 
-def arm_clearance(build: kin.Build, rotations: Float[np.ndarray, "j 3"]) -> float:
+def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
     """How far (metres) both forearms and hands are from the body and each other; negative if one is inside."""
     world, positions = kin.joint_positions(build, rotations)
     body, worst = body_capsules(build, world, positions), np.inf
@@ -131,9 +132,7 @@ Capsule = tuple[np.ndarray, np.ndarray, float]
 """Two ends (3,) and a radius, metres."""
 
 
-def body_capsules(
-    build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"]
-) -> list[Capsule]:
+def body_capsules(build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations) -> list[Capsule]:
     """Trunk, legs and head of a posed body."""
     sideways = 0.25 * (positions[kin.LEFT_HIP] - positions[kin.RIGHT_HIP])
     top = positions[kin.NECK] + world[kin.SPINE3] @ np.asarray([0, -0.06, 0])
@@ -152,7 +151,7 @@ def body_capsules(
 
 
 def arm_capsules(
-    build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: Float[np.ndarray, "j 3"], side: int
+    build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations, side: int
 ) -> list[Capsule]:
     """Upper arm, forearm and hand of one side."""
     _, shoulder, elbow, wrist = ARMS[side]
@@ -161,7 +160,7 @@ def arm_capsules(
     return [(positions[shoulder], positions[elbow], radius), (positions[elbow], tip, radius)]
 
 
-def clearance(build: kin.Build, capsules: list[Capsule], points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
+def clearance(build: kin.Build, capsules: list[Capsule], points: Points) -> Field:
     """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
     distances = []
     for a, b, radius in capsules:
@@ -208,7 +207,7 @@ GESTURES = {
 }
 
 
-def pose_hand(rng: np.random.Generator, rotations: Float[np.ndarray, "j 3"], side: int) -> None:
+def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> None:
     """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a random gesture."""
     first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
     odds = np.asarray([gesture.odds for gesture in GESTURES.values()])

@@ -16,7 +16,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.people.surfaces import edges_of, unit
+from humangs_jax.people.surfaces import Faces, Points, edges_of, unit
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 SIDES = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
@@ -47,7 +47,7 @@ class Atlas:
     """
 
     uvs: Float[np.ndarray, "u 2"]
-    faces: Int[np.ndarray, "f 3"]
+    faces: Faces
     vertices: Int[np.ndarray, " u"]
     charts: Int[np.ndarray, " f"]
     size: int
@@ -55,11 +55,7 @@ class Atlas:
 
 
 def unwrap(
-    vertices: Float[np.ndarray, "n 3"],
-    faces: Int[np.ndarray, "f 3"],
-    pieces: Int[np.ndarray, " f"],
-    size: int,
-    density: Float[np.ndarray, " f"],
+    vertices: Points, faces: Faces, pieces: Int[np.ndarray, " f"], size: int, density: Float[np.ndarray, " f"]
 ) -> Atlas:
     """Charts of a mesh, none across two `pieces` (a number per face), packed into size x size texels.
 

@@ -14,7 +14,7 @@ from humangs_jax.people.atlas import Atlas, texels, unwrap
 from humangs_jax.people.kinematics import HEAD
 from humangs_jax.people.rendering import paint, spots_at
 from humangs_jax.people.subject import SyntheticSubject
-from humangs_jax.people.surfaces import vertex_normals
+from humangs_jax.people.surfaces import Faces, Points, vertex_normals
 
 JOINTS_PER_VERTEX = 6
 """Bodies have up to 7, smoothed garments up to 12; six lose at most 0.4 % of the weight, under a millimetre in any pose."""
@@ -42,9 +42,9 @@ class BakedSubject:
 
     seed: int
     betas: Float[np.ndarray, " s"]
-    vertices: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices: Points
+    normals: Points
+    faces: Faces
     joint_ids: UInt8[np.ndarray, "n k"]
     joint_weights: Float[np.ndarray, "n k"]
     face_materials: Int[np.ndarray, " f"]

@@ -231,12 +231,7 @@ def _stacked(people, body: BodyModel, split) -> PeopleBank:
     fields: dict[str, Any] = {}
     for name in _ARRAYS:
         fields[name] = jnp.asarray(np.stack([padded(name, p[name]) for p in people]))
-    return PeopleBank(
-        **fields,
-        parents=body.parents,
-        mirrored_joints=mirrored_joints(body.joint_names),
-        split=split,
-    )
+    return PeopleBank(**fields, parents=body.parents, mirrored_joints=mirrored_joints(body.joint_names), split=split)
 
 
 def mirrored_joints(names: tuple[str, ...]) -> tuple[int, ...]:

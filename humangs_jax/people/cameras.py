@@ -12,6 +12,8 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, orbit
+from humangs_jax.people.kinematics import Vector
+from humangs_jax.people.surfaces import Points
 
 VERTICAL_FOV = np.deg2rad(60.0)
 DISTANCE_FACTOR = (1.8, 2.2)
@@ -31,7 +33,7 @@ CAMERA_NUMBERS = 5
 UP = (0.0, 1.0, 0.0)
 
 
-def bounding_sphere(vertices: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "3"], float]:
+def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
     """Middle of the bounding box (3,) and the largest distance from it."""
     center = 0.5 * (vertices.min(0) + vertices.max(0))
     return center, float(np.linalg.norm(vertices - center, axis=1).max())
@@ -44,7 +46,7 @@ def spread_azimuths(rng: np.random.Generator, count: int, jitter: float = 0.3) -
 
 
 def cameras_around(
-    rng: np.random.Generator, vertices: Float[np.ndarray, "n 3"], azimuths: Float[np.ndarray, " v"], image_size: int
+    rng: np.random.Generator, vertices: Points, azimuths: Float[np.ndarray, " v"], image_size: int
 ) -> Camera:
     """A batch of cameras at the azimuths, distances and elevations drawn from the protocol's ranges."""
     center, radius = bounding_sphere(vertices)
@@ -57,7 +59,7 @@ def cameras_around(
 
 
 def close_cameras(
-    rng: np.random.Generator, vertices: Float[np.ndarray, "n 3"], azimuths: Float[np.ndarray, " v"], image_size: int
+    rng: np.random.Generator, vertices: Points, azimuths: Float[np.ndarray, " v"], image_size: int
 ) -> Camera:
     """A batch of cameras that see parts: `CLOSE_FACTOR` bounding radii away from points between middle and surface."""
     center, radius = bounding_sphere(vertices)

@@ -7,10 +7,24 @@ import numpy as np
 from humangs_jax.people.fabrics import Material, Spots, band, colour, mix
 from humangs_jax.people.hair import LONG_CUTS, SHORT_LINE, Haircut, above_line, beard_field
 from humangs_jax.people.noise import Ripples, lattice
+from humangs_jax.people.outfits import drawn
 
 EYE_X, EYE_Y, MOUTH_Y = 0.029, 0.330, 0.2629
 HAND_Y = 0.085
 """Template height that parts the backs of the hands from the palms."""
+
+
+HAIR = {
+    "black": (0.07, 0.3, (0.05, 0.12)),
+    "brown": ((0.05, 0.09), (0.5, 0.7), (0.15, 0.4)),
+    "blond": ((0.09, 0.13), (0.35, 0.6), (0.5, 0.76)),
+    "red": ((0.03, 0.06), (0.6, 0.8), (0.35, 0.6)),
+    "grey": (0.1, 0.05, (0.3, 0.66)),
+    "dyed": ((0, 1), 0.55, 0.55),
+}
+"""Hue, saturation and value of hair, or their ranges."""
+FAIR_ODDS, DARK_ODDS = np.asarray([[0.2, 0.35, 0.22, 0.08, 0.06, 0.05], [0.80, 0.12, 0.01, 0.0, 0.03, 0.03]])
+"""Odds of the colours of hair above, of fair and of dark skin."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,19 +67,13 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
         )
         lips = 0.3 * lips + 0.7 * dye
     grey = float(np.clip((years - 40) / 35, 0, 0.85))
-    odds = _hair_odds(darkness) * (1 - grey)
+    odds = (FAIR_ODDS + (DARK_ODDS - FAIR_ODDS) * np.clip((darkness - 0.22) / 0.2, 0, 1)) * (1 - grey)
     odds[4] += grey
     if years > 60:
         odds[5] *= 0.3
-    kind = rng.choice(["black", "brown", "blond", "red", "grey", "dyed"], p=odds / odds.sum())
-    hair = {
-        "black": colour(0.07, 0.3, rng.uniform(0.05, 0.12)),
-        "brown": colour(rng.uniform(0.05, 0.09), rng.uniform(0.5, 0.7), rng.uniform(0.15, 0.4)),
-        "blond": colour(rng.uniform(0.09, 0.13), rng.uniform(0.35, 0.6), rng.uniform(0.5, 0.76)),
-        "red": colour(rng.uniform(0.03, 0.06), rng.uniform(0.6, 0.8), rng.uniform(0.35, 0.6)),
-        "grey": colour(0.1, 0.05, rng.uniform(0.3, 0.66)),
-        "dyed": colour(rng.random(), 0.55, 0.55),
-    }[kind]
+    kind = rng.choice(list(HAIR), p=odds / odds.sum())
+    colours = {name: [drawn(rng, value) for value in values] for name, values in HAIR.items()}  # all of them are drawn
+    hair = colour(*colours[kind])
     brown = darkness > 0.45 or rng.random() < 0.4
     iris = colour(0.07, 0.6, rng.uniform(0.1, 0.3)) if brown else colour(rng.uniform(0.25, 0.62), 0.4, 0.5)
     nails = skin * [1.02, 0.9, 0.9]
@@ -86,15 +94,6 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
         blush=rng.uniform(0.3, 0.8) if made_up else rng.uniform(0.0, 0.35),
         tan=rng.uniform(0.0, 0.12) * (darkness < 0.6),
     )
-
-
-def _hair_odds(darkness):
-    dark = np.clip((darkness - 0.22) / 0.2, 0, 1)
-    fair_odds, dark_odds = (
-        np.asarray([0.2, 0.35, 0.22, 0.08, 0.06, 0.05]),
-        np.asarray([0.80, 0.12, 0.01, 0.0, 0.03, 0.03]),
-    )
-    return fair_odds + (dark_odds - fair_odds) * dark
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,7 +13,9 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.people.anatomy import ARMHOLE, SAME_GIRTH, TRUNK_GIRTH, sewn_coordinates
+from humangs_jax.people.kinematics import Vector
 from humangs_jax.people.noise import Ripples, hashed, lattice
+from humangs_jax.people.surfaces import Field, Points
 
 SHOULDER_RIDGE = -0.02
 """Template z of the line from neck to shoulder on which front and back are sewn together."""
@@ -29,13 +31,13 @@ class Spots:
     """
 
     cloth: Float[np.ndarray, "n 4"]
-    template: Float[np.ndarray, "n 3"]
+    template: Points
 
     def __post_init__(self):
         object.__setattr__(self, "cloth", sewn_coordinates(self.cloth, self.template))
 
     @property
-    def around(self) -> Float[np.ndarray, " n"]:
+    def around(self) -> Field:
         """(n,) metres around the trunk or limb, 0 in front; on the shoulders metres from the middle, back and front apart."""
         girth = self.cloth[:, 3]
         turned = np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * girth
@@ -47,7 +49,7 @@ class Spots:
         return turned + flat * (across - turned)
 
     @property
-    def along(self) -> Float[np.ndarray, " n"]:
+    def along(self) -> Field:
         """(n,) metres along the trunk or limb: height, but towards the shoulders the way up to their ridge."""
         rising = np.clip((self.template[:, 1] + 0.25) / 0.35, 0, 1) * self._on_trunk
         return self.cloth[:, 1] - rising * np.abs(self.template[:, 2] - SHOULDER_RIDGE)
@@ -77,7 +79,7 @@ class Material:
     draped: bool = False
 
 
-def colour(hue: float, saturation: float, value: float) -> Float[np.ndarray, "3"]:
+def colour(hue: float, saturation: float, value: float) -> Vector:
     """(3,) linear-as-given RGB."""
     return np.asarray(colorsys.hsv_to_rgb(hue % 1, np.clip(saturation, 0, 1), np.clip(value, 0, 1)), np.float32)
 
@@ -96,12 +98,12 @@ def _colour_of(rng, ranges):
     return colour(*(rng.uniform(*values) if len(values) == 2 else rng.choice(values) for values in ranges))
 
 
-def random_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
+def random_colour(rng: np.random.Generator) -> Vector:
     """A dye: neutral, muted, vivid, an earth colour or navy."""
     return _colour_of(rng, DYES[rng.choice(list(DYES), p=[odds for odds, *_ in DYES.values()])][1:])
 
 
-def accent(rng: np.random.Generator, base: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+def accent(rng: np.random.Generator, base: Vector) -> Vector:
     """A second dye that stands out from the first."""
     for _ in range(8):
         other = random_colour(rng)
@@ -117,12 +119,7 @@ def mix(
     return a + (b - a) * amount[:, None]
 
 
-def band(
-    x: Float[np.ndarray, " n"],
-    low: float | int | Float[np.ndarray, " n"],
-    high: float | int | Float[np.ndarray, " n"],
-    soft: float = 0.0015,
-) -> Float[np.ndarray, " n"]:
+def band(x: Field, low: float | int | Field, high: float | int | Field, soft: float = 0.0015) -> Field:
     """1 between low and high (metres), with soft edges."""
     return np.clip((x - low) / soft + 0.5, 0, 1) * np.clip((high - x) / soft + 0.5, 0, 1)
 
@@ -132,8 +129,8 @@ class Fabric:
     """pattern: key of PATTERNS. base, other: (3,) dyes. seed: of everything else about it (periods, prints, buttons)."""
 
     pattern: str
-    base: Float[np.ndarray, "3"]
-    other: Float[np.ndarray, "3"]
+    base: Vector
+    other: Vector
     seed: int
 
     def rng(self, stream: int) -> np.random.Generator:

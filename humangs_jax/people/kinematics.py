@@ -10,6 +10,11 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 
+Rotations = Float[np.ndarray, "j 3"]
+"""Rotation vectors of all joints, relative to their parents."""
+Vector = Float[np.ndarray, "3"]
+Matrix = Float[np.ndarray, "3 3"]
+
 PELVIS, LEFT_HIP, RIGHT_HIP, SPINE1, LEFT_KNEE, RIGHT_KNEE, SPINE2, LEFT_ANKLE, RIGHT_ANKLE, SPINE3 = range(10)
 LEFT_FOOT, RIGHT_FOOT, NECK, LEFT_COLLAR, RIGHT_COLLAR, HEAD = range(10, 16)
 LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST = range(16, 22)
@@ -54,7 +59,7 @@ REACH = 0.998
 class Build:
     """A body as the prior needs it: rest joints (j, 3), parents, and radii in metres of its clothed parts."""
 
-    joints: Float[np.ndarray, "j 3"]
+    joints: Rotations
     parents: tuple[int, ...]
     torso_radius: float
     thigh_radius: float
@@ -116,19 +121,17 @@ def between(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"], t: float
     return rotation_vector(first @ rotation_matrix(t * step))
 
 
-def about_x(angle: float) -> Float[np.ndarray, "3 3"]:
+def about_x(angle: float) -> Matrix:
     """Rotation about x: legs and feet swing backwards, heels up, for positive angles."""
     return rotation_matrix(np.asarray([angle, 0.0, 0.0]))
 
 
-def about_y(angle: float) -> Float[np.ndarray, "3 3"]:
+def about_y(angle: float) -> Matrix:
     """Rotation about the vertical: to the left for positive angles."""
     return rotation_matrix(np.asarray([0.0, angle, 0.0]))
 
 
-def joint_positions(
-    build: Build, rotations: Float[np.ndarray, "j 3"]
-) -> tuple[Float[np.ndarray, "j 3 3"], Float[np.ndarray, "j 3"]]:
+def joint_positions(build: Build, rotations: Rotations) -> tuple[Float[np.ndarray, "j 3 3"], Rotations]:
     """World rotations (j, 3, 3) and positions (j, 3) of all joints for rotation vectors (j, 3)."""
     local = rotation_matrix(rotations)
     world, positions = np.empty_like(local), np.empty_like(build.joints, dtype=np.float64)
@@ -141,13 +144,13 @@ def joint_positions(
     return world, positions
 
 
-def limited(rotations: Float[np.ndarray, "j 3"]) -> Float[np.ndarray, "j 3"]:
+def limited(rotations: Rotations) -> Rotations:
     """Rotation vectors (j, 3) shortened to the limits of their joints."""
     angle = np.linalg.norm(rotations, axis=1)
     return rotations * np.minimum(1, _limit_angles() / np.maximum(angle, 1e-9))[:, None]
 
 
-def excess(rotations: Float[np.ndarray, "j 3"], joints: tuple[int, ...]) -> float:
+def excess(rotations: Rotations, joints: tuple[int, ...]) -> float:
     """By how much (radians) the worst of some joints exceeds its limit; negative if none does."""
     return float(np.max(np.linalg.norm(rotations[list(joints)], axis=1) - _limit_angles()[list(joints)]))
 
@@ -177,13 +180,10 @@ class Foot:
     lift: float = 0.0
 
 
-LEGS = (
-    (LEFT_HIP, LEFT_KNEE, LEFT_ANKLE, LEFT_FOOT),
-    (RIGHT_HIP, RIGHT_KNEE, RIGHT_ANKLE, RIGHT_FOOT),
-)
+LEGS = ((LEFT_HIP, LEFT_KNEE, LEFT_ANKLE, LEFT_FOOT), (RIGHT_HIP, RIGHT_KNEE, RIGHT_ANKLE, RIGHT_FOOT))
 
 
-def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
     """Position of the ankle, the ground at y = 0, and orientation of the foot. side: 0 left, 1 right."""
     _, _, ankle, ball = LEGS[side]
     a, b = build.joints[ankle], build.joints[ball]
@@ -197,7 +197,7 @@ def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Float[np.ndarray, "3"
 
 
 def highest_pelvis(
-    build: Build, turn: Float[np.ndarray, "3 3"], x: float, z: float, feet: tuple[Foot, Foot], reach: float = REACH
+    build: Build, turn: Matrix, x: float, z: float, feet: tuple[Foot, Foot], reach: float = REACH
 ) -> float:
     """The greatest height of the pelvis, turned by `turn`, above x, z, at which both legs reach their feet."""
     heights = []
@@ -209,9 +209,7 @@ def highest_pelvis(
     return min(heights)
 
 
-def place_feet(
-    build: Build, rotations: Float[np.ndarray, "j 3"], pelvis: Float[np.ndarray, "3"], feet: tuple[Foot, Foot]
-) -> float:
+def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: tuple[Foot, Foot]) -> float:
     """Set hips, knees, ankles and toes (in place) so that the feet are at their targets; the pelvis's rotation stays.
 
     pelvis: where the pelvis joint is, the ground at y = 0. Returns how far (metres) the worse ankle is from its place,

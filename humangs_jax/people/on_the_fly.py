@@ -100,7 +100,7 @@ class OnTheFlyConfig:
 
     input_views, target_views; input_size, target_size: pixels a side. poses: poses per example; targets show any of them.
     mixed_pose_share: share of examples whose inputs show any of the poses too, each; otherwise all show the first.
-    jitter, scattered_share: see `live_camera.azimuths_from`. close_share: share of close cameras among the targets.
+    jitter, scattered_share: see `cameras.azimuths_from`. close_share: share of close cameras among the targets.
     mirrored_share, dyed_share: of examples. supersampling: samples a side of each pixel.
     views_at_once: views drawn side by side: 1 suits CPUs, all of them accelerators. pixels_per_step: of the person, that are
     coloured at a time: few for CPUs, whole images for accelerators.

@@ -10,6 +10,7 @@ import numpy as np
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.people.kinematics import Rotations
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 
 OUTSIDE = 2e-3
@@ -44,7 +45,7 @@ class OverlapMeter:
         self.at_rest = np.zeros(len(self.body.template), bool)
         self.at_rest = self.inside(np.zeros((len(body.parents), 3)))
 
-    def inside(self, rotations: Float[np.ndarray, "j 3"]) -> Bool[np.ndarray, " n"]:
+    def inside(self, rotations: Rotations) -> Bool[np.ndarray, " n"]:
         """The vertices (n,) that a pose of rotation vectors (j, 3) puts inside another part of the body."""
         return np.asarray(_inside(self.body, self.rest, jnp.asarray(rotations, jnp.float32))) & ~self.at_rest
 

@@ -8,7 +8,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float
 from humangs_jax.people import kinematics as kin
 from humangs_jax.people.arms import bend_arm, draw_goal, pose_hand
 
@@ -31,9 +30,7 @@ class Stance:
     lean: float = 0.0
 
 
-def sample_stance(
-    rng: np.random.Generator, build: kin.Build, rotations: Float[np.ndarray, "j 3"]
-) -> tuple[Stance, np.ndarray]:
+def sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations) -> tuple[Stance, np.ndarray]:
     """Set legs and pelvis in `rotations`, keeping the pelvis's heading. Returns the stance and the pelvis's position (3,)."""
     names = list(STANCES)
     odds = np.asarray([STANCES[name][0] for name in names])
@@ -47,9 +44,7 @@ def sample_stance(
     return stance, take_stance(build, rotations, heading[1], stance)[0]
 
 
-def take_stance(
-    build: kin.Build, rotations: Float[np.ndarray, "j 3"], heading: float, stance: Stance
-) -> tuple[Float[np.ndarray, "3"], float]:
+def take_stance(build: kin.Build, rotations: kin.Rotations, heading: float, stance: Stance) -> tuple[kin.Vector, float]:
     """Set pelvis and legs. Returns the pelvis's position, the ground at y = 0, and the larger error of the two feet, metres."""
     turn = kin.about_y(heading) @ kin.rotation_matrix(np.asarray([stance.tilt, 0.0, stance.roll]))
     rotations[kin.PELVIS] = kin.rotation_vector(turn)
@@ -180,7 +175,7 @@ CLEAR = 0.0
 """Least clearance of an accepted arm, metres."""
 
 
-def sample_rotations(rng: np.random.Generator, build: kin.Build) -> Float[np.ndarray, "j 3"]:
+def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotations:
     """(j, 3) rotation vectors of a random plausible pose; the lowest points of planted feet are at one height."""
     rotations = np.zeros((kin.JOINTS, 3))
     rotations[kin.PELVIS] = [0.0, rng.uniform(-0.7, 0.7), 0.0]
@@ -197,7 +192,7 @@ def sample_rotations(rng: np.random.Generator, build: kin.Build) -> Float[np.nda
     return kin.limited(rotations)
 
 
-def bend_trunk(rng: np.random.Generator, rotations: Float[np.ndarray, "j 3"], lean: float, roll: float) -> None:
+def bend_trunk(rng: np.random.Generator, rotations: kin.Rotations, lean: float, roll: float) -> None:
     """Set spine, neck and head in `rotations`.
 
     lean: how far the trunk bends forward, about. roll: of the pelvis, left side up, which the spine evens out.

@@ -16,9 +16,10 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.exr import ExrView, write_exr
 from humangs_jax.people import shading
 from humangs_jax.people.fabrics import Spots
+from humangs_jax.people.kinematics import Rotations, Vector
 from humangs_jax.people.noise import Folds
 from humangs_jax.people.subject import SyntheticSubject
-from humangs_jax.people.surfaces import vertex_normals
+from humangs_jax.people.surfaces import Faces, Field, Points, vertex_normals
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 SUPERSAMPLING = 2
@@ -40,17 +41,15 @@ class PosedSubject:
     """
 
     subject: SyntheticSubject
-    rotations: Float[np.ndarray, "j 3"]
-    translation: Float[np.ndarray, "3"]
-    vertices: Float[np.ndarray, "n 3"]
-    normals: Float[np.ndarray, "n 3"]
-    openness: Float[np.ndarray, " n"]
-    lit: Float[np.ndarray, " n"]
+    rotations: Rotations
+    translation: Vector
+    vertices: Points
+    normals: Points
+    openness: Field
+    lit: Field
 
 
-def pose_subject(
-    subject: SyntheticSubject, rotations: Float[np.ndarray, "j 3"], translation: Float[np.ndarray, "3"]
-) -> PosedSubject:
+def pose_subject(subject: SyntheticSubject, rotations: Rotations, translation: Vector) -> PosedSubject:
     """Skin the mesh and gather what its shading needs."""
     faces, count = subject.surface.faces, len(subject.surface.vertices)
     vertices = subject.posed_vertices(rotations, translation).astype(np.float32)
@@ -59,9 +58,7 @@ def pose_subject(
     return PosedSubject(subject, rotations, translation, vertices, normals, *(np.asarray(x)[:count] for x in shades))
 
 
-def padded(
-    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]
-) -> tuple[Float[Array, "n_padded 3"], Int[Array, "f_padded 3"]]:
+def padded(vertices: Points, faces: Faces) -> tuple[Float[Array, "n_padded 3"], Int[Array, "f_padded 3"]]:
     """A mesh with repeated vertices and faces without area up to the next step of sizes."""
     spare_vertices, spare_faces = -len(vertices) % VERTEX_STEP, -len(faces) % FACE_STEP
     vertices = np.concatenate([vertices, np.repeat(vertices[:1], spare_vertices, axis=0)]).astype(np.float32)
@@ -133,9 +130,7 @@ def spots_at(subject: SyntheticSubject, face_ids: Int[np.ndarray, " m"], weights
     return Spots(blended[:, :4], blended[:, 4:])
 
 
-def paint(
-    subject: SyntheticSubject, face_ids: Int[np.ndarray, " n"], spots: Spots
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+def paint(subject: SyntheticSubject, face_ids: Int[np.ndarray, " n"], spots: Spots) -> tuple[Points, Points]:
     """The materials at points on given faces: albedo (n, 3) and slope (n, 3) of the painted folds."""
     material_ids = subject.face_materials[face_ids]
     albedo, slope = np.empty((len(face_ids), 3), np.float32), np.zeros((len(face_ids), 3), np.float32)

@@ -17,10 +17,10 @@ from humangs_jax.people.anatomy import Anatomy
 from humangs_jax.people.complexion import Complexion, sample_complexion
 from humangs_jax.people.fabrics import Material
 from humangs_jax.people.hair import Haircut, sample_haircut
-from humangs_jax.people.kinematics import LEFT_KNEE, Build, joint_positions
+from humangs_jax.people.kinematics import LEFT_KNEE, Build, Rotations, Vector, joint_positions
 from humangs_jax.people.outfits import Garment, sample_outfit
 from humangs_jax.people.shading import Lights, sample_lights
-from humangs_jax.people.surfaces import Surface, compact, join
+from humangs_jax.people.surfaces import Field, Points, Surface, compact, join
 
 SHAPE_STD = 0.55
 """Standard deviation of the shape coefficients without a rule of their own; values are clipped at twice that."""
@@ -83,25 +83,11 @@ def sample_shape(
     youth = 0.04 * np.clip(18 - years, 0, 3) / 3 + 0.03 * np.clip((years - 60) / 25, 0, 1)
     tall = rng.standard_t(5) if rng.random() < 0.85 else rng.uniform(-2.6, 3.4)
     wanted = np.clip(mean - youth + std * tall, HEIGHT_RANGE[0], HEIGHT_RANGE[1] if male else TALLEST_WOMAN)
-    stature, gains = _stature(body)
+    *_, stature, gains = _host_arrays(body)
     share = np.asarray([gains[at[name]] for name in LENGTHS])
     missing = wanted - (stature + gains @ betas)
     betas[[at[name] for name in LENGTHS]] += missing * share / (share @ share)
     return betas.astype(np.float32), float(wanted)
-
-
-_STATURES: dict[int, tuple] = {}
-
-
-def _stature(body):
-    """Height of the mean body and metres (s,) that a unit of each coefficient adds; kept for the body used last."""
-    if id(body) not in _STATURES:
-        template, directions = np.asarray(body.template), np.asarray(body.shape_directions)
-        top, bottom = np.argmax(template[:, 1]), np.argmin(template[:, 1])
-        gains = (directions[top, 1] - directions[bottom, 1]).astype(float)
-        _STATURES.clear()
-        _STATURES[id(body)] = (body, float(template[top, 1] - template[bottom, 1]), gains)
-    return _STATURES[id(body)][1:]
 
 
 UNDER_CLOTH = 0.003
@@ -126,12 +112,10 @@ class SyntheticSubject:
     lights: Lights
     build: Build
     under_cloth: Bool[np.ndarray, " n"]
-    cover: Float[np.ndarray, " n"]
+    cover: Field
     person: Person
 
-    def posed_vertices(
-        self, rotations: Float[np.ndarray, "j 3"], translation: Float[np.ndarray, "3"]
-    ) -> Float[np.ndarray, "n 3"]:
+    def posed_vertices(self, rotations: Rotations, translation: Vector) -> Points:
         """(n, 3) world positions of the mesh in a pose: rotations (j, 3), translation (3,)."""
         transforms = self._transforms(rotations, translation)
         blended = (self.surface.weights @ transforms[:, :3].reshape(len(transforms), 12)).reshape(-1, 3, 4)
@@ -159,7 +143,7 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
         raise ValueError(f"synthetic people need the shipped body '{anatomy_module.BODY_NAME}', got '{body.name}'")
     person = describe(seed, body)
     rest = _shape(body, jnp.asarray(person.betas))
-    template, faces, weights = _host_arrays(body)
+    template, faces, weights, *_ = _host_arrays(body)
     anatomy = anatomy_module.measure(
         np.asarray(rest.vertices), np.asarray(rest.joints), template, faces, weights, body.parents
     )
@@ -196,11 +180,17 @@ _HOST: dict[int, tuple] = {}
 
 
 def _host_arrays(body):
-    """Template, faces and weights as numpy; kept for the body used last."""
+    """Template, faces and weights as numpy; height of the mean body, and metres (s,) that a unit of each coefficient adds to it.
+
+    Kept for the body used last.
+    """
     if id(body) not in _HOST:
+        template, faces, weights = (np.asarray(a) for a in (body.template, body.faces, body.skinning_weights))
+        top, bottom = np.argmax(template[:, 1]), np.argmin(template[:, 1])
+        directions = np.asarray(body.shape_directions)
+        gains = (directions[top, 1] - directions[bottom, 1]).astype(float)
         _HOST.clear()
-        arrays = (body.template, body.faces, body.skinning_weights)
-        _HOST[id(body)] = (body, *(np.asarray(a) for a in arrays))
+        _HOST[id(body)] = (body, template, faces, weights, float(template[top, 1] - template[bottom, 1]), gains)
     return _HOST[id(body)][1:]
 
 

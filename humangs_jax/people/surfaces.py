@@ -13,6 +13,10 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float, Int
 
+Points = Float[np.ndarray, "n 3"]
+Faces = Int[np.ndarray, "f 3"]
+Field = Float[np.ndarray, " n"]
+
 NORMAL_FLOOR = 1e-12
 """Added to lengths before dividing: vertices without area get the zero normal."""
 
@@ -21,12 +25,12 @@ NORMAL_FLOOR = 1e-12
 class Surface:
     """vertices: (n, 3) metres at rest. faces: (f, 3). weights: (n, j) skinning weights. attributes: name -> (n, ...)."""
 
-    vertices: Float[np.ndarray, "n 3"]
-    faces: Int[np.ndarray, "f 3"]
+    vertices: Points
+    faces: Faces
     weights: Float[np.ndarray, "n j"]
     attributes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
-    def moved(self, vertices: Float[np.ndarray, "n 3"]) -> "Surface":
+    def moved(self, vertices: Points) -> "Surface":
         """The same surface with other vertex positions."""
         return dataclasses.replace(self, vertices=np.asarray(vertices, np.float32))
 
@@ -34,20 +38,20 @@ class Surface:
         """The same surface with more (or other) attributes."""
         return dataclasses.replace(self, attributes={**self.attributes, **attributes})
 
-    def painted(self, template: Float[np.ndarray, "n 3"], cloth: Float[np.ndarray, "n 3"], girth: float) -> "Surface":
+    def painted(self, template: Points, cloth: Points, girth: float) -> "Surface":
         """The same surface with template and cloth coordinates; girth: radius that turns angles into metres."""
         cloth = np.concatenate([cloth, np.full((len(cloth), 1), girth)], 1).astype(np.float32)
         return self.with_attributes(template=np.asarray(template, np.float32), cloth=cloth)
 
 
-def rigid(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], joint: int, joints: int) -> Surface:
+def rigid(vertices: Points, faces: Faces, joint: int, joints: int) -> Surface:
     """A surface whose vertices all follow one joint; joints: how many there are."""
     weights = np.zeros((len(vertices), joints), np.float32)
     weights[:, joint] = 1
     return Surface(np.asarray(vertices, np.float32), faces, weights)
 
 
-def vertex_normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
+def vertex_normals(vertices: Points, faces: Faces) -> Points:
     """(n, 3) area-weighted unit normals."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
     face_normals = np.cross(b - a, c - a)
@@ -67,12 +71,12 @@ def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     return vectors / (np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)) + NORMAL_FLOOR)
 
 
-def edges_of(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+def edges_of(faces: Faces) -> Int[np.ndarray, "e 2"]:
     """(e, 2) directed edges of all faces, three per face."""
     return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
-def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
+def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
     """(e, 2) directed edges that only one face has: the hems."""
     edges = edges_of(faces).astype(np.int64)
     count = int(faces.max()) + 1
@@ -82,11 +86,7 @@ def boundary_edges(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, "e 2"]:
 
 
 def smooth(
-    values: Float[np.ndarray, "n c"],
-    faces: Int[np.ndarray, "f 3"],
-    iterations: int,
-    strength: float = 0.5,
-    keep_hems: bool = False,
+    values: Float[np.ndarray, "n c"], faces: Faces, iterations: int, strength: float = 0.5, keep_hems: bool = False
 ) -> Float[np.ndarray, "n c"]:
     """Laplacian smoothing of vertex values (n, c): each step moves a vertex towards the mean of its neighbours.
 
@@ -125,7 +125,7 @@ def compact(surface: Surface, face_mask: Bool[np.ndarray, " f"]) -> Surface:
     )
 
 
-def cut(surface: Surface, field: Float[np.ndarray, " n"]) -> Surface:
+def cut(surface: Surface, field: Field) -> Surface:
     """The part where a per-vertex field (n,) is positive, cut exactly along its zero line."""
     field = np.where(np.abs(field) < 1e-6, 1e-6, field).astype(np.float32)
     inside = field > 0
@@ -196,7 +196,7 @@ def turn_in_hems(surface: Surface, depth: float) -> Surface:
     )
 
 
-def grid_faces(rows: int, columns: int, closed: bool) -> Int[np.ndarray, "f 3"]:
+def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
     """Triangles of a (rows, columns) grid of vertices, row-major; `closed`: the last column joins the first.
 
     Counter-clockwise seen from the side where columns run to the right and rows run down.
@@ -208,7 +208,7 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Int[np.ndarray, "f 3"]:
     return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.int32)
 
 
-def ball(rows: int, columns: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]:
+def ball(rows: int, columns: int) -> tuple[Points, Faces]:
     """Unit vectors on a grid of polar angles (from +y) and azimuths (from +z), and its faces."""
     polar, around = np.meshgrid(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns, indexing="ij")
     directions = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], -1)
@@ -221,7 +221,7 @@ def sweep(
     widths: Float[np.ndarray, "m 2"],
     columns: int = 10,
     closed: bool = False,
-) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]:
+) -> tuple[Points, Faces]:
     """Vertices (m columns, 3) and faces of a tube of elliptic sections along a path (m, 3).
 
     across: (m, 3) directions of the first half axis, made normal to the path. widths: (m, 2) half axes, metres.

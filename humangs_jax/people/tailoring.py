@@ -2,11 +2,8 @@
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float
 from humangs_jax.people.anatomy import FLOOR
-
-Points = Float[np.ndarray, "n 3"]
-Field = Float[np.ndarray, " n"]
+from humangs_jax.people.surfaces import Field, Points
 
 TRUNK_HALF_WIDTH = 0.25
 """In T-pose everything further out than this is an arm."""

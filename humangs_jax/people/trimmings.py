@@ -8,10 +8,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.array_types import Bool
 from humangs_jax.people.anatomy import ARMHOLE
 from humangs_jax.people.fabrics import Spots, accent, band, colour, mix
 from humangs_jax.people.noise import lattice
+from humangs_jax.people.surfaces import Field
 
 ROWS, ADVANCE = 7, 6
 """Cells of a letter: rows, and columns from one letter to the next."""
@@ -70,9 +71,7 @@ def random_text(rng: np.random.Generator) -> str:
     return "".join(syllables)
 
 
-def written(
-    cells: Bool[np.ndarray, "7 w"], x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]
-) -> Float[np.ndarray, " n"]:
+def written(cells: Bool[np.ndarray, "7 w"], x: Field, y: Field) -> Field:
     """(n,) ink of a word at points given in cells from its lower left corner, x to the right, y up; edges are rounded."""
     padded = np.pad(cells.astype(np.float32), 1)
     column = np.clip(x + 0.5, 0, padded.shape[1] - 1.001)
@@ -84,9 +83,7 @@ def written(
     return np.clip(((top * (1 - u) + bottom * u) - 0.45) / 0.2 + 0.5, 0, 1).astype(np.float32)
 
 
-def emblem(
-    kind: str, x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"], points: int = 5
-) -> Float[np.ndarray, " n"]:
+def emblem(kind: str, x: Field, y: Field, points: int = 5) -> Field:
     """(n,) how far inside of an emblem of radius 1 or so: positive inside, in units of x and y. `points`: of a star."""
     r, a = np.sqrt(x * x + y * y), np.arctan2(x, y)
     if kind == "disc":

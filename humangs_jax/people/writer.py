@@ -263,12 +263,7 @@ def _make(seeds, folders, layout, body, workers):
 def _attempt(folder, seed, body, layout):
     try:
         write_person(folder, seed, body, layout)
-    except (
-        ValueError,
-        ArithmeticError,
-        IndexError,
-        KeyError,
-    ) as error:  # of the generator; a full disk ends everything
+    except (ValueError, ArithmeticError, IndexError, KeyError) as error:  # not OSError: a full disk ends everything
         return error
     return None
 

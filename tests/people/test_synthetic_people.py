@@ -1,7 +1,5 @@
 """Whole people: deterministic, dressed, in the frame, on the ground; and their capture folders."""
 
-import json
-
 import jax
 import numpy as np
 import pytest
@@ -9,10 +7,10 @@ import pytest
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import load_capture
-from humangs_jax.people import cameras, fabrics, rendering, seeds, subject, writer
+from humangs_jax.people import cameras, fabrics, rendering, subject, writer
 from humangs_jax.people.fabrics import PATTERNS
 from humangs_jax.people.kinematics import LEFT_HIP, LEFT_KNEE
-from humangs_jax.people.seeds import DEMO, SPLITS, split_of
+from humangs_jax.people.seeds import DEMO
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 SEEDS = [DEMO[i] for i in range(6)]
@@ -65,16 +63,6 @@ def test_different_seeds_are_different_people(people):
     shapes = np.stack([person.betas for person in people])
     assert np.linalg.norm(shapes[:, None] - shapes[None], axis=-1)[np.triu_indices(len(SEEDS), 1)].min() > 0.5
     assert len({len(person.surface.vertices) for person in people}) > 3
-
-
-def test_seed_ranges_are_disjoint_and_complete():
-    ranges = list(SPLITS.values())
-    for i, a in enumerate(ranges):
-        for b in ranges[i + 1 :]:
-            assert a.stop <= b.start or b.stop <= a.start
-    assert all(split_of(r[0]) == name == split_of(r[-1]) for name, r in SPLITS.items())
-    with pytest.raises(ValueError, match="no range"):
-        split_of(seeds.DEMO.stop)
 
 
 def test_other_bodies_are_refused(body):
@@ -243,22 +231,3 @@ def test_a_written_subject_loads_back(tmp_path, body, people):
     image, mask = rendering.render_view(writer.sample_pose(people[0], 0), inputs.cameras[1])
     assert np.abs(image - inputs.images[1]).max() < 2 * EIGHT_BITS
     assert np.abs(mask - inputs.masks[1]).max() < 2 * EIGHT_BITS
-
-
-def test_a_set_is_resumed_and_keeps_what_is_there(tmp_path, body):
-    write = lambda count, first=0, split="demo", views=2: writer.write_set(
-        tmp_path, count, writer.Layout(32, poses=2, views=views), split, first, body=body, progress=False
-    )
-    (first,) = write(1)
-    stamp = (first / "capture.json").stat().st_mtime_ns
-    (tmp_path / f".{DEMO[1]:07d}.1").mkdir()  # what a killed run leaves
-    folders = write(2)
-    assert (first / "capture.json").stat().st_mtime_ns == stamp
-    capture = load_capture(folders[1], body=body)
-    np.testing.assert_array_equal(capture.frames, [0, 0, 1, 1])
-    manifest = json.loads((tmp_path / "manifest.json").read_text())
-    assert manifest["subjects"] == [f.name for f in folders]
-    with pytest.raises(ValueError, match="written with settings"):
-        write(1, views=3)
-    with pytest.raises(ValueError, match="reach beyond"):
-        write(2, len(DEMO) - 1)

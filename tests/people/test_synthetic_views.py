@@ -178,6 +178,8 @@ def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):
     assert not remains.exists()
     write(4)
     assert made == list(DEMO[:4])  # nobody twice
+    manifest = json.loads((tmp_path / "manifest.json").read_text())
+    assert manifest["subjects"] == [f"{seed:07d}" for seed in DEMO[:4]]
     with pytest.raises(ValueError, match=r"image_size 32 -> 64\): choose another folder"):
         write(4, layout=writer.Layout(64, views=2))
     with pytest.raises(ValueError, match="of the split 'demo', now asked for 'train'"):
@@ -267,6 +269,9 @@ def test_the_splits_share_no_seed():
     ranges = sorted(SPLITS.values(), key=lambda r: r.start)
     assert all(a.stop <= b.start for a, b in itertools.pairwise(ranges))
     assert all(r.step == 1 and 0 <= r.start < r.stop <= 2**32 for r in ranges)  # seeds are words of keys
+    assert all(split_of(r[0]) == name == split_of(r[-1]) for name, r in SPLITS.items())
+    with pytest.raises(ValueError, match="no range"):
+        split_of(SPLITS["demo"].stop)
 
 
 @given(st.integers(0, len(SPLITS["train"]) - 1), st.integers(1, 50))
