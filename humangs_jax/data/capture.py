@@ -114,6 +114,7 @@ def capture_from_arrays(
     background: str = "photo",
     body: BodyModel | None = None,
     body_file: str | Path = DEFAULT_BODY,
+    source: str = "arrays",
 ) -> Capture:
     """A checked capture from array-likes.
 
@@ -125,10 +126,10 @@ def capture_from_arrays(
         names: (v,) file names without suffix; "000", "001", ... if left out.
         background: "photo": the masks are used to put the images on white; "white": they are on white already.
         body: the model; None loads `body_file`, by default the body that comes with the package.
+        source: what errors call the arrays.
 
-    Raises: CaptureError.
+    Raises: CaptureError, one line that names the array and what was expected: a shape, finite numbers, a range.
     """
-    source = "arrays"
     images = numbers(images, source, "images")
     if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
         raise CaptureError(source, "images", f"expected shape (views, h, w, 3), got {images.shape}")
@@ -247,24 +248,27 @@ def read_parameters(file: Path) -> tuple[str, np.ndarray, np.ndarray, np.ndarray
 
 def _check_before_writing(capture):
     """Everything that reading would check, of a `Capture` made by hand."""
-    source, v = "capture", len(capture.images)
-    check_names(capture.names, v, source)
-    for field in ("images", "masks"):
-        if (array := getattr(capture, field)) is not None:
-            check_range(numbers(array, source, field), source, field)
-    K, cam_from_world = np.asarray(capture.cameras.K), np.asarray(capture.cameras.cam_from_world)
-    if len(K) != v:
-        raise CaptureError(source, "cameras", f"expected {v}, one per image, got {len(K)}")
-    height, width = capture.images.shape[1:3]
-    if (capture.cameras.width, capture.cameras.height) != (width, height):
-        got = f"{capture.cameras.width} x {capture.cameras.height}"
-        raise CaptureError(source, "cameras", f"expected the image size {width} x {height}, got {got}")
-    for i in range(v):
-        checked_camera(K[i], cam_from_world[i], width, height, source, f"view {i}")
-    poses = capture.poses
-    body_parameters(capture.body, capture.betas, np.asarray(poses.rotations), np.asarray(poses.translation), source)
-    for i, frame in enumerate(capture.frames):
-        checked_frame(int(frame), capture.frame_count, source, f"frames[{i}]")
+    v, (height, width) = len(capture.images), capture.images.shape[1:3]
+    cameras, poses = capture.cameras, capture.poses
+    if len(cameras.K) != v:
+        raise CaptureError("capture", "cameras", f"expected {v}, one per image, got {len(cameras.K)}")
+    if (cameras.width, cameras.height) != (width, height):
+        got = f"{cameras.width} x {cameras.height}"
+        raise CaptureError("capture", "cameras", f"expected the image size {width} x {height}, got {got}")
+    capture_from_arrays(
+        capture.images,
+        np.asarray(cameras.K),
+        np.asarray(cameras.cam_from_world),
+        np.asarray(poses.rotations),
+        np.asarray(poses.translation),
+        betas=capture.betas,
+        masks=capture.masks,
+        frames=capture.frames,
+        names=capture.names,
+        background="white",
+        body=capture.body,
+        source="capture",
+    )
 
 
 def _write_folder(folder, capture, target):

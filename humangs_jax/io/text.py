@@ -6,6 +6,14 @@ from pathlib import Path
 from typing import Any
 
 
+class FileError(ValueError):
+    """Something is wrong with a file; the message is one line: file, field, and what was expected. Empty parts are left out."""
+
+    def __init__(self, file: object, field: str, problem: object):
+        parts = [str(part) for part in (file, field, problem) if part]
+        super().__init__(" ".join(": ".join(parts).split()))
+
+
 def read_text(path: str | os.PathLike) -> str:
     """The text of a file in UTF-8, with or without a byte order mark.
 

@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.data.loading.captures import CaptureCache, CaptureSource
-from humangs_jax.data.loading.examples import Example, Source, ViewSampling
+from humangs_jax.data.loading.examples import Example, Source
 from humangs_jax.data.loading.order import input_count_at
 from humangs_jax.data.loading.threads import Reader, Waiting, prefetched, read_in_order
 
@@ -121,40 +120,3 @@ def _stack(*leaves):
     """Where all were made on a device they stay there."""
     on_device = all(isinstance(leaf, jax.Array) for leaf in leaves)
     return jnp.stack(leaves) if on_device else np.stack([np.asarray(leaf) for leaf in leaves])
-
-
-@dataclasses.dataclass(frozen=True)
-class ExampleSource:
-    """Batches of capture folders in one process: a `Loader` of a `CaptureSource`, in short.
-
-    input_size, target_size: pixels a side of the square views.
-    """
-
-    cache: CaptureCache
-    sampling: ViewSampling
-    input_size: int
-    target_size: int
-    batch_size: int = 1
-    seed: int = 0
-
-    @property
-    def source(self) -> CaptureSource:
-        """The examples without their batches."""
-        return CaptureSource(self.cache, self.sampling, self.input_size, self.target_size)
-
-    @property
-    def loader(self) -> Loader:
-        """The batches."""
-        return Loader(self.source, self.batch_size, self.seed)
-
-    def batch_at(self, step: int) -> Example:
-        """The batch of a step: an `Example` with a leading axis of `batch_size` on every leaf."""
-        return self.loader.batch_at(step)
-
-    def example_at(self, index: int, input_count: int) -> Example:
-        """The index-th example of the run; the next usable subject in the order replaces a broken one."""
-        return jax.tree.map(jnp.asarray, self.source.example(self.seed, index, input_count))
-
-    def batches(self, start: int, stop: int, ahead: int = AHEAD) -> Generator[tuple[int, Example], None, None]:
-        """(step, batch) for start <= step < stop, prepared ahead by threads: see `Loader.batches`."""
-        return self.loader.batches(start, stop, ahead)
