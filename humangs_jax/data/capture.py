@@ -9,7 +9,6 @@ the file, the field and what was expected. In memory the images have a white bac
 """
 
 import dataclasses
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,8 +31,6 @@ from humangs_jax.data.capture_checks import (
     numbers,
 )
 from humangs_jax.data.photos import (
-    FORMAT,
-    VERSION,
     Photos,
     capture_folder,
     check_background,
@@ -41,6 +38,7 @@ from humangs_jax.data.photos import (
     on_white_background,
     read_description,
     read_photos,
+    write_description,
 )
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import replace_folder
@@ -287,9 +285,8 @@ def _write_folder(folder, capture, target):
         view["cam_from_world"] = np.asarray(capture.cameras.cam_from_world[i], float).tolist()
         views.append(view)
     background = "photo" if capture.masks is None else "white"
-    description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": background, "views": views}
     write_npz(folder / "body.npz", parameter_arrays(capture, target), compressed=False)
-    (folder / "capture.json").write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+    write_description(folder, views, background)
 
 
 def parameter_arrays(capture: Capture, folder: Path) -> dict[str, np.ndarray]:
