@@ -290,7 +290,7 @@ def _write_folder(folder, capture, target):
 
 
 def parameter_arrays(capture: Capture, folder: Path) -> dict[str, np.ndarray]:
-    """What body.npz of a capture in `folder` holds; the model file is named relative to it."""
+    """The arrays of body.npz of a capture in `folder`; the model file is named relative to it."""
     body_file = capture.body_file
     if body_file != DEFAULT_BODY:
         body_file = Path(os.path.relpath(Path(body_file).resolve(), folder.resolve())).as_posix()

@@ -44,7 +44,7 @@ AIST_FPS, DEFAULT_FPS = 60.0, 30.0
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 MILLIMETRES = 1000.0
 PELVIS = np.array([0.0, -0.35, 0.0])
-"""Where SMPL-X's root joint (and the shipped body's) is in T-pose, metres: a world is turned about the posed one. Other
+"""Where SMPL-X's root joint (and the shipped body's) is in T-pose, metres: worlds are turned about it. Other
 bodies are off by a constant, which `grounded` removes."""
 UPRIGHT = {
     "y": (1.0, 0.0, 0.0, 0.0),

@@ -205,7 +205,7 @@ def read_view(
 
 
 def read_checked(reader: Callable[[Path], Any], file: Path) -> Any:
-    """What a function of `io.images` reads from a file."""
+    """Read a file by a function of `io.images`. Raises: CaptureError."""
     try:
         return reader(file)
     except FileNotFoundError:

@@ -29,7 +29,7 @@ NO_COMMON_FRAME = "no two cameras have a photo of the same frame: photos of one 
 
 @dataclasses.dataclass(frozen=True)
 class ImportReport:
-    """What was imported and how it was understood; as a string, the lines that a user should read."""
+    """What was imported and how it was read; `str(report)` is what the command line prints."""
 
     out: Path
     format: str
@@ -48,7 +48,7 @@ class ImportReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What looks wrong."""
+        """Likely mistakes."""
         return self.checks.warnings
 
     def __str__(self) -> str:
@@ -212,7 +212,7 @@ def _copy(folder, photo, name):
 
 
 def _undistort(folder, photo, name, camera):
-    """Photo and mask (its alpha, if that is all there is) as a pinhole sees them; what it does not see is white and no person."""
+    """Photo and mask (or its alpha) as a pinhole sees them; pixels that it does not see are white and background."""
     image, mask = read_checked(read_image, photo.image)
     if photo.mask is not None:
         mask = read_checked(read_grey, photo.mask)

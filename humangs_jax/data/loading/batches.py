@@ -78,7 +78,7 @@ class Loader:
         """(step, batch) for start <= step < stop; `ahead` batches are made and put on the devices by threads meanwhile.
 
         Errors of the threads are raised here. Closing the generator (or leaving the loop over it) ends them.
-        waiting: what the loop had to wait for its batches is added to it.
+        waiting: the time that the loop waited for batches is added to it.
         """
 
         def make():
@@ -117,6 +117,6 @@ class Loader:
 
 
 def _stack(*leaves):
-    """Where all were made on a device they stay there."""
+    """Leaves that are all on a device stay there."""
     on_device = all(isinstance(leaf, jax.Array) for leaf in leaves)
     return jnp.stack(leaves) if on_device else np.stack([np.asarray(leaf) for leaf in leaves])
