@@ -18,6 +18,9 @@ SCALE = float(os.environ.get("HUMANGS_TOLERANCE_SCALE", "1"))
 UNIT = 2.0**-24
 """Largest relative error of one float32 operation."""
 
+LARGEST_ROUNDING = 1e-3
+"""A larger rtol or atol is not about rounding (millimetres of a body, say): the switch leaves it alone."""
+
 
 def bound(value: float) -> float:
     """A float32 tolerance, under the switch."""
@@ -39,7 +42,8 @@ def scaled_comparison(compare):
     defaults = {"rtol": 1e-7, "atol": 0.0} if compare is np.testing.assert_allclose else {"rtol": 1e-5, "atol": 1e-8}
 
     def scaled(actual, desired, rtol=defaults["rtol"], atol=defaults["atol"], **options):
-        factor = SCALE if any(getattr(a, "dtype", None) == np.float32 for a in (actual, desired)) else 1.0
-        return compare(actual, desired, rtol=factor * rtol, atol=factor * atol, **options)
+        if any(getattr(a, "dtype", None) == np.float32 for a in (actual, desired)):
+            rtol, atol = (SCALE * x if x < LARGEST_ROUNDING else x for x in (rtol, atol))
+        return compare(actual, desired, rtol=rtol, atol=atol, **options)
 
     return scaled

@@ -47,7 +47,7 @@ def main() -> None:
     parser.add_argument("--preset", default="published")
     parser.add_argument("--chips", default="v5e:16x16", help="TPU topology")
     parser.add_argument("--fsdp", type=int, help="chips that share one copy of the state; all if not given")
-    parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="of photographs and targets, pixels")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="of photos and targets, pixels")
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--targets", type=int, default=4)
     parser.add_argument("--per-chip", type=int, default=1, help="subjects of a chip in a step")

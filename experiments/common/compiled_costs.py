@@ -234,7 +234,7 @@ LAZY = ("convert", "copy", "reshape", "transpose", "negate")
 
 
 def moved_bytes(computation: Computation, x: Instruction) -> int:
-    """Of an instruction that stands in no fusion and calls nothing."""
+    """Of an instruction outside of fusions that calls nothing."""
     if x.opcode in FREE or x.opcode.endswith(("-done", "-update")):
         return 0
     if x.opcode.endswith("-start") and len(x.arrays) > 1:
@@ -250,7 +250,7 @@ def moved_bytes(computation: Computation, x: Instruction) -> int:
 
 
 def fusion_bytes(program: Program, x: Instruction) -> int:
-    """Of a fusion that stands in no other."""
+    """Of a fusion outside of other fusions."""
     total = 0
     for name in x.names("calls"):
         called = program.computations[name]

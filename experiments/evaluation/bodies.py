@@ -10,9 +10,9 @@ and scores are those of `evaluation/synthetic.py`.
 
 --json writes {"bodies": {name: {"body_vertices": of the body, "vertices": that carry Gaussians, "novel", "animation": mean
 scores, "costs": medians}}, "settings", "subjects": [{"seed", "bodies": {name: ...}}], "others": rows of people who are not asked
-for} after every person; run again it goes on. One of the names is the painted default body, the baseline, which has no costs.
+for} after every person; a later run continues. One of the names is the painted default body, the baseline, which has no costs.
 Costs are the number of "gaussians" and seconds of compiled programs: "reconstruct" (photos to avatar, without choosing the body's
-vertices, which is done once a body), "frame" (posing and drawing one picture), and the same in CPU time ("_cpu"). About 10 s of
+vertices, which is done once a body), "frame" (posing and drawing one image), and the same in CPU time ("_cpu"). About 10 s of
 CPU time a person, and some minutes of compiling.
 """
 
@@ -58,7 +58,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=4, choices=COUNTS, help="photos that the network sees")
     add_people_options(parser, subjects=8)
-    parser.add_argument("--pictures", type=Path, help="write the truth and every body's picture of one person here")
+    parser.add_argument("--pictures", type=Path, help="write the truth and every body's image of one person here")
     arguments = parser.parse_args()
     check_people_options(parser, arguments)
     lpips = load_lpips(parser, arguments)
@@ -73,7 +73,7 @@ def main() -> None:
 
 
 def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]:
-    """Score every person on every body, and write what was asked for. lpips: its weights, if there are any."""
+    """Score every person on every body, and write what was asked for. lpips: its weights or None."""
     import jax
     from tqdm import tqdm
 
@@ -97,7 +97,7 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     drawn: dict[str, Any] = {}
 
     def add(seed: int) -> None:
-        """The person's scores on every body, into rows, and its pictures into drawn."""
+        """The person's scores on every body, into rows, and its images into drawn."""
         subject = make_evaluation_subject(seed, body, [arguments.views], arguments.size, held_out)
         truth = subject.held_out
         painted = draw_painted_body(painted_body(subject.inputs(arguments.views)), truth)

@@ -1,4 +1,4 @@
-"""Bodies that weights are tried on: the default one, one that is made up in SMPL-X's format, and decimated ones."""
+"""Bodies to evaluate weights on: the default one, a made-up one in SMPL-X's format, and decimated ones."""
 
 import dataclasses
 import tempfile
@@ -33,7 +33,7 @@ class BodyCase:
 def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
     """By name: the body, the made-up one in SMPL-X's format, and the body with a fraction of its vertices.
 
-    Decimated bodies are there as they are and, where the weights want long edges split, with these split.
+    Decimated bodies are included unchanged and, if the weights want long edges split, also with split edges.
     """
     wanted = {"default": body, "SMPL-X format": smplx_body(body)}
     cases = {name: BodyCase(model, gaussian_body(model, config)) for name, model in wanted.items()}

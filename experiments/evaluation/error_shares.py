@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 BAND = 3
 """Pixels to either side that count as the outline."""
 LEAST_COVERAGE = 0.05
-"""Where a picture covers less there is no colour to speak of: the true one stands in."""
+"""Below this coverage the predicted colour is undefined; the true one is used."""
 
 
 def main() -> None:
@@ -87,7 +87,7 @@ def psnr(picture, truth) -> float:
 
 
 def shares(rgb, alpha, image, mask) -> dict[str, float]:
-    """Squared error of one picture by place, and its PSNR, also under the true coverage. (h, w, 3) and (h, w)."""
+    """Squared error of one image by place, and its PSNR, also under the true coverage. (h, w, 3) and (h, w)."""
     import numpy as np
     from scipy import ndimage
 

@@ -12,7 +12,7 @@ COUNTS = (1, 2, 3, 4, 6, 12)
 
 
 def add_people_options(parser: argparse.ArgumentParser, subjects: int) -> None:
-    """Options of every evaluation: whom to look at, with what, and where the results go."""
+    """Options of every evaluation: people, weights, and files of results."""
     parser.add_argument("--subjects", type=int, default=subjects, help="how many people")
     parser.add_argument("--held-out", type=int, default=8, help="views to compare with, in the pose of the photos")
     parser.add_argument("--poses", type=int, default=2, help="unseen poses")
@@ -20,13 +20,13 @@ def add_people_options(parser: argparse.ArgumentParser, subjects: int) -> None:
     parser.add_argument("--size", type=int, default=256, help="side of the photos in pixels")
     parser.add_argument("--first", type=int, default=0, help="index of the first subject within the split")
     parser.add_argument("--weights", type=Path, help="weights file; the shipped ones if not given")
-    parser.add_argument("--split", choices=("validation", "test"), default="test", help="whom to look at")
+    parser.add_argument("--split", choices=("validation", "test"), default="test", help="seeds of the people")
     parser.add_argument(
         "--tokens",
         choices=("all", "foreground"),
         help="patches that the network looks at; as it was trained if not given",
     )
-    parser.add_argument("--json", type=Path, help="write the numbers here, and go on from what is there")
+    parser.add_argument("--json", type=Path, help="numbers are written here; rows already there are kept")
     parser.add_argument("--page", "--docs", type=Path, help="page whose table is written")
     parser.add_argument("--lpips-backbone", type=Path, help="weights of the network under LPIPS")
     parser.add_argument("--lpips-heads", type=Path, help="heads of LPIPS, where the backbone's file does not have them")

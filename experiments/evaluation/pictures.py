@@ -1,4 +1,4 @@
-"""Pictures of an evaluation: the best people beside the worst, and PSNR against the number of views."""
+"""Images of an evaluation: the best people beside the worst, and PSNR against the number of views."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from humangs_jax.io.images import to_uint8, write_png
 
 TRIPLE = ("truth", "ours", "painted body")
 CROP = 0.75
-"""Share of the picture's width that is shown: cameras keep the whole height of a person in a square frame."""
+"""Share of the image's width that is shown: cameras keep the whole height of a person in a square frame."""
 TITLE = 22
 """Height of the letters of titles, pixels."""
 Strip = dict[str, np.ndarray]
@@ -63,14 +63,14 @@ def _half(name: str, people: Sequence[dict[str, Any]], count: str, strips: Mappi
 
 
 def cropped(image: np.ndarray) -> np.ndarray:
-    """The middle of a picture's width."""
+    """The middle of an image's width."""
     width = image.shape[1]
     left = round(0.5 * (1 - CROP) * width)
     return image[:, left : width - left]
 
 
 def plot_views(path: Path, report: dict[str, Any]) -> None:
-    """Mean PSNR of the whole picture and of the person alone against the number of photos, ours and the painted body."""
+    """Mean PSNR of the whole image and of the person alone against the number of photos, ours and the painted body."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -2,7 +2,7 @@
 
 A person has a row {cell: {"novel": scores, "animation": scores}}, where a cell is a number of photos or a body. "novel" are
 held-out views in the pose of the photos, "animation" held-out views in poses that no photo shows. Scores are means over views:
-PSNR in dB, SSIM, LPIPS, PSNR on the person alone ("psnr_foreground", weighted by the true mask), the share of the picture that
+PSNR in dB, SSIM, LPIPS, PSNR on the person alone ("psnr_foreground", weighted by the true mask), the share of the image that
 the person takes ("foreground"), and those of the painted body ("baseline_").
 """
 
@@ -90,7 +90,7 @@ def file_digest(path: Path) -> str:
 
 
 def headline(counts: Sequence[int]) -> str:
-    """The number of views whose scores stand for all: 4 if that was asked for, else the largest."""
+    """The number of views of the headline scores: 4 if it was asked for, else the largest."""
     return str(4 if 4 in counts else max(counts))
 
 
@@ -166,7 +166,7 @@ def about(settings: dict[str, Any], people: int) -> str:
 
 
 def views_section(report: dict[str, Any], page: Path, pictures: Path | None = None, plot: Path | None = None) -> str:
-    """Tables of the scores by number of views, what they say, who is best and worst, and the pictures if there are any."""
+    """Tables of the scores by number of views, a verdict, the best and worst people, and the images if given."""
     by_views = report["by_views"]
     keys = shown_scores([scores for tasks in by_views.values() for scores in tasks.values()])
     tasks = [task for task in TASK_NAMES if task in next(iter(by_views.values()))]

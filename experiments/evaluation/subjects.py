@@ -1,9 +1,9 @@
-"""A person to evaluate on: photographs from a ring of cameras, and held-out views of the same pose and of others.
+"""A person to evaluate on: photos from a ring of cameras, and held-out views of the same pose and of others.
 
 The ring has `RING` cameras of the published protocol around the person, evenly spaced but for the generator's jitter, number 0
-the most frontal one. Any number of photographs is every n-th camera of the ring, so that one person is photographed once for
-all of them. Held-out cameras and unseen poses are those of `humangs_jax.people.writer.write_subject` for the same seed,
-and pictures have 8 bits as they would have on disk.
+the most frontal one. N photos are every (RING / N)-th camera of the ring, so each person is rendered once for all numbers of
+photos. Held-out cameras and unseen poses are those of `humangs_jax.people.writer.write_subject` for the same seed, and images
+have 8 bits as they would have on disk.
 """
 
 import dataclasses
@@ -32,12 +32,12 @@ from humangs_jax.people.subject import make_subject
 from humangs_jax.people.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capture_views, sample_pose
 
 RING = 12
-"""Cameras that photographs are taken from; numbers of photographs divide it."""
+"""Cameras that photos are taken from; numbers of photos divide it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class HeldOut:
-    """What a reconstruction is compared with: `views` of the pose of the photographs, `pose_views` of each of `poses` others."""
+    """What a reconstruction is compared with: `views` of the pose of the photos, `pose_views` of each of `poses` others."""
 
     views: int = 8
     poses: int = 2
@@ -54,14 +54,14 @@ class EvaluationSubject:
     held_out: Capture
 
     def inputs(self, count: int) -> Capture:
-        """So many photographs, evenly spaced on the ring, the frontal one first. ValueError if they were not taken."""
+        """That number of photos, evenly spaced on the ring, frontal first. Raises ValueError if they were not rendered."""
         wanted = ring_positions(count)
         if missing := set(wanted) - set(self.positions):
             raise ValueError(f"{count} photographs need ring positions {sorted(missing)}, which were not photographed")
         return self.photos.select([self.positions.index(position) for position in wanted])
 
     def with_body(self, body: BodyModel) -> "EvaluationSubject":
-        """The same pictures with the parameters of another body, which has the same directions of shape; the poses go to its
+        """The same images with the parameters of another body, which has the same directions of shape; the poses go to its
         joints by name, and joints that have none of that name rest.
         """
         captures = {name: with_body(getattr(self, name), body) for name in ("photos", "held_out")}
@@ -81,7 +81,7 @@ def with_body(capture: Capture, body: BodyModel) -> Capture:
 
 
 def ring_positions(count: int) -> tuple[int, ...]:
-    """Which cameras of the ring take `count` photographs. Raises ValueError unless the count divides `RING`."""
+    """Which cameras of the ring take `count` photos. Raises ValueError unless the count divides `RING`."""
     if count < 1 or RING % count:
         raise ValueError(f"{count} photographs are not evenly spaced among {RING} cameras")
     return tuple(range(0, RING, RING // count))
@@ -90,7 +90,7 @@ def ring_positions(count: int) -> tuple[int, ...]:
 def make_evaluation_subject(
     seed: int, body: BodyModel, counts: Sequence[int], image_size: int = 256, held_out: HeldOut | None = None
 ) -> EvaluationSubject:
-    """The person of a seed, photographed from every place that one of the numbers of photographs asks for."""
+    """The person of a seed, rendered from every camera that one of the numbers of photos asks for."""
     held_out = held_out or HeldOut()
     subject = make_subject(seed, body)
     posed = [sample_pose(subject, i) for i in range(1 + held_out.poses)]
@@ -124,13 +124,13 @@ def frontal_camera(posed: PosedSubject, cameras: Camera) -> int:
 
 
 def _as_stored(capture):
-    """The capture with pictures and masks of 8 bits."""
+    """The capture with images and masks of 8 bits."""
     rounded = {name: to_uint8(getattr(capture, name)).astype(np.float32) / 255 for name in ("images", "masks")}
     return dataclasses.replace(capture, **rounded)
 
 
 MeanLpips = Callable[[np.ndarray, np.ndarray], float | None]
-"""Of pictures (v, h, w, 3) against true ones; None where LPIPS has no weights."""
+"""Of images (v, h, w, 3) against true ones; None where LPIPS has no weights."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class Drawn:
 
 
 def draw_person(variables: Variables, config: HumanGSConfig, subject: EvaluationSubject, count: int) -> Drawn:
-    """Reconstruct from so many photographs, and paint the body with the same ones."""
+    """Reconstruct from that number of photos, and paint the body with the same ones."""
     inputs = subject.inputs(count)
     avatar = reconstruct(variables, config, inputs)
     return Drawn(draw_avatar(avatar, subject.held_out), draw_painted_body(painted_body(inputs), subject.held_out))
@@ -154,7 +154,7 @@ def draw_avatar(avatar: Avatar, views: Capture) -> np.ndarray:
 
 
 def task_views(held_out: Capture) -> dict[str, np.ndarray]:
-    """Indices of the held-out views by task: those in the pose of the photographs, which is frame 0, and the others."""
+    """Indices of the held-out views by task: those in the pose of the photos, which is frame 0, and the others."""
     still = np.asarray(held_out.frames) == 0
     return dict(zip(TASKS, (np.flatnonzero(still), np.flatnonzero(~still)), strict=True))
 
@@ -171,14 +171,14 @@ def score_tasks(pictures: np.ndarray, held_out: Capture, lpips_of: MeanLpips) ->
 
 
 def score_person(drawn: Drawn, held_out: Capture, lpips_of: MeanLpips) -> dict[str, Scores]:
-    """Scores by task, those of the painted body beside ours under names that begin with "baseline_"."""
+    """Scores by task, those of the painted body beside ours under names with the prefix "baseline_"."""
     ours, painted = (score_tasks(x, held_out, lpips_of) for x in (drawn.ours, drawn.painted))
     compared = ("psnr", "ssim", "psnr_foreground", "lpips")
     return {task: ours[task] | {f"baseline_{name}": painted[task][name] for name in compared} for task in ours}
 
 
 def lpips_scorer(weights: Lpips | None) -> MeanLpips:
-    """The mean LPIPS of pictures (v, h, w, 3), clipped to [0, 1], against true ones; None for any without weights."""
+    """The mean LPIPS of images (v, h, w, 3), clipped to [0, 1], against true ones; None for any without weights."""
     if weights is None:
         return lambda predicted, truth: None
     import jax

@@ -4,16 +4,16 @@
         [--pictures sheet.png] [--plot views.png] [--page docs/evaluation.md]
 
 Subjects are drawn from the test seeds (`humangs_jax.people.seeds`), which training never sees; choices are made
-on `--split validation`. A person is made once, photographed from evenly spaced places (`evaluation/subjects.py`), reconstructed
+on `--split validation`. A person is made once, rendered from evenly spaced cameras (`evaluation/subjects.py`), reconstructed
 from every number of photos asked for, and always compared with the same held-out views: "novel" ones in the pose of the photos,
 and "animation" ones in unseen poses. The baseline is the body mesh, each vertex painted with the mean photo colour over the
-input views that see it (grey where none does), posed likewise. `evaluation/results.py` says what the scores are.
+input views that see it (grey where none does), in the same pose. `evaluation/results.py` defines the scores.
 
 --json writes {"psnr", "ssim", "lpips", "psnr_foreground", "foreground", "baseline_psnr", "baseline_ssim",
-"baseline_psnr_foreground", "baseline_lpips": means over people of the novel views with 4 photos (or the most asked for, which
-"views" tells), "by_views": {"4": {"novel": the same keys, "animation": the same keys}, ...}, "settings": {...},
+"baseline_psnr_foreground", "baseline_lpips": means over people of the novel views with 4 photos (or the most asked for, see
+"views"), "by_views": {"4": {"novel": the same keys, "animation": the same keys}, ...}, "settings": {...},
 "subjects": [{"seed", the same keys, "by_views": {...}}, ...], "others": rows of people who are not asked for or not finished}
-after every person. Run again it goes on: what the file holds with the same settings (weights, split, sizes, ...) is not
+after every person. A later run continues: rows in the file with the same settings (weights, split, sizes, ...) are not
 computed again; a file of other settings is replaced.
 
 --pictures shows the best five people beside the worst five, by PSNR; --plot needs matplotlib (the `notebooks` extra);
@@ -76,7 +76,7 @@ def main() -> None:
 
 
 def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]:
-    """Make, reconstruct and score every person, and write what was asked for. lpips: its weights, if there are any."""
+    """Make, reconstruct and score every person, and write what was asked for. lpips: its weights or None."""
     from tqdm import tqdm
 
     from experiments.evaluation.pictures import plot_views, strip_of, write_sheet
@@ -98,7 +98,7 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     lpips_of, chosen, strips = lpips_scorer(lpips), headline(arguments.views), {}
 
     def add(seed: int, counts: Sequence[int]) -> None:
-        """The person's scores with so many photos, into rows, and its pictures into strips."""
+        """The person's scores with these numbers of photos, into rows, and its images into strips."""
         subject = make_evaluation_subject(seed, body, counts, arguments.size, held_out)
         for count in counts:
             drawn = draw_person(variables, config, subject, count)
@@ -121,7 +121,7 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
         write_json(arguments.json, report)
     if arguments.pictures:
         for row in chain(*extremes(report)):
-            if row["seed"] not in strips:  # scored by an earlier run, which kept no pictures
+            if row["seed"] not in strips:  # scored by an earlier run, which kept no images
                 add(row["seed"], [int(chosen)])
         write_sheet(arguments.pictures, report, strips)
     if arguments.plot:

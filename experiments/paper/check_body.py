@@ -50,7 +50,7 @@ def compare(model: Path, arrays: Path) -> list[tuple[str, int, float, float, flo
                 hands=hands,
                 **{part: number(part, i) for part in PARTS},
                 **{f"{side}_hand_pose": number(f"{side}_hand_{suffix}", i) for side in ("left", "right")},
-                translation=number("transl", i),
+                transl=number("transl", i),
             )
             found = run(jnp.concatenate([number("betas", i), number("expression", i)]), pose)
             wanted = [expected[f"{convention}_{name}"][i] for name in ("vertices", "joints", "full_pose")]

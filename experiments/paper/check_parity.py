@@ -62,7 +62,7 @@ PER_VIEW = ("mid_tokens", "mid_feature_map_stride4")
 TIES, TIE_LEVELS = "candidates of posed_rotations", "their q_abs"
 """What `compute_stages` gives beside the stages: see `nearest_candidates`."""
 RENDER_SIZE = 256
-"""Pixels a side of the pictures that --render compares."""
+"""Pixels a side of the images that --render compares."""
 MAP_STRIDE, WEIGHTS_STRIDE = 4, 5
 """Which pixels of the feature map and which Gaussians' skinning weights are stored."""
 
@@ -348,7 +348,7 @@ def run_checkpoint(checkpoint: Path, arrays: Path, config: Path, dtype: str) -> 
 
 
 def render_psnr(found: dict[str, Any], reference: dict[str, Any], arrays: dict[str, Any]) -> float:
-    """The lowest PSNR, dB, of pictures of the posed Gaussians to those of the reference, as all input cameras see them.
+    """The lowest PSNR, dB, of images of the posed Gaussians to those of the reference, as all input cameras see them.
 
     Drawn as the release draws, RENDER_SIZE pixels high.
     """

@@ -3,7 +3,7 @@
     python experiments/people/check_people.py --subjects 200 --json OUT [--described 1000]
         [--plots docs/images/people_diversity.png]
 
-Faults are counted in pictures of random poses from random cameras, as shares of the person's pixels:
+Faults are counted in images of random poses from random cameras, as shares of the person's pixels:
 - poking: skin that lies inside of a hem and is seen although the OUTER side of cloth is at most 6 cm behind it on the same ray,
   of which skin deeper than 1 cm inside of the hem is `poking_deep`. (Skin seen up a sleeve or under a skirt has the inner side
   of cloth behind it: no fault.) Skin that cloth covers well is not in the mesh at all and cannot poke: see `hollow`.
@@ -11,8 +11,8 @@ Faults are counted in pictures of random poses from random cameras, as shares of
 - hollow: the INNER side of cloth is seen where the naked body, posed alike, would be at least 1 cm nearer: one looks through a
   neckline, a cuff or a hem into empty clothes.
 - gaps: the background is seen where the naked body would be.
-Diversity is that of descriptions (`person.describe`: shape, garments, colours, hair; a millisecond each) and of pictures
-(foreground share, colours as seen, joint angles). 1,000 descriptions take 3 s, 1,000 subjects with pictures about 15 minutes
+Diversity is that of descriptions (`person.describe`: shape, garments, colours, hair; a millisecond each) and of images
+(foreground share, colours as seen, joint angles). 1,000 descriptions take 3 s, 1,000 subjects with images about 15 minutes
 on 2 CPU cores. Expected: poking below 0.1 %.
 """
 
@@ -54,7 +54,7 @@ SHARE_BINS = 40
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--subjects", type=int, default=50, help="people that are built, posed and looked at")
+    parser.add_argument("--subjects", type=int, default=50, help="people that are built, posed and rendered")
     parser.add_argument("--described", type=int, default=1000, help="people whose descriptions are counted")
     parser.add_argument("--poses", type=int, default=2, help="poses of every built person")
     parser.add_argument("--views", type=int, default=2, help="cameras around every pose")
@@ -279,7 +279,7 @@ def _hues(colours):
 
 
 def _colour_histogram(pixels):
-    """(12, 4, 4) counts of hue, saturation, value, each picture with the same weight."""
+    """(12, 4, 4) counts of hue, saturation, value, each image with the same weight."""
     import numpy as np
 
     cells = np.minimum((_hsv(pixels) * [12, 4, 4]).astype(int), [11, 3, 3])
@@ -289,7 +289,7 @@ def _colour_histogram(pixels):
 
 
 def draw(file, people, seen):
-    """One picture of eight plots."""
+    """One image of eight plots."""
     import colorsys
 
     import matplotlib

@@ -1,10 +1,10 @@
-"""Contact sheets of synthetic people, to be looked at: front and back, all around, close-ups, sequences.
+"""Contact sheets of synthetic people: front and back, all around, close-ups, sequences.
 
     python experiments/people/contact_sheets.py --out docs/images [--subjects 64] [--sheets front_back views close sequences]
 
 Writes people_front_back.jpg (subjects, front over back), people_views.jpg (16 subjects over 8 views), people_close.jpg (8 heads
 from two sides, 8 hands) and people_sequences.jpg (8 sequences of 8 frames). All four take 90 s of one CPU core. People are those
-of the demo seeds; the same command gives the same pictures bit for bit on the same machine.
+of the demo seeds; the same command gives the same images bit for bit on the same machine.
 """
 
 import argparse
@@ -12,12 +12,12 @@ from pathlib import Path
 
 SHEETS = ("front_back", "views", "close", "sequences")
 FRONT_BACK_SIZE, VIEW_SIZE, CLOSE_SIZE = (184, 228), (148, 176), (256, 256)
-"""Width and height of one picture, pixels."""
+"""Width and height of one image, pixels."""
 COLUMNS = 16
 MOTION_FRAMES = 75
 QUALITY = 85
 TELE = 0.42
-"""Vertical field of view of pictures that show the whole person, radians."""
+"""Vertical field of view of images that show the whole person, radians."""
 
 
 def main() -> None:
@@ -155,7 +155,7 @@ def _camera(target, distance, azimuth, elevation, fov, size, scale):
 
 
 def _whole(posed, azimuth, size, scale):
-    """The whole person, feet near the lower edge; all people at one scale, 2.3 metres to the picture's height."""
+    """The whole person, feet near the lower edge; all people at one scale, 2.3 metres to the image's height."""
     import numpy as np
 
     from humangs_jax.people.rendering import render_view
@@ -178,7 +178,7 @@ def _near(posed, target, reach, azimuth, elevation, scale):
 
 
 def _grid(rows):
-    """(h, w, 3) picture of rows of pictures of one size; short rows are filled with white."""
+    """(h, w, 3) image of rows of images of one size; short rows are filled with white."""
     import numpy as np
 
     columns = max(len(row) for row in rows)

@@ -5,7 +5,7 @@
 With all tokens and with those of the foreground, in turns with a plain matrix product, which gives the peak of this run.
 Random weights: they cost what trained ones cost. Floating-point operations and bytes are counted from the compiled
 programs, loops included (`common/compiled_costs.py`); "published_flops" is the same network with its last convolution
-evaluated at every pixel, as the release does. `--memory 1 4 8 16` adds the peak memory of programs for so many views at
+evaluated at every pixel, as the release does. `--memory 1 4 8 16` adds the peak memory of programs for these numbers of views at
 `--memory-size`, from XLA's memory analysis: they are compiled and not run. `--stages` times encoder, sampling and decoder.
 
 Writes {"all", "foreground": {"ms", "cpu_ms", "compile_s", "tokens", "flops", "bytes", "temporary_mb", "share_of_peak",
@@ -182,7 +182,7 @@ def whole_network_flops(variables: Any, inputs: Any, config: Any) -> int:
 
 
 def memory(config: Any, views: int, size: int) -> dict[str, float]:
-    """MiB that a program for so many photos of that size needs besides its arguments and results; its operations."""
+    """MiB that a program for that number of photos of that size needs besides its arguments and results; its operations."""
     import jax
 
     from humangs_jax.network.humangs import apply_humangs

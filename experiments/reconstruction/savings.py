@@ -4,7 +4,7 @@
 
 Starts from the network as published (all tokens, the last convolution at every pixel, every view for every vertex) and
 leaves out one thing after the other; the rows of a table are timed in turns. Errors are those of the Gaussians against
-the first row (relative L2 of offsets from the vertices, and of colours) and of a picture drawn from them (PSNR). With
+the first row (relative L2 of offsets from the vertices, and of colours) and of an image drawn from them (PSNR). With
 random weights (the default) the rows that are exact by construction must show rounding only; what foreground tokens do
 to a network that was trained with all of them, only `--weights` of such a network tell.
 
@@ -153,7 +153,7 @@ def errors(gaussians: Any, reference: Any, inputs: Any) -> dict[str, float]:
 
 
 def drawn(gaussians: Any, inputs: Any) -> np.ndarray:
-    """A picture of the T-pose from the front, 512 x 512 on white."""
+    """An image of the T-pose from the front, 512 x 512 on white."""
     import jax.numpy as jnp
 
     from humangs_jax.geometry.camera import intrinsics_from_fov, orbit

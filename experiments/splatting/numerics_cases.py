@@ -387,7 +387,7 @@ def relative_l2(found: np.ndarray, expected: np.ndarray) -> float:
 
 
 def natural(scene: Scene, gradients: tuple) -> dict[str, np.ndarray]:
-    """Gradients by name, in float64 and in the units that the module docstring tells."""
+    """Gradients by name, in float64 and in the units of the module docstring."""
     wide = lambda tree: jax.tree.map(lambda a: np.asarray(a, np.float64), tree)
     gaussians, pose = wide(scene.gaussians), wide(scene.pose)
     by_name = dict(zip(NAMES, jax.tree.leaves(wide(gradients)), strict=True))

@@ -52,7 +52,7 @@ KNOBS: dict[str, tuple[Any, ...]] = {
     "scale": (0.75, 0.5, 0.25),
 }
 SCHEDULE = ("tile_size", "block", "chunk", "chunk_backward", "matmul_precision")
-"""Knobs of the exact image: not drawn in the picture."""
+"""Knobs that do not change the image: left out of the plot."""
 
 HIDDEN = (1 / 255, 0.01, 0.03, 0.1)
 """Weights on any pixel of any camera below which a Gaussian is dropped (`splatting.seen_from`)."""

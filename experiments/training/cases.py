@@ -7,7 +7,7 @@ from typing import Any
 
 
 def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -> Any:
-    """The `TrainConfig` of a preset for photographs and targets of `size` pixels, numbers of views as given."""
+    """The `TrainConfig` of a preset for photos and targets of `size` pixels, numbers of views as given."""
     from humangs_jax.data.loader import ViewSampling
     from humangs_jax.training.config import PRESETS
 
@@ -103,7 +103,7 @@ CASES = {
     "published 512": ("published", 512, 4, 4),
     "tiny 32": ("tiny", 32, 2, 2),
 }
-"""Preset, size of photographs and targets, input views, targets. The last one is for tests."""
+"""Preset, size of photos and targets, input views, targets. The last one is for tests."""
 
 
 class Case:

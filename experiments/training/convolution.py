@@ -2,7 +2,7 @@
 
     python experiments/training/convolution.py --json OUT --page docs/performance_training.md
 
-A round gives the result, and the gradients of the map and of the kernel. Alone it is a program by itself; in a loop it is the
+A round gives the result, and the gradients of the map and of the kernel. "Alone" is one program; in a loop it is the
 body of a loop over ROUNDS maps, as a training step is one over its microbatches, and the time is divided by ROUNDS. "ours" is
 `humangs_jax/network/convolution.py`. CPU time of all threads, float32, the three in turns. It runs on the CPU whatever else is
 there: elsewhere both are the same program. Two minutes on one core, nearly all of them in the loop as XLA differentiates it.

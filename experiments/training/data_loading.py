@@ -2,13 +2,13 @@
 
     python experiments/training/data_loading.py --json data.json [--sizes 128 256 512] [--subjects 4] [--train-step-s 0.9]
 
-For every picture size, on this machine: `synth` (people written to disk: subjects and views per second of one process),
+For every image size, on this machine: `synth` (people written to disk: subjects and views per second of one process),
 `read` (written people through the loader: every example decoded from disk, and kept in memory), and `live` (people on the
 fly from a bank: building it, compiling, views per second). Then the time of one step of the small preset (measured at its own
 sizes unless --train-step-s gives it), which consumes the views of one example, and what a step would wait: the loader works
 beside the step, so a step waits for what a batch takes beyond it; live people are drawn on the device of the step, so all of
 their time is added, unless the device has time to spare (CPUs of several cores). Where the step is measured, so is what it
-waits when the loader feeds it with either. CPU seconds count the work of all threads and hardly depend on other programs.
+waits when the loader feeds it with either. CPU seconds count the work of all threads and depend little on other programs.
 
 About 4 minutes on 2 CPU cores to themselves, 2 of them with --train-step-s. Expected there, CPU ms a view at 256: written
 170, live 32, read 9 from disk and 1 from memory; drawing an example live takes a sixth of the CPU time of a step.

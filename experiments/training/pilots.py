@@ -1,10 +1,10 @@
-"""What matters: short runs from the same start that differ in little, compared on the same people.
+"""Short training runs that differ in one setting each, compared on the same people.
 
     python experiments/training/pilots.py --bank runs/people.npz --people people --validation unseen --out runs/pilots
     python experiments/training/pilots.py ... --only "as it is" "rate 1e-3" --steps 150
 
-Of how the network is trained, from weights that know their way already (`--start`), or with `--fresh` of the network
-itself, from nothing. Every run is whole: its learning rate ends at 0. The table is written to docs/training.md, the numbers to
+The variants change the training, starting from trained weights (`--start`), or with `--fresh` the network, from fresh weights.
+The learning rate of every run ends at 0. The table is written to docs/training.md, the numbers to
 OUT/pilots.json; runs that are in there are not repeated. About 3 CPU minutes a run of 60 steps.
 """
 
@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 FIRST, TABLE = "as it is", "training_pilots"
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "training.md"
 TOKENS = 1024
-"""For 4 photographs of 256 pixels."""
+"""For 4 photos of 256 pixels."""
 COLUMNS = ("psnr", "psnr_mask", "ssim")
 
 
@@ -138,7 +138,7 @@ def run(arguments, parser) -> None:
 
 
 def kept(path, settings, parser):
-    """The runs in a file, none if there is no file; ends with a message if they had other settings."""
+    """The runs in a file, {} without a file; exits with a message if they had other settings."""
     if not path.is_file():
         return {}
     report = json.loads(path.read_text())
@@ -171,7 +171,7 @@ def pilot(arguments, config, live, started, name) -> dict:
     if int(state.step) < config.steps:
         raise SystemExit(f"interrupted at step {int(state.step)} of {name!r}; the same command goes on there")
     seconds = time.process_time() - begin
-    # compared alike, whatever the run saw
+    # the same validation for all runs
     views = dataclasses.replace(config.views, input_counts=(4,), target_count=6)
     compared = dataclasses.replace(config, views=views)
     cache = CaptureCache(find_captures(arguments.validation), body)

@@ -1,11 +1,11 @@
-"""A training run from nothing, and the page that tells of it: people, training, curve, validation pictures, numbers.
+"""A training run from fresh weights, and its page: people, training, curve, validation images, numbers.
 
     python experiments/training/report.py --out runs/report
 
-makes 64 synthetic people of the training seeds and 8 of the validation seeds in runs/report, trains the preset `small` for 500
-steps and writes docs/training_run.md with its pictures in docs/images. Ctrl-C saves; the same command goes on where it
-stopped, and run again after the end it writes the page anew. On 2 CPU cores about 5 minutes for the people and 15 for the
-run; expected: 22 dB on the validation people, no step skipped. Needs matplotlib (the `notebooks` extra).
+Makes 64 synthetic people of the training seeds and 8 of the validation seeds in runs/report, trains the preset `small` for 500
+steps and writes the tables of docs/training_run.md and its images in docs/images. Ctrl-C saves; the same command continues, and
+after the end it writes tables and images again. On 2 CPU cores about 5 minutes for the people and 15 for the run; expected: 22 dB
+on the validation people, no step skipped. Needs matplotlib (the `notebooks` extra).
 
 `--config tiny --people 3 --validation 2 --steps 10` tries all of it in two minutes.
 """
@@ -15,7 +15,6 @@ import dataclasses
 import json
 import os
 import sys
-import textwrap
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,11 +22,12 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import peak_rss_mb, prepare_process
-from experiments.common.results import markdown_table, write_json, write_text
+from experiments.common.results import check_section, markdown_table, publish, write_json
 from experiments.training.plot import draw_curve, read_lines, steps_of, validations_of
 
+TABLES = ("training_run_steps", "training_run_facts")
 SIZE, POSES, VIEWS = 256, 2, 12
-"""Pictures of a person."""
+"""Images of a person."""
 COLUMNS = 5
 """Validations that are shown."""
 AVERAGED = 20
@@ -42,11 +42,15 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=500, help="length of the run")
     parser.add_argument("--people", type=int, default=64, help="people to train on")
     parser.add_argument("--validation", type=int, default=8, help="people to look at")
-    parser.add_argument("--page", type=Path, default=Path("docs/training_run.md"), help="page to write")
+    parser.add_argument(
+        "--page", type=Path, default=Path("docs/training_run.md"), help="page of the tables training_run_*"
+    )
     parser.add_argument("--images", type=Path, default=Path("docs/images"), help="folder for its pictures")
     arguments = parser.parse_args()
     if min(arguments.steps, arguments.people, arguments.validation) < 1:
         parser.error("--steps, --people and --validation must be at least 1")
+    for name in TABLES:
+        check_section(arguments.page, name)
     prepare_process()
     if train(arguments):
         write_report(arguments.out, arguments.page, arguments.images)
@@ -85,7 +89,7 @@ def train(arguments: argparse.Namespace) -> bool:
 
 
 def reported(config: Any, steps: int) -> Any:
-    """The preset for a run of so many steps: ten validations, a hundred log lines, a warm-up of a tenth at most."""
+    """The preset for a run of that many steps: ten validations, a hundred log lines, a warm-up of a tenth at most."""
     warmup = min(config.optimizer.warmup_steps, steps // 10)
     tenth = max(1, steps // 10)
     return dataclasses.replace(
@@ -105,7 +109,7 @@ def read_facts(out: Path) -> dict[str, Any]:
 
 
 def write_report(out: Path, page: Path, images: Path) -> None:
-    """The page and its pictures from a run's log, sheets, configuration and report.json."""
+    """The page's tables and images from a run's log, sheets, configuration and report.json."""
     lines, facts = read_lines(out / "log.jsonl"), read_facts(out)
     config = json.loads((out / "config.json").read_text())
     validated = [line["step"] for line in validations_of(lines)]
@@ -113,9 +117,9 @@ def write_report(out: Path, page: Path, images: Path) -> None:
     draw_curve(lines, images / "training_run.png")
     draw_progress(out / "sheets", shown_steps(validated), config, images / "training_run_progress.jpg")
     draw_sheet(out / "sheets", validated[-1], images / "training_run_sheet.jpg")
-    link = lambda name: Path(os.path.relpath(images / name, page.parent)).as_posix()
-    pictures = {name: link(f"training_run{name}") for name in (".png", "_progress.jpg", "_sheet.jpg")}
-    write_text(page, page_text(lines, facts, config, pictures))
+    steps, about = table_of_steps(lines), table_of_facts(lines, facts, config)
+    for name, table in zip(TABLES, (steps, about), strict=True):
+        publish(page, name, table, facts)
 
 
 def shown_steps(validated: Sequence[int]) -> list[int]:
@@ -176,57 +180,14 @@ def read_picture(sheets: Path, step: int) -> Any:
         return np.asarray(picture.convert("RGB"))
 
 
-def page_text(
-    lines: Sequence[dict[str, Any]], facts: dict[str, Any], config: dict[str, Any], pictures: dict[str, str]
-) -> str:
-    """The page in Markdown. pictures: links by the end of their names."""
-    views, optimizer, size = config["views"], config["optimizer"], config["model"]["conventions"]["image_size"]
-    counts = " or ".join(str(count) for count in sorted(set(views["input_counts"])))
-    other = ("structural_scales", "random_background")
-    terms = [f"{value:g} {name}" for name, value in config["loss"].items() if value and name not in other]
-    parts = [
-        f"# A training run of {config['steps']} steps",
-        "Written by one command, which also makes the people and trains:",
-        "```sh\npython experiments/training/report.py --out runs/report\n```",
-        paragraph(
-            f"The preset `{facts['config']}` from fresh weights: {facts['people']} synthetic people to learn from, {POSES} poses",
-            f"x {VIEWS} views each, and {facts['validation']} of the validation seeds to look at. A step takes",
-            f"{config['batch_size']} of them: {counts} photos of {size} pixels go in, {views['target_count']}",
-            f"other views of {config['target_size']} pixels are compared. Loss: {' + '.join(terms)}. Peak learning rate",
-            f"{optimizer['learning_rate']:g} after {optimizer['warmup_steps']} steps of warm-up, then a cosine to",
-            f"0{average_text(config)}. So short a run shows that training works and what it costs; the shipped weights had a",
-            "longer one ([training](training.md)).",
-        ),
-        f"![Training loss, PSNR of training and validation views]({pictures['.png']})",
-        "A view of the first validation people that the network was not shown, and what it makes of it on the way:",
-        f"![Validation people at some steps]({pictures['_progress.jpg']})",
-        "All that is in a validation picture, here the last: input photos, then each target beside the network's view.",
-        f"![The last validation picture]({pictures['_sheet.jpg']})",
-        "## Numbers",
-        paragraph(
-            f"Training numbers are means over the log lines since the row before, {AVERAGED} at most: of views that change, half",
-            f"of them on random backgrounds. Validation numbers are of the same views of the same {facts['validation']} people",
-            "every time, on white.",
-        ),
-        markdown_table(*table_of_steps(lines)),
-        f"| | |\n|---|---|\n{facts_of_run(lines, facts, config)}",
-    ]
-    return "\n\n".join(parts) + "\n"
-
-
-def paragraph(*pieces: str) -> str:
-    """Wrapped text."""
-    return textwrap.fill(" ".join(pieces), 130, break_long_words=False, break_on_hyphens=False)
-
-
 def average_text(config: dict[str, Any]) -> str:
-    """What is validated, if it is an average."""
+    """What is validated, if it is an average of weights."""
     decay = config["ema_decay"]
     return "" if decay is None else f"; averaged weights ({decay:g}) are validated"
 
 
-def table_of_steps(lines: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Header and rows: one per validation."""
+def table_of_steps(lines: Sequence[dict[str, Any]]) -> str:
+    """One row per validation."""
     header = [
         "step",
         "loss",
@@ -256,11 +217,11 @@ def table_of_steps(lines: Sequence[dict[str, Any]]) -> tuple[list[str], list[lis
             ]
         )
         before = step
-    return header, rows
+    return markdown_table(header, rows)
 
 
-def facts_of_run(lines: Sequence[dict[str, Any]], facts: dict[str, Any], config: dict[str, Any]) -> str:
-    """Rows of the table: machine, times, what went wrong."""
+def table_of_facts(lines: Sequence[dict[str, Any]], facts: dict[str, Any], config: dict[str, Any]) -> str:
+    """The run, the machine, times, what went wrong."""
     steps, validated = steps_of(lines), {line["step"] for line in validations_of(lines)}
     total, plain, before = 0.0, [], 0
     for line in steps:
@@ -275,7 +236,17 @@ def facts_of_run(lines: Sequence[dict[str, Any]], facts: dict[str, Any], config:
     dropped = {name: max(line[name] for line in steps) for name in ("dropped_tokens", "dropped_reads", "overflow")}
     made = f" in {facts['people_s'] / 60:.1f} min" if "people_s" in facts else ""
     cores = f"{machine['cores']} cores of {machine['architecture']} (load average {facts['load']:.1f})"
+    views, optimizer = config["views"], config["optimizer"]
+    counts = " or ".join(str(count) for count in sorted(set(views["input_counts"])))
+    other = ("structural_scales", "random_background")
+    terms = [f"{value:g} {name}" for name, value in config["loss"].items() if value and name not in other]
     rows = {
+        "run": f"preset `{facts['config']}` from fresh weights, {config['steps']} steps of {config['batch_size']} people",
+        "people": f"{facts['people']} for training, {POSES} poses x {VIEWS} views each; {facts['validation']} for validation",
+        "photos": f"{counts} of {config['model']['conventions']['image_size']} px",
+        "targets": f"{views['target_count']} of {config['target_size']} px",
+        "loss": " + ".join(terms),
+        "learning rate": f"{optimizer['learning_rate']:g} after {optimizer['warmup_steps']} steps{average_text(config)}",
         "machine": f"{cores}, {machine['device']}, JAX {machine['jax']}",
         "people made": f"{facts['people'] + facts['validation']}{made}",
         "a step": f"{step_s:.2f} s, {config['batch_size'] / step_s:.2f} subjects a second (median)",
@@ -286,7 +257,7 @@ def facts_of_run(lines: Sequence[dict[str, Any]], facts: dict[str, Any], config:
         "steps with anything not finite": f"{last.get('nonfinite', 0):.0f}",
         "patches, vertices, splats without room in any logged step": ", ".join(f"{x:.0f}" for x in dropped.values()),
     }
-    return "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+    return markdown_table(["", ""], list(rows.items()), "ll")
 
 
 def average(values: Sequence[float]) -> float:

@@ -5,7 +5,7 @@
 
 The run is experiments/training/small.json; every setting of it is an option: `--steps 4000 --optimizer.learning-rate 2e-4`.
 Makes the people first: `--live` of the training seeds that are drawn anew for every step, `--subjects` that are written as
-captures, and a few of the validation seeds to look at. Continues the run in `--out` if there is one; Ctrl-C saves.
+captures, and a few of the validation seeds. Continues the run in `--out` if there is one; Ctrl-C saves.
 
 On 2 CPU cores: 1 s a live person, 5 s a written one, then about 1.2 s a step on an otherwise quiet machine. How the shipped
 weights came about is in humangs_jax/assets/weights.md.
@@ -36,9 +36,9 @@ def main(
     """Train on synthetic people, written and live ones by halves.
 
     Args:
-        out: checkpoints, log, pictures and weights of the run.
+        out: checkpoints, log, images and weights of the run.
         people: folder of capture folders to train on; made in out/people if not given.
-        validation: folder of captures of other people, looked at now and then; made in out/validation if not given.
+        validation: folder of captures of other people, for validation; made in out/validation by default.
         subjects: how many people to write; 0 for live ones alone.
         live: how many live people; kept in out/people.npz. 0 for written ones alone.
         init_weights: start from these weights instead of fresh ones, see `fit_variables` for how much their network may
@@ -50,7 +50,7 @@ def main(
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import find_captures
     from humangs_jax.network.weights import fit_variables, load_weights
-    from humangs_jax.people import SPLITS, synthesize
+    from humangs_jax.people import Layout, write_set
     from humangs_jax.training.launch import training_people
     from humangs_jax.training.loop import train
 
@@ -61,10 +61,10 @@ def main(
         variables = fit_variables(variables, model, config.model)
     if people is None and subjects:
         people = out / "people"
-        synthesize(people, subjects, SPLITS["train"].start)
+        write_set(people, subjects, Layout(256, poses=2, views=12))
     if validation is None:
         validation = out / "validation"
-        synthesize(validation, VALIDATION_SUBJECTS, SPLITS["validation"].start)
+        write_set(validation, VALIDATION_SUBJECTS, Layout(256, poses=2, views=12), "validation")
     training = training_people(people, live, out, body)
     train(config, body, training, out, validation=find_captures(validation), variables=variables)
 

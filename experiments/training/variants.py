@@ -76,7 +76,7 @@ def variant_numbers(
 
 
 def stage_numbers(case: Case, repeats: int, warm_up: int) -> dict[str, list[float]]:
-    """(wall, CPU ms) of parts of a step, each a program; of reading a batch from kept pictures and from disk."""
+    """(wall, CPU ms) of parts of a step, each a program; of reading a batch from kept images and from disk."""
     import jax
 
     programs = {}

@@ -35,7 +35,7 @@ SMALLEST_TURN = 0.3
 SMALLEST_QUALITY = 0.08
 """Lower bound of 4 sqrt(3) area / (sum of squared edges), 1 for an equilateral triangle, unless it was worse."""
 LOCAL = 200
-"""At least so many vertices near a joint share the correction of its regressor (three per equation if that is more)."""
+"""Smallest number of vertices near a joint that share the correction of its regressor (or three per equation, if more)."""
 RIDGE = 1e-13
 """Relative to the trace of the normal equations, which are singular where a shape direction moves nothing."""
 

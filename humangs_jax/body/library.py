@@ -1,4 +1,4 @@
-"""Where bodies come from: the package's own licence-free one, or a file."""
+"""Loading a body: the CC0 body of the package, or a file."""
 
 from importlib import resources
 from pathlib import Path
@@ -20,7 +20,7 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
     """
     if path is None:
         if smplx_options:
-            raise TypeError(f"options of SMPL-X files make no sense for the shipped body: {sorted(smplx_options)}")
+            raise TypeError(f"options of SMPL-X files do not apply to the shipped body: {sorted(smplx_options)}")
         with resources.as_file(resources.files("humangs_jax") / "assets" / "makehuman.npz") as file:
             return storage.read_body(file)
     path = Path(path)
@@ -28,7 +28,7 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
         raise FileNotFoundError(f"{path}: no such body model file")
     if storage.is_body_file(path):
         if smplx_options:
-            raise TypeError(f"{path}: options of SMPL-X files make no sense for this file: {sorted(smplx_options)}")
+            raise TypeError(f"{path}: options of SMPL-X files do not apply to this file: {sorted(smplx_options)}")
         return storage.read_body(path)
     from humangs_jax.body.smplx import load_smplx
 

@@ -88,7 +88,7 @@ def rest_pose(body: BodyModel) -> BodyPose:
 def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
     """The T-pose of a person.
 
-    Arguments: betas, coefficients of the first directions; those not given are 0.
+    Arguments: betas, coefficients of the first directions; missing ones are 0.
     Raises: ValueError if there are more coefficients than directions.
     """
     used, available = betas.shape[0], body.shape_directions.shape[-1]

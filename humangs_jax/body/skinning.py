@@ -22,7 +22,7 @@ EXACT = jax.lax.Precision.HIGHEST
 def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
     """Indices (j,) of every joint's parent, then grandparent, then the fourth, eighth ... ancestor; j where there is none.
 
-    Raises: ValueError if there is not exactly one root (-1), or a parent does not exist or leads round in a circle.
+    Raises: ValueError if there is not exactly one root (-1), a parent does not exist, or the parents form a cycle.
     """
     count = len(parents)
     if list(parents).count(-1) != 1:

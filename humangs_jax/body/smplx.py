@@ -1,7 +1,7 @@
 """SMPL-X model files and pose vectors.
 
 A pose vector has 165 numbers: global_orient 3, body 63, jaw 3, left eye 3, right eye 3, left hand 45, right hand 45.
-Two things about the hands differ between datasets and are always asked for by name: `use_pca` (the hand numbers are
+Two conventions for the hands differ between datasets; both are required keyword arguments: `use_pca` (the hand numbers are
 coefficients of the model's principal components) and `flat_hand_mean` (True: zero means a flat hand; False: zero means
 the model's mean hand, which is added).
 
@@ -62,7 +62,7 @@ class _ModelFile:
             raise ValueError(f"{self.path}: key '{key}' is missing (keys: {sorted(self.content)})")
         try:
             array = as_array(self.content[key])
-        except ValueError as error:  # numpy's word for a pickled object, or ours
+        except ValueError as error:  # numpy's message for a pickled object, or ours
             raise ValueError(f"{self.path}: key '{key}': {error}") from error
         fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
         if not fits:
@@ -151,7 +151,7 @@ def load_hands(path: str | Path) -> HandBasis:
 
 
 def _part(name: str, values: Any, size: int, dtype: Any) -> Float[Array, " size"]:
-    """Rotations of one body part, flat; zeros if not given."""
+    """Rotations of one body part, flat; zeros if missing."""
     if values is None:
         return jnp.zeros(size, dtype)
     values = jnp.asarray(values)
@@ -166,7 +166,7 @@ def _hand(side: int, values: Any, hands: HandBasis | None, use_pca: bool, flat_h
     if hands is None and not (flat_hand_mean and (values is None or not use_pca)):
         raise ValueError(f"{name}: use_pca or flat_hand_mean=False need the model's hand basis (`load_hands`)")
     if values is not None and use_pca:
-        assert hands is not None  # or it was refused above
+        assert hands is not None  # else it was refused above
         values = jnp.asarray(values)
         if values.ndim != 1 or values.shape[0] > 45:
             raise ValueError(f"{name}: expected at most 45 principal coefficients, got shape {values.shape}")
@@ -191,12 +191,12 @@ def assemble_pose(
     reye_pose: Any = None,
     left_hand_pose: Any = None,
     right_hand_pose: Any = None,
-    translation: Any = None,
+    transl: Any = None,
 ) -> BodyPose:
-    """A full pose from named parts; those not given are 0.
+    """A full pose from named parts; missing ones are 0.
 
     Arguments: global_orient, jaw_pose, leye_pose, reye_pose (3,); body_pose (63,) or (21, 3); hand poses (45,) or (15,
-    3) axis-angle, or with `use_pca` at most 45 coefficients; radians, and translation (3,) in metres.
+    3) axis-angle, or with `use_pca` at most 45 coefficients; radians, and transl (3,) in metres.
     `flat_hand_mean=False` adds the mean hand.
     hands: from `load_hands`, needed for `use_pca` or `flat_hand_mean=False`.
     Raises: ValueError, naming the part, for a wrong shape or a missing hand basis.
@@ -214,4 +214,4 @@ def assemble_pose(
             _hand(1, right_hand_pose, hands, use_pca, flat_hand_mean, dtype),
         ]
     )
-    return BodyPose(rotations.reshape(JOINTS, 3), part("translation", translation, 3))
+    return BodyPose(rotations.reshape(JOINTS, 3), part("transl", transl, 3))

@@ -14,7 +14,7 @@ _KEPT = 1 << 30
 
 
 def keep_freed_memory() -> bool:
-    """Lets the process keep what it frees. Call it once, before the first large array; programs do, the library never.
+    """Lets the process keep what it frees. Programs call it once, before the first large array; the library never does.
 
     Returns whether this C library has the setting (glibc). The process then never gets smaller than its peak.
     """

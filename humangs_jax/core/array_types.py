@@ -4,7 +4,7 @@
 axis    meaning
 ======  ====================================================
 b       subjects in a batch
-v       views (photographs) of one subject
+v       views (photos) of one subject
 h w     image rows and columns, in pixels
 c       channels
 p       patches of an image

@@ -1,6 +1,6 @@
 """Compiled programs kept on disk between runs: a program of this package takes seconds to a minute to compile.
 
-JAX has the cache; here is where it lies, for whom, and how large it may grow.
+JAX has the cache; this module decides where it lies and how large it may grow.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ def enable_compile_cache(folder: str | os.PathLike | None = None) -> Path | None
     Arguments: folder: where the cache lies; None: what the environment variable `HUMANGS_COMPILE_CACHE` names, else
     `humangs_jax` in the user's cache folder (`XDG_CACHE_HOME`, or what the platform has in its place).
     Returns: the folder in use, or None where there is none: `HUMANGS_COMPILE_CACHE=0` turns the cache off, and a folder that
-    cannot be written to is no error. A cache that JAX has been given already (`JAX_COMPILATION_CACHE_DIR`) stays.
+    cannot be written to is not an error. A cache that JAX already has (`JAX_COMPILATION_CACHE_DIR`) stays.
     """
     wish = os.environ.get(VARIABLE, "")
     if wish == "0":

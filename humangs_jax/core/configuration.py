@@ -47,7 +47,7 @@ def _is_protocol(annotation):
 
 
 def config_from_json(cls: type[T], text: str) -> T:
-    """Inverse of `config_to_json` for a configuration of class `cls`; fields that are absent take their defaults.
+    """Inverse of `config_to_json` for a configuration of class `cls`; missing fields take their defaults.
 
     Raises: ValueError for a field that the configuration does not have or a value of another type, naming it.
     """
@@ -67,7 +67,7 @@ def config_from_file(cls: type[T], path: Path) -> T:
 
 
 def _build(annotation: Any, value: Any, path: str) -> Any:
-    """A JSON value as what its annotation says."""
+    """A JSON value, converted to its annotation."""
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if _is_protocol(annotation) and isinstance(value, dict):
         cls = _find_part(value.get(KIND), annotation, path)
@@ -87,7 +87,7 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
             return tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
     elif _matches(value, annotation):
         return value
-    raise ValueError(f"{path}: {value!r} is not a {annotation}")
+    raise ValueError(f"{path}: expected {_named(annotation)}, got {value!r}")
 
 
 def _find_part(kind, protocol, path):
@@ -114,6 +114,10 @@ def _build_dataclass(cls, values, path):
     if unknown := sorted(set(values) - set(annotations)):
         raise ValueError(f"{path}.{unknown[0]}: {cls.__name__} has no such field")
     return cls(**{name: _build(annotations[name], value, f"{path}.{name}") for name, value in values.items()})
+
+
+def _named(annotation):
+    return annotation.__name__ if isinstance(annotation, type) else str(annotation)
 
 
 def _matches(value, annotation):

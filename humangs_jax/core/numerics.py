@@ -11,7 +11,7 @@ from humangs_jax.core.array_types import Array, Float, PyTree
 
 
 def at_least_float32(tree: PyTree) -> PyTree:
-    """The tree with its bfloat16 and float16 arrays in float32; wider ones as they are. Gradients return narrow."""
+    """The tree with its bfloat16 and float16 arrays in float32; wider ones unchanged. Gradients come back in the narrow type."""
     widen = lambda a: a.astype(dtype) if (dtype := jnp.promote_types(a.dtype, jnp.float32)) != a.dtype else a
     return jax.tree.map(widen, tree)
 

@@ -6,12 +6,15 @@ Weights files record `Architecture` and `Conventions`. `Execution` belongs to th
 import dataclasses
 from typing import Any, Literal
 
+from humangs_jax.core.configuration import knob
 from humangs_jax.network.bilinear import PixelGrid
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.execution import Execution, TokenSelection
 from humangs_jax.network.parts import Decoder, Encoder, Reader
 from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.vertex_decoder import VertexDecoder
+
+SCALING, EVALUATION = "performance_reconstruction.md", "evaluation.md"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +60,12 @@ class Conventions:
     afterwards; None for neither.
     """
 
-    image_size: int = 512
+    image_size: int = knob(
+        512,
+        cost="detail of the photos",
+        gain="tokens grow with its square, attention with its fourth power",
+        measured=SCALING,
+    )
     tokens: TokenSelection = "all"
     position_map: Literal["plain", "gouraud"] = "plain"
     ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
@@ -65,8 +73,12 @@ class Conventions:
     pixel_grid: PixelGrid = "half_pixel"
     skinning: Literal["affine", "rotation"] = "affine"
     rendering: Literal["exact", "inria"] = "exact"
-    body_vertices: int | None = None
-    longest_edge: float | None = None
+    body_vertices: int | None = knob(
+        None, cost="detail of the body", gain="Gaussians, reads and decoding in proportion", measured=EVALUATION
+    )
+    longest_edge: float | None = knob(
+        None, cost="Gaussians grow as it shrinks", gain="detail where the body is coarse", measured=EVALUATION
+    )
 
 
 @dataclasses.dataclass(frozen=True)

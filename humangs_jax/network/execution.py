@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from humangs_jax.core.configuration import knob
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
+MEASURED = "performance_reconstruction.md"
+
 TokenSelection = Literal["all", "foreground"]
 AttentionKernel = Literal["xla", "cudnn", "chunked"]
 
@@ -33,13 +35,13 @@ class Execution:
         None,
         cost="no background in the attention: exact only for weights that were trained so",
         gain="5 x in time at a foreground share of 0.2",
-        measured="performance_reconstruction.md",
+        measured=MEASURED,
     )
     token_capacity: int = knob(
         0,
         cost="tokens beyond it are dropped and counted",
         gain="time and memory",
-        measured="performance_reconstruction.md",
+        measured=MEASURED,
     )
     dtype: Literal["float32", "bfloat16"] = knob(
         "float32", cost="1e-2 of relative error", gain="time on accelerators; none on CPUs", measured="parity.md"
@@ -48,23 +50,23 @@ class Execution:
         "auto",
         cost="none",
         gain="chunked: a third of the time on CPUs, memory linear in tokens",
-        measured="performance_reconstruction.md",
+        measured=MEASURED,
     )
-    attention_chunk: int = knob(1024, cost="none", gain="memory", measured="performance_reconstruction.md")
+    attention_chunk: int = knob(1024, cost="none", gain="memory", measured=MEASURED)
     scan: bool = knob(
         False,
         cost="a copy of the blocks' parameters",
         gain="compile time on TPU and GPU",
-        measured="performance_reconstruction.md",
+        measured=MEASURED,
     )
     remat: Literal["none", "full", "dots"] = knob(
-        "none", cost="a third more arithmetic", gain="memory of training", measured="performance_reconstruction.md"
+        "none", cost="a third more arithmetic", gain="memory of training", measured=MEASURED
     )
     vertex_capacity: int | None = knob(
         None,
         cost="vertices beyond it are dropped and counted",
         gain="none measured in a reconstruction",
-        measured="performance_reconstruction.md",
+        measured=MEASURED,
     )
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.configuration import knob
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
@@ -54,7 +55,7 @@ class VertexDecoder:
 
     hidden: int = 256
     tight: int = 1
-    free: int = 4
+    free: int = knob(4, cost="detail: K = tight + free", gain="drawing in proportion to K", measured="evaluation.md")
     skinning_joints: int | None = None
     offset_scale: float | None = None
     initial_log_scale: float = -3.0

@@ -31,7 +31,7 @@ Weights = dict[str, Convolution]
 
 
 class Conv(NamedTuple):
-    """A convolution with as much zero padding on each side as `padding` says, and its ReLU."""
+    """A convolution with `padding` zeros on each side, and its ReLU."""
 
     name: str
     inputs: int
@@ -42,7 +42,7 @@ class Conv(NamedTuple):
 
 
 class Pool(NamedTuple):
-    """Largest or mean value of a window; without `ceil`, rows and columns that fill no window are left out."""
+    """Largest or mean value of a window; without `ceil`, rows and columns that fill no window are ignored."""
 
     size: int = 3
     stride: int = 2
@@ -115,7 +115,7 @@ VGG16 = vgg((2, 2, 3, 3, 3), (2, 2, 3, 3, 3))
 
 
 def convolutions(slices: Slices) -> Iterator[Conv]:
-    """All convolutions of a network, those of the fire modules among them."""
+    """All convolutions of a network, including those of the fire modules."""
     for layer in itertools.chain.from_iterable(slices):
         if isinstance(layer, Fire):
             yield layer.squeeze
@@ -130,7 +130,7 @@ def channels(slices: Slices) -> tuple[int, ...]:
 
 
 def random_weights(key: Key, slices: Slices) -> Weights:
-    """Made-up weights of a network, for tests and timings: what it computes with them means nothing."""
+    """Random weights of a network, for tests and timings only."""
 
     def draw(layer: Conv, key: Key) -> Convolution:
         shape = (layer.size, layer.size, layer.inputs, layer.outputs)
@@ -207,5 +207,5 @@ def _pool(layer, x):
 
 
 def _larger(x, y):
-    # of equal ones, which a plain background is full of, the first gets the gradient, as in torch; NaN wins
+    # of equal values (plain backgrounds) the first gets the gradient, as in torch; NaN propagates
     return jnp.where((y > x) | jnp.isnan(y), y, x)

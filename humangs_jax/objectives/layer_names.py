@@ -1,6 +1,6 @@
 """Finds the loss networks among the tensors of a file, by the names that are in use for them.
 
-Layers have torchvision's numbers, whatever stands before them: `features.0.weight`, `vgg.features.0.weight`,
+Layers have torchvision's numbers, with any prefix: `features.0.weight`, `vgg.features.0.weight`,
 `net.slice1.0.weight`, `module.0.weight`. Heads of LPIPS are `lin0.model.1.weight`, or `lins.0.` for `lin0.`. Classifiers
 are left out.
 """
@@ -31,17 +31,17 @@ Tensors = dict[str, np.ndarray]
 
 
 def is_layer(key: str) -> bool:
-    """Whether a tensor may be one of a backbone."""
+    """Whether a tensor's name fits a layer of a backbone."""
     return LAYER.fullmatch(key) is not None and "classifier" not in key
 
 
 def is_head(key: str) -> bool:
-    """Whether a tensor may be a head of LPIPS."""
+    """Whether a tensor's name fits a head of LPIPS."""
     return HEAD.fullmatch(key) is not None
 
 
 def expected_tensors(network: str) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of what torch keeps of one of `NETWORKS`, as far as it is needed here.
+    """Names and shapes of the torch tensors of one of `NETWORKS` that are needed here.
 
     {"0.weight": (out, in, rows, columns), "0.bias": (out,), ...}
     """
@@ -59,7 +59,7 @@ def find_layers(tensors: Tensors, network: str) -> Tensors:
     networks that differ.
     """
     expected = expected_tensors(network)
-    groups = collections.defaultdict(dict)  # by what stands before the numbers
+    groups = collections.defaultdict(dict)  # by prefix
     for key in filter(is_layer, tensors):
         if match := LAYER.fullmatch(key):
             groups[match["before"]][match["layer"]] = key

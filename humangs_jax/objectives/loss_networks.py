@@ -1,4 +1,4 @@
-"""The frozen networks that losses may use, read from files that the user has: nothing of them ships with the package.
+"""The frozen networks that losses may use, read from files that the user has: none ships with the package.
 
 Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, in either format of `torch.save` or as
 safetensors; VGG-19 may also be MatConvNet's `.mat`. Names that are understood: `layer_names`.
@@ -36,7 +36,7 @@ Path = str | os.PathLike
 
 @pytree_dataclass
 class LossNetworks:
-    """What there is of them; a pytree, to be handed to a training step as an argument."""
+    """The networks that are available, None for the others; a pytree, to be passed to a training step."""
 
     perceptual: Vgg19 | None = None
     lpips: Lpips | None = None
@@ -74,7 +74,7 @@ def load_vgg19(path: Path) -> Vgg19:
 def load_lpips(net: str, backbone: Path, heads: Path | None = None) -> Lpips:
     """LPIPS "vgg", "alex" or "squeeze" from its backbone and its heads, in float32.
 
-    heads: file of the heads (the lpips package ships them); if not given, they are in the same file as the backbone.
+    heads: file of the heads (the lpips package ships them); default: the same file as the backbone.
     Raises: as `load_vgg19`; ValueError for an unknown net.
     """
     if net not in LPIPS_NETWORKS:
@@ -108,7 +108,7 @@ def load_loss_networks(
 
 
 def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
-    """The loss networks that a released checkpoint carries, under names that the loaders read; and what they are.
+    """The loss networks in a released checkpoint, under names that the loaders read; and which networks they are.
 
     Raises: OSError; ValueError naming file and tensor if the checkpoint has none, or a part of one.
     """
@@ -130,9 +130,9 @@ def collect_loss_networks(checkpoint: Path) -> tuple[Tensors, list[str]]:
 
 
 def _which_net(tensors: Tensors) -> str:
-    """Told by the heads."""
+    """The network that the heads fit."""
     for net in LPIPS_NETWORKS:
         with contextlib.suppress(ValueError):
             find_heads(tensors, net)
             return net
-    return "vgg"  # whose errors then say what is wrong
+    return "vgg"  # its errors then name what is wrong

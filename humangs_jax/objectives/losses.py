@@ -1,4 +1,4 @@
-"""Losses, unreduced: each says where the error lies, and the caller weighs and averages."""
+"""Losses, unreduced: the caller weighs and averages."""
 
 import jax.numpy as jnp
 
@@ -11,7 +11,7 @@ def squared_error(predicted: Float[Array, "*b"], target: Float[Array, "*b"]) -> 
 
 
 def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:
-    """How far the tight Gaussians stray from their vertex: squared norm of the offset, averaged over the k of a vertex.
+    """Distance of the tight Gaussians from their vertex: squared norm of the offset, averaged over the k of a vertex.
 
     Offsets are in normalised units (body height 1.8), so the weight of this term does not depend on the subject's size.
     Without tight Gaussians (k = 0) it is 0.

@@ -1,4 +1,4 @@
-"""Metrics of a predicted image against a photograph, both (h, w, 3) in [0, 1]."""
+"""Metrics of a predicted image against a photo, both (h, w, 3) in [0, 1]."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from humangs_jax.people.seeds import GENERATOR_VERSION, SPLITS, seeds_of, split_of
     from humangs_jax.people.source import GeneratedSource, on_the_fly_source
     from humangs_jax.people.subject import SyntheticSubject, make_subject
-    from humangs_jax.people.writer import Layout, synthesize, write_set, write_subject, write_training_subject
+    from humangs_jax.people.writer import Layout, write_set, write_subject, write_training_subject
 
 _MODULES = {
     "bank": ("PeopleBank", "build_bank", "load_bank", "save_bank"),
@@ -23,14 +23,14 @@ _MODULES = {
     "seeds": ("GENERATOR_VERSION", "SPLITS", "seeds_of", "split_of"),
     "source": ("GeneratedSource", "on_the_fly_source"),
     "subject": ("SyntheticSubject", "make_subject"),
-    "writer": ("Layout", "synthesize", "write_set", "write_subject", "write_training_subject"),
+    "writer": ("Layout", "write_set", "write_subject", "write_training_subject"),
 }
 _HOME = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [
     "GENERATOR_VERSION", "ON_THE_FLY", "SPLITS", "GeneratedSource", "Layout", "OnTheFlyConfig", "PeopleBank",
     "SyntheticSubject", "build_bank", "find_people", "load_bank", "make_subject", "on_the_fly_source", "save_bank", "seeds_of",
-    "split_of", "synthesize", "write_set", "write_subject", "write_training_subject",
+    "split_of", "write_set", "write_subject", "write_training_subject",
 ]  # fmt: skip
 
 

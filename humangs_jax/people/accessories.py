@@ -9,17 +9,19 @@ from humangs_jax.people import hair, tailoring
 from humangs_jax.people.anatomy import FLOOR, Anatomy
 from humangs_jax.people.fabrics import Material, band, colour, mix, weave
 from humangs_jax.people.garments import nearest_weights, rest_height, smooth_weights
-from humangs_jax.people.kinematics import HEAD, LEFT_ANKLE
+from humangs_jax.people.kinematics import HEAD, LEFT_ANKLE, LEFT_EYE, NECK, RIGHT_EYE
 from humangs_jax.people.noise import ripples
 from humangs_jax.people.outfits import Garment
 from humangs_jax.people.surfaces import (
     Outlines,
     Surface,
+    ball,
     blurred,
     grid_faces,
     hanging,
     join,
     outlines,
+    rigid,
     sweep,
     turn_in_hems,
     unit,
@@ -27,11 +29,10 @@ from humangs_jax.people.surfaces import (
 
 RING = 40
 """Points of a ring around neck or head."""
-LEFT_EYE, RIGHT_EYE = 23, 24
 
 
 def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float) -> list[tuple[Surface, Material]]:
-    """Surfaces with materials of an accessory that no hem depends on. ease: of the outermost layer on the trunk, metres."""
+    """Surfaces and materials of an accessory. ease: distance of the outermost layer from the trunk, metres."""
     kind, sizes = garment.kind, garment.sizes
     cloth = weave(garment.fabric)
     knit = Material(cloth, wrinkles=0.3)
@@ -102,13 +103,8 @@ def _followed(anatomy, vertices, faces, candidates=None):
         template = anatomy.skin.attributes["template"]
         candidates = np.flatnonzero((np.abs(template[:, 0]) < 0.2) & (template[:, 1] > -0.35) & (template[:, 1] < 0.2))
     weights = smooth_weights(nearest_weights(anatomy, vertices, candidates), faces, 6)
-    return _placed(Surface(vertices, faces, weights), vertices - [0, anatomy.joints[12, 1] - 0.19, 0], 0.12)
-
-
-def _placed(surface, template, girth):
-    template = np.asarray(template, np.float32)
-    cloth = np.concatenate([template, np.full((len(template), 1), girth)], 1).astype(np.float32)
-    return surface.with_attributes(template=template, cloth=cloth)
+    around_middle = vertices - [0, anatomy.joints[NECK, 1] - 0.19, 0]
+    return Surface(vertices, faces, weights).painted(around_middle, around_middle, 0.12)
 
 
 def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
@@ -176,10 +172,8 @@ def _tail(rng, anatomy, start, side, length, thickness, ease):
     return _followed(anatomy, vertices, faces)
 
 
-def _on_head(anatomy, vertices, faces, template, girth=0.09):
-    weights = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
-    weights[:, HEAD] = 1
-    return _placed(Surface(np.asarray(vertices, np.float32), faces, weights), template, girth)
+def _on_head(anatomy, vertices, faces, template):
+    return rigid(vertices, faces, HEAD, len(anatomy.joints)).painted(template, template, 0.09)
 
 
 def _flange(anatomy, ring, outwards, widths, droop, closed):
@@ -312,25 +306,15 @@ def necklace(anatomy: Anatomy, length: float) -> Surface:
     return _followed(anatomy, vertices, faces)
 
 
-def _box(half, rows=14, columns=24, sharpness=4.0):
-    """Vertices, faces and unit coordinates of a rounded box with half axes (3,)."""
-    polar, around = (
-        x.reshape(-1)
-        for x in np.meshgrid(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns, indexing="ij")
-    )
-    d = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], -1)
-    unit_box = d / (np.sum(np.abs(d) ** sharpness, -1, keepdims=True) ** (1 / sharpness))
-    return unit_box * half, grid_faces(rows, columns, closed=True), unit_box
-
-
 def _bag(anatomy, center, half, turn, near):
-    points, faces, unit_box = _box(np.asarray(half))
+    """A rounded box with half axes (3,), turned about the vertical, that moves as the skin near it does on average."""
+    d, faces = ball(14, 24)
+    unit_box = d / (np.sum(np.abs(d) ** 4.0, -1, keepdims=True) ** (1 / 4.0))
+    points = unit_box * np.asarray(half)
     c, s = np.cos(turn), np.sin(turn)
     vertices = (points @ np.asarray([[c, 0, -s], [0, 1, 0], [s, 0, c]]) + center).astype(np.float32)
     weights = np.repeat(anatomy.skin.weights[near].mean(0, keepdims=True), len(vertices), 0)
-    template = np.asarray(unit_box, np.float32)
-    cloth = np.concatenate([points, np.full((len(points), 1), 0.15)], 1).astype(np.float32)
-    return Surface(vertices, faces, weights).with_attributes(template=template, cloth=cloth)
+    return Surface(vertices, faces, weights).painted(unit_box, points, 0.15)
 
 
 def backpack(anatomy: Anatomy, size: float, ease: float) -> Surface:
@@ -407,11 +391,7 @@ def _shoe(anatomy, side, height, sole, ease):
     weights = smooth_weights(weights, faces, 3)
     ankle = anatomy.joints[LEFT_ANKLE + side]
     local = vertices - np.asarray([ankle[0], floor, ankle[2]])
-    cloth = np.concatenate([local, np.full((len(local), 1), 0.06)], 1).astype(np.float32)
-    surface = Surface(
-        vertices, np.ascontiguousarray(faces), weights, {"template": local.astype(np.float32), "cloth": cloth}
-    )
-    return turn_in_hems(surface, 0.01)
+    return turn_in_hems(Surface(vertices, np.ascontiguousarray(faces), weights).painted(local, local, 0.06), 0.01)
 
 
 def _outlines(points, levels):

@@ -1,7 +1,7 @@
-"""The shaped body as a tailor sees it: template coordinates for cutting, limbs, outlines.
+"""The shaped body for fitting clothes: template coordinates for cutting, limbs, outlines.
 
-Cuts (hems, necklines, hairlines) and paint are given in TEMPLATE coordinates, the T-pose of the mean body in metres, which every
-vertex keeps whatever the shape of the person: one number fits all. Draping uses the rest vertices of the person.
+Cuts (hems, necklines, hairlines) and paint are given in TEMPLATE coordinates: the T-pose of the mean body in metres. A vertex
+keeps them for every shape of the person, so one number fits all people. Draping uses the rest vertices of the person.
 """
 
 import dataclasses
@@ -23,7 +23,7 @@ ARMHOLE = 0.185
 TRUNK_GIRTH, LEG_GIRTH, ARM_GIRTH = 0.16, 0.08, 0.06
 """Radii that turn angles around trunk, legs and arms into metres of cloth."""
 SAME_GIRTH = 1e-4
-"""What rounding may do to them."""
+"""Tolerance for comparing girths."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ MARGIN = 0.015
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """Where a wrist should be.
+    """Target of a wrist.
 
     odds: of being drawn. place: of the left wrist relative to the shoulder in arm lengths, in axes of the chest.
     raised: range of the upper arm's elevation, 0 is horizontal. forward: of its turn towards the front. flexed: of the elbow.
@@ -179,7 +179,7 @@ def _along(elbows, wrists, tips):
 FINGERS = ("index", "middle", "pinky", "ring")
 """In the order of SMPL-X's joints; the thumb comes last."""
 BONE_SHARE = (0.85, 1.0, 0.7)
-"""Of a finger's curl that its knuckles take, from the palm outwards."""
+"""Share of a finger's curl at each knuckle, from the palm outwards."""
 SPLAY = {"index": 1.0, "middle": 0.15, "ring": -0.6, "pinky": -1.2}
 
 
@@ -209,7 +209,7 @@ GESTURES = {
 
 
 def pose_hand(rng: np.random.Generator, rotations: Float[np.ndarray, "j 3"], side: int) -> None:
-    """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: on the way from relaxed to some gesture."""
+    """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a random gesture."""
     first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
     odds = np.asarray([gesture.odds for gesture in GESTURES.values()])
     goal = list(GESTURES.values())[rng.choice(len(odds), p=odds / odds.sum())]

@@ -22,18 +22,18 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 SIDES = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
 """Directions that charts look towards at first."""
 LEAST_COSINE = 0.45
-"""A face may join its neighbours' chart if it is turned away from the chart's side by no more than this cosine."""
+"""Least cosine between the normal of a face and the side of a chart that it may join."""
 NEIGHBOUR_GAIN = 0.2
-"""What a neighbour in the same chart is worth, as a cosine."""
+"""Weight of a neighbour in the same chart, as a cosine."""
 SMOOTHING_STEPS = 8
 PEELINGS = 3
-"""How often folded charts are taken apart; what still overlaps then is counted by the tests."""
+"""How often charts that overlap themselves are split; the tests count what still overlaps."""
 GUTTER = 2
-"""Texels between charts, at least."""
+"""Least number of texels between charts."""
 CELLS = 128
 """Cells a side of the square as it is packed."""
 SHRINKING = 0.97
-"""Scale of the next try to pack, from that of the last."""
+"""Factor on the scale after a failed attempt to pack."""
 VERTEX_STEP, FACE_STEP = 32768, 32768
 """Charts are padded to multiples of these for the rasterizer: few shapes are compiled."""
 
@@ -118,7 +118,7 @@ def _choose_sides(normals, pairs):
 
 
 def _connected(count, pairs, labels):
-    """(f,) number of the connected set of faces of one label that a face belongs to."""
+    """(f,) index of the connected set of faces of one label that contains each face."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

@@ -1,7 +1,7 @@
-"""Banks of dressed people, ready for a device: made on the host once, all of one shape, drawn from by `live.on_the_fly_example`.
+"""Banks of dressed people, ready for a device: made on the host once, all of one shape, used by `on_the_fly_example`.
 
-A bank holds people of ONE range of seeds (see `seeds`): what is drawn from a bank for training is nobody of the test range,
-whatever the key. About 3 MB a person at 512 texels a side.
+A bank holds people of ONE range of seeds (see `seeds`), so no key of a training bank makes a person of the test range. About
+3 MB a person at 512 texels a side.
 """
 
 import concurrent.futures
@@ -96,7 +96,7 @@ def build_bank(
 ) -> PeopleBank:
     """The people of some seeds, which must all lie in the range `split` of `seeds.SPLITS`.
 
-    texture_size: texels a side, a multiple of 128; 512 suits pictures up to 256 pixels, 1024 those of 512.
+    texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 those of 512.
     processes: how many work at once; with more than one, each loads the shipped body itself.
     Raises: ValueError if there are no seeds, a seed lies in another range, or the body is not the package's own.
     """

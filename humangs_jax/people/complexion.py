@@ -261,7 +261,7 @@ def _stubble(tones, haircut, result, x, y, z, lips, template, seed):
 
 
 def eye_material(tones: Complexion) -> Material:
-    """White, iris, pupil and a catch-light that belongs to the surface."""
+    """White, iris, pupil and a highlight painted on the surface."""
 
     def albedo(s: Spots):
         d = s.template

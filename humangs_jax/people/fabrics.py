@@ -18,14 +18,14 @@ from humangs_jax.people.noise import Ripples, hashed, lattice
 SHOULDER_RIDGE = -0.02
 """Template z of the line from neck to shoulder on which front and back are sewn together."""
 ALBEDO_LIMIT = 0.88
-"""White clothes stay darker than the white background."""
+"""Largest albedo: white clothes stay darker than the white background."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Spots:
     """Points on a surface. cloth: (n, 4), see `anatomy.cloth_coordinates`. template: (n, 3) template coordinates.
 
-    Coordinates of sleeves and trouser legs are made sharp at their seams, where patterns meet, whatever was given.
+    Coordinates of sleeves and trouser legs are recomputed, so that they are sharp at seams, where patterns meet.
     """
 
     cloth: Float[np.ndarray, "n 4"]
@@ -82,18 +82,23 @@ def colour(hue: float, saturation: float, value: float) -> Float[np.ndarray, "3"
     return np.asarray(colorsys.hsv_to_rgb(hue % 1, np.clip(saturation, 0, 1), np.clip(value, 0, 1)), np.float32)
 
 
+DYES = {
+    "neutral": (0.28, (0, 1), (0, 0.06), (0.1, 0.18, 0.32, 0.5, 0.7, 0.85)),
+    "muted": (0.28, (0, 1), (0.2, 0.5), (0.3, 0.8)),
+    "vivid": (0.22, (0, 1), (0.5, 0.85), (0.35, 0.8)),
+    "earth": (0.11, (0.05, 0.12), (0.3, 0.7), (0.2, 0.7)),
+    "navy": (0.11, (0.56, 0.66), (0.4, 0.8), (0.12, 0.45)),
+}
+"""Kinds of dyes: odds; hue, saturation and value, each a range or a choice of more than two numbers."""
+
+
+def _colour_of(rng, ranges):
+    return colour(*(rng.uniform(*values) if len(values) == 2 else rng.choice(values) for values in ranges))
+
+
 def random_colour(rng: np.random.Generator) -> Float[np.ndarray, "3"]:
-    """A dye: neutrals, denim blues, earth colours or something loud."""
-    kind = rng.choice(["neutral", "muted", "vivid", "earth", "navy"], p=[0.28, 0.28, 0.22, 0.11, 0.11])
-    if kind == "neutral":
-        return colour(rng.random(), rng.uniform(0, 0.06), rng.choice([0.1, 0.18, 0.32, 0.5, 0.7, 0.85]))
-    if kind == "muted":
-        return colour(rng.random(), rng.uniform(0.2, 0.5), rng.uniform(0.3, 0.8))
-    if kind == "vivid":
-        return colour(rng.random(), rng.uniform(0.5, 0.85), rng.uniform(0.35, 0.8))
-    if kind == "earth":
-        return colour(rng.uniform(0.05, 0.12), rng.uniform(0.3, 0.7), rng.uniform(0.2, 0.7))
-    return colour(rng.uniform(0.56, 0.66), rng.uniform(0.4, 0.8), rng.uniform(0.12, 0.45))
+    """A dye: neutral, muted, vivid, an earth colour or navy."""
+    return _colour_of(rng, DYES[rng.choice(list(DYES), p=[odds for odds, *_ in DYES.values()])][1:])
 
 
 def accent(rng: np.random.Generator, base: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
@@ -141,6 +146,38 @@ def weave(fabric: Fabric) -> Callable[[Spots], np.ndarray]:
     return PATTERNS[fabric.pattern][1](fabric.rng(0), fabric.base, fabric.other)
 
 
+LEATHER_SHOES = ("flats", "sandals", "ankle_boots", "boots")
+USUAL = {
+    "denim": ((0.57, 0.63), (0.3, 0.75), (0.12, 0.6)),
+    "cotton": ((0.06, 0.13), (0.15, 0.5), (0.2, 0.75)),
+    "leather": ((0.05, 0.09), (0.2, 0.7), (0.06, 0.4)),
+    "suit": ((0.58, 0.68), (0.05, 0.35), (0.06, 0.4)),
+}
+"""Hue, saturation and value of usual cloths."""
+CLOTHS = {
+    "jeans": ("denim", 0.85), "denim_jacket": ("denim", 0.9), "chinos": ("cotton", 0.6), "cargo": ("cotton", 0.65),
+    "slim": ("suit", 0.5), "blazer": ("suit", 0.6), "coat": ("suit", 0.35), "flats": ("leather", 0.75),
+    "boots": ("leather", 0.75), "ankle_boots": ("leather", 0.75), "belt": ("leather", 0.9), "sandals": ("leather", 0.7),
+    "shoulder_bag": ("leather", 0.5), "watch": ("leather", 0.6), "glasses": ("leather", 0.6),
+    "sunglasses": ("leather", 0.85), "track": ("suit", 0.5), "leggings": ("suit", 0.6), "wide": ("cotton", 0.4),
+}  # fmt: skip
+"""Usual cloth of a kind of garment, and how often it is of that colour."""
+COLOURS = (
+    (("shirt", "socks", "sneakers"), 0.45, ((0, 1), (0, 0.05), (0.72, 0.87))),
+    (("sneakers", "leggings", "coat", "puffer", "slim"), 0.4, ((0, 1), (0, 0.1), (0.06, 0.16))),
+    (("sneakers", *LEATHER_SHOES), 0.6, ((0.03, 0.12), (0.0, 0.5), (0.1, 0.7))),
+)
+"""Kinds of garments, how often they are (if of no colour so far) of these colours; otherwise any dye."""
+PATTERN_RULES = (
+    (("jeans", "denim_jacket"), "denim", 1, ()),
+    (("cargo", "hooded_jacket", "shorts"), "camouflage", 0.25, ()),
+    (("puffer", "leggings", "backpack"), "plain", 0.7, ()),
+    (("cap", "brim_hat"), "plain", 1, ("camouflage", "melange", "checks", "herringbone")),
+    (("sneakers", *LEATHER_SHOES, "belt", "watch", "necklace", "glasses"), "plain", 1, ()),
+)
+"""Kinds of garments, the pattern that they get instead of a random one, how often, and patterns that they keep."""
+
+
 def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabric:
     """A fabric that suits a kind of garment; with probability `plainness` in one dye or nearly so."""
     if rng.random() < plainness:
@@ -150,44 +187,18 @@ def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabr
         odds = np.asarray([PATTERNS[n][0] for n in names])
         pattern = str(rng.choice(names, p=odds / odds.sum()))
     base = _dye(rng, kind)
-    if kind in ("jeans", "denim_jacket"):
-        pattern = "denim"
-    if kind in ("cargo", "hooded_jacket", "shorts") and rng.random() < 0.25:
-        pattern = "camouflage"
-    if kind in ("puffer", "leggings", "backpack") and rng.random() < 0.7:
-        pattern = "plain"
-    if kind in ("cap", "brim_hat") and pattern not in ("camouflage", "melange", "checks", "herringbone"):
-        pattern = "plain"
-    if kind in ("sneakers", "flats", "sandals", "ankle_boots", "boots", "belt", "watch", "necklace", "glasses"):
-        pattern = "plain"
+    for kinds, usual, odds, kept in PATTERN_RULES:
+        if kind in kinds and pattern not in kept and (odds == 1 or rng.random() < odds):
+            pattern = usual
     return Fabric(pattern, base, accent(rng, base), int(rng.integers(1 << 31)))
 
 
 def _dye(rng, kind):
-    """A colour that the trade sells the garment in."""
-    sober = {
-        "denim": (0.57, 0.63, 0.3, 0.75, 0.12, 0.6),
-        "cotton": (0.06, 0.13, 0.15, 0.5, 0.2, 0.75),
-        "leather": (0.05, 0.09, 0.2, 0.7, 0.06, 0.4),
-        "suit": (0.58, 0.68, 0.05, 0.35, 0.06, 0.4),
-    }
-    trade = {
-        "jeans": ("denim", 0.85), "denim_jacket": ("denim", 0.9), "chinos": ("cotton", 0.6), "cargo": ("cotton", 0.65),
-        "slim": ("suit", 0.5), "blazer": ("suit", 0.6), "coat": ("suit", 0.35), "flats": ("leather", 0.75),
-        "boots": ("leather", 0.75), "ankle_boots": ("leather", 0.75), "belt": ("leather", 0.9), "sandals": ("leather", 0.7),
-        "shoulder_bag": ("leather", 0.5), "watch": ("leather", 0.6), "trousers": ("cotton", 0.5), "glasses": ("leather", 0.6),
-        "sunglasses": ("leather", 0.85), "track": ("suit", 0.5), "leggings": ("suit", 0.6), "wide": ("cotton", 0.4),
-    }  # fmt: skip
-    cloth, odds = trade.get(kind, ("", 0.0))
-    if rng.random() < odds:
-        low_h, high_h, low_s, high_s, low_v, high_v = sober[cloth]
-        return colour(rng.uniform(low_h, high_h), rng.uniform(low_s, high_s), rng.uniform(low_v, high_v))
-    if kind in ("shirt", "socks", "sneakers") and rng.random() < 0.45:
-        return colour(rng.random(), rng.uniform(0, 0.05), rng.uniform(0.72, 0.87))
-    if kind in ("sneakers", "leggings", "coat", "puffer", "slim") and rng.random() < 0.4:
-        return colour(rng.random(), rng.uniform(0, 0.1), rng.uniform(0.06, 0.16))
-    if kind in ("sneakers", "flats", "sandals", "ankle_boots", "boots") and rng.random() < 0.6:
-        return colour(rng.uniform(0.03, 0.12), rng.uniform(0.0, 0.5), rng.uniform(0.1, 0.7))
+    """A usual colour of a kind of garment, or any."""
+    cloth, odds = CLOTHS.get(kind, ("cotton", 0.0))
+    for kinds, share, ranges in (((kind,), odds, USUAL[cloth]), *COLOURS):
+        if kind in kinds and rng.random() < share:
+            return _colour_of(rng, ranges)
     return random_colour(rng)
 
 

@@ -28,7 +28,7 @@ from humangs_jax.people.surfaces import (
 HEM_MARGIN = 0.012
 """Skin is removed below cloth from this far inside the hem (metres of template coordinates)."""
 UNDER_A_HEM = 0.009
-"""Metres that a skirt is narrower where something hangs over it."""
+"""How much narrower a skirt is below a top that hangs over it, metres."""
 TUBE_COLUMNS, TUBE_STEP = 72, 0.035
 
 
@@ -69,11 +69,6 @@ def shell(rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], 
     return turn_in_hems(Surface(draped.vertices, draped.faces, weights, kept), fit.hem)
 
 
-def covered(fields: list[np.ndarray], margin: float = HEM_MARGIN) -> np.ndarray:
-    """(n,) whether a body vertex lies under the cloth of `fields`, hems excluded."""
-    return np.min(fields, axis=0) > margin
-
-
 def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> np.ndarray:
     """Skinning weights (n, j) smoothed over a surface; rows sum to 1."""
     used = weights.max(0) > 0
@@ -111,7 +106,7 @@ def _drape(rng, anatomy, surface, fit):
 
 
 def _over_the_seat(template):
-    """(n,) 1 between the buttocks and below the belly, where skin has a cleft and cloth has none."""
+    """(n,) 1 between the buttocks and below the belly: cloth is smoothed more there than elsewhere."""
     x, y, _ = template.T
     return np.exp(-((x / 0.045) ** 2)) * smoothstep(0.22, 0.28, -y) * (y > -0.5)
 
@@ -152,7 +147,7 @@ def _push_trunk(anatomy, points, arm, leg, fit):
 
 
 def anatomy_height(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
-    """(n,) heights of points above the shoulders' height less that of the template: about template y for the trunk."""
+    """(n,) heights of points relative to the shoulders, moved so that they are about template y on the trunk."""
     shoulders = anatomy.joints[LEFT_SHOULDER, 1]
     return points[:, 1] - shoulders + ARM_HEIGHT
 
@@ -235,7 +230,7 @@ def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
 
 
 def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
-    """Rest heights of the person for heights on the trunk and the legs of the template: where the skin of that height is."""
+    """Rest heights of the person's skin for template heights on trunk and legs."""
     x, y, _ = anatomy.skin.attributes["template"].T
     own = (np.abs(x) < 0.2) & (y < 0.14) & (y > ANKLE)
     bins = np.floor((y[own] - ANKLE) / 0.03).astype(int)
@@ -249,7 +244,7 @@ def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
 
 
 def _skirt_weights(anatomy, vertices, template_y):
-    """The trunk's weights at the waist, then more and more of the thighs (and shins), shared by the side a vertex is on."""
+    """Weights of the trunk at the waist, blending into those of thighs and shins of the vertex's side further down."""
     template = anatomy.skin.attributes["template"]
     near = np.flatnonzero((np.abs(template[:, 0]) < 0.2) & (template[:, 1] < 0.0) & (template[:, 1] > -0.4))[::2]
     trunk = nearest_weights(anatomy, vertices, near)

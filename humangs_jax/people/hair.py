@@ -10,16 +10,19 @@ import numpy as np
 
 from humangs_jax.people.anatomy import Anatomy, smoothstep
 from humangs_jax.people.garments import nearest_weights, smooth_weights
-from humangs_jax.people.kinematics import HEAD, NECK, SPINE3
+from humangs_jax.people.kinematics import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3
 from humangs_jax.people.noise import ripples
+from humangs_jax.people.outfits import HEADWEAR, drawn, row
 from humangs_jax.people.surfaces import (
     Surface,
+    ball,
     blurred,
     cut,
     grid_faces,
     hanging,
     join,
     outlines,
+    rigid,
     smooth,
     sweep,
     turn_in_hems,
@@ -27,23 +30,25 @@ from humangs_jax.people.surfaces import (
 )
 
 CUTS = {
-    "cropped": (0.22, 0.03),
-    "short": (0.26, 0.10),
-    "quiff": (0.10, 0.01),
-    "curly": (0.08, 0.12),
-    "afro": (0.05, 0.05),
-    "buzz": (0.09, 0.01),
-    "bald": (0.07, 0.004),
-    "bob": (0.012, 0.17),
-    "long": (0.025, 0.25),
-    "ponytail": (0.02, 0.11),
-    "bun": (0.03, 0.08),
-    "braid": (0.01, 0.05),
+    "cropped": (0.22, 0.03, (0.005, 0.010)),
+    "short": (0.26, 0.10, (0.012, 0.022)),
+    "quiff": (0.10, 0.01, (0.010, 0.016)),
+    "curly": (0.08, 0.12, (0.024, 0.045)),
+    "afro": (0.05, 0.05, (0.045, 0.085)),
+    "buzz": (0.09, 0.01, 0.008),
+    "bald": (0.07, 0.004, 0.008),
+    "bob": (0.012, 0.17, (0.012, 0.024)),
+    "long": (0.025, 0.25, (0.010, 0.022)),
+    "ponytail": (0.02, 0.11, 0.008),
+    "bun": (0.03, 0.08, 0.008),
+    "braid": (0.01, 0.05, 0.008),
 }
-"""Odds for men and women."""
+"""Odds for men and women, thickness (metres, or their range)."""
+NOT_UNDER_HEADWEAR = ("curly", "afro", "quiff", "bun")
+"""Cuts that no headwear fits over."""
 LONG_CUTS = ("bob", "long")
 FRINGES = {"straight": 0.28, "parted": 0.34, "side": 0.38}
-"""Odds of what hangs over the forehead of longer hair."""
+"""Odds of a fringe of longer hair."""
 BEARDS = {"none": 0.5, "stubble": 0.2, "moustache": 0.05, "goatee": 0.09, "full": 0.16}
 """Odds for men."""
 
@@ -69,34 +74,22 @@ class Haircut:
 
 
 def sample_haircut(rng: np.random.Generator, male: bool, years: float, worn: set[str]) -> Haircut:
-    """A random cut that goes under what is worn on the head; old men lose hair."""
-    odds = np.asarray([value[0 if male else 1] for value in CUTS.values()])
-    names = list(CUTS)
+    """A random cut that fits under the headwear; old men lose hair."""
+    headwear = bool(worn & set(HEADWEAR))
+    odds = {name: value[0 if male else 1] for name, value in CUTS.items()}
     if male and years > 45:
-        odds[names.index("bald")] *= 3.0
-    if worn & {"cap", "beanie", "brim_hat", "headscarf"}:
-        odds[[names.index(n) for n in ("curly", "afro", "quiff", "bun")]] = 0
-    cut = str(rng.choice(names, p=odds / odds.sum()))
-    thickness = {
-        "cropped": rng.uniform(0.005, 0.010),
-        "short": rng.uniform(0.012, 0.022),
-        "quiff": rng.uniform(0.010, 0.016),
-        "curly": rng.uniform(0.024, 0.045),
-        "afro": rng.uniform(0.045, 0.085),
-        "bob": rng.uniform(0.012, 0.024),
-        "long": rng.uniform(0.010, 0.022),
-    }.get(cut, 0.008)
-    if worn & {"cap", "beanie", "brim_hat", "headscarf"}:
-        thickness = min(thickness, 0.010)
+        odds["bald"] *= 3.0
+    cut = drawn(rng, odds | (dict.fromkeys(NOT_UNDER_HEADWEAR, 0) if headwear else {}))
+    thickness = row(rng, {name: value[2] for name, value in CUTS.items()}, cut)
+    thickness = min(thickness, 0.010) if headwear else thickness
     bottom = rng.uniform(0.15, 0.2) if cut == "bob" else rng.uniform(-0.17, 0.1)
     wave = rng.choice([rng.uniform(0.002, 0.004), rng.uniform(0.006, 0.014)], p=[0.55, 0.45])
     receding = rng.uniform(-0.004, 0.012 + 0.012 * (years > 45)) if male else rng.uniform(-0.006, 0.004)
-    beards = np.asarray(list(BEARDS.values()))
-    beard = str(rng.choice(list(BEARDS), p=beards / beards.sum())) if male and years > 17 else "none"
+    beard = drawn(rng, BEARDS) if male and years > 17 else "none"
     long = 0.35 if rng.random() < 0.8 else 1.0
     return Haircut(
         cut=cut,
-        fringe=str(rng.choice(list(FRINGES), p=list(FRINGES.values()))),
+        fringe=drawn(rng, FRINGES),
         side=float(rng.choice([-1, 1])),
         thickness=float(thickness),
         bottom=bottom,
@@ -177,12 +170,12 @@ def fringe(rng: np.random.Generator, haircut: Haircut) -> Callable[[np.ndarray, 
 
 
 def over_ears(haircut: Haircut) -> bool:
-    """Whether nothing is seen of the ears."""
+    """Whether the hair hides the ears."""
     return haircut.cut in LONG_CUTS
 
 
 def ears(template: np.ndarray) -> np.ndarray:
-    """(n,) the outer parts of the ears."""
+    """(n,) whether a vertex is on the outer part of an ear."""
     x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
     return (x > 0.0765) & (y > 0.265) & (y < 0.36) & (z < 0.03)
 
@@ -312,11 +305,13 @@ def bun(rng, anatomy: Anatomy, radius: float, elevation: float) -> Surface:
     to_rest = _rest_heights(anatomy)
     direction = np.asarray([0, np.sin(elevation), -np.cos(elevation)])
     center = np.asarray([0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01]) + direction * (0.095 + 0.55 * radius)
-    return _rigid(anatomy, _ball(center, radius * np.asarray([1.0, 0.9, 0.85])), HEAD)
+    directions, faces = ball(12, 20)
+    vertices = center + directions * (radius * np.asarray([1.0, 0.9, 0.85]))
+    return _painted(rigid(vertices, faces, HEAD, len(anatomy.joints)))
 
 
 def ponytail(rng, anatomy: Anatomy, length: float, knots: float = 0.0) -> Surface:
-    """A tapering tail from the back of the head down the back; a braid with knots every so many metres."""
+    """A tapering tail from the back of the head down the back; a braid has knots, `knots` metres apart."""
     to_rest = _rest_heights(anatomy)
     start = np.asarray([0, to_rest(0.36), anatomy.joints[HEAD, 2] - 0.105])
     rows = 40 if knots else 16
@@ -371,40 +366,19 @@ def _finish(surface, depth):
 def _painted(surface):
     """Template and cloth coordinates of hair that does not come from the scalp: its own position."""
     flat = surface.vertices - surface.vertices.mean(0)
-    cloth = np.concatenate([flat, np.full((len(flat), 1), 0.09)], 1).astype(np.float32)
-    return surface.with_attributes(template=(flat + SKULL).astype(np.float32), cloth=cloth)
-
-
-def _rigid(anatomy, vertices_and_faces, joint):
-    vertices, faces = vertices_and_faces
-    weights = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
-    weights[:, joint] = 1
-    return _painted(Surface(vertices, faces, weights))
-
-
-def _ball(center, radii, rows=12, columns=20):
-    polar, around = (
-        x.reshape(-1)
-        for x in np.meshgrid(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns, indexing="ij")
-    )
-    directions = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], -1)
-    return (center + directions * radii).astype(np.float32), grid_faces(rows, columns, closed=True)
+    return surface.painted(flat + SKULL, flat, 0.09)
 
 
 def eyeballs(anatomy: Anatomy) -> Surface:
     """Two balls in the sockets; their `template` attribute is the unit direction from the ball's middle."""
     parts = []
-    for joint in (23, 24):
+    directions, faces = ball(14, 22)
+    directions = directions.astype(np.float32)
+    for joint in (LEFT_EYE, RIGHT_EYE):
         center = anatomy.joints[joint]
         lids = np.sort(np.linalg.norm(anatomy.skin.vertices - center, axis=1))[:12]
-        directions, faces = _ball(np.zeros(3), np.ones(3), 14, 22)
-        weights = np.zeros((len(directions), anatomy.skin.weights.shape[1]), np.float32)
-        weights[:, joint] = 1
-        cloth = np.concatenate([directions, np.ones((len(directions), 1), np.float32)], 1)
-        attributes = {"template": directions, "cloth": cloth}
-        parts.append(
-            Surface((center + directions * lids.mean() * 0.985).astype(np.float32), faces, weights, attributes)
-        )
+        eye = rigid(center + directions * lids.mean() * 0.985, faces, joint, len(anatomy.joints))
+        parts.append(eye.painted(directions, directions, 1.0))
     return join(parts)
 
 
@@ -416,7 +390,7 @@ def _rest_heights(anatomy):
 
 
 def _falling_weights(anatomy, vertices, template_y):
-    """The head's above the jaw; further down more and more of what lies below."""
+    """Weights of the head above the jaw, blending into those of the nearest skin further down."""
     template = anatomy.skin.attributes["template"]
     near = np.flatnonzero((np.abs(template[:, 0]) < 0.15) & (template[:, 1] > -0.3) & (template[:, 1] < 0.26))[::2]
     head = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)

@@ -1,4 +1,4 @@
-"""Joints, their limits, rotations as numpy arrays, forward kinematics, and legs that reach for a foot's place.
+"""Joints, their limits, rotations as numpy arrays (float64), forward kinematics, and inverse kinematics of legs.
 
 Joints in SMPL-X order, T-pose at rest, the person faces +z with the left side at +x. Angles in radians, about the axes of the
 parent joint at rest.
@@ -13,7 +13,7 @@ from humangs_jax.core.array_types import Float
 PELVIS, LEFT_HIP, RIGHT_HIP, SPINE1, LEFT_KNEE, RIGHT_KNEE, SPINE2, LEFT_ANKLE, RIGHT_ANKLE, SPINE3 = range(10)
 LEFT_FOOT, RIGHT_FOOT, NECK, LEFT_COLLAR, RIGHT_COLLAR, HEAD = range(10, 16)
 LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST = range(16, 22)
-LEFT_HAND, RIGHT_HAND, JOINTS = 25, 40, 55
+LEFT_EYE, RIGHT_EYE, LEFT_HAND, RIGHT_HAND, JOINTS = 23, 24, 25, 40, 55
 
 LIMITS = {
     PELVIS: 1.0,
@@ -39,7 +39,7 @@ LIMITS = {
     LEFT_WRIST: 0.8,
     RIGHT_WRIST: 0.8,
 }
-"""Largest rotation angle of a joint that the prior may draw; fingers: FINGER_LIMIT; jaw and eyes stay at rest."""
+"""Largest rotation angle of each joint in the prior; fingers: FINGER_LIMIT; jaw and eyes stay at rest."""
 FINGER_LIMIT = 1.5
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
@@ -47,12 +47,12 @@ MIRROR = np.asarray([1.0, -1.0, -1.0])
 BALL_HEIGHT, HEEL_BACK = 0.0112, 0.064
 """Of the shipped body, in lengths of a leg: the joint at the ball of the foot above the sole; the heel behind the ankle."""
 REACH = 0.998
-"""A leg is never stretched beyond this share of its length: the knee's direction would be lost."""
+"""Largest stretch of a leg as a share of its length: a straight leg leaves the knee's direction undefined."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Build:
-    """What the prior must know of a body: rest joints (j, 3), parents, and radii in metres of its clothed parts."""
+    """A body as the prior needs it: rest joints (j, 3), parents, and radii in metres of its clothed parts."""
 
     joints: Float[np.ndarray, "j 3"]
     parents: tuple[int, ...]
@@ -164,7 +164,7 @@ def _limit_angles():
 
 @dataclasses.dataclass(frozen=True)
 class Foot:
-    """Where a foot is: what its sole would touch if it were flat.
+    """Position of a foot, given by the point that a flat sole would touch.
 
     x, z: the point below the ball, metres. yaw: its heading. pitch: positive rolls it onto the toes, which stay flat where
     they are, negative onto the heel. lift: of all of it above the ground, metres.
@@ -199,7 +199,7 @@ def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Float[np.ndarray, "3"
 def highest_pelvis(
     build: Build, turn: Float[np.ndarray, "3 3"], x: float, z: float, feet: tuple[Foot, Foot], reach: float = REACH
 ) -> float:
-    """The greatest height of the pelvis, turned so, above x, z, at which both legs get to their feet."""
+    """The greatest height of the pelvis, turned by `turn`, above x, z, at which both legs reach their feet."""
     heights = []
     for side, foot in enumerate(feet):
         hip = turn @ (build.joints[LEGS[side][0]] - build.joints[PELVIS])
@@ -212,7 +212,7 @@ def highest_pelvis(
 def place_feet(
     build: Build, rotations: Float[np.ndarray, "j 3"], pelvis: Float[np.ndarray, "3"], feet: tuple[Foot, Foot]
 ) -> float:
-    """Set hips, knees, ankles and toes (in place) so that the feet are where they are to be; the pelvis's rotation stays.
+    """Set hips, knees, ankles and toes (in place) so that the feet are at their targets; the pelvis's rotation stays.
 
     pelvis: where the pelvis joint is, the ground at y = 0. Returns how far (metres) the worse ankle is from its place,
     which is 0 unless a leg is too short.
@@ -239,7 +239,7 @@ def place_feet(
 
 
 def _knee_angle(thigh, shin, distance):
-    """The bend, backwards, at which hip and ankle are so far apart."""
+    """The knee's angle at which hip and ankle are at the given distance."""
     wanted = 0.5 * (distance**2 - thigh @ thigh - shin @ shin) - thigh[0] * shin[0]
     cosine, sine = thigh[1] * shin[1] + thigh[2] * shin[2], thigh[2] * shin[1] - thigh[1] * shin[2]
     return float(np.arctan2(sine, cosine) + np.arccos(np.clip(wanted / np.hypot(cosine, sine), -1, 1)))

@@ -4,11 +4,11 @@
 """
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from humangs_jax.data.loading.captures import find_captures
+from humangs_jax.io.atomic import replace_file
 from humangs_jax.people.seeds import GENERATOR_VERSION, split_of
 
 MANIFEST = "manifest.json"
@@ -71,9 +71,8 @@ def write_manifest(folder: str | Path, split: str, settings: dict[str, Any]) -> 
         "settings": settings,
         "subjects": sorted(file.parent.name for file in folder.glob("[0-9]*/capture.json")),
     }
-    temporary = folder / f".{MANIFEST}.{os.getpid()}"
-    temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    temporary.replace(folder / MANIFEST)
+    text = json.dumps(content, indent=1) + "\n"
+    replace_file(folder / MANIFEST, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
 def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:

@@ -43,7 +43,7 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from humangs_jax.rendering.tiling import cumsum
 
 MIXING = 0.5
-"""Farthest that a pose is moved towards the nearest one: everything between the two is then reached from one of them."""
+"""Largest share of the way to the nearest pose; the other half of the way is reached from that pose."""
 
 
 def rotations_from(u: Float[Array, "2"], bank: PeopleBank, person: Int[Array, ""]) -> Float[Array, "j 3"]:
@@ -103,7 +103,7 @@ class OnTheFlyConfig:
     jitter, scattered_share: see `live_camera.azimuths_from`. close_share: share of close cameras among the targets.
     mirrored_share, dyed_share: of examples. supersampling: samples a side of each pixel.
     views_at_once: views drawn side by side: 1 suits CPUs, all of them accelerators. pixels_per_step: of the person, that are
-    coloured at a time: few suit CPUs, whole pictures accelerators.
+    coloured at a time: few for CPUs, whole images for accelerators.
     """
 
     input_views: int = 4
@@ -127,11 +127,11 @@ ON_THE_FLY = OnTheFlyConfig()
 
 @pytree_dataclass
 class Scene:
-    """A person as a key has them stand there, in several poses o; what all views of an example share.
+    """What all views of an example share: a person in several poses o, dyes and light.
 
     person: () index in the bank. rotations: (o, j, 3). translations: (o, 3). vertices: (o, n, 3) metres.
     corners: (o, f, 15) of every face's corners normal, openness and share of the key light that arrives.
-    dyes: (m, 3, 3) what turns the colours of every piece. lights.
+    dyes: (m, 3, 3) colour matrix of every piece. lights.
     """
 
     person: Int[Array, ""]
@@ -144,7 +144,7 @@ class Scene:
 
 
 def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
-    """Views of somebody of the bank: some shown, others asked for."""
+    """Views of a person of the bank: inputs and targets."""
     numbers = _draw_numbers(bank, key, config)
     scene = scene_from(numbers, bank, config)
     plans = _input_plan(numbers, config), _target_plan(numbers, config)
@@ -266,7 +266,7 @@ def _batch(config, count):
 def draw_view(
     bank: PeopleBank, scene: Scene, pose: Int[Array, ""], camera: Camera, config: OnTheFlyConfig = ON_THE_FLY
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """(h, w, 3) picture on white and (h, w) coverage of one of the scene's poses, both in [0, 1]."""
+    """(h, w, 3) image on white and (h, w) coverage of one of the scene's poses, both in [0, 1]."""
     s = config.supersampling
     fine = camera.resized(camera.width * s, camera.height * s)
     vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
@@ -284,7 +284,7 @@ def _box_average(samples, camera, s):
 
 
 def _light_pixels(bank, scene, corners, behind, fragments, step):
-    """(h w, 3) colours of all pixels, white where nobody is; covered ones `step` at a time, as many steps as it takes."""
+    """(h w, 3) colours of all pixels, white in the background; covered pixels are coloured `step` at a time."""
     ids, weights = fragments.face_ids.reshape(-1), fragments.barycentrics.reshape(-1, 3)
     covered = ids >= 0
     count = ids.shape[0]

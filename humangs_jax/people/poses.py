@@ -13,7 +13,7 @@ from humangs_jax.people import kinematics as kin
 from humangs_jax.people.arms import bend_arm, draw_goal, pose_hand
 
 TRIES = 20
-"""Stances drawn until one is within the limits of the joints; after that the person just stands."""
+"""Stances tried until one is within the limits of the joints; after that the person stands upright."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Stance:
 def sample_stance(
     rng: np.random.Generator, build: kin.Build, rotations: Float[np.ndarray, "j 3"]
 ) -> tuple[Stance, np.ndarray]:
-    """Sets the pelvis (but for its heading, which stays) and the legs in `rotations`; the stance and the pelvis's place (3,)."""
+    """Set legs and pelvis in `rotations`, keeping the pelvis's heading. Returns the stance and the pelvis's position (3,)."""
     names = list(STANCES)
     odds = np.asarray([STANCES[name][0] for name in names])
     heading = rotations[kin.PELVIS].copy()
@@ -50,7 +50,7 @@ def sample_stance(
 def take_stance(
     build: kin.Build, rotations: Float[np.ndarray, "j 3"], heading: float, stance: Stance
 ) -> tuple[Float[np.ndarray, "3"], float]:
-    """Sets pelvis and legs; where the pelvis is, the ground at y = 0, and how far the worse foot is from its place."""
+    """Set pelvis and legs. Returns the pelvis's position, the ground at y = 0, and the larger error of the two feet, metres."""
     turn = kin.about_y(heading) @ kin.rotation_matrix(np.asarray([stance.tilt, 0.0, stance.roll]))
     rotations[kin.PELVIS] = kin.rotation_vector(turn)
     left, right = (in_world(foot, build.leg, heading) for foot in stance.feet)
@@ -61,7 +61,7 @@ def take_stance(
 
 
 def in_world(foot: kin.Foot, leg: float, heading: float) -> kin.Foot:
-    """A foot of a stance, in legs and before the turn, in metres after it."""
+    """A foot of a stance (lengths in legs, unturned) in metres, turned by the heading."""
     x, _, z = kin.about_y(heading) @ np.asarray([foot.x * leg, 0.0, foot.z * leg])
     return kin.Foot(float(x), float(z), heading + foot.yaw, foot.pitch, foot.lift * leg)
 
@@ -169,15 +169,15 @@ STANCES: dict[str, tuple[float, Callable[[np.random.Generator, float], Stance]]]
     "one leg": (0.07, _one_leg),
     "tiptoe": (0.02, _tiptoe),
 }
-"""Name -> probability, and what draws it from a generator and the distance of a hip from the middle in legs."""
+"""Name -> probability, and a function of a generator and the distance of a hip from the middle in legs."""
 
 
 BOTH_ARMS = 0.45
 """Share of people whose arms have the same goal."""
 ATTEMPTS = 3
-"""How often an arm may look for another goal when it cannot keep clear of the body."""
+"""How many goals are tried for an arm that cannot keep clear of the body."""
 CLEAR = 0.0
-"""Metres: an arm that is at least so clear is taken."""
+"""Least clearance of an accepted arm, metres."""
 
 
 def sample_rotations(rng: np.random.Generator, build: kin.Build) -> Float[np.ndarray, "j 3"]:

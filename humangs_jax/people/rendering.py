@@ -23,7 +23,7 @@ from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, raster
 
 SUPERSAMPLING = 2
 VERTEX_STEP, FACE_STEP, POINT_STEP = 4096, 8192, 1 << 15
-"""Meshes are padded to multiples of these and points are coloured so many at a time, so that few shapes are compiled."""
+"""Sizes of meshes are padded to multiples of these, and points are coloured in steps of that length: few shapes are compiled."""
 FOLD_SLOPE = 0.6
 """Slope of painted creases on the most wrinkled cloth."""
 DEPTH_UNIT = 1e-4
@@ -98,7 +98,7 @@ def light_points(
 ) -> Float[np.ndarray, "m 3"]:
     """Colours (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the weights of the corners.
 
-    eye: where they are seen from, which tells cloth's inner side; None: everything is seen from outside.
+    eye: camera centre, which decides whether the inner side of cloth is seen; None: everything is seen from outside.
     """
     subject, faces = posed.subject, posed.subject.surface.faces
     values = np.concatenate([posed.normals, posed.openness[:, None], posed.lit[:, None]], axis=1)
@@ -136,7 +136,7 @@ def spots_at(subject: SyntheticSubject, face_ids: Int[np.ndarray, " m"], weights
 def paint(
     subject: SyntheticSubject, face_ids: Int[np.ndarray, " n"], spots: Spots
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """What the materials say of points on given faces: albedo (n, 3) and slope (n, 3) of the painted folds."""
+    """The materials at points on given faces: albedo (n, 3) and slope (n, 3) of the painted folds."""
     material_ids = subject.face_materials[face_ids]
     albedo, slope = np.empty((len(face_ids), 3), np.float32), np.zeros((len(face_ids), 3), np.float32)
     order = np.argsort(material_ids, kind="stable")

@@ -1,4 +1,4 @@
-"""Dressed people as the files that a scanner would give: OBJ with MTL and PNG texture, and GLB, through trimesh.
+"""Dressed people as files like those of a scanner: OBJ with MTL and PNG texture, and GLB, through trimesh.
 
 A scan is a folder: scan.obj with material.mtl and material_0.png, and scan.glb; and scan.json with what is known of the
 person: seed, shape, pose. Metres, y up, texture coordinates with v up; a vertex is written once per chart that it is in.
@@ -79,9 +79,9 @@ def _write_mesh(folder: Path, vertices: Float[np.ndarray, "u 3"], baked, texture
     from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
-    picture = Image.fromarray(texture)
-    simple = SimpleMaterial(image=picture, diffuse=[255, 255, 255, 255])
-    physical = PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=1.0)
+    image = Image.fromarray(texture)
+    simple = SimpleMaterial(image=image, diffuse=[255, 255, 255, 255])
+    physical = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
     for kind, material in (("obj", simple), ("glb", physical)):
         if kind in formats:
             visual = TextureVisuals(uv=baked.atlas.uvs, material=material)

@@ -1,4 +1,4 @@
-"""Which seeds and keys are for what. Written down once: people of one range are never seen in another.
+"""Which seeds and keys are for training, validation, test and documentation. The ranges share no person.
 
 A seed names a person. Written people are made from the seed by numpy; people made on the fly from its keys, whose words are
 (appearance, seed), so that the person, and the split, can be read off every key.
@@ -11,8 +11,8 @@ import numpy as np
 from humangs_jax.core.array_types import Key
 
 GENERATOR_VERSION = 2
-"""What a seed makes: counted up whenever the same seed gives another person, pose or picture. Manifests tell it, and sets of
-different versions are not mixed in one folder."""
+"""Raised whenever the same seed makes another person, pose or image. Manifests record it; sets of different versions are not
+mixed in one folder."""
 
 TRAIN = range(0, 1_000_000)
 VALIDATION = range(1_000_000, 1_001_000)
@@ -24,7 +24,7 @@ DEMO = range(3_000_000, 3_001_000)
 SPLITS = {"train": TRAIN, "validation": VALIDATION, "test": TEST, "demo": DEMO}
 
 KEY_KIND = "threefry2x32"
-"""Implementation of all keys of people, whatever the default: the words of a key are its seed."""
+"""Implementation of all keys of people: the words of such a key are its seed."""
 APPEARANCES = 2**32
 
 

@@ -17,7 +17,7 @@ from humangs_jax.people.poses import STANCES, bend_trunk, in_world
 
 FPS = 30.0
 STANCE_SHARE = 0.62
-"""Of a stride that a foot is on the ground."""
+"""Share of a stride during which a foot is on the ground."""
 HEEL_STRIKE, TOE_OFF = 0.28, 0.85
 """Pitch of the foot, radians, when it comes down on the heel and leaves from the toes, at a long stride."""
 FLAT_FROM, FLAT_UNTIL = 0.15, 0.55
@@ -27,9 +27,9 @@ LONG_STEP = 0.75
 SMOOTHING = 4
 """Frames to both sides over which the pelvis's height is smoothed, below what the legs allow."""
 SPARE = 0.995
-"""Of the legs' reach that the pelvis's height uses."""
+"""Share of the legs' reach that the pelvis's height uses."""
 TRIES = 12
-"""Goals tried for an arm until the way there is clear."""
+"""Goals tried for an arm until the way to one is clear."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Sequence:
 
 
 def sample_sequence(rng: np.random.Generator, build: kin.Build, frames: int = 60, kind: str | None = None) -> Sequence:
-    """A motion of so many frames at 30 a second. kind: "walk", "turn" or "reach"; None draws one.
+    """A motion of `frames` frames at 30 a second. kind: "walk", "turn" or "reach"; None draws one.
 
     Raises: ValueError if there is no such kind, or no frame.
     """
@@ -64,7 +64,7 @@ def sample_sequence(rng: np.random.Generator, build: kin.Build, frames: int = 60
 
 @dataclasses.dataclass(frozen=True)
 class Gait:
-    """How someone goes.
+    """Parameters of walking or turning.
 
     cadence: strides a second. step: metres forward per step. bend: radians turned per step. width: metres from the line that
     a foot keeps. lift: metres that a swinging foot is raised. turn_out: of the feet. swing: of the arms, radians.
@@ -144,7 +144,7 @@ def _step_along(rng, build, frames, gait):
 
 
 def _path(heading, stride, first, last):
-    """Where the body's line is (3,) at a phase: the integral of the heading."""
+    """A function from the phase to the body's position (3,) on its path: the integral of the heading."""
     grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
     direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)
     along = np.concatenate(
@@ -182,7 +182,7 @@ def _foot_at(build, gait, heading, track, side, phase):
 
 
 def _footprint(build, gait, heading, track, side, down):
-    """Where the foot that comes down at a phase stands: beside the line, ahead of the pelvis as it passes in mid-stance."""
+    """Position of the foot that comes down at a phase: beside the path, ahead of the pelvis in mid-stance."""
     middle = down + 0.5 * STANCE_SHARE
     yaw, sign = heading(middle), 1 - 2 * side
     ahead = (
@@ -222,7 +222,7 @@ def _swing_arms(rng, build, rotations, phase, gait):
 
 
 def _reach(rng, build, frames):
-    """From pose to pose on planted feet: the hands go to places, the trunk and the knees help."""
+    """From pose to pose on planted feet: the hands reach for targets, trunk and knees follow."""
     width = build.hip_width / build.leg
     name = rng.choice(["stand", "contrapposto", "wide", "stride"], p=[0.4, 0.2, 0.2, 0.2])
     heading = rng.uniform(-0.7, 0.7)
@@ -298,7 +298,7 @@ def _clear_of(build, rotations, side):
 
 
 def _ride(build, turns, centers, feet, sinks=None):
-    """Places of the pelvis (m, 3): above the centers, smoothly, never higher than the legs allow, less `sinks`."""
+    """Positions of the pelvis (m, 3) above the centers: smooth heights that the legs allow, minus `sinks`."""
     heights = np.asarray([
         kin.highest_pelvis(build, turn, center[0], center[2], both, SPARE)
         for turn, center, both in zip(turns, centers, feet, strict=True)
@@ -326,4 +326,4 @@ def _rise(t):
 
 
 KINDS: dict[str, tuple[float, Callable]] = {"walk": (0.5, _walk), "turn": (0.2, _turn), "reach": (0.3, _reach)}
-"""Name -> probability, and what makes (rotations, places of the pelvis, planted) of a generator, a build and a length."""
+"""Name -> probability, and a function of a generator, a build and a length: (rotations, positions of the pelvis, planted)."""

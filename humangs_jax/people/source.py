@@ -22,7 +22,7 @@ MakeExample = Callable[[Key, int], Example]
 
 @dataclasses.dataclass(frozen=True)
 class GeneratedSource:
-    """Examples that `make` makes of keys, which are all of people of one split (`seeds.SPLITS`).
+    """Examples that `make` computes from keys; all keys are of people of one split (`seeds.SPLITS`).
 
     make: called as make(key, input_count); runs wherever it is jitted to run. input_counts: see `ViewSampling`.
     on_host: bring the arrays to the host, where they mix with those of files and are divided among devices.
@@ -41,7 +41,7 @@ class GeneratedSource:
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """Nothing: what is computed cannot be damaged."""
+        """Empty: there are no files."""
         return {}
 
     def __len__(self) -> int:
@@ -73,7 +73,7 @@ def _compiled():
 def on_the_fly_source(
     bank: PeopleBank, config: OnTheFlyConfig, input_counts: tuple[int, ...] = (4,), on_host: bool = False
 ) -> GeneratedSource:
-    """Examples of a bank for `loader.Loader` and `loader.Mixture`: of people of the bank's split, whatever the key.
+    """Examples of a bank for `loader.Loader` and `loader.Mixture`: all of people of the bank's split.
 
     input_counts replace `config.input_views`; each is compiled once. on_host: see `GeneratedSource`.
     """

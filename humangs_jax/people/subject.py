@@ -22,8 +22,8 @@ from humangs_jax.people.outfits import Garment, sample_outfit
 from humangs_jax.people.shading import Lights, sample_lights
 from humangs_jax.people.surfaces import Surface, compact, join
 
-SHAPE_SPREAD = 0.55
-"""Standard deviation of the shape coefficients that have no rule of their own; beyond 2 of them nothing is drawn."""
+SHAPE_STD = 0.55
+"""Standard deviation of the shape coefficients without a rule of their own; values are clipped at twice that."""
 HEIGHTS = {True: (1.765, 0.085), False: (1.645, 0.08)}
 """Mean and standard deviation of the stature in metres of men (True) and women."""
 HEIGHT_RANGE = (1.42, 2.08)
@@ -73,16 +73,16 @@ def sample_shape(
     """(s,) shape coefficients and the stature in metres that they give."""
     names = body.shape_names
     at = {name: i for i, name in enumerate(names)}
-    betas = np.clip(rng.normal(0, 1, len(names)), -2, 2) * SHAPE_SPREAD
+    betas = np.clip(rng.normal(0, 1, len(names)), -2, 2) * SHAPE_STD
     betas[at["sex_male"]] = (1 if male else -1) * rng.uniform(0.55, 1.0)
     betas[at["age"]] = (years - YOUNG) / (OLD - YOUNG) if years > YOUNG else 0.03 * (years - YOUNG)
     heavier = 0.25 * np.clip((years - 20) / 30, 0, 1)
     betas[at["weight"]] = np.clip(rng.normal(0.05 + heavier, 0.62), -1.0, 1.8)
     betas[at["muscle"]] = np.clip(rng.normal(0.1 - 0.4 * (years > 60), 0.6), -1.0, 1.5)
-    mean, spread = HEIGHTS[male]
+    mean, std = HEIGHTS[male]
     youth = 0.04 * np.clip(18 - years, 0, 3) / 3 + 0.03 * np.clip((years - 60) / 25, 0, 1)
     tall = rng.standard_t(5) if rng.random() < 0.85 else rng.uniform(-2.6, 3.4)
-    wanted = np.clip(mean - youth + spread * tall, HEIGHT_RANGE[0], HEIGHT_RANGE[1] if male else TALLEST_WOMAN)
+    wanted = np.clip(mean - youth + std * tall, HEIGHT_RANGE[0], HEIGHT_RANGE[1] if male else TALLEST_WOMAN)
     stature, gains = _stature(body)
     share = np.asarray([gains[at[name]] for name in LENGTHS])
     missing = wanted - (stature + gains @ betas)
@@ -205,7 +205,7 @@ def _host_arrays(body):
 
 
 def _visible_skin(anatomy: Anatomy, outfit: wardrobe.Outfit) -> tuple[Surface, np.ndarray]:
-    """Skin without the faces that nobody can see, and how far inside of a hem its vertices (n,) lie, metres."""
+    """Skin without hidden faces, and how far inside of a hem its vertices (n,) lie, metres."""
     skin = anatomy.skin.with_attributes(cover=outfit.cover.astype(np.float32))
     bare = compact(skin, ~outfit.removed[skin.faces].all(1))
     kept = {name: bare.attributes[name] for name in ("template", "cloth")}

@@ -34,6 +34,18 @@ class Surface:
         """The same surface with more (or other) attributes."""
         return dataclasses.replace(self, attributes={**self.attributes, **attributes})
 
+    def painted(self, template: Float[np.ndarray, "n 3"], cloth: Float[np.ndarray, "n 3"], girth: float) -> "Surface":
+        """The same surface with template and cloth coordinates; girth: radius that turns angles into metres."""
+        cloth = np.concatenate([cloth, np.full((len(cloth), 1), girth)], 1).astype(np.float32)
+        return self.with_attributes(template=np.asarray(template, np.float32), cloth=cloth)
+
+
+def rigid(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"], joint: int, joints: int) -> Surface:
+    """A surface whose vertices all follow one joint; joints: how many there are."""
+    weights = np.zeros((len(vertices), joints), np.float32)
+    weights[:, joint] = 1
+    return Surface(np.asarray(vertices, np.float32), faces, weights)
+
 
 def vertex_normals(vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "n 3"]:
     """(n, 3) area-weighted unit normals."""
@@ -194,6 +206,13 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Int[np.ndarray, "f 3"]:
     a, b = row * columns + column, row * columns + right
     c, d = (row + 1) * columns + column, (row + 1) * columns + right
     return np.concatenate([np.stack([a, c, b], -1), np.stack([b, c, d], -1)]).reshape(-1, 3).astype(np.int32)
+
+
+def ball(rows: int, columns: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]:
+    """Unit vectors on a grid of polar angles (from +y) and azimuths (from +z), and its faces."""
+    polar, around = np.meshgrid(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns, indexing="ij")
+    directions = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], -1)
+    return directions.reshape(-1, 3), grid_faces(rows, columns, closed=True)
 
 
 def sweep(

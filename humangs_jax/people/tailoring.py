@@ -9,7 +9,7 @@ Points = Float[np.ndarray, "n 3"]
 Field = Float[np.ndarray, " n"]
 
 TRUNK_HALF_WIDTH = 0.25
-"""Hands hang below the waist in no T-pose: what lies further out than this is an arm."""
+"""In T-pose everything further out than this is an arm."""
 NECKLINES = {
     "crew": (0.0, 0.085),
     "vee": (0.0, 0.085),
@@ -17,7 +17,7 @@ NECKLINES = {
     "high": (0.052, 0.085),
     "collar": (0.012, 0.085),
 }
-"""Lift of the neckline's plane, and distance from the neck's axis beyond which the shoulder is covered whatever its height."""
+"""Lift of the neckline's plane, and distance from the neck's axis beyond which the shoulder is always covered."""
 
 
 def neckline(template: Points, style: str, depth: float) -> Field:

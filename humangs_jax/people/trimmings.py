@@ -123,7 +123,7 @@ def _trunk(s: Spots):
 
 
 def printed(rng: np.random.Generator, fabric: Colouring, base: np.ndarray, number: bool = False) -> Colouring:
-    """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a picture."""
+    """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a scene."""
     ink = accent(rng, base)
     ink2 = accent(rng, ink)
     kind = (
@@ -158,8 +158,8 @@ def printed(rng: np.random.Generator, fabric: Colouring, base: np.ndarray, numbe
         if kind == "picture":
             inside = band(np.maximum(np.abs(x), 0.8 * np.abs(y)), -1, 1.2 * size)
             scene = lattice(np.stack([x / 0.05, y / 0.03], -1), seed)
-            picture = mix(mix(ink, ink2, (scene > 0.45).astype(np.float32)), base, band(scene, 0.62, 2, 0.02))
-            return result + (picture - result) * (inside * where)[:, None]
+            printed = mix(mix(ink, ink2, (scene > 0.45).astype(np.float32)), base, band(scene, 0.62, 2, 0.02))
+            return result + (printed - result) * (inside * where)[:, None]
         result = mix(result, ink, inside * where)
         if kind == "both":
             result = mix(result, ink2, words(x * 1.25, (y + size * 1.1 + 5 * cell) * 1.25) * where)

@@ -41,7 +41,7 @@ class Piece:
 class Outfit:
     """What has been put on so far. cover: (n,) how far inside of some hem each body vertex is, metres; negative on bare skin.
 
-    removed: (n,) body vertices that nobody can see. trunk, legs: distances from the skin of the outermost layer, metres.
+    removed: (n,) hidden body vertices. trunk, legs: distances from the skin of the outermost layer, metres.
     fit: of the outermost layer on the trunk.
     """
 

@@ -1,6 +1,6 @@
-"""Synthetic people as capture folders: pictures, masks, cameras and body poses on disk, made from nothing but seeds.
+"""Synthetic people as capture folders: images, masks, cameras and body poses on disk, made from seeds.
 
-out/manifest.json                    with what the set was made and who is finished, see `manifest`
+out/manifest.json                    settings of the set and finished subjects, see `manifest`
 out/SEED/                            a capture (docs/capture_format.md): views of one person in one or several poses
 out/SEED/held_out/                   a capture of its own with the views that reconstruction may not see
 out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
@@ -30,7 +30,7 @@ from humangs_jax.people.manifest import begin_set, write_manifest
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.rendering import PosedSubject, pose_subject, render_maps, render_view, write_depth, write_maps
 from humangs_jax.people.scans import export_scan
-from humangs_jax.people.seeds import SPLITS, seeds_of, split_of
+from humangs_jax.people.seeds import seeds_of
 from humangs_jax.people.sequences import sample_sequence
 from humangs_jax.people.subject import SyntheticSubject, make_subject
 
@@ -39,22 +39,22 @@ HELD_OUT = "held_out"
 POSE_STREAM, CAMERA_STREAM, HELD_OUT_STREAM, CLOSE_STREAM, MOTION_STREAM = 1, 2, 3, 4, 5
 """Independent random streams of a seed; stream 0 makes the person."""
 STALE = 3600.0
-"""Seconds after which a half-written folder is taken for the remains of a killed run."""
+"""Seconds after which a half-written folder counts as left over from a killed run."""
 GROUNDED_EVERY = 5
-"""Frames between those that tell how high a motion is above the ground."""
+"""Every how many frames the height of a motion above the ground is measured."""
 MANIFEST_EVERY = 30.0
 """Seconds between two updates of the manifest."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """What is written of each person.
+    """What is written for each person.
 
     image_size: pixels a side; smaller sizes are box averages of it (the loader makes them).
     poses: how many; each is seen by `views` cameras of the published protocol and `close_views` nearer ones.
     held_out_views: cameras of the same pose, and of each of `novel_poses` others, in held_out/.
-    frames: 0: poses are independent. Otherwise they are `poses` evenly spaced frames of a motion of so many at 30 a second.
-    depth, maps: files beside each picture. scan_texture: texels a side of the scan's texture, 0: no scan.
+    frames: 0: poses are independent. Otherwise `poses` evenly spaced frames of a motion of `frames` frames, 30 a second.
+    depth, maps: files beside each image. scan_texture: texels a side of the scan's texture, 0: no scan.
     """
 
     image_size: int = 512
@@ -71,7 +71,7 @@ class Layout:
 
 @dataclasses.dataclass(frozen=True)
 class View:
-    """A picture to take: of the pose number `frame`, by a camera."""
+    """A camera that sees pose number `frame`."""
 
     frame: int
     name: str
@@ -105,8 +105,8 @@ def capture_views(
     subject: SyntheticSubject, body: BodyModel, poses: list[PosedSubject], views: Sequence[View]
 ) -> Capture:
     """A capture of these views."""
-    pictures = [render_view(poses[view.frame], view.camera) for view in views]
-    images, masks = (np.stack(x) for x in zip(*pictures, strict=True))
+    rendered = [render_view(poses[view.frame], view.camera) for view in views]
+    images, masks = (np.stack(x) for x in zip(*rendered, strict=True))
     rotations, translations = (np.stack([getattr(p, name) for p in poses]) for name in ("rotations", "translation"))
     return Capture(
         images=images,
@@ -179,31 +179,6 @@ def write_training_subject(
     write_person(folder, seed, body, Layout(image_size, poses=poses, views=views))
 
 
-def synthesize(
-    out: str | Path,
-    subjects: int,
-    first_seed: int = 0,
-    *,
-    training: bool = True,
-    image_size: int = 256,
-    views: int = 12,
-    poses: int = 2,
-    held_out_views: int = 8,
-    body: BodyModel | None = None,
-    progress: bool = True,
-) -> list[Path]:
-    """Write `subjects` people, seeds from `first_seed` on, see `write_set`.
-
-    training: one capture of `poses` x `views` each; otherwise `views` input photos of one pose and `held_out_views` held-out
-    ones, `poses` - 1 novel poses among them. Returns the folders. Raises: see `write_set`.
-    """
-    layout = Layout(image_size, poses=poses, views=views)
-    if not training:
-        layout = Layout(image_size, views=views, held_out_views=held_out_views, novel_poses=poses - 1)
-    split = split_of(first_seed)
-    return write_set(out, subjects, layout, split, first_seed - SPLITS[split].start, body=body, progress=progress)
-
-
 def write_set(
     out: str | Path,
     subjects: int,
@@ -218,7 +193,7 @@ def write_set(
     """Write people `first` .. `first + subjects - 1` of a split into `out`/SEED; folders that are there already are kept.
 
     Arguments:
-        workers: processes that make people; with more than one they use the CPU, whatever the default device is. The
+        workers: processes that make people; with more than one they always use the CPU. The
             files are the same. More than one needs the calling script to be guarded by `if __name__ == "__main__"`.
         body: the package's own if not given. progress: show a bar.
 
@@ -255,7 +230,7 @@ def write_set(
 
 
 def _make(seeds, folders, layout, body, workers):
-    """Yields (seed, None or what went wrong) as people are finished."""
+    """Yields (seed, None or the error) as people are finished."""
     if workers <= 1 or len(seeds) <= 1:
         if body is None and seeds:
             from humangs_jax.body.library import load_body
@@ -278,7 +253,7 @@ def _make(seeds, folders, layout, body, workers):
             raise OSError(
                 "a process that makes people was killed, perhaps for want of memory: try fewer workers"
             ) from error
-        except BaseException:  # interrupted: nobody waits for people half made
+        except BaseException:  # interrupted: unfinished people are dropped
             pool.shutdown(wait=False, cancel_futures=True)
             for process in multiprocessing.active_children():
                 process.terminate()

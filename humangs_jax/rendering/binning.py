@@ -28,8 +28,8 @@ SLACK = 2e-3
 REACH_SLACK = (1.0001, 1e-5)
 """The squared reach is multiplied by the first and raised by the second, against rounding of alpha at its threshold."""
 
-INRIA_LEAST_SPREAD = 0.1
-"""Pixels^4; INRIA takes no smaller square of half the difference of the variances along a splat's axes."""
+INRIA_MIN_DISCRIMINANT = 0.1
+"""Pixels^4; INRIA's rasterizer raises the squared half difference of a splat's two variances to at least this."""
 
 
 class Footprints(NamedTuple):
@@ -153,7 +153,7 @@ def square_footprints(projected: ProjectedGaussians, reach: Float[Array, " g"], 
     """Squares of `radius_sigma` times the larger standard deviation, rounded up to pixels, where reach is positive."""
     p = lax.stop_gradient(projected)
     middle = 0.5 * (p.xx + p.yy)
-    largest = middle + jnp.sqrt(jnp.maximum(middle * middle - p.determinant, INRIA_LEAST_SPREAD))
+    largest = middle + jnp.sqrt(jnp.maximum(middle * middle - p.determinant, INRIA_MIN_DISCRIMINANT))
     radius = jnp.where(p.visible & (reach > 0), jnp.ceil(radius_sigma * jnp.sqrt(largest)), 0.0)
     return Squares(p.x, p.y, radius)
 
@@ -210,7 +210,7 @@ def emit_pairs(
     slot = jnp.arange(max_pairs, dtype=jnp.int32)
     table = take(jnp.stack([row * grid.columns + column0 - pairs.first, rows.source], axis=-1), pairs.source)
     tiles = jnp.where(slot < pairs.needed, table[:, 0] + slot, grid.tiles)
-    # If rows are missing, so are their pairs, and they must be counted some other way; else this loop runs zero times.
+    # If rows are missing, so are their pairs, and they are counted row by row; otherwise this loop runs zero times.
     missing = rows.needed > max_rows
     recount = _count_row_by_row(footprints, grid, share, jnp.where(missing, jnp.max(counts, initial=0), 0))
     needed = jnp.where(missing, recount, pairs.needed)

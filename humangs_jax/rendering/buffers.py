@@ -91,7 +91,7 @@ def raise_on_overflow(
 def _needed(gaussians, cameras, config, mesh):
     """Most rows and most pairs that any of the views needs, on any of the devices that share them."""
     gaussians, cameras = at_least_float32((gaussians, cameras))
-    config = dataclasses.replace(config, max_pairs=None, max_rows=None)  # they play no part: one program for all
+    config = dataclasses.replace(config, max_pairs=None, max_rows=None)  # not read here: one program for all
     return [int(most) for most in _count(gaussians, cameras, config, device_count(mesh))]
 
 

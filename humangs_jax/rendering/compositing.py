@@ -20,7 +20,7 @@ alpha enters as log alpha, whose derivative is dL/dalpha_k alpha_k =: e_k, 0 whe
 sums over pixels of e_k (1, dx, dy, dx^2, dx dy, dy^2) give the gradient of a splat's shape. They are matrix products
 with monomials about the tile's centre that are moved to the splat's centre afterwards.
 
-In which order the work is done is a schedule's business: `small_blocks` on CPUs, `fat_chunks` elsewhere. A schedule is
+The order of the work is chosen by a schedule: `small_blocks` on CPUs, `fat_chunks` elsewhere. A schedule is
 two functions, `forward(grid, config)` and `backward(grid, config)`. `vmap` joins the tiles of all images into one list
 of tiles, so a batch is one call with more tiles, not a loop of masked loops.
 """

@@ -1,8 +1,9 @@
 """The numbers of Gaussian splatting, why they are what they are, and what the public rasterizers use instead.
 
-Two rasterizers set the customs: INRIA's diff-gaussian-rasterization and gsplat. Ours follow gsplat where they differ,
-except that nothing is cut at three standard deviations: a footprint ends where its alpha falls below `ALPHA_MIN`, so
-the image is a function of the formula and not of a bounding box.
+Two rasterizers set the conventions: INRIA's diff-gaussian-rasterization
+(https://github.com/graphdeco-inria/diff-gaussian-rasterization) and gsplat (https://github.com/nerfstudio-project/gsplat).
+Ours follow gsplat where they differ, except that nothing is cut at three standard deviations: a footprint ends where its
+alpha falls below `ALPHA_MIN`, so the image follows from the formula and not from a bounding box.
 """
 
 NEAR = 0.01

@@ -75,7 +75,7 @@ def project(
 
     Arguments: near: metres. eps2d: pixels^2. jacobian_margin: None for the exact Jacobian; a number clamps the point
     where it is evaluated, to that fraction of the half field of view beyond the border (`INRIA_JACOBIAN_MARGIN`).
-    normalize_quats: False takes the quaternions as they are.
+    normalize_quats: False uses quaternions without normalising them.
     """
     K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]

@@ -75,7 +75,7 @@ class TileGrid:
 
 
 class Expansion(NamedTuple):
-    """Slots shared out among items, item by item.
+    """Slots divided among items, item by item.
 
     source: (capacity,) item of each slot; of slots >= needed, the last item.
     first: (n,) first slot of each item, so that slot - first[source] counts the slots of one item.
@@ -141,7 +141,7 @@ def _sums_in_rows(rows):
 
 
 def expand(counts: Int[Array, " n"], capacity: int) -> Expansion:
-    """Shares out `capacity` slots: item i takes the next counts[i] >= 0 of them. The counts must suit `cumsum`."""
+    """Divides `capacity` slots: item i takes the next counts[i] >= 0 of them. For the counts, the limits of `cumsum` hold."""
     if counts.shape[0] == 0:
         return Expansion(jnp.zeros(capacity, jnp.int32), counts, jnp.zeros((), jnp.int32))
     end = materialized(cumsum(counts))
@@ -179,8 +179,8 @@ def bits_for(count: int) -> int:
 
 
 def sort_keys(keys: UInt[Array, " n"]) -> UInt[Array, " n"]:
-    """Ascending. Equal keys cannot be told apart, so stability is a matter of speed: XLA's stable sort is faster on CPUs
-    by a third, and elsewhere carries the positions along.
+    """Ascending. Equal keys are identical, so a sort need not be stable; XLA's stable sort is a third faster on CPUs, and
+    elsewhere has to carry the positions along.
     """
     return lax.platform_dependent(keys, cpu=jnp.sort, default=lambda keys: lax.sort(keys, is_stable=False))
 

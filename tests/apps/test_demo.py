@@ -19,8 +19,9 @@ PRODUCTS = {
     "novel_views.png",
     "report.json",
 }
-LEAST_PSNR, LEAST_SSIM = 22.0, 0.85  # dB over the held-out views: what the README promises of the shipped weights
-
+LEAST = {"psnr": 27.0, "ssim": 0.94, "psnr_foreground": 18.1, "baseline_psnr": 20.4}
+"""What the README claims of the held-out views (27.3 dB, 0.945, 18.4 dB, 20.7 dB), less 0.3 dB and 0.005: that is more than
+processors and XLA's versions differ by, and less than any change of the method that matters."""
 
 FRAME_SIZE = 64
 
@@ -59,7 +60,7 @@ def test_every_product_is_there(out):
 
 def test_the_report_holds_what_is_promised(out):
     report = json.loads((out / "report.json").read_text())
-    assert report["psnr"] >= LEAST_PSNR and report["ssim"] >= LEAST_SSIM
+    assert all(report[name] >= least for name, least in LEAST.items()), report
     assert report["psnr"] > report["baseline_psnr"]
     assert report["psnr_foreground"] > report["baseline_psnr_foreground"]
     assert {"reconstruct", "animate", "render_held_out"} <= set(report["timings"])

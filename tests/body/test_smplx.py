@@ -47,7 +47,7 @@ def made_up_file(n=9, columns=20, seed=0):
 
 
 def check_script():
-    path = Path(__file__).parents[2] / "experiments" / "check_body.py"
+    path = Path(__file__).parents[2] / "experiments" / "paper" / "check_body.py"
     spec = importlib.util.spec_from_file_location("check_body", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
@@ -241,10 +241,10 @@ def test_parts_go_to_their_joints():
         "left_hand_pose": np.arange(75, 120.0),
         "right_hand_pose": np.arange(120, 165.0).reshape(15, 3),
     }
-    pose = assemble_pose(use_pca=False, flat_hand_mean=True, translation=[1.0, 2, 3], **parts)
+    pose = assemble_pose(use_pca=False, flat_hand_mean=True, transl=[1.0, 2, 3], **parts)
     assert np.array_equal(pose.rotations, np.arange(165.0).reshape(55, 3))
     assert np.array_equal(pose.translation, [1, 2, 3])
-    for name, shape in (("body_pose", (66,)), ("jaw_pose", (4,)), ("left_hand_pose", (12,)), ("translation", (4,))):
+    for name, shape in (("body_pose", (66,)), ("jaw_pose", (4,)), ("left_hand_pose", (12,)), ("transl", (4,))):
         with pytest.raises(ValueError, match=name):
             assemble_pose(use_pca=False, flat_hand_mean=True, **{name: np.zeros(shape)})
 

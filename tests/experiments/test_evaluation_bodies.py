@@ -1,7 +1,5 @@
 """Bodies that weights are tried on: the made-up one is another mesh of the same people, and reads as SMPL-X."""
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -73,7 +71,7 @@ def test_other_joints_are_no_smplx(body, tmp_path):
 
 def test_fractions_are_as_they_are_and_split(body, monkeypatch):
     monkeypatch.setattr(bodies, "SMPLX_SEED_VERTICES", 600)
-    config = dataclasses.replace(tiny(), body_vertices=1000, longest_edge=0.05)
+    config = tiny().with_conventions(body_vertices=1000, longest_edge=0.05)
     cases = bodies.body_cases(body, config)
     assert list(cases) == ["default", "SMPL-X format", "1/4", "1/16", "1/4, edges split", "1/16, edges split"]
     counts = {name: (len(case.body.template), len(case.carrier.template)) for name, case in cases.items()}

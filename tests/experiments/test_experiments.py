@@ -1,6 +1,7 @@
-"""Every script in experiments/ answers --help quickly, whatever is installed."""
+"""Every script in experiments/ answers --help quickly, and the README says what it is for."""
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ SCRIPTS = sorted(
     (path.relative_to(EXPERIMENTS).as_posix() for path in EXPERIMENTS.rglob("*.py") if "__main__" in path.read_text()),
     key=lambda name: (name == TYPED, name),
 )
+DOCS = sorted((EXPERIMENTS.parent / "docs").glob("*.md"))
 HEAVY = ("jax", "flax", "scipy", "matplotlib", "imageio", "trimesh", "torch", "libtpu")
 CPU_SECONDS = 5
 
@@ -54,3 +56,24 @@ def test_help_is_quick_and_imports_nothing_heavy(script, answers):
     assert code in (0, None) and "usage:" in text
     if script != TYPED:
         assert seconds < CPU_SECONDS and not set(HEAVY) & set(modules)
+
+
+def test_the_readme_names_every_script_table_and_figure():
+    text = (EXPERIMENTS / "README.md").read_text()
+    named = {name for name in re.findall(r"\b(?:\w+/)?\w+\.py\b", text.replace("experiments/render", "render"))}
+    missing = [name for name in SCRIPTS if name not in named]
+    assert missing == []
+    docs = EXPERIMENTS.parent / "docs"
+    for folder, pattern in (("results", "*.json"), ("images", "*.*")):
+        assert [path.name for path in (docs / folder).glob(pattern) if path.name not in text] == []
+
+
+@pytest.mark.parametrize("path", ["README.md", "../README.md", *(f"../docs/{page.name}" for page in DOCS)])
+def test_every_script_that_a_page_names_exists(path):
+    text = (EXPERIMENTS / path).read_text()
+    pattern = (
+        r"`(?:python )?((?:\w+/)+\w+\.py)\b" if path == "README.md" else r"\bexperiments/((?:\w+/)*\w+\.(?:py|json))\b"
+    )
+    roots = EXPERIMENTS, EXPERIMENTS.parent
+    missing = [name for name in re.findall(pattern, text) if not any((root / name).is_file() for root in roots)]
+    assert missing == []

@@ -1,9 +1,10 @@
 """The published network's numbers at every stage: the copy of the reference that tests carry.
 
 `data/golden_a.pt` is a checkpoint of the published network with random weights at small sizes, in the released format;
-`data/golden_a_subject_0.npz` the reference's numbers for one subject, some stages thinned out (see `THINNED`). Both come
-from the project's golden data `golden_a` (computed in float64 by the authors' release, stored as float32);
-`python tests/network/network_golden.py GOLDEN_DIRECTORY` makes the npz again.
+`data/golden_a_subject_0.npz` the reference's numbers for one subject, some stages thinned out (see `THINNED`). `golden_b` has
+one view, eight layers, and pools visible vertices only (`POOLS`). Both come from the project's golden data (computed in
+float64 by the authors' release, stored as float32); `python tests/network/network_golden.py GOLDEN_DIRECTORY` makes the npz
+files again.
 """
 
 import sys
@@ -17,6 +18,8 @@ from humangs_jax.network.conversion import read_state_dict
 DATA = Path(__file__).parent / "data"
 CHECKPOINT = DATA / "golden_a.pt"
 SUBJECT = DATA / "golden_a_subject_0.npz"
+POOLS = {"golden_a": "all", "golden_b": "visible"}
+"""Which views a vertex's features are pooled over: what a checkpoint does not record."""
 
 every = lambda step, axes=1, before=0: (slice(None),) * before + (slice(None, None, step),) * axes
 THINNED = {
@@ -34,11 +37,17 @@ THINNED = {
 """What the carried copy keeps of each stage."""
 
 
-def load_subject():
+def carried(name):
+    """(checkpoint, stages of one subject) of "golden_a" or "golden_b"."""
+    return DATA / f"{name}.pt", DATA / f"{name}_subject_0.npz"
+
+
+def load_subject(name="golden_a"):
     """Arrays of the carried subject in the layout of the golden files (b = 1), stages thinned out."""
-    arrays = dict(np.load(SUBJECT))
+    checkpoint, subject = carried(name)
+    arrays = dict(np.load(subject))
     arrays = {name: x if name in check_parity.PER_VIEW else x[None] for name, x in arrays.items()}
-    return arrays | {"in_lbs_weights": read_state_dict(CHECKPOINT)[0]["tpose_lbs_weights"]}
+    return arrays | {"in_lbs_weights": read_state_dict(checkpoint)[0]["tpose_lbs_weights"]}
 
 
 def thinned_errors(found, carried):
@@ -48,8 +57,9 @@ def thinned_errors(found, carried):
 
 
 if __name__ == "__main__":
-    arrays = dict(np.load(Path(sys.argv[1]) / "golden_a.npz"))
-    views = arrays["in_image"].shape[1]
-    del arrays["in_lbs_weights"]  # the checkpoint carries them
-    first = {name: x[:views] if name in check_parity.PER_VIEW else x[0] for name, x in arrays.items()}
-    np.savez_compressed(SUBJECT, **{name: x[THINNED.get(name, ())] for name, x in first.items()})
+    for golden in POOLS:
+        arrays = dict(np.load(Path(sys.argv[1]) / f"{golden}.npz"))
+        views = arrays["in_image"].shape[1]
+        del arrays["in_lbs_weights"]  # the checkpoint carries them
+        first = {name: x[:views] if name in check_parity.PER_VIEW else x[0] for name, x in arrays.items()}
+        np.savez_compressed(carried(golden)[1], **{name: x[THINNED.get(name, ())] for name, x in first.items()})

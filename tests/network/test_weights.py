@@ -59,7 +59,7 @@ def test_half_precision_halves_the_file_and_loads_as_float32(file, tmp_path):
     huge = jax.tree.map(lambda x: x * 1e6, VARIABLES)
     with pytest.raises(ValueError, match="overflows float16"):
         save_weights(half, huge, TINY, "float16")
-    assert load_weights(half)[1] == TINY  # what was there is there
+    assert load_weights(half)[1] == TINY.trained  # the file that was there stays
 
 
 @pytest.mark.parametrize(
@@ -85,7 +85,7 @@ def test_tensors_that_do_not_fit_are_named(file, change, message):
         ({"architecture": "{"}, "not JSON"),
         ({"conventions": "[]"}, "expected an object"),
         ({"conventions": json.dumps({"poll": "all"})}, "config.poll: Conventions has no such"),
-        ({"conventions": json.dumps({"pool": "some"})}, "config.pool: 'some'"),
+        ({"conventions": json.dumps({"pool": "some"})}, "config.pool: .*got 'some'"),
         ({"conventions": json.dumps({"image_size": True})}, "config.image_size"),
         ({"conventions": json.dumps({"image_size": 100})}, "not a multiple of patch_size"),
         ({"architecture": json.dumps({"encoder": {"patch_size": 8}})}, "config.encoder.kind"),

@@ -149,7 +149,7 @@ def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
     direct, mask = rendering.render_view(posed, camera)
     faces, uvs = jnp.asarray(mesh.faces, jnp.int32), jnp.asarray(mesh.visual.uv, jnp.float32)
     vertices, texture = jnp.asarray(mesh.vertices, jnp.float32), jnp.asarray(textures[0] / 255, jnp.float32)
-    again, alpha, _ = render_textured_mesh(vertices, faces, uvs, faces, texture, camera, jnp.ones(3), supersample=2)
+    again, alpha, _ = render_textured_mesh(vertices, faces, uvs, faces, texture, camera, supersample=2)
     assert np.abs(np.asarray(alpha) - mask).mean() < 1e-3
     assert -10 * np.log10(np.mean((np.asarray(again) - direct) ** 2)) > SCAN_PSNR
 

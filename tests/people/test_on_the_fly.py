@@ -169,9 +169,7 @@ def draw(scene, bank, seed, close_share, size):
 
 def test_it_looks_like_the_rendering_on_the_host(bank, scene, body):
     person = make_subject(SEEDS[int(scene.person)], body)
-    fields = [field.name for field in dataclasses.fields(person.lights)]
-    lights = {name: np.asarray(getattr(scene.lights, name)) for name in fields}
-    person = dataclasses.replace(person, lights=dataclasses.replace(person.lights, **lights))
+    person = dataclasses.replace(person, lights=scene.lights)
     scene = replace(scene, dyes=jnp.tile(jnp.eye(3), (bank.sheen.shape[1], 1, 1)))
     posed = rendering.pose_subject(person, np.asarray(scene.rotations[0]), np.asarray(scene.translations[0]))
     np.testing.assert_allclose(scene.vertices[0][: len(posed.vertices)], posed.vertices, atol=SKIN_DEPTH)

@@ -245,18 +245,20 @@ def test_a_written_subject_loads_back(tmp_path, body, people):
     assert np.abs(mask - inputs.masks[1]).max() < 2 * EIGHT_BITS
 
 
-def test_synthesize_resumes_and_keeps_what_is_there(tmp_path, body):
-    sizes = {"image_size": 32, "views": 2, "poses": 2, "body": body, "progress": False}
-    (first,) = writer.synthesize(tmp_path, 1, DEMO[0], **sizes)
+def test_a_set_is_resumed_and_keeps_what_is_there(tmp_path, body):
+    write = lambda count, first=0, split="demo", views=2: writer.write_set(
+        tmp_path, count, writer.Layout(32, poses=2, views=views), split, first, body=body, progress=False
+    )
+    (first,) = write(1)
     stamp = (first / "capture.json").stat().st_mtime_ns
     (tmp_path / f".{DEMO[1]:07d}.1").mkdir()  # what a killed run leaves
-    folders = writer.synthesize(tmp_path, 2, DEMO[0], **sizes)
+    folders = write(2)
     assert (first / "capture.json").stat().st_mtime_ns == stamp
     capture = load_capture(folders[1], body=body)
     np.testing.assert_array_equal(capture.frames, [0, 0, 1, 1])
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     assert manifest["subjects"] == [f.name for f in folders]
     with pytest.raises(ValueError, match="written with settings"):
-        writer.synthesize(tmp_path, 1, DEMO[0], **{**sizes, "views": 3})
+        write(1, views=3)
     with pytest.raises(ValueError, match="reach beyond"):
-        writer.synthesize(tmp_path, 2, seeds.TRAIN[-1], **sizes)
+        write(2, len(DEMO) - 1)

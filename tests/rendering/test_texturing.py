@@ -57,7 +57,6 @@ def test_gradient_is_the_weights_of_the_texels():
 WIDTH, HEIGHT = 9, 7
 UVS = jnp.asarray([UPPER_LEFT, (1.0, 1.0), (0.0, 0.0), LOWER_RIGHT])
 FACES = jnp.asarray([[0, 1, 2], [1, 3, 2]])
-WHITE = jnp.ones(3)
 
 
 def rectangle(left, top, right, bottom, depth=1.0):
@@ -73,7 +72,7 @@ def flat_camera():
 def test_a_texel_per_pixel_gives_the_texture_back():
     texture = jax.random.uniform(jax.random.key(0), (HEIGHT, WIDTH, 3))
     vertices = rectangle(0, 0, WIDTH, HEIGHT, depth=2.0)
-    rgb, alpha, depth = render_textured_mesh(vertices, FACES, UVS, FACES, texture, flat_camera(), WHITE)
+    rgb, alpha, depth = render_textured_mesh(vertices, FACES, UVS, FACES, texture, flat_camera())
     np.testing.assert_allclose(rgb, texture, atol=10 * ROUNDING)
     np.testing.assert_array_equal(alpha, 1)
     np.testing.assert_allclose(depth, 2, rtol=1e-6)
@@ -85,7 +84,7 @@ def test_supersampling_measures_coverage():
     background = jnp.asarray([1.0, 0.0, 0.5])
     vertices = rectangle(2.25, 1.5, 6.5, 4.75, depth=3.0)
     rgb, alpha, depth = render_textured_mesh(
-        vertices, FACES, UVS, FACES, texture, flat_camera(), background, supersample=4
+        vertices, FACES, UVS, FACES, texture, flat_camera(), background=background, supersample=4
     )
     along_x, along_y = np.array([0, 0, 0.75, 1, 1, 1, 0.5, 0, 0]), np.array([0, 0.5, 1, 1, 0.75, 0, 0])
     expected = np.outer(along_y, along_x)
@@ -101,8 +100,8 @@ def test_supersampling_is_the_mean_of_a_finer_picture():
     vertices = jnp.asarray([[-1, -1, 2.0], [1, -0.8, 1.5], [-0.7, 1, 1.8], [1.1, 0.9, 2.5]])
     camera = Camera.from_opencv([[6, 0, 4.4], [0, 6, 3.6], [0, 0, 1]], np.eye(4), WIDTH, HEIGHT)
     fine = camera.resized(WIDTH * supersample, HEIGHT * supersample)
-    rgb, alpha, _ = render_textured_mesh(vertices, FACES, UVS, FACES, texture, camera, WHITE, supersample=supersample)
-    fine_rgb, fine_alpha, _ = render_textured_mesh(vertices, FACES, UVS, FACES, texture, fine, WHITE)
+    rgb, alpha, _ = render_textured_mesh(vertices, FACES, UVS, FACES, texture, camera, supersample=supersample)
+    fine_rgb, fine_alpha, _ = render_textured_mesh(vertices, FACES, UVS, FACES, texture, fine)
     mean = lambda x: x.reshape(HEIGHT, supersample, WIDTH, supersample, -1).mean((1, 3))
     np.testing.assert_allclose(rgb, mean(fine_rgb), atol=ROUNDING)
     np.testing.assert_allclose(alpha, mean(fine_alpha)[..., 0], atol=ROUNDING)
@@ -116,7 +115,7 @@ def test_vmap_over_views_and_gradient_of_the_texture():
     vertices = jnp.asarray([[-1, 1, 0.0], [1, 1, 0], [-1, -1, 0], [1, -1, 0]])
 
     def pictures(texture):
-        draw = lambda camera: render_textured_mesh(vertices, FACES, UVS, FACES, texture, camera, WHITE)
+        draw = lambda camera: render_textured_mesh(vertices, FACES, UVS, FACES, texture, camera)
         return jax.vmap(draw)(cameras)
 
     def total(texture):
@@ -124,7 +123,7 @@ def test_vmap_over_views_and_gradient_of_the_texture():
         return rgb.sum(), (rgb, alpha)
 
     gradient, (rgb, alpha) = jax.jit(jax.grad(total, has_aux=True))(texture)
-    one = render_textured_mesh(vertices, FACES, UVS, FACES, texture, cameras[1], WHITE)
+    one = render_textured_mesh(vertices, FACES, UVS, FACES, texture, cameras[1])
     np.testing.assert_allclose(rgb[1], one[0], atol=1e-5)
     # every covered sample hands its unit of gradient to the texels
     np.testing.assert_allclose(gradient.sum(), 3 * alpha.sum(), rtol=1e-5)

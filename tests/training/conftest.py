@@ -1,12 +1,39 @@
 """A body of 64 vertices and made-up captures of it: enough to train on in seconds."""
 
+import functools
+from unittest import mock
+
 import jax
 import numpy as np
 import pytest
 from training_cases import tube, write_subject
 
 from humangs_jax.network.humangs import init_humangs
+from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
+from humangs_jax.training import loop, step
 from humangs_jax.training.config import tiny
+
+make_train_step = step.jitted_train_step.__wrapped__
+
+
+@functools.cache
+def quick_train_step():
+    """`jitted_train_step()` without LLVM's optimisations: 37 CPU seconds of compilation for `tiny` instead of 74."""
+    with mock.patch.dict(CPU_COMPILER_OPTIONS, {"xla_backend_optimization_level": 0}):
+        return make_train_step()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _compiled_quickly(request):
+    """Training steps are compiled quickly, unless a module says OPTIMIZED: most run a few times."""
+    if getattr(request.module, "OPTIMIZED", False):
+        yield
+        return
+    with (
+        mock.patch.object(step, "jitted_train_step", quick_train_step),
+        mock.patch.object(loop, "jitted_train_step", quick_train_step),
+    ):
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from rounding import bound
 from training_cases import without_upsampler
 
 from humangs_jax.core.pytree import replace
@@ -61,8 +62,8 @@ def planted(value, *index):
 def test_the_numbers_are_those_of_the_step(body, batch, variables):
     diagnosis = diagnose_step(init_state(CONFIG, variables), batch, body, CONFIG)
     _, metrics = train_step(init_state(CONFIG, variables), batch, body, CONFIG)
-    assert diagnosis.loss == pytest.approx(float(metrics["loss"]), rel=FLOAT32)
-    assert diagnosis.gradient_norm == pytest.approx(float(metrics["grad_norm"]), rel=FLOAT32)
+    assert diagnosis.loss == pytest.approx(float(metrics["loss"]), rel=bound(FLOAT32))
+    assert diagnosis.gradient_norm == pytest.approx(float(metrics["grad_norm"]), rel=bound(FLOAT32))
     assert diagnosis.fault is None and diagnosis.verdict.startswith("all finite; gradient norm")
     named = {leaf.name for stage in diagnosis.stages for leaf in stage.gradients}
     assert named == {name for name, _ in inexact_leaves(variables["params"])}
@@ -342,5 +343,5 @@ def test_networks_of_other_parts_have_the_same_stages(monkeypatch, body, batch):
     whole = diagnose_step(init_state(config), batch, body, config)
     _, metrics = train_step(init_state(config), batch, body, config)
     assert whole.fault is None and {"block 3", "encoding", "loss"} <= {stage.name for stage in whole.stages}
-    assert whole.loss == pytest.approx(float(metrics["loss"]), rel=FLOAT32)
+    assert whole.loss == pytest.approx(float(metrics["loss"]), rel=bound(FLOAT32))
     assert whole.gradient_norm == pytest.approx(float(metrics["grad_norm"]), rel=1e-3)  # without the compiler's fusions

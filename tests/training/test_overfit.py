@@ -27,6 +27,7 @@ from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
 from humangs_jax.training.validation import evaluate
 
+OPTIMIZED = True  # hundreds of steps
 SIZE, STEPS = 128, 280
 GOAL = 35.0
 """dB, mean over the views."""

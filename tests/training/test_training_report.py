@@ -6,6 +6,7 @@ import json
 import numpy as np
 import pytest
 
+from experiments.training import report
 from experiments.training.plot import joined, steps_of, validations_of
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.io.images import write_png
@@ -16,7 +17,7 @@ MACHINE = {"cores": 2, "architecture": "x86_64", "device": "cpu", "jax": "0.0"}
 
 
 @pytest.fixture
-def run(report, tmp_path):
+def run(tmp_path):
     """The files of a run that was killed and went on, skipped a step, and waited for a tenth of its time."""
     folder = tmp_path / "run"
     (folder / "sheets").mkdir(parents=True)
@@ -39,12 +40,14 @@ def run(report, tmp_path):
     return folder
 
 
-def test_the_page_tells_what_the_files_hold(report, run, tmp_path):
+def test_the_page_tells_what_the_files_hold(run, tmp_path):
     pytest.importorskip("matplotlib")
     page = tmp_path / "docs" / "page.md"
+    page.parent.mkdir()
+    page.write_text("".join(f"<!-- table: {name} -->\n<!-- end -->\n" for name in report.TABLES))
     report.write_report(run, page, tmp_path / "docs" / "images")
     text = page.read_text()
-    assert text.startswith("# A training run of 40 steps\n")
+    assert "| preset `tiny` from fresh weights, 40 steps of " in text
     assert "| 20 | 0.0646 | 26.00 dB | 0.500 | 22.00 dB | 15.00 dB | 0.9000 | no weights |" in text
     assert "| a step | 0.50 s, 2.00 subjects a second (median) |" in text
     assert "| of that, waiting for data | 50 ms, 10.0% |" in text
@@ -53,13 +56,12 @@ def test_the_page_tells_what_the_files_hold(report, run, tmp_path):
     assert "averaged weights (0.5) are validated" in " ".join(text.split()) and "nan" not in text
     from PIL import Image
 
-    for line in text.splitlines():
-        if line.startswith("!["):
-            with Image.open(page.parent / line.split("](")[1].rstrip(")")) as picture:
-                assert min(picture.size) >= SIZE
+    for name in (".png", "_progress.jpg", "_sheet.jpg"):
+        with Image.open(page.parent / "images" / f"training_run{name}") as image:
+            assert min(image.size) >= SIZE
 
 
-def test_shown_validations_begin_dense_and_end_with_the_last(report):
+def test_shown_validations_begin_dense_and_end_with_the_last():
     assert report.shown_steps(range(50, 501, 50)) == [50, 100, 150, 300, 500]
     assert report.shown_steps([7]) == [7] and report.shown_steps([1, 2]) == [1, 2]
 

@@ -3,17 +3,17 @@
 Conventions: OpenCV cameras, pixel centres at +0.5, depth is the camera's z. The nearest face wins, of equally near
 ones the one of lower index; both sides of a face are seen. A face covers the pixel centres inside it AND on its edges.
 Faces without area in the image cover nothing. Faces that reach behind the near plane are dropped whole; those that
-also reach before it may be missing from the picture and are counted in `Fragments.overflow`.
+also reach in front of it may be missing from the image and are counted in `Fragments.overflow`.
 
 Method: scanlines. Faces of a body cover a few pixels or none, so that tiles of pixels times lists of faces would
 mostly test pixels that a face does not touch. Instead each face is expanded to its rows of pixel centres and each row
 to the pixels of its span (see `_window`); these fragments meet in a z-buffer by two scatters, first the least
 depth of a pixel, then the least face number at that depth. Both levels run in steps of a fixed number of slots, and as
-many steps as the mesh needs: shapes are static, yet there is no capacity that a mesh could exceed.
+many steps as the mesh needs: shapes are static, and there is no capacity that a mesh could exceed.
 
 Watertight: an edge function is taken from the pixel's point of view, (a - p) x (b - p), the ends a and b in an order
-that depends on their positions alone. Two faces that share an edge so compute one number with opposite signs, whatever
-the compiler contracts, and close to a vertex the differences are exact: both may claim a pixel, but never neither.
+that depends on their positions alone. Two faces that share an edge therefore compute the same number with opposite signs,
+however the compiler contracts it, and close to a vertex the differences are exact: both may cover a pixel, but never neither.
 
 Derivatives: fragments are constants (`stop_gradient`); `interpolate_attributes` is differentiable with respect to the attributes.
 """
@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.configuration import knob
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, owners
@@ -41,16 +42,16 @@ NO_FACE = jnp.iinfo(jnp.int32).max
 
 @dataclasses.dataclass(frozen=True)
 class RasterConfig:
-    """Knobs of the rasterizer; the picture depends on `near` alone.
+    """Knobs of the rasterizer; the image depends on `near` alone.
 
     near: faces with a corner at z <= near are dropped, in the units of the vertices.
-    rows_per_step, fragments_per_step: slots per step of the two loops. Large steps waste time on slots that stay empty,
-    small ones on the overhead of more steps.
+    rows_per_step, fragments_per_step: slots per step of the two loops. Large steps spend
+    time on empty slots, small ones on the overhead of more steps.
     """
 
     near: float = 0.01
-    rows_per_step: int = 1 << 15
-    fragments_per_step: int = 1 << 16
+    rows_per_step: int = knob(1 << 15, cost="none", gain="fewer, larger steps", measured="performance.md")
+    fragments_per_step: int = knob(1 << 16, cost="none", gain="fewer, larger steps", measured="performance.md")
 
 
 DEFAULT_CONFIG = RasterConfig()
@@ -63,7 +64,7 @@ class Fragments(Batchable):
     face_ids: (h, w) index of the face, -1 where there is none.
     barycentrics: (h, w, 3) perspective-correct weights of the face's corners, >= 0, of sum 1; 0 where there is no face.
     depth: (h, w) z in the camera, in the units of the vertices; -1 where there is no face.
-    overflow: faces that may be missing from the picture: they cross the near plane, are not finite numbers of pixels, or
+    overflow: faces that may be missing from the image: they cross the near plane, are not finite numbers of pixels, or
         come after the first 2^30 rows of pixels.
     """
 

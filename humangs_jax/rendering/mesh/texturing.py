@@ -1,9 +1,9 @@
-"""Textured meshes: texture lookup and anti-aliased pictures.
+"""Textured meshes: texture lookup and anti-aliased images.
 
-Texture coordinates follow OBJ files: u to the right, v UP, (0, 0) the lower left corner of the picture and (1, 1) its
-upper right one, while row 0 of the texture array is the top of the picture. Texel centres lie at half texels: texel
+Texture coordinates follow OBJ files: u to the right, v UP, (0, 0) the lower left corner of the texture and (1, 1) its
+upper right one; row 0 of the array is the top. Texel centres lie at half texels: texel
 (row, column) is at u = (column + 0.5) / width, v = 1 - (row + 0.5) / height. Beyond the outermost centres the border
-texels go on (no repetition).
+texels continue (no repetition).
 """
 
 import functools
@@ -38,16 +38,17 @@ def render_textured_mesh(
     uv_faces: Int[Array, "f 3"],
     texture: Float[Array, "th tw 3"],
     camera: Camera,
-    background: Float[Array, "3"],
-    supersample: int = 1,
     config: RasterConfig = DEFAULT_CONFIG,
+    background: Float[Array, "3"] | None = None,
+    supersample: int = 1,
 ) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
-    """A picture of the mesh as seen by one camera: rgb over the background, alpha, and depth.
+    """The mesh as seen by one camera: rgb over the background (None: white), alpha, and depth.
 
     A pixel is the mean of supersample x supersample samples of visibility and texture. alpha is its covered share,
-    depth the mean z of its covered samples and 0 where there are none (as in splatted pictures). Differentiable with
+    depth the mean z of its covered samples and 0 where there are none (as in `splatting.Rendering`). Differentiable with
     respect to texture, uvs and background. A texture much finer than the samples aliases: raise `supersample`.
     """
+    background = jnp.ones(3, texture.dtype) if background is None else background
     fine = camera.resized(camera.width * supersample, camera.height * supersample)
     fragments = rasterize_mesh(vertices, faces, fine, config)
     uv = interpolate_attributes(fragments, uv_faces, uvs, jnp.zeros(2, uvs.dtype))

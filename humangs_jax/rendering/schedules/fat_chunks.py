@@ -2,7 +2,7 @@
 
 There a sequential step costs microseconds however little it does, so nothing may be sequential along a list. Every list
 is cut into chunks of `CHUNK` splats, and the chunks of ALL lists of all images of a batch, B of them at once, become
-arrays (B, k, p) (p pixels of a tile), whatever list they belong to. Nothing is padded to the longest list, empty tiles
+arrays (B, k, p) (p pixels of a tile). Nothing is padded to the longest list, empty tiles
 have no chunk, and the number of steps is that of chunks / B: it does not depend on how long the longest list is.
 
 The chain over a list becomes products, because along it only log T accumulates:
@@ -14,7 +14,7 @@ plus what the list that runs on from the step before has come to: that vector (p
 backward pass the sums over i <= j of w_i g . f_i are formed by the same two products.
 
 Exactness. The alphas are computed as by the other schedule, so the same are skipped and clamped; T comes from sums of
-log1p(-alpha) instead of products of 1 - alpha, which agrees to |log T| eps: a pixel's stop may fall on the other side
+log1p(-alpha) instead of products of 1 - alpha, which agrees to |log T| eps: a pixel's stop may differ
 only within that. (Measured on person scenes in float32 against float64: no less exact than the products.) The exponent
 is not a product of six coefficients with six monomials of the pixels, because the elementwise sum of squares is fused
 into exp at no traffic, where a product has to write (B, k, p) first; because it cannot become positive; and because it
@@ -69,11 +69,11 @@ STEP_CHUNKS = 2048
 """Largest B: the product over earlier chunks costs 2 B / k flops per pair, half of the triangular one at this B."""
 
 _LOG_ZERO = -1e3
-"""Stands for log 0 where 1 - alpha_max rounds to 0: exp of it is 0, and 0 times it is no NaN."""
+"""Stands for log 0 where 1 - alpha_max rounds to 0: its exp is 0, and its product with 0 is 0 and not NaN."""
 
 
 class Chunks(NamedTuple):
-    """All lists cut into chunks of at most `CHUNK`, list by list; those that are not needed have tile t and count 0.
+    """All lists cut into chunks of at most `CHUNK`, list by list; chunks that are not needed have tile t and count 0.
 
     tiles, starts, counts: of each chunk. ends: how far into its list it reaches. steps: of B chunks that hold any.
     """

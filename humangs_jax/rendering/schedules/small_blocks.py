@@ -3,8 +3,8 @@
 Tiles come by falling list length in blocks of `config.block` (`tiling.blocks_by_length`); a block takes its lists in
 chunks until the longest list ends or all its pixels have. A chunk's arrays (block, chunk, pixels) stay in the cache, and
 its chain of splats is unrolled, once for each thing that the loop carries: XLA makes of each ONE kernel that runs the
-chain in registers. T only falls, so "T_k+1 > stop" needs no memory of having stopped; the loop carries T as its negative
-once a pixel has, which keeps the final T and tells that the pixel is done.
+chain in registers. T only falls, so "T_k+1 > stop" needs no flag for stopped pixels; once a pixel has stopped, the
+loop carries -T, which keeps the final T and marks the pixel as done.
 
 The blocks are small because padding is what small lists cost: a block works as long as its longest list, and stops
 early only when all its pixels are done. Compile with `splatting.CPU_COMPILER_OPTIONS`: its kernels take microseconds, so

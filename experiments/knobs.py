@@ -1,0 +1,69 @@
+"""docs/knobs.md: every setting that trades accuracy or memory for speed, from the code itself.
+
+    python experiments/knobs.py [--check]
+
+A knob is a field made by `humangs_jax.core.configuration.knob`. --check writes nothing; exit status 1 if the page differs.
+"""
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).parents[1]
+sys.path.insert(0, str(REPOSITORY))
+PAGE = REPOSITORY / "docs" / "knobs.md"
+HEAD = """# Knobs
+
+Every setting that trades accuracy or memory for speed. `experiments/knobs.py` writes this page from the code. Decibels
+compare with the exact image; times are shares of the default's. The linked page has the measurement and its conditions.
+
+| knob | default | costs | buys | measured in |
+|---|---|---|---|---|
+"""
+
+
+def page() -> str:
+    """The page in Markdown."""
+    from humangs_jax.network.config import Conventions
+    from humangs_jax.network.encoder import PatchTransformer
+    from humangs_jax.network.execution import Execution
+    from humangs_jax.network.vertex_decoder import VertexDecoder
+    from humangs_jax.rendering.mesh.rasterizer import RasterConfig
+    from humangs_jax.rendering.splat_config import SplatConfig
+    from humangs_jax.training.config import TrainConfig
+
+    classes = (Execution, Conventions, PatchTransformer, VertexDecoder, SplatConfig, RasterConfig, TrainConfig)
+    rows = [row for cls in classes for row in knob_rows(cls)]
+    return HEAD + "\n".join(rows) + "\n"
+
+
+def knob_rows(cls: Any) -> list[str]:
+    """A row for each knob of a configuration."""
+    source = "../" + cls.__module__.replace(".", "/") + ".py"
+    rows = []
+    for field in dataclasses.fields(cls):
+        if "gain" in field.metadata:
+            cost, gain, measured = (field.metadata[name] for name in ("cost", "gain", "measured"))
+            default = field.default if not dataclasses.is_dataclass(field.default) else "on"
+            rows.append(
+                f"| [`{cls.__name__}`]({source})`.{field.name}` | {default} | {cost} | {gain} | [{measured}]({measured}) |"
+            )
+    return rows
+
+
+def main() -> int:
+    """Command line; the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="compare instead of writing")
+    arguments = parser.parse_args()
+    text = page()
+    if arguments.check:
+        return int(text != PAGE.read_text())
+    PAGE.write_text(text)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

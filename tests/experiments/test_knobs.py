@@ -1,0 +1,14 @@
+"""docs/knobs.md is what the code says."""
+
+import re
+
+from experiments.knobs import PAGE, REPOSITORY, page
+
+
+def test_the_page_of_knobs_is_up_to_date():
+    assert page() == PAGE.read_text(), "run experiments/knobs.py"
+
+
+def test_its_links_lead_somewhere():
+    for link in set(re.findall(r"\]\(([^)]+)\)", page())):
+        assert (REPOSITORY / "docs" / link).is_file(), link
