@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+OURS = {"humangs_jax", "tests", "experiments"}
 NAMES = {"PIL": "pillow", "skimage": "scikit-image", "orbax": "orbax-checkpoint", "jaxlib": "jax"}
 """Distributions that are not called like their module."""
 UNTESTED = {"torch"}
@@ -22,7 +23,7 @@ def imported(folder):
                 found |= {alias.name.split(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
                 found.add(node.module.split(".")[0])
-    return {plain(NAMES.get(module, module)) for module in found - sys.stdlib_module_names - {"humangs_jax", "tests"}}
+    return {plain(NAMES.get(module, module)) for module in found - sys.stdlib_module_names - OURS}
 
 
 def plain(requirement):

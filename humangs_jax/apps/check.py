@@ -59,7 +59,7 @@ MISTAKES = {
         lambda m, t: m @ _FROM_Y_UP
     ),
 }
-"""What people give, and the cam_from_world that undoes it, from theirs and the body's translation."""
+"""Usual mistakes, and the correct cam_from_world from the given one and the body's translation."""
 
 
 @pytree_dataclass
@@ -79,7 +79,7 @@ class BodyImage:
 
 @dataclasses.dataclass(frozen=True)
 class ViewCheck:
-    """What is known of one view. iou: of body and mask, None without masks. inside: share of the vertices in the image."""
+    """One view. iou: of body and mask, None without masks. inside: share of the vertices in the image."""
 
     name: str
     iou: float | None

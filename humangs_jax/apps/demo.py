@@ -1,7 +1,6 @@
 """The demonstration: an unseen person, four photos, one forward pass, new views, a walk."""
 
 import dataclasses
-import json
 import os
 import platform
 import time
@@ -25,6 +24,7 @@ from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.io.atomic import add_files
+from humangs_jax.io.text import write_json
 from humangs_jax.network.weights import load_weights
 
 VERSIONS = ("humangs_jax", "jax", "jaxlib", "flax", "numpy")
@@ -42,7 +42,7 @@ def run_demo(out: str | os.PathLike, weights: str | os.PathLike | None = None, f
     def write(folder: Path):
         report.update(_write_products(folder, weights, frame_size))
         report["total_seconds"] = round(time.perf_counter() - started, 3)
-        (folder / "report.json").write_text(json.dumps(report, indent=2) + "\n")
+        write_json(folder / "report.json", report, indent=2)
 
     add_files(out, write)
     print(

@@ -41,7 +41,7 @@ class Reconstruct:
     """The patches of the photos that the network reads: all, or those that show the person, which is several times
     faster. For weights trained with the other setting it is an approximation (docs/performance_reconstruction.md)."""
     dtype: Literal["float32", "bfloat16"] = "float32"
-    """Of the encoder's matrix products. bfloat16 is faster on GPU and TPU."""
+    """Number type of the encoder's matrix products. bfloat16 is faster on GPU and TPU."""
 
     def run(self) -> None:
         """Write the avatar."""

@@ -66,7 +66,7 @@ class Synth:
     out: Path = Path("synthetic_people")
     """Folder for one capture folder per subject and manifest.json."""
     subjects: int = 8
-    """How many."""
+    """Number of people."""
     split: Literal["train", "validation", "test", "demo"] = "train"
     """The seeds of the splits never overlap."""
     first: int = 0

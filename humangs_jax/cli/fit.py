@@ -21,7 +21,7 @@ class Detections:
     """2D keypoints of a detector."""
 
     keypoints: Path | None = None
-    """Of OpenPose, COCO, COCO-WholeBody, MMPose or AlphaPose, a file or folder (docs/fitting.md)."""
+    """Keypoint file or folder of OpenPose, COCO, COCO-WholeBody, MMPose or AlphaPose (docs/fitting.md)."""
     person: int | None = None
     """Which person of the keypoint file, from 0, if a view has several."""
 
@@ -46,9 +46,9 @@ class Scan:
     views: Path | None = None
     """Folder of images of the scan. They are rendered there; then, with --keypoints, those that the keypoints are of."""
     height: float | None = None
-    """Of the person in the scan without shoes, metres, which gives the scan its unit."""
+    """Height of the person in the scan without shoes, metres. It sets the scale of the scan."""
     bare: bool = False
-    """The scan wears no clothes."""
+    """The person in the scan wears no clothes."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,7 +187,7 @@ class Fit:
 
 
 def _reading_warnings(keypoints):
-    """What was odd about a file of keypoints that could be read."""
+    """Problems of a keypoint file that could be read."""
     if keypoints.missing:
         names = ", ".join(keypoints.missing[:LISTED]) + (" ..." if len(keypoints.missing) > LISTED else "")
         yield f"no keypoints of {len(keypoints.missing)} views: {names}"

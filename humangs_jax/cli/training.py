@@ -20,7 +20,7 @@ class LossNetworkFiles:
     lpips_heads: Path | None = None
     """The linear heads of LPIPS, if the backbone's file does not have them."""
     lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg"
-    """Which network LPIPS is on."""
+    """The network under LPIPS."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,13 +28,13 @@ class Processes:
     """Training in several processes (docs/scaling.md)."""
 
     distributed: bool = False
-    """This is one of several processes; which one, SLURM or a TPU pod says, or the following options."""
+    """This is one of several processes. SLURM or a TPU pod says which one, or the following options do."""
     coordinator: str | None = None
     """HOST:PORT of process 0."""
     processes: int | None = None
-    """How many there are."""
+    """Number of processes."""
     process: int | None = None
-    """Which one this is."""
+    """Index of this process."""
 
     def join(self) -> None:
         """Join the other processes, if there are any. Raises: see `join_processes`."""
@@ -128,7 +128,7 @@ class Convert:
     pool: Literal["all", "visible"] = "all"
     """Average a vertex's features over all views (as released) or over those that see it."""
     dtype: Literal["float32", "float16"] = "float32"
-    """To store; float16 halves the file."""
+    """Of the stored numbers; float16 halves the file."""
 
     def run(self) -> None:
         """Write the weights."""

@@ -9,7 +9,6 @@ the file, the field and what was expected. In memory the images have a white bac
 """
 
 import dataclasses
-import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,8 +31,6 @@ from humangs_jax.data.capture_checks import (
     numbers,
 )
 from humangs_jax.data.photos import (
-    FORMAT,
-    VERSION,
     Photos,
     capture_folder,
     check_background,
@@ -41,6 +38,7 @@ from humangs_jax.data.photos import (
     on_white_background,
     read_description,
     read_photos,
+    write_description,
 )
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import replace_folder
@@ -114,6 +112,7 @@ def capture_from_arrays(
     background: str = "photo",
     body: BodyModel | None = None,
     body_file: str | Path = DEFAULT_BODY,
+    source: str = "arrays",
 ) -> Capture:
     """A checked capture from array-likes.
 
@@ -125,10 +124,10 @@ def capture_from_arrays(
         names: (v,) file names without suffix; "000", "001", ... if left out.
         background: "photo": the masks are used to put the images on white; "white": they are on white already.
         body: the model; None loads `body_file`, by default the body that comes with the package.
+        source: what errors call the arrays.
 
-    Raises: CaptureError.
+    Raises: CaptureError, one line that names the array and what was expected: a shape, finite numbers, a range.
     """
-    source = "arrays"
     images = numbers(images, source, "images")
     if images.ndim != 4 or images.shape[-1] != 3 or 0 in images.shape:
         raise CaptureError(source, "images", f"expected shape (views, h, w, 3), got {images.shape}")
@@ -247,24 +246,27 @@ def read_parameters(file: Path) -> tuple[str, np.ndarray, np.ndarray, np.ndarray
 
 def _check_before_writing(capture):
     """Everything that reading would check, of a `Capture` made by hand."""
-    source, v = "capture", len(capture.images)
-    check_names(capture.names, v, source)
-    for field in ("images", "masks"):
-        if (array := getattr(capture, field)) is not None:
-            check_range(numbers(array, source, field), source, field)
-    K, cam_from_world = np.asarray(capture.cameras.K), np.asarray(capture.cameras.cam_from_world)
-    if len(K) != v:
-        raise CaptureError(source, "cameras", f"expected {v}, one per image, got {len(K)}")
-    height, width = capture.images.shape[1:3]
-    if (capture.cameras.width, capture.cameras.height) != (width, height):
-        got = f"{capture.cameras.width} x {capture.cameras.height}"
-        raise CaptureError(source, "cameras", f"expected the image size {width} x {height}, got {got}")
-    for i in range(v):
-        checked_camera(K[i], cam_from_world[i], width, height, source, f"view {i}")
-    poses = capture.poses
-    body_parameters(capture.body, capture.betas, np.asarray(poses.rotations), np.asarray(poses.translation), source)
-    for i, frame in enumerate(capture.frames):
-        checked_frame(int(frame), capture.frame_count, source, f"frames[{i}]")
+    v, (height, width) = len(capture.images), capture.images.shape[1:3]
+    cameras, poses = capture.cameras, capture.poses
+    if len(cameras.K) != v:
+        raise CaptureError("capture", "cameras", f"expected {v}, one per image, got {len(cameras.K)}")
+    if (cameras.width, cameras.height) != (width, height):
+        got = f"{cameras.width} x {cameras.height}"
+        raise CaptureError("capture", "cameras", f"expected the image size {width} x {height}, got {got}")
+    capture_from_arrays(
+        capture.images,
+        np.asarray(cameras.K),
+        np.asarray(cameras.cam_from_world),
+        np.asarray(poses.rotations),
+        np.asarray(poses.translation),
+        betas=capture.betas,
+        masks=capture.masks,
+        frames=capture.frames,
+        names=capture.names,
+        background="white",
+        body=capture.body,
+        source="capture",
+    )
 
 
 def _write_folder(folder, capture, target):
@@ -283,13 +285,12 @@ def _write_folder(folder, capture, target):
         view["cam_from_world"] = np.asarray(capture.cameras.cam_from_world[i], float).tolist()
         views.append(view)
     background = "photo" if capture.masks is None else "white"
-    description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": background, "views": views}
     write_npz(folder / "body.npz", parameter_arrays(capture, target), compressed=False)
-    (folder / "capture.json").write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+    write_description(folder, views, background)
 
 
 def parameter_arrays(capture: Capture, folder: Path) -> dict[str, np.ndarray]:
-    """What body.npz of a capture in `folder` holds; the model file is named relative to it."""
+    """The arrays of body.npz of a capture in `folder`; the model file is named relative to it."""
     body_file = capture.body_file
     if body_file != DEFAULT_BODY:
         body_file = Path(os.path.relpath(Path(body_file).resolve(), folder.resolve())).as_posix()

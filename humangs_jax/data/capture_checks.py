@@ -11,18 +11,14 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import check_replaceable
-from humangs_jax.io.text import parse_json, read_text
+from humangs_jax.io.text import FileError, parse_json, read_text
 
 COLOUR_SLACK = 1e-3
 """Resampled images overshoot [0, 1] a little; values further outside have another range, for instance 0 to 255."""
 
 
-class CaptureError(ValueError):
+class CaptureError(FileError):
     """Something is wrong with a capture; the message is one line: file, field, and what was expected."""
-
-    def __init__(self, file: object, field: str, problem: object):
-        parts = [str(part) for part in (file, field, problem) if part]
-        super().__init__(" ".join(": ".join(parts).split()))
 
 
 # Files ---------------------------------------------------------------------------------------------------------------

@@ -5,8 +5,8 @@ made on the fly from keys) and `Mixture` (several of these by weight). `Loader` 
 of its devices, some batches ahead, by grain where it is installed and by plain threads where it is not.
 """
 
-from humangs_jax.data.loading.batches import ExampleSource, Loader
-from humangs_jax.data.loading.captures import CaptureCache, CaptureSource, find_captures, store_capture
+from humangs_jax.data.loading.batches import Loader
+from humangs_jax.data.loading.captures import CaptureCache, CaptureSource, find_captures
 from humangs_jax.data.loading.examples import (
     Example,
     Source,
@@ -24,7 +24,6 @@ __all__ = [
     "CaptureCache",
     "CaptureSource",
     "Example",
-    "ExampleSource",
     "Loader",
     "Mixture",
     "Source",
@@ -36,7 +35,6 @@ __all__ = [
     "has_grain",
     "nearest_view",
     "shrink",
-    "store_capture",
     "subject_order",
     "subject_views",
 ]

@@ -35,7 +35,7 @@ from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
-from humangs_jax.io.text import read_json
+from humangs_jax.io.text import FileError, read_json
 
 WALK = "walk.npz"
 BODY_NUMBERS = 3 * len(BODY_NAMES)  # 66
@@ -44,7 +44,7 @@ AIST_FPS, DEFAULT_FPS = 60.0, 30.0
 AMASS_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
 MILLIMETRES = 1000.0
 PELVIS = np.array([0.0, -0.35, 0.0])
-"""Where SMPL-X's root joint (and the shipped body's) is in T-pose, metres: a world is turned about the posed one. Other
+"""Where SMPL-X's root joint (and the shipped body's) is in T-pose, metres: worlds are turned about it. Other
 bodies are off by a constant, which `grounded` removes."""
 UPRIGHT = {
     "y": (1.0, 0.0, 0.0, 0.0),
@@ -59,12 +59,8 @@ CLEARLY_UP = 0.5
 """Mean cosine between the pelvis's own up and an axis from which on that axis is taken for the world's up."""
 
 
-class MotionError(ValueError):
+class MotionError(FileError):
     """Something is wrong with a motion file; the message is one line: file, key, and what was expected."""
-
-    def __init__(self, file: object, key: str, problem: object):
-        parts = [str(part) for part in (file, key, problem) if part]
-        super().__init__(" ".join(": ".join(parts).split()))
 
 
 @pytree_dataclass

@@ -17,6 +17,7 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_frame, checked_json, numbers
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import read_grey, read_image
+from humangs_jax.io.text import write_json
 
 FORMAT = "humangs-capture"
 VERSION = 1
@@ -91,6 +92,12 @@ def read_description(file: Path) -> dict[str, Any]:
             if key in view and not (isinstance(view[key], str) and view[key]):
                 raise CaptureError(file, f"views[{i}].{key}", f"expected the path of a file, got {view[key]!r}")
     return description
+
+
+def write_description(folder: Path, views: Sequence[dict[str, Any]], background: str = "photo") -> None:
+    """Write capture.json of views with the keys of the format; the body is in body.npz."""
+    description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": background, "views": views}
+    write_json(folder / "capture.json", description)
 
 
 def check_keys(mapping: Iterable[str], known: set[str], required: set[str], file: Path, prefix: str = "") -> None:
@@ -198,7 +205,7 @@ def read_view(
 
 
 def read_checked(reader: Callable[[Path], Any], file: Path) -> Any:
-    """What a function of `io.images` reads from a file."""
+    """Read a file by a function of `io.images`. Raises: CaptureError."""
     try:
         return reader(file)
     except FileNotFoundError:

@@ -1,9 +1,19 @@
-"""Text and JSON files from strangers; every kind of damage is one line."""
+"""Text and JSON files: written whole or not at all; every kind of damage in one that is read is one line."""
 
 import json
 import os
 from pathlib import Path
 from typing import Any
+
+from humangs_jax.io.atomic import write_text
+
+
+class FileError(ValueError):
+    """Something is wrong with a file; the message is one line: file, field, and what was expected. Empty parts are left out."""
+
+    def __init__(self, file: object, field: str, problem: object):
+        parts = [str(part) for part in (file, field, problem) if part]
+        super().__init__(" ".join(": ".join(parts).split()))
 
 
 def read_text(path: str | os.PathLike) -> str:
@@ -28,6 +38,11 @@ def parse_json(text: str) -> Any:
         raise ValueError(f"line {error.lineno}: not valid JSON: {error.msg}") from error
     except RecursionError as error:
         raise ValueError("not usable JSON: nested too deeply") from error
+
+
+def write_json(path: str | os.PathLike, value: Any, indent: int | None = 1) -> None:
+    """Write a JSON file, whole or not at all. Raises: TypeError for what JSON cannot hold; OSError."""
+    write_text(path, json.dumps(value, indent=indent) + "\n")
 
 
 def read_json(path: str | os.PathLike) -> Any:

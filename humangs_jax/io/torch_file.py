@@ -24,7 +24,7 @@ import numpy as np
 ZIP_START = b"PK\x03\x04"
 PICKLE_START = b"\x80"
 MAGIC_NUMBER = 0x1950A86A20F9469CFC6C
-"""What the older format begins with."""
+"""First value of the older format."""
 STREAM_VERSION = 1001
 LARGEST_RATIO = 16
 """Members may unpack to this many times the size of the file: torch does not compress at all."""
@@ -59,7 +59,7 @@ class _StorageType(NamedTuple):
 
 
 class _Storage(NamedTuple):
-    """Which numbers: their type, the name of the storage that holds them, how many of its numbers come before."""
+    """A run of stored numbers: their type, the name of the storage, and the position of the first."""
 
     kind: str
     name: str
@@ -67,7 +67,7 @@ class _Storage(NamedTuple):
 
     @property
     def dtype(self) -> np.dtype:
-        """Of the numbers as they are stored."""
+        """Type of the numbers as stored."""
         return STORAGE_DTYPES[self.kind]
 
 
@@ -119,7 +119,7 @@ class _StateDictUnpickler(pickle.Unpickler):
         self.kinds: dict[str, str] = {}
 
     def find_class(self, module: str, name: str) -> Any:
-        """What stands for a name of the pickle."""
+        """The stand-in for a name of the pickle."""
         if (module, name) not in _ALLOWED:
             module = "builtins" if module == "__builtin__" else module  # its name in protocol 2, which torch writes
             raise pickle.UnpicklingError(f"refused to load {module}.{name}: no part of a state dict")

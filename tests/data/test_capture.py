@@ -432,10 +432,8 @@ def test_existing_folders(folder, tmp_path):
 
 
 def test_a_failed_write_leaves_what_was_there(folder, monkeypatch):
-    from humangs_jax.data import capture as module
-
     before = {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
-    monkeypatch.setattr(module.json, "dumps", lambda *a, **k: (_ for _ in ()).throw(OSError("disk full")))
+    monkeypatch.setattr(json, "dumps", lambda *a, **k: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
         save_capture(folder, capture_from_arrays(**arrays(1)), overwrite=True)
     assert {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()} == before

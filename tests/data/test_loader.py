@@ -16,14 +16,14 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import capture_from_arrays, load_capture, save_capture
 from humangs_jax.data.loader import (
     CaptureCache,
-    ExampleSource,
+    CaptureSource,
+    Loader,
     StoredSubject,
     ViewSampling,
     draw_views,
     find_captures,
     nearest_view,
     shrink,
-    store_capture,
     subject_order,
 )
 from humangs_jax.data.loading.captures import read_outline
@@ -74,6 +74,15 @@ def write_subject(path, seed, views=VIEWS, masks=True):
     save_capture(path, capture)
 
 
+def loader_of(cache, sampling, input_size, target_size, batch_size=1):
+    return Loader(CaptureSource(cache, sampling, input_size, target_size), batch_size)
+
+
+def stored_subject(path, body):
+    """A whole capture folder as the loader sees it."""
+    return CaptureCache([path], body).some_views(0, range(len(read_outline(path, body).frames)))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     root = tmp_path_factory.mktemp("subjects")
@@ -84,7 +93,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture
 def source(folder):
-    return ExampleSource(CaptureCache(find_captures(folder), small_body()), SAMPLING, SIZE, SIZE // 2, batch_size=2)
+    return loader_of(CaptureCache(find_captures(folder), small_body()), SAMPLING, SIZE, SIZE // 2, batch_size=2)
 
 
 def greys(views):
@@ -103,7 +112,7 @@ def fake_subject(views, poses, seed=0):
 
 
 def test_batches_are_a_function_of_seed_and_step(folder, source):
-    again = ExampleSource(CaptureCache(find_captures(folder), small_body()), SAMPLING, SIZE, SIZE // 2, batch_size=2)
+    again = loader_of(CaptureCache(find_captures(folder), small_body()), SAMPLING, SIZE, SIZE // 2, batch_size=2)
     again.batch_at(9)  # whatever was asked for before must not matter
     assert same(source.batch_at(5), again.batch_at(5))
     assert not same(source.batch_at(5), source.batch_at(6))
@@ -117,15 +126,15 @@ def test_iterating_resumes_to_the_very_batch(source):
 
 
 def test_a_pass_shows_every_subject_once(source):
-    shown = [greys(source.example_at(i, 2).inputs)[0][0] for i in range(8)]
+    shown = [greys(source.source.example(0, i, 2).inputs)[0][0] for i in range(8)]
     assert sorted(shown[:4]) == sorted(shown[4:]) == [0, 1, 2, 3]
     assert len({tuple(subject_order(0, epoch, 20)) for epoch in range(5)}) == 5
 
 
 def test_views_carry_their_own_pose_camera_and_size(folder, source):
-    stored = store_capture(folder / "s3", small_body())
+    stored = stored_subject(folder / "s3", small_body())
     for index in range(4):
-        example = source.example_at(index, 2)
+        example = source.source.example(0, index, 2)
         assert example.inputs.images.shape == (2, SIZE, SIZE, 3)
         assert example.targets.images.shape == (2, SIZE // 2, SIZE // 2, 3)
         assert example.targets.cameras.width == SIZE // 2
@@ -188,20 +197,20 @@ def test_a_broken_folder_is_skipped_counted_and_named(folder, tmp_path, caplog):
     write_subject(tmp_path / "torn", 7)
     next((tmp_path / "torn").glob("images/*")).write_bytes(b"no image")
     folders = (*find_captures(tmp_path), folder / "s1")
-    source = ExampleSource(CaptureCache(folders, small_body()), SAMPLING, SIZE, SIZE)
+    source = loader_of(CaptureCache(folders, small_body()), SAMPLING, SIZE, SIZE)
     with caplog.at_level(logging.WARNING):
         for index in range(8):
-            assert greys(source.example_at(index, 2).inputs)[0][0] == 1
-    assert {path.name for path in source.cache.broken} == {"few", "nomask", "torn"}
-    assert "3 views, but inputs and targets need 4" in source.cache.broken[tmp_path / "few"]
-    assert "no masks" in source.cache.broken[tmp_path / "nomask"]
+            assert greys(source.source.example(0, index, 2).inputs)[0][0] == 1
+    assert {path.name for path in source.source.cache.broken} == {"few", "nomask", "torn"}
+    assert "3 views, but inputs and targets need 4" in source.source.cache.broken[tmp_path / "few"]
+    assert "no masks" in source.source.cache.broken[tmp_path / "nomask"]
     assert len(caplog.records) == 3
     assert all(any(name in r.getMessage() for r in caplog.records) for name in ("few", "nomask", "torn"))
 
 
 def test_nothing_but_broken_folders_is_an_error_of_the_loop(tmp_path):
     write_subject(tmp_path / "few", 5, views=3)
-    source = ExampleSource(CaptureCache(find_captures(tmp_path), small_body()), SAMPLING, SIZE, SIZE)
+    source = loader_of(CaptureCache(find_captures(tmp_path), small_body()), SAMPLING, SIZE, SIZE)
     with pytest.raises(ValueError, match=r"none of the 1 capture folders can be used.*need 4"):
         next(source.batches(0, 1))
 
@@ -223,9 +232,7 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder,
         return read_view(*arguments)
 
     monkeypatch.setattr("humangs_jax.data.photos.read_view", reading)
-    examples = lambda cache: [
-        ExampleSource(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(s) for s in range(6)
-    ]
+    examples = lambda cache: [loader_of(cache, SAMPLING, SIZE, SIZE // 2, batch_size=2).batch_at(s) for s in range(6)]
     cache = CaptureCache(find_captures(folder), small_body(), limit_bytes=limit)
     first = examples(cache)
     counts = [len(read)]
@@ -239,7 +246,7 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder,
         assert counts == [distinct, 0]
     else:  # of 20 views there is room
         assert counts[1] < counts[0] <= drawn and counts[1] > 0
-    stored = [store_capture(path, small_body()) for path in find_captures(folder)]
+    stored = [stored_subject(path, small_body()) for path in find_captures(folder)]
     for batch, same_batch in zip(first, again, strict=True):
         assert same(batch, same_batch)
         for (subject, view), image in zip(
@@ -261,15 +268,15 @@ def test_a_picture_that_only_decoding_finds_broken_costs_its_examples_alone(fold
         return read_view(path, view, on_white)
 
     monkeypatch.setattr("humangs_jax.data.photos.read_view", reading)
-    new = lambda: ExampleSource(CaptureCache(folders, small_body()), SAMPLING, SIZE, SIZE)
+    new = lambda: loader_of(CaptureCache(folders, small_body()), SAMPLING, SIZE, SIZE)
     whole = new()
-    examples = [whole.example_at(i, 2) for i in range(40)]
+    examples = [whole.source.example(0, i, 2) for i in range(40)]
     subjects = [greys(example.inputs)[0][0] for example in examples]
     assert 40 > subjects.count(0) > 20 and subjects.count(2) > 0
     seen = {view for example in examples for views in (example.inputs, example.targets) for view in greys(views)}
     assert (2, 3) not in seen and (2, 4) in seen
-    assert list(whole.cache.broken) == [tmp_path / "s2"]
-    assert all(same(examples[i], new().example_at(i, 2)) for i in range(0, 40, 3))
+    assert list(whole.source.cache.broken) == [tmp_path / "s2"]
+    assert all(same(examples[i], new().source.example(0, i, 2)) for i in range(0, 40, 3))
 
 
 def test_outlines_find_every_fault_without_decoding(folder, tmp_path, monkeypatch):
@@ -364,6 +371,6 @@ def test_the_window_rule_scales_with_the_number_of_views(count):
 
 def test_the_window_rule_is_a_function_of_seed_and_step(folder):
     sampling = ViewSampling(input_counts=(2,), target_count=2, rule="window")
-    source = lambda: ExampleSource(CaptureCache(find_captures(folder), small_body()), sampling, SIZE, SIZE)
-    assert all(same(source().example_at(i, 2), source().example_at(i, 2)) for i in range(5))
-    assert not same(source().example_at(0, 2), source().example_at(3, 2))
+    source = lambda: loader_of(CaptureCache(find_captures(folder), small_body()), sampling, SIZE, SIZE)
+    assert all(same(source().source.example(0, i, 2), source().source.example(0, i, 2)) for i in range(5))
+    assert not same(source().source.example(0, 0, 2), source().source.example(0, 3, 2))

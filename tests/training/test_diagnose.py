@@ -12,7 +12,7 @@ from rounding import bound
 from training_cases import without_upsampler
 
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import CaptureCache, CaptureSource, ExampleSource
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import PRESETS
 from humangs_jax.network.reader import PixelAlignedReader
@@ -40,7 +40,9 @@ CONFIG = tiny()
 @pytest.fixture(scope="module")
 def batch(body, captures):
     size = CONFIG.model.conventions.image_size
-    source = ExampleSource(CaptureCache(captures, body), CONFIG.views, size, CONFIG.target_size, CONFIG.batch_size)
+    source = Loader(
+        CaptureSource(CaptureCache(captures, body), CONFIG.views, size, CONFIG.target_size), CONFIG.batch_size
+    )
     return source.batch_at(0)
 
 

@@ -10,7 +10,7 @@ from rounding import bound
 from training_cases import without_upsampler
 
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import CaptureCache, ExampleSource, ViewSampling
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.humangs import init_humangs
@@ -35,9 +35,8 @@ CONFIG = tiny()
 
 @pytest.fixture(scope="module")
 def source(body, captures):
-    return ExampleSource(
-        CaptureCache(captures, body), CONFIG.views, CONFIG.model.image_size, CONFIG.target_size, CONFIG.batch_size
-    )
+    views = CaptureCache(captures, body), CONFIG.views, CONFIG.model.image_size, CONFIG.target_size
+    return Loader(CaptureSource(*views), CONFIG.batch_size)
 
 
 def test_a_step_moves_the_parameters_and_tells_of_it(body, source, variables):

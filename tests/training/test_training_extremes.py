@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import CaptureCache, ExampleSource
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader
 from humangs_jax.training.config import tiny
 from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
@@ -20,7 +20,9 @@ OUTSIDE = 100.0
 
 def batch_of(body, captures, config, step=0):
     size = config.model.conventions.image_size
-    source = ExampleSource(CaptureCache(captures, body), config.views, size, config.target_size, config.batch_size)
+    source = Loader(
+        CaptureSource(CaptureCache(captures, body), config.views, size, config.target_size), config.batch_size
+    )
     return source.batch_at(step)
 
 

@@ -14,7 +14,7 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import CaptureError, floats, numbers
 
 ROUNDED_ROTATION = 5e-3
-"""R R^T of matrices written with three decimals (EasyMocap) is so far from 1; such are replaced by the nearest rotation."""
+"""R R^T of matrices written with three decimals (EasyMocap) is this far from 1; they are replaced by the nearest rotation."""
 ROTATION_TO_Y_UP = {
     "+x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
@@ -34,7 +34,7 @@ CONVENTIONS = {
     CAM_FROM_WORLD_OPENGL: lambda matrix: OPENGL_FROM_OPENCV @ matrix,
     WORLD_FROM_CAM_OPENGL: lambda matrix: OPENGL_FROM_OPENCV @ np.linalg.inv(matrix),
 }
-"""What a matrix in a file may mean, and the cam_from_world with OpenCV's axes that it then stands for. OpenCV: x right,
+"""What a matrix in a file may mean, and the cam_from_world with OpenCV's axes that follows. OpenCV: x right,
 y down, z forward; OpenGL: x right, y up, z backwards."""
 PIXEL_CENTERS = ("integer", "half")
 """Where the centre of the first pixel is: at (0, 0), as OpenCV has it, or at (0.5, 0.5)."""

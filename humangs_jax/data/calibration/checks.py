@@ -36,7 +36,7 @@ COINCIDENT = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class Checks:
-    """What was measured, and what looks wrong.
+    """What was measured, and warnings.
 
     reprojection: mean over all observations, pixels, or None without any. observations: how many.
     distance: median from the cameras to where their axes meet, metres, or None where they are parallel (one camera).

@@ -5,7 +5,6 @@ asks for it; capture.json names body.npz, which `humangs fit` makes.
 """
 
 import dataclasses
-import json
 import shutil
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from humangs_jax.data.calibration.checks import Checks, check_calibration
 from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.calibration.photos import Photo, find_photo, find_photos, photo_size
 from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera
-from humangs_jax.data.photos import FORMAT, VERSION, names_from_paths, read_checked
+from humangs_jax.data.photos import names_from_paths, read_checked, write_description
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import read_grey, read_image, write_png
 
@@ -30,7 +29,7 @@ NO_COMMON_FRAME = "no two cameras have a photo of the same frame: photos of one 
 
 @dataclasses.dataclass(frozen=True)
 class ImportReport:
-    """What was imported and how it was understood; as a string, the lines that a user should read."""
+    """What was imported and how it was read; `str(report)` is what the command line prints."""
 
     out: Path
     format: str
@@ -49,7 +48,7 @@ class ImportReport:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What looks wrong."""
+        """Likely mistakes."""
         return self.checks.warnings
 
     def __str__(self) -> str:
@@ -199,8 +198,7 @@ def _write(folder: Path, calibration: Calibration, photos: tuple[Photo, ...], na
         files = _copy(folder, photo, name) if as_they_are else _undistort(folder, photo, name, camera)
         matrices = {"K": camera.K.tolist(), "cam_from_world": camera.cam_from_world.tolist()}
         views.append({**files, "frame": photo.frame, **matrices})
-    description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "views": views}
-    (folder / "capture.json").write_text(json.dumps(description, indent=1) + "\n", encoding="utf-8")
+    write_description(folder, views)
 
 
 def _copy(folder, photo, name):
@@ -214,7 +212,7 @@ def _copy(folder, photo, name):
 
 
 def _undistort(folder, photo, name, camera):
-    """Photo and mask (its alpha, if that is all there is) as a pinhole sees them; what it does not see is white and no person."""
+    """Photo and mask (or its alpha) as a pinhole sees them; pixels that it does not see are white and background."""
     image, mask = read_checked(read_image, photo.image)
     if photo.mask is not None:
         mask = read_checked(read_grey, photo.mask)

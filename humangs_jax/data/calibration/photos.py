@@ -11,7 +11,7 @@ from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import image_size
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
-"""Of the photos that a capture may have."""
+"""File types of photos."""
 LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
 
 
@@ -47,7 +47,7 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
 
 
 def find_photo(folder: Path, name: str) -> Path | None:
-    """The photo of a path that may lack its suffix, have another one, or begin with folders that `folder` stands for."""
+    """The photo of a path that may lack its suffix, have another one, or begin with folders above `folder`."""
     parts = PurePosixPath(name.replace("\\", "/")).parts
     parts = [part for part in parts if part not in (".", "..", "/")]
     found = (_any_suffix(folder.joinpath(*parts[start:])) for start in range(len(parts)))
@@ -81,7 +81,7 @@ def _of_images(images, names, file):
 
 
 def _mask(masks, images, image):
-    """Where the photo's path has it in the other folder (COLMAP: with one more suffix); AvatarReX: in mask/pha beside it.
+    """The mask at the same path in the folder of masks (COLMAP: with one more suffix); AvatarReX: in mask/pha beside the photo.
 
     AvatarReX has photos and masks in one folder, so that the photo itself can be what is found first.
     """
@@ -109,7 +109,7 @@ def _of_cameras(calibration, images):
 
 
 def _folders_of_cameras(images, names):
-    """Of each camera, frame name -> photo."""
+    """For each camera, frame name -> photo."""
     return [{p.stem: p for p in _photos_in(images / name)} for name in names]
 
 

@@ -36,7 +36,7 @@ UNDERSTOOD = (
 HALF_PIXEL = 0.5
 """Every tool that we read counts pixels: the centre of the first one is at 0. Ours is at 0.5."""
 SETS_BY_COUNT = {len(each.names): each for each in (COCO_17, COCO_WHOLEBODY_133)}
-"""What lists of points without names are. 67 is not among them: OpenPose keeps body and hands apart."""
+"""The set of a list of points without names. OpenPose's 67 are not in it: its files keep body and hands apart."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class DetectedImage:
 class Detections:
     """The images of a file or folder. offset: pixels to add to x and y so that pixel centres are at +0.5.
 
-    set: None where there is nobody in any of the images.
+    set: None if no image has a person.
     """
 
     set: KeypointSet | None
@@ -169,7 +169,7 @@ def _common_set(images: Sequence[DetectedImage]) -> KeypointSet | None:
 _WHOLE_BODY_PARTS = {"foot_kpts": 6, "face_kpts": 68, "lefthand_kpts": 21, "righthand_kpts": 21}
 """COCO-WholeBody's, in the order of its 133 points, after the 17 of the body."""
 HIDDEN_CONFIDENCE = 0.5
-"""Of a point that an annotator guessed behind something else."""
+"""For points that an annotator guessed behind something else."""
 LARGEST_VISIBILITY = 2
 
 
@@ -250,7 +250,7 @@ def _by_visibility(person: Float[np.ndarray, "k 3"], file: Path, field: str) -> 
 
 
 def _stated_size(image: dict[str, Any]) -> tuple[int, int] | None:
-    """What the file states; 0 is a placeholder for unknown."""
+    """Width and height that the file states; 0 means unknown."""
     width, height = image.get("width"), image.get("height")
     return (int(width), int(height)) if width and height else None
 

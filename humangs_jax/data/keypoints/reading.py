@@ -249,12 +249,12 @@ def _shift(numbers: list[int], of_views: list[int], views: int) -> int:
 
 
 def _as_name(text: str) -> str:
-    """As the names of views are made from paths."""
+    """The name of a view that is made from such a path."""
     return re.sub(r"[^\w.-]", "_", text).lstrip("._")
 
 
 def _plain(name: str) -> str:
-    """Without zeros before numbers."""
+    """The name without zeros before numbers."""
     return re.sub(r"(?<!\d)0+(?=\d)", "", name)
 
 

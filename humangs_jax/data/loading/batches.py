@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.data.loading.captures import CaptureCache, CaptureSource
-from humangs_jax.data.loading.examples import Example, Source, ViewSampling
+from humangs_jax.data.loading.examples import Example, Source
 from humangs_jax.data.loading.order import input_count_at
 from humangs_jax.data.loading.threads import Reader, Waiting, prefetched, read_in_order
 
@@ -79,7 +78,7 @@ class Loader:
         """(step, batch) for start <= step < stop; `ahead` batches are made and put on the devices by threads meanwhile.
 
         Errors of the threads are raised here. Closing the generator (or leaving the loop over it) ends them.
-        waiting: what the loop had to wait for its batches is added to it.
+        waiting: the time that the loop waited for batches is added to it.
         """
 
         def make():
@@ -118,43 +117,6 @@ class Loader:
 
 
 def _stack(*leaves):
-    """Where all were made on a device they stay there."""
+    """Leaves that are all on a device stay there."""
     on_device = all(isinstance(leaf, jax.Array) for leaf in leaves)
     return jnp.stack(leaves) if on_device else np.stack([np.asarray(leaf) for leaf in leaves])
-
-
-@dataclasses.dataclass(frozen=True)
-class ExampleSource:
-    """Batches of capture folders in one process: a `Loader` of a `CaptureSource`, in short.
-
-    input_size, target_size: pixels a side of the square views.
-    """
-
-    cache: CaptureCache
-    sampling: ViewSampling
-    input_size: int
-    target_size: int
-    batch_size: int = 1
-    seed: int = 0
-
-    @property
-    def source(self) -> CaptureSource:
-        """The examples without their batches."""
-        return CaptureSource(self.cache, self.sampling, self.input_size, self.target_size)
-
-    @property
-    def loader(self) -> Loader:
-        """The batches."""
-        return Loader(self.source, self.batch_size, self.seed)
-
-    def batch_at(self, step: int) -> Example:
-        """The batch of a step: an `Example` with a leading axis of `batch_size` on every leaf."""
-        return self.loader.batch_at(step)
-
-    def example_at(self, index: int, input_count: int) -> Example:
-        """The index-th example of the run; the next usable subject in the order replaces a broken one."""
-        return jax.tree.map(jnp.asarray, self.source.example(self.seed, index, input_count))
-
-    def batches(self, start: int, stop: int, ahead: int = AHEAD) -> Generator[tuple[int, Example], None, None]:
-        """(step, batch) for start <= step < stop, prepared ahead by threads: see `Loader.batches`."""
-        return self.loader.batches(start, stop, ahead)

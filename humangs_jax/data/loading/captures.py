@@ -32,13 +32,6 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
     return tuple(folders)
 
 
-def store_capture(path: str | Path, body: BodyModel) -> StoredSubject:
-    """Read a whole capture folder whose parameters belong to `body`. Raises: ValueError naming file and field."""
-    cache = CaptureCache([path], body)
-    outline = read_outline(path, body)
-    return cache.some_views(0, range(len(outline.frames)))
-
-
 def read_outline(path: str | Path, body: BodyModel) -> StoredSubject:
     """All of a capture but its pixels: parameters that belong to `body`, images and masks of no views but of the right size.
 
@@ -142,17 +135,6 @@ class CaptureCache:
         images, masks = (np.stack(column) for column in zip(*(decoded[view] for view in views), strict=True))
         of_views = {name: getattr(outline, name)[chosen] for name in ("K", "cam_from_world", "frames", "azimuths")}
         return outline._replace(images=images, masks=masks, **of_views)
-
-    def load(self, index: int) -> StoredSubject | None:
-        """The whole subject of folder `index`; None if it is broken, which is reported once."""
-        outline = self.outline(index)
-        if outline is None:
-            return None
-        try:
-            return self.some_views(index, range(len(outline.frames)))
-        except (ValueError, OSError) as error:
-            self.note(index, str(error))
-            return None
 
     def note(self, index: int, problem: str) -> None:
         """Record folder `index` as broken, and log it the first time; its other views are still used."""

@@ -51,11 +51,6 @@ class StoredSubject(NamedTuple):
     translations: Float[np.ndarray, "m 3"]
     betas: Float[np.ndarray, " s"]
 
-    @property
-    def size_bytes(self) -> int:
-        """Memory that the arrays take."""
-        return sum(array.nbytes for array in self)
-
 
 @pytree_dataclass
 class Example:

@@ -25,12 +25,12 @@ def subject_order(seed: int, epoch: int, count: int) -> Int[np.ndarray, " count"
 
 
 def view_generator(seed: int, index: int) -> np.random.Generator:
-    """What draws the views of the index-th example of a source."""
+    """The random generator for the views of the index-th example of a source."""
     return np.random.default_rng([VIEW_STREAM, seed, index])
 
 
 def input_count_at(seed: int, step: int, counts: Sequence[int]) -> int:
-    """How many input views a step has."""
+    """Number of input views of a step."""
     return counts[int(np.random.default_rng([BATCH_STREAM, seed, step]).integers(len(counts)))]
 
 
@@ -55,7 +55,7 @@ def source_at(seed: int, index: int, counts: Int[np.ndarray, " sources"]) -> tup
     """(which source the index-th example comes from, its number among the examples of that source).
 
     Blocks of `MIX_BLOCK` examples are permutations of the same multiset: shares are exact over every block, and each source
-    hands out its own examples 0, 1, 2, ... without a gap.
+    provides its own examples 0, 1, 2, ... without a gap.
     """
     block, position = divmod(index, MIX_BLOCK)
     labels = np.repeat(np.arange(len(counts)), counts)
