@@ -49,7 +49,7 @@ def body_cases(body: BodyModel, config: HumanGSConfig) -> dict[str, BodyCase]:
 
 def as_it_is(config: HumanGSConfig) -> HumanGSConfig:
     """The configuration for a body whose vertices carry the Gaussians as they are."""
-    return dataclasses.replace(config, body_vertices=None, longest_edge=None)
+    return config.with_conventions(body_vertices=None, longest_edge=None)
 
 
 def smplx_body(body: BodyModel) -> BodyModel:

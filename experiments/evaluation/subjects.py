@@ -54,7 +54,7 @@ class EvaluationSubject:
     held_out: Capture
 
     def inputs(self, count: int) -> Capture:
-        """That number of photos, evenly spaced on the ring, frontal first. Raises ValueError if they were not rendered."""
+        """Evenly spaced photos of the ring, the frontal one first. Raises ValueError if they were not rendered."""
         wanted = ring_positions(count)
         if missing := set(wanted) - set(self.positions):
             raise ValueError(f"{count} photographs need ring positions {sorted(missing)}, which were not photographed")

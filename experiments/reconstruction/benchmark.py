@@ -17,7 +17,6 @@ Published at 256 with 4 views takes 3 minutes on 2 cores. Numbers: docs/performa
 """
 
 import argparse
-import dataclasses
 import os
 import sys
 from pathlib import Path
@@ -112,7 +111,7 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
         "views": arguments.views,
         "size": arguments.size,
         "vertices": int(inputs.canonical_vertices.shape[0]),
-        "dtype": config.dtype,
+        "dtype": config.execution.dtype,
         "repeats": arguments.repeats,
         "load_average": load,
         "device": jax.devices()[0].device_kind,
@@ -130,7 +129,7 @@ def configured(preset: str, dtype: str, size: int) -> Any:
         raise SystemExit(f"--preset {preset}: expected one of {', '.join(PRESETS)}")
     if dtype == "auto":
         dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
-    return dataclasses.replace(PRESETS[preset](), dtype=dtype, image_size=size)
+    return PRESETS[preset]().with_conventions(image_size=size).with_execution(dtype=dtype)
 
 
 def reconstruction(variables: Any, inputs: Any, config: Any) -> tuple[Any, dict[str, Any]]:

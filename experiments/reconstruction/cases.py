@@ -112,7 +112,7 @@ def random_variables(config: Any, seed: int = 0) -> Any:
     geometry = variables["params"]["decoder"]["geometry_out"]
     resting = jnp.asarray([0, 0, 0, 1, 0, 0, 0, *[LOG_SCALE] * 3], jnp.float32)
     geometry["kernel"] *= HEAD_SCALE
-    geometry["bias"] = jnp.tile(resting, config.decoder.gaussians_per_vertex)
+    geometry["bias"] = jnp.tile(resting, config.architecture.decoder.gaussians_per_vertex)
     return variables
 
 

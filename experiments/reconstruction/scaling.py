@@ -78,7 +78,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         "width": WIDTH,
         "layers": LAYERS,
         "size": arguments.size,
-        "dtype": half.dtype,
+        "dtype": half.execution.dtype,
         "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
     }

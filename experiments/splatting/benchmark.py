@@ -8,7 +8,7 @@ Files: see `splatting/scenes.py`. DIR holds a `yardstick.py` with `Scene` and `Y
 noise; black background. Half a minute at 512. `--float64` draws the scene in float64 instead and compares that.
 An image is shared between two of XLA's host devices where there are two cores (`--devices 1`: not).
 
-Prints a table and writes {"forward_ms", "forward_backward_ms", "forward_cpu_ms", "forward_backward_cpu_ms" (medians),
+Prints tables and writes {"forward_ms", "forward_backward_ms", "forward_cpu_ms", "forward_backward_cpu_ms" (medians),
 "yardstick": {the same} or null, "ratio": ours / yardstick, "compile_s", "peak_rss_mb", "psnr", "max_abs_error",
 "fraction_above_2e-4", "gradient_relative_l2", "gradient_cosine", "gradient_signed_bias", "gradient_gain": {parameter:
 number}, "work", "config", "devices", ...}; what needs a reference that is not given is null.
@@ -24,7 +24,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -71,12 +71,13 @@ def main() -> None:
     arguments = parser.parse_args()
     prepare_process()
     result = benchmark(arguments)
-    print(printed(result))
+    text = "\n\n".join(table for table in (times_table(result), errors_table(result)) if table)
+    work_done = ", ".join(f"{name.replace('_', ' ')} {value:,}" for name, value in result["work"].items())
+    print(f"{text}\n\nwork: {work_done}")
     if arguments.json:
         write_json(arguments.json, result)
     if arguments.page:
-        tables = [table for table in (times_table([result]), errors_table([result])) if table]
-        publish(arguments.page, TABLE, "\n\n".join(tables), result, name_of(result))
+        publish(arguments.page, TABLE, text, result, name_of(result))
 
 
 def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -216,71 +217,36 @@ def work(scene: Scene, config: Any, dtype: type) -> dict[str, float]:
     return tile_work(scene, config, dtype)
 
 
-def printed(result: Mapping[str, Any]) -> str:
-    """What is printed."""
-    number = lambda value, form: "-" if value is None else format(value, form)
-    theirs, ratio = result["yardstick"] or {}, result["ratio"] or {}
-    lines = [
-        f"{result['scene']} {result['size']}, {result['gaussians']:,} Gaussians, {result['dtype']}, preset "
-        f"{result['preset']}, {', '.join(result['devices'])}, load {result['load_average']:.1f}",
-        f"{'median ms':24}{'ours':>10}{'yardstick':>11}{'ratio':>8}",
-    ]
-    for direction in DIRECTIONS:
-        for kind, label in (("ms", "wall"), ("cpu_ms", "CPU")):
-            key = f"{direction}_{kind}"
-            cells = number(result[key], "10.1f"), number(theirs.get(key), "11.1f"), number(ratio.get(key), "8.2f")
-            lines.append(f"{direction.replace('_', '+') + ' ' + label:24}{cells[0]:>10}{cells[1]:>11}{cells[2]:>8}")
-    each = ", ".join(f"{name.replace('_', '+')} {s:.1f} s" for name, s in result["compile_s_each"].items())
-    lines.append(f"compile: {each}; peak memory {result['peak_rss_mb']:.0f} MiB")
-    lines.append(
-        f"image: {number(result['psnr'], '.1f')} dB, largest error {number(result['max_abs_error'], '.1e')}, "
-        f"{number(result['fraction_above_2e-4'], '.4%')} of the pixels off by more than 2e-4"
-    )
-    lines.append(f"{'gradient of':12}" + "".join(f"{name:>12}" for name in PARAMETERS))
-    for measure, form in (("relative_l2", ".1e"), ("cosine", ".8f"), ("signed_bias", ".1e"), ("gain", ".1e")):
-        row = result[f"gradient_{measure}"]
-        lines.append(f"{measure:12}" + "".join(f"{number(row[name], form):>12}" for name in PARAMETERS))
-    lines.append("work: " + ", ".join(f"{name.replace('_', ' ')} {value:,}" for name, value in result["work"].items()))
-    return "\n".join(lines)
-
-
 def name_of(run: Mapping[str, Any]) -> str:
     """Scene, size and how many devices shared the image."""
     devices = len(run["devices"])
     return f"{run['scene']} {run['size']}" + (f", {devices} devices" if devices > 1 else "")
 
 
-def times_table(runs: Sequence[Mapping[str, Any]]) -> str:
-    """Wall and CPU ms, and their ratios to the yardstick's."""
-    rows = []
-    for run in runs:
-        if run["forward_ms"] is None:
-            continue
-        cells = [name_of(run)]
-        for name in DIRECTIONS:
-            cells.append(f"{run[f'{name}_ms']:.0f}, {run[f'{name}_cpu_ms']:.0f}")
-            ratio = run["ratio"]
-            cells.append(f"{ratio[f'{name}_ms']:.2f}, {ratio[f'{name}_cpu_ms']:.2f}" if ratio else "-")
-        cells.append(", ".join(f"{seconds:.1f}" for seconds in run["compile_s_each"].values()))
-        rows.append([*cells, f"{run['peak_rss_mb']:.0f}"])
+def times_table(run: Mapping[str, Any]) -> str:
+    """Wall and CPU ms, and their ratios to the yardstick's; empty if nothing was timed."""
+    if run["forward_ms"] is None:
+        return ""
+    cells, ratio = [name_of(run)], run["ratio"]
+    for name in DIRECTIONS:
+        cells.append(f"{run[f'{name}_ms']:.0f}, {run[f'{name}_cpu_ms']:.0f}")
+        cells.append(f"{ratio[f'{name}_ms']:.2f}, {ratio[f'{name}_cpu_ms']:.2f}" if ratio else "-")
+    cells += [", ".join(f"{seconds:.1f}" for seconds in run["compile_s_each"].values()), f"{run['peak_rss_mb']:.0f}"]
     header = ["wall, CPU", "forward, ms", "/ yardstick", "forward+backward, ms", "/ yardstick"]
-    return markdown_table([*header, "compile each, s", "peak memory, MiB"], rows)
+    return markdown_table([*header, "compile each, s", "peak memory, MiB"], [cells])
 
 
-def errors_table(runs: Sequence[Mapping[str, Any]]) -> str:
-    """Errors of images and gradients; empty where no run had a reference."""
-    rows = []
-    for run in runs:
-        if run["psnr"] is None:
-            continue
-        cells = [f"{name_of(run)}, {run['dtype']}", f"{run['psnr']:.1f}", f"{run['max_abs_error']:.1e}"]
-        cells.append(f"{run['fraction_above_2e-4']:.4%}")
-        for measure, worst, form in (("relative_l2", max, ".1e"), ("cosine", min, ".8f"), ("signed_bias", max, ".0e")):
-            values = [abs(value) for value in run[f"gradient_{measure}"].values() if value is not None]
-            cells.append(format(worst(values), form) if values else "-")
-        rows.append(cells)
+def errors_table(run: Mapping[str, Any]) -> str:
+    """Errors of image and gradients (the worst parameter); empty without a reference."""
+    if run["psnr"] is None:
+        return ""
+    cells = [f"{name_of(run)}, {run['dtype']}", f"{run['psnr']:.1f}", f"{run['max_abs_error']:.1e}"]
+    cells.append(f"{run['fraction_above_2e-4']:.4%}")
+    for measure, worst, form in (("relative_l2", max, ".1e"), ("cosine", min, ".8f"), ("signed_bias", max, ".0e")):
+        values = [abs(value) for value in run[f"gradient_{measure}"].values() if value is not None]
+        cells.append(format(worst(values), form) if values else "-")
     header = ["error to float64", "PSNR, dB", "largest", "pixels off by > 2e-4"]
-    return markdown_table([*header, "gradients: relative L2", "cosine", "signed bias"], rows) if rows else ""
+    return markdown_table([*header, "gradients: relative L2", "cosine", "signed bias"], [cells])
 
 
 if __name__ == "__main__":

@@ -3,15 +3,15 @@
     python experiments/training/data_loading.py --json data.json [--sizes 128 256 512] [--subjects 4] [--train-step-s 0.9]
 
 For every image size, on this machine: `synth` (people written to disk: subjects and views per second of one process),
-`read` (written people through the loader: every example decoded from disk, and kept in memory), and `live` (people on the
-fly from a bank: building it, compiling, views per second). Then the time of one step of the small preset (measured at its own
-sizes unless --train-step-s gives it), which consumes the views of one example, and what a step would wait: the loader works
-beside the step, so a step waits for what a batch takes beyond it; live people are drawn on the device of the step, so all of
-their time is added, unless the device has time to spare (CPUs of several cores). Where the step is measured, so is what it
-waits when the loader feeds it with either. CPU seconds count the work of all threads and depend little on other programs.
+`read` (written people through the loader: every example decoded from disk, and kept in memory), and `on_the_fly` (people from a
+bank: building it, compiling, views per second). Then the time of one step of the small preset (measured at its own sizes unless
+--train-step-s gives it), which consumes the views of one example, and how long a step would wait. The loader works beside the
+step, so a step waits for the time of a batch beyond its own; on-the-fly people are rendered on the device of the step, so all of
+their time is added, unless the device has time to spare (CPUs of several cores). Where the step is measured, its waiting time
+with each source is measured too. CPU seconds count the work of all threads and depend little on other programs.
 
 About 4 minutes on 2 CPU cores to themselves, 2 of them with --train-step-s. Expected there, CPU ms a view at 256: written
-170, live 32, read 9 from disk and 1 from memory; drawing an example live takes a sixth of the CPU time of a step.
+170, on the fly 32, read 9 from disk and 1 from memory; rendering an example on the fly takes a sixth of the CPU time of a step.
 """
 
 import argparse
@@ -76,7 +76,7 @@ def measure_read(out: Path, size: int, examples: int, body: Any) -> dict[str, di
     return results
 
 
-def measure_live(size: int, people: int, examples: int, body: Any) -> dict[str, Any]:
+def measure_on_the_fly(size: int, people: int, examples: int, body: Any) -> dict[str, Any]:
     """Build a bank, compile, draw examples one by one."""
     import jax
 
@@ -102,7 +102,7 @@ def measure_live(size: int, people: int, examples: int, body: Any) -> dict[str, 
 
 
 def measure_training(folder: Path, body: Any) -> dict[str, Any]:
-    """Steps of the small preset at its own sizes: alone, and fed by the loader with written and with live people."""
+    """Steps of the small preset at its own sizes: alone, and fed by the loader with written and with on-the-fly people."""
     import dataclasses
 
     import jax
@@ -124,7 +124,7 @@ def measure_training(folder: Path, body: Any) -> dict[str, Any]:
     write_set(folder, 2, Layout(max(sizes), poses=POSES, views=VIEWS), "train", 0, body=body, progress=False)
     bank = build_bank([0, 1], body, "train", pose_count=4)
     sources = {
-        "live": on_the_fly_source(bank, OnTheFlyConfig(INPUTS, TARGETS, *sizes), (INPUTS,)),
+        "on_the_fly": on_the_fly_source(bank, OnTheFlyConfig(INPUTS, TARGETS, *sizes), (INPUTS,)),
         "read": CaptureSource(CaptureCache(find_people(folder), body), sampling, *sizes),
     }
     state, model_body = init_state(config, None), gaussian_body(body, config.model)
@@ -134,7 +134,7 @@ def measure_training(folder: Path, body: Any) -> dict[str, Any]:
         state, metrics = train_step(state, batch, model_body, config)
         jax.block_until_ready(metrics)
 
-    batch = Loader(sources["live"]).batch_at(0)
+    batch = Loader(sources["on_the_fly"]).batch_at(0)
     compiled = seconds(lambda: step(batch))
     step(batch)
     spent = seconds(lambda: [step(batch) for _ in range(STEPS)])
@@ -155,28 +155,30 @@ def waits(sizes: dict[str, Any], step_s: float) -> dict[str, dict[str, float]]:
     for size, result in sizes.items():
         per_example = lambda r: r["wall_s"] / r["subjects"]
         ahead = {name: max(0.0, per_example(result["read"][name]) - step_s) for name in ("disk", "memory")}
-        added = {f"read_{name}": value for name, value in ahead.items()} | {"live": per_example(result["live"])}
+        added = {f"read_{name}": value for name, value in ahead.items()} | {
+            "on_the_fly": per_example(result["on_the_fly"])
+        }
         results[size] = added | {f"{name}_share": value / step_s for name, value in added.items()}
     return results
 
 
-def ways(of_size: dict[str, Any]) -> dict[str, dict[str, float]]:
+def by_way(of_size: dict[str, Any]) -> dict[str, dict[str, float]]:
     """The numbers of each way, as the tables name it."""
     written = f"written by `synth` (people, posing, PNG included; {POSES * VIEWS} views each)"
     kept = {f"read by the loader, {place}": of_size["read"][name] for name, place in PLACES.items()}
-    return {written: of_size["synth"], **kept, "on the fly": of_size["live"]}
+    return {written: of_size["synth"], **kept, "on the fly": of_size["on_the_fly"]}
 
 
 def cpu_table(sizes: dict[str, Any]) -> str:
     """CPU ms a view, one column for each size."""
-    columns = [ways(of_size) for of_size in sizes.values()]
+    columns = [by_way(of_size) for of_size in sizes.values()]
     rows = [[name, *(significant(1e3 * column[name]["cpu_s_per_view"]) for column in columns)] for name in columns[0]]
     return markdown_table(["CPU ms a view", *(f"{size} px" for size in sizes)], rows)
 
 
 def rates_table(sizes: dict[str, Any]) -> str:
     """Views and subjects a second, one column for each size."""
-    columns = [ways(of_size) for of_size in sizes.values()]
+    columns = [by_way(of_size) for of_size in sizes.values()]
     cell = lambda numbers: f"{significant(numbers['views_per_s'])} ({significant(numbers['subjects_per_s'])})"
     rows = [[name, *(cell(column[name]) for column in columns)] for name in columns[0]]
     return markdown_table(["views (subjects) a second, one process", *(f"{size} px" for size in sizes)], rows)
@@ -214,7 +216,7 @@ def main() -> None:
     prepare_process()
     from humangs_jax.body.library import load_body
 
-    body, sizes, rows = load_body(), {}, []
+    body, sizes = load_body(), {}
     result: dict[str, Any] = {"machine": machine(), "views_per_example": INPUTS + TARGETS, "sizes": sizes}
     with tempfile.TemporaryDirectory() as folder:
         for size in arguments.sizes:
@@ -222,14 +224,9 @@ def main() -> None:
             sizes[str(size)] = {
                 "synth": measure_synth(out, size, arguments.subjects, body),
                 "read": measure_read(out, size, arguments.examples, body),
-                "live": measure_live(size, arguments.subjects, arguments.examples, body),
+                "on_the_fly": measure_on_the_fly(size, arguments.subjects, arguments.examples, body),
             }
-            ways = {"synth": sizes[str(size)]["synth"], "live": sizes[str(size)]["live"]}
-            ways |= {f"read from {name}": numbers for name, numbers in sizes[str(size)]["read"].items()}
-            for name, numbers in ways.items():
-                rows.append([name, size, *(f"{numbers[k]:.3g}" for k in ("subjects_per_s", "views_per_s"))])
-                rows[-1].append(f"{1e3 * numbers['cpu_s_per_view']:.1f}")
-            print(markdown_table(["way", "size", "subjects/s", "views/s", "CPU ms/view"], rows), flush=True)
+    print(f"{cpu_table(sizes)}\n\n{rates_table(sizes)}\n", flush=True)
     given = arguments.train_step_s
     if given is None:
         with tempfile.TemporaryDirectory() as folder:
@@ -240,12 +237,12 @@ def main() -> None:
     result["waits"] = waits(sizes, step_s)
     print(f"a training step takes {step_s:.3g} s and consumes {(INPUTS + TARGETS) / step_s:.3g} views a second")
     for size, wait in result["waits"].items():
-        told = ", ".join(
+        shares = ", ".join(
             f"{n} {1e3 * wait[n]:.0f} ms ({100 * wait[f'{n}_share']:.0f} %)"
-            for n in ("read_disk", "read_memory", "live")
+            for n in ("read_disk", "read_memory", "on_the_fly")
         )
-        print(f"at {size} pixels a step waits for its data: {told}")
-    for name in ("read", "live"):
+        print(f"at {size} pixels a step waits for its data: {shares}")
+    for name in ("read", "on_the_fly"):
         fed: Any = result["train_step"].get(f"fed_{name}")
         if fed:
             print(

@@ -5,7 +5,8 @@ import jax
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
-from humangs_jax.rendering.gaussians import Gaussians, factored, skin_gaussians
+from humangs_jax.core.checks import FINITE, check_values
+from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values, skin_gaussians
 
 
 def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
@@ -14,10 +15,25 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
     return skin_gaussians(avatar.gaussians, blend_transforms(avatar.skinning_weights, transforms), avatar.skinning)
 
 
-@jax.jit
 def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
     """Posed Gaussians that means, quats and scales describe completely (the linear deformation is factored into them).
 
     The factors are not differentiable where two scales coincide: optimise through `skin`.
+
+    Raises: ValueError if the pose has another number of joints than the avatar; outside of transformations, also for values
+    that are not finite or out of range, naming the array.
     """
+    joints = len(avatar.parents)
+    if pose.rotations.shape != (joints, 3) or pose.translation.shape != (3,):
+        found = f"rotations {pose.rotations.shape}, translation {pose.translation.shape}"
+        raise ValueError(
+            f"animate: expected one pose of {joints} joints, got {found}; use jax.vmap for a batch of poses"
+        )
+    moves = {"pose.rotations": (pose.rotations, FINITE), "pose.translation": (pose.translation, FINITE)}
+    check_values("animate", gaussian_values(avatar.gaussians) | moves)
+    return _animate(avatar, pose)
+
+
+@jax.jit
+def _animate(avatar, pose):
     return factored(skin(avatar, pose))

@@ -13,9 +13,11 @@ import numpy as np
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
+from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, gaussian_body, pad_views, prepare_inputs, standardize
+from humangs_jax.geometry.camera import camera_values
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, needed_tokens
 from humangs_jax.network.inputs import HumanGSInputs
@@ -31,9 +33,9 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     want (`gaussian_body`), and the token capacity to what these photos need. Up to 8 views each number has a program of
     its own, beyond that at most a fifth of the views is padding.
 
-    Raises: ValueError if the capture has no view.
+    Raises: ValueError if the capture has no view, or values that are not finite or out of range, naming the array.
     """
-    _require_views(capture, "capture")
+    _check(capture, "capture")
     body = gaussian_body(capture.body, config)
     views = standardize(capture, config.conventions.image_size)
     bucket = round_up(capture.view_count, smallest=1)
@@ -54,7 +56,7 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
         raise ValueError("captures: none given")
     model = captures[0].body
     for index, capture in enumerate(captures):
-        _require_views(capture, f"captures[{index}]")
+        _check(capture, f"captures[{index}]")
         if capture.body is not model and not _equal(capture.body, model):
             raise ValueError(
                 f"captures[{index}]: its body is not the one of captures[0]; a batch shares one body model"
@@ -123,9 +125,17 @@ def _most_needed(inputs, config):
     return jnp.max(jax.vmap(count)(inputs)) if inputs.images.ndim == 5 else count(inputs)
 
 
-def _require_views(capture, name):
+def _check(capture, name):
     if capture.view_count == 0:
         raise ValueError(f"{name}: 0 views; at least one photo is needed")
+    arrays = {
+        "images": (capture.images, UNIT),
+        "masks": (capture.masks, UNIT),
+        "betas": (capture.betas, FINITE),
+        "poses.rotations": (capture.poses.rotations, FINITE),
+        "poses.translation": (capture.poses.translation, FINITE),
+    }
+    check_values(f"reconstruct: {name}", arrays | camera_values(capture.cameras))
 
 
 def _equal(body, other):

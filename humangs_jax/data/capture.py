@@ -84,8 +84,8 @@ class Capture:
         return len(self.poses.translation)
 
     def pose(self, frame: int) -> BodyPose:
-        """The pose of one frame (not of one view: that is `pose(capture.frames[view])`)."""
-        return jax.tree.map(lambda leaf: leaf[frame], self.poses)
+        """The pose of one frame (not of one view: that is `pose(capture.frames[view])`). Raises: IndexError."""
+        return self.poses[frame]
 
     def select(self, views: Sequence[int] | Int[np.ndarray, " any"]) -> "Capture":
         """The capture with only these views, in this order; the poses stay."""

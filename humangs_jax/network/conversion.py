@@ -27,7 +27,7 @@ from humangs_jax.network.vertex_decoder import VertexDecoder
 from humangs_jax.network.weights import FORMAT, expected_variables, flatten_variables, variables_from_tensors
 
 LOSS_PREFIX = "loss_computer."
-"""The release saves its frozen loss networks along; they are no part of the network."""
+"""The release also saves its frozen loss networks; they are not part of the network."""
 SKINNING_WEIGHTS = "tpose_lbs_weights"
 """(n, j) of the body that the network was trained with; carried along, the network has no use for them."""
 UNSUPPORTED = "target_pose_tokenizer.1.weight"
@@ -246,14 +246,14 @@ def _check(state: StateDict, expected: dict[str, tuple[int, ...]]) -> None:
     if missing := sorted(set(expected) - set(state)):
         raise ValueError(f"tensor {missing[0]!r} is missing ({len(missing)} in all)")
     if unknown := sorted(set(state) - set(expected)):
-        raise ValueError(f"tensor {unknown[0]!r} is no part of the published network ({len(unknown)} such in all)")
+        raise ValueError(f"tensor {unknown[0]!r} is not part of the published network ({len(unknown)} such tensors)")
     if wrong := [key for key, shape in expected.items() if state[key].shape != shape]:
         found, wanted = state[wrong[0]].shape, expected[wrong[0]]
         raise ValueError(
-            f"tensor {wrong[0]!r} has shape {found}; to fit the others it should have {wanted} ({len(wrong)} such in all)"
+            f"tensor {wrong[0]!r} has shape {found}; to fit the others it should have {wanted} ({len(wrong)} such tensors)"
         )
     if bad := [key for key, value in state.items() if not np.isfinite(value.astype(np.float64)).all()]:
-        raise ValueError(f"tensor {bad[0]!r} holds numbers that are not finite ({len(bad)} such in all)")
+        raise ValueError(f"tensor {bad[0]!r} holds numbers that are not finite ({len(bad)} such tensors)")
 
 
 def load_checkpoint(path: str | os.PathLike, head_width: int | None = None) -> Converted:

@@ -22,7 +22,7 @@ class Packing:
     """Which patches became tokens.
 
     indices: (l,) of the kept patches, in their order; the number of patches itself where a token is padding.
-    count: tokens that are no padding (they come first).
+    count: number of real tokens, which come first; the rest is padding.
     """
 
     indices: Int[Array, " l"]

@@ -20,8 +20,8 @@ class LossConfig:
     squared error of the coverage. tightness: squared tight offsets, normalised units. perceptual: difference of the
     features of VGG-19, lpips: learned distance of features; both need networks that the user has, see
     `objectives.loss_networks`, and are not computed where their weight is 0.
-    random_background: share of the targets that are seen against one random colour instead of white, so that Gaussians
-    as white as the background are told from none at all.
+    random_background: share of the targets that are seen against one random colour instead of white, so that
+    white Gaussians differ from missing ones.
     """
 
     squared: float = 1.0
@@ -47,14 +47,14 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """One run. Photos enter at `model.conventions.image_size` pixels, targets are learnt at `target_size`.
+    """One run. Photos enter at `model.conventions.image_size` pixels, targets are learned at `target_size`.
 
     steps: of the whole run, which the learning rate ends with. stages: in the order of their starts, for instance larger
-    photographs for the last steps; before the first the fields here hold, see `at`.
+    photos for the last steps. Before the first stage the fields here hold, see `at`.
     batch_size: subjects per step. microbatch_size: of those of a device, how many it works on at once, gradients
     accumulating over the rest: 1 needs least memory and suits CPUs. The upsampler's batch statistics are of the subjects
     that all devices work on at once. ema_decay: of the averaged parameters, None for none.
-    log_every, validate_every, checkpoint_every: steps. keep_checkpoints: the newest so many, besides the best.
+    log_every, validate_every, checkpoint_every: steps. keep_checkpoints: newest checkpoints to keep, besides the best.
 
     Raises: ValueError for stages that are not in order, or sizes that do not divide each other.
     """

@@ -3,8 +3,8 @@
     print(diagnose_step(state, batch, body, config))       # one step
     print(diagnose_run("runs/small", load_body(), people)) # the first step of a run that failed
 
-For one process and device; needs the memory of a step that recomputes nothing. JAX_PLATFORMS=cpu has it where an
-accelerator has not.
+For one process and device. It needs the memory of a step that recomputes nothing; JAX_PLATFORMS=cpu helps where an
+accelerator has too little.
 """
 
 import dataclasses
@@ -32,7 +32,7 @@ from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import NO_NETWORKS, subject_keys, subject_loss, train_step
 
 FAILED = ("skipped", "nonfinite")
-"""Events of a run's log that are worth a diagnosis."""
+"""Events of a run's log that a diagnosis looks for."""
 
 
 @pytree_dataclass

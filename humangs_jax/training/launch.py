@@ -30,7 +30,7 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
 
 
 def training_people(data: Path | None, live: int, out: Path, body: BodyModel) -> MakeSource:
-    """The people of a folder of captures, so many that are drawn on the fly, or both by halves.
+    """The people of a folder of captures, `live` people made on the fly, or both by halves.
 
     The latter are made once, into out/people.npz, by one process. Raises: ValueError if there are none.
     """
@@ -61,7 +61,7 @@ def _bank(people, out, body):
 
 
 def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:
-    """The configuration with the losses that the networks at hand allow; what is left out is told."""
+    """The configuration without the losses whose networks are missing; a warning names them."""
     missing = [
         name for name in ("perceptual", "lpips") if getattr(config.loss, name) and getattr(networks, name) is None
     ]

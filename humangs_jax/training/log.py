@@ -2,7 +2,7 @@
 
 out/log.jsonl       one object per line; {"step", "loss", ...} while training, {"step", "val_psnr", ...} from validations,
                     {"step", "event", ...} where something happened
-out/tensorboard/    the numbers and the validation pictures, if tensorboardX is installed
+out/tensorboard/    the numbers and the validation images, if tensorboardX is installed
 """
 
 import json
@@ -80,10 +80,10 @@ class RunLog:
             for name, value in numbers.items():
                 self._board.add_scalar(f"{group}/{name}", value, done)
 
-    def picture(self, done: int, name: str, picture: np.ndarray) -> None:
-        """An (h, w, 3) picture in [0, 1] for TensorBoard."""
+    def image(self, done: int, name: str, image: np.ndarray) -> None:
+        """An (h, w, 3) image in [0, 1] for TensorBoard."""
         if self._board is not None:
-            self._board.add_image(name, (255 * np.clip(picture, 0, 1) + 0.5).astype(np.uint8), done, dataformats="HWC")
+            self._board.add_image(name, (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8), done, dataformats="HWC")
 
     def event(self, done: int, event: str, message: str, **numbers: float) -> None:
         """Something worth knowing, as a line and beside the progress bar."""

@@ -34,7 +34,7 @@ from humangs_jax.training.watch import Watch
 VALIDATED = 8
 """Subjects that a validation looks at."""
 SHOWN = 4
-"""Subjects of those in the picture."""
+"""Subjects of those in the image."""
 
 
 def train(
@@ -109,10 +109,10 @@ def train(
                     continue
                 variables, score = state.variables if mesh is None else whole(state.variables, mesh), None
                 if validating:
-                    numbers, pictures = validate(variables, own_body, examples, part, own_networks)
+                    numbers, images = validate(variables, own_body, examples, part, own_networks)
                     score = numbers["psnr"]
                     if leading:
-                        _tell(log, out, done, numbers, sheet(examples[:SHOWN], pictures[:SHOWN]))
+                        _report(log, out, done, numbers, sheet(examples[:SHOWN], images[:SHOWN]))
                 if leading:
                     save_weights(out / "weights.safetensors", variables, part.model, "float16")
                 if score is not None and (best is None or score > best):
@@ -131,14 +131,14 @@ def train(
 
 
 def _rehearse(make_source, config, step, state, body, networks, mesh):
-    """Trace a step of a later stage: sizes that do not fit are told before the run, not in the middle of it."""
+    """Trace a step of a later stage: sizes that do not fit raise before the run, not in the middle of it."""
     batch = stage_loader(make_source, config, step, mesh).batch_at(step)
     jitted_train_step().eval_shape(state, batch, body, networks, config=config.at(step), mesh=mesh)
 
 
-def _tell(log, out, done, numbers, picture):
+def _report(log, out, done, numbers, image):
     """Of a validation."""
     log.numbers(done, {f"val_{name}": value for name, value in numbers.items()}, "validation")
-    write_sheet(out / "sheets" / f"{done:07d}.png", picture)
-    log.picture(done, "validation/sheet", picture)
+    write_sheet(out / "sheets" / f"{done:07d}.png", image)
+    log.image(done, "validation/sheet", image)
     log.bar.write(f"step {done}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items()))

@@ -1,6 +1,6 @@
 """Where a run's examples come from: capture folders, people made on the fly, or both.
 
-A run asks for its source anew at every stage, whose picture sizes differ.
+A run asks for a new source at every stage, because image sizes differ.
 """
 
 import dataclasses
@@ -29,13 +29,13 @@ def stage_loader(make_source: MakeSource, config: TrainConfig, step: int, mesh: 
 
 
 def captured_people(folders: Sequence[str | Path], body: BodyModel) -> MakeSource:
-    """Capture folders whose parameters belong to `body`; pictures that are decoded once serve all stages."""
+    """Capture folders whose parameters belong to `body`; images that are decoded once serve all stages."""
     cache = CaptureCache(folders, body)
     return lambda config: CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size)
 
 
 def live_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -> MakeSource:
-    """People of a bank, drawn anew for every step on the device that trains; sizes and views are those of the run."""
+    """People of a bank, rendered for every step on the device that trains; sizes and views are those of the run."""
 
     def make(config: TrainConfig) -> Source:
         views = config.views
@@ -48,7 +48,7 @@ def live_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -> Make
             jitter=views.jitter,
             scattered_share=views.scattered_share,
         )
-        if jax.default_backend() != "cpu":  # whole pictures, all views at once
+        if jax.default_backend() != "cpu":  # whole images, all views at once
             most = max(views.input_counts) + views.target_count
             live = dataclasses.replace(live, views_at_once=most, pixels_per_step=1 << 30)
         return on_the_fly_source(bank, live, views.input_counts, on_host=jax.device_count() > 1)

@@ -1,4 +1,4 @@
-"""Validation: the same views of the same unseen people every time, with the running statistics, in numbers and a picture.
+"""Validation: the same views of the same unseen people every time, with the running statistics, in numbers and a image.
 
 Several processes share the people; every process ends up with the means over all of them.
 """
@@ -53,7 +53,7 @@ def evaluate(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
-    """The pictures of one example's targets and their mean psnr, psnr_mask (both dB), ssim, and lpips if its network is
+    """The images of one example's targets and their mean psnr, psnr_mask (both dB), ssim, and lpips if its network is
     there.
     """
     drawn, outputs = predict(variables, body, example, config)
@@ -80,16 +80,16 @@ def validate(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
 ) -> tuple[dict[str, float], list[np.ndarray]]:
-    """Means over the examples of all processes, and the pictures of this process's. All arguments are local arrays."""
-    # buffers of another size than in training: as many pairs as the larger pictures may need
+    """Means over the examples of all processes, and the images of this process's. All arguments are local arrays."""
+    # buffers of another size than in training: as many pairs as the larger images may need
     config = dataclasses.replace(config, splat=dataclasses.replace(config.splat, max_pairs=None, max_rows=None))
-    pictures, rows = [], []
+    images, rows = [], []
     for example in examples:
         shown, metrics = evaluate(variables, body, example, config, networks)
-        pictures.append(np.asarray(shown))
+        images.append(np.asarray(shown))
         rows.append({name: float(value) for name, value in metrics.items()})
     names = METRICS if networks.lpips is None else (*METRICS, "lpips")
-    return _means(names, rows), pictures
+    return _means(names, rows), images
 
 
 def _means(names, rows):
@@ -103,16 +103,16 @@ def _means(names, rows):
     return {name: float(total / totals[-1]) for name, total in zip(names, totals[:-1], strict=True)}
 
 
-def sheet(examples: Sequence[Example], pictures: Sequence[np.ndarray]) -> Float[np.ndarray, "h w 3"]:
+def sheet(examples: Sequence[Example], images: Sequence[np.ndarray]) -> Float[np.ndarray, "h w 3"]:
     """A row per example: its inputs, then each target beside what the network shows of it."""
     rows = []
-    for example, shown in zip(examples, pictures, strict=True):
+    for example, shown in zip(examples, images, strict=True):
         targets = np.asarray(example.targets.images)
-        pairs = [picture for pair in zip(targets, shown, strict=True) for picture in pair]
+        pairs = [image for pair in zip(targets, shown, strict=True) for image in pair]
         rows.append(np.concatenate([*np.asarray(example.inputs.images), *pairs], axis=1))
     return np.concatenate(rows)
 
 
-def write_sheet(path: str | Path, picture: Float[np.ndarray, "h w 3"]) -> None:
+def write_sheet(path: str | Path, image: Float[np.ndarray, "h w 3"]) -> None:
     """The `sheet` as a PNG."""
-    write_png(Path(path), picture)
+    write_png(Path(path), image)

@@ -8,7 +8,7 @@ from humangs_jax.training.log import RunLog
 from humangs_jax.training.state import TrainState
 
 MANY_SKIPPED = 20
-"""Steps skipped one after the other that are worth a word."""
+"""Number of consecutive skipped steps that is reported."""
 
 
 class Watch:
@@ -39,12 +39,12 @@ class Watch:
         self._in_a_row = self._in_a_row + 1 if was_skipped else 0
         if not (was_skipped or was_nonfinite):
             return
-        told = f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}"
+        numbers_text = f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}"
         if was_skipped:
-            self._log.event(done, "skipped", f"skipped ({told}), {skipped} so far", **numbers)
+            self._log.event(done, "skipped", f"skipped ({numbers_text}), {skipped} so far", **numbers)
         else:
             self._log.event(
-                done, "nonfinite", f"gradient entries that were not finite were replaced ({told})", **numbers
+                done, "nonfinite", f"gradient entries that were not finite were replaced ({numbers_text})", **numbers
             )
         if self._in_a_row == MANY_SKIPPED:
             advice = f"{MANY_SKIPPED} steps in a row were skipped: `humangs train --diagnose` names the first stage that fails"

@@ -9,6 +9,7 @@ from humangs_jax.avatar.animate import animate, skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import SH_C0, write_ply
 from humangs_jax.body.model import BodyPose
+from humangs_jax.core.pytree import replace
 from humangs_jax.rendering.gaussians import Gaussians, covariances
 
 COVARIANCE_TOLERANCE = 2e-5  # relative to the largest entry: a float32 SVD and its squares
@@ -133,3 +134,34 @@ def test_ply_survives_extremes(tmp_path):
     write_ply(tmp_path / "a.ply", g)
     data = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
     assert all(np.isfinite(data[name]).all() for name in data.dtype.names)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda a, p: (a, replace(p, rotations=p.rotations.at[1, 2].set(jnp.nan))),
+            r"pose\.rotations: .*\[1, 2\]: nan",
+        ),
+        (lambda a, p: (a, replace(p, translation=p.translation.at[0].set(jnp.inf))), r"pose\.translation"),
+        (
+            lambda a, p: (replace(a, gaussians=replace(a.gaussians, opacities=a.gaussians.opacities + 9)), p),
+            "opacities",
+        ),
+        (lambda a, p: (a, replace(p, rotations=p.rotations[:1])), "expected one pose of 3 joints"),
+        (lambda a, p: (a, jax.tree.map(lambda x: x[None], p)), "use jax.vmap for a batch of poses"),
+    ],
+)
+def test_animate_names_what_it_cannot_use(change, message):
+    avatar, pose = change(make_avatar(), make_pose())
+    with pytest.raises(ValueError, match=message):
+        animate(avatar, pose)
+
+
+def test_values_stay_what_they_are_inside_transformations():
+    avatar, pose = make_avatar(), make_pose()
+    bad = replace(pose, translation=pose.translation.at[0].set(jnp.nan))
+    assert np.isnan(jax.jit(animate)(avatar, bad).means[:, 0]).all()
+    both = jax.tree.map(lambda *leaves: jnp.stack(leaves), pose, pose)
+    moved = jax.vmap(animate, in_axes=(None, 0))(avatar, both)
+    np.testing.assert_allclose(moved.means[1], animate(avatar, pose).means, rtol=1e-6, atol=1e-6)

@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -132,6 +134,17 @@ def test_the_token_capacity_follows_the_photos(body, network):
 def test_no_photos_are_an_error(body, network):
     with pytest.raises(ValueError, match="0 views"):
         reconstruct(*network, capture(body, SIZE, SIZE).select([]))
+
+
+def test_photos_that_are_not_numbers_are_an_error(body, network):
+    variables, config = network
+    photos = capture(body, SIZE, SIZE)
+    photos.images[0, 3, 4, 1] = np.nan
+    with pytest.raises(ValueError, match=r"reconstruct: capture: images: .*\[0, 3, 4, 1\]: nan"):
+        reconstruct(variables, config, photos)
+    bytes_ = dataclasses.replace(capture(body, SIZE, SIZE), images=np.full((2, SIZE, SIZE, 3), 255.0, np.float32))
+    with pytest.raises(ValueError, match=r"images: expected numbers in \[0, 1\]"):
+        reconstruct(variables, config, bytes_)
 
 
 def test_the_body_is_decimated_to_what_the_weights_want(body, network):

@@ -108,7 +108,7 @@ def test_reports_times_beside_the_yardstick_and_errors(files):
     assert 0 < work["contributing_pairs"] <= work["pixel_pairs_in_lists"]
     assert work["tile_pairs"] <= len(result["devices"]) * work["tile_pairs_capacity"]
     assert result["config"]["tile_size"] == 8 and result["gaussians"] == COUNT
-    assert f"{result['psnr']:.1f} dB" in printed
+    assert f"| {result['psnr']:.1f} |" in printed and f"| {result['scene']} {SIZE}" in printed
 
 
 def test_draws_in_float64_without_a_yardstick(files):

@@ -52,7 +52,7 @@ def test_tensorboard_reads_the_numbers_and_the_pictures(tmp_path):
         waiting.add(0.5)
         log.steps(4, {"loss": jnp.asarray(0.25), "psnr": jnp.asarray(21.0)}, subjects=2, waiting=waiting, broken=1)
         log.numbers(4, {"val_psnr": 19.0}, "validation")
-        log.picture(4, "validation/sheet", np.random.default_rng(0).random((8, 16, 3)))
+        log.image(4, "validation/sheet", np.random.default_rng(0).random((8, 16, 3)))
     training, validation = read(tmp_path / "log.jsonl")
     assert np.isclose(training["samples_per_second"] * training["seconds_per_step"], 2.0)
     assert training["data_seconds_per_step"] == 0.5 / 4 and training["broken_folders"] == 1
@@ -76,7 +76,7 @@ def test_a_process_that_does_not_record_writes_nothing(tmp_path):
     with RunLog(tmp_path, 0, 10, recording=False) as log:
         log.steps(1, {"loss": jnp.ones(()), "psnr": jnp.ones(())}, 1, Waiting(), 0)
         log.event(1, "skipped", "skipped")
-        log.picture(1, "sheet", np.zeros((2, 2, 3)))
+        log.image(1, "sheet", np.zeros((2, 2, 3)))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -25,9 +25,9 @@ def test_the_middle_number_of_views_the_same_ones_again(body, captures, same):
 def test_a_row_of_the_sheet_is_inputs_and_then_pairs(body, captures):
     examples = validation_examples(CaptureCache(captures, body), CONFIG, 2)
     shown = [np.full(example.targets.images.shape, 0.25 * i) for i, example in enumerate(examples)]
-    picture, size = sheet(examples, shown), CONFIG.model.conventions.image_size
-    assert picture.shape == (2 * size, (2 + 2 * 2) * size, 3)
+    image, size = sheet(examples, shown), CONFIG.model.conventions.image_size
+    assert image.shape == (2 * size, (2 + 2 * 2) * size, 3)
     row = jax.tree.map(np.asarray, examples[1])
-    tiles = np.split(picture[size:], 6, axis=1)
+    tiles = np.split(image[size:], 6, axis=1)
     for tile, expected in zip(tiles, [*row.inputs.images, row.targets.images[0], shown[1][0]], strict=False):
         np.testing.assert_array_equal(tile, expected)
