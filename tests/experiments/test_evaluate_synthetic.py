@@ -123,7 +123,7 @@ def test_bodies_see_the_same_photos_and_what_they_cost_is_noted(weights, tmp_pat
     drawings = {"ours": lambda views: np.clip(views.images + 0.1, 0, 1), "painted": lambda views: 0.5 * views.images}
 
     def reconstructed(variables, config, capture):
-        assert config.body_vertices is None and config.longest_edge is None
+        assert config.conventions.body_vertices is None and config.conventions.longest_edge is None
         seen.append((len(capture.body.template), capture.images))
         return SimpleNamespace(gaussians=SimpleNamespace(means=np.zeros((3 * len(capture.body.template), 3))))
 

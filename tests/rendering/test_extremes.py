@@ -25,8 +25,9 @@ SWEEP_GRADIENT = 5e-2
 """Relative L2 of any one gradient, natural units. Of 1,500 scenes of the first sweep, half are below 1.4e-5, 99 % below
 9e-4, all below 9e-3; of the second, with needles of 1e10 that are 1e8 pixels long, 1.1e-5, 7e-3, and one has 0.3."""
 
-BIAS = 1e-6
-"""Mean error over mean magnitude, ordinary scenes."""
+TYPICAL_GRADIENT = 1.4e-5
+"""Relative L2 of a gradient of an ordinary scene: the median of the sweep above. Without a bias the mean of n such errors has a
+standard deviation of TYPICAL_GRADIENT |g| / n; a biased one would be as large as TYPICAL_GRADIENT times the mean of |g|."""
 
 
 SMALL = SplatConfig(block=4, chunk=4, max_pairs=256)
@@ -45,6 +46,8 @@ CASES = [pytest.param(case, id=name, marks=pytest.mark.slow if case.slow else ()
 
 @pytest.mark.parametrize("case", CASES)
 def test_case(case):
+    # With bounds divided by 3 two cases fail, for reasons that stand: bfloat16 itself rounds by 2^-9, half of its bound; for the
+    # needle of 1e6:1 one rounding of 6e-8 is 6e-4 of a gradient that is 1e-4 of its terms, and the bound 2e-3 allows three.
     outcome = cases.measure(case)
     case = dataclasses.replace(case, image=bound(case.image), gradient=bound(case.gradient))
     assert outcome.passes(case), outcome
@@ -167,7 +170,9 @@ def test_gradients_have_no_signed_bias():
     pairs = [[cases.natural(s, draw(s)[1]) for draw in (cases.tiled, cases.dense_in_float64)] for s in scenes]
     for name in cases.NAMES:
         found, exact = (np.concatenate([pair[i][name].ravel() for pair in pairs]) for i in (0, 1))
-        assert abs(np.mean(found - exact)) < bound(BIAS) * np.mean(np.abs(exact)), name
+        n = np.count_nonzero(exact)  # K and the pose have zeros
+        four_deviations = bound(4 * TYPICAL_GRADIENT) * np.linalg.norm(exact) / n
+        assert abs(np.sum(found - exact)) / n < four_deviations, name
 
 
 @pytest.mark.slow
