@@ -192,7 +192,7 @@ def draw(motion, folder: Path) -> None:
     import numpy as np
 
     from humangs_jax.apps.check import draw_body
-    from humangs_jax.avatar.pictures import contact_sheet
+    from humangs_jax.avatar.sheets import contact_sheet
     from humangs_jax.avatar.video import write_video
     from humangs_jax.body.library import load_body
     from humangs_jax.geometry.camera import intrinsics_from_fov, orbit

@@ -202,7 +202,7 @@ def write_bodies(path: Path, drawn: dict[str, Any], views: Sequence[int]) -> Non
     """Truth and every body, a row for each of the views."""
     import numpy as np
 
-    from humangs_jax.avatar.pictures import contact_sheet
+    from humangs_jax.avatar.sheets import contact_sheet
 
     tiles = np.stack([pictures[view] for view in views for pictures in drawn.values()])
     contact_sheet(tiles, path, headers=list(drawn), columns=len(drawn))

@@ -8,7 +8,7 @@ import numpy as np
 
 from experiments.evaluation.results import TASK_NAMES, TASKS, extremes
 from experiments.evaluation.subjects import Drawn, task_views
-from humangs_jax.avatar.pictures import GAP, tile, write_texts
+from humangs_jax.avatar.sheets import GAP, tile, write_texts
 from humangs_jax.data.capture import Capture
 from humangs_jax.io.images import to_uint8, write_png
 

@@ -92,7 +92,7 @@ def compare(variables, config, body, subject, arguments) -> dict:
         pictures[name] = draw_avatar(reconstruct(variables, config, inputs), views)
     scores = {name: score(drawn, subject.held_out) for name, drawn in pictures.items()}
     if arguments.pictures:
-        from humangs_jax.avatar.pictures import contact_sheet
+        from humangs_jax.avatar.sheets import contact_sheet
 
         arguments.pictures.mkdir(parents=True, exist_ok=True)
         sheet = np.concatenate([subject.held_out.images[:3], pictures["true"][:3], pictures["fitted"][:3]])

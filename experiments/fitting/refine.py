@@ -135,7 +135,7 @@ def draw(path: Path, start: Any, refined: Any) -> None:
     import numpy as np
 
     from humangs_jax.apps.check import draw_body
-    from humangs_jax.avatar.pictures import contact_sheet
+    from humangs_jax.avatar.sheets import contact_sheet
 
     path.parent.mkdir(parents=True, exist_ok=True)
     views = range(0, start.view_count, 2)

@@ -158,13 +158,13 @@ def pilot(arguments, config, live, started, name) -> dict:
     from humangs_jax.people.bank import load_bank
     from humangs_jax.people.on_the_fly import OnTheFlyConfig
     from humangs_jax.training.loop import train
-    from humangs_jax.training.sources import captured_people, live_people, mixed_people
+    from humangs_jax.training.sources import captured_people, mixed_people, on_the_fly_people
     from humangs_jax.training.validation import validate, validation_examples
 
     body, begin = load_body(), time.process_time()
     people = [
         captured_people(find_captures(arguments.people), body),
-        live_people(load_bank(arguments.bank), OnTheFlyConfig(**live)),
+        on_the_fly_people(load_bank(arguments.bank), OnTheFlyConfig(**live)),
     ]
     variables = None if started is None else fit_variables(*started, config.model)
     state = train(config, body, mixed_people(people, [1, 1]), arguments.out / name, variables=variables, progress=False)

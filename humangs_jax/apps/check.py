@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.avatar.pictures import contact_sheet
+from humangs_jax.avatar.sheets import contact_sheet
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace

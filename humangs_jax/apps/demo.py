@@ -17,8 +17,8 @@ from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.evaluate import draw_painted_body, painted_body, score
 from humangs_jax.avatar.export import write_ply
 from humangs_jax.avatar.frames import capture_renderings, motion_frames, write_renderings_exr
-from humangs_jax.avatar.pictures import contact_sheet, side_by_side
 from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.avatar.sheets import contact_sheet, side_by_side
 from humangs_jax.avatar.video import write_video
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion

@@ -225,7 +225,7 @@ class Check:
             record = read_fit_record(record_file)
         print(check_capture(capture, self.out))
         if record is not None or keypoints is not None:
-            from humangs_jax.apps.fit_pictures import fit_sheet
+            from humangs_jax.apps.fit_sheet import fit_sheet
             from humangs_jax.fitting.examination import examine_record
 
             examination, keypoints = examine_record(capture, record, keypoints)

@@ -11,7 +11,7 @@ from humangs_jax.core.configuration import config_from_file
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.people import SPLITS, build_bank, find_people, load_bank, save_bank
 from humangs_jax.training.config import PRESETS, TrainConfig, without_losses
-from humangs_jax.training.sources import MakeSource, captured_people, live_people, mixed_people
+from humangs_jax.training.sources import MakeSource, captured_people, mixed_people, on_the_fly_people
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +38,7 @@ def training_people(data: Path | None, live: int, out: Path, body: BodyModel) ->
     if data is not None:
         parts.append(captured_people(find_people(data), body))
     if live:
-        parts.append(live_people(_bank(live, out, body)))
+        parts.append(on_the_fly_people(_bank(live, out, body)))
     if not parts:
         raise ValueError("nobody to train on: name a folder of captures, or give --live a number of people")
     return parts[0] if len(parts) == 1 else mixed_people(parts, [1] * len(parts))

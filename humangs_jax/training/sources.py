@@ -34,12 +34,12 @@ def captured_people(folders: Sequence[str | Path], body: BodyModel) -> MakeSourc
     return lambda config: CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size)
 
 
-def live_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -> MakeSource:
+def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -> MakeSource:
     """People of a bank, rendered for every step on the device that trains; sizes and views are those of the run."""
 
     def make(config: TrainConfig) -> Source:
         views = config.views
-        live = dataclasses.replace(
+        drawn = dataclasses.replace(
             settings,
             target_views=views.target_count,
             input_size=config.model.conventions.image_size,
@@ -50,8 +50,8 @@ def live_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -> Make
         )
         if jax.default_backend() != "cpu":  # whole images, all views at once
             most = max(views.input_counts) + views.target_count
-            live = dataclasses.replace(live, views_at_once=most, pixels_per_step=1 << 30)
-        return on_the_fly_source(bank, live, views.input_counts, on_host=jax.device_count() > 1)
+            drawn = dataclasses.replace(drawn, views_at_once=most, pixels_per_step=1 << 30)
+        return on_the_fly_source(bank, drawn, views.input_counts, on_host=jax.device_count() > 1)
 
     return make
 

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.apps.check import LEFT, LONGEST_SIDE, RIGHT, draw_body
-from humangs_jax.avatar.pictures import tile
+from humangs_jax.avatar.sheets import tile
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture import Capture

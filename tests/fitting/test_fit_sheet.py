@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from seen_people import person
 
-from humangs_jax.apps import fit_pictures as module
+from humangs_jax.apps import fit_sheet as module
 from humangs_jax.apps.check import LEFT, RIGHT
-from humangs_jax.apps.fit_pictures import fit_sheet, plot_over_time
-from humangs_jax.avatar.pictures import GAP
+from humangs_jax.apps.fit_sheet import fit_sheet, plot_over_time
+from humangs_jax.avatar.sheets import GAP
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.fitting.examination import examine
 from humangs_jax.fitting.report import FitReport, ViewReport

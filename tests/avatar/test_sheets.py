@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from humangs_jax.avatar.pictures import (
+from humangs_jax.avatar.sheets import (
     ERROR_COLORS,
     GAP,
     contact_sheet,
