@@ -23,6 +23,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.network.config import paper_parts
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables
