@@ -50,7 +50,8 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
 
     A batch keeps an accelerator busy that one person does not; on a CPU it takes as long as one person after the other.
 
-    Raises: ValueError if there is no capture, one has no view, or their bodies differ (their shapes may).
+    Raises: ValueError if there is no capture, one has no view or values that are not finite or out of range, or their bodies
+    differ (their shapes may).
     """
     if not captures:
         raise ValueError("captures: none given")
@@ -78,9 +79,8 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
 def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
     """The configuration with room for all that some inputs hold, those of one subject or of a batch."""
     capacity = 0 if config.tokens == "all" else round_up(int(_needed_tokens(inputs, config)))
-    return config.with_execution(
-        token_capacity=capacity, vertex_capacity=None
-    )  # reading all vertices is 2 % of the time
+    # vertex_capacity: reading all vertices is 2 % of the time
+    return config.with_execution(token_capacity=capacity, vertex_capacity=None)
 
 
 def reconstruct_views(
@@ -89,7 +89,9 @@ def reconstruct_views(
     """The pure function behind `reconstruct`: one subject's views -> avatar, and the count of foreground patches that did
     not fit into `config.execution.token_capacity`.
 
-    Batch over subjects with `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`, with a body from `gaussian_body`.
+    Weights files record no token capacity, and the default has room for all patches:
+    `config.with_execution(token_capacity=...)` saves the time of the others. Batch over subjects with
+    `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`, with a body from `gaussian_body`.
     """
     return _assemble(variables, config, body, views, prepare_inputs(body, views, config))
 

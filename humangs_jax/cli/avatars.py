@@ -40,7 +40,7 @@ class Reconstruct:
     tokens: Literal["as_trained", "all", "foreground"] = "as_trained"
     """The patches of the photos that the network reads: all, or those that show the person, which is several times
     faster. For weights trained with the other setting it is an approximation (docs/performance_reconstruction.md)."""
-    dtype: Literal["float32", "bfloat16"] = "float32"
+    dtype: Literal["as_trained", "float32", "bfloat16"] = "as_trained"
     """Number type of the encoder's matrix products. bfloat16 is faster on GPU and TPU."""
 
     def run(self) -> None:
@@ -53,7 +53,8 @@ class Reconstruct:
         require_parent(self.out)
         variables, config = load_weights(self.weights)
         tokens = None if self.tokens == "as_trained" else self.tokens
-        config = config.with_execution(tokens=tokens, dtype=self.dtype)
+        dtype = "float32" if self.dtype == "as_trained" else self.dtype
+        config = config.with_execution(tokens=tokens, dtype=dtype)
         avatar = reconstruct(variables, config, photos)
         avatar.save(self.out)
         print(f"{self.out}: {len(avatar.gaussians.means):,} Gaussians from {len(photos.images)} photos")

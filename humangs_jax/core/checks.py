@@ -29,7 +29,9 @@ class Values(NamedTuple):
 
 
 FINITE = Values("finite numbers")
-UNIT = Values("numbers in [0, 1]", 0.0, 1.0)
+ROUNDING = 1e-6
+"""Photos that were resized, and opacities from a sigmoid, may be a few float32 roundings outside of [0, 1]."""
+UNIT = Values("numbers in [0, 1]", -ROUNDING, 1 + ROUNDING)
 NOT_NEGATIVE = Values("finite numbers >= 0", 0.0)
 POSITIVE = Values("finite numbers > 0", math.ulp(0.0))
 
@@ -68,4 +70,4 @@ def _fault(array, values):
     wrong = ~(np.isfinite(array) & (array >= values.low) & (array <= values.high))
     first = np.argwhere(wrong)[0]
     place = f"the first at {first.tolist()}: " if array.ndim else ""
-    return f"expected {values.words}, but {wrong.sum()} of {wrong.size} are not, {place}{array[tuple(first)]:g}"
+    return f"expected {values.words}, but {wrong.sum()} of {wrong.size} are not, {place}{array[tuple(first)]:.9g}"

@@ -70,7 +70,10 @@ def _processor():
 
 def _delete_oldest(root: Path, largest: int) -> None:
     """Deletes the cached programs under `root`, of all versions, that were not used for longest, beyond `largest` bytes."""
-    files = [(file, file.stat()) for file in root.glob("jax-*/*-cache")]
+    files = []
+    for file in root.glob("jax-*/*-cache"):
+        with contextlib.suppress(OSError):  # another program deletes, too
+            files.append((file, file.stat()))
     total = sum(stat.st_size for _, stat in files)
     for file, stat in sorted(files, key=lambda item: max(item[1].st_atime, item[1].st_mtime)):
         if total <= largest:

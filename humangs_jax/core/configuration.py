@@ -61,7 +61,7 @@ def config_from_json(cls: type[T], text: str) -> T:
 def config_from_file(cls: type[T], path: Path) -> T:
     """`config_from_json` of a file. Raises: OSError; ValueError, naming file and field."""
     try:
-        return config_from_json(cls, path.read_text())
+        return config_from_json(cls, path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
 

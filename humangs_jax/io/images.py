@@ -1,6 +1,6 @@
 """Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel) and JPEG, values as stored, no gamma.
 
-The orientation flag that phones write into JPEG files (EXIF) is ignored: a calibration speaks of the stored pixels.
+The orientation flag that phones write into JPEG files (EXIF) is ignored: calibrations refer to the stored pixels.
 """
 
 import subprocess

@@ -1,5 +1,6 @@
 """npz archives: written whole or not at all, read without pickle, every kind of damage one exception."""
 
+import os
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,11 +42,13 @@ def read_npz(path: str | Path) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     return arrays, tuple(pickled)
 
 
-def write_npz(path: str | Path, arrays: Mapping[str, Any], compressed: bool = True) -> None:
-    """Write an npz archive of array-likes by name. Raises: ValueError if the path does not end in .npz; OSError."""
-    if Path(path).suffix != ".npz":  # numpy would add it
-        raise ValueError(f"{path}: expected a name ending in .npz")
+def write_npz(path: str | os.PathLike, arrays: Mapping[str, Any], compressed: bool = True) -> None:
+    """Write an npz archive of array-likes by name, under any suffix; it appears whole or not at all. Raises: OSError."""
     save = np.savez_compressed if compressed else np.savez
-    converted = {name: np.asarray(value) for name, value in arrays.items()}
-    # no array is called allow_pickle, the stub's only other keyword
-    replace_file(path, lambda temporary: save(temporary, **converted))  # ty: ignore[invalid-argument-type]
+    converted: dict[str, Any] = {name: np.asarray(value) for name, value in arrays.items()}
+
+    def write(temporary: Path) -> None:
+        with open(temporary, "wb") as file:  # numpy would add .npz to a name
+            save(file, **converted)
+
+    replace_file(path, write)

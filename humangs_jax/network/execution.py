@@ -1,4 +1,4 @@
-"""How the network runs: changes time and memory, and the result only as each field says. No weights file records it."""
+"""How the network runs: settings of time and memory. Weights files do not record them."""
 
 import dataclasses
 from typing import Any, Literal
@@ -65,7 +65,7 @@ class Execution:
     vertex_capacity: int | None = knob(
         None,
         cost="vertices beyond it are dropped and counted",
-        gain="none measured in a reconstruction",
+        gain="no gain measured",
         measured=MEASURED,
     )
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)

@@ -49,7 +49,10 @@ def apply_humangs(
     encoding, statistics = stage("encoding", lambda: parts.encoder.apply(of("encoder"), inputs, run))
     features = stage("vertex features", lambda e: parts.reader.apply(of("reader"), e, inputs, run), encoding)
     outputs = parts.decoder.apply(of("decoder"), features, inputs, run)
-    return replace(outputs, dropped_tokens=encoding.dropped_tokens), {"encoder": statistics} if statistics else {}
+    kept = variables.get("batch_stats", {})
+    return replace(outputs, dropped_tokens=encoding.dropped_tokens), kept | (
+        {"encoder": statistics} if statistics else {}
+    )
 
 
 @functools.partial(jax.jit, static_argnames="config")

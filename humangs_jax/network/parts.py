@@ -4,7 +4,9 @@
 
 A part is a frozen dataclass: its fields are its configuration, which weights files record, and its methods are pure functions.
 A new part is a new file with such a class, and one line of a preset that names it. Variables of a part are {"params": ...,
-"batch_stats": ...}, the latter only where it has running statistics.
+"batch_stats": ...}, the latter only where it has running statistics, which only encoders update.
+
+Weights files name a part by module and class: a part that moves leaves an alias at its old place.
 """
 
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable

@@ -121,7 +121,7 @@ class Upsampler(nn.Module):
                 momentum=MOMENTUM,
                 use_fast_variance=False,
                 dtype=self.dtype,
-                # several names are as good to it as one, whatever its annotation says
+                # it accepts several names; its annotation says one
                 axis_name=self.axis_name if train else None,  # ty: ignore[invalid-argument-type]
                 name=name,
             )

@@ -200,7 +200,8 @@ def activate(raw: RawGaussians, config: VertexDecoder, features: VertexFeatures 
         offsets = jnp.einsum("nkij,nkj->nki", quaternion.to_matrix(frames), offsets)
         quats = quaternion.multiply(frames, quats)
     if config.residual_color:
-        assert seen is not None  # such a network samples them
+        if seen is None:
+            raise ValueError("decoder.residual_color needs a reader that gives photo_colors")
         colors = colors + inverse_sigmoid(seen, COLOR_MARGIN)
     return VertexGaussians(offsets, quats, jax.nn.softplus(scales), jax.nn.sigmoid(opacities), jax.nn.sigmoid(colors))
 

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.configuration import config_from_json, config_to_json
-from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.atomic import write_bytes
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Variables
@@ -58,7 +58,7 @@ def save_weights(
     recorded = {name: config_to_json(getattr(config, name)) for name in ("architecture", "conventions")}
     metadata = {"format": FORMAT, "version": VERSION, **recorded}
     data = save({key: np.ascontiguousarray(x, np.dtype(dtype)) for key, x in tensors.items()}, metadata)
-    replace_file(Path(path), lambda temporary: temporary.write_bytes(data))
+    write_bytes(path, data)
 
 
 def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, HumanGSConfig]:
@@ -151,34 +151,36 @@ def config_of_version_1(text: str) -> HumanGSConfig:
     """
     try:
         old = json.loads(text)
-        encoder, upsampler, sampling = old["transformer"], old["upsampler"], old["sampling"]
-        sizes, heads = ("width", "layers", "mlp_ratio", "class_token"), ("head_width", "qk_norm")
+        encoder, upsampler, sampling = (old.get(name, {}) for name in ("transformer", "upsampler", "sampling"))
+        upsampled = upsampler.get("enabled", True)
         conventions = ("image_size", "tokens", "position_map", "ray_origins", "skinning", "rendering", "body_vertices")
-        upsampled = upsampler["enabled"]
+        transformer = _pick(encoder, "width", "layers", "mlp_ratio", "class_token")
         new = {
             "architecture": {
                 "encoder": {
                     "kind": "humangs_jax.network.encoder.PatchTransformer",
-                    "patch_size": old["patch_size"],
-                    "texture": old["texture"],
-                    "transformer": {key: encoder[key] for key in sizes}
-                    | {key: encoder["attention"][key] for key in heads},
-                    "upsampler": {key: upsampler[key] for key in ("hidden", "features")} if upsampled else None,
+                    **_pick(old, "patch_size", "texture"),
+                    "transformer": transformer | _pick(encoder.get("attention", {}), "head_width", "qk_norm"),
+                    "upsampler": _pick(upsampler, "hidden", "features") if upsampled else None,
                 },
                 "reader": {
                     "kind": "humangs_jax.network.reader.PixelAlignedReader",
-                    "output_width": upsampler["out"] if upsampled else None,
-                    "sample_rgb": sampling["sample_rgb"],
-                    "shells": sampling["shells"],
+                    "output_width": upsampler.get("out", 768) if upsampled else None,
+                    **_pick(sampling, "sample_rgb", "shells"),
                 },
-                "decoder": {"kind": "humangs_jax.network.vertex_decoder.VertexDecoder"} | old["decoder"],
+                "decoder": {"kind": "humangs_jax.network.vertex_decoder.VertexDecoder"} | old.get("decoder", {}),
             },
-            "conventions": {key: old[key] for key in (*conventions, "longest_edge")}
-            | {"pool": sampling["pool"], "pixel_grid": sampling["convention"]},
+            "conventions": _pick(old, *conventions, "longest_edge")
+            | _pick(sampling, "pool")
+            | {"pixel_grid": sampling.get("convention", "half_pixel")},
         }
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
+    except (AttributeError, TypeError, json.JSONDecodeError) as error:
         raise ValueError(f"config of version 1: {error!r}") from error
     return config_from_json(HumanGSConfig, json.dumps(new))
+
+
+def _pick(values: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {name: values[name] for name in names if name in values}
 
 
 def variables_from_tensors(tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str) -> Variables:

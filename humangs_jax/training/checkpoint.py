@@ -120,11 +120,11 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
     path = Path(out) / "config.json"
     fields = json.loads(config_to_json(config))
     if path.is_file():
-        earlier = _flat(json.loads(path.read_text()))
-        for name, value in _flat(fields).items():
-            if name not in ADJUSTABLE and earlier.get(name, value) != value:
+        earlier, now = (_flat(json.loads(config_to_json(run))) for run in (load_config(out), config))
+        for name in sorted((earlier.keys() | now.keys()) - set(ADJUSTABLE)):
+            if earlier.get(name) != now.get(name):
                 raise ValueError(
-                    f"{path}: this run was started with {name} = {earlier[name]}, not {value}: use another --out"
+                    f"{path}: this run was started with {name} = {earlier.get(name)}, not {now.get(name)}: use another --out"
                 )
     if not write:
         return

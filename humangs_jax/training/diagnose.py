@@ -35,6 +35,10 @@ FAILED = ("skipped", "nonfinite")
 """Events of a run's log that a diagnosis looks for."""
 
 
+NEAREST = {"encoder": "encoding", "reader": "vertex features", "decoder": "posed Gaussians"}
+"""Stages for the parameters of parts that have no stages of their own."""
+
+
 @pytree_dataclass
 class ObservedStage:
     """values: what a stage gives. cotangents: the gradients that it sends back to what it takes. gradients: of its parameters."""
@@ -74,7 +78,9 @@ def observe_subject(
     (value, given), (gradients, cotangents) = differentiated(params, dry.probes())
     own: dict[str, Named] = {}
     for name, gradient in inexact_leaves(gradients):
-        own.setdefault(parameter_stage(name), {})[name] = gradient
+        stage = parameter_stage(name)
+        stage = stage if stage in dry.given else NEAREST[name.split(".")[0]]
+        own.setdefault(stage, {})[name] = gradient
     stages = [ObservedStage(name, given[name], cotangents.get(name, {}), own.get(name, {})) for name in dry.given]
     return value, stages
 

@@ -1,4 +1,4 @@
-"""What a diagnosis says: the stages of one step in numbers, which of them went bad first, and all of that as text."""
+"""What a diagnosis says: the stages of one step in numbers, the first one that is not finite, and all of that as text."""
 
 import dataclasses
 import math
@@ -28,6 +28,8 @@ AXES = {
     "final norm": "token",
     "maps": "view row column",
     "encoding": "view row column",
+    "rgb": "view row column",
+    "alpha": "view row column",
     "global_token": "feature",
     "vertex features": "vertex",
     "raw heads": "vertex Gaussian",

@@ -1,4 +1,4 @@
-"""What a run tells of itself: JSON lines, the same numbers for TensorBoard, and a progress bar.
+"""Records of a run: JSON lines, the same numbers for TensorBoard, and a progress bar.
 
 out/log.jsonl       one object per line; {"step", "loss", ...} while training, {"step", "val_psnr", ...} from validations,
                     {"step", "event", ...} where something happened

@@ -34,7 +34,7 @@ from humangs_jax.training.watch import Watch
 VALIDATED = 8
 """Subjects that a validation looks at."""
 SHOWN = 4
-"""Subjects of those in the image."""
+"""Validation subjects on the sheet."""
 
 
 def train(
@@ -107,6 +107,7 @@ def train(
                 validating = unseen is not None and (done % config.validate_every == 0 or done == config.steps)
                 if not (validating or stop or done == end or done % config.checkpoint_every == 0):
                     continue
+                recorded = part.model.with_conventions(tokens=part.model.tokens)  # what the weights were trained with
                 variables, score = state.variables if mesh is None else whole(state.variables, mesh), None
                 if validating:
                     numbers, images = validate(variables, own_body, examples, part, own_networks)
@@ -114,11 +115,11 @@ def train(
                     if leading:
                         _report(log, out, done, numbers, sheet(examples[:SHOWN], images[:SHOWN]))
                 if leading:
-                    save_weights(out / "weights.safetensors", variables, part.model, "float16")
+                    save_weights(out / "weights.safetensors", variables, recorded, "float16")
                 if score is not None and (best is None or score > best):
                     best = score
                     if leading:
-                        save_weights(out / "best.safetensors", variables, part.model, "float16")
+                        save_weights(out / "best.safetensors", variables, recorded, "float16")
                 checkpoints.save(state, score)
                 if stop:
                     break

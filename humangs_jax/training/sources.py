@@ -4,6 +4,7 @@ A run asks for a new source at every stage, because image sizes differ.
 """
 
 import dataclasses
+import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture
 from humangs_jax.people import ON_THE_FLY, OnTheFlyConfig, PeopleBank, on_the_fly_source
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.sharding import batch_sharding
+
+logger = logging.getLogger(__name__)
 
 MakeSource = Callable[[TrainConfig], Source]
 """Configuration of a stage -> examples of its sizes."""
@@ -39,6 +42,8 @@ def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -
 
     def make(config: TrainConfig) -> Source:
         views = config.views
+        if views.rule != "random":
+            logger.warning('views.rule "%s" is for written people; on-the-fly people are drawn by "random"', views.rule)
         drawn = dataclasses.replace(
             settings,
             target_views=views.target_count,

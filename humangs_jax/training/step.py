@@ -68,18 +68,18 @@ def loss_terms(
     """
     dissimilarity = functools.partial(multiscale_structural_dissimilarity, scales=config.structural_scales)
     terms: dict[str, Callable[..., Array]] = {
-        "squared": lambda rgb, alpha, tight: squared_error(rgb, images),
-        "structural": lambda rgb, alpha, tight: jax.vmap(dissimilarity)(rgb, images),
-        "silhouette": lambda rgb, alpha, tight: squared_error(alpha, targets.masks),
-        "tightness": lambda rgb, alpha, tight: tightness(tight),
+        "squared": lambda rgb, alpha, tight_offsets: squared_error(rgb, images),
+        "structural": lambda rgb, alpha, tight_offsets: jax.vmap(dissimilarity)(rgb, images),
+        "silhouette": lambda rgb, alpha, tight_offsets: squared_error(alpha, targets.masks),
+        "tightness": lambda rgb, alpha, tight_offsets: tightness(tight_offsets),
     }
     if config.perceptual:
         features = functools.partial(perceptual_loss, _required(networks.perceptual, "perceptual", "VGG-19"))
-        terms["perceptual"] = lambda rgb, alpha, tight: _each(features, rgb, images)
+        terms["perceptual"] = lambda rgb, alpha, tight_offsets: _each(features, rgb, images)
     if config.lpips:
         distance = functools.partial(lpips, _required(networks.lpips, "lpips", "LPIPS"))
-        terms["lpips"] = lambda rgb, alpha, tight: _each(distance, rgb, images)
-    learned = {"rgb": drawn.rgb, "alpha": drawn.alpha, "tight": outputs.tight_offsets}
+        terms["lpips"] = lambda rgb, alpha, tight_offsets: _each(distance, rgb, images)
+    learned = {"rgb": drawn.rgb, "alpha": drawn.alpha, "tight_offsets": outputs.tight_offsets}
     mean = lambda term: lambda seen: jnp.mean(term(**seen))
     return {name: stage(f"loss: {name}", mean(term), learned) for name, term in terms.items()}
 

@@ -1,6 +1,6 @@
 """When a run should end early: Ctrl-C, or a signal that the machine is about to be taken away.
 
-One process looks at its own signals. Of several, each may hear of the end at another step, so that jax's coordination
+One process checks its own signals. Several processes may receive the signal at different steps, so that jax's coordination
 service agrees on one (https://docs.jax.dev/en/latest/_autosummary/jax.experimental.multihost_utils.html).
 """
 

@@ -1,4 +1,4 @@
-"""Validation: the same views of the same unseen people every time, with the running statistics, in numbers and a image.
+"""Validation: the same views of the same unseen people every time, with the running statistics, as numbers and as a sheet.
 
 Several processes share the people; every process ends up with the means over all of them.
 """

@@ -1,4 +1,4 @@
-"""Tells of the steps of a run that went wrong."""
+"""Reports the steps of a run that failed."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ MANY_SKIPPED = 20
 
 
 class Watch:
-    """Looks at every step's numbers, one step late so that the device is never idle, and tells of steps that went wrong."""
+    """Reads every step's metrics one step late, so that the device is never idle, and reports failed steps."""
 
     def __init__(self, log: RunLog, state: TrainState):
         self._log, self._pending = log, None
@@ -21,7 +21,7 @@ class Watch:
 
     def __call__(self, done: int, metrics: dict[str, Any]) -> None:
         """The metrics of the step that was just begun; done: steps with it."""
-        # one step may wait behind the one that runs: enough to keep a device busy, and a signal is obeyed soon
+        # one step may wait behind the one that runs: enough to keep a device busy, and the run reacts to a signal soon
         self.look()
         names = ("skipped", "nonfinite", "loss", "grad_norm")
         self._pending = done, {name: metrics[name] for name in names}
@@ -39,12 +39,12 @@ class Watch:
         self._in_a_row = self._in_a_row + 1 if was_skipped else 0
         if not (was_skipped or was_nonfinite):
             return
-        numbers_text = f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}"
+        text = f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}"
         if was_skipped:
-            self._log.event(done, "skipped", f"skipped ({numbers_text}), {skipped} so far", **numbers)
+            self._log.event(done, "skipped", f"skipped ({text}), {skipped} so far", **numbers)
         else:
             self._log.event(
-                done, "nonfinite", f"gradient entries that were not finite were replaced ({numbers_text})", **numbers
+                done, "nonfinite", f"gradient entries that were not finite were replaced ({text})", **numbers
             )
         if self._in_a_row == MANY_SKIPPED:
             advice = f"{MANY_SKIPPED} steps in a row were skipped: `humangs train --diagnose` names the first stage that fails"

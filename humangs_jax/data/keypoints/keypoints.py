@@ -48,4 +48,6 @@ def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str])
         "set": keypoints.set.name,
         "names": np.asarray(list(names), np.str_),
     }
+    if Path(path).suffix != ".npz":
+        raise ValueError(f"{path}: expected a name ending in .npz")
     write_npz(path, arrays)

@@ -1,0 +1,5 @@
+"""`python -m humangs_jax.cli`."""
+
+from humangs_jax.cli import main
+
+main()
