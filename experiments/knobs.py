@@ -16,8 +16,9 @@ sys.path.insert(0, str(REPOSITORY))
 PAGE = REPOSITORY / "docs" / "knobs.md"
 HEAD = """# Knobs
 
-Every setting of the network, the renderer and the training step that trades accuracy or memory for speed. `experiments/knobs.py` writes this page from the code. Decibels
-compare with the exact image; times are shares of the default's. The linked page has the measurement and its conditions.
+Every setting of the network, the renderer and the training step that trades accuracy or memory for speed.
+`experiments/knobs.py` writes this page from the code. Decibels compare with the exact image; times are shares of the default's.
+The linked page has the measurement and its conditions.
 
 | knob | default | costs | buys | measured in |
 |---|---|---|---|---|
