@@ -52,6 +52,12 @@ def test_save_and_load_are_exact(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
 
 
+def test_a_file_may_have_any_name(tmp_path):
+    make_avatar().save(tmp_path / "me")
+    assert [file.name for file in tmp_path.iterdir()] == ["me"]
+    assert len(Avatar.load(tmp_path / "me").gaussians.means) == 12
+
+
 def test_broken_files_are_refused_by_name(tmp_path):
     path = tmp_path / "a.npz"
     with pytest.raises(FileNotFoundError, match="no such file"):

@@ -93,7 +93,8 @@ def test_tensors_that_do_not_fit_are_named(file, change, message):
         ({"architecture": json.dumps({"encoder": {"kind": "antigravity.Encoder"}})}, "import the module antigravity"),
         ({"architecture": json.dumps({"encoder": {"kind": f"{PARTS}.encoder.EncoderModule"}})}, "config.encoder.kind"),
         ({"architecture": json.dumps({"encoder": {"kind": f"{PARTS}.encoder.PatchTransformer", "a": 1}})}, "encoder.a"),
-        ({"version": "1", "config": json.dumps({"patch_size": 8})}, "config of version 1"),
+        ({"version": "1", "config": "[]"}, "config of version 1"),
+        ({"version": "1", "config": json.dumps({"patch_size": 8.5})}, "patch_size"),
     ],
 )
 def test_bad_headers_are_clear_errors(file, metadata, message):
@@ -226,6 +227,13 @@ OF_VERSION_1 = {
     },
 }
 """The configuration in the header of a file that version 0.1 wrote for `tiny`."""
+
+
+def test_missing_fields_of_version_1_are_defaults():
+    config = weights.config_of_version_1(json.dumps({"transformer": {"layers": 8}}))
+    encoder, reader, _ = paper_parts(config.architecture)
+    assert encoder.transformer.layers == 8 and encoder.transformer.width == 768
+    assert encoder.upsampler is not None and reader.output_width == 768
 
 
 def test_files_of_version_1_load(tmp_path):

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import pytest
+from training_cases import without_upsampler
 
 from humangs_jax.training.checkpoint import Checkpoints, save_config
 from humangs_jax.training.config import tiny
@@ -73,3 +74,9 @@ def test_a_folder_belongs_to_one_configuration(tmp_path):
     other = dataclasses.replace(tiny(), loss=dataclasses.replace(tiny().loss, structural=9.0))
     with pytest.raises(ValueError, match=r"loss\.structural = "):
         save_config(tmp_path, other)
+
+
+def test_a_part_that_is_gone_is_another_configuration(tmp_path):
+    save_config(tmp_path, tiny())
+    with pytest.raises(ValueError, match=r"model\.architecture\.encoder\.upsampler.* = None"):
+        save_config(tmp_path, dataclasses.replace(tiny(), model=without_upsampler(tiny().model)))
