@@ -92,7 +92,9 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
 
 def _find_part(kind, protocol, path):
     """The class that a "kind" names."""
-    expected = f"{path}.{KIND}: expected the full name of a dataclass that is a {protocol.__name__}, got {kind!r}"
+    expected = (
+        f"{path}.{KIND}: expected the full name of a frozen dataclass that is a {protocol.__name__}, got {kind!r}"
+    )
     if not isinstance(kind, str) or "." not in kind:
         raise ValueError(expected)
     module, _, name = kind.rpartition(".")
@@ -102,7 +104,8 @@ def _find_part(kind, protocol, path):
     if module not in sys.modules:
         raise ValueError(f"{expected}: import the module {module} first")
     cls = getattr(sys.modules[module], name, None)
-    if not (isinstance(cls, type) and dataclasses.is_dataclass(cls) and issubclass(cls, protocol)):
+    frozen = isinstance(cls, type) and dataclasses.is_dataclass(cls) and cls.__dataclass_params__.frozen
+    if not (frozen and issubclass(cls, protocol)):
         raise ValueError(expected)
     return cls
 
@@ -113,7 +116,11 @@ def _build_dataclass(cls, values, path):
     annotations = typing.get_type_hints(cls)
     if unknown := sorted(set(values) - set(annotations)):
         raise ValueError(f"{path}.{unknown[0]}: {cls.__name__} has no such field")
-    return cls(**{name: _build(annotations[name], value, f"{path}.{name}") for name, value in values.items()})
+    fields = {name: _build(annotations[name], value, f"{path}.{name}") for name, value in values.items()}
+    needed = [f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is dataclasses.MISSING]
+    if missing := [name for name in needed if name not in fields]:
+        raise ValueError(f"{path}.{missing[0]} is missing")
+    return cls(**fields)
 
 
 def _named(annotation):

@@ -154,7 +154,7 @@ def test_the_body_is_decimated_to_what_the_weights_want(body, network):
         config.with_conventions(body_vertices=300).with_execution(token_capacity=64),
         capture(body, SIZE, SIZE),
     )
-    per_vertex = config.decoder.gaussians_per_vertex
+    per_vertex = config.architecture.decoder.gaussians_per_vertex
     assert len(avatar.rest_vertices) == 300 and len(avatar.gaussians.means) == 300 * per_vertex
     np.testing.assert_allclose(np.asarray(avatar.skinning_weights).sum(-1), 1, atol=1e-5)
 

@@ -168,10 +168,10 @@ def change(key, value):
 
 
 REFUSED = {
-    "unknown": (change("decoder.weight", np.zeros(3, np.float32)), "tensor 'decoder.weight' is no part"),
+    "unknown": (change("decoder.weight", np.zeros(3, np.float32)), "tensor 'decoder.weight' is not part"),
     "unknown in a block": (
         change("transformer_blocks.0.attn.bias.weight", np.zeros(3, np.float32)),
-        "'transformer_blocks.0.attn.bias.weight' is no part",
+        "'transformer_blocks.0.attn.bias.weight' is not part",
     ),
     "a block of no number": (
         change("transformer_blocks.x.norm1.weight", np.zeros(3, np.float32)),

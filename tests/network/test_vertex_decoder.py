@@ -104,7 +104,7 @@ def test_shells_enter_the_decoder_and_start_at_the_surface():
         jnp.zeros((2, 1)), photo_colors=colors[:, 0], visible_fraction=jnp.ones(2), shells=shells_of(colors)
     )
     entering = decoder_input(features, jnp.zeros((2, 3)))
-    assert entering.shape == (2, 1 + 39 + 4 + 3 * SHELL_WIDTH)
+    assert entering.shape == (2, 1 + 39 + 4 + 3 * 6)
     assert np.allclose(entering[0, -18:], [0.5] * 9 + [1] * 3 + [1, 1, 0] * 2)
     decoder = DecoderModule(CONFIG, shells=3)
     raw = decoder.apply(decoder.init(jax.random.key(0), entering), entering)

@@ -197,7 +197,7 @@ def test_bare_skin_is_where_the_body_is(bank, scene, body):
     assert skin.sum() > 50
     views = views_of(bank, scene, camera)
     prepare = jax.jit(prepare_inputs, static_argnames="config")
-    inputs = prepare(body, views, config=dataclasses.replace(tiny(), image_size=SIZE))
+    inputs = prepare(body, views, config=tiny().with_conventions(image_size=SIZE))
     unit = float(subject_unit(inputs.canonical_vertices))
     depth = np.asarray(inputs.depth_maps[0]) * unit
     alike = np.abs(depth - np.asarray(fragments.depth))[skin] < SKIN_DEPTH

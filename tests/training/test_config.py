@@ -36,7 +36,7 @@ def test_stages_out_of_order_are_refused(starts):
 
 
 def test_sizes_that_do_not_fit_are_refused_before_the_run():
-    with pytest.raises(ValueError, match="no multiple of patch_size"):
+    with pytest.raises(ValueError, match="not a multiple of patch_size"):
         dataclasses.replace(tiny(), steps=10, stages=(Stage(4, image_size=65),))
     with pytest.raises(ValueError, match="microbatch_size 0"):
         dataclasses.replace(tiny(), microbatch_size=0)
@@ -55,7 +55,7 @@ def test_runs_survive_json(name):
         ('{"optimizer": {"betas": [0.9]}}', r"config\.optimizer\.betas: expected tuple.*, got \[0\.9\]"),
         ('{"views": {"input_counts": [4, "6"]}}', r"config\.views\.input_counts\[1\]: expected int, got '6'"),
         ('{"ema_decay": "much"}', r"config\.ema_decay: expected float, got 'much'"),
-        ('{"steps": 2', "config.json: configuration is not JSON"),
+        ('{"steps": 2', "config.json: the configuration is not JSON"),
     ],
 )
 def test_a_wrong_file_is_told_with_file_and_field(text, message, tmp_path):

@@ -74,9 +74,14 @@ def test_the_numbers_are_those_of_the_step(body, batch, variables):
 
 
 IN_BATCH = {
-    "photograph": ("inputs.images", (0, 1, 3, 4, 2), "view 1, row 3, column 4 [2]", "pixels"),
+    "photo": ("inputs.images", (0, 1, 3, 4, 2), "view 1, row 3, column 4 [2]", "pixels"),
     "target": ("targets.images", (0, 0, 5, 6, 0), "view 0, row 5, column 6 [0]", "loss: squared"),
-    "mask": ("targets.masks", (0, 1, 2, 3), "view 1, row 2, column 3", "loss: silhouette"),
+    "mask": (
+        "targets.masks",
+        (0, 1, 2, 3),
+        "view 1, row 2, column 3",
+        "loss: squared",
+    ),  # the background is blended by it
     "shape": ("inputs.betas", (0, 0), "[0]", "position maps"),
     "pose": ("inputs.rotations", (0, 1, 1, 2), "view 1, joint 1 [2]", "position maps"),
     "input camera": ("inputs.cameras.cam_from_world", (0, 1, 0, 3), "view 1 [0, 3]", "pixels"),

@@ -35,7 +35,7 @@ CONFIG = tiny()
 
 @pytest.fixture(scope="module")
 def source(body, captures):
-    views = CaptureCache(captures, body), CONFIG.views, CONFIG.model.image_size, CONFIG.target_size
+    views = CaptureCache(captures, body), CONFIG.views, CONFIG.model.conventions.image_size, CONFIG.target_size
     return Loader(CaptureSource(*views), CONFIG.batch_size)
 
 
