@@ -2,6 +2,7 @@
 
 import json
 import os
+from pathlib import Path
 from typing import Literal
 
 import jax.numpy as jnp
@@ -9,7 +10,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.npz import write_npz
 from humangs_jax.rendering.gaussians import Gaussians
 
 FORMAT = "humangs-avatar"
@@ -58,10 +59,7 @@ class Avatar:
         }
         values = {name: getattr(self.gaussians, name) for name in _ARRAYS[:5]}
         values |= {name: getattr(self, name) for name in _ARRAYS[5:]}
-        arrays = {name: np.asarray(value) for name, value in values.items()}
-        header_array = np.asarray(json.dumps(header))
-        # no array is called allow_pickle, the stub's only other keyword
-        replace_file(path, lambda temporary: np.savez_compressed(temporary, header=header_array, **arrays))  # ty: ignore[invalid-argument-type]
+        write_npz(Path(path), {"header": json.dumps(header)} | values)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Avatar":
