@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import re
 import shutil
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from humangs_jax import cli
+from humangs_jax.cli import fit
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.io.images import read_image
 
@@ -168,6 +170,13 @@ def test_fit_says_what_is_missing(folder, tmp_path, monkeypatch, capsys, argumen
     code, _, err = run(monkeypatch, capsys, "fit", *arguments)
     assert code == 2 and message in err and err.count("\n") == 1
     assert not any(tmp_path.iterdir())
+
+
+def test_the_options_of_each_way_to_fit_exist():
+    parts = (fit.Detections, fit.Scan, fit.Refinement, fit.Fit)
+    options = {field.name for part in parts for field in dataclasses.fields(part)}
+    for way, others in fit.WAYS.items():
+        assert others | {way.removeprefix("--")} <= options
 
 
 def test_import_of_what_is_no_calibration_is_one_line(folder, tmp_path, monkeypatch, capsys):

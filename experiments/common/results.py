@@ -67,7 +67,7 @@ def markdown_table(header: Sequence[str], rows: Sequence[Sequence[object]], alig
 
 
 def significant(value: float, digits: int = 2) -> str:
-    """A number with at least so many digits, without an exponent."""
+    """A number with at least `digits` significant digits, without an exponent."""
     decimals = digits - 1 - math.floor(math.log10(abs(value))) if value else digits - 1
     return f"{value:.{max(0, decimals)}f}"
 

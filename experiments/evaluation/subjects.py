@@ -57,7 +57,7 @@ class EvaluationSubject:
         """Evenly spaced photos of the ring, the frontal one first. Raises ValueError if they were not rendered."""
         wanted = ring_positions(count)
         if missing := set(wanted) - set(self.positions):
-            raise ValueError(f"{count} photographs need ring positions {sorted(missing)}, which were not photographed")
+            raise ValueError(f"{count} photos need ring positions {sorted(missing)}, which the capture lacks")
         return self.photos.select([self.positions.index(position) for position in wanted])
 
     def with_body(self, body: BodyModel) -> "EvaluationSubject":
@@ -83,7 +83,7 @@ def with_body(capture: Capture, body: BodyModel) -> Capture:
 def ring_positions(count: int) -> tuple[int, ...]:
     """Which cameras of the ring take `count` photos. Raises ValueError unless the count divides `RING`."""
     if count < 1 or RING % count:
-        raise ValueError(f"{count} photographs are not evenly spaced among {RING} cameras")
+        raise ValueError(f"{count} photos are not evenly spaced among {RING} cameras")
     return tuple(range(0, RING, RING // count))
 
 

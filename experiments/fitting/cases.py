@@ -9,7 +9,7 @@ POSE_STREAM, CAMERA_STREAM, ERROR_STREAM = 21, 22, 23
 
 @dataclasses.dataclass(frozen=True)
 class FitCase:
-    """One person in m moments seen by c cameras. betas (s,), rotations (m, j, 3), translations (m, 3), joints (m, j, 3),
+    """One person in m frames seen by c cameras. betas (s,), rotations (m, j, 3), translations (m, 3), joints (m, j, 3),
     landmarks (m, k, 3) are true; K (m, c, 3, 3) and cam_from_world (m, c, 4, 4).
     """
 

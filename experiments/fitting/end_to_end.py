@@ -1,10 +1,10 @@
-"""What a fitted body costs in the end: photographs and keypoints -> fit -> reconstruct, beside true body parameters.
+"""What a fitted body costs in the end: photos and keypoints -> fit -> reconstruct, beside true body parameters.
 
     python experiments/fitting/end_to_end.py --people 4 --json end_to_end.json --docs
 
-People of the fitting seeds, four photographs of 256 pixels each. Keypoints are the true ones with noise and outliers, at the
+People of the fitting seeds, four photos of 256 pixels each. Keypoints are the true ones with noise and outliers, at the
 accuracy of a detector that sees 512 pixels; cameras are true. Each reconstruction is drawn with the parameters it was made
-from, fitted or true, and compared with held-out photographs. About 20 seconds a person after a minute of compilation.
+from, fitted or true, and compared with held-out photos. About 20 seconds a person after a minute of compilation.
 """
 
 import argparse
@@ -110,7 +110,7 @@ def fit_photos(photos, body, seed, arguments):
     from humangs_jax.data.keypoints.keypoints import Keypoints
     from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
     from humangs_jax.data.photos import Photos
-    from humangs_jax.fitting.fit_capture import fit_photographs
+    from humangs_jax.fitting.fit_capture import fit_photos
 
     kind = KEYPOINT_SETS[arguments.set]
     model = landmark_model(body, kind.names)
@@ -123,7 +123,7 @@ def fit_photos(photos, body, seed, arguments):
     confidences = np.broadcast_to(np.asarray(model.known, np.float32), points.shape[:-1])
     keypoints = Keypoints(points.astype(np.float32), confidences, kind)
     seen = Photos(photos.images, photos.masks, photos.cameras, photos.frames, photos.names)
-    fitted = fit_photographs(seen, keypoints, body)
+    fitted = fit_photos(seen, keypoints, body)
     error = np.linalg.norm(np.asarray(fitted.fit.joints)[0] - np.asarray(joints), axis=-1)
     return fitted.capture, float(1000 * error.mean())
 

@@ -27,9 +27,9 @@ FIRST = 4_000_000
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=16, help="moments of each person")
+    parser.add_argument("--frames", type=int, default=16, help="frames of each person")
     parser.add_argument("--people", type=int, default=4, help="of the fitting seeds")
-    parser.add_argument("--views", type=int, default=4, help="cameras of each moment")
+    parser.add_argument("--views", type=int, default=4, help="cameras of each frame")
     parser.add_argument("--noise-px", type=float, default=2.0, help="standard deviation of detections, pixels of 512")
     parser.add_argument("--outliers", type=float, default=0.2, help="share of points displaced by up to 100 pixels")
     parser.add_argument("--set", default=ALL, choices=("coco17", ALL, "openpose67"), help="which keypoints")
@@ -95,7 +95,7 @@ class Bench:
         self.kept: dict = {}
 
     def cases(self, kind, views):
-        """The keypoint model of a set and the people seen by so many views."""
+        """The keypoint model of a set and people seen by that number of views."""
         from experiments.fitting.cases import make_case
         from humangs_jax.body.landmarks import landmark_model
         from humangs_jax.data.keypoints.sets import KEYPOINT_SETS

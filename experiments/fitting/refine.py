@@ -7,10 +7,10 @@ The start: all focal lengths off by 5 %, every camera turned by 2 degrees about 
 stay. Photos of 512 px. What it is refined by:
 
     bare               masks of the body alone
-    clothed            masks of the dressed person with hair, as photographs have them
+    clothed            masks of the dressed person with hair, as photos have them
     keypoints          COCO's 17, normal errors of --noise-px, no masks
     clothed+keypoints  both
-    clothed+photos     dressed masks, then the colours of the photographs
+    clothed+photos     dressed masks, then the colours of the photos
 
 --json writes {"cases": {case: means}, "subjects": [{"seed", "cases": {case: row}}], "settings"} after every person. A row has
 `iou_before`, `iou_after` (body against the masks of the case), `bare_iou_before`, `bare_iou_after` (against the true body),

@@ -1,4 +1,4 @@
-"""People of the fitting seeds in photographs whose cameras and poses are a little off: what refinement is measured on."""
+"""People of the fitting seeds in photos whose cameras and poses are a little off: what refinement is measured on."""
 
 import dataclasses
 from typing import Any

@@ -21,7 +21,7 @@ import numpy as np
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.constants import ALPHA_MIN, NEAR
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.reference import render_dense
+from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splatting import render
 
 WIDTH, HEIGHT, COUNT = 24, 16, 32
@@ -46,7 +46,7 @@ BFLOAT16_GRADIENT, FLOAT16_GRADIENT = 4e-3, 5e-4
 """The gradient is returned in the input's dtype, which rounds it by 2^-9 or 2^-11."""
 
 FLOAT64 = 1e-9
-"""The tiled renderer in float64 against the dense oracle, images absolute and gradients relative: every case."""
+"""The tiled renderer in float64 against the reference, images absolute and gradients relative: every case."""
 
 
 class Arrays(NamedTuple):
@@ -364,9 +364,9 @@ def tiled_in_float64(scene: Scene):
     return _in_float64(render, scene)
 
 
-def dense_in_float64(scene: Scene):
-    """(rendering, gradients) of the oracle."""
-    return _in_float64(render_dense, scene)
+def reference_in_float64(scene: Scene):
+    """(rendering, gradients) of the reference."""
+    return _in_float64(render_reference, scene)
 
 
 def _in_float64(draw, scene):
@@ -421,6 +421,6 @@ def compare(scene: Scene, found: tuple, expected: tuple) -> Outcome:
 
 
 def measure(case: Case, in_float64: bool = False) -> Outcome:
-    """Draws one case in float32 (or float64), and densely in float64, and compares."""
+    """Draws one case in float32 (or float64) and by the reference in float64, and compares."""
     scene = case.build()
-    return compare(scene, tiled_in_float64(scene) if in_float64 else tiled(scene), dense_in_float64(scene))
+    return compare(scene, tiled_in_float64(scene) if in_float64 else tiled(scene), reference_in_float64(scene))

@@ -1,4 +1,4 @@
-"""Where on a body the landmarks are that people and detectors mark in photographs: `landmark_model(body, names)`.
+"""Positions on a body of the landmarks that annotators and detectors mark in photos.
 
 A landmark is a weighted mean of joints, or a vertex that a rule finds on the body's own template, so that any body whose joints
 have SMPL-X's names has them. Sides are the person's. By name:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.io.npz import write_npz
 
 FORMAT = "humangs-body-1"
 DIRECTION_STEP = 1e-5
@@ -69,8 +70,7 @@ def save_body(path: str | Path, body: BodyModel) -> None:
     if body.collapse_order is not None:
         arrays["collapse_order"] = _indices(np.asarray(body.collapse_order))
         arrays["collapse_into"] = _indices(np.asarray(body.collapse_into))
-    # no array is called allow_pickle, the stub's only other keyword
-    np.savez_compressed(path, **arrays)  # ty: ignore[invalid-argument-type]
+    write_npz(path, arrays)
 
 
 def is_body_file(path: str | Path) -> bool:

@@ -101,7 +101,12 @@ class Fit:
             if option not in WAYS[way] and f"--{option}" != way:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
                 raise ValueError(f"--{option} is for {owners or 'captures'}, not for {way}")
-        {"--scan": self._fit_scan, "--refine": self._refine, "--keypoints": self._fit_keypoints}[way]()
+        if way == "--scan":
+            self._fit_scan()
+        elif way == "--refine":
+            self._refine()
+        else:
+            self._fit_keypoints()
 
     def _given(self):
         """Options of the ways of fitting whose value is not the default, in the order of the help."""
@@ -116,7 +121,7 @@ class Fit:
         from humangs_jax.data.capture import DEFAULT_BODY
         from humangs_jax.data.photos import load_photos
         from humangs_jax.fitting.files import check_place, write_fitted
-        from humangs_jax.fitting.fit_capture import fit_photographs
+        from humangs_jax.fitting.fit_capture import fit_photos
         from humangs_jax.fitting.landmark_fit import FitConfig
 
         assert self.capture is not None  # `run` has checked it
@@ -128,7 +133,7 @@ class Fit:
         keypoints = self.detections.read(photos)
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
         config = dataclasses.replace(FitConfig(), smoothness=self.smoothness)
-        fitted = fit_photographs(photos, keypoints, load_body(self.body), body_file=body_file, config=config)
+        fitted = fit_photos(photos, keypoints, load_body(self.body), body_file=body_file, config=config)
         warnings = (*fitted.report.warnings, *_reading_warnings(keypoints))
         report = dataclasses.replace(fitted.report, warnings=warnings)
         write_fitted(self.capture, target, fitted.capture, report, fitted.record)

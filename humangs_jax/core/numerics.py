@@ -33,18 +33,11 @@ def absolute(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     return x * jax.lax.stop_gradient(jnp.sign(x))
 
 
-def safe_norm(x: Float[Array, "*b d"]) -> Float[Array, "*b"]:
-    """Euclidean norm over the last axis; zero gradient at the zero vector.
+def safe_normalize(x: Float[Array, "*b d"], fallback: Float[Array, " d"]) -> Float[Array, "*b d"]:
+    """x / |x|, and `fallback` with zero gradient where |x| is 0.
 
     Scaled by the largest magnitude first, so that neither squares overflow nor small vectors underflow.
     """
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
-    scale = jnp.where((largest > 0) & jnp.isfinite(largest), largest, 1.0)
-    return safe_sqrt(jnp.sum(jnp.square(x / scale), axis=-1)) * scale[..., 0]
-
-
-def safe_normalize(x: Float[Array, "*b d"], fallback: Float[Array, " d"]) -> Float[Array, "*b d"]:
-    """x / |x|, and `fallback` with zero gradient where |x| is 0."""
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(x), axis=-1, keepdims=True))
     zero = ~(largest > 0)
     y = jnp.where(zero, fallback.astype(x.dtype), x / jnp.where(zero, 1.0, largest))
@@ -56,9 +49,3 @@ def inverse_sigmoid(p: Float[Array, "*n"], margin: float = 1e-6) -> Float[Array,
     """log(p / (1 - p)) with p clamped to [margin, 1 - margin]."""
     p = jnp.clip(p, margin, 1 - margin)
     return jnp.log(p) - jnp.log1p(-p)
-
-
-def inverse_softplus(y: Float[Array, "*n"], smallest: float = 1e-12) -> Float[Array, "*n"]:
-    """x with softplus(x) = y for y > 0: y + log(-expm1(-y))."""
-    y = jnp.maximum(y, smallest)
-    return y + jnp.log(-jnp.expm1(-y))

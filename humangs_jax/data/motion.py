@@ -75,12 +75,6 @@ class Motion:
         """One frame."""
         return BodyPose(self.rotations[frame], self.translations[frame])
 
-    def at_rate(self, fps: float | int) -> "Motion":
-        """The motion at another frame rate, by the nearest frames (no blending: captured motions have many frames)."""
-        count = max(1, round(len(self.translations) * fps / self.fps))
-        frames = np.clip(np.rint(np.arange(count) * self.fps / fps).astype(int), 0, len(self.translations) - 1)
-        return replace(self, rotations=self.rotations[frames], translations=self.translations[frames], fps=float(fps))
-
 
 def load_motion(
     path: str | Path | None = None,

@@ -65,8 +65,8 @@ def examine(
     """
     if len(keypoints.points) != capture.view_count:
         raise ValueError(f"keypoints of {len(keypoints.points)} views, but the capture has {capture.view_count}")
-    photographs = Photos(capture.images, capture.masks, capture.cameras, capture.frames, capture.names)
-    observations, views = group_by_frame(photographs, keypoints)
+    photos = Photos(capture.images, capture.masks, capture.cameras, capture.frames, capture.names)
+    observations, views = group_by_frame(photos, keypoints)
     expected, poses = np.asarray(observations.noise), jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
     model = landmark_model(capture.body, keypoints.set.names)
     errors = np.asarray(_errors(model, jnp.asarray(capture.betas), poses, observations))

@@ -13,7 +13,6 @@ is) and body_in_scan.ply.
 """
 
 import dataclasses
-import json
 import shutil
 from pathlib import Path
 
@@ -27,8 +26,9 @@ from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
 from humangs_jax.data.photos import capture_folder, read_description
 from humangs_jax.fitting.report import FitReport
 from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
-from humangs_jax.io.atomic import replace_file, replace_folder
-from humangs_jax.io.npz import read_npz
+from humangs_jax.io.atomic import check_replaceable, replace_folder
+from humangs_jax.io.npz import read_npz, write_npz
+from humangs_jax.io.text import write_json
 
 FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
 SCAN_BODY_FILE, SCAN_REPORT_FILE, SCAN_MESH_FILE = "body.npz", "scan_fit.json", "body_in_scan.ply"
@@ -61,7 +61,7 @@ def write_fit_record(path: str | Path, record: FitRecord) -> None:
         "confidences": record.keypoints.confidences.astype(np.float32),
         **{key: np.asarray(getattr(record, key), np.float32) for key in KEYS[4:]},
     }
-    replace_file(path, lambda temporary: np.savez(temporary, **arrays))  # ty: ignore[invalid-argument-type]
+    write_npz(path, arrays, compressed=False)
 
 
 def read_fit_record(path: str | Path) -> FitRecord:
@@ -99,7 +99,8 @@ def read_fit_record(path: str | Path) -> FitRecord:
 def check_place(source: str | Path, out: str | Path | None, overwrite: bool) -> Path:
     """The folder that a fit of the capture `source` is written to, checked before the work begins.
 
-    Arguments: out: None: the capture folder itself. Raises: ValueError if something would be overwritten without `overwrite`.
+    Arguments: out: None: the capture folder itself.
+    Raises: ValueError if something would be overwritten without `overwrite`; see also `check_replaceable`.
     """
     source = capture_folder(source)
     target = source if out is None else Path(out)
@@ -114,6 +115,8 @@ def check_place(source: str | Path, out: str | Path | None, overwrite: bool) -> 
         raise ValueError(f"--out {target}: holds no capture.json: refusing to overwrite what is no capture")
     if target.resolve() in source.resolve().parents:
         raise ValueError(f"--out {target}: {source} lies inside of it, and would be lost")
+    if target.resolve() != source.resolve():
+        check_replaceable(target)
     return target
 
 
@@ -126,36 +129,29 @@ def write_fitted(
     """
     source, target = capture_folder(source), Path(target)
     description = read_description(source / "capture.json")
-    texts = {
-        "capture.json": json.dumps(_with_cameras(description, capture), indent=1) + "\n",
-        REPORT_FILE: json.dumps(report.to_json(), indent=1) + "\n",
-    }
+    contents = {"capture.json": _with_cameras(description, capture), REPORT_FILE: report.to_json()}
     name, arrays = description["body"], parameter_arrays(capture, target)
     if target.resolve() == source.resolve():
         if record is None:
             (target / FIT_FILE).unlink(missing_ok=True)
         else:
             write_fit_record(target / FIT_FILE, record)
-        replace_file(target / name, lambda path: np.savez(path, **arrays))  # ty: ignore[invalid-argument-type]
-        for file, text in texts.items():
-            replace_file(target / file, lambda path, text=text: _write_text(path, text))
+        write_npz(target / name, arrays, compressed=False)
+        for file, content in contents.items():
+            write_json(target / file, content)
         return
 
     def write(folder: Path):
         folder.mkdir()
         for file in sorted({view[key] for view in description["views"] for key in ("image", "mask") if key in view}):
             _copy(source, folder, file)
-        np.savez(folder / name, **arrays)  # ty: ignore[invalid-argument-type]
-        for file, text in texts.items():
-            _write_text(folder / file, text)
+        write_npz(folder / name, arrays, compressed=False)
+        for file, content in contents.items():
+            write_json(folder / file, content)
         if record is not None:
             write_fit_record(folder / FIT_FILE, record)
 
     replace_folder(target, write)
-
-
-def _write_text(path, text):
-    path.write_text(text, encoding="utf-8")
 
 
 def _with_cameras(description, capture):
@@ -188,7 +184,7 @@ def save_scan_fit(folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BOD
     """
     check_scan_folder(Path(folder), overwrite)
     pose, align = fit.pose, fit.world_from_scan
-    arrays = {"betas": fit.betas, "rotations": np.asarray(pose.rotations)[None]}
+    arrays = {"body": body_file, "betas": fit.betas, "rotations": np.asarray(pose.rotations)[None]}
     arrays["translations"] = np.asarray(pose.translation)[None]
     place = {"world_from_scan": align.matrix().tolist(), "scale": align.scale, "rotation": align.rotation.tolist()}
     place |= {"translation": align.translation.tolist(), "up": fit.up}
@@ -197,18 +193,19 @@ def save_scan_fit(folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BOD
         import trimesh
 
         temporary.mkdir()
-        np.savez(temporary / SCAN_BODY_FILE, body=body_file, **arrays)  # ty: ignore[invalid-argument-type]
+        write_npz(temporary / SCAN_BODY_FILE, arrays, compressed=False)
         mesh = trimesh.Trimesh(body_in_scan(fit), np.asarray(fit.body.faces), process=False)
         mesh.export(temporary / SCAN_MESH_FILE)
-        _write_text(temporary / SCAN_REPORT_FILE, json.dumps(place | fit.report.to_json(), indent=2) + "\n")
+        write_json(temporary / SCAN_REPORT_FILE, place | fit.report.to_json(), indent=2)
 
     replace_folder(folder, write)
 
 
 def check_scan_folder(folder: Path, overwrite: bool) -> None:
-    """Raises: ValueError if it is a file, not empty without `overwrite`, or holds something other than a fit to a scan."""
-    if folder.is_file():
-        raise ValueError(f"{folder}: is a file: expected a folder")
+    """Raises: ValueError if it is not empty without `overwrite`, holds something other than a fit to a scan, or cannot be
+    replaced (see `check_replaceable`).
+    """
+    check_replaceable(folder)
     if not folder.is_dir() or not any(folder.iterdir()):
         return
     if not overwrite:

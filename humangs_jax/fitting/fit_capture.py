@@ -1,4 +1,4 @@
-"""From photographs with cameras and keypoints to a capture with a body."""
+"""From photos with cameras and keypoints to a capture with a body."""
 
 import dataclasses
 import functools
@@ -45,38 +45,36 @@ class FittedCapture:
         return dataclasses.replace(report, stages=stages, warnings=(*report.warnings, *_blind_frames(seen)))
 
 
-def fit_photographs(
-    photographs: Photos,
+def fit_photos(
+    photos: Photos,
     keypoints: Keypoints,
     body: BodyModel,
     *,
     body_file: str = DEFAULT_BODY,
     config: FitConfig | None = None,
 ) -> FittedCapture:
-    """Find shape and poses of the person in photographs.
+    """Find shape and poses of the person in photos.
 
-    Arguments: keypoints: of each view, in the order of the photographs. body_file: where the body comes from, see `Capture`.
+    Arguments: keypoints: of each view, in the order of the photos. body_file: where the body comes from, see `Capture`.
     Raises: ValueError if the numbers of views differ, no view has a keypoint that the body has, or the body's root is not its
     first joint.
     """
     config = config or FitConfig()
-    if len(keypoints.points) != len(photographs.names):
-        raise ValueError(
-            f"keypoints of {len(keypoints.points)} views, but there are {len(photographs.names)} photographs"
-        )
+    if len(keypoints.points) != len(photos.names):
+        raise ValueError(f"keypoints of {len(keypoints.points)} views, but there are {len(photos.names)} photos")
     if body.parents.index(-1) != 0:
         raise ValueError(
             f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}"
         )
     model = landmark_model(body, keypoints.set.names)
-    observations, _ = group_by_frame(photographs, keypoints)
+    observations, _ = group_by_frame(photos, keypoints)
     if not (np.asarray(observations.confidences) * np.asarray(model.known) > 0).any():
         raise ValueError("no view has a keypoint that the body has: nothing to fit")
     fit = fit_landmarks(model, observations, config)
     found = fit_uncertainty(model, observations, fit, config)
-    capture = Capture(**vars(photographs), body=body, betas=np.asarray(fit.betas), poses=fit.poses, body_file=body_file)
+    capture = Capture(**vars(photos), body=body, betas=np.asarray(fit.betas), poses=fit.poses, body_file=body_file)
     known = (np.asarray(fit.noise), found.joint_std, found.determined, found.shape_covariance)
-    record = FitRecord(keypoints, photographs.names, *known)
+    record = FitRecord(keypoints, photos.names, *known)
     return FittedCapture(capture, record, fit, model, observations, config)
 
 

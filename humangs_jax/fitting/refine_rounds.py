@@ -1,8 +1,8 @@
-"""Rounds of refinement, as of iterated closest points: draw the body, match points of its outline and of the mask's, move
-cameras, shape and poses by a few steps of damped least squares, match again with a smaller reach.
+"""Rounds of refinement, similar to iterated closest points. Each draws the body, matches its outline with the mask's, and moves
+cameras, shape and poses by a few steps of damped least squares. The reach falls from round to round.
 
-The state's deviations have the standard deviations of a prior around the start (`StateStd`). The prior keeps the problem
-solvable: cameras and people that move together look the same (a gauge), and silhouettes hardly show twists of limbs.
+`StateStd` is a Gaussian prior around the start; without it the problem has free directions: cameras and people that move
+together look the same (a gauge), and silhouettes hardly show twists of limbs.
 """
 
 import dataclasses
@@ -21,7 +21,6 @@ from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.fitting.residuals.colors import NORMAL_MAD
 from humangs_jax.fitting.residuals.keypoints import NEAR, Observations, keypoint_residuals, make_observations
 from humangs_jax.fitting.residuals.outlines import BodyView, body_outline, mask_outline, mesh_edges, view_body
 from humangs_jax.fitting.residuals.silhouettes import (
@@ -32,7 +31,7 @@ from humangs_jax.fitting.residuals.silhouettes import (
     outline_points,
     silhouette_residuals,
 )
-from humangs_jax.fitting.solve import Outcome, solve
+from humangs_jax.fitting.solve import NORMAL_MAD, Outcome, solve
 from humangs_jax.fitting.state import (
     FitState,
     Origin,

@@ -90,13 +90,15 @@ class Violation:
 class FitReport:
     """What came of a fit.
 
-    fitted: "keypoints", "refinement" or "scan". kept: False if the start was better and stays. errors: by name, see `LABELS`.
-    moved: how far parameters moved, by name. violations: of joint limits. swaps: what seems exchanged. undetermined: joints, or
-    groups of joints, that the views do not determine. notes: further results. warnings: what points to a mistake.
+    fitted: "keypoints", "refinement" or "scan". kept: False if the start was better and stays. start: of a fit to a scan, where
+    it came from: "landmarks" or "search". errors: by name, see `LABELS`. moved: how far parameters moved, by name. violations:
+    of joint limits. swaps: what seems exchanged. undetermined: joints, or groups of joints, that the views do not determine.
+    notes: further results. warnings: what points to a mistake.
     """
 
     fitted: str
     kept: bool = True
+    start: str = ""
     errors: dict[str, Change] = dataclasses.field(default_factory=dict)
     views: tuple[ViewReport, ...] = ()
     stages: tuple[Stage, ...] = ()

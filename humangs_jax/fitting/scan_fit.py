@@ -163,8 +163,9 @@ def _report(scan, from_joints, scale, up, distances, covered, outcomes):
         low, middle, high = 1000 * np.quantile(distances, (0.05, 0.5, 0.95))
         values = {"scan_outside_median_mm": middle, "scan_outside_5_mm": low, "scan_outside_95_mm": high}
         errors = {name: Change(float(value)) for name, value in values.items()} | errors
-    start = "given joints" if from_joints else "a search, without joints: look at the result before you use it"
-    notes = [f"start: {start}", f"scale: {scale:.5g} metres per unit of the scan; up: {up}"]
+    origin = "given joints" if from_joints else "a search, without joints: look at the result before you use it"
+    notes = [f"start: {origin}", f"scale: {scale:.5g} metres per unit of the scan; up: {up}"]
+    notes.append(f"left out, because it cannot be seen from outside: {scan.hidden:.0%} of the surface")
     if scan.turned:
         notes.append("the faces of the file were inside out and have been reversed")
     last = Stage.of("last round", outcomes[-1])
@@ -174,6 +175,7 @@ def _report(scan, from_joints, scale, up, distances, covered, outcomes):
     doubt = "much of the scan is not near the body: does it contain a floor, or other things?"
     return FitReport(
         fitted="scan",
+        start="landmarks" if from_joints else "search",
         errors=errors,
         stages=(dataclasses.replace(last, converged=int(settled)),),
         notes=tuple(notes),

@@ -6,7 +6,6 @@ lining) are left out, as by a scanner.
 """
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ import numpy as np
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.keypoints.sets import FINGER_JOINTS, FINGERS
 from humangs_jax.io.npz import read_npz
+from humangs_jax.io.text import read_json
 
 VIEWS = 48
 """Directions from which points are looked at."""
@@ -165,7 +165,7 @@ def read_joints(path: str | Path) -> dict[str, Float[np.ndarray, "3"]]:
     """
     path = Path(path)
     try:
-        joints = _joints_of_npz(path) if path.suffix == ".npz" else json.loads(path.read_text())
+        joints = _joints_of_npz(path) if path.suffix == ".npz" else read_json(path)
         if not isinstance(joints, dict):
             raise ValueError('expected {"left_hip": [x, y, z], ...}')
         if not joints:

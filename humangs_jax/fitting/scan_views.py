@@ -4,7 +4,6 @@ render_scan_views("scan.obj", "views")          a capture folder without a body;
 joints = joints_from_views("views", keypoints)  then fit_scan("scan.obj", joints=joints, ...)
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +13,15 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.photos import FORMAT, VERSION, load_photos
+from humangs_jax.data.photos import load_photos, write_description
 from humangs_jax.fitting.residuals.keypoints import group_by_frame
 from humangs_jax.fitting.scan_reading import SCAN_LANDMARKS, read_mesh
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
-from humangs_jax.io.atomic import replace_folder
+from humangs_jax.io.atomic import check_replaceable, replace_folder
 from humangs_jax.io.images import write_png
+from humangs_jax.io.text import read_json, write_json
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 SCAN_FILE = "scan.json"
@@ -40,9 +40,11 @@ def render_scan_views(
 
     Arguments: up: which axis of the file is up for the person, "+y", "-z", ...; None: the positive one along which the scan is
     longest. Detectors expect standing people: look at the images.
-    Raises: ValueError for a mesh that cannot be used (see `read_mesh`), an unknown axis, or a folder that is not empty.
+    Raises: ValueError for a mesh that cannot be used (see `read_mesh`), an unknown axis, or a folder that is not empty or
+    cannot be replaced (see `check_replaceable`).
     """
     out = Path(out)
+    check_replaceable(out)
     if out.is_dir() and any(out.iterdir()):
         raise ValueError(f"{out}: the folder is not empty: expected a new one")
     mesh = read_mesh(mesh_path)
@@ -64,7 +66,7 @@ def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Flo
     """
     folder = Path(folder)
     try:
-        matrix = np.asarray(json.loads((folder / SCAN_FILE).read_text())["world_from_scan"], np.float64)
+        matrix = np.asarray(read_json(folder / SCAN_FILE)["world_from_scan"], np.float64)
     except (OSError, ValueError, KeyError) as error:
         raise ValueError(f"{folder / SCAN_FILE}: expected what render_scan_views writes: {error}") from error
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
@@ -130,6 +132,5 @@ def _write(folder, drawn, cameras, align):
             key: np.asarray(getattr(cameras, key)[view], np.float64).tolist() for key in ("K", "cam_from_world")
         }
         listed.append({**files, "frame": 0, **matrices})
-    description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": "white", "views": listed}
-    (folder / "capture.json").write_text(json.dumps(description, indent=2) + "\n")
-    (folder / SCAN_FILE).write_text(json.dumps({"world_from_scan": align.matrix().tolist()}) + "\n")
+    write_description(folder, listed, "white")
+    write_json(folder / SCAN_FILE, {"world_from_scan": align.matrix().tolist()}, indent=None)

@@ -17,6 +17,8 @@ from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree
 from humangs_jax.core.pytree import pytree_dataclass
 
 T = TypeVar("T")
+NORMAL_MAD = 1.4826
+"""Standard deviations of a normal distribution per median absolute deviation."""
 
 
 @pytree_dataclass

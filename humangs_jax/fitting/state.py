@@ -167,12 +167,12 @@ def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitSt
     joints, start = np.asarray(origin.joints, int), origin.pose
     conjugate = quaternion.from_axis_angle(-start.rotations[..., 0, :])
     turn = quaternion.multiply(quaternion.from_axis_angle(pose.rotations[..., 0, :]), conjugate)
-    bends = pose.rotations[..., joints, :] - start.rotations[..., joints, :]
+    turned = pose.rotations[..., joints, :] - start.rotations[..., joints, :]
     return FitState(
         betas=(betas - origin.betas) / origin.std.betas,
         global_orient=quaternion.to_axis_angle(turn) / math.radians(origin.std.global_orient),
         transl=(pose.translation - start.translation) / origin.std.transl,
-        body_pose=bends / origin.body_pose_std,
+        body_pose=turned / origin.body_pose_std,
     )
 
 

@@ -17,8 +17,7 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.io.atomic import replace_file
-from humangs_jax.io.npz import read_npz
+from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.people.baking import BakedSubject, bake_subject
 from humangs_jax.people.kinematics import joint_positions
 from humangs_jax.people.poses import sample_rotations
@@ -125,7 +124,7 @@ def save_bank(path: str | Path, bank: PeopleBank) -> None:
     fields |= {"parents": np.asarray(bank.parents), "mirrored_joints": np.asarray(bank.mirrored_joints)}
     fields |= {"format": np.asarray(FORMAT), "version": np.asarray(VERSION), "split": np.asarray(bank.split)}
     fields |= {"generator": np.asarray(bank.generator)}
-    replace_file(path, lambda temporary: np.savez_compressed(temporary, **fields))  # ty: ignore[invalid-argument-type]
+    write_npz(path, fields)
 
 
 def load_bank(path: str | Path) -> PeopleBank:

@@ -3,12 +3,11 @@
 {"format": "humangs-synthetic", "version": 2, "generator_version": ..., "split": ..., "settings": {...}, "subjects": [...]}
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
 from humangs_jax.data.loading.captures import find_captures
-from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.text import read_json, write_json
 from humangs_jax.people.seeds import GENERATOR_VERSION, split_of
 
 MANIFEST = "manifest.json"
@@ -19,7 +18,7 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
     """What a set was made with. Raises: ValueError, one line naming the file, if it is no manifest of this format."""
     file = Path(folder) / MANIFEST
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = read_json(file)
     except (OSError, ValueError) as error:
         raise ValueError(f"{file}: cannot be read: {error}") from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
@@ -71,8 +70,7 @@ def write_manifest(folder: str | Path, split: str, settings: dict[str, Any]) -> 
         "settings": settings,
         "subjects": sorted(file.parent.name for file in folder.glob("[0-9]*/capture.json")),
     }
-    text = json.dumps(content, indent=1) + "\n"
-    replace_file(folder / MANIFEST, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_json(folder / MANIFEST, content)
 
 
 def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:

@@ -160,11 +160,6 @@ def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_T
     return Example(*(jax.tree.map(choose, mirrored(views, bank.mirrored_joints), views) for views in parts))
 
 
-def draw_scene(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Scene:
-    """What the views of `on_the_fly_example` of this key show."""
-    return scene_from(_draw_numbers(bank, key, config), bank, config)
-
-
 def _draw_numbers(bank, key, config):
     """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
     inputs, targets = config.input_views, config.target_views

@@ -4,7 +4,6 @@ A scan is a folder: scan.obj with material.mtl and material_0.png, and scan.glb;
 person: seed, shape, pose. Metres, y up, texture coordinates with v up; a vertex is written once per chart that it is in.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Float, UInt8
 from humangs_jax.io.atomic import replace_folder
+from humangs_jax.io.text import write_json
 from humangs_jax.people.atlas import texels
 from humangs_jax.people.baking import SLOPE_STEP, SLOPE_ZERO, BakedSubject, bake_subject, fill_gaps
 from humangs_jax.people.rendering import PosedSubject, light_points, pose_subject
@@ -56,7 +56,7 @@ def export_scan(
         temporary.mkdir()
         _write_mesh(temporary, posed.vertices[baked.atlas.vertices], baked, texture, formats)
         listed = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known.items()}
-        (temporary / PARAMETERS).write_text(json.dumps(listed) + "\n")
+        write_json(temporary / PARAMETERS, listed, indent=None)
 
     replace_folder(folder, write)
     return Path(folder)

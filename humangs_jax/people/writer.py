@@ -10,7 +10,6 @@ out/SEED/depth/NAME.png, maps/NAME.exr    where asked for, see `maps`; also in h
 
 import dataclasses
 import os
-import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -38,8 +37,6 @@ HELD_OUT = "held_out"
 """Sub-folder of a subject's folder: a capture of its own with the views that reconstruction may not see."""
 POSE_STREAM, CAMERA_STREAM, HELD_OUT_STREAM, CLOSE_STREAM, MOTION_STREAM = 1, 2, 3, 4, 5
 """Independent random streams of a seed; stream 0 makes the person."""
-STALE = 3600.0
-"""Seconds after which a half-written folder counts as left over from a killed run."""
 GROUNDED_EVERY = 5
 """Every how many frames the height of a motion above the ground is measured."""
 MANIFEST_EVERY = 30.0
@@ -206,7 +203,6 @@ def write_set(
     begin_set(out, split, settings)
     folders = {seed: out / f"{seed:07d}" for seed in seeds}
     missing = [seed for seed, folder in folders.items() if not (folder / "capture.json").is_file()]
-    _remove_remains(out)
     failed: dict[int, Exception] = {}
     written = time.monotonic()
     try:
@@ -308,10 +304,3 @@ def _write_views(folder, subject, body, posed, views, layout):
             write_depth(folder / "depth" / f"{view.name}.png", maps.depth)
         if layout.maps:
             write_maps(folder / "maps" / f"{view.name}.exr", capture.images[i], capture.masks[i], maps, view.camera)
-
-
-def _remove_remains(out):
-    """Half-written folders of killed runs."""
-    for folder in out.glob(".[0-9]*.[0-9]*"):
-        if folder.is_dir() and time.time() - folder.stat().st_mtime > STALE:
-            shutil.rmtree(folder, ignore_errors=True)

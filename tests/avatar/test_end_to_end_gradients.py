@@ -1,6 +1,6 @@
-"""Gradients through all of it: photographs -> network -> skinned Gaussians -> pictures -> loss, in float64.
+"""Gradients through all of it: photos -> network -> skinned Gaussians -> pictures -> loss, in float64.
 
-Differentiable are the network's parameters, the photographs, the cameras, posed and canonical vertices and position
+Differentiable are the network's parameters, the photos, the cameras, posed and canonical vertices and position
 maps that come with them, and pose, shape and camera of every target. Depth maps and foreground only decide; and
 `prepare_inputs`, which rasterizes, is not differentiated: training stops gradients there.
 
@@ -206,7 +206,7 @@ def subject(position_map):
 
 def prepared(views, position_map):
     prepare = jax.jit(prepare_inputs, static_argnames="config", compiler_options=in_a_hurry())
-    return prepare(body(), views, config=dataclasses.replace(tiny(), position_map=position_map))
+    return prepare(body(), views, config=tiny().with_conventions(position_map=position_map))
 
 
 def starting_point(inputs, targets, params):
@@ -321,8 +321,8 @@ def turned_away(cameras):
     return replace(cameras, cam_from_world=about @ cameras.cam_from_world)
 
 
-def nobody_in_the_photographs(case, point, fixed):
-    """White photographs, and a body that stands beside what they show."""
+def nobody_in_the_photos(case, point, fixed):
+    """White photos, and a body that stands beside what they show."""
     inputs, *rest = fixed
     blank = replace(inputs, depth_maps=-np.ones_like(inputs.depth_maps), foreground=np.zeros_like(inputs.foreground))
     geometry = point["input_geometry"]
@@ -334,7 +334,7 @@ def nobody_in_the_photographs(case, point, fixed):
 
 
 def subject_behind_the_cameras(case, point, fixed):
-    """Photographs taken in the other direction, prepared like any."""
+    """Photos taken in the other direction, prepared like any."""
     inputs, *rest = fixed
     position_map = case.config.model.conventions.position_map
     betas = point["target_pose"]["betas"].astype(np.float64)
@@ -359,7 +359,7 @@ def every_gaussian_culled(case, point, fixed):
 
 
 DEGENERATE = (
-    nobody_in_the_photographs,
+    nobody_in_the_photos,
     subject_behind_the_cameras,
     vertices_in_the_cameras,
     every_gaussian_culled,

@@ -12,29 +12,27 @@ decades = st.floats(-18, 18).map(lambda e: 10.0**e)  # squares of float32 overfl
 
 
 @given(decades, st.integers(0, 2**31))
-def test_norm_and_direction_over_many_decades(scale, seed):
+def test_directions_over_many_decades(scale, seed):
     x = (np.random.default_rng(seed).normal(size=3) * scale).astype(np.float32)
     exact = np.linalg.norm(x.astype(np.float64))
-    assert np.isclose(numerics.safe_norm(jnp.asarray(x)), exact, rtol=FLOAT32_RELATIVE, atol=0)
     unit = numerics.safe_normalize(jnp.asarray(x), jnp.asarray([1.0, 0, 0]))
     assert np.allclose(unit, x / exact, rtol=0, atol=FLOAT32_RELATIVE)
 
 
 @pytest.mark.parametrize("largest", [1e-37, 1e-30, 1e25, 1e37])
-def test_norm_at_the_extremes_of_float32(largest):  # denormals (also of 1 / x) are flushed to 0
+def test_directions_at_the_extremes_of_float32(largest):  # denormals (also of 1 / x) are flushed to 0
     x = jnp.asarray([largest, 0.5 * largest, 0.0], jnp.float32)
-    assert np.isclose(float(numerics.safe_norm(x)) / largest, np.sqrt(1.25), rtol=1e-5)
+    unit = numerics.safe_normalize(x, jnp.asarray([0.0, 0, 1]))
+    np.testing.assert_allclose(unit, np.asarray([1, 0.5, 0]) / np.sqrt(1.25), rtol=1e-5)
 
 
 @pytest.mark.parametrize(
     "f",
     [
         lambda x: numerics.safe_sqrt(x).sum(),
-        lambda x: numerics.safe_norm(x),
         lambda x: numerics.safe_normalize(x, jnp.asarray([0.0, 1, 0])).sum(),
         lambda x: numerics.safe_divide(x, x).sum(),
         lambda x: numerics.inverse_sigmoid(x).sum(),
-        lambda x: numerics.inverse_softplus(x).sum(),
     ],
 )
 def test_values_and_gradients_are_finite_at_zero(f):
@@ -54,9 +52,8 @@ def test_zero_has_the_stated_value():
 
 
 @given(st.floats(-12, 12))
-def test_inverses_invert(x):
+def test_the_inverse_of_the_sigmoid_inverts(x):
     assert np.isclose(numerics.inverse_sigmoid(jax.nn.sigmoid(jnp.float32(x))), x, atol=0.05, rtol=0)
-    assert np.isclose(numerics.inverse_softplus(jax.nn.softplus(jnp.float32(x))), x, atol=1e-4, rtol=0)
 
 
 def test_narrow_floats_become_float32_and_their_gradients_narrow_again():

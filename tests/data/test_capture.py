@@ -323,12 +323,12 @@ BAD = {
 @pytest.mark.parametrize("case", BAD)
 def test_bad_folder_is_one_line_with_file_and_field(folder, case):
     load(folder)  # valid before
-    spoil, place, told = BAD[case]
+    spoil, place, expected = BAD[case]
     spoil(folder)
     with pytest.raises(CaptureError) as caught:
         load(folder)
     message = str(caught.value)
-    assert "\n" not in message and message.startswith(f"{folder}/{place}") and told in message, message
+    assert "\n" not in message and message.startswith(f"{folder}/{place}") and expected in message, message
 
 
 def test_no_folder_and_no_model_file(folder, tmp_path):
@@ -367,10 +367,10 @@ BAD_ARRAYS = {
 
 @pytest.mark.parametrize("case", BAD_ARRAYS)
 def test_bad_arrays_are_one_line(case):
-    changes, told = BAD_ARRAYS[case]
+    changes, expected = BAD_ARRAYS[case]
     with pytest.raises(CaptureError) as caught:
         capture_from_arrays(**{**arrays(), **changes})
-    assert str(caught.value).startswith(f"arrays: {told}") and "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"arrays: {expected}") and "\n" not in str(caught.value)
 
 
 # Nothing is written when something is wrong --------------------------------------------------------------------------
@@ -450,10 +450,12 @@ def test_the_examples_of_the_documentation_run(tmp_path, monkeypatch):
     capture = load_capture("me")
     assert capture.view_count == 4 and capture.frame_count == 1 and capture.body.name == "makehuman"
     written = json.loads(Path("me/capture.json").read_text())
-    told = json.loads(description)
-    assert set(told) == set(written) and set(told["views"][0]) == set(written["views"][0])
+    content = json.loads(description)
+    assert set(content) == set(written) and set(content["views"][0]) == set(written["views"][0])
     for key in ("image", "mask"):
-        (tmp_path / "me" / told["views"][0][key]).write_bytes((tmp_path / "me" / written["views"][0][key]).read_bytes())
+        (tmp_path / "me" / content["views"][0][key]).write_bytes(
+            (tmp_path / "me" / written["views"][0][key]).read_bytes()
+        )
     Path("me/capture.json").write_text(description)
     np.testing.assert_array_equal(load_capture("me").cameras.cam_from_world[0], capture.cameras.cam_from_world[0])
     # the camera that the text describes: 2.6 m in front, 0.9 m above the ground

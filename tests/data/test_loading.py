@@ -59,7 +59,7 @@ class CountingSource:
         return jax.tree.map(np.asarray, Example(views(input_count), views(1)))
 
 
-def told(batch):
+def content(batch):
     """(source, index) of each row."""
     return [tuple(row) for row in np.asarray(batch.inputs.translations)[:, :2, 0].astype(int).tolist()]
 
@@ -79,7 +79,7 @@ def test_batches_are_in_order_whatever_thread_is_first(reader):
     seen = list(loader.batches(2, 6))
     assert [step for step, _ in seen] == [2, 3, 4, 5]
     for step, batch in seen:
-        assert told(batch) == [(0, 4 * step + i) for i in range(4)]
+        assert content(batch) == [(0, 4 * step + i) for i in range(4)]
         assert same(batch, loader.batch_at(step))
         assert batch.inputs.images.shape == (4, 3 + loader.input_count(step), SIZE, SIZE, 3)
 
@@ -201,12 +201,12 @@ def test_a_mixture_is_a_source_of_its_sources():
     assert isinstance(mixture, Source) and len(mixture) == 14
     assert sorted(mixture.broken) == ["thing of 1.0", "thing of 2.0"]
     loader = Loader(mixture, 64, seed=4)
-    rows = [row for step in range(4) for row in told(loader.batch_at(step))]
+    rows = [row for step in range(4) for row in content(loader.batch_at(step))]
     assert [index for source, index in rows if source == 1] == list(range(192))
     assert [index for source, index in rows if source == 2] == list(range(64))
     assert {source for source, _ in rows[:20]} == {1, 2}  # mixed, not one after the other
     other = Loader(mixture, 64, seed=5)
-    assert [s for s, _ in told(other.batch_at(0))] != [s for s, _ in rows[:64]]
+    assert [s for s, _ in content(other.batch_at(0))] != [s for s, _ in rows[:64]]
 
 
 def test_mixtures_are_checked():

@@ -177,15 +177,15 @@ def rotation_vector(matrix):
 
 @pytest.mark.parametrize("axis", list(UPRIGHT))
 def test_any_world_is_turned_upright(tmp_path, axis):
-    """The same motion told in another world comes back, as joints in space."""
+    """The same motion in the coordinates of another world comes back, as joints in space."""
     poses, trans = upright_poses(165), random((FRAMES, 3))
     turn = np.asarray(quaternion.to_matrix(jnp.asarray(UPRIGHT[axis])), float).round()  # to our world
-    told = poses.copy()
+    turned = poses.copy()
     for i in range(FRAMES):
         root = np.asarray(quaternion.matrix_from_axis_angle(jnp.asarray(poses[i, :3], jnp.float32)), float)
-        told[i, :3] = rotation_vector(turn.T @ root)
-    told_trans = (trans + PELVIS) @ turn - PELVIS  # the pelvis moves with the world
-    path = write(tmp_path / "a.npz", poses=told, trans=told_trans, mocap_framerate=30)
+        turned[i, :3] = rotation_vector(turn.T @ root)
+    turned_trans = (trans + PELVIS) @ turn - PELVIS  # the pelvis moves with the world
+    path = write(tmp_path / "a.npz", poses=turned, trans=turned_trans, mocap_framerate=30)
     asked = load_motion(path) if axis != "y" else load_motion(path, up="y")
     for motion in (asked, load_motion(path, up=axis)):
         back = quaternion.matrix_from_axis_angle(motion.rotations)
@@ -193,7 +193,7 @@ def test_any_world_is_turned_upright(tmp_path, axis):
         np.testing.assert_allclose(back, expected, atol=FLOAT32)
         np.testing.assert_allclose(motion.translations, trans, atol=FLOAT32)
     untouched = load_motion(path, up="y")
-    np.testing.assert_allclose(untouched.translations, told_trans, atol=FLOAT32)
+    np.testing.assert_allclose(untouched.translations, turned_trans, atol=FLOAT32)
 
 
 def test_where_no_axis_is_clear_the_format_decides(tmp_path):
@@ -246,11 +246,11 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_npz_is_one_line_with_file_and_key(tmp_path, case):
-    arrays, told = BAD[case]
+    arrays, expected = BAD[case]
     path = write(tmp_path / "a.npz", **arrays)
     with pytest.raises(MotionError) as caught:
         load_motion(path)
-    assert str(caught.value).startswith(f"{path}{told}") and "\n" not in str(caught.value)
+    assert str(caught.value).startswith(f"{path}{expected}") and "\n" not in str(caught.value)
 
 
 class Evil:
@@ -315,15 +315,6 @@ def test_grounded_stands_on_the_floor_at_the_origin():
     np.testing.assert_allclose(joints[0, 0, [0, 2]], 0, atol=FLOAT32)
     sole = float(rest.joints[:, 1].min() - rest.vertices[:, 1].min())
     np.testing.assert_allclose(joints[..., 1].min(), sole, atol=FLOAT32)
-
-
-def test_at_rate_takes_the_nearest_frames():
-    motion = Motion(jnp.zeros((120, 2, 3)), jnp.arange(120.0)[:, None] * jnp.ones(3), 120.0)
-    slow = motion.at_rate(30)
-    assert slow.fps == 30.0 and list(np.asarray(slow.translations)[:, 0]) == list(range(0, 120, 4))
-    fast = motion.at_rate(240.0)
-    assert len(fast.translations) == 240 and float(fast.translations[-1, 0]) == 119
-    assert len(motion.at_rate(0.5).translations) == 1
 
 
 def test_motions_are_pytrees():

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,8 +12,9 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
 from humangs_jax.data.photos import load_photos
-from humangs_jax.fitting.files import check_place, read_fit_record, write_fitted
-from humangs_jax.fitting.fit_capture import fit_photographs
+from humangs_jax.fitting.files import check_place, check_scan_folder, read_fit_record, write_fitted
+from humangs_jax.fitting.fit_capture import fit_photos
+from humangs_jax.fitting.scan_views import render_scan_views
 
 SIZE = 16
 FRAMES = NAMES_WITHIN_LIMITS
@@ -38,7 +40,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(folder):
-    return fit_photographs(load_photos(folder[0]), folder[1], default_body())
+    return fit_photos(load_photos(folder[0]), folder[1], default_body())
 
 
 def test_views_are_sorted_by_their_frames(folder, fitted):
@@ -103,12 +105,29 @@ def test_written_elsewhere_with_its_pictures_and_new_cameras(folder, fitted, tmp
         check_place(inside, target, overwrite=True)
 
 
+def test_folders_that_cannot_be_replaced_are_refused_before_the_fit(folder, tmp_path, monkeypatch):
+    work, link = tmp_path / "work", tmp_path / "link"
+    work.mkdir()
+    link.symlink_to(work)
+    monkeypatch.chdir(work)
+    for place, message in ((Path(), "is the working folder"), (link, "is a symbolic link")):
+        with pytest.raises(ValueError, match=message):
+            check_place(folder[0], place, overwrite=True)
+        with pytest.raises(ValueError, match=message):
+            check_scan_folder(place, overwrite=True)
+        with pytest.raises(ValueError, match=message):
+            render_scan_views(tmp_path / "scan.ply", place)
+    here = copied(folder[0], tmp_path / "copy")
+    monkeypatch.chdir(here)
+    assert check_place(here, None, overwrite=True) == here  # files are replaced one by one
+
+
 def test_frames_that_views_hardly_show_are_named(folder):
     points, confidences = folder[1].points, folder[1].confidences.copy()
     frames = load_photos(folder[0]).frames
     confidences[frames == 1] = 0
     confidences[np.flatnonzero(frames == 3)[1:]] = 0
-    found = fit_photographs(load_photos(folder[0]), Keypoints(points, confidences, folder[1].set), default_body())
+    found = fit_photos(load_photos(folder[0]), Keypoints(points, confidences, folder[1].set), default_body())
     blind, single = found.report.warnings[-2:]
     assert blind.startswith("frame 1: 0 keypoints are seen")
     assert single.startswith("frame 3: seen by one view")
@@ -119,13 +138,13 @@ def test_frames_that_views_hardly_show_are_named(folder):
     ("change", "message"),
     [
         (lambda p, c: (p, 0 * c), "no view has a keypoint"),
-        (lambda p, c: (p[:3], c[:3]), "keypoints of 3 views, but there are 20 photographs"),
+        (lambda p, c: (p[:3], c[:3]), "keypoints of 3 views, but there are 20 photos"),
     ],
 )
 def test_what_cannot_be_fitted_is_one_error(folder, change, message):
     keypoints = Keypoints(*change(folder[1].points, folder[1].confidences), folder[1].set)
     with pytest.raises(ValueError, match=message):
-        fit_photographs(load_photos(folder[0]), keypoints, default_body())
+        fit_photos(load_photos(folder[0]), keypoints, default_body())
 
 
 @pytest.mark.parametrize(
@@ -153,7 +172,7 @@ def test_a_body_whose_root_is_not_first_is_refused(folder):
     body = default_body()
     strange = replace(body, parents=(1, -1, *body.parents[2:]))
     with pytest.raises(ValueError, match="root to be its first joint, got joint 1"):
-        fit_photographs(load_photos(folder[0]), folder[1], strange)
+        fit_photos(load_photos(folder[0]), folder[1], strange)
 
 
 def copied(folder, tmp_path):

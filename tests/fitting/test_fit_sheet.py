@@ -64,7 +64,7 @@ def test_lines_lead_to_the_body(sheet):
     assert (np.abs(near - cross).max(-1) < 0.3).sum() >= 5
 
 
-def test_many_views_and_moments(tmp_path, monkeypatch):
+def test_many_views_and_frames(tmp_path, monkeypatch):
     """An evenly chosen few of them, and a plot below."""
     monkeypatch.setattr(module, "LONGEST_SIDE", SIDE)
     capture, keypoints = person(31, 9, 3)

@@ -25,23 +25,23 @@ def blocks(path, up=2):
 @pytest.mark.parametrize("up", [2, 0])
 def test_pictures_show_the_scan_upright_and_in_its_colours(tmp_path, up):
     blocks(tmp_path / "scan.ply", up)
-    photographs = load_photos(render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=2, size=64))
-    rows, columns = np.nonzero(photographs.masks[0])
+    photos = load_photos(render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=2, size=64))
+    rows, columns = np.nonzero(photos.masks[0])
     assert np.ptp(rows) > 35 and np.ptp(rows) > 2.5 * np.ptp(columns)
-    inside = photographs.images[0][photographs.masks[0] > 0.9]
+    inside = photos.images[0][photos.masks[0] > 0.9]
     assert inside[:, 0].min() > 0.3 and inside[:, 1:].max() < 0.1
 
 
 def test_what_a_detector_sees_comes_back_as_joints_of_the_scan(tmp_path):
     vertices = blocks(tmp_path / "scan.ply")
     folder = render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=4, size=64)
-    photographs = load_photos(folder)
+    photos = load_photos(folder)
     true = vertices[np.random.default_rng(0).integers(0, len(vertices), 17)]
     import json
 
     matrix = np.asarray(json.loads((folder / "scan.json").read_text())["world_from_scan"])
     world = jnp.asarray(true @ matrix[:3, :3].T + matrix[:3, 3], jnp.float32)
-    points = np.stack([np.asarray(project(photographs.cameras[i], world)[0]) for i in range(4)])
+    points = np.stack([np.asarray(project(photos.cameras[i], world)[0]) for i in range(4)])
     confidences = np.ones((4, 17), np.float32)
     confidences[:, 3] = 0
     joints = joints_from_views(folder, Keypoints(points.astype(np.float32), confidences, COCO_17))

@@ -18,8 +18,8 @@ MIRROR = list(COCO_17.mirror)
 
 
 def seen(capture, keypoints):
-    photographs = Photos(capture.images, None, capture.cameras, capture.frames, capture.names)
-    return (*group_by_frame(photographs, keypoints)[:1], keypoints.set, group_by_frame(photographs, keypoints)[1])
+    photos = Photos(capture.images, None, capture.cameras, capture.frames, capture.names)
+    return (*group_by_frame(photos, keypoints)[:1], keypoints.set, group_by_frame(photos, keypoints)[1])
 
 
 def found(capture, keypoints):

@@ -19,7 +19,7 @@ LATERAL = 0.02
 
 
 def scene(views=VIEWS):
-    """Photographs of the coat: red as the first view sees it, green as the others do."""
+    """Photos of the coat: red as the first view sees it, green as the others do."""
     cameras = orbit(
         jnp.zeros(3), 4.0, jnp.arange(views) * 2 * np.pi / views, 0.0, intrinsics_from_fov(0.6, SIZE, SIZE), SIZE, SIZE
     )

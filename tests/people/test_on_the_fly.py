@@ -53,7 +53,11 @@ def bank(body):
 
 @pytest.fixture(scope="module")
 def scene(bank):
-    return jax.jit(on_the_fly.draw_scene, static_argnames="config")(bank, jax.random.key(5), config=CONFIG)
+    @jax.jit
+    def draw(bank, key):
+        return on_the_fly.scene_from(on_the_fly._draw_numbers(bank, key, CONFIG), bank, CONFIG)
+
+    return draw(bank, jax.random.key(5))
 
 
 @pytest.fixture(scope="module")

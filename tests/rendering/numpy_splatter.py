@@ -1,5 +1,5 @@
 """Gaussian splatting in float64 numpy, written from the formulas and sharing no code with the package, but for `NEAR` and the
-like, which are repeated here as numbers. An oracle for small images: everything is held for every Gaussian on every pixel.
+like, which are repeated here as numbers. A reference for small images: everything is held for every Gaussian on every pixel.
 
 EWA projection (Zwicker et al. 2001): cov2d = J W Sigma W^T J^T + eps2d I. With the singular value decomposition M = U S V^T
 of M = J W R diag(s), (2, 3), the quadratic form is sum_i (u_i . d)^2 / (S_i^2 + eps2d): accurate for needles of any length,

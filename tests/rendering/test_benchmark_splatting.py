@@ -1,4 +1,4 @@
-"""The benchmark script on a small scene whose reference is the dense oracle's, in float64."""
+"""The benchmark script on a small scene whose expected image is the reference's, in float64."""
 
 import json
 import math

@@ -142,7 +142,7 @@ decade = lambda low, high: st.floats(low, high).map(lambda e: 10.0**e)
 
 
 def check_sweep(scene):
-    exact = cases.dense_in_float64(scene)
+    exact = cases.reference_in_float64(scene)
     outcome = cases.compare(scene, cases.tiled(scene), exact)
     assert outcome.finite
     if outcome.image >= bound(DECISION):  # then it must be a decision: with more digits the same program is right
@@ -167,7 +167,7 @@ def test_random_scenes_of_every_size_at_every_depth_at_once():
 
 def test_gradients_have_no_signed_bias():
     scenes = [cases.ordinary(seed) for seed in range(8)]
-    pairs = [[cases.natural(s, draw(s)[1]) for draw in (cases.tiled, cases.dense_in_float64)] for s in scenes]
+    pairs = [[cases.natural(s, draw(s)[1]) for draw in (cases.tiled, cases.reference_in_float64)] for s in scenes]
     for name in cases.NAMES:
         found, exact = (np.concatenate([pair[i][name].ravel() for pair in pairs]) for i in (0, 1))
         n = np.count_nonzero(exact)  # K and the pose have zeros
@@ -196,7 +196,7 @@ def test_coincident_depths_keep_the_order_of_their_indices():
     image, other = (cases.tiled(s)[0].rgb for s in (scene, reverse))
     assert np.abs(image - other).max() > 0.1  # the order is visible
     assert np.ptp(scene.gaussians.means[:, 2]) == 0
-    np.testing.assert_allclose(image, cases.dense_in_float64(scene)[0].rgb, rtol=0, atol=cases.IMAGE)
+    np.testing.assert_allclose(image, cases.reference_in_float64(scene)[0].rgb, rtol=0, atol=cases.IMAGE)
 
 
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, np.float16])

@@ -22,7 +22,7 @@ SMALL_STEPS = RasterConfig(rows_per_step=64, fragments_per_step=128)
 WIDTH, HEIGHT = 33, 21
 
 
-class Oracle(NamedTuple):
+class RayReference(NamedTuple):
     """What rays hit: (h, w) maps; `unsure` where an edge is within PIXEL_ERROR or two depths are within DEPTH_TIE."""
 
     face_ids: np.ndarray
@@ -32,7 +32,7 @@ class Oracle(NamedTuple):
     unsure: np.ndarray
 
 
-def ray_oracle(vertices, faces, camera, near=0.01):
+def ray_reference(vertices, faces, camera, near=0.01):
     """A ray z d hits the plane of a face where z d = [v0 v1 v2] b with the weights b adding up to 1."""
     transform, K = np.asarray(camera.cam_from_world, np.float64), np.asarray(camera.K, np.float64)
     points = np.asarray(vertices, np.float64) @ transform[:3, :3].T + transform[:3, 3]
@@ -57,7 +57,7 @@ def ray_oracle(vertices, faces, camera, near=0.01):
     unsure |= ((hits > depth) & (hits < depth * (1 + DEPTH_TIE))).any(0)
     slope = np.linalg.norm(scaled.sum(1)[:, :2] / [K[0, 0], K[1, 1]], axis=-1)[nearest]
     finite = np.where(hit, depth, 0)
-    return Oracle(
+    return RayReference(
         face_ids=np.where(hit, ids[nearest], -1),
         depth=np.where(hit, depth, -1),
         barycentrics=np.where(hit[..., None], weights[nearest, row, column] * finite[..., None], 0),
@@ -67,23 +67,23 @@ def ray_oracle(vertices, faces, camera, near=0.01):
 
 
 def check_against_rays(fragments, vertices, faces, camera, pixel_error=PIXEL_ERROR, most_unsure=0.1):
-    oracle = ray_oracle(vertices, faces, camera)
-    assert oracle.unsure.mean() <= most_unsure  # or the test would be empty
+    expected = ray_reference(vertices, faces, camera)
+    assert expected.unsure.mean() <= most_unsure  # or the test would be empty
     ids = np.asarray(fragments.face_ids)
-    np.testing.assert_array_equal(ids[~oracle.unsure], oracle.face_ids[~oracle.unsure])
+    np.testing.assert_array_equal(ids[~expected.unsure], expected.face_ids[~expected.unsure])
     np.testing.assert_array_equal(np.asarray(fragments.depth)[ids < 0], -1)
     np.testing.assert_array_equal(np.asarray(fragments.barycentrics)[ids < 0], 0)
-    same = (ids == oracle.face_ids) & (ids >= 0)
+    same = (ids == expected.face_ids) & (ids >= 0)
     depth, weights = np.asarray(fragments.depth, np.float64)[same], np.asarray(fragments.barycentrics, np.float64)[same]
     assert weights.min(initial=0) >= 0
     np.testing.assert_allclose(weights.sum(-1), 1, atol=1e-6)
-    allowed = pixel_error * (oracle.steepness[same] + oracle.depth[same])
-    assert (np.abs(depth - oracle.depth[same]) <= allowed).all()
+    allowed = pixel_error * (expected.steepness[same] + expected.depth[same])
+    assert (np.abs(depth - expected.depth[same]) <= allowed).all()
     # the weights say where on the face: the same point, seen from the camera, as the ray's
     corners = np.asarray(vertices, np.float64)[np.asarray(faces)[ids[same]]]
-    error = np.linalg.norm(np.einsum("pc,pci->pi", weights - oracle.barycentrics[same], corners), axis=-1)
+    error = np.linalg.norm(np.einsum("pc,pci->pi", weights - expected.barycentrics[same], corners), axis=-1)
     assert (error <= allowed).all()
-    return oracle
+    return expected
 
 
 def sphere(rows=12, columns=18, radius=1.0):
@@ -141,8 +141,8 @@ def test_random_triangles_equal_rays(seed, size):
 def test_sphere_equals_rays(seed):
     vertices, faces = sphere()
     camera = some_camera(seed)
-    oracle = check_against_rays(draw(vertices, faces, camera), vertices, faces, camera)
-    assert 0.2 < (oracle.face_ids >= 0).mean() < 0.9
+    expected = check_against_rays(draw(vertices, faces, camera), vertices, faces, camera)
+    assert 0.2 < (expected.face_ids >= 0).mean() < 0.9
 
 
 def test_faces_smaller_than_pixels_equal_rays():

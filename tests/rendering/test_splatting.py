@@ -59,7 +59,7 @@ def tiled(gaussians, view, background, config=CHUNKS):
 
 
 @jax.jit
-def dense(gaussians, view, background):
+def reference(gaussians, view, background):
     return evaluate(lambda g, c, b: render_reference(g, c, background=b), gaussians, view, background)
 
 
@@ -80,10 +80,10 @@ def assert_close(ours, expected, tolerance):
 
 @settings(max_examples=8, deadline=None)
 @given(seed=st.integers(0, 2**20))
-def test_equals_dense_with_all_gradients(seed):
+def test_equals_the_reference_with_all_gradients(seed):
     with jax.enable_x64(True):
         gaussians = random_gaussians(seed)
-        ours, expected = (f(gaussians, camera(), background()) for f in (tiled, dense))
+        ours, expected = (f(gaussians, camera(), background()) for f in (tiled, reference))
         assert_close(ours, expected, FLOAT64)
         assert all(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(expected[1]))
 
@@ -125,11 +125,11 @@ def test_gradients_are_derivatives():
 def test_the_schedule_does_not_change_the_image(config):
     with jax.enable_x64(True):
         gaussians = random_gaussians(5)
-        expected = dense(gaussians, camera(), background())[0]
+        expected = reference(gaussians, camera(), background())[0]
         assert_close(render(gaussians, camera(), config, background()), expected, FLOAT64)
 
 
-def test_every_knob_means_the_same_as_in_dense():
+def test_every_knob_means_the_same_as_in_the_reference():
     config = dataclasses.replace(
         CHUNKS, near=2.5, eps2d=0.1, alpha_min=0.05, alpha_max=0.8, transmittance_stop=0.02, jacobian_margin=0.0
     )
@@ -146,7 +146,7 @@ def test_float32_differs_only_by_rounding_and_by_decisions():
         exact = jax.tree.map(
             lambda a: jnp.asarray(np.asarray(a, np.float64)), (gaussians, view, background(np.float32))
         )
-        expected = dense(*exact)
+        expected = reference(*exact)
     error = np.abs(np.asarray(ours[0].rgb) - np.asarray(expected[0].rgb)).max(axis=-1)
     assert (
         np.sum(error > bound(FLOAT32)) <= 2
@@ -172,7 +172,7 @@ def test_coincident_depths_are_drawn_by_index():
         level = replace(camera(), cam_from_world=jnp.eye(4))
         flat = replace(gaussians, means=gaussians.means.at[:, 2].set(3.0))
         image, reverse = (tiled(g, level, background())[0] for g in (flat, few(flat, np.arange(COUNT)[::-1])))
-        assert_close(image, dense(flat, level, background())[0], FLOAT64)
+        assert_close(image, reference(flat, level, background())[0], FLOAT64)
         assert np.abs(image.rgb - reverse.rgb).max() > 0.01  # the order is visible, and is that of the index
 
 

@@ -1,6 +1,6 @@
 """One subject, learnt by heart: what the network and its training are able to say at all.
 
-A synthetic person of the package, four photographs of 128 x 128, which are inputs and targets alike. The network is
+A synthetic person of the package, four photos of 128 x 128, which are inputs and targets alike. The network is
 small, has its upsampler, and starts from nothing. With edges of 3 cm, K = 1 has 6,792 Gaussians for the 10,917 pixels of
 the person; so its body has edges of 2 cm.
 """
@@ -56,7 +56,7 @@ def configuration(free: int, longest_edge: float) -> TrainConfig:
 
 
 @pytest.fixture(scope="module")
-def photographs(tmp_path_factory):
+def photos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("people") / "person"
     write_subject(folder, 0, body=load_body(), image_size=SIZE, input_views=4, held_out_views=0)
     return jax.tree.map(jnp.asarray, standardize(load_capture(folder), SIZE))
@@ -64,11 +64,11 @@ def photographs(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("free", "longest_edge"), [(0, 0.02), (4, 0.03)], ids=["K = 1", "K = 5"])
-def test_a_subject_is_learnt_by_heart(photographs, free, longest_edge):
+def test_a_subject_is_learnt_by_heart(photos, free, longest_edge):
     start = time.process_time()
     config = configuration(free, longest_edge)
     body = gaussian_body(load_body(), config.model)
-    example = Example(photographs, photographs)
+    example = Example(photos, photos)
     batch = jax.tree.map(lambda x: x[None], example)
     state = init_state(config)
     for _ in range(STEPS):

@@ -19,15 +19,13 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, PyTree
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import MASK_THRESHOLD, SubjectViews, standardize
-from humangs_jax.fitting.solve import robust
+from humangs_jax.fitting.solve import NORMAL_MAD, robust
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.humangs import HumanGSConfig
 from humangs_jax.objectives.metrics import decibels
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.splatting import plan_buffers, render
 
-NORMAL_MAD = 1.4826
-"""Standard deviations of a normal distribution per median absolute deviation."""
 LEAST_NOISE = 0.02
 """Of colours in [0, 1]: avatars are no better."""
 ROBUST_SCALE = 3.0
@@ -65,9 +63,9 @@ def likeness(variables: PyTree, network: HumanGSConfig, capture: Capture) -> Lik
 
 def _with_margin(avatar, poses, cameras):
     """Buffers for the most demanding view, and for small moves."""
-    needs = []
+    needs, skin_once = [], jax.jit(skin)
     for i in range(len(poses.translation)):
-        posed = jax.jit(skin)(avatar, jax.tree.map(lambda leaf, i=i: leaf[i], poses))
+        posed = skin_once(avatar, jax.tree.map(lambda leaf, i=i: leaf[i], poses))
         needs.append(plan_buffers(posed, cameras[i], SPLAT_PRESETS[avatar.rendering], margin=MARGIN))
     most = lambda name: max(getattr(config, name) for config in needs)
     return dataclasses.replace(needs[0], max_pairs=most("max_pairs"), max_rows=most("max_rows"))

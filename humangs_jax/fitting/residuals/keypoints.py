@@ -52,16 +52,16 @@ def make_observations(points, confidences, K, cam_from_world) -> Observations:
     )
 
 
-def group_by_frame(photographs: Photos, keypoints: Keypoints) -> tuple[Observations, Int[np.ndarray, "m c"]]:
+def group_by_frame(photos: Photos, keypoints: Keypoints) -> tuple[Observations, Int[np.ndarray, "m c"]]:
     """Observations with a leading axis of frames (m, c, ...), and the view (m, c) of each, -1 where there is none."""
-    frames, count = np.asarray(photographs.frames), photographs.frame_count
+    frames, count = np.asarray(photos.frames), photos.frame_count
     members = [np.flatnonzero(frames == frame) for frame in range(count)]
     views = np.full((count, max(len(own) for own in members)), -1)
     for row, own in zip(views, members, strict=True):
         row[: len(own)] = own
     confidences = np.where(views[..., None] < 0, 0.0, keypoints.confidences[views])
     points = np.where(confidences[..., None] > 0, keypoints.points[views], 0.0)
-    cameras = photographs.cameras
+    cameras = photos.cameras
     return make_observations(points, confidences, cameras.K[views], cameras.cam_from_world[views]), views
 
 

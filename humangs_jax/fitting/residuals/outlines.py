@@ -20,7 +20,7 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 PROBE = 1.5
 """Pixels outside of an outline at which there must be no body."""
-NEAR = 0.05
+NEAREST_EDGE = 0.05
 """Metres: edges of faces nearer to the camera than this, or behind it, are no outline."""
 BORDER = 1.0
 """Pixels from the image border within which nothing is an outline: the image ends there, not the person."""
@@ -86,7 +86,7 @@ def _look(vertices, faces, camera):
     rotation, focal = camera.cam_from_world[:3, :3], jnp.stack([camera.K[0, 0], camera.K[1, 1]])
     seen = vertices @ rotation.T + camera.cam_from_world[:3, 3]
     depths = seen[:, 2]
-    pixels = seen[:, :2] / jnp.where(depths > NEAR, depths, 1.0)[:, None] * focal + camera.K[:2, 2]
+    pixels = seen[:, :2] / jnp.where(depths > NEAREST_EDGE, depths, 1.0)[:, None] * focal + camera.K[:2, 2]
     # a plane through the camera with normal n is the line n . (x / fx, y / fy, 1) = 0 of the image
     normals = (vertex_normals(vertices, faces) @ rotation.T)[:, :2] / focal
     normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
@@ -98,7 +98,7 @@ def body_outline(view: BodyView, faces: Int[np.ndarray, "f 3"], edges: MeshEdges
     corners = view.pixels[faces]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     towards = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
-    before = (view.depths > NEAR)[faces].all(axis=1)
+    before = (view.depths > NEAREST_EDGE)[faces].all(axis=1)
     first, second = edges.faces.T
     turns = (towards[first] != towards[second]) | (second < 0)
     chosen = np.flatnonzero(turns & before[first] & (before[second] | (second < 0)))

@@ -26,7 +26,6 @@ import jax.numpy as jnp
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Float, Int
-from humangs_jax.core.configuration import knob
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, owners
@@ -42,7 +41,7 @@ NO_FACE = jnp.iinfo(jnp.int32).max
 
 @dataclasses.dataclass(frozen=True)
 class RasterConfig:
-    """Knobs of the rasterizer; the image depends on `near` alone.
+    """Settings of the rasterizer; the image depends on `near` alone.
 
     near: faces with a corner at z <= near are dropped, in the units of the vertices.
     rows_per_step, fragments_per_step: slots per step of the two loops. Large steps spend
@@ -50,8 +49,8 @@ class RasterConfig:
     """
 
     near: float = 0.01
-    rows_per_step: int = knob(1 << 15, cost="none", gain="fewer, larger steps", measured="performance.md")
-    fragments_per_step: int = knob(1 << 16, cost="none", gain="fewer, larger steps", measured="performance.md")
+    rows_per_step: int = 1 << 15
+    fragments_per_step: int = 1 << 16
 
 
 DEFAULT_CONFIG = RasterConfig()
