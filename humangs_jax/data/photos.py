@@ -147,7 +147,8 @@ def read_photos(
 ) -> Photos:
     """Photos and cameras that a checked capture.json describes.
 
-    Arguments: chosen: read these views only, in this order. poses: how many frames there are; None: as many as views say.
+    Arguments: chosen: read these views only, in this order. poses: how many frames there are; None: one more than the
+    last that a view names.
     Raises: CaptureError.
     """
     file, views = folder / "capture.json", description["views"]

@@ -33,7 +33,7 @@ PER_STEP = 3
 
 
 def by_hand(seed, lengths, dtype, grid=GRID, opacities=(0.05, 1.0)):
-    """Splats around the first tiles, and on each tile a list of so many of them, in depth order."""
+    """Splats around the first tiles, and for each tile a list of as many of them as `lengths` says, in depth order."""
     rng, tile = np.random.default_rng(seed), grid.tile_size
     xy = rng.uniform(-0.6, 3.1, (SPLATS, 2)) * tile
     shape = rng.uniform([0.16, -0.8, 0.16], 0.8, (SPLATS, 3)) / tile

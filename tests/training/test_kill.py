@@ -38,7 +38,7 @@ def kill_in_a_checkpoint_write(arguments, out, moment):
 
 
 def survive(kills, tmp_path, captures):
-    """Kill a run so many times, then let it end; compare with one that was never killed."""
+    """Kill a run `kills` times, then let it end; compare with one that was never killed."""
     options = ["--no-validation", "--batch", "1", "--cache", str(tmp_path / "compiled")]
     killed, whole, generator = tmp_path / "killed", tmp_path / "whole", random.Random(0)
     folder = str(captures[0].parent)

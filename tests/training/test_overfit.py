@@ -32,7 +32,7 @@ SIZE, STEPS = 128, 280
 GOAL = 35.0
 """dB, mean over the views."""
 CPU_SECONDS = 600.0
-"""Of all threads, compilation included: on an idle machine never more than so many seconds of waiting."""
+"""Limit, CPU seconds of all threads, with compilation. On an idle machine the wait is no longer than that."""
 
 
 def configuration(free: int, longest_edge: float) -> TrainConfig:
