@@ -159,7 +159,7 @@ class Case:
                 self.body, first(self.batch).inputs, self.config.model
             )
             self.config = with_model(
-                self.config, token_capacity=foreground(inputs, self.config.model)[0].token_capacity
+                self.config, token_capacity=foreground(inputs, self.config.model)[0].execution.token_capacity
             )
 
     def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float]:

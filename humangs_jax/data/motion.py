@@ -75,6 +75,13 @@ class Motion:
         """One frame."""
         return BodyPose(self.rotations[frame], self.translations[frame])
 
+    def at_rate(self, fps: float | int) -> "Motion":
+        """The motion at another frame rate, by the nearest frames (halves: the later one)."""
+        count = max(1, round(len(self.translations) * fps / self.fps))
+        nearest = np.floor(np.arange(count) * self.fps / fps + 0.5).astype(int)
+        frames = np.clip(nearest, 0, len(self.translations) - 1)
+        return replace(self, rotations=self.rotations[frames], translations=self.translations[frames], fps=float(fps))
+
 
 def load_motion(
     path: str | Path | None = None,

@@ -317,6 +317,16 @@ def test_grounded_stands_on_the_floor_at_the_origin():
     np.testing.assert_allclose(joints[..., 1].min(), sole, atol=FLOAT32)
 
 
+def test_at_rate_takes_the_nearest_frames():
+    motion = Motion(jnp.zeros((120, 2, 3)), jnp.arange(120.0)[:, None] * jnp.ones(3), 120.0)
+    slow = motion.at_rate(30)
+    assert slow.fps == 30.0 and list(np.asarray(slow.translations)[:, 0]) == list(range(0, 120, 4))
+    fast = motion.at_rate(240.0)
+    assert list(np.asarray(fast.translations)[:6, 0]) == [0, 1, 1, 2, 2, 3]
+    assert len(fast.translations) == 240 and float(fast.translations[-1, 0]) == 119
+    assert len(motion.at_rate(0.5).translations) == 1
+
+
 def test_motions_are_pytrees():
     motion = Motion(jnp.zeros((4, 2, 3)), jnp.ones((4, 3)), 24.0)
     poses = jax.vmap(lambda rotations, translation: BodyPose(rotations, translation))(
