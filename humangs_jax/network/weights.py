@@ -117,29 +117,31 @@ def fit_variables(variables: Variables, old: HumanGSConfig, new: HumanGSConfig) 
             raise ValueError(f"{name} {was}: that of trained weights cannot become {wanted}")
     if old_reader.shells not in ((), new_reader.shells):
         raise ValueError(f"shells {old_reader.shells}: those of trained weights cannot become {new_reader.shells}")
-    ours = flatten_variables(variables)
-    fresh = flatten_variables(init_humangs(jax.random.key(0), new))
-    anew = {f"{HEADS}shells_{name}/{kind}" for name in ("hidden", "out") for kind in ("kernel", "bias")} - set(ours)
-    if unknown := sorted((set(ours) - set(fresh)) | (set(fresh) - set(ours) - anew)):
+    ours, wanted = flatten_variables(variables), flatten_variables(expected_variables(new))
+    anew = {key for key in wanted if key.startswith(f"{HEADS}shells_")} - set(ours)
+    if unknown := sorted((set(ours) - set(wanted)) | (set(wanted) - set(ours) - anew)):
         raise ValueError(f"tensor {unknown[0]!r} is in one of the two networks alone")
     if old_decoder.frame != new_decoder.frame:
         anew |= {key for key in ours if key.startswith(f"{HEADS}geometry_out")}
 
-    def fit(key, leaf):
-        if key in anew:
-            return leaf
-        if key == f"{HEADS}trunk_0/kernel" and len(ours[key]) <= len(leaf):
-            rows = len(ours[key])  # shells and normals enter last
-            leaf = leaf.at[rows:].set(0).at[:rows].set(ours[key])
-        elif key.startswith(HEADS) and key.split("/")[-2].endswith("_out"):
-            both = min(leaf.shape[-1], ours[key].shape[-1])  # Gaussians come one after the other
-            leaf = leaf.at[..., :both].set(ours[key][..., :both])
-        elif leaf.shape != ours[key].shape:
-            raise ValueError(f"tensor {key!r} has shape {ours[key].shape}, the other network wants {leaf.shape}")
-        else:
-            leaf = ours[key]
-        return leaf
+    differ = {key for key in set(ours) - anew if ours[key].shape != wanted[key].shape}
+    heads = {key for key in differ if key.startswith(HEADS) and key.split("/")[-2].endswith("_out")}
+    trunk = {key for key in differ if key == f"{HEADS}trunk_0/kernel" and len(ours[key]) <= len(wanted[key])}
+    if wrong := sorted(differ - heads - trunk):
+        was, now = ours[wrong[0]].shape, wanted[wrong[0]].shape
+        raise ValueError(f"tensor {wrong[0]!r} has shape {was}, the other network wants {now}")
+    if not (anew | differ):
+        return variables
 
+    def fit(key, leaf):
+        if key in trunk:  # shells and normals enter last
+            return leaf.at[len(ours[key]) :].set(0).at[: len(ours[key])].set(ours[key])
+        if key in heads:  # Gaussians come one after the other
+            both = min(leaf.shape[-1], ours[key].shape[-1])
+            return leaf.at[..., :both].set(ours[key][..., :both])
+        return leaf if key in anew else ours[key]
+
+    fresh = flatten_variables(init_humangs(jax.random.key(0), new))  # compiles for a while: only where it is needed
     structure = jax.tree.structure(expected_variables(new))
     return jax.tree.unflatten(structure, [fit(key, leaf) for key, leaf in fresh.items()])
 
