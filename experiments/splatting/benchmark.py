@@ -11,7 +11,7 @@ An image is shared between two of XLA's host devices where there are two cores (
 Prints tables and writes {"forward_ms", "forward_backward_ms", "forward_cpu_ms", "forward_backward_cpu_ms" (medians),
 "yardstick": {the same} or null, "ratio": ours / yardstick, "compile_s", "peak_rss_mb", "psnr", "max_abs_error",
 "fraction_above_2e-4", "gradient_relative_l2", "gradient_cosine", "gradient_signed_bias", "gradient_gain": {parameter:
-number}, "work", "config", "devices", ...}; what needs a reference that is not given is null.
+number}, "work", "config", "devices", ...}; values that need a missing reference are null.
 
 Expected: psnr at least 95 dB (90 where a head's tiles are crowded), gradients within 1e-3, cosine above 0.99999, and in
 float64 no error above 1e-6. On 2 cores of an AMD EPYC (Zen 4), 52,375 Gaussians at 512: see docs/performance.md.

@@ -24,7 +24,7 @@ class SurfacePoints:
 def shaped(
     mean: Float[Array, "p 3"], directions: Float[Array, "p 3 s"], betas: Float[Array, " s_used"]
 ) -> Float[Array, "p 3"]:
-    """Points or joints of a person in T-pose, metres; coefficients that are not given are 0."""
+    """Points or joints of a person in T-pose, metres; missing coefficients are 0."""
     return mean + jnp.einsum("pas,s->pa", directions[..., : betas.shape[0]], betas, precision=skinning.EXACT)
 
 
