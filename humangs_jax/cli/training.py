@@ -56,7 +56,7 @@ class Train:
     """Checkpoints, log, TensorBoard curves, validation images and weights.safetensors."""
     config: str = "small"
     """small, paper, published or tiny, or a JSON file of settings like the config.json of a run."""
-    live: int = 0
+    on_the_fly: int = 0
     """Also (or without DATA only) train on this number of synthetic people who are rendered anew for every step."""
     validation: Path | None = None
     """Folder of capture folders of other people, evaluated now and then."""
@@ -72,7 +72,7 @@ class Train:
 
     def run(self) -> None:
         """Train, or diagnose."""
-        require_at_least(0, live=self.live)
+        require_at_least(0, on_the_fly=self.on_the_fly)
         self.processes.join()  # before anything asks for devices
         from humangs_jax.body.library import load_body
         from humangs_jax.network.weights import load_weights
@@ -93,7 +93,7 @@ class Train:
             model = dataclasses.replace(model, execution=settings.model.execution)
             settings = dataclasses.replace(settings, model=model)
         body = load_body()
-        people = training_people(self.data, self.live, self.out, body)
+        people = training_people(self.data, self.on_the_fly, self.out, body)
         if self.diagnose:
             print(diagnose_run(self.out, body, people, networks=networks, variables=variables))
             return

@@ -17,9 +17,9 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.configuration import config_from_file, config_to_json
+from humangs_jax.core.configuration import config_to_json
 from humangs_jax.io.atomic import write_text
-from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.config import TrainConfig, train_config_from_file
 from humangs_jax.training.state import TrainState
 
 logger = logging.getLogger(__name__)
@@ -136,7 +136,7 @@ def load_config(out: str | Path) -> TrainConfig:
     path = Path(out) / "config.json"
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no run here")
-    return config_from_file(TrainConfig, path)
+    return train_config_from_file(path)
 
 
 def _placed_as(value, like):

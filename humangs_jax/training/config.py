@@ -3,8 +3,9 @@
 import dataclasses
 import itertools
 from collections.abc import Collection
+from pathlib import Path
 
-from humangs_jax.core.configuration import knob
+from humangs_jax.core.configuration import config_from_file, knob
 from humangs_jax.data.loader import ViewSampling
 from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig
@@ -177,6 +178,19 @@ def tiny() -> TrainConfig:
 
 
 PRESETS = {"published": published, "paper": paper, "small": small, "tiny": tiny}
+
+
+def train_config_from_file(path: Path) -> TrainConfig:
+    """The run of a JSON file, such as the config.json of a run. Raises: OSError; ValueError, naming file and field."""
+    try:
+        return config_from_file(TrainConfig, path)
+    except ValueError as error:
+        if "HumanGSConfig has no such field" not in str(error):
+            raise
+        raise ValueError(
+            f"{error}: expected architecture, conventions and execution. A run of a version before `model` was divided so "
+            "cannot be continued: start another with --init-weights (its weights.safetensors still loads) and another --out"
+        ) from error
 
 
 def without_losses(config: TrainConfig, names: Collection[str]) -> TrainConfig:

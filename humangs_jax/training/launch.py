@@ -7,10 +7,9 @@ from pathlib import Path
 import jax
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.core.configuration import config_from_file
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.people import SPLITS, build_bank, find_people, load_bank, save_bank
-from humangs_jax.training.config import PRESETS, TrainConfig, without_losses
+from humangs_jax.training.config import PRESETS, TrainConfig, train_config_from_file, without_losses
 from humangs_jax.training.sources import MakeSource, captured_people, mixed_people, on_the_fly_people
 
 logger = logging.getLogger(__name__)
@@ -26,21 +25,21 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
     path = Path(preset_or_path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: neither a file nor one of the presets {', '.join(PRESETS)}")
-    return config_from_file(TrainConfig, path)
+    return train_config_from_file(path)
 
 
-def training_people(data: Path | None, live: int, out: Path, body: BodyModel) -> MakeSource:
-    """The people of a folder of captures, `live` people made on the fly, or both by halves.
+def training_people(data: Path | None, on_the_fly: int, out: Path, body: BodyModel) -> MakeSource:
+    """The people of a folder of captures, `on_the_fly` synthetic people rendered for every step, or both by halves.
 
     The latter are made once, into out/people.npz, by one process. Raises: ValueError if there are none.
     """
     parts = []
     if data is not None:
         parts.append(captured_people(find_people(data), body))
-    if live:
-        parts.append(on_the_fly_people(_bank(live, out, body)))
+    if on_the_fly:
+        parts.append(on_the_fly_people(_bank(on_the_fly, out, body)))
     if not parts:
-        raise ValueError("nobody to train on: name a folder of captures, or give --live a number of people")
+        raise ValueError("nobody to train on: name a folder of captures, or give --on-the-fly a number of people")
     return parts[0] if len(parts) == 1 else mixed_people(parts, [1] * len(parts))
 
 

@@ -15,7 +15,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.network.parts import HumanGSOutputs
-from humangs_jax.network.stages import Stage, call
+from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.losses import squared_error, tightness
 from humangs_jax.objectives.lpips import lpips
@@ -60,7 +60,7 @@ def loss_terms(
     targets: SubjectViews,
     config: LossConfig,
     networks: LossNetworks = NO_NETWORKS,
-    stage: Stage = call,
+    stage: StageCaller = call,
 ) -> Metrics:
     """The unweighted terms of `LossConfig` by name, for renderings on the backgrounds of `images`.
 
@@ -109,7 +109,7 @@ def subject_loss(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
     axis_name: str | tuple[str, ...] | None = None,
-    stage: Stage = call,
+    stage: StageCaller = call,
 ) -> tuple[Scalar, tuple[PyTree, Metrics]]:
     """Loss of one subject, with the updated batch statistics and metrics. stage: see `network.stages`."""
     variables = {"params": params, "batch_stats": batch_stats}

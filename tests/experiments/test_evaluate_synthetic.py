@@ -97,7 +97,7 @@ def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch)
     assert report["views"] == 1 and report["lpips"] is None and set(report["by_views"]) == {"1"}
 
     made.clear(), drawn.clear()
-    run(synthetic, monkeypatch, "--subjects", 2, "--views", 2, 1, *options, "--page", page, "--pictures", pictures)
+    run(synthetic, monkeypatch, "--subjects", 2, "--views", 2, 1, *options, "--page", page, "--images", pictures)
     assert made == [first, second] and drawn == [(first, 2), (second, 2)]  # the rows of one photo are kept
     assert "| new views, same pose | 2 |" in page.read_text() and page.read_text().endswith("After\n")
     report = json.loads(out.read_text())
@@ -112,7 +112,7 @@ def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch)
 
     made.clear(), drawn.clear()
     pictures.unlink()
-    run(synthetic, monkeypatch, "--subjects", 1, "--views", 2, *options, "--pictures", pictures)
+    run(synthetic, monkeypatch, "--subjects", 1, "--views", 2, *options, "--images", pictures)
     assert drawn == [(first, 2)] and pictures.is_file()  # for its pictures alone
     report = json.loads(out.read_text())
     assert [person["seed"] for person in report["others"]] == [second] and len(report["subjects"]) == 1
@@ -151,7 +151,7 @@ def test_bodies_see_the_same_photos_and_what_they_cost_is_noted(weights, tmp_pat
     assert page.read_text().count("\n| ") == len(costs) + 2
 
     seen.clear()
-    run(bodies, monkeypatch, *options, "--pictures", pictures)
+    run(bodies, monkeypatch, *options, "--images", pictures)
     assert len(seen) == 8 and pictures.is_file()  # for the pictures alone
 
 
