@@ -15,6 +15,7 @@ A view agrees with a landmark by how near its keypoint is to the best of the poi
 
 import dataclasses
 import itertools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -49,12 +50,12 @@ MIRRORED_SHARE, MIRRORED_GAIN = 0.6, 60.0
 class Swap:
     """One exchange that explains a disagreement; `str()` is a sentence about it.
 
-    kind: "sides", "cameras", "all sides" or "hands". views: names of the views. instead: alternatives that explain it as well;
-    for cameras pairs ("a and b"). gain: how much better the views agree without it, as a share of what is attainable; for "all
-    sides": the share by which the cost of the fit falls. frames: for cameras, in how many; the views are those of the first.
+    views: names of the views. instead: alternatives that explain it as well; for cameras pairs ("a and b"). gain: how much better
+    the views agree without it, as a share of what is attainable; for "all sides": the share by which the cost of the fit falls.
+    frames: for cameras, in how many; the views are those of the first.
     """
 
-    kind: str
+    kind: Literal["sides", "cameras", "all sides", "hands"]
     views: tuple[str, ...]
     gain: float
     instead: tuple[str, ...] = ()

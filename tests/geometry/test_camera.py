@@ -47,7 +47,7 @@ def test_rays_pass_through_the_pixel_centres_they_belong_to():
     assert np.allclose(moment[5, 9], np.cross(origin, direction[5, 9]), atol=ATOL)
 
 
-def test_resizing_and_units_keep_the_picture():
+def test_resizing_and_units_keep_the_image():
     c, point = ring()[1], jnp.asarray([0.2, 1.0, 0.1])
     uv, depth = cameras.project(c, point)
     doubled, _ = cameras.project(c.resized(64, 64), point)

@@ -6,7 +6,7 @@ pixel centres still those of the source. `in_capture_convention` makes metres, y
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -36,7 +36,7 @@ CONVENTIONS = {
 }
 """What a matrix in a file may mean, and the cam_from_world with OpenCV's axes that follows. OpenCV: x right,
 y down, z forward; OpenGL: x right, y up, z backwards."""
-PIXEL_CENTERS = ("integer", "half")
+PixelCenters = Literal["integer", "half"]
 """Where the centre of the first pixel is: at (0, 0), as OpenCV has it, or at (0.5, 0.5)."""
 
 
@@ -81,7 +81,7 @@ class Calibration:
     file: Path
     cameras: tuple[CalibratedCamera, ...]
     per_image: bool
-    pixel_centers: str
+    pixel_centers: PixelCenters
     up: str
     observations: Observations | None = None
     convention: str = CAM_FROM_WORLD
