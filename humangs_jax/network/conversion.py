@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from humangs_jax.io.tensor_file import is_safetensors, read_tensors, safetensors_metadata
+from humangs_jax.io.tensor_file import is_safetensors, read_safetensors, read_tensors
 from humangs_jax.network.config import Architecture, HumanGSConfig, paper_parts
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.presets import published
 from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
-from humangs_jax.network.triplane import TriplaneConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
 from humangs_jax.network.weights import FORMAT, expected_variables, flatten_variables, variables_from_tensors
@@ -155,7 +155,7 @@ def read_state_dict(path: str | os.PathLike) -> tuple[StateDict, int]:
 
     Raises: OSError; ValueError if the file is damaged, is none, or holds anything but tensors.
     """
-    if is_safetensors(path) and safetensors_metadata(path).get("format") == FORMAT:
+    if is_safetensors(path) and read_safetensors(path, lambda _: False)[2].get("format") == FORMAT:
         raise ValueError(f"{path} is a weights file already: nothing to convert")
     return read_tensors(path, lambda key: not key.startswith(LOSS_PREFIX))
 

@@ -11,8 +11,7 @@ from collections.abc import Generator
 import jax.numpy as jnp
 
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.io.matconvnet import is_matlab_file, read_matconvnet
-from humangs_jax.io.tensor_file import read_tensors
+from humangs_jax.io.tensor_file import is_matlab_file, read_matconvnet, read_tensors
 from humangs_jax.network.conversion import LOSS_PREFIX
 from humangs_jax.objectives.backbones import Convolution, Weights, convolutions
 from humangs_jax.objectives.layer_names import (

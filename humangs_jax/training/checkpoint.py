@@ -118,7 +118,6 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
     Raises: ValueError, naming a field, if the folder belongs to a run of another configuration.
     """
     path = Path(out) / "config.json"
-    fields = json.loads(config_to_json(config))
     if path.is_file():
         earlier, now = (_flat(json.loads(config_to_json(run))) for run in (load_config(out), config))
         for name in sorted((earlier.keys() | now.keys()) - set(ADJUSTABLE)):
@@ -126,9 +125,8 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
                 raise ValueError(
                     f"{path}: this run was started with {name} = {earlier.get(name)}, not {now.get(name)}: use another --out"
                 )
-    if not write:
-        return
-    write_text(path, json.dumps(fields, indent=1))
+    if write:
+        write_text(path, config_to_json(config, indent=1))
 
 
 def load_config(out: str | Path) -> TrainConfig:

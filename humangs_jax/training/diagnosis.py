@@ -10,34 +10,19 @@ import numpy as np
 from humangs_jax.core.array_types import PyTree
 from humangs_jax.network.stages import inexact_leaves
 
-AXES = {
-    "images": "view row column",
-    "masks": "view row column",
-    "K": "view",
-    "cam_from_world": "view",
-    "rotations": "view joint",
-    "translations": "view",
-    "posed_vertices": "view vertex",
-    "canonical_vertices": "vertex",
-    "position_maps": "view row column",
-    "depth_maps": "view row column",
-    "pixels": "view row column",
-    "tokens": "token",
-    "input norm": "token",
-    "block": "token",
-    "final norm": "token",
-    "maps": "view row column",
-    "encoding": "view row column",
-    "rgb": "view row column",
-    "alpha": "view row column",
-    "global_token": "feature",
-    "vertex features": "vertex",
-    "raw heads": "vertex Gaussian",
-    "canonical Gaussians": "Gaussian",
-    "tight_offsets": "vertex Gaussian",
-    "posed Gaussians": "view Gaussian",
-    "projected splats": "view Gaussian",
+_COUNTED = {
+    "view": ("K", "cam_from_world", "translations"),
+    "view joint": ("rotations",),
+    "view vertex": ("posed_vertices",),
+    "view row column": ("images", "masks", "position_maps", "depth_maps", "pixels", "maps", "encoding", "rgb", "alpha"),
+    "view Gaussian": ("posed Gaussians", "projected splats"),
+    "vertex": ("canonical_vertices", "vertex features"),
+    "vertex Gaussian": ("raw heads", "tight_offsets"),
+    "token": ("tokens", "input norm", "block", "final norm"),
+    "feature": ("global_token",),
+    "Gaussian": ("canonical Gaussians",),
 }
+AXES = {name: axes for axes, names in _COUNTED.items() for name in names}
 """What the leading axes of an array count: by the last part of its name, or else by its stage."""
 
 Direction = Literal["stored", "forward", "backward"]

@@ -5,8 +5,7 @@ import pytest
 
 from humangs_jax.geometry import camera as cameras
 from humangs_jax.geometry import transform
-from humangs_jax.geometry.camera import Camera
-from humangs_jax.geometry.rays import pixel_rays, plucker_rays
+from humangs_jax.geometry.camera import Camera, pixel_rays, plucker_rays
 
 ATOL = 1e-5
 K = np.array([[100.0, 0, 16], [0, 110, 12], [0, 0, 1]])

@@ -120,7 +120,7 @@ def test_safetensors_state_dicts(tmp_path):
     leaves = zip(*(jax.tree.leaves(x.variables) for x in (ours, other)), strict=True)
     assert all(np.array_equal(*pair) for pair in leaves)
     (tmp_path / "broken.safetensors").write_bytes((tmp_path / "a.safetensors").read_bytes()[:-9])
-    with pytest.raises(ValueError, match="no readable safetensors file"):
+    with pytest.raises(ValueError, match="not a readable safetensors file"):
         read_state_dict(tmp_path / "broken.safetensors")
     with pytest.raises(FileNotFoundError, match="nowhere"):
         read_state_dict(tmp_path / "nowhere.safetensors")

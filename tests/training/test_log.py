@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.data.loader import Waiting
-from humangs_jax.training.log import RunLog, forget_after
+from humangs_jax.training.log import MANY_SKIPPED, RunLog, Watch, forget_after
 from humangs_jax.training.optimizer import GuardState
 from humangs_jax.training.state import TrainState
-from humangs_jax.training.watch import MANY_SKIPPED, Watch
 
 
 def read(path):
