@@ -88,7 +88,7 @@ def fit_one(seed, kind, body, arguments):
     """Scores of one scan, and what a picture of it needs."""
     import jax.numpy as jnp
 
-    from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan_points
+    from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan
     from humangs_jax.fitting.scan_reading import sample_scan
 
     true, landmarks, vertices, faces = person(seed, kind, body)
@@ -97,7 +97,7 @@ def fit_one(seed, kind, body, arguments):
     joints = None if arguments.without_joints else dict(zip(JOINTS, noisy, strict=True))
     start = time.perf_counter()
     scan = sample_scan(place(vertices), faces)
-    fit = fit_scan_points(scan, body=body, joints=joints, clothed=kind == "clothed")
+    fit = fit_scan(scan, body=body, joints=joints, clothed=kind == "clothed")
     seconds = time.perf_counter() - start
     fitted = place.inverse()(body_in_scan(fit))
     vertex = 1000 * np.linalg.norm(fitted - true, axis=1)

@@ -105,6 +105,11 @@ def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
     return (matrices - jnp.eye(3, dtype=matrices.dtype)).reshape(-1)
 
 
+def person_vertices(body: BodyModel, betas: Float[Array, " s_used"], pose: BodyPose) -> Float[Array, "n 3"]:
+    """Vertices of a person in a pose, metres."""
+    return pose_body(body, shape_body(body, betas), pose).vertices
+
+
 def pose_body(body: BodyModel, rest: RestBody, pose: BodyPose) -> PosedBody:
     """Pose a shaped body: correctives, blend skinning, translation."""
     vertices = rest.vertices

@@ -21,7 +21,6 @@ class Demo:
     """Side of the animation's frames in pixels."""
 
     def run(self) -> None:
-        """Run the demonstration."""
         from humangs_jax.apps.demo import run_demo
 
         run_demo(self.out, weights=self.weights, frame_size=self.size)
@@ -44,7 +43,6 @@ class Reconstruct:
     """Number type of the encoder's matrix products. bfloat16 is faster on GPU and TPU."""
 
     def run(self) -> None:
-        """Write the avatar."""
         from humangs_jax.avatar.reconstruct import reconstruct
         from humangs_jax.data.capture import load_capture
         from humangs_jax.network.weights import load_weights
@@ -78,7 +76,6 @@ class Animate:
     """Degrees that the camera travels around the avatar during the motion."""
 
     def run(self) -> None:
-        """Write the video."""
         from humangs_jax.avatar.avatar import Avatar
         from humangs_jax.avatar.frames import motion_frames
         from humangs_jax.avatar.video import write_video
@@ -111,7 +108,6 @@ class Render:
     """Also write views.exr: float32 RGBA, depth Z and camera matrices, one part per view."""
 
     def run(self) -> None:
-        """Write the images."""
         from humangs_jax.avatar.avatar import Avatar
         from humangs_jax.avatar.frames import capture_renderings, turntable_renderings, write_renderings
         from humangs_jax.data.capture import load_capture
@@ -141,7 +137,6 @@ class Export:
     """Add the 45 zero f_rest fields that some importers (Unity) require."""
 
     def run(self) -> None:
-        """Write the Gaussians."""
         from humangs_jax.avatar.animate import animate
         from humangs_jax.avatar.avatar import Avatar
         from humangs_jax.avatar.export import write_ply

@@ -217,7 +217,6 @@ class Check:
     """The contact sheet to write; that of the keypoints is NAME_fit.png beside it."""
 
     def run(self) -> None:
-        """Write the sheets."""
         from humangs_jax.apps.check import check_capture
         from humangs_jax.data.capture import load_capture
         from humangs_jax.data.photos import capture_folder

@@ -71,7 +71,6 @@ class Train:
     numbers are not finite."""
 
     def run(self) -> None:
-        """Train, or diagnose."""
         require_at_least(0, on_the_fly=self.on_the_fly)
         self.processes.join()  # before anything asks for devices
         from humangs_jax.body.library import load_body
@@ -99,14 +98,7 @@ class Train:
             return
         others = find_people(self.validation, None) if self.validation is not None else ()
         train(
-            settings,
-            body,
-            people,
-            self.out,
-            validation=others,
-            variables=variables,
-            networks=networks,
-            fsdp=self.fsdp,
+            settings, body, people, self.out, validation=others, variables=variables, networks=networks, fsdp=self.fsdp
         )
 
 
@@ -128,10 +120,9 @@ class Convert:
     pool: Literal["all", "visible"] = "all"
     """Average a vertex's features over all views (as released) or over those that see it."""
     dtype: Literal["float32", "float16"] = "float32"
-    """Of the stored numbers; float16 halves the file."""
+    """Type of the stored numbers; float16 halves the file."""
 
     def run(self) -> None:
-        """Write the weights."""
         from safetensors.numpy import save_file
 
         from humangs_jax.io.atomic import replace_file

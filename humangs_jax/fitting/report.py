@@ -200,7 +200,7 @@ GROUPS = {
 
 
 def limit_violations(joint_names: tuple[str, ...], poses: BodyPose) -> tuple[Violation, ...]:
-    """Of a batch of poses, by frame."""
+    """Violations of joint limits in a batch of poses, by frame."""
     prior, rotations = pose_prior(joint_names), np.asarray(poses.rotations)
     return tuple(
         Violation(frame, joint_names[j], "xyz"[axis], float(np.rad2deg(beyond)))

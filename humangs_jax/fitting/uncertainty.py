@@ -23,7 +23,7 @@ UNSEEN = 1e-8
 
 @pytree_dataclass
 class Uncertainty:
-    """Of m frames (numpy on the host).
+    """The uncertainty of a fit of m frames (numpy on the host).
 
     joint_covariances: (m, j, 3, 3) of the joints' positions, square metres. determined: (m, j) share of the prior's variance of
     a joint's rotation, mean over axes, that the views remove: 1 all, 0 nothing, as for joints that no keypoint depends on.
@@ -73,7 +73,7 @@ def fit_uncertainty(
 
 
 def _determined(problem, config, poses):
-    """(m, j) of the variances of the unknowns, in the order global_orient, transl, body_pose."""
+    """`Uncertainty.determined` from the covariance (m, p, p) of the unknowns, in the order global_orient, transl, body_pose."""
     joints, variances = np.asarray(problem.origin.joints), np.diagonal(poses, axis1=-2, axis2=-1)
     left = variances[:, 6:].reshape(len(poses), len(joints), 3)
     std = np.radians(problem.origin.std.global_orient) * np.sqrt(variances[:, :3])
@@ -85,7 +85,7 @@ def _determined(problem, config, poses):
 
 @functools.partial(jax.jit, static_argnames="config")
 def _derivatives(model, observations, fit, config):
-    """Of the residuals (m, r, .) and of the joints (m, j, 3, .), by pose and by shape."""
+    """Derivatives of the residuals (m, r, .) and of the joints (m, j, 3, .), by pose and by shape."""
     problem = keypoint_problem(model, config)
 
     def both(seen, vector, betas):

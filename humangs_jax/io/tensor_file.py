@@ -69,8 +69,8 @@ def read_matconvnet(path: str | os.PathLike) -> Tensors:
 
 
 def _convolutions(cells: np.ndarray) -> Tensors:
-    """Of structures with a `type`: "conv" has its filters (rows, columns, in, out) and biases under `weights`, or in older files
-    under `filters` and `biases`.
+    """From structures with a `type`. A "conv" has its filters (rows, columns, in, out) and biases under `weights`, or in older
+    files under `filters` and `biases`.
     """
     tensors = {}
     for index, layer in enumerate(cell.ravel()[0] for cell in cells.ravel()):

@@ -12,6 +12,7 @@ import statistics
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from humangs_jax.io.tensor_file import is_safetensors, read_safetensors, read_tensors
@@ -33,7 +34,7 @@ SKINNING_WEIGHTS = "tpose_lbs_weights"
 UNSUPPORTED = "target_pose_tokenizer.1.weight"
 """Marks a variant of the network (canonical target maps) that does not exist here."""
 COUNTER = "num_batches_tracked"
-"""Of every batch norm; means nothing here."""
+"""A counter that torch keeps in every batch norm; it is ignored."""
 PIXEL_CHANNELS = 9
 """rgb and ray, beside the pose features."""
 
@@ -141,13 +142,8 @@ def to_release(variables: Variables) -> StateDict:
 
 def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
     """Shapes of the state dict that the release has for a configuration, without the body's skinning weights."""
-    shapes = {}
-    for path, leaf in flatten_variables(expected_variables(config)).items():
-        key, layout = release_name(path)
-        shapes[key] = layout.to_release(np.broadcast_to(np.float32(0), leaf.shape)).shape
-        if key.endswith("running_var"):
-            shapes[f"{key.removesuffix('running_var')}{COUNTER}"] = ()
-    return shapes
+    empty = jax.tree.map(lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), expected_variables(config))
+    return {key: tensor.shape for key, tensor in to_release(empty).items()}
 
 
 def read_state_dict(path: str | os.PathLike) -> tuple[StateDict, int]:

@@ -22,8 +22,6 @@ from humangs_jax.io.atomic import write_text
 from humangs_jax.training.config import TrainConfig, train_config_from_file
 from humangs_jax.training.state import TrainState
 
-logger = logging.getLogger(__name__)
-
 UNSCORED = -1e9
 """Score of a checkpoint that was saved before any validation: worse than every other."""
 ADJUSTABLE = ("log_every", "validate_every", "checkpoint_every", "keep_checkpoints", "microbatch_size")

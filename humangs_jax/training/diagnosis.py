@@ -60,7 +60,6 @@ class Leaf:
 
     @property
     def magnitude(self) -> float:
-        """The largest magnitude."""
         return max(abs(self.smallest), abs(self.largest)) if self.smallest <= self.largest else 0.0
 
 
@@ -111,7 +110,7 @@ class Fault:
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """Of one subject of one step: the first with a fault, or else the one of the largest gradient.
+    """The diagnosis of one subject of a step: the first with a fault, or else the one with the largest gradient.
 
     step: steps done before it. stored: what the step began with, state and batch. stages: in the order of the forward
     pass. skip_norm: gradients longer than this are skipped. `str` of it is a report.
@@ -152,7 +151,7 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """In a line or a few."""
+        """What was found, in one line or a few."""
         if self.faults:
             return "\n".join(map(str, self.faults))
         norm = self.gradient_norm
@@ -172,7 +171,7 @@ class Diagnosis:
 
 
 def leaves(tree: PyTree) -> tuple[Leaf, ...]:
-    """Of all arrays of a tree that could be NaN."""
+    """The numbers of all floating-point arrays of a tree."""
     return tuple(Leaf.of(name, np.asarray(leaf)) for name, leaf in inexact_leaves(tree))
 
 

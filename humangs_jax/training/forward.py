@@ -86,7 +86,6 @@ def draw_targets(
 
 
 def white_backgrounds(targets: SubjectViews) -> Float[Array, "v 3"]:
-    """White for every target."""
     return jnp.ones((*targets.translations.shape[:-1], 3), targets.images.dtype)
 
 

@@ -117,7 +117,7 @@ class Watch:
         self._pending = done, {name: metrics[name] for name in names}
 
     def look(self) -> None:
-        """At the step that waits."""
+        """Read the metrics of the pending step, and report it if it failed."""
         if self._pending is None:
             return
         done, metrics = self._pending

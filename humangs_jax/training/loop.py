@@ -143,7 +143,6 @@ def _rehearse(make_source, config, step, state, body, networks, mesh):
 
 
 def _report(log, out, done, numbers, image):
-    """Of a validation."""
     log.numbers(done, {f"val_{name}": value for name, value in numbers.items()}, "validation")
     write_png(out / "sheets" / f"{done:07d}.png", image)
     log.image(done, "validation/sheet", image)

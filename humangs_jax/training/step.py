@@ -142,7 +142,7 @@ def local_gradients(
     networks: LossNetworks = NO_NETWORKS,
     axes: tuple[str, ...] = (),
 ) -> Gradients:
-    """Of the subjects of one device: means over them, but sums of what was dropped. keys: one per subject.
+    """Gradients of one device's subjects: means over them, but sums of what was dropped. keys: one per subject.
 
     `config.microbatch_size` subjects are worked on at once, the gradients accumulate over the rest. axes: of the mesh,
     along which batch statistics are shared too. Raises: ValueError if the subjects cannot be divided so.

@@ -45,11 +45,7 @@ def validation_examples(cache: CaptureCache, config: TrainConfig, count: int) ->
 
 @functools.partial(jax.jit, static_argnames="config")
 def evaluate(
-    variables: Variables,
-    body: BodyModel,
-    example: Example,
-    config: TrainConfig,
-    networks: LossNetworks = NO_NETWORKS,
+    variables: Variables, body: BodyModel, example: Example, config: TrainConfig, networks: LossNetworks = NO_NETWORKS
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
     """The images of one example's targets and their mean psnr, psnr_mask (both dB), ssim, and lpips if its network is
     there.

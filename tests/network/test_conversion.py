@@ -26,8 +26,7 @@ from humangs_jax.network.conversion import (
 from humangs_jax.network.presets import published
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.weights import load_weights
-from humangs_jax.objectives.layer_names import expected_tensors
-from humangs_jax.objectives.loss_networks import load_lpips
+from humangs_jax.objectives.loss_networks import expected_tensors, load_lpips
 
 VARIANTS = [
     Options(),
