@@ -51,8 +51,8 @@ def main(
     from humangs_jax.data.loader import find_captures
     from humangs_jax.network.weights import fit_variables, load_weights
     from humangs_jax.people import Layout, write_set
-    from humangs_jax.training.launch import training_people
     from humangs_jax.training.loop import train
+    from humangs_jax.training.sources import training_people
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     body, variables = load_body(), None

@@ -77,9 +77,10 @@ class Train:
         from humangs_jax.network.weights import load_weights
         from humangs_jax.objectives.loss_networks import load_loss_networks
         from humangs_jax.people import find_people
+        from humangs_jax.training.config import fitting_losses, read_config
         from humangs_jax.training.diagnose import diagnose_run
-        from humangs_jax.training.launch import fitting_losses, read_config, training_people
         from humangs_jax.training.loop import train
+        from humangs_jax.training.sources import training_people
 
         files = self.networks
         networks = load_loss_networks(files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.io.atomic import write_text
-from humangs_jax.training.config import TrainConfig, train_config_from_file
+from humangs_jax.training.config import TrainConfig, read_config
 from humangs_jax.training.state import TrainState
 
 UNSCORED = -1e9
@@ -132,7 +132,7 @@ def load_config(out: str | Path) -> TrainConfig:
     path = Path(out) / "config.json"
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no run here")
-    return train_config_from_file(path)
+    return read_config(path)
 
 
 def _placed_as(value, like):

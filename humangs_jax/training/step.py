@@ -86,7 +86,7 @@ def loss_terms(
 
 def _required(network, name, title):
     if network is None:
-        raise ValueError(f"loss.{name} is not 0, but there is no {title}: pass its weights, or use `without_losses`")
+        raise ValueError(f"loss.{name} is not 0, but there is no {title}: pass its weights, or use `fitting_losses`")
     return network
 
 

@@ -9,8 +9,8 @@ import pytest
 from humangs_jax.core.configuration import config_from_file, config_from_json, config_to_json
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training import config
-from humangs_jax.training.config import Stage, TrainConfig, small, tiny
-from humangs_jax.training.launch import fitting_losses, read_config, training_people
+from humangs_jax.training.config import Stage, TrainConfig, fitting_losses, read_config, small, tiny
+from humangs_jax.training.sources import training_people
 
 STAGED = dataclasses.replace(
     tiny(), steps=10, batch_size=3, stages=(Stage(4, image_size=64, batch_size=2), Stage(8, target_size=32))
