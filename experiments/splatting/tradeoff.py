@@ -232,14 +232,14 @@ def pareto(rows: Sequence[dict[str, Any]], time: str) -> list[dict[str, Any]]:
 
 def table(result: dict[str, Any]) -> str:
     """Markdown."""
-    header = ["setting", "forward: CPU, wall", "forward+backward: CPU, wall", "PSNR, dB", "largest error", "gradients"]
+    header = ["setting", "forward, CPU", "forward+backward, CPU", "PSNR, dB", "largest error", "gradients"]
     exact = result["exact"]
-    milliseconds = (f"{exact[name]['cpu_ms']:.0f}, {exact[name]['wall_ms']:.0f} ms" for name in DIRECTIONS)
+    milliseconds = (f"{exact[name]['cpu_ms']:.0f} ms" for name in DIRECTIONS)
     error = lambda row: [f"{row['psnr']:.1f}", f"{row['max_abs_error']:.1g}", f"{row['gradient_relative_l2']:.1g}"]
     rows = [["exact", *milliseconds, *error(exact)]]
     for row in result["settings"]:
         label = f"**{row['label']}**" if row["knob"] == "preset" else row["label"]
-        times = (f"{row[f'{name}_cpu']:.2f}, {row[f'{name}_wall']:.2f}" for name in DIRECTIONS)
+        times = (f"{row[f'{name}_cpu']:.2f}" for name in DIRECTIONS)
         rows.append([label, *times, *error(row)])
     title = (
         f"{result['scene']}, {result['gaussians']:,} Gaussians at {result['size']}; times relative to the exact ones."

@@ -13,7 +13,6 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -35,7 +34,11 @@ def main() -> None:
     parser.add_argument("--validation", type=Path, required=True, help="captures of other people")
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--start", type=Path, help="weights to start from; the shipped ones if not given")
-    parser.add_argument("--fresh", action="store_true", help="start from nothing; has a table of its own")
+    parser.add_argument(
+        "--fresh",
+        action="store_true",
+        help="start from nothing; table training_pilots_fresh, which needs a --page with its markers",
+    )
     parser.add_argument("--steps", type=int, default=150, help="of each run")
     parser.add_argument("--only", nargs="+", help="names of the runs to make; all if not given")
     parser.add_argument("--page", type=Path, default=DOCS, help="page with the table")
@@ -136,7 +139,7 @@ def run(arguments, parser) -> None:
         row |= {"steps": config.steps, "config": json.loads(config_to_json(config)), "on_the_fly": on_the_fly}
         rows = kept(path, settings, parser) | {name: row}  # another process may have added to it
         write_json(path, {"settings": settings, "runs": rows})
-    write_table(arguments.page, kept(path, settings, parser), list(runs), table)
+    write_table(arguments.page, kept(path, settings, parser), table)
 
 
 def kept(path, settings, parser):
@@ -182,8 +185,8 @@ def pilot(arguments, config, on_the_fly, started, name) -> dict:
     return {key: numbers[key] for key in COLUMNS} | {"cpu_seconds": seconds}
 
 
-def write_table(page: Path, rows: dict, names: Sequence[str], table: str) -> None:
-    """One row a run, each score as a difference to the first; the runs that were not made, too."""
+def write_table(page: Path, rows: dict, table: str) -> None:
+    """One row a run, each score as a difference to the first."""
     from experiments.common.results import markdown_table, publish
 
     first = rows[FIRST]
@@ -192,7 +195,6 @@ def write_table(page: Path, rows: dict, names: Sequence[str], table: str) -> Non
         scores = [row[key] if name == FIRST else row[key] - first[key] for key in COLUMNS]
         texts = [form.format(score) for form, score in zip(forms[name == FIRST], scores, strict=True)]
         lines.append([name, *texts, row["steps"], f"{row['cpu_seconds']:.0f}"])
-    lines += [[name, *["not run"] * 5] for name in names if name not in rows]
     header = ["run", "PSNR, dB", "in the foreground, dB", "SSIM", "steps", "CPU s"]
     publish(page, table, markdown_table(header, lines), rows)
 
