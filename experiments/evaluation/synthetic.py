@@ -58,7 +58,9 @@ def main() -> None:
         "--views", type=int, nargs="+", default=[4], choices=COUNTS, help="numbers of photos that the network sees"
     )
     add_people_options(parser, subjects=8)
-    parser.add_argument("--images", type=Path, help="write the best five people beside the worst five here")
+    parser.add_argument(
+        "--images", "--pictures", type=Path, help="write the best five people beside the worst five here"
+    )
     parser.add_argument("--plot", type=Path, help="draw PSNR against the number of photos here")
     arguments = parser.parse_args()
     check_people_options(parser, arguments)

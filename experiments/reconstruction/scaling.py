@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256, help="side of the photos, pixels")
     parser.add_argument("--repeats", type=int, default=1, help="timed rounds")
     add_outputs(parser, "reconstruction_scaling")
-    parser.add_argument("--image", type=Path, help="draw them here (.png)")
+    parser.add_argument("--image", "--picture", type=Path, help="draw them here (.png)")
     arguments = parser.parse_args()
     prepare_process()
     result = measure(arguments)

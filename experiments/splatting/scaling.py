@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512, help="side of the image where pixels are not what grows")
     parser.add_argument("--repeats", type=int, default=7, help="timed rounds")
     add_outputs(parser, "splatting_scaling")
-    parser.add_argument("--image", type=Path, help="draw the growth here")
+    parser.add_argument("--image", "--picture", type=Path, help="draw the growth here")
     arguments = parser.parse_args()
     if bool(arguments.scene) == bool(arguments.measured):
         parser.error("give either --scene or --measured")

@@ -98,7 +98,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=9, help="timed rounds")
     parser.add_argument("--only", nargs="+", help="knobs to measure (also: hidden, combined, preset)")
     add_outputs(parser, "splatting_tradeoff")
-    parser.add_argument("--image", type=Path, help="draw the Pareto front here")
+    parser.add_argument("--image", "--picture", type=Path, help="draw the Pareto front here")
     parser.add_argument("--section", default="splatting_tradeoff", help="the page's section")
     arguments = parser.parse_args()
     if bool(arguments.scene) == bool(arguments.measured):
