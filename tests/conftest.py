@@ -4,6 +4,7 @@ Environment variables:
 
 JAX_COMPILATION_CACHE_DIR: where compiled programs are kept; default `cache_folder()`.
 HUMANGS_TOLERANCE_SCALE: factor on all float32 bounds, see rounding.py.
+JAX_DISABLE_MOST_OPTIMIZATIONS: default 1: most of the time of a run is compilation; 0: as users compile.
 HUMANGS_PLAIN_COMPILER: if set, programs are compiled without `splatting.CPU_COMPILER_OPTIONS` (wide vectors).
 """
 
@@ -15,6 +16,9 @@ import json
 import os
 import platform
 from pathlib import Path
+
+# before JAX is imported; the programs that tests start inherit it
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 import jax
 import numpy as np
