@@ -16,7 +16,7 @@ sys.path.insert(0, str(REPOSITORY))
 PAGE = REPOSITORY / "docs" / "knobs.md"
 HEAD = """# Knobs
 
-Every setting of the network, the renderer and the training step that trades accuracy or memory for speed.
+Every setting of the network, the renderer, the training step and the people on the fly that trades accuracy or memory for speed.
 `experiments/knobs.py` writes this page from the code. Decibels compare with the exact image; times are shares of the default's.
 The linked page has the measurement and its conditions.
 
@@ -31,11 +31,21 @@ def page() -> str:
     from humangs_jax.network.encoder import PatchTransformer
     from humangs_jax.network.execution import Execution
     from humangs_jax.network.vertex_decoder import VertexDecoder
+    from humangs_jax.people import OnTheFlyConfig
     from humangs_jax.rendering.mesh.rasterizer import RasterConfig
     from humangs_jax.rendering.splat_config import SplatConfig
     from humangs_jax.training.config import TrainConfig
 
-    classes = (Execution, Conventions, PatchTransformer, VertexDecoder, SplatConfig, RasterConfig, TrainConfig)
+    classes = (
+        Execution,
+        Conventions,
+        PatchTransformer,
+        VertexDecoder,
+        SplatConfig,
+        RasterConfig,
+        TrainConfig,
+        OnTheFlyConfig,
+    )
     rows = [row for cls in classes for row in knob_rows(cls)]
     return HEAD + "\n".join(rows) + "\n"
 

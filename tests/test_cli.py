@@ -121,7 +121,7 @@ def test_wrong_options_are_one_line_too(folder, tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_from_photos_to_pictures(folder, tmp_path, monkeypatch, capsys):
+def test_from_photos_to_images(folder, tmp_path, monkeypatch, capsys):
     """reconstruct, render, animate, export and check, one after the other, as a user would."""
     import plyfile
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 OURS = {"humangs_jax", "tests", "experiments"}
-NAMES = {"PIL": "pillow", "skimage": "scikit-image", "orbax": "orbax-checkpoint", "jaxlib": "jax"}
+NAMES = {"PIL": "pillow", "skimage": "scikit-image", "orbax": "orbax-checkpoint", "jaxlib": "jax", "yaml": "PyYAML"}
 """Distributions that are not called like their module."""
 UNTESTED = {"torch"}
 """Imported by scripts in tests/ that made stored references, not by tests."""

@@ -14,7 +14,7 @@ def test_notebook_runs_from_top_to_bottom(path, tmp_path):
 
     notebook = nbformat.read(path, as_version=4)
     committed = [cell for cell in notebook.cells if cell.cell_type == "code" and "image/png" in str(cell.outputs)]
-    assert committed, f"{path.name} is committed without its pictures"
+    assert committed, f"{path.name} is committed without its images"
     NotebookClient(notebook, timeout=TIMEOUT_SECONDS, resources={"metadata": {"path": tmp_path}}).execute()
     assert sum("image/png" in str(cell.outputs) for cell in notebook.cells if cell.cell_type == "code") >= len(
         committed

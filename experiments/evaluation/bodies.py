@@ -1,7 +1,7 @@
 """The same weights, people and photos on other bodies: another topology in SMPL-X's format, and fewer vertices.
 
     python experiments/evaluation/bodies.py --subjects 8 --views 4 --json bodies.json
-        [--page docs/evaluation.md] [--pictures P.png]
+        [--page docs/evaluation.md] [--images P.png]
 
 Bodies: "default", the one that the weights were trained on; "SMPL-X format", a made-up body of another
 topology, written as an SMPL-X file and read by its loader, to whose joints the poses go by name; "1/4" and "1/16" of the default
@@ -58,7 +58,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=4, choices=COUNTS, help="photos that the network sees")
     add_people_options(parser, subjects=8)
-    parser.add_argument("--pictures", type=Path, help="write the truth and every body's image of one person here")
+    parser.add_argument("--images", type=Path, help="write the truth and every body's image of one person here")
     arguments = parser.parse_args()
     check_people_options(parser, arguments)
     lpips = load_lpips(parser, arguments)
@@ -130,9 +130,9 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     )
     if arguments.json:
         write_json(arguments.json, report)
-    if arguments.pictures:
+    if arguments.images:
         add(seeds[0])  # whoever was scored last
-        write_bodies(arguments.pictures, drawn, [0, arguments.held_out] if arguments.poses else [0])
+        write_bodies(arguments.images, drawn, [0, arguments.held_out] if arguments.poses else [0])
     return report
 
 

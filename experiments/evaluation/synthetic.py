@@ -1,7 +1,7 @@
 """Reconstruct unseen synthetic people from a few photos and compare with held-out views, in the same pose and in others.
 
     python experiments/evaluation/synthetic.py --subjects 32 --views 1 2 4 6 --json evaluation.json
-        [--pictures sheet.png] [--plot views.png] [--page docs/evaluation.md]
+        [--images sheet.png] [--plot views.png] [--page docs/evaluation.md]
 
 Subjects are drawn from the test seeds (`humangs_jax.people.seeds`), which training never sees; choices are made
 on `--split validation`. A person is made once, rendered from evenly spaced cameras (`evaluation/subjects.py`), reconstructed
@@ -16,7 +16,7 @@ input views that see it (grey where none does), in the same pose. `evaluation/re
 after every person. A later run continues: rows in the file with the same settings (weights, split, sizes, ...) are not
 computed again; a file of other settings is replaced.
 
---pictures shows the best five people beside the worst five, by PSNR; --plot needs matplotlib (the `notebooks` extra);
+--images shows the best five people beside the worst five, by PSNR; --plot needs matplotlib (the `notebooks` extra);
 --page writes the table evaluation_views of a page. LPIPS needs weights (`--lpips-backbone`, docs/loss_networks.md); without them
 it is missing: null, and a dash in the table. About 10 s of CPU time a person with four numbers of views, and a minute or two of
 compiling.
@@ -58,7 +58,9 @@ def main() -> None:
         "--views", type=int, nargs="+", default=[4], choices=COUNTS, help="numbers of photos that the network sees"
     )
     add_people_options(parser, subjects=8)
-    parser.add_argument("--pictures", type=Path, help="write the best five people beside the worst five here")
+    parser.add_argument(
+        "--images", "--pictures", type=Path, help="write the best five people beside the worst five here"
+    )
     parser.add_argument("--plot", type=Path, help="draw PSNR against the number of photos here")
     arguments = parser.parse_args()
     check_people_options(parser, arguments)
@@ -71,7 +73,7 @@ def main() -> None:
     except (ValueError, OSError) as error:
         parser.error(str(error))
     if arguments.page:
-        section = views_section(report, arguments.page, arguments.pictures, arguments.plot)
+        section = views_section(report, arguments.page, arguments.images, arguments.plot)
         publish(arguments.page, "evaluation_views", section, report)
 
 
@@ -119,11 +121,11 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     print(printed_table(report["by_views"]))
     if arguments.json:
         write_json(arguments.json, report)
-    if arguments.pictures:
+    if arguments.images:
         for row in chain(*extremes(report)):
             if row["seed"] not in strips:  # scored by an earlier run, which kept no images
                 add(row["seed"], [int(chosen)])
-        write_sheet(arguments.pictures, report, strips)
+        write_sheet(arguments.images, report, strips)
     if arguments.plot:
         plot_views(arguments.plot, report)
     return report

@@ -28,7 +28,7 @@ def main() -> None:
     parser.add_argument("--set", default="wholebody133", help="coco17, wholebody133 or openpose67")
     parser.add_argument("--json", type=Path, required=True, help="numbers")
     parser.add_argument(
-        "--pictures", type=Path, help="folder for PERSON.png: truth, with true and with fitted parameters"
+        "--images", type=Path, help="folder for PERSON.png: truth, with true and with fitted parameters"
     )
     parser.add_argument("--docs", action="store_true", help="write the table into docs/fitting.md")
     arguments = parser.parse_args()
@@ -91,12 +91,12 @@ def compare(variables, config, body, subject, arguments) -> dict:
         views = dataclasses.replace(subject.held_out, poses=inputs.poses, betas=inputs.betas)
         pictures[name] = draw_avatar(reconstruct(variables, config, inputs), views)
     scores = {name: score(drawn, subject.held_out) for name, drawn in pictures.items()}
-    if arguments.pictures:
+    if arguments.images:
         from humangs_jax.avatar.sheets import contact_sheet
 
-        arguments.pictures.mkdir(parents=True, exist_ok=True)
+        arguments.images.mkdir(parents=True, exist_ok=True)
         sheet = np.concatenate([subject.held_out.images[:3], pictures["true"][:3], pictures["fitted"][:3]])
-        contact_sheet(sheet, arguments.pictures / f"{subject.seed}.png")
+        contact_sheet(sheet, arguments.images / f"{subject.seed}.png")
     found = {f"{name}_psnr": s.psnr for name, s in scores.items()}
     return found | {f"{name}_foreground": s.psnr_foreground for name, s in scores.items()} | {"joints_mm": millimetres}
 

@@ -17,7 +17,7 @@ stay. Photos of 512 px. What it is refined by:
 `joints_before_mm`, `joints_after_mm` (mean over the body's 22 joints, in the world), `aligned_before_mm`, `aligned_after_mm`
 (after the best rigid motion, since cameras and person moved together look the same), `focal_before_percent`,
 `focal_after_percent`, `seconds`, `refined` (1: kept), and with photos `psnr_before`, `psnr_after` of the reconstructed avatar,
-dB. --pictures writes the body over the photos, before and after. About 10 s of CPU time a case and person, 25 s with photos,
+dB. --images writes the body over the photos, before and after. About 10 s of CPU time a case and person, 25 s with photos,
 and two minutes of compiling.
 """
 
@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--exact", action="store_true", help="start at the truth: nothing should be kept")
     parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument("--page", type=Path, help=f"page whose table {TABLE} is written")
-    parser.add_argument("--pictures", type=Path, help="folder for pictures of every person before and after")
+    parser.add_argument("--images", type=Path, help="folder for pictures of every person before and after")
     arguments = parser.parse_args()
     if min(arguments.subjects, arguments.views) < 1 or arguments.first < 0:
         parser.error("--subjects and --views must be at least 1, --first at least 0")
@@ -106,8 +106,8 @@ def refine_subject(seed: int, body: Any, arguments: argparse.Namespace) -> dict[
         if "avatar_psnr" in refined.report.errors:
             psnr = refined.report.errors["avatar_psnr"]
             rows[case] |= {"psnr_before": float(psnr.before or 0), "psnr_after": psnr.after}
-        if arguments.pictures:
-            draw(arguments.pictures / f"{seed}_{case}.png", start, refined.capture)
+        if arguments.images:
+            draw(arguments.images / f"{seed}_{case}.png", start, refined.capture)
     return rows
 
 

@@ -1,6 +1,6 @@
 """How far bodies fitted into scans are from the true ones: bare and clothed, with noisy joints given and without any.
 
-    python experiments/fitting/scans.py --subjects 32 --json scans.json [--without-joints] [--pictures scans.png]
+    python experiments/fitting/scans.py --subjects 32 --json scans.json [--without-joints] [--images scans.png]
 
 People of the fitting seeds in random poses. A scan is the posed mesh of the dressed person, or of the bare body; each is
 turned by a random rotation, scaled by 0.1 to 100 and moved. Given joints are the 17 of COCO with errors of --noise-mm
@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument("--without-joints", action="store_true", help="search for the pose")
     parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument("--page", type=Path, help=f"page whose table {TABLE} or {TABLE}_without_joints is written")
-    parser.add_argument("--pictures", type=Path, help="write scans with the fitted body, worst and best people, here")
+    parser.add_argument("--images", type=Path, help="write scans with the fitted body, worst and best people, here")
     arguments = parser.parse_args()
     if arguments.subjects < 1:
         parser.error("--subjects: expected at least 1")
@@ -79,8 +79,8 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         report |= {"settings": settings, "subjects": rows}
         if arguments.json:
             write_json(arguments.json, report)
-    if arguments.pictures:
-        draw_extremes(arguments.pictures, drawn, arguments.kinds)
+    if arguments.images:
+        draw_extremes(arguments.images, drawn, arguments.kinds)
     return report
 
 
@@ -88,7 +88,7 @@ def fit_one(seed, kind, body, arguments):
     """Scores of one scan, and what a picture of it needs."""
     import jax.numpy as jnp
 
-    from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan_points
+    from humangs_jax.fitting.scan_fit import body_in_scan, fit_scan
     from humangs_jax.fitting.scan_reading import sample_scan
 
     true, landmarks, vertices, faces = person(seed, kind, body)
@@ -97,7 +97,7 @@ def fit_one(seed, kind, body, arguments):
     joints = None if arguments.without_joints else dict(zip(JOINTS, noisy, strict=True))
     start = time.perf_counter()
     scan = sample_scan(place(vertices), faces)
-    fit = fit_scan_points(scan, body=body, joints=joints, clothed=kind == "clothed")
+    fit = fit_scan(scan, body=body, joints=joints, clothed=kind == "clothed")
     seconds = time.perf_counter() - start
     fitted = place.inverse()(body_in_scan(fit))
     vertex = 1000 * np.linalg.norm(fitted - true, axis=1)

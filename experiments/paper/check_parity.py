@@ -215,7 +215,7 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
     from humangs_jax.network.humangs import apply_humangs, part_variables
     from humangs_jax.network.parts import Pass
     from humangs_jax.network.stages import Recorder
-    from humangs_jax.network.triplane import sample_triplane
+    from humangs_jax.network.tokenizer import sample_triplane
     from humangs_jax.network.vertex_decoder import corrected_skinning_weights
     from humangs_jax.rendering.gaussians import skin_gaussians
 

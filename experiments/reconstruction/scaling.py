@@ -1,6 +1,6 @@
 """How the cost of a reconstruction grows with the number of photos.
 
-    python experiments/reconstruction/scaling.py --size 256 --picture OUT.png --json OUT
+    python experiments/reconstruction/scaling.py --size 256 --image OUT.png --json OUT
 
 Half of the published network's width and depth (384, 6), so that 16 views of 256 x 256 take seconds and not minutes, with
 all tokens and with those of the foreground; and, counted from compiled programs that are not run, the operations of the
@@ -37,13 +37,13 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=256, help="side of the photos, pixels")
     parser.add_argument("--repeats", type=int, default=1, help="timed rounds")
     add_outputs(parser, "reconstruction_scaling")
-    parser.add_argument("--picture", type=Path, help="draw them here (.png)")
+    parser.add_argument("--image", "--picture", type=Path, help="draw them here (.png)")
     arguments = parser.parse_args()
     prepare_process()
     result = measure(arguments)
     write_outputs(arguments, "reconstruction_scaling", table(result), result)
-    if arguments.picture:
-        draw(result, arguments.picture)
+    if arguments.image:
+        draw(result, arguments.image)
 
 
 def measure(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """How the time of splatting grows with pixels, Gaussians and views.
 
-    python experiments/splatting/scaling.py --scene S.npz --size 512 [--json OUT] [--picture OUT.png]
+    python experiments/splatting/scaling.py --scene S.npz --size 512 [--json OUT] [--image OUT.png]
         [--page docs/performance.md]
-    python experiments/splatting/scaling.py --scene demo --picture docs/images/splatting_scaling.png
+    python experiments/splatting/scaling.py --scene demo --image docs/images/splatting_scaling.png
 
 Pixels: the same view at 128 to 1024. Gaussians: random subsets of 1/8 to all of them, and all of them twice, the copies
 moved by a quarter of their size. Views: 1 to 8 cameras side by side (so that all have the same to draw) at half the
@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512, help="side of the image where pixels are not what grows")
     parser.add_argument("--repeats", type=int, default=7, help="timed rounds")
     add_outputs(parser, "splatting_scaling")
-    parser.add_argument("--picture", type=Path, help="draw the growth here")
+    parser.add_argument("--image", "--picture", type=Path, help="draw the growth here")
     arguments = parser.parse_args()
     if bool(arguments.scene) == bool(arguments.measured):
         parser.error("give either --scene or --measured")
@@ -53,8 +53,8 @@ def main() -> None:
         prepare_process()
         result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats)
     write_outputs(arguments, "splatting_scaling", table(result), result)
-    if arguments.picture:
-        draw(result, arguments.picture)
+    if arguments.image:
+        draw(result, arguments.image)
 
 
 def measure(scene: Scene, repeats: int) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """What each knob of the splatting renderer gains in time and costs in accuracy, and the Pareto front of their settings.
 
-    python experiments/splatting/tradeoff.py --scene S.npz --size 512 [--json OUT] [--picture OUT.png]
+    python experiments/splatting/tradeoff.py --scene S.npz --size 512 [--json OUT] [--image OUT.png]
         [--page docs/performance.md]
-    python experiments/splatting/tradeoff.py --scene demo --picture docs/images/splatting_tradeoff.png
+    python experiments/splatting/tradeoff.py --scene demo --image docs/images/splatting_tradeoff.png
 
 Every setting takes turns with the exact one, call by call, in one process; its time is the median of the quotients. Its
 error is that of the image to the exact one, drawn in float64, on black; of gradients (mean squared error against noise)
@@ -98,7 +98,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=9, help="timed rounds")
     parser.add_argument("--only", nargs="+", help="knobs to measure (also: hidden, combined, preset)")
     add_outputs(parser, "splatting_tradeoff")
-    parser.add_argument("--picture", type=Path, help="draw the Pareto front here")
+    parser.add_argument("--image", "--picture", type=Path, help="draw the Pareto front here")
     parser.add_argument("--section", default="splatting_tradeoff", help="the page's section")
     arguments = parser.parse_args()
     if bool(arguments.scene) == bool(arguments.measured):
@@ -109,8 +109,8 @@ def main() -> None:
         prepare_process()
         result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats, arguments.only)
     write_outputs(arguments, arguments.section, table(result), result)
-    if arguments.picture:
-        draw(result, arguments.picture)
+    if arguments.image:
+        draw(result, arguments.image)
 
 
 def settings(scene: Scene, only: Sequence[str] | None) -> list[Setting]:
@@ -232,14 +232,14 @@ def pareto(rows: Sequence[dict[str, Any]], time: str) -> list[dict[str, Any]]:
 
 def table(result: dict[str, Any]) -> str:
     """Markdown."""
-    header = ["setting", "forward: CPU, wall", "forward+backward: CPU, wall", "PSNR, dB", "largest error", "gradients"]
+    header = ["setting", "forward, CPU", "forward+backward, CPU", "PSNR, dB", "largest error", "gradients"]
     exact = result["exact"]
-    milliseconds = (f"{exact[name]['cpu_ms']:.0f}, {exact[name]['wall_ms']:.0f} ms" for name in DIRECTIONS)
+    milliseconds = (f"{exact[name]['cpu_ms']:.0f} ms" for name in DIRECTIONS)
     error = lambda row: [f"{row['psnr']:.1f}", f"{row['max_abs_error']:.1g}", f"{row['gradient_relative_l2']:.1g}"]
     rows = [["exact", *milliseconds, *error(exact)]]
     for row in result["settings"]:
         label = f"**{row['label']}**" if row["knob"] == "preset" else row["label"]
-        times = (f"{row[f'{name}_cpu']:.2f}, {row[f'{name}_wall']:.2f}" for name in DIRECTIONS)
+        times = (f"{row[f'{name}_cpu']:.2f}" for name in DIRECTIONS)
         rows.append([label, *times, *error(row)])
     title = (
         f"{result['scene']}, {result['gaussians']:,} Gaussians at {result['size']}; times relative to the exact ones."

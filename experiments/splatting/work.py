@@ -1,6 +1,6 @@
 """Work done over work needed: how much of what a splatting renderer evaluates contributes to the image.
 
-    python experiments/splatting/work.py --scene S.npz --size 512 [--json OUT] [--page docs/performance.md]
+    python experiments/splatting/work.py --scene S.npz --size 512 [--json OUT]
     python experiments/splatting/work.py --scene demo --size 512
 
 Needed are the (pixel, Gaussian) pairs that contribute: alpha at least alpha_min, the pixel not ended before. Done is what
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import add_outputs, markdown_table, write_outputs
+from experiments.common.results import markdown_table, write_json
 from experiments.splatting.scenes import Scene, load_scene
 
 if TYPE_CHECKING:
@@ -62,10 +62,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", nargs="+", required=True, help="npz files of scenes, or 'demo'")
     parser.add_argument("--size", type=int, nargs="+", default=[512], help="sides of the image, pixels")
-    add_outputs(parser, "splatting_work")
+    parser.add_argument("--json", type=Path, help="write the numbers here")
     arguments = parser.parse_args()
     results = [count(load_scene(scene, size)) for scene in arguments.scene for size in arguments.size]
-    write_outputs(arguments, "splatting_work", table(results), results)
+    print(table(results))
+    if arguments.json:
+        write_json(arguments.json, results)
 
 
 def count(scene: Scene) -> dict[str, Any]:

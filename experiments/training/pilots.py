@@ -13,7 +13,6 @@ import dataclasses
 import json
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -28,12 +27,18 @@ COLUMNS = ("psnr", "psnr_mask", "ssim")
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--bank", type=Path, required=True, help="live people: the people.npz of a run with --live")
-    parser.add_argument("--people", type=Path, required=True, help="captures, mixed with the live people by halves")
+    parser.add_argument("--bank", type=Path, required=True, help="the people.npz of a run with --on-the-fly")
+    parser.add_argument(
+        "--people", type=Path, required=True, help="captures, mixed with the on-the-fly people by halves"
+    )
     parser.add_argument("--validation", type=Path, required=True, help="captures of other people")
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--start", type=Path, help="weights to start from; the shipped ones if not given")
-    parser.add_argument("--fresh", action="store_true", help="start from nothing; has a table of its own")
+    parser.add_argument(
+        "--fresh",
+        action="store_true",
+        help="start from nothing; table training_pilots_fresh, which needs a --page with its markers",
+    )
     parser.add_argument("--steps", type=int, default=150, help="of each run")
     parser.add_argument("--only", nargs="+", help="names of the runs to make; all if not given")
     parser.add_argument("--page", type=Path, default=DOCS, help="page with the table")
@@ -45,7 +50,7 @@ def main() -> None:
 
 
 def training_variants(base):
-    """Name -> (configuration, settings of the live people): of how the network is trained, from weights."""
+    """Name -> (configuration, settings of the on-the-fly people): of how the network is trained, from weights."""
     replace = dataclasses.replace
     model = base.model
     view = lambda **changes: replace(base, views=replace(base.views, **changes))
@@ -75,7 +80,7 @@ def training_variants(base):
 
 
 def network_variants(base):
-    """Name -> (configuration, settings of the live people): of the network, from nothing."""
+    """Name -> (configuration, settings of the on-the-fly people): of the network, from nothing."""
     replace, model = dataclasses.replace, base.model
     parts = model.architecture
     bare = model.with_parts(reader=replace(parts.reader, shells=()))
@@ -128,13 +133,13 @@ def run(arguments, parser) -> None:
     for name in names:
         if name in kept(path, settings, parser):
             continue
-        config, live = runs[name]
+        config, on_the_fly = runs[name]
         started = None if arguments.fresh else (variables, model)
-        row = pilot(arguments, config, live, started, name.replace(" ", "_").replace(",", ""))
-        row |= {"steps": config.steps, "config": json.loads(config_to_json(config)), "live": live}
+        row = pilot(arguments, config, on_the_fly, started, name.replace(" ", "_").replace(",", ""))
+        row |= {"steps": config.steps, "config": json.loads(config_to_json(config)), "on_the_fly": on_the_fly}
         rows = kept(path, settings, parser) | {name: row}  # another process may have added to it
         write_json(path, {"settings": settings, "runs": rows})
-    write_table(arguments.page, kept(path, settings, parser), list(runs), table)
+    write_table(arguments.page, kept(path, settings, parser), table)
 
 
 def kept(path, settings, parser):
@@ -147,7 +152,7 @@ def kept(path, settings, parser):
     return report["runs"]
 
 
-def pilot(arguments, config, live, started, name) -> dict:
+def pilot(arguments, config, on_the_fly, started, name) -> dict:
     """One run: scores on the validation people with 4 inputs and 6 targets each, and CPU seconds."""
     import jax
 
@@ -164,7 +169,7 @@ def pilot(arguments, config, live, started, name) -> dict:
     body, begin = load_body(), time.process_time()
     people = [
         captured_people(find_captures(arguments.people), body),
-        on_the_fly_people(load_bank(arguments.bank), OnTheFlyConfig(**live)),
+        on_the_fly_people(load_bank(arguments.bank), OnTheFlyConfig(**on_the_fly)),
     ]
     variables = None if started is None else fit_variables(*started, config.model)
     state = train(config, body, mixed_people(people, [1, 1]), arguments.out / name, variables=variables, progress=False)
@@ -180,8 +185,8 @@ def pilot(arguments, config, live, started, name) -> dict:
     return {key: numbers[key] for key in COLUMNS} | {"cpu_seconds": seconds}
 
 
-def write_table(page: Path, rows: dict, names: Sequence[str], table: str) -> None:
-    """One row a run, each score as a difference to the first; the runs that were not made, too."""
+def write_table(page: Path, rows: dict, table: str) -> None:
+    """One row a run, each score as a difference to the first."""
     from experiments.common.results import markdown_table, publish
 
     first = rows[FIRST]
@@ -190,7 +195,6 @@ def write_table(page: Path, rows: dict, names: Sequence[str], table: str) -> Non
         scores = [row[key] if name == FIRST else row[key] - first[key] for key in COLUMNS]
         texts = [form.format(score) for form, score in zip(forms[name == FIRST], scores, strict=True)]
         lines.append([name, *texts, row["steps"], f"{row['cpu_seconds']:.0f}"])
-    lines += [[name, *["not run"] * 5] for name in names if name not in rows]
     header = ["run", "PSNR, dB", "in the foreground, dB", "SSIM", "steps", "CPU s"]
     publish(page, table, markdown_table(header, lines), rows)
 

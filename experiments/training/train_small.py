@@ -4,11 +4,11 @@
     python experiments/training/train_small.py --out runs/more --init-weights shipped
 
 The run is experiments/training/small.json; every setting of it is an option: `--steps 4000 --optimizer.learning-rate 2e-4`.
-Makes the people first: `--live` of the training seeds that are drawn anew for every step, `--subjects` that are written as
-captures, and a few of the validation seeds. Continues the run in `--out` if there is one; Ctrl-C saves.
+Makes the people first: `--on-the-fly` of the training seeds that are drawn anew for every step, `--subjects` that are written
+as captures, and a few of the validation seeds. Continues the run in `--out` if there is one; Ctrl-C saves.
 
-On 2 CPU cores: 1 s a live person, 5 s a written one, then about 1.2 s a step on an otherwise quiet machine. How the shipped
-weights came about is in humangs_jax/assets/weights.md.
+On 2 CPU cores: 1 s a person on the fly, 5 s a written one, then about 1.2 s a step on an otherwise quiet machine. How the
+shipped weights came about is in humangs_jax/assets/weights.md.
 """
 
 from pathlib import Path
@@ -29,18 +29,18 @@ def main(
     people: Path | None = None,
     validation: Path | None = None,
     subjects: int = 64,
-    live: int = 320,
+    on_the_fly: int = 320,
     init_weights: Literal["shipped"] | Path | None = None,  # the word first: tyro takes the first type that fits
     config: Annotated[TrainConfig, tyro.conf.arg(name="")] = SMALL,
 ) -> None:
-    """Train on synthetic people, written and live ones by halves.
+    """Train on synthetic people, written and on-the-fly ones by halves.
 
     Args:
         out: checkpoints, log, images and weights of the run.
         people: folder of capture folders to train on; made in out/people if not given.
         validation: folder of captures of other people, for validation; made in out/validation by default.
-        subjects: how many people to write; 0 for live ones alone.
-        live: how many live people; kept in out/people.npz. 0 for written ones alone.
+        subjects: how many people to write; 0 for on-the-fly ones alone.
+        on_the_fly: how many people rendered anew for every step; kept in out/people.npz. 0 for written ones alone.
         init_weights: start from these weights instead of fresh ones, see `fit_variables` for how much their network may
             differ from that of `config`; "shipped": the package's own.
         config: the run.
@@ -51,8 +51,8 @@ def main(
     from humangs_jax.data.loader import find_captures
     from humangs_jax.network.weights import fit_variables, load_weights
     from humangs_jax.people import Layout, write_set
-    from humangs_jax.training.launch import training_people
     from humangs_jax.training.loop import train
+    from humangs_jax.training.sources import training_people
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
     body, variables = load_body(), None
@@ -65,7 +65,7 @@ def main(
     if validation is None:
         validation = out / "validation"
         write_set(validation, VALIDATION_SUBJECTS, Layout(256, poses=2, views=12), "validation")
-    training = training_people(people, live, out, body)
+    training = training_people(people, on_the_fly, out, body)
     train(config, body, training, out, validation=find_captures(validation), variables=variables)
 
 

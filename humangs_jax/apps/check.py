@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.sheets import contact_sheet
-from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
@@ -118,22 +118,23 @@ def check_capture(capture: Capture, out: str | Path) -> CheckReport:
 
     Raises: OSError if the sheet cannot be written.
     """
-    cameras, images, masks = _shrunk(capture)
+    if max(capture.images.shape[1:3]) > LONGEST_SIDE:
+        capture = capture.resized(LONGEST_SIDE)
     vertices = _posed_frames(capture)
     tints = side_tints(capture.body)
     overlays, views = [], []
     for i, name in enumerate(capture.names):
         posed = vertices[int(capture.frames[i])]
-        drawn = _body_image(posed, capture.body.faces, tints, cameras[i])
-        mask = None if masks is None else masks[i] > 0.5
+        drawn = _body_image(posed, capture.body.faces, tints, capture.cameras[i])
+        mask = None if capture.masks is None else capture.masks[i] > 0.5
         view = _judge(name, drawn, mask)
         if view.warnings:
             translation = np.asarray(capture.poses.translation[int(capture.frames[i])], float)
             draw = functools.partial(_body_image, posed, capture.body.faces, tints)
-            cause = _mistake_in_image(drawn, mask) or _mistake_in_space(draw, cameras[i], translation, mask)
+            cause = _mistake_in_image(drawn, mask) or _mistake_in_space(draw, capture.cameras[i], translation, mask)
             explained = f"it would fit if {cause}"
             view = dataclasses.replace(view, warnings=view.warnings + ((explained,) if cause else ()))
-        overlays.append(overlay(images[i], drawn))
+        overlays.append(overlay(capture.images[i], drawn))
         views.append(view)
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
     return CheckReport(tuple(views))
@@ -143,7 +144,7 @@ def draw_body(
     body: BodyModel, betas: Float[Array, " s"], pose: BodyPose, camera: Camera, photo: Float[np.ndarray, "h w 3"]
 ) -> tuple[Float[np.ndarray, "h w 3"], BodyImage]:
     """The posed body over a photo of one camera, and the body alone."""
-    drawn = _body_image(_pose(body, betas, pose), body.faces, side_tints(body), camera)
+    drawn = _body_image(jax.jit(person_vertices)(body, betas, pose), body.faces, side_tints(body), camera)
     return overlay(photo, drawn), drawn
 
 
@@ -169,11 +170,6 @@ def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
 
 
 @jax.jit
-def _pose(body, betas, pose):
-    return pose_body(body, shape_body(body, betas), pose).vertices
-
-
-@jax.jit
 def _body_image(vertices, faces, tints, camera) -> BodyImage:
     points = vertices @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     before = points[:, 2] > 0
@@ -195,23 +191,9 @@ def _body_image(vertices, faces, tints, camera) -> BodyImage:
 
 def _posed_frames(capture):
     """Vertices of the frames that views show, by frame."""
+    pose = jax.jit(person_vertices)
     shown = sorted({int(frame) for frame in capture.frames})
-    return {frame: _pose(capture.body, jnp.asarray(capture.betas), capture.pose(frame)) for frame in shown}
-
-
-def _shrunk(capture):
-    """Cameras, photos and masks with the longest side of at most `LONGEST_SIDE`."""
-    height, width = capture.images.shape[1:3]
-    share = LONGEST_SIDE / max(height, width)
-    if share >= 1:
-        return capture.cameras, capture.images, capture.masks
-    from PIL import Image
-
-    size = (max(1, round(width * share)), max(1, round(height * share)))
-    shrink = lambda channel: np.asarray(Image.fromarray(channel).resize(size, Image.Resampling.BOX))
-    images = np.stack([np.stack([shrink(x[..., c]) for c in range(3)], axis=-1) for x in capture.images])
-    masks = None if capture.masks is None else np.stack([shrink(x) for x in capture.masks])
-    return capture.cameras.resized(*size), images, masks
+    return {frame: pose(capture.body, jnp.asarray(capture.betas), capture.pose(frame)) for frame in shown}
 
 
 def _iou(drawn, mask):

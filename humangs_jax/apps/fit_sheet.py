@@ -20,11 +20,11 @@ from humangs_jax.fitting.examination import Examination
 from humangs_jax.io.images import to_uint8, write_png
 
 VIEWS = 24
-"""At most on a sheet."""
+"""Most views on a sheet."""
 FINE = 2
 """Factor by which sheets are drawn larger and then shrunk, for smooth lines."""
 RADIUS, SMALL = 4, 2
-"""Of discs on body and on hands and face, pixels of a tile."""
+"""Radii of discs on the body, and on hands and face, pixels of a tile."""
 WHITE, BLACK, CROSS = (255, 255, 255), (0, 0, 0), (255, 0, 230)
 TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT = 1 / 60, 10, 22
 """Height of the plot's letters: a share of its width, within limits, pixels."""
@@ -79,16 +79,9 @@ def plot_over_time(errors: Float[np.ndarray, " m"], width: int) -> Float[np.ndar
 
 def _overlay(capture, view):
     """The body over a photo, its longest side as long as that of any tile."""
-    from PIL import Image
-
-    height, width = capture.images.shape[1:3]
-    share = LONGEST_SIDE / max(height, width)
-    size = (max(1, round(width * share)), max(1, round(height * share)))
-    method = Image.Resampling.BOX if share < 1 else Image.Resampling.BICUBIC
-    channels = [np.asarray(Image.fromarray(capture.images[view, ..., c]).resize(size, method)) for c in range(3)]
-    pose, camera = capture.pose(int(capture.frames[view])), capture.cameras[view].resized(*size)
-    drawn, _ = draw_body(capture.body, jnp.asarray(capture.betas), pose, camera, np.stack(channels, axis=-1))
-    return drawn
+    shown = capture.select([view]).resized(LONGEST_SIDE)
+    pose = capture.pose(int(capture.frames[view]))
+    return draw_body(capture.body, jnp.asarray(capture.betas), pose, shown.cameras[0], shown.images[0])[0]
 
 
 def _with_keypoints(image, capture, keypoints, examination, view):

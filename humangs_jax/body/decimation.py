@@ -29,7 +29,7 @@ VIEWS = 40
 CELL = 0.004
 """Metres: size of a depth-buffer cell, and with it how narrow a gap lets light through."""
 MOST_STEPS = 40
-"""Of the subdivision of one face for the depth buffer."""
+"""A side of a face is divided into at most this many parts for the depth buffer."""
 SMALLEST_TURN = 0.3
 """A face may turn by at most acos(0.3) = 73 degrees in one collapse."""
 SMALLEST_QUALITY = 0.08
@@ -53,7 +53,7 @@ def _surface_points(vertices: np.ndarray, faces: np.ndarray, spacing: float | np
 
 
 def exposure(vertices: np.ndarray, faces: np.ndarray, views: int = VIEWS) -> np.ndarray:
-    """In how many of `views` parallel projections each vertex (n, 3) is the nearest thing, as a share in [0, 1]."""
+    """The share of `views` parallel projections, in [0, 1], in which each vertex (n, 3) is not hidden."""
     size = np.linalg.norm(np.ptp(vertices, axis=0))
     cell = CELL * size / 2.5  # written for a person, whose T-pose has a diagonal of about 2.5 m
     points = _surface_points(vertices, faces, cell)

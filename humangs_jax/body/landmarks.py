@@ -29,6 +29,7 @@ from humangs_jax.body.model import BodyModel, BodyPose, pose_features
 from humangs_jax.body.surface_points import SurfacePoints, pose_points, shaped
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.geometry import transform
 
 SIDES = {"left": 1.0, "right": -1.0}
 """And the sign of x that is outwards in T-pose."""
@@ -113,7 +114,7 @@ def pose_joints(
     """Transforms of the joints from rest, and where the joints are, metres."""
     rest = shaped(model.joints, model.joint_directions, betas)
     transforms = skinning.joint_transforms(rest, model.parents, pose.rotations, pose.translation)
-    return transforms, skinning.apply_transforms(transforms, rest)
+    return transforms, transform.apply(transforms, rest)
 
 
 def landmarks_from(

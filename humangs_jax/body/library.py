@@ -1,18 +1,33 @@
-"""Loading a body: the CC0 body of the package, or a file."""
+"""Loading a body: the CC0 body of the package, or a file; and the package's own body file, one small npz without pickles.
 
+Small numbers make it small: positions of shape directions are multiples of 10 micrometres in int16, weights are the
+largest few of each vertex in uint16, indices are uint16 where they fit. `read_body` returns float32 weights whose rows
+sum to 1.
+"""
+
+import zipfile
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from humangs_jax.body import storage
+import jax.numpy as jnp
+import numpy as np
+
 from humangs_jax.body.model import BodyModel
+from humangs_jax.io.npz import read_npz, write_npz
+
+FORMAT = "humangs-body-1"
+DIRECTION_STEP = 1e-5
+"""Metres. int16 then spans +-0.33 m per unit of a shape coefficient; larger directions are stored as float32."""
+WEIGHT_STEPS = 65535
+UV_STEPS = 65535
 
 
 def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel:
     """A body model.
 
     Arguments: path: None for the CC0 body shipped with the package (13,380 vertices, 55 joints in SMPL-X order, the
-    person faces +z, pelvis at (0, -0.35, 0)); a file of `humangs_jax.body.storage`; or an SMPL-X model file (.npz or
+    person faces +z, pelvis at (0, -0.35, 0)); a file of `save_body`; or an SMPL-X model file (.npz or
     .pkl).
     smplx_options: for SMPL-X files only, see `humangs_jax.body.smplx.load_smplx`.
     Raises: FileNotFoundError; ValueError, naming file and key, for what cannot be read; TypeError for options of SMPL-X
@@ -22,14 +37,112 @@ def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel
         if smplx_options:
             raise TypeError(f"options of SMPL-X files do not apply to the shipped body: {sorted(smplx_options)}")
         with resources.as_file(resources.files("humangs_jax") / "assets" / "makehuman.npz") as file:
-            return storage.read_body(file)
+            return read_body(file)
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such body model file")
-    if storage.is_body_file(path):
+    if is_body_file(path):
         if smplx_options:
             raise TypeError(f"{path}: options of SMPL-X files do not apply to this file: {sorted(smplx_options)}")
-        return storage.read_body(path)
+        return read_body(path)
     from humangs_jax.body.smplx import load_smplx
 
     return load_smplx(path, **smplx_options)
+
+
+def _indices(array: np.ndarray) -> np.ndarray:
+    """Non-negative integers in 2 bytes where they fit."""
+    return array.astype(np.uint16 if array.max(initial=0) < 2**16 else np.int32)
+
+
+def _sparse_rows(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and values (rows, k) of the non-zero entries, k the most in any row, padded with zeros."""
+    count = max(1, int((matrix != 0).sum(1).max()))
+    columns = np.argsort(-np.abs(matrix), axis=1, kind="stable")[:, :count]
+    return columns, np.take_along_axis(matrix, columns, axis=1)
+
+
+def _dense_rows(columns: np.ndarray, values: np.ndarray, width: int) -> np.ndarray:
+    matrix = np.zeros((len(columns), width), np.float64)
+    np.add.at(matrix, (np.arange(len(columns))[:, None], columns.astype(np.int64)), values)
+    return (matrix / matrix.sum(1, keepdims=True)).astype(np.float32)
+
+
+def save_body(path: str | Path, body: BodyModel) -> None:
+    """Write a body model. Raises: ValueError for one with pose correctives, which this format does not hold."""
+    if body.pose_directions is not None:
+        raise ValueError(f"body '{body.name}' has pose directions: this format is for bodies without them")
+    directions = np.asarray(body.shape_directions, np.float64)
+    if np.abs(directions).max(initial=0) < DIRECTION_STEP * 32767:
+        directions = np.rint(directions / DIRECTION_STEP).astype(np.int16)
+    regressor_columns, regressor_values = _sparse_rows(np.asarray(body.joint_regressor, np.float64))
+    weight_columns, weight_values = _sparse_rows(np.asarray(body.skinning_weights, np.float64))
+    arrays = {
+        "format": np.asarray(FORMAT),
+        "name": np.asarray(body.name),
+        "template": np.asarray(body.template, np.float32),
+        "shape_directions": np.ascontiguousarray(np.moveaxis(directions, -1, 0)),  # compresses better by direction
+        "regressor_vertices": _indices(regressor_columns),
+        "regressor_values": regressor_values.astype(np.float32),
+        "weight_joints": _indices(weight_columns),
+        "weight_values": np.rint(weight_values * WEIGHT_STEPS).astype(np.uint16),
+        "faces": _indices(np.asarray(body.faces)),
+        "parents": np.asarray(body.parents, np.int16),
+        "joint_names": np.asarray(body.joint_names),
+        "shape_names": np.asarray(body.shape_names),
+    }
+    if body.uvs is not None:
+        uvs = np.asarray(body.uvs, np.float64)
+        inside = uvs.min() >= 0 and uvs.max() <= 1
+        arrays["uvs"] = np.rint(uvs * UV_STEPS).astype(np.uint16) if inside else uvs.astype(np.float32)
+        arrays["uv_faces"] = _indices(np.asarray(body.uv_faces))
+    if body.collapse_order is not None:
+        arrays["collapse_order"] = _indices(np.asarray(body.collapse_order))
+        arrays["collapse_into"] = _indices(np.asarray(body.collapse_into))
+    write_npz(path, arrays)
+
+
+def is_body_file(path: str | Path) -> bool:
+    """Whether a file is an npz with this format's mark."""
+    if not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as file:
+        return "format.npy" in file.namelist()
+
+
+def read_body(path: str | Path) -> BodyModel:
+    """Read what `save_body` wrote. Raises: ValueError, naming the file and the key, if it is something else."""
+    arrays, pickled = read_npz(path)
+    if str(arrays.get("format")) != FORMAT:
+        raise ValueError(f"{path}: not a '{FORMAT}' file (its keys: {sorted(arrays)})")
+    if pickled:
+        raise ValueError(f"{path}: key '{pickled[0]}' cannot be read without pickles")
+    try:
+        directions = np.moveaxis(arrays["shape_directions"], 0, -1)
+        if directions.dtype == np.int16:
+            directions = directions * DIRECTION_STEP
+        uvs = arrays.get("uvs")
+        if uvs is not None and uvs.dtype == np.uint16:
+            uvs = uvs / UV_STEPS
+        joints, vertices = len(arrays["parents"]), len(arrays["template"])
+        index = lambda key: jnp.asarray(arrays[key], jnp.int32) if key in arrays else None
+        return BodyModel(
+            template=jnp.asarray(arrays["template"], jnp.float32),
+            shape_directions=jnp.asarray(directions, jnp.float32),
+            pose_directions=None,
+            joint_regressor=jnp.asarray(
+                _dense_rows(arrays["regressor_vertices"], arrays["regressor_values"], vertices)
+            ),
+            skinning_weights=jnp.asarray(_dense_rows(arrays["weight_joints"], arrays["weight_values"], joints)),
+            faces=jnp.asarray(arrays["faces"], jnp.int32),
+            uvs=None if uvs is None else jnp.asarray(uvs, jnp.float32),
+            uv_faces=index("uv_faces"),
+            collapse_order=index("collapse_order"),
+            collapse_into=index("collapse_into"),
+            parents=tuple(int(p) for p in arrays["parents"]),
+            joint_names=tuple(str(name) for name in arrays["joint_names"]),
+            shape_names=tuple(str(name) for name in arrays["shape_names"]),
+            name=str(arrays["name"]),
+        )
+    except KeyError as error:
+        raise ValueError(f"{path}: key {error} is missing") from error

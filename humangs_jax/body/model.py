@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from humangs_jax.body import skinning
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, static_field
-from humangs_jax.geometry import quaternion
+from humangs_jax.geometry import quaternion, transform
 
 
 @pytree_dataclass
@@ -105,6 +105,11 @@ def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:
     return (matrices - jnp.eye(3, dtype=matrices.dtype)).reshape(-1)
 
 
+def person_vertices(body: BodyModel, betas: Float[Array, " s_used"], pose: BodyPose) -> Float[Array, "n 3"]:
+    """Vertices of a person in a pose, metres."""
+    return pose_body(body, shape_body(body, betas), pose).vertices
+
+
 def pose_body(body: BodyModel, rest: RestBody, pose: BodyPose) -> PosedBody:
     """Pose a shaped body: correctives, blend skinning, translation."""
     vertices = rest.vertices
@@ -113,6 +118,4 @@ def pose_body(body: BodyModel, rest: RestBody, pose: BodyPose) -> PosedBody:
         vertices = vertices + jnp.einsum("naq,q->na", body.pose_directions, features, precision=skinning.EXACT)
     transforms = skinning.joint_transforms(rest.joints, body.parents, pose.rotations, pose.translation)
     blended = skinning.blend_transforms(body.skinning_weights, transforms)
-    return PosedBody(
-        skinning.apply_transforms(blended, vertices), transforms, skinning.apply_transforms(transforms, rest.joints)
-    )
+    return PosedBody(transform.apply(blended, vertices), transforms, transform.apply(transforms, rest.joints))

@@ -9,14 +9,13 @@ Rotations turn about the joints in the rest pose, whose frames are all aligned w
 Products here ask for full precision: accelerators otherwise round float32 factors to 8 or 10 bits, millimetres here.
 """
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.geometry import quaternion, transform
 
-EXACT = jax.lax.Precision.HIGHEST
+EXACT = transform.EXACT
 
 
 def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
@@ -79,8 +78,3 @@ def _product(a, b):
 def blend_transforms(weights: Float[Array, "n j"], transforms: Float[Array, "j 4 4"]) -> Float[Array, "n 4 4"]:
     """T_n = sum_j w_nj G_j. Its linear part is in general no rotation."""
     return jnp.einsum("nj,jab->nab", weights, transforms, precision=EXACT)
-
-
-def apply_transforms(transforms: Float[Array, "n 4 4"], points: Float[Array, "n 3"]) -> Float[Array, "n 3"]:
-    """T_n p_n, in full precision."""
-    return jnp.einsum("nab,nb->na", transforms[:, :3, :3], points, precision=EXACT) + transforms[:, :3, 3]

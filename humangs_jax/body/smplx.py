@@ -23,7 +23,7 @@ from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 
 SHAPE_COLUMNS, EXPRESSION_COLUMNS = 300, 100
-"""Of `shapedirs` in current files; older ones have 10 + 10."""
+"""Columns of `shapedirs` in current files; older ones have 10 + 10."""
 OLD_COLUMNS = 10
 JOINTS = len(JOINT_NAMES)
 

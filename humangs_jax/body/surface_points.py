@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from humangs_jax.body import skinning
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.geometry import transform
 
 
 @pytree_dataclass
@@ -38,4 +39,4 @@ def pose_points(
     rest = shaped(points.rest, points.directions, betas)
     if points.corrections is not None:
         rest = rest + jnp.einsum("paq,q->pa", points.corrections, features, precision=skinning.EXACT)
-    return skinning.apply_transforms(skinning.blend_transforms(points.weights, transforms), rest)
+    return transform.apply(skinning.blend_transforms(points.weights, transforms), rest)

@@ -25,7 +25,6 @@ class Demo:
     """Side of the animation's frames in pixels."""
 
     def run(self) -> None:
-        """Run the demonstration."""
         from humangs_jax.apps.demo import run_demo
 
         run_demo(self.out, weights=self.weights, frame_size=self.size)
@@ -50,7 +49,6 @@ class Reconstruct:
     """Fit the avatar to the photos afterwards for so long: seconds ("15s") or steps ("100steps"); see `humangs refine`."""
 
     def run(self) -> None:
-        """Write the avatar."""
         limits = None if self.refine is None else refine_limits(self.refine)
         if limits is not None:
             use_all_cores()
@@ -89,7 +87,6 @@ class Refine:
     """Let the pose of each photo move a little, too: for poses from `humangs fit`, which are millimetres off."""
 
     def run(self) -> None:
-        """Write the avatar."""
         limits = refine_limits(self.limit)
         use_all_cores()
         from humangs_jax.avatar.avatar import Avatar
@@ -134,7 +131,6 @@ class Animate:
     """Degrees that the camera travels around the avatar during the motion."""
 
     def run(self) -> None:
-        """Write the video."""
         from humangs_jax.avatar.avatar import Avatar
         from humangs_jax.avatar.frames import motion_frames
         from humangs_jax.avatar.video import write_video
@@ -167,7 +163,6 @@ class Render:
     """Also write views.exr: float32 RGBA, depth Z and camera matrices, one part per view."""
 
     def run(self) -> None:
-        """Write the images."""
         from humangs_jax.avatar.avatar import Avatar
         from humangs_jax.avatar.frames import capture_renderings, turntable_renderings, write_renderings
         from humangs_jax.data.capture import load_capture
@@ -197,7 +192,6 @@ class Export:
     """Add the 45 zero f_rest fields that some importers (Unity) require."""
 
     def run(self) -> None:
-        """Write the Gaussians."""
         from humangs_jax.avatar.animate import animate
         from humangs_jax.avatar.avatar import Avatar
         from humangs_jax.avatar.export import write_ply

@@ -37,7 +37,6 @@ class ImportCameras:
     """Replace the capture folder."""
 
     def run(self) -> None:
-        """Write the capture folder."""
         from humangs_jax.data.calibration.importing import import_cameras
 
         options = {name: value for name, value in vars(self).items() if name != "what"}
@@ -89,7 +88,6 @@ class Synth:
     """Processes. Default: as many as cores."""
 
     def run(self) -> None:
-        """Write the people."""
         from humangs_jax.people import Layout, write_set
 
         extras = self.extras

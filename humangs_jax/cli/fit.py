@@ -6,7 +6,7 @@ Everything is checked before the work begins, and written after it.
 import dataclasses
 import os
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
@@ -61,7 +61,8 @@ class Refinement:
     """Also compare photos and renderings of a reconstruction while refining."""
 
 
-WAYS = {
+Way = Literal["--scan", "--refine", "--keypoints"]
+WAYS: dict[Way, set[str]] = {
     "--scan": {"keypoints", "person", "body", "joints", "views", "height", "bare"},
     "--refine": {"keypoints", "person", "photometric"},
     "--keypoints": {"person", "body", "smoothness"},
@@ -96,7 +97,7 @@ class Fit:
         """Fit in the way that was asked for."""
         if (self.capture is None) == (self.scan.scan is None):
             raise ValueError("give either a CAPTURE folder or --scan MESH")
-        way = "--scan" if self.scan.scan else "--refine" if self.refinement.refine else "--keypoints"
+        way: Way = "--scan" if self.scan.scan else "--refine" if self.refinement.refine else "--keypoints"
         for option in self._given():
             if option not in WAYS[way] and f"--{option}" != way:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
@@ -216,7 +217,6 @@ class Check:
     """The contact sheet to write; that of the keypoints is NAME_fit.png beside it."""
 
     def run(self) -> None:
-        """Write the sheets."""
         from humangs_jax.apps.check import check_capture
         from humangs_jax.data.capture import load_capture
         from humangs_jax.data.photos import capture_folder

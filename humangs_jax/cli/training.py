@@ -56,7 +56,7 @@ class Train:
     """Checkpoints, log, TensorBoard curves, validation images and weights.safetensors."""
     config: str = "small"
     """small, paper, published or tiny, or a JSON file of settings like the config.json of a run."""
-    live: int = 0
+    on_the_fly: int = 0
     """Also (or without DATA only) train on this number of synthetic people who are rendered anew for every step."""
     validation: Path | None = None
     """Folder of capture folders of other people, evaluated now and then."""
@@ -71,16 +71,16 @@ class Train:
     numbers are not finite."""
 
     def run(self) -> None:
-        """Train, or diagnose."""
-        require_at_least(0, live=self.live)
+        require_at_least(0, on_the_fly=self.on_the_fly)
         self.processes.join()  # before anything asks for devices
         from humangs_jax.body.library import load_body
         from humangs_jax.network.weights import load_weights
         from humangs_jax.objectives.loss_networks import load_loss_networks
         from humangs_jax.people import find_people
+        from humangs_jax.training.config import fitting_losses, read_config
         from humangs_jax.training.diagnose import diagnose_run
-        from humangs_jax.training.launch import fitting_losses, read_config, training_people
         from humangs_jax.training.loop import train
+        from humangs_jax.training.sources import training_people
 
         files = self.networks
         networks = load_loss_networks(files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net)
@@ -93,20 +93,13 @@ class Train:
             model = dataclasses.replace(model, execution=settings.model.execution)
             settings = dataclasses.replace(settings, model=model)
         body = load_body()
-        people = training_people(self.data, self.live, self.out, body)
+        people = training_people(self.data, self.on_the_fly, self.out, body)
         if self.diagnose:
             print(diagnose_run(self.out, body, people, networks=networks, variables=variables))
             return
         others = find_people(self.validation, None) if self.validation is not None else ()
         train(
-            settings,
-            body,
-            people,
-            self.out,
-            validation=others,
-            variables=variables,
-            networks=networks,
-            fsdp=self.fsdp,
+            settings, body, people, self.out, validation=others, variables=variables, networks=networks, fsdp=self.fsdp
         )
 
 
@@ -128,10 +121,9 @@ class Convert:
     pool: Literal["all", "visible"] = "all"
     """Average a vertex's features over all views (as released) or over those that see it."""
     dtype: Literal["float32", "float16"] = "float32"
-    """Of the stored numbers; float16 halves the file."""
+    """Type of the stored numbers; float16 halves the file."""
 
     def run(self) -> None:
-        """Write the weights."""
         from safetensors.numpy import save_file
 
         from humangs_jax.io.atomic import replace_file

@@ -105,7 +105,9 @@ def _find_part(kind, protocol, path):
         raise ValueError(f"{expected}: import the module {module} first")
     cls = getattr(sys.modules[module], name, None)
     frozen = isinstance(cls, type) and dataclasses.is_dataclass(cls) and cls.__dataclass_params__.frozen
-    if not (frozen and issubclass(cls, protocol)):
+    # not issubclass: it refuses protocols with attributes, and a field without a default is no attribute of its class
+    members = [member for member in vars(protocol) if not member.startswith("_")]
+    if not (frozen and all(hasattr(cls, member) or member in cls.__dataclass_fields__ for member in members)):
         raise ValueError(expected)
     return cls
 

@@ -42,7 +42,7 @@ from humangs_jax.data.photos import (
 )
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.images import write_png
+from humangs_jax.io.images import resized, write_png
 from humangs_jax.io.npz import read_npz, write_npz
 
 DEFAULT_BODY = "makehuman"
@@ -73,12 +73,10 @@ class Capture:
 
     @property
     def view_count(self) -> int:
-        """Number of views."""
         return len(self.images)
 
     @property
     def frame_count(self) -> int:
-        """Number of poses."""
         return len(self.poses.translation)
 
     def pose(self, frame: int) -> BodyPose:
@@ -96,6 +94,14 @@ class Capture:
             frames=self.frames[views],
             names=tuple(self.names[i] for i in views),
         )
+
+    def resized(self, longest: int) -> "Capture":
+        """The capture with photos whose longest side has that many pixels."""
+        height, width = self.images.shape[1:3]
+        size = [max(1, round(side * longest / max(height, width))) for side in (width, height)]
+        resize = lambda images: np.stack([resized(image, *size) for image in images])
+        masks = None if self.masks is None else resize(self.masks)
+        return dataclasses.replace(self, images=resize(self.images), masks=masks, cameras=self.cameras.resized(*size))
 
 
 def capture_from_arrays(

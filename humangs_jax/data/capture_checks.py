@@ -47,15 +47,9 @@ def checked_json(file: Path, text: str | None = None, missing: str = "no such fi
 def check_place(folder: Path, overwrite: bool) -> None:
     """Whether a capture may be written to a folder: a new or an empty one, or with `overwrite` another capture."""
     try:
-        check_replaceable(folder)
+        check_replaceable(folder, overwrite, "capture.json")
     except ValueError as error:
         raise CaptureError("", "", error) from error
-    if not folder.is_dir() or not any(folder.iterdir()):
-        return
-    if not overwrite:
-        raise CaptureError(folder, "", "the folder is not empty: choose another one or ask to overwrite it")
-    if not (folder / "capture.json").is_file():
-        raise CaptureError(folder, "", "the folder holds no capture.json: refusing to overwrite what is no capture")
 
 
 def required(mapping: Mapping[str, Any], key: str, file: object, prefix: str = "") -> Any:

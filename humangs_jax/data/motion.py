@@ -211,7 +211,7 @@ def _lhm(file):
 
 
 _FORMATS = {"rotations": _ours, "smpl_poses": _aist, "poses": _amass, "root_pose": _lhm, "body_pose": _smpl_params}
-"""By a key that only this format has; asked in this order."""
+"""Readers by a key that only their format has; the first that fits is used."""
 
 
 class _MotionFile:

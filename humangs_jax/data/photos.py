@@ -9,7 +9,7 @@ import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -25,7 +25,7 @@ DEMO_CAPTURE = "demo_capture"
 """Name of the capture of a synthetic person that comes with the package."""
 TOP_KEYS = {"format", "version", "body", "background", "views"}
 VIEW_KEYS = {"image", "mask", "K", "cam_from_world", "frame"}
-BACKGROUNDS = ("photo", "white")
+Background = Literal["photo", "white"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -94,7 +94,7 @@ def read_description(file: Path) -> dict[str, Any]:
     return description
 
 
-def write_description(folder: Path, views: Sequence[dict[str, Any]], background: str = "photo") -> None:
+def write_description(folder: Path, views: Sequence[dict[str, Any]], background: Background = "photo") -> None:
     """Write capture.json of views with the keys of the format; the body is in body.npz."""
     description = {"format": FORMAT, "version": VERSION, "body": "body.npz", "background": background, "views": views}
     write_json(folder / "capture.json", description)
@@ -111,9 +111,9 @@ def check_keys(mapping: Iterable[str], known: set[str], required: set[str], file
 
 
 def check_background(background: Any, file: object) -> None:
-    """One of `BACKGROUNDS`."""
-    if background not in BACKGROUNDS:
-        raise CaptureError(file, "background", f"expected one of {', '.join(BACKGROUNDS)}, got {background!r}")
+    """One of `Background`."""
+    if background not in get_args(Background):
+        raise CaptureError(file, "background", f"expected one of {', '.join(get_args(Background))}, got {background!r}")
 
 
 def read_frames_and_matrices(

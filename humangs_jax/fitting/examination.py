@@ -146,6 +146,6 @@ def _view_report(name, frame, lengths, outliers):
 
 
 def _quantile(values, share):
-    """Of the values that are not NaN; NaN if all are."""
+    """A quantile of the values that are not NaN; NaN if all are."""
     known = values[np.isfinite(values)]
     return float(np.quantile(known, share)) if known.size else float("nan")

@@ -202,13 +202,5 @@ def save_scan_fit(folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BOD
 
 
 def check_scan_folder(folder: Path, overwrite: bool) -> None:
-    """Raises: ValueError if it is not empty without `overwrite`, holds something other than a fit to a scan, or cannot be
-    replaced (see `check_replaceable`).
-    """
-    check_replaceable(folder)
-    if not folder.is_dir() or not any(folder.iterdir()):
-        return
-    if not overwrite:
-        raise ValueError(f"{folder}: the folder is not empty: choose another one or ask to overwrite it")
-    if not (folder / SCAN_REPORT_FILE).is_file():
-        raise ValueError(f"{folder}: holds no {SCAN_REPORT_FILE}: refusing to overwrite what is no fit to a scan")
+    """Raises: ValueError unless the folder is empty, or with `overwrite` a fit to a scan; see also `check_replaceable`."""
+    check_replaceable(folder, overwrite, SCAN_REPORT_FILE)

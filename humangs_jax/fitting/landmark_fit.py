@@ -189,7 +189,7 @@ def _position(observations, offsets, weights):
 
 
 def _metres_per_pixel(seen, points, weights):
-    """At the person's distance."""
+    """Metres per pixel at the person's distance."""
     centers = -jnp.einsum("cba,cb->ca", seen.cam_from_world[:, :3, :3], seen.cam_from_world[:, :3, 3])
     distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
     each = distance / seen.K[:, :1, 0]
@@ -250,7 +250,7 @@ def _run_stages(problem, seen, start, stages, config):
 
 
 def _noise_found(problem, observations, states):
-    """(m,) pixels."""
+    """(m,) std of the detections after the first stages, pixels."""
 
     def of_frame(seen, state):
         lengths = jnp.linalg.norm(keypoint_errors(seen, problem.landmarks_and_joints(state)[0]), axis=-1)

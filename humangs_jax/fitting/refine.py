@@ -27,7 +27,7 @@ LEAST_GAIN = 0.2
 started at the truth, by up to 0.15.
 """
 LEAST_DIFFERENCE = 0.005
-"""Of the loss, besides: less than half a percent of the silhouettes is rounding of pixels."""
+"""Least decrease of the loss that is kept: less than half a percent of the silhouettes is rounding of pixels."""
 LEAST_IOU = 0.6
 """Bodies in clothes overlap masks by more than this; less means that the start was too far off."""
 DEFAULT_CONFIG = RefineConfig()

@@ -199,7 +199,10 @@ class Scene:
 
     def __init__(self, capture: Capture, keypoints: Keypoints | None, config: RefineConfig) -> None:
         self.capture, self.config = capture, config
-        self.cameras, self.masks = _shrunk(capture, config.longest_side)
+        small = max(capture.images.shape[1:3]) <= config.longest_side
+        looked_at = capture if small else capture.resized(config.longest_side)
+        empty = np.zeros(looked_at.images.shape[:3], np.float32)
+        self.cameras, self.masks = looked_at.cameras, empty if looked_at.masks is None else looked_at.masks
         self.faces = np.asarray(capture.body.faces)
         self.edges = mesh_edges(self.faces)
         self.views = [MaskView(mask, mask_outline(mask, config.points)) for mask in self.masks]
@@ -294,22 +297,8 @@ def _noise(outlines, matches):
     return max(NORMAL_MAD * float(np.median(np.abs(off))), LEAST_NOISE) if len(off) else 1.0
 
 
-def _shrunk(capture, longest):
-    """Cameras and masks with a longest side of at most `longest` pixels; empty masks if the capture has none."""
-    height, width = capture.images.shape[1:3]
-    masks = np.zeros((capture.view_count, height, width), np.float32) if capture.masks is None else capture.masks
-    share = longest / max(height, width)
-    if share >= 1:
-        return capture.cameras, masks
-    from PIL import Image
-
-    size = (max(1, round(width * share)), max(1, round(height * share)))
-    shrink = lambda mask: np.asarray(Image.fromarray(mask).resize(size, Image.Resampling.BOX))
-    return capture.cameras.resized(*size), np.stack([shrink(mask) for mask in masks])
-
-
 def _person_height(masks, observations):
-    """Of the person in the image, pixels: median over the views of the extent of masks, or else of keypoints."""
+    """Height of the person in the image, pixels: median over the views of the extent of masks, or else of keypoints."""
     sizes = [max(np.ptp(x) for x in np.nonzero(mask > 0.5)) for mask in masks if (mask > 0.5).any()]
     if not sizes and observations is not None:
         pairs = zip(np.asarray(observations.points)[:, 0], np.asarray(observations.confidences)[:, 0] > 0, strict=True)

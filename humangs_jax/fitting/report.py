@@ -6,7 +6,7 @@
 import dataclasses
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -90,13 +90,13 @@ class Violation:
 class FitReport:
     """What came of a fit.
 
-    fitted: "keypoints", "refinement" or "scan". kept: False if the start was better and stays. start: of a fit to a scan, where
-    it came from: "landmarks" or "search". errors: by name, see `LABELS`. moved: how far parameters moved, by name. violations:
-    of joint limits. swaps: what seems exchanged. undetermined: joints, or groups of joints, that the views do not determine.
+    kept: False if the start was better and stays. start: of a fit to a scan, where it came from: "landmarks" or "search".
+    errors: by name, see `LABELS`. moved: how far parameters moved, by name. violations: of joint limits. swaps: what
+    seems exchanged. undetermined: joints, or groups of joints, that the views do not determine.
     notes: further results. warnings: what points to a mistake.
     """
 
-    fitted: str
+    fitted: Literal["keypoints", "refinement", "scan"]
     kept: bool = True
     start: str = ""
     errors: dict[str, Change] = dataclasses.field(default_factory=dict)
@@ -200,7 +200,7 @@ GROUPS = {
 
 
 def limit_violations(joint_names: tuple[str, ...], poses: BodyPose) -> tuple[Violation, ...]:
-    """Of a batch of poses, by frame."""
+    """Violations of joint limits in a batch of poses, by frame."""
     prior, rotations = pose_prior(joint_names), np.asarray(poses.rotations)
     return tuple(
         Violation(frame, joint_names[j], "xyz"[axis], float(np.rad2deg(beyond)))

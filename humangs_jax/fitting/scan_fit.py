@@ -15,17 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyModel, BodyPose, person_vertices, shape_body
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.fitting.report import Change, FitReport, Stage, limit_violations
-from humangs_jax.fitting.residuals.scan import (
-    Given,
-    ScanMatches,
-    Target,
-    Tolerances,
-    body_surface,
-    scan_problem,
-)
+from humangs_jax.fitting.residuals.scan import Given, ScanMatches, Target, Tolerances, body_surface, scan_problem
 from humangs_jax.fitting.scan_reading import SCAN_LANDMARKS, Scan, checked_joints, read_scan
 from humangs_jax.fitting.scan_search import (
     COARSE,
@@ -45,7 +38,7 @@ from humangs_jax.geometry import quaternion
 LANDMARK_STDS = (0.2, 0.1, 0.05, 0.02, 0.01)
 """Metres: std of given joints in the rounds that bring a body to them."""
 LANDMARK_STEPS = 5
-"""Of the solver in each of these."""
+"""Steps of the solver in each of these rounds."""
 CLOSER = COARSE[4:]
 """Rounds of the best start of a search with all joints."""
 FINE = (Round(0.15, 0.07), Round(0.1, 0.05), Round(0.1, 0.03), Round(0.08, 0.03), *(Round(0.05, 0.02),) * 6)
@@ -82,7 +75,7 @@ class ScanFit:
 
 
 def fit_scan(
-    mesh_path: str | Path,
+    scan: Scan | str | Path,
     *,
     body: BodyModel,
     joints: dict[str, Float[np.ndarray, "3"]] | None = None,
@@ -90,26 +83,14 @@ def fit_scan(
     height: float | None = None,
     config: ScanFitConfig = DEFAULT_CONFIG,
 ) -> ScanFit:
-    """Fit a body to a mesh file.
+    """Fit a body to a mesh file, or to a scan in memory.
 
-    Arguments: joints: landmarks by name, in the file's coordinates; any of `SCAN_LANDMARKS`, at least three of the trunk.
+    Arguments: joints: landmarks by name, in the scan's coordinates; any of `SCAN_LANDMARKS`, at least three of the trunk.
     clothed: whether the surface may be outside of the skin. height: of the person without shoes, metres, if it is known.
     Raises: ValueError, naming the file, if it holds no usable surface; ValueError for unknown or too few joints.
     """
-    scan = read_scan(mesh_path, config.samples)
-    return fit_scan_points(scan, body=body, joints=joints, clothed=clothed, height=height, config=config)
-
-
-def fit_scan_points(
-    scan: Scan,
-    *,
-    body: BodyModel,
-    joints: dict[str, Float[np.ndarray, "3"]] | None = None,
-    clothed: bool = True,
-    height: float | None = None,
-    config: ScanFitConfig = DEFAULT_CONFIG,
-) -> ScanFit:
-    """The same for a scan in memory. Raises: see `fit_scan`."""
+    if not isinstance(scan, Scan):
+        scan = read_scan(scan, config.samples)
     points, known = checked_joints(joints or {})
     if height is not None and not 0.5 < height < 2.6:
         raise ValueError(f"--height {height}: expected metres, 0.5 to 2.6")
@@ -219,12 +200,7 @@ def _up_axis(own, rotation):
     return sign * rotation[:, best], f"{'+' if sign > 0 else '-'}{'xyz'[best]} of the scan"
 
 
-@jax.jit
-def _vertices(body, betas, pose):
-    return pose_body(body, shape_body(body, betas), pose).vertices
-
-
 def body_in_scan(fit: ScanFit) -> Float[np.ndarray, "n 3"]:
     """The body's vertices (n, 3) in the scan's coordinates."""
-    vertices = _vertices(fit.body, jnp.asarray(fit.betas), fit.pose)
+    vertices = jax.jit(person_vertices)(fit.body, jnp.asarray(fit.betas), fit.pose)
     return fit.world_from_scan.inverse()(np.asarray(vertices, np.float64))

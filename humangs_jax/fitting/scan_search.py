@@ -114,7 +114,7 @@ def run_rounds(
 def improve(
     problem: ScanProblem, matches: ScanMatches, given: Given, tolerances: Tolerances, state: FitState, steps: int
 ) -> tuple[FitState, Outcome]:
-    """At most `steps` steps with these pairs."""
+    """The body after at most `steps` steps of the solver with these pairs, and what the solver did."""
     return solve(lambda y: scan_residuals(problem, matches, given, tolerances, y), state, steps, method="lm")
 
 
@@ -141,7 +141,7 @@ def start_state(problem: ScanProblem, rotations: Float[np.ndarray, "j 3"]) -> Fi
 def landmarks_and_joints(
     problem: ScanProblem, betas: Float[Array, " s"], pose: BodyPose
 ) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
-    """Of a body in a pose, metres."""
+    """Landmarks and joints of a body in a pose, metres."""
     return pose_vertices(problem.surface, jnp.zeros(1, jnp.int32), betas, pose)[1:]
 
 
@@ -158,7 +158,7 @@ STANCES = {
 }
 """Rotation vectors of the left side, which the right mirrors; the other joints rest."""
 POINTS = 400
-"""Of scan and body that are compared."""
+"""Points of scan and body that are compared in the search."""
 TURNS = 24
 """Directions along which the body's axis is tried."""
 CROWDED = 0.9

@@ -29,7 +29,7 @@ SCAN_FILE = "scan.json"
 HEIGHT = 1.7
 """Metres: the scan's longest side in that world (arbitrary)."""
 DISTANCE, FIELD_OF_VIEW = 4.0, np.radians(36.0)
-"""Of the cameras: metres, and vertical."""
+"""Distance of the cameras, metres, and their vertical field of view, radians."""
 AXES = {f"{sign}{axis}": (s, i) for s, sign in ((1, "+"), (-1, "-")) for i, axis in enumerate("xyz")}
 
 

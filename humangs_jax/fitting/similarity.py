@@ -19,7 +19,6 @@ class Similarity:
     translation: Float[np.ndarray, "3"]
 
     def __call__(self, points: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
-        """Transformed points (..., 3)."""
         return self.scale * np.asarray(points, np.float64) @ self.rotation.T + self.translation
 
     def after(self, first: "Similarity") -> "Similarity":
@@ -29,12 +28,10 @@ class Similarity:
         )
 
     def inverse(self) -> "Similarity":
-        """The inverse."""
         back = self.rotation.T
         return Similarity(1 / self.scale, back, -(back @ self.translation) / self.scale)
 
     def matrix(self) -> Float[np.ndarray, "4 4"]:
-        """(4, 4) homogeneous."""
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
         return matrix

@@ -121,8 +121,8 @@ def usual_origin(prior: PosePrior, joints: tuple[int, ...], coefficients: int) -
     return Origin(betas=jnp.zeros(coefficients), pose=pose, body_pose_std=std, joints=joints)
 
 
-def zero_state(origin: Origin, *, scaled: bool = False) -> FitState:
-    """The state of the origin. scaled: with the scale of a scan."""
+def zero_state(origin: Origin) -> FitState:
+    """The state of the origin, without the scale of a scan."""
     frames, a = origin.pose.translation.shape[:-1], len(origin.joints)
     cameras = None
     if (views := origin.cameras) is not None:
@@ -135,7 +135,6 @@ def zero_state(origin: Origin, *, scaled: bool = False) -> FitState:
         body_pose=jnp.zeros((*frames, a, 3)),
         cameras=cameras,
         clothing=None if origin.segment is None else jnp.zeros(a + 1),
-        log_scale=jnp.zeros(()) if scaled else None,
     )
 
 

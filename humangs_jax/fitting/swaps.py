@@ -15,6 +15,7 @@ A view agrees with a landmark by how near its keypoint is to the best of the poi
 
 import dataclasses
 import itertools
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -49,19 +50,18 @@ MIRRORED_SHARE, MIRRORED_GAIN = 0.6, 60.0
 class Swap:
     """One exchange that explains a disagreement; `str()` is a sentence about it.
 
-    kind: "sides", "cameras", "all sides" or "hands". views: names of the views. instead: alternatives that explain it as well;
-    for cameras pairs ("a and b"). gain: how much better the views agree without it, as a share of what is attainable; for "all
-    sides": the share by which the cost of the fit falls. frames: for cameras, in how many; the views are those of the first.
+    views: names of the views. instead: alternatives that explain it as well; for cameras pairs ("a and b"). gain: how much better
+    the views agree without it, as a share of what is attainable; for "all sides": the share by which the cost of the fit falls.
+    frames: for cameras, in how many; the views are those of the first.
     """
 
-    kind: str
+    kind: Literal["sides", "cameras", "all sides", "hands"]
     views: tuple[str, ...]
     gain: float
     instead: tuple[str, ...] = ()
     frames: int = 1
 
     def __str__(self) -> str:
-        """One sentence."""
         if self.kind == "all sides":
             return "left and right of the keypoints seem exchanged in all views: the mirrored person fits much better"
         if self.kind == "hands":
@@ -114,11 +114,7 @@ def find_exchanged_hands(keypoints: Keypoints, names: tuple[str, ...]) -> tuple[
 
 
 def find_mirrored(
-    model: LandmarkModel,
-    observations: Observations,
-    kind: KeypointSet,
-    fit: LandmarkFit,
-    config: FitConfig,
+    model: LandmarkModel, observations: Observations, kind: KeypointSet, fit: LandmarkFit, config: FitConfig
 ) -> tuple[Swap, ...]:
     """Left and right exchanged in all views: the keypoints are mirrored and fitted once more.
 
@@ -152,13 +148,13 @@ class Order:
         return cls(np.tile(np.arange(views), (frames, 1)), np.zeros((frames, views), bool))
 
     def exchanged(self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"], b: Int[np.ndarray, " e"]) -> "Order":
-        """With the keypoints of cameras a and b exchanged in some frames."""
+        """The order with the keypoints of cameras a and b exchanged in some frames."""
         source = self.source.copy()
         source[frames, a], source[frames, b] = self.source[frames, b], self.source[frames, a]
         return dataclasses.replace(self, source=source)
 
     def sides_exchanged(self, frames: Int[np.ndarray, " e"], a: Int[np.ndarray, " e"]) -> "Order":
-        """With left and right of camera a's keypoints exchanged in some frames."""
+        """The order with left and right of camera a's keypoints exchanged in some frames."""
         mirrored = self.mirrored.copy()
         mirrored[frames, self.source[frames, a]] ^= True
         return dataclasses.replace(self, mirrored=mirrored)
@@ -174,7 +170,7 @@ def arranged(observations: Observations, mirror: Int[np.ndarray, " k"], order: O
 
 @pytree_dataclass
 class Agreement:
-    """Of c views with the points that they agree on best: confidences summed over keypoints, less for larger errors.
+    """How well c views agree with the points that they agree on best: confidences summed over keypoints, less for larger errors.
 
     own: (c,) with the keypoints as they are. crossed: (c, c) if the first view had the second's keypoints, and mirrored: (c,)
     with left and right exchanged, both without new triangulation.
@@ -292,7 +288,7 @@ def _trial(gains, most, count, frames, a, b=None):
 
 
 def _clear_flips(rig, state):
-    """By frame, the view whose sides are exchanged most clearly."""
+    """The view of each frame whose sides are exchanged most clearly, by frame."""
     most, count = attainable(state.confidences, rig.mirror != np.arange(len(rig.mirror)))
     found: dict[int, _Trial] = {}
     for slot in np.flatnonzero(state.sides.any(0)):

@@ -13,7 +13,7 @@ from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.fitting.residuals.keypoints import Observations, focal_lengths, in_cameras
 
 RIDGE = 1e-6
-"""Of the weights: parallel rays leave the distance open; the point is then near the cameras."""
+"""Share of the weights that pulls towards the cameras: parallel rays leave the distance open."""
 REWEIGHTED = 3
 """Rounds of weighting the rays by the distance of the last point."""
 MARGIN = 6.0

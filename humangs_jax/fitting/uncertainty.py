@@ -23,15 +23,14 @@ UNSEEN = 1e-8
 
 @pytree_dataclass
 class Uncertainty:
-    """Of m frames (numpy on the host).
+    """The uncertainty of a fit of m frames (numpy on the host).
 
-    joint_covariances: (m, j, 3, 3) of the joints' positions, square metres. rotation_std: (m, j, 3) of the rotation vectors,
-    radians. determined: (m, j) share of the prior's variance of a joint's rotation, mean over axes, that the views remove: 1 all,
-    0 nothing, as for joints that no keypoint depends on. shape_covariance: (s, s).
+    joint_covariances: (m, j, 3, 3) of the joints' positions, square metres. determined: (m, j) share of the prior's variance of
+    a joint's rotation, mean over axes, that the views remove: 1 all, 0 nothing, as for joints that no keypoint depends on.
+    shape_covariance: (s, s).
     """
 
     joint_covariances: Float[np.ndarray, "m j 3 3"]
-    rotation_std: Float[np.ndarray, "m j 3"]
     determined: Float[np.ndarray, "m j"]
     shape_covariance: Float[np.ndarray, "s s"]
 
@@ -70,27 +69,23 @@ def fit_uncertainty(
         + mixed.swapaxes(-1, -2)
         + np.einsum("mjas,st,mjbt->mjab", joints_by_shape, shape_covariance, joints_by_shape)
     )
-    return _by_joint(keypoint_problem(model, config), config, covariances, poses, shape_covariance)
+    return Uncertainty(covariances, _determined(keypoint_problem(model, config), config, poses), shape_covariance)
 
 
-def _by_joint(problem, config, covariances, poses, shape_covariance):
-    """Variances of the unknowns, in the order global_orient, transl, body_pose, sorted by joint."""
-    prior, joints = problem.prior, np.asarray(problem.origin.joints)
-    m, j = covariances.shape[:2]
-    variances = np.diagonal(poses, axis1=-2, axis2=-1)
-    left = variances[:, 6:].reshape(m, len(joints), 3)
-    std = np.broadcast_to(prior.std, (m, j, 3)).copy()
-    std[:, joints] = prior.std[joints] * np.sqrt(left)
-    std[:, 0] = np.radians(problem.origin.std.global_orient) * np.sqrt(variances[:, :3])
-    determined = np.zeros((m, j))
+def _determined(problem, config, poses):
+    """`Uncertainty.determined` from the covariance (m, p, p) of the unknowns, in the order global_orient, transl, body_pose."""
+    joints, variances = np.asarray(problem.origin.joints), np.diagonal(poses, axis1=-2, axis2=-1)
+    left = variances[:, 6:].reshape(len(poses), len(joints), 3)
+    std = np.radians(problem.origin.std.global_orient) * np.sqrt(variances[:, :3])
+    determined = np.zeros((len(poses), len(problem.prior.std)))
     determined[:, joints] = 1 - np.clip(left.mean(-1) * config.pose_weight**2, 0, 1)
-    determined[:, 0] = 1 - np.clip((std[:, 0] / np.pi).max(-1), 0, 1)
-    return Uncertainty(covariances, std, determined, shape_covariance)
+    determined[:, 0] = 1 - np.clip((std / np.pi).max(-1), 0, 1)
+    return determined
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def _derivatives(model, observations, fit, config):
-    """Of the residuals (m, r, .) and of the joints (m, j, 3, .), by pose and by shape."""
+    """Derivatives of the residuals (m, r, .) and of the joints (m, j, 3, .), by pose and by shape."""
     problem = keypoint_problem(model, config)
 
     def both(seen, vector, betas):

@@ -79,8 +79,11 @@ def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object]) -
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def check_replaceable(folder: str | os.PathLike) -> None:
-    """Raises: ValueError for what `replace_folder` refuses: a symbolic link, a file, the working folder or one above it."""
+def check_replaceable(folder: str | os.PathLike, overwrite: bool = True, mark: str | None = None) -> None:
+    """Raises: ValueError for what `replace_folder` refuses: a symbolic link, a file, the working folder or one above it.
+
+    mark: a file that all folders of this kind hold. Then the folder has to be empty or, with `overwrite`, of this kind.
+    """
     folder = Path(folder)
     if folder.is_symlink():
         raise ValueError(f"{folder}: is a symbolic link: expected the folder itself")
@@ -88,6 +91,12 @@ def check_replaceable(folder: str | os.PathLike) -> None:
         raise ValueError(f"{folder}: is a file: expected a folder name")
     if Path.cwd().is_relative_to(folder.resolve()):
         raise ValueError(f"{folder}: is the working folder or contains it: expected another folder")
+    if mark is None or not folder.is_dir() or not any(folder.iterdir()):
+        return
+    if not overwrite:
+        raise ValueError(f"{folder}: the folder is not empty: choose another one or ask to overwrite it")
+    if not (folder / mark).is_file():
+        raise ValueError(f"{folder}: the folder holds no {mark}: refusing to overwrite something else")
 
 
 def add_files(folder: str | os.PathLike, write: Callable[[Path], object]) -> None:

@@ -57,6 +57,16 @@ def to_uint8(image: Float[np.ndarray, "*shape"]) -> np.ndarray:
     return np.rint(255 * np.clip(np.nan_to_num(np.asarray(image)), 0, 1)).astype(np.uint8)
 
 
+def resized(image: Float[np.ndarray, "h w *c"], width: int, height: int) -> Float[np.ndarray, "height width *c"]:
+    """A float32 image at another size: box-averaged where it becomes narrower, else bicubic."""
+    from PIL import Image
+
+    method = Image.Resampling.BOX if width < image.shape[1] else Image.Resampling.BICUBIC
+    channels = np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
+    planes = [np.asarray(Image.fromarray(channel).resize((width, height), method)) for channel in channels]
+    return np.stack(planes, axis=-1).reshape(height, width, *image.shape[2:])
+
+
 def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
     """((width, height), whether there is an alpha channel). PNG files are checked by their checksums, others by decoding.
 

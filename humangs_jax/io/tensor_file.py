@@ -1,6 +1,6 @@
-"""Named tensors of a file, whichever of the formats it is in: safetensors, or either format of `torch.save`.
+"""Named tensors of a file, whichever of the formats it is in: safetensors, either format of `torch.save`, or MatConvNet's.
 
-What a file is, its first bytes say; its name does not matter.
+The first bytes of a file decide; its name does not matter.
 """
 
 import os
@@ -11,6 +11,8 @@ import numpy as np
 
 from humangs_jax.io.torch_file import Tensors, Wanted, everything, read_torch_file
 
+MATLAB_START = b"MATLAB "
+
 
 def read_tensors(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[Tensors, int]:
     """The tensors whose name is wanted, and how many others the file has. Nothing in the file is run.
@@ -18,7 +20,7 @@ def read_tensors(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[
     Raises: OSError; ValueError, naming the file, if it is none of these formats, is damaged, or asks for more than
     tensors.
     """
-    return _read_safetensors(path, wanted) if is_safetensors(path) else read_torch_file(path, wanted)
+    return read_safetensors(path, wanted)[:2] if is_safetensors(path) else read_torch_file(path, wanted)
 
 
 def is_safetensors(path: str | os.PathLike) -> bool:
@@ -28,25 +30,53 @@ def is_safetensors(path: str | os.PathLike) -> bool:
     return start[8:] == b"{" and struct.unpack("<Q", start[:8])[0] < 1 << 32
 
 
-def safetensors_metadata(path: str | os.PathLike) -> dict[str, str]:
-    """The strings in the header of a safetensors file. Raises: ValueError."""
-    return _open(path, lambda file: file.metadata() or {})
-
-
-def _read_safetensors(path, wanted: Wanted) -> tuple[Tensors, int]:
-    def read(file):
-        keys = list(file.keys())
-        tensors = {key: np.asarray(file.get_tensor(key)) for key in keys if wanted(key)}
-        return tensors, len(keys) - len(tensors)
-
-    return _open(path, read)
-
-
-def _open(path, use):
+def read_safetensors(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[Tensors, int, dict[str, str]]:
+    """The tensors whose name is wanted, how many others the file has, and the strings in its header. Raises: ValueError."""
     from safetensors import SafetensorError, safe_open
 
     try:
         with safe_open(Path(path), framework="numpy") as file:
-            return use(file)
+            keys = list(file.keys())
+            tensors = {key: np.asarray(file.get_tensor(key)) for key in keys if wanted(key)}
+            return tensors, len(keys) - len(tensors), file.metadata() or {}
     except (SafetensorError, TypeError) as error:
-        raise ValueError(f"{path} is no readable safetensors file: {error}") from error
+        raise ValueError(f"{path} is not a readable safetensors file: {error}") from error
+
+
+def is_matlab_file(path: str | os.PathLike) -> bool:
+    """Whether a file begins like MATLAB's."""
+    with open(path, "rb") as file:
+        return file.read(len(MATLAB_START)) == MATLAB_START
+
+
+def read_matconvnet(path: str | os.PathLike) -> Tensors:
+    """Convolutions of a network in MatConvNet's `.mat` files, such as imagenet-vgg-verydeep-19.mat, in the layout of torch.
+
+    {"0.weight": (out, in, rows, columns), "0.bias": (out,), "2.weight": ...}, numbered as in torchvision's `features`. Fully
+    connected layers are convolutions there too, and not used.
+
+    Raises: OSError; ValueError, naming the file, if it is no such network.
+    """
+    from scipy.io import loadmat
+
+    with open(path, "rb") as file:
+        try:
+            return _convolutions(loadmat(file, variable_names=["layers"])["layers"])
+        except NotImplementedError as error:
+            raise ValueError(f"{path}: MATLAB files of version 7.3 are not supported: {error}") from error
+        except Exception as error:  # a damaged file, or another one, raises nearly anything
+            raise ValueError(f"{path} is no network of MatConvNet: {error!r}") from error
+
+
+def _convolutions(cells: np.ndarray) -> Tensors:
+    """From structures with a `type`. A "conv" has its filters (rows, columns, in, out) and biases under `weights`, or in older
+    files under `filters` and `biases`.
+    """
+    tensors = {}
+    for index, layer in enumerate(cell.ravel()[0] for cell in cells.ravel()):
+        if layer["type"].item() != "conv":
+            continue
+        new = "weights" in layer.dtype.names
+        kernel, bias = layer["weights"].ravel() if new else (layer["filters"], layer["biases"])
+        tensors[f"{index}.weight"], tensors[f"{index}.bias"] = kernel.transpose(3, 2, 0, 1), bias.ravel()
+    return tensors

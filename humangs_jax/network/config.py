@@ -91,7 +91,7 @@ class HumanGSConfig:
 
     def __post_init__(self):
         """Raises ValueError for photos that the encoder cannot cut into patches."""
-        patch = getattr(self.architecture.encoder, "patch_size", 1)
+        patch = self.architecture.encoder.patch_size
         if self.conventions.image_size % patch:
             raise ValueError(f"image_size {self.conventions.image_size} is not a multiple of patch_size {patch}")
 

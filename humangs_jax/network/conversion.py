@@ -12,16 +12,17 @@ import statistics
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
-from humangs_jax.io.tensor_file import is_safetensors, read_tensors, safetensors_metadata
+from humangs_jax.io.tensor_file import is_safetensors, read_safetensors, read_tensors
 from humangs_jax.network.config import Architecture, HumanGSConfig, paper_parts
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.presets import published
 from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
-from humangs_jax.network.triplane import TriplaneConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
 from humangs_jax.network.weights import FORMAT, expected_variables, flatten_variables, variables_from_tensors
@@ -33,7 +34,7 @@ SKINNING_WEIGHTS = "tpose_lbs_weights"
 UNSUPPORTED = "target_pose_tokenizer.1.weight"
 """Marks a variant of the network (canonical target maps) that does not exist here."""
 COUNTER = "num_batches_tracked"
-"""Of every batch norm; means nothing here."""
+"""A counter that torch keeps in every batch norm; it is ignored."""
 PIXEL_CHANNELS = 9
 """rgb and ray, beside the pose features."""
 
@@ -141,13 +142,8 @@ def to_release(variables: Variables) -> StateDict:
 
 def expected_shapes(config: HumanGSConfig) -> dict[str, tuple[int, ...]]:
     """Shapes of the state dict that the release has for a configuration, without the body's skinning weights."""
-    shapes = {}
-    for path, leaf in flatten_variables(expected_variables(config)).items():
-        key, layout = release_name(path)
-        shapes[key] = layout.to_release(np.broadcast_to(np.float32(0), leaf.shape)).shape
-        if key.endswith("running_var"):
-            shapes[f"{key.removesuffix('running_var')}{COUNTER}"] = ()
-    return shapes
+    empty = jax.tree.map(lambda leaf: np.broadcast_to(np.float32(0), leaf.shape), expected_variables(config))
+    return {key: tensor.shape for key, tensor in to_release(empty).items()}
 
 
 def read_state_dict(path: str | os.PathLike) -> tuple[StateDict, int]:
@@ -155,7 +151,7 @@ def read_state_dict(path: str | os.PathLike) -> tuple[StateDict, int]:
 
     Raises: OSError; ValueError if the file is damaged, is none, or holds anything but tensors.
     """
-    if is_safetensors(path) and safetensors_metadata(path).get("format") == FORMAT:
+    if is_safetensors(path) and read_safetensors(path, lambda _: False)[2].get("format") == FORMAT:
         raise ValueError(f"{path} is a weights file already: nothing to convert")
     return read_tensors(path, lambda key: not key.startswith(LOSS_PREFIX))
 

@@ -9,13 +9,12 @@ import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
 from humangs_jax.core.configuration import knob
-from humangs_jax.geometry.rays import plucker_rays
+from humangs_jax.geometry.camera import plucker_rays
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, Pass, Variables
-from humangs_jax.network.tokenizer import Packing, Tokenizer, pack_patches, patchify, unpack_tokens
+from humangs_jax.network.tokenizer import Packing, Tokenizer, TriplaneConfig, pack_patches, patchify, unpack_tokens
 from humangs_jax.network.transformer import INIT_STD, Transformer, TransformerConfig
-from humangs_jax.network.triplane import TriplaneConfig
 from humangs_jax.network.upsampler import Upsampler, UpsamplerConfig
 
 

@@ -38,35 +38,23 @@ class Execution:
         measured=MEASURED,
     )
     token_capacity: int = knob(
-        0,
-        cost="tokens beyond it are dropped and counted",
-        gain="time and memory",
-        measured=MEASURED,
+        0, cost="tokens beyond it are dropped and counted", gain="time and memory", measured=MEASURED
     )
     dtype: Literal["float32", "bfloat16"] = knob(
         "float32", cost="1e-2 of relative error", gain="time on accelerators; none on CPUs", measured="parity.md"
     )
     attention: Literal["auto"] | AttentionKernel = knob(
-        "auto",
-        cost="none",
-        gain="chunked: a third of the time on CPUs, memory linear in tokens",
-        measured=MEASURED,
+        "auto", cost="none", gain="chunked: a third of the time on CPUs, memory linear in tokens", measured=MEASURED
     )
     attention_chunk: int = knob(1024, cost="none", gain="memory", measured=MEASURED)
     scan: bool = knob(
-        False,
-        cost="a copy of the blocks' parameters",
-        gain="compile time on TPU and GPU",
-        measured=MEASURED,
+        False, cost="a copy of the blocks' parameters", gain="compile time on TPU and GPU", measured=MEASURED
     )
     remat: Literal["none", "full", "dots"] = knob(
         "none", cost="a third more arithmetic", gain="memory of training", measured=MEASURED
     )
     vertex_capacity: int | None = knob(
-        None,
-        cost="vertices beyond it are dropped and counted",
-        gain="no gain measured",
-        measured=MEASURED,
+        None, cost="vertices beyond it are dropped and counted", gain="no gain measured", measured=MEASURED
     )
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
 

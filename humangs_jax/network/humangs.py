@@ -22,7 +22,7 @@ from humangs_jax.network.encoder import touched_patches
 from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
 from humangs_jax.network.reader import project_and_test, view_weights
-from humangs_jax.network.stages import Stage, call
+from humangs_jax.network.stages import StageCaller, call
 
 PARTS = ("encoder", "reader", "decoder")
 
@@ -33,7 +33,7 @@ def apply_humangs(
     config: HumanGSConfig,
     train: bool = False,
     axis_name: str | tuple[str, ...] | None = None,
-    stage: Stage = call,
+    stage: StageCaller = call,
 ) -> tuple[HumanGSOutputs, Variables]:
     """The whole network for one subject: outputs and batch statistics.
 
@@ -101,7 +101,7 @@ def part_variables(variables: Variables, part: str) -> Variables:
 
 def needed_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]:
     """The token capacity that these photos need: patches that the foreground touches, over all views."""
-    return jnp.sum(touched_patches(inputs, getattr(config.architecture.encoder, "patch_size", 1)), dtype=jnp.int32)
+    return jnp.sum(touched_patches(inputs, config.architecture.encoder.patch_size), dtype=jnp.int32)
 
 
 def needed_reads(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]:
@@ -113,7 +113,7 @@ def needed_reads(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]
 
 def _example_inputs(config):
     """One view of two by two patches with one vertex: enough to find shapes."""
-    side = 2 * getattr(config.architecture.encoder, "patch_size", 1)
+    side = 2 * config.architecture.encoder.patch_size
     camera = Camera(jnp.eye(3), jnp.eye(4), side, side)
     grid, vertex = jnp.zeros((1, side, side)), jnp.zeros((1, 1, 3))
     return HumanGSInputs(

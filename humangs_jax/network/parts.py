@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.stages import Stage, call
+from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.rendering.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class Pass(NamedTuple):
     config: "HumanGSConfig"
     train: bool = False
     axis_name: str | tuple[str, ...] | None = None
-    stage: Stage = call
+    stage: StageCaller = call
 
 
 class Encoding(NamedTuple):
@@ -68,6 +68,11 @@ class HumanGSOutputs:
 @runtime_checkable
 class Encoder(Protocol):
     """Photos -> `Encoding`."""
+
+    @property
+    def patch_size(self) -> int:
+        """Side of a token's patch, pixels: the side of photos is a multiple of it. 1 where any side will do."""
+        ...
 
     def init(self, key: Key, inputs: HumanGSInputs, run: Pass) -> Variables:
         """Fresh variables; only shapes of `inputs` matter."""

@@ -6,8 +6,8 @@ from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig,
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
-from humangs_jax.network.triplane import TriplaneConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
 

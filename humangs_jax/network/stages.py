@@ -1,6 +1,6 @@
 """Named stages of one computation, and a recorder that watches them.
 
-The pass, the drawing and the loss are written once. Each names its stages by calling them through a `Stage`:
+The pass, the drawing and the loss are written once. Each names its stages by calling them through a `StageCaller`:
 
     features = stage("vertex features", read, encoding)
 
@@ -20,7 +20,7 @@ from humangs_jax.core.array_types import Array, Float, PyTree
 
 T = TypeVar("T")
 
-Stage = Callable[..., Any]
+StageCaller = Callable[..., Any]
 """stage(name, function, *learned) -> function(*learned). learned: the arguments that depend on parameters."""
 Named = dict[str, Array]
 """Arrays by their paths in a pytree, as cameras.K; "" for a bare array."""
@@ -52,7 +52,7 @@ observe.defvjp(lambda x, probe: (x, None), lambda _, cotangent: (cotangent, cota
 
 
 class Recorder:
-    """A `Stage` that records what the stages of one traced computation take and give, in the order of their first use.
+    """A `StageCaller` that records what the stages of one traced computation take and give, in the order of their first use.
 
     outputs: {stage: what it returned}. given: {stage: {leaf: array}}, the floating-point arrays of the same. probes:
     {stage: {leaf: zeros}} to differentiate with respect to; None in a first run, which finds their shapes: `probes()`.

@@ -2,8 +2,13 @@
 
 Channel order of a pixel: 2 rgb - 1 (3), moment (3), direction (3), texture planes xy, xz, yz. Channels run fastest
 inside a pixel, pixels row-major inside a patch, patches row-major inside a view, views in their order.
+
+The neural texture is three feature planes over the canonical body, read at canonical positions. The first named axis of a plane
+is the horizontal texture coordinate. Positions in [-1, 1] span a plane from the centre of its first texel to the centre of its
+last one (`align_corners=True`); outside are zeros.
 """
 
+import dataclasses
 from typing import Any
 
 import flax.linen as nn
@@ -11,10 +16,27 @@ import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.network.bilinear import sample_bilinear
 from humangs_jax.network.transformer import INIT_STD
-from humangs_jax.network.triplane import TriplaneConfig, sample_triplane
 
 TEXTURE_STD = 0.1
+PLANES = ((0, 1), (0, 2), (1, 2))
+
+
+@dataclasses.dataclass(frozen=True)
+class TriplaneConfig:
+    """Size of the neural texture. resolution: texels along each side of a plane. channels: features per texel."""
+
+    resolution: int = 128
+    channels: int = 16
+
+
+def sample_triplane(texture: Float[Array, "3 r r c"], positions: Float[Array, "*p 3"]) -> Float[Array, "*p 3*c"]:
+    """Features of canonical positions (normalised units): those of plane xy, then xz, then yz."""
+    middle = (texture.shape[1] - 1) / 2
+    indices = positions * middle  # from the middle: a third of the rounding of (positions + 1) * middle
+    planes = zip(texture, map(list, PLANES), strict=True)
+    return jnp.concatenate([sample_bilinear(plane, indices[..., axes], middle) for plane, axes in planes], axis=-1)
 
 
 @pytree_dataclass

@@ -59,7 +59,7 @@ class Block(nn.Module):
 
     @property
     def stage_name(self) -> str:
-        """Of this block in a diagnosis."""
+        """Name of this block in a diagnosis."""
         return f"block {self.index}"
 
     @nn.compact

@@ -23,7 +23,7 @@ from humangs_jax.network.neighborhoods import KERNEL
 
 SLOPE = 0.2
 MOMENTUM = 0.9
-"""Of the running statistics; torch calls it 0.1, and takes the unbiased variance: larger by one part in v * h * w."""
+"""Momentum of the running statistics; torch calls it 0.1, and takes the unbiased variance: larger by one part in v * h * w."""
 KAIMING = nn.initializers.variance_scaling(2.0, "fan_out", "normal")
 KAIMING_TRANSPOSED = nn.initializers.variance_scaling(2.0, "fan_in", "normal")
 """torch counts the fan-out of a transposed convolution over its input channels."""

@@ -17,6 +17,7 @@ import numpy as np
 
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.io.atomic import write_bytes
+from humangs_jax.io.tensor_file import read_safetensors
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Variables
@@ -72,16 +73,9 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
             if not shipped.exists():
                 raise FileNotFoundError("this installation ships no weights: give the path of a weights file")
             return load_weights(shipped)
-    from safetensors import SafetensorError, safe_open
-
     if not Path(path).is_file():
         raise FileNotFoundError(f"no weights file {path}")
-    try:
-        with safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (no mapping)
-    except (SafetensorError, TypeError) as error:
-        raise ValueError(f"{path} is not a readable safetensors file: {error}") from error
+    tensors, _, metadata = read_safetensors(path)
     if metadata.get("format") != FORMAT or metadata.get("version") not in ("1", VERSION):
         found = f"format {metadata.get('format')!r}, version {metadata.get('version')!r}"
         raise ValueError(f"{path}: expected header format {FORMAT!r}, version {VERSION!r} or '1'; found {found}")

@@ -125,7 +125,7 @@ def convolutions(slices: Slices) -> Iterator[Conv]:
 
 
 def channels(slices: Slices) -> tuple[int, ...]:
-    """Of each compared feature map."""
+    """Number of channels of each compared feature map."""
     return tuple([layer for layer in part if not isinstance(layer, Pool)][-1].outputs for part in slices)
 
 

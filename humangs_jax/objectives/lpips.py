@@ -16,7 +16,7 @@ from humangs_jax.objectives.backbones import ALEXNET, SQUEEZENET, VGG16, Slices,
 BACKBONES: dict[str, Slices] = {"vgg": VGG16, "alex": ALEXNET, "squeeze": SQUEEZENET}
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
-"""Of colours in [-1, 1]."""
+"""Mean and scale of colours in [-1, 1] that the backbones expect."""
 EPSILON = 1e-10
 """Added to the length of a feature vector."""
 

@@ -16,7 +16,7 @@ from humangs_jax.objectives.backbones import Weights, feature_maps, vgg
 VGG19 = vgg((2, 2, 4, 4, 4), (2, 2, 2, 2, 2), average=True)
 MEAN_COLOR = (123.68, 116.779, 103.939)
 DIVISORS = (1.0, 2.6, 4.8, 3.7, 5.6, 0.15)
-"""Of the errors of the pixels and the five depths."""
+"""Divisors of the errors of the pixels and of the five depths."""
 
 
 @pytree_dataclass

@@ -21,6 +21,7 @@ from jax import lax
 
 from humangs_jax.body.skinning import joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int, Key, UInt8
+from humangs_jax.core.configuration import knob
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.loading.examples import Example
 from humangs_jax.data.views import SubjectViews
@@ -118,8 +119,12 @@ class OnTheFlyConfig:
     mirrored_share: float = 0.5
     dyed_share: float = 0.7
     supersampling: int = 2
-    views_at_once: int = 1
-    pixels_per_step: int = 1 << 14
+    views_at_once: int = knob(
+        1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md"
+    )
+    pixels_per_step: int = knob(
+        1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md"
+    )
 
 
 ON_THE_FLY = OnTheFlyConfig()

@@ -4,6 +4,7 @@ Everything is a pure function of explicit state, for one person; batch with `jax
 """
 
 import dataclasses
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -78,7 +79,7 @@ class RefineState:
 def init_state(parameters: Parameters, visibility: Float[Array, " g"], config: RefineConfig) -> RefineState:
     """visibility: largest weight of each Gaussian on the pixels of the photos."""
     trust = jnp.minimum(visibility / config.visible, 1.0)
-    return RefineState(parameters, parameters, trust, ADAM.init(parameters))
+    return RefineState(parameters, parameters, trust, ADAM.init(cast(Any, parameters)))
 
 
 def update(
@@ -88,7 +89,7 @@ def update(
 
     Adam's steps do not shrink with the gradient, so the trust multiplies the step and not the loss.
     """
-    steps, adam = ADAM.update(gradient, state.adam)
+    steps, adam = ADAM.update(cast(Any, gradient), state.adam)
     cosine = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + jnp.cos(jnp.pi * progress))
 
     def moved(name):

@@ -17,12 +17,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.configuration import config_from_file, config_to_json
+from humangs_jax.core.configuration import config_to_json
 from humangs_jax.io.atomic import write_text
-from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.config import TrainConfig, read_config
 from humangs_jax.training.state import TrainState
-
-logger = logging.getLogger(__name__)
 
 UNSCORED = -1e9
 """Score of a checkpoint that was saved before any validation: worse than every other."""
@@ -118,7 +116,6 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
     Raises: ValueError, naming a field, if the folder belongs to a run of another configuration.
     """
     path = Path(out) / "config.json"
-    fields = json.loads(config_to_json(config))
     if path.is_file():
         earlier, now = (_flat(json.loads(config_to_json(run))) for run in (load_config(out), config))
         for name in sorted((earlier.keys() | now.keys()) - set(ADJUSTABLE)):
@@ -126,9 +123,8 @@ def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> Non
                 raise ValueError(
                     f"{path}: this run was started with {name} = {earlier.get(name)}, not {now.get(name)}: use another --out"
                 )
-    if not write:
-        return
-    write_text(path, json.dumps(fields, indent=1))
+    if write:
+        write_text(path, config_to_json(config, indent=1))
 
 
 def load_config(out: str | Path) -> TrainConfig:
@@ -136,7 +132,7 @@ def load_config(out: str | Path) -> TrainConfig:
     path = Path(out) / "config.json"
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no run here")
-    return config_from_file(TrainConfig, path)
+    return read_config(path)
 
 
 def _placed_as(value, like):

@@ -2,14 +2,18 @@
 
 import dataclasses
 import itertools
-from collections.abc import Collection
+import logging
+from pathlib import Path
 
-from humangs_jax.core.configuration import knob
+from humangs_jax.core.configuration import config_from_file, knob
 from humangs_jax.data.loader import ViewSampling
 from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.training.optimizer import OptimizerConfig
+
+logger = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,11 +183,41 @@ def tiny() -> TrainConfig:
 PRESETS = {"published": published, "paper": paper, "small": small, "tiny": tiny}
 
 
-def without_losses(config: TrainConfig, names: Collection[str]) -> TrainConfig:
-    """The run without some of the losses that need networks; structural dissimilarity takes their place.
+def read_config(preset_or_path: str | Path) -> TrainConfig:
+    """A preset by its name, or a JSON file such as the config.json of a run.
 
-    Its weight becomes at least that of `LossConfig()`.
+    Raises: FileNotFoundError if it is neither; ValueError, naming file and field.
     """
+    if str(preset_or_path) in PRESETS:
+        return PRESETS[str(preset_or_path)]()
+    path = Path(preset_or_path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: neither a file nor one of the presets {', '.join(PRESETS)}")
+    try:
+        return config_from_file(TrainConfig, path)
+    except ValueError as error:
+        if "HumanGSConfig has no such field" not in str(error):
+            raise
+        raise ValueError(
+            f"{error}: expected architecture, conventions and execution. A run of a version before `model` was divided so "
+            "cannot be continued: start another with --init-weights (its weights.safetensors still loads) and another --out"
+        ) from error
+
+
+def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:
+    """The run without the losses whose networks are missing; a warning names them.
+
+    Structural dissimilarity takes their place: its weight becomes at least that of `LossConfig()`.
+    """
+    needing = ("perceptual", "lpips")
+    missing = [name for name in needing if getattr(config.loss, name) and getattr(networks, name) is None]
+    if not missing:
+        return config
     structural = max(config.loss.structural, LossConfig().structural)
-    loss = dataclasses.replace(config.loss, **dict.fromkeys(names, 0.0), structural=structural)
+    logger.warning(
+        "the loss %s is left out, its network is not given; structural dissimilarity (weight %g) takes its place",
+        " and ".join(missing),
+        structural,
+    )
+    loss = dataclasses.replace(config.loss, **dict.fromkeys(missing, 0.0), structural=structural)
     return dataclasses.replace(config, loss=loss)

@@ -10,34 +10,19 @@ import numpy as np
 from humangs_jax.core.array_types import PyTree
 from humangs_jax.network.stages import inexact_leaves
 
-AXES = {
-    "images": "view row column",
-    "masks": "view row column",
-    "K": "view",
-    "cam_from_world": "view",
-    "rotations": "view joint",
-    "translations": "view",
-    "posed_vertices": "view vertex",
-    "canonical_vertices": "vertex",
-    "position_maps": "view row column",
-    "depth_maps": "view row column",
-    "pixels": "view row column",
-    "tokens": "token",
-    "input norm": "token",
-    "block": "token",
-    "final norm": "token",
-    "maps": "view row column",
-    "encoding": "view row column",
-    "rgb": "view row column",
-    "alpha": "view row column",
-    "global_token": "feature",
-    "vertex features": "vertex",
-    "raw heads": "vertex Gaussian",
-    "canonical Gaussians": "Gaussian",
-    "tight_offsets": "vertex Gaussian",
-    "posed Gaussians": "view Gaussian",
-    "projected splats": "view Gaussian",
+_COUNTED = {
+    "view": ("K", "cam_from_world", "translations"),
+    "view joint": ("rotations",),
+    "view vertex": ("posed_vertices",),
+    "view row column": ("images", "masks", "position_maps", "depth_maps", "pixels", "maps", "encoding", "rgb", "alpha"),
+    "view Gaussian": ("posed Gaussians", "projected splats"),
+    "vertex": ("canonical_vertices", "vertex features"),
+    "vertex Gaussian": ("raw heads", "tight_offsets"),
+    "token": ("tokens", "input norm", "block", "final norm"),
+    "feature": ("global_token",),
+    "Gaussian": ("canonical Gaussians",),
 }
+AXES = {name: axes for axes, names in _COUNTED.items() for name in names}
 """What the leading axes of an array count: by the last part of its name, or else by its stage."""
 
 Direction = Literal["stored", "forward", "backward"]
@@ -75,7 +60,6 @@ class Leaf:
 
     @property
     def magnitude(self) -> float:
-        """The largest magnitude."""
         return max(abs(self.smallest), abs(self.largest)) if self.smallest <= self.largest else 0.0
 
 
@@ -126,7 +110,7 @@ class Fault:
 
 @dataclasses.dataclass(frozen=True)
 class Diagnosis:
-    """Of one subject of one step: the first with a fault, or else the one of the largest gradient.
+    """The diagnosis of one subject of a step: the first with a fault, or else the one with the largest gradient.
 
     step: steps done before it. stored: what the step began with, state and batch. stages: in the order of the forward
     pass. skip_norm: gradients longer than this are skipped. `str` of it is a report.
@@ -167,7 +151,7 @@ class Diagnosis:
 
     @property
     def verdict(self) -> str:
-        """In a line or a few."""
+        """What was found, in one line or a few."""
         if self.faults:
             return "\n".join(map(str, self.faults))
         norm = self.gradient_norm
@@ -187,7 +171,7 @@ class Diagnosis:
 
 
 def leaves(tree: PyTree) -> tuple[Leaf, ...]:
-    """Of all arrays of a tree that could be NaN."""
+    """The numbers of all floating-point arrays of a tree."""
     return tuple(Leaf.of(name, np.asarray(leaf)) for name, leaf in inexact_leaves(tree))
 
 

@@ -13,7 +13,7 @@ from humangs_jax.data.views import SubjectViews, prepare_inputs
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.parts import HumanGSOutputs, Variables
-from humangs_jax.network.stages import Stage, call
+from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.rendering.drawing import draw_projected
 from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.rendering.splatting import Rendering
@@ -30,7 +30,7 @@ def reconstruct_example(
     config: TrainConfig,
     train: bool = False,
     axis_name: str | tuple[str, ...] | None = None,
-    stage: Stage = call,
+    stage: StageCaller = call,
 ) -> tuple[HumanGSOutputs, Variables]:
     """Canonical Gaussians of one subject and the batch statistics, see `apply_humangs`."""
     model = token_share(config, len(inputs.images))
@@ -57,7 +57,7 @@ def draw_targets(
     targets: SubjectViews,
     backgrounds: Float[Array, "v 3"],
     config: TrainConfig,
-    stage: Stage = call,
+    stage: StageCaller = call,
 ) -> Rendering:
     """The Gaussians in the pose and before the camera of every target: a `Rendering` with a leading axis of v."""
     poses = (targets.rotations, targets.translations)
@@ -86,7 +86,6 @@ def draw_targets(
 
 
 def white_backgrounds(targets: SubjectViews) -> Float[Array, "v 3"]:
-    """White for every target."""
     return jnp.ones((*targets.translations.shape[:-1], 3), targets.images.dtype)
 
 

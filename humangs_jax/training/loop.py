@@ -9,7 +9,11 @@ out/best.safetensors                 those of the best validation
 Of several processes all must see the same folder `out`; one of them writes all but the checkpoints.
 """
 
-from collections.abc import Sequence
+import contextlib
+import logging
+import signal
+import threading
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 
 import jax
@@ -17,19 +21,20 @@ import jax
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, Waiting
 from humangs_jax.data.views import gaussian_body
+from humangs_jax.io.images import write_png
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import save_weights
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training.checkpoint import Checkpoints, save_config
 from humangs_jax.training.config import TrainConfig
-from humangs_jax.training.log import RunLog
+from humangs_jax.training.log import RunLog, Watch
 from humangs_jax.training.sharding import place, replicated, state_shardings, training_mesh, whole
 from humangs_jax.training.sources import MakeSource, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import NO_NETWORKS, jitted_train_step, train_step
-from humangs_jax.training.stopping import stop_requested
-from humangs_jax.training.validation import sheet, validate, validation_examples, write_sheet
-from humangs_jax.training.watch import Watch
+from humangs_jax.training.validation import sheet, validate, validation_examples
+
+logger = logging.getLogger(__name__)
 
 VALIDATED = 8
 """Subjects that a validation looks at."""
@@ -138,8 +143,45 @@ def _rehearse(make_source, config, step, state, body, networks, mesh):
 
 
 def _report(log, out, done, numbers, image):
-    """Of a validation."""
     log.numbers(done, {f"val_{name}": value for name, value in numbers.items()}, "validation")
-    write_sheet(out / "sheets" / f"{done:07d}.png", image)
+    write_png(out / "sheets" / f"{done:07d}.png", image)
     log.image(done, "validation/sheet", image)
     log.bar.write(f"step {done}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
+
+
+@contextlib.contextmanager
+def stop_requested() -> Generator[Callable[[int], bool], None, None]:
+    """A function of the number of steps done: whether to stop after them, for Ctrl-C or because the machine is taken away.
+
+    All processes must ask it after every step. One process checks its own signals. Several may receive a signal at different
+    steps, so that jax's coordination service agrees on one
+    (https://docs.jax.dev/en/latest/_autosummary/jax.experimental.multihost_utils.html).
+    """
+    if jax.process_count() > 1:
+        from jax.experimental import multihost_utils
+
+        yield multihost_utils.reached_preemption_sync_point
+        return
+    with _own_signals() as stop:
+        yield lambda _: stop.is_set()
+
+
+@contextlib.contextmanager
+def _own_signals():
+    """An event that SIGINT and SIGTERM set; the second SIGINT is a KeyboardInterrupt again."""
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():  # only the main thread may catch signals
+        yield stop
+        return
+
+    def handle(number, _frame):
+        stop.set()
+        signal.signal(number, previous[number])
+        logger.warning("stopping after this step; what is done is saved")
+
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

@@ -65,12 +65,12 @@ def state_shardings(state: TrainState, mesh: Mesh) -> TrainState:
 
 
 def batch_sharding(mesh: Mesh) -> NamedSharding:
-    """Of a batch: its first axis is divided among all devices."""
+    """Sharding of a batch: its first axis is divided among all devices."""
     return NamedSharding(mesh, PartitionSpec(AXES))
 
 
 def replicated(mesh: Mesh) -> NamedSharding:
-    """Of what every device has whole."""
+    """Sharding of arrays of which every device has a copy."""
     return NamedSharding(mesh, PartitionSpec())
 
 

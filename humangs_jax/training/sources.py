@@ -5,6 +5,7 @@ A run asks for a new source at every stage, because image sizes differ.
 
 import dataclasses
 import logging
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -13,7 +14,17 @@ from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture, Source
-from humangs_jax.people import ON_THE_FLY, OnTheFlyConfig, PeopleBank, on_the_fly_source
+from humangs_jax.people import (
+    ON_THE_FLY,
+    SPLITS,
+    OnTheFlyConfig,
+    PeopleBank,
+    build_bank,
+    find_people,
+    load_bank,
+    on_the_fly_source,
+    save_bank,
+)
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.sharding import batch_sharding
 
@@ -64,3 +75,34 @@ def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -
 def mixed_people(parts: Sequence[MakeSource], weights: Sequence[float | int]) -> MakeSource:
     """Several of these, each with its share of the examples, see `loader.Mixture`."""
     return lambda config: Mixture(tuple(part(config) for part in parts), tuple(weights))
+
+
+def training_people(data: Path | None, on_the_fly: int, out: Path, body: BodyModel) -> MakeSource:
+    """The people of a folder of captures, `on_the_fly` synthetic people rendered for every step, or both by halves.
+
+    The latter are made once, into out/people.npz, by one process. Raises: ValueError if there are none.
+    """
+    parts = []
+    if data is not None:
+        parts.append(captured_people(find_people(data), body))
+    if on_the_fly:
+        parts.append(on_the_fly_people(_bank(on_the_fly, out, body)))
+    if not parts:
+        raise ValueError("nobody to train on: name a folder of captures, or give --on-the-fly a number of people")
+    return parts[0] if len(parts) == 1 else mixed_people(parts, [1] * len(parts))
+
+
+def _bank(people, out, body):
+    """The bank in out/people.npz, which one process makes unless it is there."""
+    path, seeds, bank = out / "people.npz", SPLITS["train"][:people], None
+    if jax.process_index() == 0:
+        bank = load_bank(path) if path.is_file() else None
+        if bank is None or bank.seeds.tolist() != list(seeds):
+            out.mkdir(parents=True, exist_ok=True)
+            bank = build_bank(seeds, body, "train", processes=os.cpu_count() or 1, progress=True)
+            save_bank(path, bank)
+    if jax.process_count() > 1:
+        from jax.experimental import multihost_utils
+
+        multihost_utils.sync_global_devices("people")
+    return load_bank(path) if bank is None else bank

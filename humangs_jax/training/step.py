@@ -15,7 +15,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.network.parts import HumanGSOutputs
-from humangs_jax.network.stages import Stage, call
+from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.losses import squared_error, tightness
 from humangs_jax.objectives.lpips import lpips
@@ -60,7 +60,7 @@ def loss_terms(
     targets: SubjectViews,
     config: LossConfig,
     networks: LossNetworks = NO_NETWORKS,
-    stage: Stage = call,
+    stage: StageCaller = call,
 ) -> Metrics:
     """The unweighted terms of `LossConfig` by name, for renderings on the backgrounds of `images`.
 
@@ -86,7 +86,7 @@ def loss_terms(
 
 def _required(network, name, title):
     if network is None:
-        raise ValueError(f"loss.{name} is not 0, but there is no {title}: pass its weights, or use `without_losses`")
+        raise ValueError(f"loss.{name} is not 0, but there is no {title}: pass its weights, or use `fitting_losses`")
     return network
 
 
@@ -109,7 +109,7 @@ def subject_loss(
     config: TrainConfig,
     networks: LossNetworks = NO_NETWORKS,
     axis_name: str | tuple[str, ...] | None = None,
-    stage: Stage = call,
+    stage: StageCaller = call,
 ) -> tuple[Scalar, tuple[PyTree, Metrics]]:
     """Loss of one subject, with the updated batch statistics and metrics. stage: see `network.stages`."""
     variables = {"params": params, "batch_stats": batch_stats}
@@ -142,7 +142,7 @@ def local_gradients(
     networks: LossNetworks = NO_NETWORKS,
     axes: tuple[str, ...] = (),
 ) -> Gradients:
-    """Of the subjects of one device: means over them, but sums of what was dropped. keys: one per subject.
+    """Gradients of one device's subjects: means over them, but sums of what was dropped. keys: one per subject.
 
     `config.microbatch_size` subjects are worked on at once, the gradients accumulate over the rest. axes: of the mesh,
     along which batch statistics are shared too. Raises: ValueError if the subjects cannot be divided so.

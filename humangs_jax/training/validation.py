@@ -6,7 +6,6 @@ Several processes share the people; every process ends up with the means over al
 import dataclasses
 import functools
 from collections.abc import Sequence
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,6 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, ViewSampling
-from humangs_jax.io.images import write_png
 from humangs_jax.network.parts import Variables
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import lpips
@@ -47,11 +45,7 @@ def validation_examples(cache: CaptureCache, config: TrainConfig, count: int) ->
 
 @functools.partial(jax.jit, static_argnames="config")
 def evaluate(
-    variables: Variables,
-    body: BodyModel,
-    example: Example,
-    config: TrainConfig,
-    networks: LossNetworks = NO_NETWORKS,
+    variables: Variables, body: BodyModel, example: Example, config: TrainConfig, networks: LossNetworks = NO_NETWORKS
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
     """The images of one example's targets and their mean psnr, psnr_mask (both dB), ssim, and lpips if its network is
     there.
@@ -111,8 +105,3 @@ def sheet(examples: Sequence[Example], images: Sequence[np.ndarray]) -> Float[np
         pairs = [image for pair in zip(targets, shown, strict=True) for image in pair]
         rows.append(np.concatenate([*np.asarray(example.inputs.images), *pairs], axis=1))
     return np.concatenate(rows)
-
-
-def write_sheet(path: str | Path, image: Float[np.ndarray, "h w 3"]) -> None:
-    """The `sheet` as a PNG."""
-    write_png(Path(path), image)

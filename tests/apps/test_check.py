@@ -50,13 +50,13 @@ def cameras(views=3, width=SIZE, height=SIZE):
 
 
 def capture(change=lambda matrix: matrix, masks=True, empty_masks=False, **arrays):
-    """Photos of the boxes themselves, with cameras told after `change`."""
+    """Photos of the boxes themselves, with cameras reported after `change`."""
     seen, body = cameras(), boxes()
     white = np.ones((SIZE, SIZE, 3), np.float32)
-    pictures = [draw_body(body, jnp.zeros(0), rest_pose(body), seen[i], white)[1] for i in range(3)]
-    covered = np.stack([np.asarray(p.covered) for p in pictures])
+    drawn = [draw_body(body, jnp.zeros(0), rest_pose(body), seen[i], white)[1] for i in range(3)]
+    covered = np.stack([np.asarray(p.covered) for p in drawn])
     values = dict(
-        images=np.where(covered[..., None], np.stack([np.asarray(p.shaded) for p in pictures]), 1.0),
+        images=np.where(covered[..., None], np.stack([np.asarray(p.shaded) for p in drawn]), 1.0),
         masks=covered.astype(np.float32) * (not empty_masks) if masks else None,
         K=seen.K,
         cam_from_world=np.stack([change(np.asarray(m, float)) for m in seen.cam_from_world]),
@@ -84,13 +84,13 @@ def test_a_right_capture_has_full_overlap_and_no_warning(tmp_path):
 def test_left_is_blue_and_right_is_red_on_the_photo():
     body = boxes()
     front = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.6, SIZE, SIZE), SIZE, SIZE)[0]
-    picture, parts = draw_body(body, jnp.zeros(0), rest_pose(body), front, np.ones((SIZE, SIZE, 3), np.float32))
-    # seen from the front the person's left arm (x > 0) is on the right of the picture
+    image, parts = draw_body(body, jnp.zeros(0), rest_pose(body), front, np.ones((SIZE, SIZE, 3), np.float32))
+    # seen from the front the person's left arm (x > 0) is on the right of the image
     covered = np.asarray(parts.covered)
     row = int(SIZE / 2 - 0.2 / (3 * np.tan(0.3)) * SIZE / 2)
     columns = np.flatnonzero(covered[row])
-    assert picture[row, columns[-3], 2] > picture[row, columns[-3], 0] + 0.2
-    assert picture[row, columns[2], 0] > picture[row, columns[2], 2] + 0.2
+    assert image[row, columns[-3], 2] > image[row, columns[-3], 0] + 0.2
+    assert image[row, columns[2], 0] > image[row, columns[2], 2] + 0.2
     np.testing.assert_allclose(side_tints(body)[:8], np.broadcast_to(module.MIDDLE, (8, 3)), atol=1e-6)
 
 
@@ -101,16 +101,16 @@ def test_without_names_of_sides_the_tints_go_by_position():
 
 def test_overlay_changes_only_the_body():
     photo = np.random.default_rng(0).random((SIZE, SIZE, 3)).astype(np.float32)
-    picture, parts = draw_body(boxes(), jnp.zeros(0), rest_pose(boxes()), cameras()[0], photo)
+    image, parts = draw_body(boxes(), jnp.zeros(0), rest_pose(boxes()), cameras()[0], photo)
     covered = np.asarray(parts.covered)
     assert 0.05 < covered.mean() < 0.5
-    np.testing.assert_array_equal(picture[~covered], photo[~covered])
-    edge = np.abs(picture - OUTLINE).max(-1) < 1e-6
+    np.testing.assert_array_equal(image[~covered], photo[~covered])
+    edge = np.abs(image - OUTLINE).max(-1) < 1e-6
     assert edge.any() and not (edge & ~covered).any() and edge.sum() < covered.sum() / 2
     inner = covered & ~edge
     expected = (1 - module.OPACITY) * photo + module.OPACITY * np.asarray(parts.shaded)
-    np.testing.assert_allclose(picture[inner], expected[inner], atol=1e-6)
-    np.testing.assert_array_equal(overlay(photo, parts), picture)
+    np.testing.assert_allclose(image[inner], expected[inner], atol=1e-6)
+    np.testing.assert_array_equal(overlay(photo, parts), image)
 
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # (x, y, z) -> (x, z, -y): z-up to y-up
@@ -142,7 +142,7 @@ def test_without_masks_no_wrong_mistake_is_named(tmp_path, mistake):
     assert str(report).count("no mask") == 3
 
 
-def test_mistakes_in_pictures_and_poses_are_named(tmp_path):
+def test_mistakes_in_images_and_poses_are_named(tmp_path):
     right = capture()
     aside = replace(right.cameras, K=right.cameras.K.at[:, 0, 2].add(12))  # off the middle, then mirrored
     flipped = {name: np.roll(getattr(right, name), 12, axis=2)[:, :, ::-1].copy() for name in ("images", "masks")}

@@ -68,10 +68,10 @@ def test_the_report_holds_what_is_promised(out):
     assert {"jax", "flax", "humangs_jax", "python"} <= set(report["versions"]) and report["device"]
 
 
-def test_pictures_show_a_person(out):
+def test_images_show_a_person(out):
     for name in ("inputs.png", "novel_views.png"):
-        picture = iio.imread(out / name)
-        assert picture.std() > 20 and (picture == 255).all(-1).mean() > 0.3, name
+        image = iio.imread(out / name)
+        assert image.std() > 20 and (image == 255).all(-1).mean() > 0.3, name
     frames = iio.imread(out / "animation.gif").astype(float)
     assert len(frames) == len(video_frames(out / "animation.mp4")) >= 24
     covered = (frames.min(-1) < 200).mean(axis=(1, 2))

@@ -1,4 +1,4 @@
-"""Gradients through all of it: photos -> network -> skinned Gaussians -> pictures -> loss, in float64.
+"""Gradients through all of it: photos -> network -> skinned Gaussians -> images -> loss, in float64.
 
 Differentiable are the network's parameters, the photos, the cameras, posed and canonical vertices and position
 maps that come with them, and pose, shape and camera of every target. Depth maps and foreground only decide; and
@@ -39,7 +39,7 @@ AGREEMENT = 5e-6
 SMALLEST_DERIVATIVE = 1e-6
 """Where everything moves by its own size. The neural texture's is 1e-5; something cut off would have none."""
 SEEN = (0.05, 0.5)
-"""Mean coverage of the pictures: there is somebody to see."""
+"""Mean coverage of the images: there is somebody to see."""
 FLOAT32_COSINE = 0.999
 DTYPES = (jnp.float32, jnp.float64)
 PARAMETER_GROUPS = ("texture", "tokenizer", "transformer", "upsampler", "decoder")
@@ -142,7 +142,7 @@ def cameras(count, size, distance, azimuth):
 
 
 def random_views(seed, count, size, betas):
-    """Noise in a pose: pictures far from what they are to show give every pixel a say."""
+    """Noise in a pose: images far from what they are to show give every pixel a say."""
     rng = np.random.default_rng(seed)
     y, x = np.mgrid[:size, :size] / size - 0.5
     masks = np.broadcast_to((x / 0.25) ** 2 + (y / 0.45) ** 2 < 1, (count, size, size)).astype(np.float64)
@@ -374,7 +374,7 @@ def check_degenerate(case, degenerate, dtype):
         assert np.all(np.isfinite(leaf)), jax.tree_util.keystr(path)
     culled = degenerate is every_gaussian_culled
     assert np.all(facts["alpha"] == 0) == culled
-    if culled:  # nothing that only pictures tell of has a gradient
+    if culled:  # nothing that only images tell of has a gradient
         assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_cameras"]))
         assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_pose"]))
 

@@ -68,17 +68,17 @@ def test_vmap_over_subjects_is_a_loop(body, network):
 def test_reconstruct_and_render_lower_for_every_platform(body, network):
     variables, config = network
 
-    def picture(variables, views):
+    def drawn(variables, views):
         avatar, dropped = reconstruct_views(variables, config, body, views)
         from humangs_jax.body.model import BodyPose
 
         gaussians = skin(avatar, BodyPose(views.rotations[0], views.translations[0]))
         return render(gaussians, views.cameras[0], SplatConfig()).rgb, dropped
 
-    exported = jax.export.export(jax.jit(picture), platforms=("cpu", "cuda", "tpu"))(variables, subject_views(0))
+    exported = jax.export.export(jax.jit(drawn), platforms=("cpu", "cuda", "tpu"))(variables, subject_views(0))
     assert set(exported.platforms) == {"cpu", "cuda", "tpu"}
     image, _ = exported.call(variables, subject_views(0))
-    expected, _ = jax.jit(picture)(variables, subject_views(0))
+    expected, _ = jax.jit(drawn)(variables, subject_views(0))
     np.testing.assert_allclose(image, expected, atol=1e-5)
 
 

@@ -21,25 +21,25 @@ def images(count, height=40, width=50):
 
 @pytest.mark.parametrize(("count", "columns"), [(1, 1), (5, 3), (4, None), (3, 8)])
 def test_every_tile_is_where_it_belongs(count, columns):
-    pictures = images(count)
-    sheet = tile(pictures, columns=columns)
+    tiles = images(count)
+    sheet = tile(tiles, columns=columns)
     across = 2 if columns is None else min(columns, count)
     for i in range(count):
         y, x = GAP + (i // across) * (40 + GAP), GAP + (i % across) * (50 + GAP)
-        np.testing.assert_array_equal(sheet[y : y + 40, x : x + 50], pictures[i])
+        np.testing.assert_array_equal(sheet[y : y + 40, x : x + 50], tiles[i])
         sheet[y : y + 40, x : x + 50] = 1
     assert (sheet == 1).all()  # nothing but the tiles
     assert sheet.shape == (-(-count // across) * 44 + GAP, across * 54 + GAP, 3)
 
 
 def test_texts_are_written_beside_the_images_and_cut_to_their_width():
-    pictures = images(4)
-    sheet = tile(pictures, labels=["a", "long label " * 20, "", "d"], headers=["truth", "ours"], columns=2)
+    tiles = images(4)
+    sheet = tile(tiles, labels=["a", "long label " * 20, "", "d"], headers=["truth", "ours"], columns=2)
     found = [
         (y, x)
         for y in range(sheet.shape[0] - 39)
         for x in (GAP, 2 * GAP + 50)
-        if any(np.array_equal(sheet[y : y + 40, x : x + 50], p) for p in pictures)
+        if any(np.array_equal(sheet[y : y + 40, x : x + 50], p) for p in tiles)
     ]
     assert len(found) == 4  # no letter on any image
     first_rows = sheet[: found[0][0]]
@@ -80,7 +80,7 @@ def test_side_by_side_shows_truth_ours_and_error(tmp_path, count):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (dict(images=np.zeros((0, 4, 4, 3))), "images"),
         (dict(images=np.zeros((2, 4, 4, 3)), labels=["a"]), "labels: expected 2"),
@@ -88,8 +88,8 @@ def test_side_by_side_shows_truth_ours_and_error(tmp_path, count):
         (dict(images=np.zeros((2, 4, 4, 3)), columns=0), "columns"),
     ],
 )
-def test_wrong_numbers_of_things_write_nothing(tmp_path, arguments, told):
-    with pytest.raises(ValueError, match=told):
+def test_wrong_numbers_of_things_write_nothing(tmp_path, arguments, message):
+    with pytest.raises(ValueError, match=message):
         contact_sheet(path=tmp_path / "a.png", **arguments)
     assert list(tmp_path.iterdir()) == []
 

@@ -6,7 +6,7 @@ import pytest
 from humangs_jax.avatar.video import write_video
 
 H264_ERROR = 0.02
-"""Mean absolute difference after compression of a smooth picture; a wrong colour matrix gives 0.03 and more."""
+"""Mean absolute difference after compression of a smooth image; a wrong colour matrix gives 0.03 and more."""
 PALETTE_ERROR = 0.02
 """256 colours for all frames."""
 
@@ -49,9 +49,9 @@ def test_frames_come_back(tmp_path, name):
 
 def test_mp4_says_its_speed_and_pixel_format(tmp_path):
     write_video(tmp_path / "a.mp4", moving_square(30, 47, 63), 30)  # odd sides
-    told = ffmpeg("-i", tmp_path / "a.mp4").stderr.decode()
-    assert "Video: h264" in told and "yuv420p(tv, bt709" in told and "64x48" in told and " 30 fps" in told
-    assert "Duration: 00:00:01.0" in told
+    message = ffmpeg("-i", tmp_path / "a.mp4").stderr.decode()
+    assert "Video: h264" in message and "yuv420p(tv, bt709" in message and "64x48" in message and " 30 fps" in message
+    assert "Duration: 00:00:01.0" in message
     back = read_back(tmp_path / "a.mp4")
     assert back.shape[0] == 30
     assert np.abs(back[:, :47, :63] - moving_square(30, 47, 63)).mean() < H264_ERROR  # padded, not resized
@@ -83,7 +83,7 @@ NAN[1, 2, 2, 0] = np.nan
 
 
 @pytest.mark.parametrize(
-    ("name", "frames", "fps", "told"),
+    ("name", "frames", "fps", "message"),
     [
         ("a.mp4", np.zeros((0, 4, 4, 3)), 24, "at least one frame"),
         ("a.gif", np.zeros((0, 4, 4, 3)), 24, "at least one frame"),
@@ -94,8 +94,8 @@ NAN[1, 2, 2, 0] = np.nan
         ("a.avi", np.zeros((2, 4, 4, 3)), 24, r"\.mp4 or \.gif"),
     ],
 )
-def test_errors_write_nothing(tmp_path, name, frames, fps, told):
-    with pytest.raises(ValueError, match=told):
+def test_errors_write_nothing(tmp_path, name, frames, fps, message):
+    with pytest.raises(ValueError, match=message):
         write_video(tmp_path / name, frames, fps)
     assert list(tmp_path.iterdir()) == []
 

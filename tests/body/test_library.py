@@ -10,7 +10,7 @@ import pytest
 from body_cases import areas, is_closed, made_up_body, signed_volume
 from scipy.spatial import cKDTree
 
-from humangs_jax.body import storage
+from humangs_jax.body import library
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
@@ -168,21 +168,21 @@ def test_own_files_keep_a_body(tmp_path):
         shape_directions=body.shape_directions / 4,
         name="someone",
     )
-    storage.save_body(tmp_path / "body.npz", body)
+    library.save_body(tmp_path / "body.npz", body)
     again = load_body(tmp_path / "body.npz")
     assert jax.tree.structure(again) == jax.tree.structure(body)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(body), strict=True):
         assert a.dtype == b.dtype
         assert np.abs(np.asarray(a, np.float64) - b).max() < STORED
     large = replace(body, shape_directions=body.shape_directions * 1000)
-    storage.save_body(tmp_path / "large.npz", large)
+    library.save_body(tmp_path / "large.npz", large)
     assert np.allclose(load_body(tmp_path / "large.npz").shape_directions, large.shape_directions)
 
 
 def test_what_cannot_be_stored_or_read_is_an_error(tmp_path):
     with pytest.raises(ValueError, match="pose directions"):
-        storage.save_body(tmp_path / "body.npz", made_up_body())
-    storage.save_body(tmp_path / "body.npz", made_up_body(pose_directions=False))
+        library.save_body(tmp_path / "body.npz", made_up_body())
+    library.save_body(tmp_path / "body.npz", made_up_body(pose_directions=False))
     arrays = dict(np.load(tmp_path / "body.npz"))
     del arrays["template"]
     np.savez(tmp_path / "part.npz", **arrays)

@@ -6,6 +6,7 @@ from body_cases import PARENTS, random_pose, world_frames
 from rounding import bound
 
 from humangs_jax.body import skinning
+from humangs_jax.geometry import transform
 
 EXACT = 1e-12  # float64 against float64
 ATOL = 5e-6  # float32, chains of 4 joints, lengths of about 1
@@ -54,7 +55,7 @@ def test_joint_transforms_are_frame_products(seed):
 def test_one_joint_is_a_rotation_about_it():
     joint = jnp.asarray([[0.3, -0.2, 0.5]])
     transforms = joint_transforms(joint, (-1,), jnp.asarray([[0.0, np.pi / 2, 0.0]]), jnp.asarray([0, 1.0, 0]))
-    moved = skinning.apply_transforms(transforms, joint + jnp.asarray([[0, 0, 1.0]]))
+    moved = transform.apply(transforms, joint + jnp.asarray([[0, 0, 1.0]]))
     assert np.allclose(moved, joint + jnp.asarray([[1.0, 1.0, 0]]), atol=ATOL)  # about +y, z goes to x
 
 
@@ -65,7 +66,7 @@ def test_blending_is_a_weighted_sum():
     found = skinning.blend_transforms(jnp.asarray(weights, jnp.float32), jnp.asarray(transforms, jnp.float32))
     assert np.allclose(found, expected, atol=ATOL)
     points = rng.normal(size=(6, 3))
-    applied = skinning.apply_transforms(found, jnp.asarray(points, jnp.float32))
+    applied = transform.apply(found, jnp.asarray(points, jnp.float32))
     loop = [t[:3, :3] @ p + t[:3, 3] for t, p in zip(expected, points, strict=True)]
     assert np.allclose(applied, loop, atol=ATOL)
 

@@ -257,7 +257,7 @@ def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder,
             np.testing.assert_array_equal(image, stored[subject].images[view] / np.float32(255))
 
 
-def test_a_picture_that_only_decoding_finds_broken_costs_its_examples_alone(folder, tmp_path, monkeypatch):
+def test_an_image_that_only_decoding_finds_broken_costs_its_examples_alone(folder, tmp_path, monkeypatch):
     """Whatever was asked for before: a resumed run does not know what an earlier one found out."""
     write_subject(tmp_path / "s2", 2)
     folders = (folder / "s0", tmp_path / "s2")

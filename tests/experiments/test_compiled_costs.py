@@ -201,7 +201,7 @@ def test_updates_write_their_part_of_a_buffer():
 
 
 def empty_inputs(views, size, vertices=20):
-    """What the encoder is told, all zeros."""
+    """What the encoder takes, all zeros."""
     K = intrinsics_from_fov(0.8, size, size)
     return HumanGSInputs(
         images=jnp.zeros((views, size, size, 3)),

@@ -1,4 +1,4 @@
-"""Where errors are, of pictures whose errors are known."""
+"""Where errors are, of images whose errors are known."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from experiments.evaluation import error_shares
 
 
-def picture(size=48, half=12):
+def person(size=48, half=12):
     """A grey square on white: colours, coverage."""
     alpha = np.zeros((size, size))
     alpha[size // 2 - half : size // 2 + half, size // 2 - half : size // 2 + half] = 1
@@ -18,10 +18,10 @@ NAMES = ("share at the outline", "share in holes", "share in colours", "share ar
 
 @pytest.mark.parametrize("place", NAMES)
 def test_an_error_is_counted_where_it_is(place):
-    image, mask = picture()
+    image, mask = person()
     rgb, alpha = image.copy(), mask.copy()
     if place == "share at the outline":
-        rgb, alpha = picture(half=11)
+        rgb, alpha = person(half=11)
     elif place == "share in holes":
         rgb[24, 24], alpha[24, 24] = 1, 0
     elif place == "share in colours":
@@ -34,8 +34,8 @@ def test_an_error_is_counted_where_it_is(place):
 
 
 def test_under_the_true_coverage_only_the_colours_count():
-    image, mask = picture()
-    rgb, alpha = picture(half=11)
+    image, mask = person()
+    rgb, alpha = person(half=11)
     rgb[24, 24] = 0.5  # so that the PSNR is finite
     found = error_shares.shares(rgb, alpha, image, mask)
     assert found["psnr under the true coverage"] > found["psnr"] + 20

@@ -39,7 +39,7 @@ def test_lpips_is_missing_without_weights():
     assert results.table_row(row).split().count("-") == 2
 
 
-def test_lpips_is_the_mean_over_views_of_clipped_pictures():
+def test_lpips_is_the_mean_over_views_of_clipped_images():
     heads = tuple(jnp.ones(count) for count in channels(BACKBONES["alex"]))
     weights = Lpips(random_weights(jax.random.key(0), BACKBONES["alex"]), heads, "alex")
     truth, predicted = np.random.default_rng(0).random((2, 2, 32, 32, 3)).astype(np.float32)
@@ -87,7 +87,7 @@ def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch)
 
     monkeypatch.setattr(subjects, "make_evaluation_subject", lambda *a: made.append(a[0]) or make(*a))
     monkeypatch.setattr(subjects, "draw_person", observed)
-    page, out, pictures = tmp_path / "page.md", tmp_path / "a.json", tmp_path / "sheet.png"
+    page, out, sheet = tmp_path / "page.md", tmp_path / "a.json", tmp_path / "sheet.png"
     page.write_text("Before\n<!-- table: evaluation_views -->\nold\n<!-- end -->\nAfter\n")
     options = ("--weights", weights, "--json", out, *SMALL)
     run(synthetic, monkeypatch, "--subjects", 2, "--views", 1, *options)
@@ -97,7 +97,7 @@ def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch)
     assert report["views"] == 1 and report["lpips"] is None and set(report["by_views"]) == {"1"}
 
     made.clear(), drawn.clear()
-    run(synthetic, monkeypatch, "--subjects", 2, "--views", 2, 1, *options, "--page", page, "--pictures", pictures)
+    run(synthetic, monkeypatch, "--subjects", 2, "--views", 2, 1, *options, "--page", page, "--images", sheet)
     assert made == [first, second] and drawn == [(first, 2), (second, 2)]  # the rows of one photo are kept
     assert "| new views, same pose | 2 |" in page.read_text() and page.read_text().endswith("After\n")
     report = json.loads(out.read_text())
@@ -111,9 +111,9 @@ def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch)
     assert report["psnr"] == report["by_views"]["2"]["novel"]["psnr"]
 
     made.clear(), drawn.clear()
-    pictures.unlink()
-    run(synthetic, monkeypatch, "--subjects", 1, "--views", 2, *options, "--pictures", pictures)
-    assert drawn == [(first, 2)] and pictures.is_file()  # for its pictures alone
+    sheet.unlink()
+    run(synthetic, monkeypatch, "--subjects", 1, "--views", 2, *options, "--images", sheet)
+    assert drawn == [(first, 2)] and sheet.is_file()  # for its sheet alone
     report = json.loads(out.read_text())
     assert [person["seed"] for person in report["others"]] == [second] and len(report["subjects"]) == 1
 
@@ -136,7 +136,7 @@ def test_bodies_see_the_same_photos_and_what_they_cost_is_noted(weights, tmp_pat
     monkeypatch.setattr(
         "humangs_jax.avatar.evaluate.draw_painted_body", lambda colors, views: drawings["painted"](views)
     )
-    page, out, pictures = tmp_path / "page.md", tmp_path / "a.json", tmp_path / "bodies.png"
+    page, out, sheet = tmp_path / "page.md", tmp_path / "a.json", tmp_path / "bodies.png"
     page.write_text("<!-- table: evaluation_bodies -->\n<!-- end -->\n")
     options = ("--subjects", 1, "--views", 1, "--weights", weights, "--json", out, "--page", page, *SMALL)
     run(bodies, monkeypatch, *options)
@@ -151,8 +151,8 @@ def test_bodies_see_the_same_photos_and_what_they_cost_is_noted(weights, tmp_pat
     assert page.read_text().count("\n| ") == len(costs) + 2
 
     seen.clear()
-    run(bodies, monkeypatch, *options, "--pictures", pictures)
-    assert len(seen) == 8 and pictures.is_file()  # for the pictures alone
+    run(bodies, monkeypatch, *options, "--images", sheet)
+    assert len(seen) == 8 and sheet.is_file()  # for the sheet alone
 
 
 @pytest.mark.slow  # a person made, reconstructed and drawn

@@ -1,4 +1,4 @@
-"""Rows, means and tables of the evaluation: plain data, no pictures."""
+"""Rows, means and tables of the evaluation: plain data, no images."""
 
 import json
 
@@ -86,7 +86,7 @@ def test_it_is_told_where_more_photos_are_worse():
     assert "by 0.50 dB from 1 to 2" in said and "by 5.50 dB from 2 to 4" in said and "0 of 1 people" in said
 
 
-def test_the_page_has_the_tables_and_its_pictures(tmp_path):
+def test_the_page_has_the_tables_and_its_images(tmp_path):
     report = results.views_report({s: row(v1=20 + s, v4=24 + s) for s in (1, 2)}, SETTINGS, [1, 2], [1, 4])
     section = results.views_section(report, tmp_path / "docs/page.md", tmp_path / "docs/images/sheet.png")
     assert "| new views, unseen poses | 4 | 24.50 | 0.900 | 18.50 | 15.00 | 0.800 | 9.00 |" in section

@@ -84,7 +84,7 @@ def test_records_of_earlier_versions_are_read(folder, fitted, tmp_path):
     )
 
 
-def test_written_elsewhere_with_its_pictures_and_new_cameras(folder, fitted, tmp_path):
+def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_path):
     moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
     capture = dataclasses.replace(fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved))
     target = check_place(folder[0], tmp_path / "out", overwrite=False)

@@ -39,28 +39,28 @@ def sheet(tmp_path_factory):
 
 
 def test_discs_are_where_the_keypoints_are(sheet):
-    picture, _ = sheet
-    top = picture.shape[0] - 512 - GAP
-    blue = drawn(picture[top : top + 60], LEFT)
+    image, _ = sheet
+    top = image.shape[0] - 512 - GAP
+    blue = drawn(image[top : top + 60], LEFT)
     assert len(blue) > 30
     np.testing.assert_allclose(blue.mean(0), [2 * 16 - 0.5, 2 * 32 - 0.5 + GAP], atol=1.0)
 
 
 def test_outliers_are_hollow(sheet):
-    picture, _ = sheet
-    top = picture.shape[0] - 512 - GAP
+    image, _ = sheet
+    top = image.shape[0] - 512 - GAP
     y, x = top + 2 * 16, GAP + 2 * 224
-    assert (picture[y - 1 : y + 1, x - 1 : x + 1, 2] > 0.9).all()  # the white photo, or the line, but no red disc
-    around = picture[y - 8 : y + 8, x - 8 : x + 8]
+    assert (image[y - 1 : y + 1, x - 1 : x + 1, 2] > 0.9).all()  # the white photo, or the line, but no red disc
+    around = image[y - 8 : y + 8, x - 8 : x + 8]
     assert ((around[..., 0] - around[..., 2]) > 0.3).sum() > 10 and RIGHT[0] > RIGHT[2]
 
 
 def test_lines_lead_to_the_body(sheet):
-    picture, examination = sheet
-    top = picture.shape[0] - 512 - GAP
+    image, examination = sheet
+    top = image.shape[0] - 512 - GAP
     x, y = 2 * examination.landmarks[0, LEFT_WRIST] + [GAP, top]
     cross = np.asarray(module.CROSS) / 255
-    near = picture[int(y) - 6 : int(y) + 7, int(x) - 6 : int(x) + 7]
+    near = image[int(y) - 6 : int(y) + 7, int(x) - 6 : int(x) + 7]
     assert (np.abs(near - cross).max(-1) < 0.3).sum() >= 5
 
 
@@ -75,11 +75,11 @@ def test_many_views_and_frames(tmp_path, monkeypatch):
     overlays = []
     monkeypatch.setattr(module, "_overlay", lambda capture, view: overlays.append(view) or np.ones((SIDE, SIDE, 3)))
     fit_sheet(capture, keypoints, examination, tmp_path / "fit.png")
-    picture, _ = read_image(tmp_path / "fit.png")
+    image, _ = read_image(tmp_path / "fit.png")
     assert len(overlays) == module.VIEWS == len(names) and names[0] == "m0v0" and names[-1] == "m8v2"
     assert np.diff(overlays).max() <= 2
-    plot = plot_over_time(examination.frames, picture.shape[1])
-    np.testing.assert_allclose(picture[-len(plot) :], plot, atol=1 / 255)
+    plot = plot_over_time(examination.frames, image.shape[1])
+    np.testing.assert_allclose(image[-len(plot) :], plot, atol=1 / 255)
 
 
 def test_labels(sheet):

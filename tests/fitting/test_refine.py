@@ -180,7 +180,7 @@ def test_keypoints_of_other_views_are_an_error():
 
 @pytest.mark.slow  # compiles the renderer and its gradient
 def test_colours_alone_turn_cameras_and_poses_back():
-    """A painted body of Gaussians, photographed by the renderer: what is off comes back through its gradient."""
+    """A painted body of Gaussians, drawn by the renderer: what is off comes back through its gradient."""
     size, capture = 48, truth()
     body = decimate(default_body(), 600)
     rest, count = shape_body(body, jnp.zeros(3)), len(body.template)

@@ -66,7 +66,7 @@ def test_a_sphere_s_outline_is_the_circle_of_its_tangents(sphere):
     )
 
 
-def test_what_leaves_the_picture_or_is_behind_the_camera_is_no_outline(sphere):
+def test_what_leaves_the_image_or_is_behind_the_camera_is_no_outline(sphere):
     cut = outline_of(sphere, camera(x=-1.0))
     assert len(cut.positions) == COUNT and (cut.positions > 0).all()
     assert (
@@ -80,10 +80,10 @@ def test_an_edge_before_the_body_is_no_outline():
     square = np.asarray([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     vertices = np.concatenate([square, 0.3 * square - [0, 0, 0.5]]).astype(np.float32)
     faces = np.asarray([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
-    picture = view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera())
+    image = view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera())
     outwards = np.concatenate([square[:, :2]] * 2) / np.sqrt(2)  # normals of a flat mesh do not show its border
-    picture = BodyView(picture.pixels, picture.depths, outwards.astype(np.float32), picture.covered)
-    outline = body_outline(picture, faces, mesh_edges(faces), COUNT)
+    image = BodyView(image.pixels, image.depths, outwards.astype(np.float32), image.covered)
+    outline = body_outline(image, faces, mesh_edges(faces), COUNT)
     assert len(outline.positions) == COUNT and outline.ends.max() < 4
 
 
@@ -101,7 +101,7 @@ def test_masks_without_an_outline_have_no_points_and_specks_none_either():
     speckled[5, 5] = 1
     assert (np.linalg.norm(mask_outline(speckled, COUNT).positions - SIZE / 2, axis=1) < 31).all()
     cut = mask_outline(disc(30.0, x=SIZE - 10), COUNT).positions
-    assert len(cut) == COUNT and cut.max() < SIZE - 1, "the picture's edge is no outline"
+    assert len(cut) == COUNT and cut.max() < SIZE - 1, "the image's edge is no outline"
 
 
 def test_points_find_the_mask_in_reach_and_tell_how_far_outside_they_are(sphere):

@@ -5,8 +5,7 @@ import pytest
 
 from humangs_jax.geometry import camera as cameras
 from humangs_jax.geometry import transform
-from humangs_jax.geometry.camera import Camera
-from humangs_jax.geometry.rays import pixel_rays, plucker_rays
+from humangs_jax.geometry.camera import Camera, pixel_rays, plucker_rays
 
 ATOL = 1e-5
 K = np.array([[100.0, 0, 16], [0, 110, 12], [0, 0, 1]])
@@ -47,7 +46,7 @@ def test_rays_pass_through_the_pixel_centres_they_belong_to():
     assert np.allclose(moment[5, 9], np.cross(origin, direction[5, 9]), atol=ATOL)
 
 
-def test_resizing_and_units_keep_the_picture():
+def test_resizing_and_units_keep_the_image():
     c, point = ring()[1], jnp.asarray([0.2, 1.0, 0.1])
     uv, depth = cameras.project(c, point)
     doubled, _ = cameras.project(c.resized(64, 64), point)

@@ -131,8 +131,8 @@ BAD = {
 
 @pytest.mark.parametrize("case", BAD)
 def test_bad_views_write_nothing(tmp_path, case):
-    make, told = BAD[case]
-    with pytest.raises(ValueError, match=told):
+    make, message = BAD[case]
+    with pytest.raises(ValueError, match=message):
         write_exr(tmp_path / "a.exr", make())
     assert list(tmp_path.iterdir()) == []
 

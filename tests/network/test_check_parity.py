@@ -87,7 +87,7 @@ def test_other_precisions(dtype, tmp_path, monkeypatch, capsys):
     result = json.loads((tmp_path / "out.json").read_text())
     assert result["bound"] == {"float32": 2e-5, "bfloat16": 5e-2}[dtype]
     if dtype == "bfloat16":
-        assert 45 < result["render_psnr"] < 200  # dB; equal pictures would be 300
+        assert 45 < result["render_psnr"] < 200  # dB; equal images would be 300
         assert result["stages"]["mid_encoder_out"] > 1e-4  # else it were float32
         assert result["stages"]["out_ray_d"] < 1e-6
 

@@ -26,8 +26,7 @@ from humangs_jax.network.conversion import (
 from humangs_jax.network.presets import published
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.weights import load_weights
-from humangs_jax.objectives.layer_names import expected_tensors
-from humangs_jax.objectives.loss_networks import load_lpips
+from humangs_jax.objectives.loss_networks import expected_tensors, load_lpips
 
 VARIANTS = [
     Options(),
@@ -120,7 +119,7 @@ def test_safetensors_state_dicts(tmp_path):
     leaves = zip(*(jax.tree.leaves(x.variables) for x in (ours, other)), strict=True)
     assert all(np.array_equal(*pair) for pair in leaves)
     (tmp_path / "broken.safetensors").write_bytes((tmp_path / "a.safetensors").read_bytes()[:-9])
-    with pytest.raises(ValueError, match="no readable safetensors file"):
+    with pytest.raises(ValueError, match="not a readable safetensors file"):
         read_state_dict(tmp_path / "broken.safetensors")
     with pytest.raises(FileNotFoundError, match="nowhere"):
         read_state_dict(tmp_path / "nowhere.safetensors")

@@ -85,7 +85,7 @@ def test_one_view_leaves_the_back_grey_and_unseen():
     assert np.allclose(shells.colors[back], UNSEEN_COLOR) and not np.any(shells.seen[back])
 
 
-def test_absent_views_and_points_out_of_the_picture_say_nothing():
+def test_absent_views_and_points_out_of_the_image_say_nothing():
     arguments = scene()
     fewer = jax.tree.map(lambda x: x[:2], arguments[:-1])
     padded = read(arguments, jnp.arange(VIEWS) < 2)

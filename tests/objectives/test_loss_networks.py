@@ -9,10 +9,11 @@ from loss_cases import BACKBONES, made_up_heads, made_up_state
 from safetensors.numpy import save_file
 from scipy.io import savemat
 
-from humangs_jax.objectives.layer_names import expected_tensors, find_layers
 from humangs_jax.objectives.loss_networks import (
     LossNetworks,
     collect_loss_networks,
+    expected_tensors,
+    find_layers,
     load_loss_networks,
     load_lpips,
     load_vgg19,

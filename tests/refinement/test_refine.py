@@ -90,7 +90,7 @@ def test_what_no_photo_sees_stays(body, person):
 
 def test_never_worse_than_the_start(person):
     avatar, capture = person
-    truth = toy_capture(load_body() if False else capture.body, avatar)
+    truth = toy_capture(capture.body, avatar)
     wild = dataclasses.replace(STEPS, steps=3, rates=dataclasses.replace(STEPS.rates, means=1.0))
     report = refinement.refine_with_report(avatar, truth, wild)
     assert not report.kept and report.loss[0] == report.loss[1]

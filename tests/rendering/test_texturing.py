@@ -1,4 +1,4 @@
-"""Texture lookup against a plain loop, and pictures whose pixels are known."""
+"""Texture lookup against a plain loop, and images whose pixels are known."""
 
 import jax
 import jax.numpy as jnp
@@ -94,7 +94,7 @@ def test_supersampling_measures_coverage():
     np.testing.assert_allclose(depth, np.where(expected > 0, 3.0, 0.0), rtol=1e-6)
 
 
-def test_supersampling_is_the_mean_of_a_finer_picture():
+def test_supersampling_is_the_mean_of_a_finer_image():
     supersample = 3
     texture = jax.random.uniform(jax.random.key(1), (5, 5, 3))
     vertices = jnp.asarray([[-1, -1, 2.0], [1, -0.8, 1.5], [-0.7, 1, 1.8], [1.1, 0.9, 2.5]])
@@ -114,12 +114,12 @@ def test_vmap_over_views_and_gradient_of_the_texture():
     cameras = orbit(jnp.zeros(3), 3.0, jnp.asarray([0.0, 0.7]), 0.1, K, WIDTH, HEIGHT)
     vertices = jnp.asarray([[-1, 1, 0.0], [1, 1, 0], [-1, -1, 0], [1, -1, 0]])
 
-    def pictures(texture):
+    def drawn(texture):
         draw = lambda camera: render_textured_mesh(vertices, FACES, UVS, FACES, texture, camera)
         return jax.vmap(draw)(cameras)
 
     def total(texture):
-        rgb, alpha, _ = pictures(texture)
+        rgb, alpha, _ = drawn(texture)
         return rgb.sum(), (rgb, alpha)
 
     gradient, (rgb, alpha) = jax.jit(jax.grad(total, has_aux=True))(texture)

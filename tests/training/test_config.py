@@ -9,8 +9,8 @@ import pytest
 from humangs_jax.core.configuration import config_from_file, config_from_json, config_to_json
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training import config
-from humangs_jax.training.config import Stage, TrainConfig, small, tiny
-from humangs_jax.training.launch import fitting_losses, read_config, training_people
+from humangs_jax.training.config import Stage, TrainConfig, fitting_losses, read_config, small, tiny
+from humangs_jax.training.sources import training_people
 
 STAGED = dataclasses.replace(
     tiny(), steps=10, batch_size=3, stages=(Stage(4, image_size=64, batch_size=2), Stage(8, target_size=32))
@@ -55,10 +55,11 @@ def test_runs_survive_json(name):
         ('{"optimizer": {"betas": [0.9]}}', r"config\.optimizer\.betas: expected tuple.*, got \[0\.9\]"),
         ('{"views": {"input_counts": [4, "6"]}}', r"config\.views\.input_counts\[1\]: expected int, got '6'"),
         ('{"ema_decay": "much"}', r"config\.ema_decay: expected float, got 'much'"),
+        ('{"model": {"image_size": 512}}', r"config\.model\.image_size: .*: expected architecture.* --init-weights"),
         ('{"steps": 2', "config.json: the configuration is not JSON"),
     ],
 )
-def test_a_wrong_file_is_told_with_file_and_field(text, message, tmp_path):
+def test_errors_name_file_and_field(text, message, tmp_path):
     path = tmp_path / "config.json"
     path.write_text(text)
     with pytest.raises(ValueError, match=message) as error:

@@ -1,4 +1,4 @@
-"""Killed at any moment, a run loses the steps since its last checkpoint and nothing else."""
+"""Killed at any time, a run loses the steps since its last checkpoint and nothing else."""
 
 import random
 import subprocess
@@ -15,8 +15,8 @@ def finished_checkpoints(out):
     return sorted(int(path.name) for path in (out / "checkpoints").glob("*") if path.name.isdigit())
 
 
-def kill_in_a_checkpoint_write(arguments, out, moment):
-    """Start a run, wait until a checkpoint is being written, wait a moment more, kill; the newest checkpoint there was."""
+def kill_in_a_checkpoint_write(arguments, out, delay):
+    """Start a run, wait until a checkpoint is being written, wait a little more, kill; the newest checkpoint there was."""
     process = subprocess.Popen([*worker(), *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
     deadline = time.monotonic() + WAIT_SECONDS
     try:
@@ -28,7 +28,7 @@ def kill_in_a_checkpoint_write(arguments, out, moment):
             assert process.poll() is None, process.stdout.read()
             assert time.monotonic() < deadline, "no checkpoint was written"
             time.sleep(0.001)
-        time.sleep(moment)
+        time.sleep(delay)
         newest = finished_checkpoints(out)[-1]
     finally:
         process.kill()

@@ -1,4 +1,4 @@
-"""The log: what a killed run wrote too much goes, what went wrong is told, TensorBoard reads the same numbers."""
+"""The log: what a killed run wrote too much goes, what went wrong is reported, TensorBoard reads the same numbers."""
 
 import json
 import struct
@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.data.loader import Waiting
-from humangs_jax.training.log import RunLog, forget_after
+from humangs_jax.training.log import MANY_SKIPPED, RunLog, Watch, forget_after
 from humangs_jax.training.optimizer import GuardState
 from humangs_jax.training.state import TrainState
-from humangs_jax.training.watch import MANY_SKIPPED, Watch
 
 
 def read(path):
@@ -46,7 +45,7 @@ def test_lines_of_later_steps_and_half_written_ones_go(tmp_path):
     forget_after(tmp_path / "none.jsonl", 2)
 
 
-def test_tensorboard_reads_the_numbers_and_the_pictures(tmp_path):
+def test_tensorboard_reads_the_numbers_and_the_images(tmp_path):
     waiting = Waiting()
     with RunLog(tmp_path, 0, 10, progress=False) as log:
         waiting.add(0.5)

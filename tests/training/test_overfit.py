@@ -1,4 +1,4 @@
-"""One subject, learnt by heart: what the network and its training are able to say at all.
+"""One subject, overfitted: what the network and its training are able to say at all.
 
 A synthetic person of the package, four photos of 128 x 128, which are inputs and targets alike. The network is
 small, has its upsampler, and starts from nothing. With edges of 3 cm, K = 1 has 6,792 Gaussians for the 10,917 pixels of

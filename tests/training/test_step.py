@@ -164,7 +164,7 @@ def views_on_white(color, masks):
     return SubjectViews(images, masks, cameras, jnp.zeros((2, 1, 3)), jnp.zeros((2, 3)), jnp.zeros(1))
 
 
-def test_backgrounds_are_exchanged_as_if_photographed_so():
+def test_backgrounds_are_exchanged_like_those_of_photos():
     masks = jnp.asarray(np.random.default_rng(0).random((2, 4, 4)), jnp.float32)
     color, backgrounds = jnp.asarray([0.2, 0.5, 0.9]), jnp.asarray([[0.1, 0.2, 0.3], [1.0, 1.0, 1.0]])
     views = views_on_white(color, masks)

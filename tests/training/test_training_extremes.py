@@ -15,7 +15,7 @@ from humangs_jax.training.step import train_step
 
 CONFIG = tiny()
 OUTSIDE = 100.0
-"""Metres that take any subject out of any picture."""
+"""Metres that take any subject out of any image."""
 
 
 def batch_of(body, captures, config, step=0):
@@ -73,7 +73,7 @@ NOTHING_TO_SEE = {
 def test_views_of_background_alone(body, batch, variables, what):
     _, metrics = step_without_harm(init_state(CONFIG, variables), NOTHING_TO_SEE[what](batch), body)
     if what in ("all targets", "everything"):
-        assert metrics["squared"] < 1e-9 and metrics["silhouette"] < 1e-9  # background is drawn as it was photographed
+        assert metrics["squared"] < 1e-9 and metrics["silhouette"] < 1e-9  # background is drawn as it was in the photo
 
 
 def moved(views, offset):

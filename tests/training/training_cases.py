@@ -46,7 +46,7 @@ def tube():
     )
 
 
-def photograph(points, colors, camera):
+def draw_points(points, colors, camera):
     """Points painted far to near into an image on white, with its mask; numpy, so that nothing needs compiling."""
     K, cam_from_world = np.asarray(camera.K), np.asarray(camera.cam_from_world)
     seen = points @ cam_from_world[:3, :3].T + cam_from_world[:3, 3]
@@ -74,7 +74,7 @@ def write_subject(path, body, seed):
     for view in range(VIEWS):
         frames.append(view % POSES)
         posed = pose_body(body, rest, BodyPose(jnp.asarray(rotations[frames[-1]]), jnp.zeros(3)))
-        image, mask = photograph(fill(np.asarray(posed.vertices)), fill(corner_colors), cameras[view])
+        image, mask = draw_points(fill(np.asarray(posed.vertices)), fill(corner_colors), cameras[view])
         images.append(image)
         masks.append(mask)
     capture = capture_from_arrays(

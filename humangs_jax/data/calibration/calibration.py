@@ -6,7 +6,7 @@ pixel centres still those of the source. `in_capture_convention` makes metres, y
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -36,7 +36,7 @@ CONVENTIONS = {
 }
 """What a matrix in a file may mean, and the cam_from_world with OpenCV's axes that follows. OpenCV: x right,
 y down, z forward; OpenGL: x right, y up, z backwards."""
-PIXEL_CENTERS = ("integer", "half")
+PixelCenters = Literal["integer", "half"]
 """Where the centre of the first pixel is: at (0, 0), as OpenCV has it, or at (0.5, 0.5)."""
 
 
@@ -81,7 +81,7 @@ class Calibration:
     file: Path
     cameras: tuple[CalibratedCamera, ...]
     per_image: bool
-    pixel_centers: str
+    pixel_centers: PixelCenters
     up: str
     observations: Observations | None = None
     convention: str = CAM_FROM_WORLD
@@ -144,20 +144,12 @@ def pose_matrix(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarra
     return pose
 
 
-def rotation_from_vector(vector: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Rodrigues' formula: axis times angle in radians -> rotation matrix, as cv2.Rodrigues."""
-    angle = float(np.linalg.norm(vector))
-    if angle == 0:
-        return np.eye(3)
-    x, y, z = vector / angle
-    cross = np.asarray([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
-
-
 def rotation(value: Any, file: object, field: str) -> Float[np.ndarray, "3 3"]:
-    """A rotation given as 9 numbers of its matrix, or as the 3 of a rotation vector."""
+    """A rotation given as 9 numbers of its matrix, or as the 3 of a rotation vector (cv2.Rodrigues)."""
+    from scipy.spatial.transform import Rotation
+
     if numbers(value, file, field).size == 3:
-        return rotation_from_vector(floats(value, file, field, (3,)))
+        return Rotation.from_rotvec(floats(value, file, field, (3,))).as_matrix()
     return floats(value, file, field, (3, 3))
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float
 from humangs_jax.data.calibration.calibration import (
     UNDISTORT_BEFORE,
     CalibratedCamera,
@@ -127,15 +126,9 @@ def _numbers(words, file, where):
         raise CaptureError(file, where, error) from None
 
 
-def _rotation(quaternion: Float[np.ndarray, "4"], file, where) -> Float[np.ndarray, "3 3"]:
-    norm = np.linalg.norm(quaternion)
-    if norm == 0:
+def _rotation(quaternion, file, where):
+    from scipy.spatial.transform import Rotation
+
+    if not np.any(quaternion):
         raise CaptureError(file, where, "expected a quaternion QW QX QY QZ, got zeros")
-    w, x, y, z = quaternion / norm
-    return np.asarray(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return Rotation.from_quat(quaternion, scalar_first=True).as_matrix()

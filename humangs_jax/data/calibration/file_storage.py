@@ -1,8 +1,7 @@
 """OpenCV's FileStorage, YAML or JSON, as nested dicts, lists, numbers, strings and matrices.
 
-Only what OpenCV writes (and EasyMocap, which imitates it) is read, not all of YAML: block maps and sequences, flow ones
-in brackets that may span lines, quoted and plain scalars, and `!!opencv-matrix` with rows, cols, dt and data.
-https://docs.opencv.org/4.x/da/d56/classcv_1_1FileStorage.html
+Its YAML is not quite YAML: the header is `%YAML:1.0`, and flow maps have no space after a colon ({ x:1 }). Matrices are
+`!!opencv-matrix` with rows, cols, dt and data. https://docs.opencv.org/4.x/da/d56/classcv_1_1FileStorage.html
 """
 
 import re
@@ -10,113 +9,66 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from humangs_jax.data.capture_checks import CaptureError, checked_json
 
 MATRIX = "opencv-matrix"
+YAML_TAG = "tag:yaml.org,2002:"
+"""What `!!` stands for."""
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-ENTRY = re.compile(r"""("[^"]*"|'[^']*'|[^\s:"'\[{][^:]*?)\s*:(?:\s+(.*))?$""")
-"""`key:` or `key: value`."""
+TIGHT_KEY = re.compile(r"([{,]\s*\w+):(?=\S)")
+"""A key of a flow map with its value right behind the colon."""
 
 
 def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
     """The values of a FileStorage text; matrices are (rows, cols) arrays. Raises: CaptureError naming the line."""
-    if text.lstrip().startswith("{"):
-        values = _matrices(checked_json(file, text), file, "")
-    else:
-        lines = _logical_lines(text, file)
-        values, rest = _block(lines, file) if lines else ({}, [])
-        if rest:
-            raise CaptureError(file, f"line {rest[0][1]}", "the indentation fits no line above")
+    try:
+        if text.lstrip().startswith("{"):
+            values = _matrices(checked_json(file, text), file, "")
+        else:
+            kept = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
+            root = _Loader(TIGHT_KEY.sub(r"\1: ", "\n".join(kept))).get_single_node()
+            values = {} if root is None else _value(root, file)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        raise CaptureError(file, f"line {mark.line + 1}" if mark else "", error.problem or error) from error
+    except (yaml.YAMLError, RecursionError) as error:
+        raise CaptureError(file, "", f"not readable as YAML: {error}") from error
     if not isinstance(values, dict):
         raise CaptureError(file, "", "expected keys with values")
     return values
 
 
-def _logical_lines(text, file):
-    """(indentation, line number, content), without comments, flow values joined to one line each."""
-    lines, depth = [], 0
-    for number, line in enumerate(text.splitlines(), 1):
-        content = re.sub(r"(^|\s)#.*", "", line).rstrip()
-        if not content.strip() or content.startswith(("%", "---", "...")):
-            continue
-        if depth:
-            lines[-1][2] += " " + content.strip()
-        else:
-            lines.append([len(content) - len(content.lstrip()), number, content.strip()])
-        depth += len(re.findall(r"[\[{]", content)) - len(re.findall(r"[\]}]", content))
-    if depth:
-        raise CaptureError(file, f"line {lines[-1][1]}", "a bracket is not closed")
-    return lines
+class _Loader(yaml.SafeLoader):
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """The next node; no aliases, which a small file can nest to billions of values."""
+        if self.check_event(yaml.AliasEvent):
+            where = self.get_event().start_mark
+            raise yaml.MarkedYAMLError(problem="aliases are not supported", problem_mark=where)
+        return super().compose_node(parent, index)
 
 
-def _block(lines, file):
-    """The map or sequence that begins with lines[0], and the lines after it."""
-    indent, values = lines[0][0], None
-    while lines and lines[0][0] == indent:
-        _, number, content = lines[0]
-        is_item = content == "-" or content.startswith("- ")
-        values = ([] if is_item else {}) if values is None else values
-        entry = None if is_item else ENTRY.match(content)
-        if is_item != isinstance(values, list) or not (is_item or entry):
-            raise CaptureError(
-                file, f"line {number}", f"expected {'an item' if is_item else '`key: value`'}: {content!r}"
-            )
-        text = content[1:].strip() if entry is None else (entry[2] or "").strip()
-        value, lines = _value(text, lines[1:], indent, number, file, allow_level=not is_item)
-        if isinstance(values, list):
-            values.append(value)
-        elif entry is not None:
-            values[str(_scalar(entry[1], quoted_only=True))] = value
-    return values, lines
-
-
-def _value(text, rest, indent, number, file, allow_level):
-    """The value after a key or a dash: on the same line, or the block on the deeper lines below."""
-    tag = re.match(r"!!?(\S+)\s*", text)
-    text = text[tag.end() :] if tag else text
-    if text:
-        value = _flow(text, number, file)
-    elif rest and (rest[0][0] > indent or (allow_level and rest[0][0] == indent and rest[0][2].startswith("- "))):
-        value, rest = _block(rest, file)
+def _value(node: yaml.Node, file: Path) -> Any:
+    """The value of a node; numbers are read here, because YAML takes the camera's name 01 for one."""
+    if isinstance(node, yaml.ScalarNode):
+        value = _scalar(node.value) if node.style is None else node.value
+    elif isinstance(node, yaml.SequenceNode):
+        value = [_value(item, file) for item in node.value]
     else:
-        value = None
-    if tag and tag[1] not in ("map", "seq", "str", "int", "float"):
-        value = _matrix(value, tag[1], file, f"line {number}")
-    return value, rest
+        value = {str(key.value): _value(item, file) for key, item in node.value}
+    if node.tag in yaml.SafeLoader.yaml_constructors:
+        return value
+    return _matrix(value, node.tag.removeprefix(YAML_TAG), file, f"line {node.start_mark.line + 1}")
 
 
-def _flow(text, number, file):
-    """A bracketed list or map, or a scalar."""
-    if text[0] not in "[{":
-        return _scalar(text)
-    if text[-1] != {"[": "]", "{": "}"}[text[0]]:
-        raise CaptureError(file, f"line {number}", f"expected one closed bracket: {text[:40]!r}")
-    parts, depth, start = [], 0, 1
-    for i, letter in enumerate(text):
-        depth += letter in "[{"
-        if (letter == "," and depth == 1) or i == len(text) - 1:
-            parts.append(text[start:i].strip())
-            start = i + 1
-        depth -= letter in "]}"
-    parts = [part for part in parts if part]
-    if text[0] == "[":
-        return [_flow(part, number, file) for part in parts]
-    pairs = [part.partition(":") for part in parts]
-    return {str(_scalar(key.strip(), quoted_only=True)): _flow(v.strip() or "~", number, file) for key, _, v in pairs}
-
-
-def _scalar(text, quoted_only=False):
-    """A number, .Nan, .Inf, or a string with or without quotes; keys stay strings even if they are digits."""
-    if len(text) > 1 and text[0] in "\"'" and text[-1] == text[0]:
-        return text[1:-1]
-    if quoted_only:
-        return text
+def _scalar(text):
+    """A number, .Nan, .Inf, None or a string."""
     if text.lower() in (".nan", ".inf", "-.inf"):
         return float(text.lower().replace(".", ""))
-    if NUMBER.fullmatch(text) and not re.fullmatch(r"[+-]?0\d+", text):  # 01 is a camera's name
+    if NUMBER.fullmatch(text) and not re.fullmatch(r"[+-]?0\d+", text):
         return int(text) if re.fullmatch(r"[+-]?\d+", text) else float(text)
-    return text
+    return text if text not in ("", "~", "null") else None
 
 
 def _matrix(value, tag, file, where):

@@ -7,12 +7,13 @@ asks for it; capture.json names body.npz, which `humangs fit` makes.
 import dataclasses
 import shutil
 from pathlib import Path
+from typing import get_args
 
 from humangs_jax.data.calibration.calibration import (
-    PIXEL_CENTERS,
     ROTATION_TO_Y_UP,
     CalibratedCamera,
     Calibration,
+    PixelCenters,
     in_capture_convention,
     undistort,
 )
@@ -136,8 +137,8 @@ def _check_options(scale, up, pixel_centers):
         raise ValueError(f"--scale {scale:g}: expected metres per unit of the source, more than 0")
     if up is not None and up not in ROTATION_TO_Y_UP:
         raise ValueError(f"--up {up}: expected one of {', '.join(ROTATION_TO_Y_UP)}")
-    if pixel_centers is not None and pixel_centers not in PIXEL_CENTERS:
-        raise ValueError(f"--pixel-centers {pixel_centers}: expected {' or '.join(PIXEL_CENTERS)}")
+    if pixel_centers is not None and pixel_centers not in get_args(PixelCenters):
+        raise ValueError(f"--pixel-centers {pixel_centers}: expected {' or '.join(get_args(PixelCenters))}")
 
 
 def _check_folders(source, images, masks, out, overwrite):

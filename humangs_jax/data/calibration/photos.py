@@ -131,6 +131,6 @@ def _photos_in(folder):
 
 
 def _in_order(names: Iterable[str]) -> list[str]:
-    """By number where all are numbers (10 after 9), else by letter."""
+    """Names sorted by number where all are numbers (10 after 9), else by letter."""
     names = list(names)
     return sorted(names, key=lambda name: (int(name), name)) if all(n.isdecimal() for n in names) else sorted(names)

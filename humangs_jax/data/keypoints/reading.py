@@ -206,7 +206,7 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
 
 
 def _match_path(image: str, names: Sequence[str]) -> int | None:
-    """By the file name with as many of its folders as fit; then with numbers compared as numbers."""
+    """The view of a file name with as many of its folders as fit; then with numbers compared as numbers."""
     path = PurePosixPath(image.replace("\\", "/"))
     path = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
     keys = [_as_name("_".join(path.parts[i:])) for i in range(len(path.parts))]
@@ -223,7 +223,7 @@ def _match_path(image: str, names: Sequence[str]) -> int | None:
 
 
 def _match_numbers(numbers: Sequence[int], names: Sequence[str]) -> dict[int, int]:
-    """By the last number in the names of the views.
+    """The views of image numbers, by the last number in the names of the views.
 
     Where a video's frames are counted from 0 and the photos from 1 (ffmpeg), or the other way round, there are as many of
     either, without gaps, and they are matched in order.

@@ -27,9 +27,9 @@ from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.splatting import plan_buffers, render
 
 LEAST_NOISE = 0.02
-"""Of colours in [0, 1]: avatars are no better."""
+"""Least std of colours in [0, 1]: avatars are no better."""
 ROBUST_SCALE = 3.0
-"""Of colours, standard deviations."""
+"""Robust scale of colours, standard deviations."""
 MARGIN = 1.5
 """Buffers of the renderer, as multiples of what the first images need: people move little."""
 
@@ -86,8 +86,10 @@ def color_residuals(
     noise,
     independent: float,
 ) -> Float[Array, "v h w 3"]:
-    """In standard deviations. noise: () std of colours. independent: number of independent colours that all pixels of a view
-    count for, because neighbours err together.
+    """Differences of colours in standard deviations.
+
+    noise: () std of colours. independent: number of independent colours that all pixels of a view count for, because neighbours
+    err together.
     """
     share = independent / (jnp.sum(views.masks, axis=(1, 2)) + 1)
     off = robust((draw(avatar, poses, cameras, splatting) - views.images) / noise, ROBUST_SCALE)

@@ -126,7 +126,7 @@ def _kind(name):
 def keypoint_residuals(
     model: LandmarkModel, observations: Observations, landmarks: Float[Array, "k 3"], scale: Float[Array, ""] | float
 ) -> Float[Array, "c k 2"]:
-    """In standard deviations; scale: robust scale, in standard deviations."""
+    """Errors of keypoints in standard deviations; scale: robust scale, in standard deviations."""
     certainty = landmark_certainty(model.names)[:, None]
     errors = keypoint_errors(observations, landmarks) / observations.noise * certainty
     weights = observations.confidences * np.asarray(model.known, np.float32)
@@ -160,7 +160,7 @@ class KeypointProblem:
         return np.asarray(self.model.known, np.float32)
 
     def landmarks_and_joints(self, state: FitState) -> tuple[Float[Array, "k 3"], Float[Array, "j 3"]]:
-        """Of a state, metres."""
+        """Landmarks and joints of a state, metres."""
         return pose_landmarks(self.model, betas_of(self.origin, state), pose_of(self.origin, state))
 
 

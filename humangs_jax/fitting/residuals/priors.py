@@ -24,7 +24,7 @@ LIMIT_STIFFNESS = 20.0
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """Of a joint's rotation vector, (3,) each: mean, standard deviation, lower and upper limit."""
+    """Statistics of a joint's rotation vector, (3,) each: mean, standard deviation, lower and upper limit."""
 
     mean: tuple[float, float, float]
     std: tuple[float, float, float]
@@ -59,7 +59,7 @@ RANGES = {
     **{f"left_{finger}1": _KNUCKLE for finger in FINGERS if finger != "thumb"},
     **{f"left_{finger}{k}": _FINGER for finger in FINGERS if finger != "thumb" for k in (2, 3)},
 }
-"""Of everyday movement; wider than what physiotherapists measure, since components of a rotation vector are no joint angles."""
+"""Ranges of everyday movement; wider than measured joint angles, because components of a rotation vector are not joint angles."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

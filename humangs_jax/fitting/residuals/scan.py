@@ -106,7 +106,7 @@ class ScanProblem:
 
     @property
     def prior(self) -> PosePrior:
-        """Of the body's joints."""
+        """The prior of the body's pose."""
         return pose_prior(self.surface.landmarks.joint_names)
 
     @jax.jit
@@ -116,7 +116,7 @@ class ScanProblem:
 
 
 def scan_problem(surface: BodySurface, names: tuple[str, ...], coefficients: int | None = None) -> ScanProblem:
-    """With the joints of these names free, and at most `coefficients` of the shape (default: all)."""
+    """The problem with the joints of these names free, and at most `coefficients` of the shape (default: all)."""
     model, available = surface.landmarks, surface.points.directions.shape[-1]
     joints = tuple(j for j, name in enumerate(model.joint_names) if j > 0 and name in names)
     origin = usual_origin(pose_prior(model.joint_names), joints, min(available, coefficients or available))
@@ -248,7 +248,7 @@ class Target:
         )
 
     def distances(self, problem: ScanProblem, state: FitState, gate: float) -> tuple[Float[np.ndarray, " r"], float]:
-        """By how much scan points are outside of the skin (r,), in units of the frame; the share of them that has a partner."""
+        """How far scan points are outside of the skin (r,), in units of the frame; the share of them that has a partner."""
         one = jnp.float32(1.0)
         matches = self.matches(problem, state, gate, np.inf, Tolerances(one, one, one))
         vertices, _ = self._posed(problem, state)

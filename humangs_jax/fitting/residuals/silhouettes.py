@@ -109,7 +109,7 @@ def silhouette_residuals(
     scales: tuple[Float[Array, ""], Float[Array, ""]],
     independent: float,
 ) -> Float[Array, " e"]:
-    """In standard deviations.
+    """Distances of outlines in standard deviations.
 
     Arguments: clothes: pixels by which the mask reaches beyond the body. noise: std of an outline, pixels. scales: robust scales
     outwards and inwards, pixels. independent: number of independent equations that all of a view count for, because neighbours on
