@@ -1,12 +1,16 @@
-"""`humangs demo`, `reconstruct`, `animate`, `render`, `export`: from photos to an avatar, and what to do with one."""
+"""`humangs demo`, `reconstruct`, `refine`, `animate`, `render`, `export`: from photos to an avatar, and what to do with one."""
 
 import dataclasses
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from humangs_jax.cli.options import require_at_least, require_parent, require_suffix
+from humangs_jax.cli.options import refine_limits, require_at_least, require_parent, require_suffix, use_all_cores
+
+if TYPE_CHECKING:
+    from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.data.capture import Capture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,8 +45,13 @@ class Reconstruct:
     faster. For weights trained with the other setting it is an approximation (docs/performance_reconstruction.md)."""
     dtype: Literal["as_trained", "float32", "bfloat16"] = "as_trained"
     """Number type of the encoder's matrix products. bfloat16 is faster on GPU and TPU."""
+    refine: str | None = None
+    """Fit the avatar to the photos afterwards for so long: seconds ("15s") or steps ("100steps"); see `humangs refine`."""
 
     def run(self) -> None:
+        limits = None if self.refine is None else refine_limits(self.refine)
+        if limits is not None:
+            use_all_cores()
         from humangs_jax.avatar.reconstruct import reconstruct
         from humangs_jax.data.capture import load_capture
         from humangs_jax.network.weights import load_weights
@@ -54,8 +63,54 @@ class Reconstruct:
         dtype = "float32" if self.dtype == "as_trained" else self.dtype
         config = config.with_execution(tokens=tokens, dtype=dtype)
         avatar = reconstruct(variables, config, photos)
+        if limits is not None:
+            avatar = _refined(avatar, photos, **limits)
         avatar.save(self.out)
         print(f"{self.out}: {len(avatar.gaussians.means):,} Gaussians from {len(photos.images)} photos")
+
+
+@dataclasses.dataclass(frozen=True)
+class Refine:
+    """Fit an avatar to the photos of a capture: sharper where photos show it, unchanged where none does."""
+
+    avatar: Positional[Path]
+    """File written by `humangs reconstruct` from these photos."""
+    capture: Positional[Path]
+    """Folder with capture.json: more or larger photos than the network saw are welcome."""
+    out: Path = Path("refined.npz")
+    """The avatar file to write."""
+    limit: str = "15s"
+    """How long: seconds ("15s") or steps ("100steps"), after a compilation of some seconds."""
+    image_size: int | None = None
+    """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
+    refine_poses: bool = False
+    """Let the pose of each photo move a little, too: for poses from `humangs fit`, which are millimetres off."""
+
+    def run(self) -> None:
+        limits = refine_limits(self.limit)
+        use_all_cores()
+        from humangs_jax.avatar.avatar import Avatar
+        from humangs_jax.data.capture import load_capture
+
+        require_parent(self.out)
+        avatar, photos = Avatar.load(self.avatar), load_capture(self.capture)
+        _refined(avatar, photos, image_size=self.image_size, poses=self.refine_poses, **limits).save(self.out)
+        print(f"{self.out}: {len(avatar.gaussians.means):,} Gaussians refined on {photos.view_count} photos")
+
+
+def _refined(avatar: "Avatar", photos: "Capture", **settings: Any) -> "Avatar":
+    """Refine with a progress bar, and print what it took."""
+    import jax
+
+    from humangs_jax.refinement.config import RefineConfig
+    from humangs_jax.refinement.refine import refine_with_report
+
+    devices = len(jax.devices())
+    mesh = jax.make_mesh((devices,), ("photos",)) if devices > 1 else None
+    config = RefineConfig(views_per_step=devices, **settings)
+    refinement = refine_with_report(avatar, photos, config, mesh=mesh, progress=True)
+    print(refinement.summary())
+    return refinement.avatar
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,6 +1,9 @@
-"""Checks of options that several commands share; each raises an error of one line that names the option."""
+"""What several commands share: checks of options, which raise an error of one line that names the option, and devices."""
 
+import os
+import re
 from pathlib import Path
+from typing import Any
 
 
 def require_parent(path: Path, option: str = "--out") -> None:
@@ -20,3 +23,23 @@ def require_at_least(least: int, **values: float | int) -> None:
     for name, value in values.items():
         if not value >= least:
             raise ValueError(f"--{name.replace('_', '-')} {value}: expected at least {least}")
+
+
+def refine_limits(text: str) -> dict[str, Any]:
+    """Fields of `RefineConfig` for "15s", "15" (seconds) or "100steps". Raises: ValueError."""
+    match = re.fullmatch(r"(?P<number>\d+(\.\d*)?)(?P<unit>s|steps)?", text.strip())
+    number = float(match["number"]) if match else 0.0
+    in_steps = match is not None and match["unit"] == "steps"
+    if not number > 0 or (in_steps and number != int(number)):
+        raise ValueError(f'{text!r}: expected how long to refine, as in "15s" or "100steps"')
+    return {"steps": int(number), "seconds": None} if in_steps else {"steps": None, "seconds": number}
+
+
+def use_all_cores() -> None:
+    """Let JAX see a CPU of several cores as several devices; has no effect on GPUs and TPUs.
+
+    A CPU device runs one program on one core, so photos are shared among devices. Call it before JAX is first used.
+    """
+    import jax
+
+    jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)

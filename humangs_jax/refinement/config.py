@@ -1,0 +1,83 @@
+"""Settings of refinement: how long, what is compared, how fast each parameter moves, what holds it back."""
+
+import dataclasses
+
+from humangs_jax.core.configuration import knob
+
+MEASURED = "refinement.md"
+
+
+@dataclasses.dataclass(frozen=True)
+class LearningRates:
+    """Change of each parameter in a step of Adam, in the space in which it is optimised; `refine` lowers all by a cosine.
+
+    means: metres, in the T-pose. quats: of quaternions that start at unit length. log_scales, opacity_logits, color_logits: no
+    unit. rotations: radians of the pose's axis-angles, translations: metres; both only with `RefineConfig.poses`.
+    """
+
+    means: float = 2e-4
+    quats: float = 2e-3
+    log_scales: float = 1e-2
+    opacity_logits: float = 3e-2
+    color_logits: float = 4e-2
+    rotations: float = 1e-3
+    translations: float = 2e-4
+
+
+@dataclasses.dataclass(frozen=True)
+class RefineConfig:
+    """How `refine` fits an avatar to its photos.
+
+    steps, seconds: the run ends after so many steps or so many seconds, not counting compilation, whichever is first; None for
+    no such limit. image_size: longer side to which larger photos are reduced, pixels; None: as they are. views_per_step:
+    photos that are drawn for a step.
+
+    structural, silhouette: weights of the structural dissimilarity, and of |alpha - mask|, beside the L1 distance of colours.
+    rates: see `LearningRates`. final_rate: share of the rates that is left at the end.
+
+    decay: share of the way back to the start that means and log scales go in a step. visible: weight on some pixel of some photo
+    from which a Gaussian moves at the full rate: what no photo sees stays as it was. poses: whether the body pose of each
+    photo is refined, too; the avatar is then for corrected poses, which are not returned.
+
+    held_out: share of the pixels, in square blocks, or of the photos where there are at least `HELD_OUT_PHOTOS`, that no step
+    sees. Their error decides which state of the run is returned. checks: how often it is measured in a run.
+    growth: share of the Gaussians, those with the largest gradients, that are split in two during the run.
+    seed: order of the photos, blocks.
+    """
+
+    steps: int | None = knob(
+        None, cost="blurred at few, no gain beyond some 100 for 4 photos", gain="time in proportion", measured=MEASURED
+    )
+    seconds: float | None = knob(5.0, cost="blurred at few, no gain beyond some 15 s", gain="time", measured=MEASURED)
+    image_size: int | None = knob(
+        None, cost="detail of the photos", gain="half the time of a step at half the size", measured=MEASURED
+    )
+    views_per_step: int = knob(
+        1, cost="fewer steps in the same time; less noise", gain="one photo for each device", measured=MEASURED
+    )
+    structural: float = 0.2
+    silhouette: float = 0.1
+    rates: LearningRates = dataclasses.field(default_factory=LearningRates)
+    final_rate: float = 0.1
+    decay: float = 2e-3
+    visible: float = 0.02
+    poses: bool = False
+    held_out: float = 0.05
+    checks: int = 5
+    growth: float = knob(0.0, cost="more Gaussians", gain="detail in photos of 512 pixels and more", measured=MEASURED)
+    seed: int = 0
+
+    def __post_init__(self):
+        """Raises ValueError for settings out of range, naming them."""
+        if self.steps is None and self.seconds is None:
+            raise ValueError("RefineConfig: expected steps, seconds or both; without either a run would not end")
+        counts = {"steps": self.steps, "image_size": self.image_size, "views_per_step": self.views_per_step}
+        if wrong := [name for name, value in counts.items() if value is not None and value < 1]:
+            raise ValueError(f"RefineConfig: {', '.join(wrong)} must be at least 1")
+        if self.seconds is not None and not self.seconds > 0:
+            raise ValueError(f"RefineConfig: seconds must be positive, got {self.seconds}")
+        shares = {name: getattr(self, name) for name in ("final_rate", "decay", "held_out", "growth")}
+        if wrong := [name for name, value in shares.items() if not 0 <= value <= 1]:
+            raise ValueError(f"RefineConfig: {', '.join(wrong)} must be in [0, 1]")
+        if not self.held_out < 1 or not self.visible > 0 or self.checks < 1:
+            raise ValueError("RefineConfig: need held_out < 1, visible > 0 and checks >= 1")

@@ -1,0 +1,77 @@
+"""The photos that refinement compares with: cut to the person, reduced, with the pixels that are held out."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.core.array_types import Array, Bool
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.views import SubjectViews
+
+MARGIN = 8
+"""Pixels around the mask: the window of structural similarity has 11, and Gaussians beyond the outline cost alpha there."""
+MULTIPLE = 32
+"""Sides of crops are multiples of it, so that few sizes are compiled."""
+COVERED = 0.02
+"""Coverage from which a pixel counts as the person's."""
+BLOCK = 8
+"""Side of the blocks of pixels that are held out."""
+
+
+def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectViews:
+    """The photos, cut to the person by windows of one size, with the cameras that see the windows.
+
+    Photos whose longer side exceeds `image_size` are reduced to it. Without masks nothing is cut, and the masks are empty.
+    """
+    images, cameras = capture.images, capture.cameras
+    masks = np.zeros(images.shape[:3], np.float32) if capture.masks is None else capture.masks
+    height, width = images.shape[1:3]
+    if image_size is not None and max(height, width) > image_size:
+        from skimage.transform import resize
+
+        height, width = (max(1, round(side * image_size / max(height, width))) for side in images.shape[1:3])
+        images = np.stack([resize(x, (height, width, 3), anti_aliasing=True) for x in images])
+        masks = np.stack([resize(x, (height, width), anti_aliasing=True) for x in masks])
+        cameras = cameras.resized(width, height)
+    boxes = [_bounds(mask) for mask in masks]
+    rows, columns = (_window([box[axis] for box in boxes], size) for axis, size in enumerate((height, width)))
+    crop = lambda arrays: np.stack(
+        [x[top : top + rows, left : left + columns] for x, (top, left) in zip(arrays, corners, strict=True)]
+    )
+    corners = [(_corner(box[0], rows, height), _corner(box[1], columns, width)) for box in boxes]
+    shift = np.zeros((len(images), 3, 3), np.float32)
+    shift[:, 1, 2], shift[:, 0, 2] = np.transpose(corners)
+    frames = np.asarray(capture.frames)
+    return SubjectViews(
+        images=jnp.asarray(crop(images), jnp.float32),
+        masks=jnp.asarray(crop(masks), jnp.float32),
+        cameras=replace(cameras, K=cameras.K - shift, width=columns, height=rows),
+        rotations=jnp.asarray(capture.poses.rotations)[frames],
+        translations=jnp.asarray(capture.poses.translation)[frames],
+        betas=jnp.asarray(capture.betas),
+    )
+
+
+def held_out_blocks(views: SubjectViews, share: float, seed: int) -> Bool[Array, "v h w"]:
+    """Which pixels no step sees: random blocks, `share` of all."""
+    v, height, width = views.masks.shape
+    rng = np.random.default_rng(seed)
+    blocks = rng.random((v, -(-height // BLOCK), -(-width // BLOCK))) < share
+    return jnp.asarray(blocks.repeat(BLOCK, axis=1).repeat(BLOCK, axis=2)[:, :height, :width])
+
+
+def _bounds(mask):
+    """((top, bottom), (left, right)) of the person; the whole image if nobody is in it."""
+    lines = [np.flatnonzero((mask > COVERED).any(axis)) for axis in (1, 0)]
+    if not len(lines[0]):
+        return tuple((0, size) for size in mask.shape)
+    return tuple((int(line[0]), int(line[-1]) + 1) for line in lines)
+
+
+def _window(bounds, size):
+    longest = max(stop - start for start, stop in bounds) + 2 * MARGIN
+    return min(size, -(-longest // MULTIPLE) * MULTIPLE)
+
+
+def _corner(bounds, window, size):
+    return int(np.clip((bounds[0] + bounds[1] - window) // 2, 0, size - window))

@@ -1,0 +1,125 @@
+"""What refinement minimises: the difference of an avatar's renderings from the photos.
+
+Every view has a pose of its own, since the Gaussians are skinned to it: photos of a moving person are nothing special.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh, PartitionSpec
+
+from humangs_jax.avatar.animate import skin
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
+from humangs_jax.core.numerics import safe_divide
+from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.objectives.ssim import structural_dissimilarity
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.parameters import Parameters, gaussians_of
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.rendering.splatting import Rendering, render
+
+
+@pytree_dataclass
+class Photos:
+    """Views to compare with (leading axis v), and the pixels of each that count: (v, h, w).
+
+    index: (v,) the number of the view, to which the changes of its pose belong.
+    """
+
+    images: Float[Array, "v h w 3"]
+    masks: Float[Array, "v h w"]
+    counted: Bool[Array, "v h w"]
+    cameras: Camera
+    rotations: Float[Array, "v j 3"]
+    translations: Float[Array, "v 3"]
+    index: Int[Array, " v"]
+
+
+def photos_of(views: SubjectViews, counted: Bool[Array, "v h w"]) -> Photos:
+    """All views of a person, with the pixels that count."""
+    index = jnp.arange(len(views.images))
+    return Photos(views.images, views.masks, counted, views.cameras, views.rotations, views.translations, index)
+
+
+def posed_gaussians(parameters: Parameters, avatar: Avatar, photo: Photos) -> Gaussians:
+    """The Gaussians in the pose of one photo (without the axis v), corrected as far as it has been refined."""
+    pose = BodyPose(
+        photo.rotations + parameters.rotations[photo.index], photo.translations + parameters.translations[photo.index]
+    )
+    return skin(replace(avatar, gaussians=gaussians_of(parameters)), pose)
+
+
+def photo_loss(
+    parameters: Parameters, avatar: Avatar, photo: Photos, config: RefineConfig, splat: SplatConfig
+) -> tuple[Scalar, Rendering]:
+    """Of one photo (without the axis v): L1 of colours, structural dissimilarity and L1 of coverage, means over the crop.
+
+    A pixel that does not count takes the photo's value, so that it contributes nothing anywhere.
+    """
+    rendering = render(posed_gaussians(parameters, avatar, photo), photo.cameras, splat)
+    rgb = jnp.where(photo.counted[..., None], rendering.rgb, photo.images)
+    alpha = jnp.where(photo.counted, rendering.alpha, photo.masks)
+    loss = (
+        jnp.mean(jnp.abs(rgb - photo.images))
+        + config.structural * jnp.mean(structural_dissimilarity(rgb, photo.images))
+        + config.silhouette * jnp.mean(jnp.abs(alpha - photo.masks))
+    )
+    return loss, rendering
+
+
+def photos_loss(
+    parameters: Parameters, avatar: Avatar, photos: Photos, config: RefineConfig, splat: SplatConfig
+) -> tuple[Scalar, Scalar, Int[Array, ""]]:
+    """Of the photos, one after the other: mean loss, mean squared error of the pixels that count, and overflow."""
+
+    def one(photo):
+        loss, rendering = photo_loss(parameters, avatar, photo, config, splat)
+        squared = jnp.mean(jnp.square(jnp.clip(rendering.rgb, 0, 1) - photo.images), axis=-1)
+        return loss, jnp.sum(squared * photo.counted), rendering.overflow
+
+    losses, squared, overflow = jax.lax.map(one, photos)
+    return (
+        jnp.mean(losses),
+        safe_divide(jnp.sum(squared), jnp.sum(photos.counted, dtype=squared.dtype)),
+        jnp.sum(overflow),
+    )
+
+
+def photos_gradient(
+    parameters: Parameters,
+    avatar: Avatar,
+    photos: Photos,
+    config: RefineConfig,
+    splat: SplatConfig,
+    mesh: Mesh | None = None,
+) -> tuple[Parameters, Scalar, Int[Array, ""]]:
+    """Gradient of the mean over the photos, the mean and the overflow. mesh: of one axis, whose devices share the photos."""
+
+    def total(parameters, avatar, photos):
+        def add(total, photo):
+            loss = lambda parameters: photo_loss(parameters, avatar, photo, config, splat)
+            (value, rendering), gradient = jax.value_and_grad(loss, has_aux=True)(parameters)
+            return jax.tree.map(jnp.add, total, (gradient, value, rendering.overflow)), None
+
+        zeros = (jax.tree.map(jnp.zeros_like, parameters), jnp.zeros(()), jnp.zeros((), jnp.int32))
+        return jax.lax.scan(add, zeros, photos)[0]
+
+    count = len(photos.images)
+    if mesh is None:
+        gradient, value, overflow = total(parameters, avatar, photos)
+    else:
+        (axis,) = mesh.axis_names
+        everywhere = PartitionSpec()
+        share = jax.shard_map(
+            lambda *arguments: jax.lax.psum(total(*arguments), axis),
+            mesh=mesh,
+            in_specs=(everywhere, everywhere, PartitionSpec(axis)),
+            out_specs=everywhere,
+            check_vma=False,
+        )
+        gradient, value, overflow = share(parameters, avatar, photos)
+    return jax.tree.map(lambda x: x / count, gradient), value / count, overflow

@@ -1,0 +1,259 @@
+"""Refinement: the Gaussians of an avatar are fitted to its photos by Adam through skinning and splatting.
+
+The network's answer is the start, and stays where no photo sees the person. `refine` is the whole job on the host: it crops the
+photos, sizes buffers, watches the clock and keeps the state with the smallest error on pixels that no step saw.
+`refine_views` is the same optimisation as one pure function of a fixed number of steps, for `jax.jit` and `jax.vmap`.
+"""
+
+import dataclasses
+import functools
+import inspect
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import posed
+from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Array, Float, Int, Scalar
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.objectives.metrics import decibels
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.crops import crop_to_person, held_out_blocks
+from humangs_jax.refinement.objective import Photos, photos_gradient, photos_loss, photos_of, posed_gaussians
+from humangs_jax.refinement.parameters import RefineState, gaussians_of, init_state, parameters_of, update
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
+from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, plan_buffers, render
+
+HELD_OUT_PHOTOS = 8
+"""From so many photos on one is held out instead of pixels: its error shows what the others do not agree on."""
+BUFFER_MARGIN = 1.5
+"""Room in the renderer's buffers beyond the need of the start: Gaussians grow. What does not fit is counted, and the buffers
+are planned again."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Refinement:
+    """avatar: the best state of the run. steps: done. seconds: of the run, after the compilation's compile_seconds.
+
+    loss: before and after, of all pixels of all photos. psnr: likewise, dB over the crops. kept: whether the run has improved
+    them; otherwise the avatar is the one it started from. interrupted: by Ctrl-C.
+    """
+
+    avatar: Avatar
+    steps: int
+    seconds: float
+    compile_seconds: float
+    loss: tuple[float, float]
+    psnr: tuple[float, float]
+    kept: bool
+    interrupted: bool = False
+
+    def summary(self) -> str:
+        """One line."""
+        gain = f"{self.psnr[0]:.1f} -> {self.psnr[1]:.1f} dB on the photos"
+        verdict = gain if self.kept else "no improvement on the photos: the avatar is unchanged"
+        ended = ", interrupted" if self.interrupted else ""
+        took = f"{self.steps} steps in {self.seconds:.1f} s (compiled in {self.compile_seconds:.1f} s)"
+        return f"refined by {took}{ended}: {verdict}"
+
+
+def refine(avatar: Avatar, capture: Capture, config: RefineConfig | None = None, **how: Any) -> Avatar:
+    """The avatar, fitted to the photos of a capture; never worse on them than before. See `refine_with_report`."""
+    return refine_with_report(avatar, capture, config, **how).avatar
+
+
+def refine_with_report(
+    avatar: Avatar,
+    capture: Capture,
+    config: RefineConfig | None = None,
+    *,
+    mesh: Mesh | None = None,
+    progress: bool = False,
+) -> Refinement:
+    """Fit an avatar to the photos of a capture, and say what it took.
+
+    Arguments:
+        avatar: of the person in the photos, on the body of the capture. capture: photos in any poses; without masks the
+            background is compared, too. mesh: of one axis, whose devices share the `views_per_step` photos of a step.
+        progress: show a bar.
+
+    Ctrl-C ends the run; the best state until then is returned.
+
+    Raises: ValueError if the capture has no view or its poses have another number of joints than the avatar, or if the devices
+    of the mesh do not divide `views_per_step`.
+    """
+    config = config or RefineConfig()
+    _check(avatar, capture, config, mesh)
+    views = crop_to_person(capture, config.image_size)
+    run = _Run(avatar, views, config, mesh, splat=_planned(avatar, views))
+    return run.go(progress)
+
+
+def refine_views(
+    avatar: Avatar, views: SubjectViews, config: RefineConfig, splat: SplatConfig, steps: int
+) -> tuple[Avatar, Int[Array, ""]]:
+    """The pure function behind `refine`: `steps` steps of one photo each, in turns, on all their pixels.
+
+    Static: config, splat (with `max_pairs`, see `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs that did
+    not fit. Batch over people whose arrays have the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
+    """
+    photos = photos_of(views, jnp.ones(views.masks.shape, bool))
+    state = start(avatar, photos, config, splat)
+
+    def one(carry, i):
+        state, overflow = carry
+        photo = jax.tree.map(lambda x: x[i % len(views.images)][None], photos)
+        state, _, missing = refine_step(state, avatar, photo, i / steps, config, splat)
+        return (state, overflow + missing), None
+
+    (state, overflow), _ = jax.lax.scan(one, (state, jnp.zeros((), jnp.int32)), jnp.arange(steps))
+    return replace(avatar, gaussians=gaussians_of(state.parameters)), overflow
+
+
+def start(avatar: Avatar, photos: Photos, config: RefineConfig, splat: SplatConfig) -> RefineState:
+    """The state before the first step. Gaussians that no photo shows get no trust."""
+    parameters = parameters_of(avatar.gaussians, len(photos.images), len(avatar.parents))
+    seen = dataclasses.replace(splat, visibility=True)
+
+    def visibility(photo):
+        return render(posed_gaussians(parameters, avatar, photo), photo.cameras, seen).visibility
+
+    return init_state(parameters, jnp.max(jax.lax.map(visibility, photos), axis=0), config)
+
+
+def refine_step(
+    state: RefineState,
+    avatar: Avatar,
+    photos: Photos,
+    progress: Float[Array, ""] | float,
+    config: RefineConfig,
+    splat: SplatConfig,
+    mesh: Mesh | None = None,
+) -> tuple[RefineState, Scalar, Int[Array, ""]]:
+    """One step on some photos: state, loss before it, overflow. progress: how much of the run is over, in [0, 1]."""
+    gradient, loss, overflow = photos_gradient(state.parameters, avatar, photos, config, splat, mesh)
+    return update(state, gradient, progress, config), loss, overflow
+
+
+class _Run:
+    """What one call of `refine` works with."""
+
+    def __init__(
+        self, avatar: Avatar, views: SubjectViews, config: RefineConfig, mesh: Mesh | None, splat: SplatConfig
+    ):
+        self.avatar, self.config, self.mesh, self.splat = avatar, config, mesh, splat
+        everything = jnp.ones(views.masks.shape, bool)
+        count = len(views.images)
+        if count >= HELD_OUT_PHOTOS and config.held_out:
+            checked = jnp.zeros(count, bool).at[np.random.default_rng(config.seed).integers(count)].set(True)
+            held = everything & checked[:, None, None]
+        else:
+            held = held_out_blocks(views, config.held_out, config.seed)
+        self.all = photos_of(views, everything)
+        self.seen, self.held = photos_of(views, ~held), photos_of(views, held)
+        useful = np.flatnonzero(np.asarray(~held).any(axis=(1, 2)))
+        self.order = _order(useful, config.views_per_step, np.random.default_rng(config.seed))
+
+    def go(self, progress: bool) -> Refinement:
+        from tqdm import tqdm
+
+        config, began = self.config, time.perf_counter()
+        state = _compiled(start)(self.avatar, self.all, config, self.splat)
+        before = self.loss(state, self.all)
+        best, lowest = state, self.loss(state, self.held)[0]
+        self.step(state, 0.0)  # compiles
+        compile_seconds = time.perf_counter() - began
+        began, done, interrupted = time.perf_counter(), 0, False
+        bar = tqdm(total=100, desc="refine", unit="%", disable=not progress, bar_format="{l_bar}{bar}| {elapsed}")
+        try:
+            passed, checked = 0.0, 0
+            while passed < 1:
+                state, overflow = self.step(state, passed)
+                done += 1
+                if overflow:
+                    self.splat = _planned(replace(self.avatar, gaussians=gaussians_of(state.parameters)), self.all)
+                passed = self.passed(done, time.perf_counter() - began)
+                if passed >= (checked + 1) / config.checks:
+                    checked = int(passed * config.checks)
+                    error = self.loss(state, self.held)[0]
+                    if error < lowest or not config.held_out:
+                        best, lowest = state, error
+                bar.n = int(100 * passed)
+                bar.refresh()
+        except KeyboardInterrupt:
+            interrupted = True
+        bar.close()
+        seconds = time.perf_counter() - began
+        after = self.loss(best, self.all)
+        kept = after[0] < before[0]
+        refined = replace(self.avatar, gaussians=gaussians_of(best.parameters)) if kept else self.avatar
+        after = after if kept else before
+        pairs = tuple(zip(before, after, strict=True))
+        return Refinement(refined, done, seconds, compile_seconds, pairs[0], pairs[1], kept, interrupted)
+
+    def step(self, state: RefineState, passed: float) -> tuple[RefineState, bool]:
+        """The state after one step, and whether something did not fit into the buffers."""
+        chosen = next(self.order)
+        photos = jax.tree.map(lambda x: x[chosen], self.seen)
+        state, _, overflow = _compiled(refine_step)(
+            state, self.avatar, photos, passed, self.config, self.splat, self.mesh
+        )
+        return state, int(overflow) > 0
+
+    def loss(self, state: RefineState, photos: Photos) -> tuple[float, float]:
+        """Loss and PSNR over the pixels that count."""
+        loss, squared, _ = _compiled(photos_loss)(state.parameters, self.avatar, photos, self.config, self.splat)
+        return float(loss), float(decibels(squared))
+
+    def passed(self, steps: int, seconds: float) -> float:
+        """How much of the run is over, in [0, 1]."""
+        limits = ((steps, self.config.steps), (seconds, self.config.seconds))
+        return min(1.0, max(done / limit for done, limit in limits if limit is not None))
+
+
+def _order(views: np.ndarray, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """Views of one step after the other: each round takes all of them in a new order."""
+    waiting = np.zeros(0, int)
+    while True:
+        while len(waiting) < size:
+            waiting = np.concatenate([waiting, rng.permutation(views)])
+        yield waiting[:size]
+        waiting = waiting[size:]
+
+
+def _planned(avatar: Avatar, photos: SubjectViews | Photos) -> SplatConfig:
+    """Buffers for all photos."""
+    poses = jax.vmap(BodyPose)(photos.rotations, photos.translations)
+    configs = [
+        plan_buffers(posed(avatar, poses[i]), photos.cameras[i], SPLAT_PRESETS[avatar.rendering], BUFFER_MARGIN)
+        for i in range(len(photos.images))
+    ]
+    most = lambda name: max(getattr(config, name) for config in configs)
+    return dataclasses.replace(configs[0], max_pairs=most("max_pairs"), max_rows=most("max_rows"))
+
+
+@functools.cache
+def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
+    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    static = [name for name in ("config", "splat", "mesh") if name in inspect.signature(function).parameters]
+    return jax.jit(function, static_argnames=static, compiler_options=options)
+
+
+def _check(avatar, capture, config, mesh):
+    if capture.view_count == 0:
+        raise ValueError("refine: the capture has 0 views; at least one photo is needed")
+    joints = capture.poses.rotations.shape[1]
+    if joints != len(avatar.parents):
+        raise ValueError(f"refine: the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}")
+    if mesh is not None and (len(mesh.axis_names) != 1 or config.views_per_step % mesh.size):
+        raise ValueError(
+            f"refine: views_per_step {config.views_per_step} cannot be divided among a mesh of {dict(mesh.shape)}"
+        )

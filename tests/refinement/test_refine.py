@@ -1,0 +1,175 @@
+"""Refinement on a toy person: a body whose Gaussians differ in colour from its photos."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import capture_renderings
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import shape_body
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import capture_from_arrays
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.refinement import refine as refinement
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.crops import crop_to_person
+from humangs_jax.refinement.parameters import gaussians_of, parameters_of
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splatting import plan_buffers, render
+
+WIDTH, HEIGHT = 48, 64
+STEPS = RefineConfig(steps=12, seconds=None, held_out=0.0)
+VMAP_TOLERANCE = 5e-4  # Adam divides by the gradient's size: rounding of gradients near 0 becomes a share of a rate
+
+
+@pytest.fixture(scope="module")
+def body():
+    return decimate(load_body(), 400)
+
+
+def toy_avatar(body, shade):
+    rest = shape_body(body, jnp.zeros(2))
+    n = len(rest.vertices)
+    colors = jnp.clip(0.5 + 0.4 * jnp.sin(9 * rest.vertices) + shade, 0.05, 0.95)
+    gaussians = Gaussians(
+        rest.vertices, jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (n, 1)), jnp.full((n, 3), 0.03), jnp.full(n, 0.8), colors
+    )
+    return Avatar(
+        gaussians, body.skinning_weights, rest.vertices, rest.joints, body.faces, body.parents, body.joint_names
+    )
+
+
+def toy_capture(body, avatar, views=3, moving=False):
+    """Photos of an avatar, each in a pose of its own if `moving`."""
+    cameras = orbit(
+        jnp.asarray([0.0, 0.9, 0.0]),
+        3.6,
+        jnp.arange(float(views)),
+        0.1,
+        intrinsics_from_fov(np.pi / 6, WIDTH, HEIGHT),
+        WIDTH,
+        HEIGHT,
+    )
+    rng = np.random.default_rng(0)
+    rotations = 0.2 * rng.normal(size=(views, 55, 3)) * moving
+    arrays = dict(rotations=rotations, translations=np.zeros((views, 3)), frames=np.arange(views), body=body)
+    blank = np.ones((views, HEIGHT, WIDTH, 3))
+    capture = capture_from_arrays(blank, cameras.K, cameras.cam_from_world, masks=blank[..., 0], **arrays)
+    drawn = capture_renderings(avatar, capture)[1]
+    images = np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in drawn])
+    return dataclasses.replace(capture, images=images, masks=np.stack([np.asarray(r.alpha) for r in drawn]))
+
+
+@pytest.fixture(scope="module")
+def person(body):
+    """The avatar to be refined, and photos of the same one in other colours."""
+    return toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), moving=True)
+
+
+def test_comes_closer_to_photos_of_a_moving_person(person):
+    avatar, capture = person
+    report = refinement.refine_with_report(avatar, capture, STEPS)
+    assert report.kept and report.steps == 12
+    assert report.loss[1] < 0.8 * report.loss[0]
+    assert report.psnr[1] > report.psnr[0] + 1
+    assert "12 steps" in report.summary()
+
+
+def test_what_no_photo_sees_stays(body, person):
+    avatar, capture = person
+    hidden = replace(avatar.gaussians, opacities=avatar.gaussians.opacities.at[:50].set(0.0))
+    refined = refinement.refine(replace(avatar, gaussians=hidden), capture, STEPS)
+    np.testing.assert_allclose(refined.gaussians.means[:50], avatar.gaussians.means[:50], atol=1e-7)
+    assert np.abs(refined.gaussians.means[50:] - avatar.gaussians.means[50:]).max() > 1e-4
+
+
+def test_never_worse_than_the_start(person):
+    avatar, capture = person
+    truth = toy_capture(capture.body, avatar)
+    wild = dataclasses.replace(STEPS, steps=3, rates=dataclasses.replace(STEPS.rates, means=1.0))
+    report = refinement.refine_with_report(avatar, truth, wild)
+    assert not report.kept and report.loss[0] == report.loss[1]
+    jax.tree.map(np.testing.assert_array_equal, report.avatar, avatar)
+
+
+def test_interruption_returns_the_best_state(person, monkeypatch):
+    avatar, capture = person
+    step, calls = refinement._Run.step, []
+
+    def interrupted(self, state, passed):
+        calls.append(passed)
+        if len(calls) > 9:
+            raise KeyboardInterrupt
+        return step(self, state, passed)
+
+    monkeypatch.setattr(refinement._Run, "step", interrupted)
+    report = refinement.refine_with_report(avatar, capture, STEPS)
+    assert report.interrupted and report.steps == 8 and report.kept and "interrupted" in report.summary()
+
+
+def test_pure_function_maps_over_people(body, person):
+    avatar, capture = person
+    views = crop_to_person(capture)
+    other = replace(avatar, gaussians=replace(avatar.gaussians, colors=1 - avatar.gaussians.colors))
+    splat = plan_buffers(avatar.gaussians, views.cameras, margin=3.0)
+    run = lambda avatar, views: refinement.refine_views(avatar, views, STEPS, splat, 4)
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), avatar, other), jax.tree.map(lambda x: jnp.stack([x, x]), views)
+    batch, overflow = jax.jit(jax.vmap(run))(*stacked)
+    assert not overflow.any()
+    for i, one in enumerate((avatar, other)):
+        alone, _ = jax.jit(run)(one, views)
+        for got, expected in zip(jax.tree.leaves(batch), jax.tree.leaves(alone), strict=True):
+            np.testing.assert_allclose(got[i], expected, atol=VMAP_TOLERANCE)
+
+
+def test_parameters_invert(person):
+    gaussians = person[0].gaussians
+    back = gaussians_of(parameters_of(gaussians, 2, 55))
+    for got, expected in zip(jax.tree.leaves(back), jax.tree.leaves(gaussians), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-5)
+
+
+def test_crops_show_the_same_pixels(person):
+    avatar, capture = person
+    wide = np.pad(capture.images, ((0, 0), (40, 40), (30, 70), (0, 0)), constant_values=1.0)
+    masks = np.pad(capture.masks, ((0, 0), (40, 40), (30, 70)))
+    K = np.asarray(capture.cameras.K) + np.asarray([[0, 0, 30], [0, 0, 40], [0, 0, 0]])
+    cameras = replace(capture.cameras, K=jnp.asarray(K, jnp.float32), width=WIDTH + 100, height=HEIGHT + 80)
+    views = crop_to_person(dataclasses.replace(capture, images=wide, masks=masks, cameras=cameras))
+    assert views.masks.shape[1] < HEIGHT + 80 and views.masks.shape[2] < WIDTH + 100
+    assert views.masks.sum() == pytest.approx(masks.sum(), rel=1e-6)
+    posed = refinement.posed(avatar, capture.pose(1))
+    drawn = render(posed, views.cameras[1], background=jnp.ones(3))
+    whole = render(posed, cameras[1])
+    rows, columns = (np.asarray(cameras.K[1] - views.cameras.K[1])[i, 2].astype(int) for i in (1, 0))
+    height, width = drawn.alpha.shape
+    np.testing.assert_allclose(drawn.rgb, whole.rgb[rows : rows + height, columns : columns + width], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"steps": None, "seconds": None}, "steps, seconds"),
+        ({"steps": 0}, "steps"),
+        ({"seconds": 0.0}, "seconds"),
+        ({"growth": 2.0}, "growth"),
+        ({"visible": 0.0}, "visible"),
+    ],
+)
+def test_wrong_settings_are_named(settings, named):
+    with pytest.raises(ValueError, match=named):
+        RefineConfig(**settings)
+
+
+def test_wrong_captures_are_named(body, person):
+    avatar, capture = person
+    with pytest.raises(ValueError, match="0 views"):
+        refinement.refine(avatar, capture.select([]))
+    few = dataclasses.replace(capture, poses=replace(capture.poses, rotations=capture.poses.rotations[:, :20]))
+    with pytest.raises(ValueError, match="20 joints, the avatar has 55"):
+        refinement.refine(avatar, few)
