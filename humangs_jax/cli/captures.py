@@ -90,7 +90,7 @@ class Synth:
 
     def run(self) -> None:
         """Write the people."""
-        from humangs_jax.people import Layout, write_set
+        from humangs_jax.people.writer import Layout, write_set
 
         extras = self.extras
         counts = {name: getattr(self, name) for name in ("subjects", "size", "views", "poses", "frames")}

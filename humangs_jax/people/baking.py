@@ -9,12 +9,11 @@ import dataclasses
 
 import numpy as np
 
-from humangs_jax.core.array_types import Bool, Float, Int, UInt8
+from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.people.atlas import Atlas, texels, unwrap
 from humangs_jax.people.kinematics import HEAD
 from humangs_jax.people.rendering import paint, spots_at
 from humangs_jax.people.subject import SyntheticSubject
-from humangs_jax.people.surfaces import Faces, Points, vertex_normals
 
 JOINTS_PER_VERTEX = 6
 """Bodies have up to 7, smoothed garments up to 12; six lose at most 0.4 % of the weight, under a millimetre in any pose."""
@@ -32,54 +31,32 @@ SKIN, EYES = 0, 1
 
 @dataclasses.dataclass(frozen=True)
 class BakedSubject:
-    """A person at rest as a textured, skinned mesh.
+    """The textures of a person at rest.
 
-    seed, betas (s,): of the subject. vertices (n, 3) metres, normals (n, 3) unit, faces (f, 3).
-    joint_ids, joint_weights: (n, k), the joints that move a vertex, weights of sum 1. face_materials: (f,), face_sheen: (f,).
     atlas: texture coordinates. albedo: (t, t, 3) bytes, 255 is 1, row 0 on top (v = 1).
     slopes: (t, t, 3) bytes, gradients of painted folds, `SLOPE_ZERO` + steps of `SLOPE_STEP`, axes of `Spots.cloth`.
     """
 
-    seed: int
-    betas: Float[np.ndarray, " s"]
-    vertices: Points
-    normals: Points
-    faces: Faces
-    joint_ids: UInt8[np.ndarray, "n k"]
-    joint_weights: Float[np.ndarray, "n k"]
-    face_materials: Int[np.ndarray, " f"]
-    face_sheen: Float[np.ndarray, " f"]
     atlas: Atlas
     albedo: UInt8[np.ndarray, "t t 3"]
     slopes: UInt8[np.ndarray, "t t 3"]
 
 
-def bake_subject(
-    subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1, joints_per_vertex: int = JOINTS_PER_VERTEX
-) -> BakedSubject:
-    """The textured mesh of a subject; textures of texture_size texels a side, each the mean of samples x samples points.
+def bake_subject(subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1) -> BakedSubject:
+    """The textures of a subject, texture_size texels a side, each the mean of samples x samples points.
 
     Raises: ValueError if the size is no multiple of the packing's `atlas.CELLS`.
     """
-    surface = subject.surface
     atlas = unwrap_subject(subject, texture_size)
-    albedo, slopes = _bake(subject, atlas, samples)
-    ids, weights = strongest_joints(surface.weights, joints_per_vertex)
-    sheens = np.asarray([material.sheen for material in subject.materials], np.float32)
-    return BakedSubject(
-        seed=subject.seed,
-        betas=subject.betas,
-        vertices=surface.vertices,
-        normals=vertex_normals(surface.vertices, surface.faces),
-        faces=surface.faces,
-        joint_ids=ids,
-        joint_weights=weights,
-        face_materials=subject.face_materials,
-        face_sheen=sheens[subject.face_materials],
-        atlas=atlas,
-        albedo=np.round(255 * np.clip(albedo, 0, 1)).astype(np.uint8),
-        slopes=np.round(SLOPE_ZERO + np.clip(slopes / SLOPE_STEP, -127, 127)).astype(np.uint8),
-    )
+    ids, weights = texels(dataclasses.replace(atlas, size=texture_size * samples))
+    covered = ids >= 0
+    albedo, slopes = paint(subject, ids[covered], spots_at(subject, ids[covered], weights[covered]))
+    values = np.zeros((*ids.shape, 7), np.float32)
+    values[covered] = np.concatenate([albedo, slopes, np.ones((len(albedo), 1), np.float32)], axis=1)
+    sums = values.reshape(texture_size, samples, texture_size, samples, 7).sum((1, 3))
+    filled = fill_gaps(sums[..., :6] / np.maximum(sums[..., 6:], 1), sums[..., 6] > 0)
+    albedo, slopes = 255 * np.clip(filled[..., :3], 0, 1), np.clip(filled[..., 3:] / SLOPE_STEP, -127, 127)
+    return BakedSubject(atlas, np.round(albedo).astype(np.uint8), np.round(SLOPE_ZERO + slopes).astype(np.uint8))
 
 
 def unwrap_subject(subject: SyntheticSubject, size: int) -> Atlas:
@@ -106,17 +83,3 @@ def fill_gaps(image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"])
 
     rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
     return image[rows, columns]
-
-
-def _bake(subject, atlas, samples):
-    """Albedo and slopes (t, t, 3) of the texels."""
-    fine = dataclasses.replace(atlas, size=atlas.size * samples)
-    ids, weights = texels(fine)
-    covered = ids >= 0
-    albedo, slopes = paint(subject, ids[covered], spots_at(subject, ids[covered], weights[covered]))
-    values = np.zeros((*ids.shape, 7), np.float32)
-    values[covered] = np.concatenate([albedo, slopes, np.ones((len(albedo), 1), np.float32)], axis=1)
-    sums = values.reshape(atlas.size, samples, atlas.size, samples, 7).sum((1, 3))
-    known = sums[..., 6] > 0
-    filled = fill_gaps(sums[..., :6] / np.maximum(sums[..., 6:], 1), known)
-    return filled[..., :3], filled[..., 3:]

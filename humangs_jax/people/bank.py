@@ -18,11 +18,12 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.io.npz import read_npz, write_npz
-from humangs_jax.people.baking import BakedSubject, bake_subject
+from humangs_jax.people.baking import JOINTS_PER_VERTEX, bake_subject, strongest_joints
 from humangs_jax.people.kinematics import joint_positions
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.seeds import GENERATOR_VERSION, split_of
 from humangs_jax.people.subject import SyntheticSubject, make_subject
+from humangs_jax.people.surfaces import vertex_normals
 
 FORMAT, VERSION = "humangs-people", 1
 POSE_STREAM = 20
@@ -102,9 +103,7 @@ def build_bank(
     seeds = list(seeds)
     if not seeds:
         raise ValueError("no seeds")
-    for seed in seeds:
-        if split_of(seed) != split:
-            raise ValueError(f"seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
+    _check_range(seeds, split)
     from tqdm import tqdm
 
     make = functools.partial(_person, texture_size=texture_size, pose_count=pose_count)
@@ -137,9 +136,7 @@ def load_bank(path: str | Path) -> PeopleBank:
     if missing := {*_ARRAYS, *_STATIC} - set(arrays):
         raise ValueError(f"{path}: a bank without {sorted(missing)}")
     split = str(arrays["split"])
-    for seed in arrays["seeds"].tolist():
-        if split_of(seed) != split:
-            raise ValueError(f"{path}: seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
+    _check_range(arrays["seeds"].tolist(), split, f"{path}: ")
     return PeopleBank(
         **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
         parents=tuple(arrays["parents"].tolist()),
@@ -152,48 +149,50 @@ def load_bank(path: str | Path) -> PeopleBank:
 _STATIC = ("parents", "mirrored_joints", "split", "generator")
 _ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in _STATIC)
 
-_shipped_body: list[BodyModel] = []
+
+def _check_range(seeds, split, where=""):
+    for seed in seeds:
+        if split_of(seed) != split:
+            raise ValueError(f"{where}seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
+
+
+@functools.cache
+def _shipped_body():
+    """For processes of their own."""
+    from humangs_jax.body.library import load_body
+
+    return load_body()
 
 
 def _person(seed, body=None, *, texture_size, pose_count):
     """One subject's share of the bank, unpadded: name -> array."""
-    if body is None:  # in a process of its own
-        if not _shipped_body:
-            from humangs_jax.body.library import load_body
-
-            _shipped_body.append(load_body())
-        body = _shipped_body[0]
-    subject = make_subject(seed, body)
-    samples = 2 if texture_size <= 512 else 1  # fine patterns are averaged where texels are coarse
-    return _arrays(subject, bake_subject(subject, texture_size, samples), pose_count)
-
-
-def _arrays(subject: SyntheticSubject, baked: BakedSubject, pose_count):
-    if len(subject.materials) > MOST_MATERIALS or len(baked.vertices) > np.iinfo(np.uint16).max:
-        raise ValueError(
-            f"seed {subject.seed}: {len(subject.materials)} pieces, {len(baked.vertices)} vertices: too many"
-        )
-    uvs = baked.atlas.uvs[baked.atlas.faces]
+    subject = make_subject(seed, _shipped_body() if body is None else body)
+    baked = bake_subject(subject, texture_size, 2 if texture_size <= 512 else 1)  # fine patterns on coarse texels
+    surface, atlas, materials = subject.surface, baked.atlas, subject.materials
+    if len(materials) > MOST_MATERIALS or len(surface.vertices) > np.iinfo(np.uint16).max:
+        raise ValueError(f"seed {seed}: {len(materials)} pieces, {len(surface.vertices)} vertices: too many")
+    uvs = atlas.uvs[atlas.faces]
     uvs = np.round(UV_STEPS * np.stack([uvs[..., 0], 1 - uvs[..., 1]], -1)).astype(np.uint16)
-    pad = lambda values: np.pad(np.asarray(values), (0, MOST_MATERIALS - len(subject.materials)))
-    identities = [id(material) for material in subject.materials]
+    pad = lambda values, kind: np.pad(np.asarray(values), (0, MOST_MATERIALS - len(materials))).astype(kind)
+    identities = [id(material) for material in materials]
     rotations = sample_poses(subject, pose_count)
+    joint_ids, joint_weights = strongest_joints(surface.weights, JOINTS_PER_VERTEX)
     return {
-        "seeds": np.int32(subject.seed),
-        "betas": baked.betas,
+        "seeds": np.int32(seed),
+        "betas": subject.betas,
         "joints": subject.build.joints.astype(np.float32),
-        "vertex_counts": np.int32(len(baked.vertices)),
-        "face_counts": np.int32(len(baked.faces)),
-        "vertices": baked.vertices.astype(np.float32),
-        "normals": baked.normals.astype(np.float16),
-        "joint_ids": baked.joint_ids,
-        "joint_weights": baked.joint_weights.astype(np.float16),
-        "faces": baked.faces.astype(np.uint16),
+        "vertex_counts": np.int32(len(surface.vertices)),
+        "face_counts": np.int32(len(surface.faces)),
+        "vertices": surface.vertices.astype(np.float32),
+        "normals": vertex_normals(surface.vertices, surface.faces).astype(np.float16),
+        "joint_ids": joint_ids,
+        "joint_weights": joint_weights.astype(np.float16),
+        "faces": surface.faces.astype(np.uint16),
         "uvs": uvs,
-        "face_pieces": baked.face_materials.astype(np.uint8),
-        "sheen": pad([material.sheen for material in subject.materials]).astype(np.float32),
-        "groups": pad([identities.index(i) for i in identities]).astype(np.uint8),
-        "dyeable": pad([material.wrinkles > 0 for material in subject.materials]).astype(np.float32),
+        "face_pieces": subject.face_materials.astype(np.uint8),
+        "sheen": pad([material.sheen for material in materials], np.float32),
+        "groups": pad([identities.index(i) for i in identities], np.uint8),
+        "dyeable": pad([material.wrinkles > 0 for material in materials], np.float32),
         "texture": np.concatenate([baked.albedo, baked.slopes], axis=-1),
         "rotations": rotations,
         "nearest": _nearest(subject.build, rotations),
@@ -213,23 +212,21 @@ def _nearest(build, rotations):
     return np.argmin(away, axis=1).astype(np.int32)
 
 
+_BY_VERTEX, _BY_FACE = ("vertices", "normals", "joint_ids", "joint_weights"), ("faces", "uvs", "face_pieces")
+
+
 def _stacked(people, body: BodyModel, split) -> PeopleBank:
     vertices = -(-max(len(p["vertices"]) for p in people) // PAD_VERTICES) * PAD_VERTICES
     faces = -(-max(len(p["faces"]) for p in people) // PAD_FACES) * PAD_FACES
-    lengths = {"vertices": vertices, "normals": vertices, "joint_ids": vertices, "joint_weights": vertices}
-    lengths |= {"faces": faces, "uvs": faces, "face_pieces": faces}
 
     def padded(name, array):
-        if name not in lengths:
-            return array
-        extra = lengths[name] - len(array)
-        if name in ("faces", "uvs", "face_pieces"):
-            return np.pad(array, [(0, extra)] + [(0, 0)] * (array.ndim - 1))
-        return np.concatenate([array, np.repeat(array[:1], extra, axis=0)])
+        if name in _BY_FACE:
+            return np.pad(array, [(0, faces - len(array))] + [(0, 0)] * (array.ndim - 1))
+        if name in _BY_VERTEX:
+            return np.concatenate([array, np.repeat(array[:1], vertices - len(array), axis=0)])
+        return array
 
-    fields: dict[str, Any] = {}
-    for name in _ARRAYS:
-        fields[name] = jnp.asarray(np.stack([padded(name, p[name]) for p in people]))
+    fields: dict[str, Any] = {name: jnp.asarray(np.stack([padded(name, p[name]) for p in people])) for name in _ARRAYS}
     return PeopleBank(**fields, parents=body.parents, mirrored_joints=mirrored_joints(body.joint_names), split=split)
 
 

@@ -20,30 +20,8 @@ LEFT_FOOT, RIGHT_FOOT, NECK, LEFT_COLLAR, RIGHT_COLLAR, HEAD = range(10, 16)
 LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST = range(16, 22)
 LEFT_EYE, RIGHT_EYE, LEFT_HAND, RIGHT_HAND, JOINTS = 23, 24, 25, 40, 55
 
-LIMITS = {
-    PELVIS: 1.0,
-    LEFT_HIP: 1.7,
-    RIGHT_HIP: 1.7,
-    SPINE1: 0.35,
-    SPINE2: 0.35,
-    SPINE3: 0.35,
-    LEFT_KNEE: 2.1,
-    RIGHT_KNEE: 2.1,
-    LEFT_ANKLE: 0.8,
-    RIGHT_ANKLE: 0.8,
-    LEFT_FOOT: 0.9,
-    RIGHT_FOOT: 0.9,
-    NECK: 0.5,
-    HEAD: 0.5,
-    LEFT_COLLAR: 0.35,
-    RIGHT_COLLAR: 0.35,
-    LEFT_SHOULDER: 2.3,
-    RIGHT_SHOULDER: 2.3,
-    LEFT_ELBOW: 2.4,
-    RIGHT_ELBOW: 2.4,
-    LEFT_WRIST: 0.8,
-    RIGHT_WRIST: 0.8,
-}
+LIMITS = dict(enumerate([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9, 0.9, 0.5, 0.35, 0.35, 0.5, 2.3, 2.3,
+                         2.4, 2.4, 0.8, 0.8]))  # fmt: skip
 """Largest rotation angle of each joint in the prior; fingers: FINGER_LIMIT; jaw and eyes stay at rest."""
 FINGER_LIMIT = 1.5
 

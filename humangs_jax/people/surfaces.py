@@ -54,8 +54,7 @@ def rigid(vertices: Points, faces: Faces, joint: int, joints: int) -> Surface:
 def vertex_normals(vertices: Points, faces: Faces) -> Points:
     """(n, 3) area-weighted unit normals."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    face_normals = np.cross(b - a, c - a)
-    return unit(scatter_add(faces.T.reshape(-1), np.tile(face_normals, (3, 1)), len(vertices)))
+    return unit(scatter_add(faces.T.reshape(-1), np.tile(np.cross(b - a, c - a), (3, 1)), len(vertices)))
 
 
 def scatter_add(
@@ -86,9 +85,9 @@ def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
 
 
 def smooth(
-    values: Float[np.ndarray, "n c"], faces: Faces, iterations: int, strength: float = 0.5, keep_hems: bool = False
+    values: Float[np.ndarray, "n c"], faces: Faces, iterations: int, keep_hems: bool = False
 ) -> Float[np.ndarray, "n c"]:
-    """Laplacian smoothing of vertex values (n, c): each step moves a vertex towards the mean of its neighbours.
+    """Laplacian smoothing of vertex values (n, c): each step moves a vertex halfway towards the mean of its neighbours.
 
     keep_hems: vertices on the boundary only feel their neighbours on the boundary, so that hems stay crisp and do not shrink.
     """
@@ -107,7 +106,7 @@ def smooth(
     for _ in range(iterations):
         mean = scatter_add(target, values[source], count) / neighbours
         mean[lonely] = values[lonely]
-        values = values + strength * (mean - values)
+        values = values + 0.5 * (mean - values)
     return values.astype(np.float32)
 
 
@@ -210,42 +209,53 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
 
 def ball(rows: int, columns: int) -> tuple[Points, Faces]:
     """Unit vectors on a grid of polar angles (from +y) and azimuths (from +z), and its faces."""
-    polar, around = np.meshgrid(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns, indexing="ij")
-    directions = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], -1)
-    return directions.reshape(-1, 3), grid_faces(rows, columns, closed=True)
+    down, azimuth = grid(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns)
+    return around(np.sin(down), azimuth, np.cos(down)), grid_faces(rows, columns, closed=True)
+
+
+def grid(rows: Field, columns: Field) -> tuple[Field, Field]:
+    """Every row's value with every column's, row-major, (rows * columns,) each."""
+    return np.repeat(rows, len(columns)), np.tile(columns, len(rows))
 
 
 def sweep(
     path: Float[np.ndarray, "m 3"],
-    across: Float[np.ndarray, "m 3"],
-    widths: Float[np.ndarray, "m 2"],
+    across: Float[np.ndarray, "*m 3"],
+    widths: Float[np.ndarray, "m 2"] | float,
     columns: int = 10,
     closed: bool = False,
 ) -> tuple[Points, Faces]:
     """Vertices (m columns, 3) and faces of a tube of elliptic sections along a path (m, 3).
 
-    across: (m, 3) directions of the first half axis, made normal to the path. widths: (m, 2) half axes, metres.
+    across: direction(s) of the first half axis, made normal to the path. widths: half axes, metres; one for all, or (m, 2).
     closed: the path's end joins its start; otherwise the ends are open (let the widths run out to close them).
     """
     tangent = unit(np.roll(path, -1, 0) - np.roll(path, 1, 0)) if closed else unit(np.gradient(path, axis=0))
     first = unit(across - np.sum(across * tangent, -1, keepdims=True) * tangent)
-    second = np.cross(tangent, first)
-    angle = np.arange(columns) * (2 * np.pi / columns)
-    ring = (
-        np.cos(angle)[None, :, None] * (widths[:, :1] * first)[:, None]
-        + np.sin(angle)[None, :, None] * (widths[:, 1:] * second)[:, None]
-    )
+    second, widths = np.cross(tangent, first), np.broadcast_to(widths, (len(path), 2))
+    c, s = np.cos(circle(columns))[None, :, None], np.sin(circle(columns))[None, :, None]
+    ring = c * (widths[:, :1] * first)[:, None] + s * (widths[:, 1:] * second)[:, None]
     vertices = (path[:, None] + ring).reshape(-1, 3).astype(np.float32)
     rows = len(path) + closed
     faces = grid_faces(rows, columns, closed=True) % len(vertices)
     return vertices, np.ascontiguousarray(faces[:, ::-1])
 
 
+def circle(count: int) -> Field:
+    """(count,) angles all around from 0 on."""
+    return np.arange(count) * (2 * np.pi / count)
+
+
+def around(radius: Field | float, angle: Field, height: Field, center: Field | tuple = (0, 0)) -> Points:
+    """(n, 3) points at radii (n,) and angles (n,) around the vertical axis through center (x, z)."""
+    return np.stack([center[0] + radius * np.sin(angle), height, center[1] + radius * np.cos(angle)], -1)
+
+
 ANGLES = 48
 EMPTY = 1e-3
 """Radius (metres) of a slice without points."""
 
-_GRID = np.arange(ANGLES) * (2 * np.pi / ANGLES)
+_GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
 _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
 """radius(a) = min over b of support(b) / cos(a - b)."""
@@ -321,15 +331,9 @@ def blurred(shape: Outlines, times: int = 1) -> Outlines:
     return shape.with_radii(radii)
 
 
-def hanging(shape: Outlines, slope: float, downwards: bool = True) -> Outlines:
-    """Cloth that hangs: it keeps the largest radius of the slices before it, less `slope` metres per metre.
-
-    downwards: before means above (larger level), else below.
-    """
+def hanging(shape: Outlines, slope: float) -> Outlines:
+    """Cloth that hangs: it keeps the largest radius of the slices above it, less `slope` metres per metre."""
     radii = shape.radii.copy()
-    order = range(len(radii) - 2, -1, -1) if downwards else range(1, len(radii))
-    step = 1 if downwards else -1
-    for i in order:
-        drop = slope * abs(shape.levels[i] - shape.levels[i + step])
-        radii[i] = np.maximum(radii[i], radii[i + step] - drop)
+    for i in range(len(radii) - 2, -1, -1):
+        radii[i] = np.maximum(radii[i], radii[i + 1] - slope * abs(shape.levels[i] - shape.levels[i + 1]))
     return shape.with_radii(radii)

@@ -9,7 +9,9 @@ import jax
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.configuration import config_from_file
 from humangs_jax.objectives.loss_networks import LossNetworks
-from humangs_jax.people import SPLITS, build_bank, find_people, load_bank, save_bank
+from humangs_jax.people.bank import build_bank, load_bank, save_bank
+from humangs_jax.people.manifest import find_people
+from humangs_jax.people.seeds import SPLITS
 from humangs_jax.training.config import PRESETS, TrainConfig, without_losses
 from humangs_jax.training.sources import MakeSource, captured_people, mixed_people, on_the_fly_people
 

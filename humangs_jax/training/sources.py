@@ -13,7 +13,9 @@ from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture, Source
-from humangs_jax.people import ON_THE_FLY, OnTheFlyConfig, PeopleBank, on_the_fly_source
+from humangs_jax.people.bank import PeopleBank
+from humangs_jax.people.on_the_fly import ON_THE_FLY, OnTheFlyConfig
+from humangs_jax.people.source import on_the_fly_source
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.sharding import batch_sharding
 

@@ -84,7 +84,7 @@ def test_corners_of_the_atlas_are_those_of_the_mesh(person, baked):
 
 def test_the_texture_says_what_the_materials_say(person, baked):
     rng = np.random.default_rng(0)
-    faces = rng.integers(len(baked.faces), size=4000)
+    faces = rng.integers(len(person.surface.faces), size=4000)
     weights = rng.dirichlet(np.ones(3), size=4000).astype(np.float32)
     albedo, slopes = rendering.paint(person, faces, rendering.spots_at(person, faces, weights))
     uv = sum(weights[:, i : i + 1] * baked.atlas.uvs[baked.atlas.faces[faces, i]] for i in range(3))

@@ -163,12 +163,12 @@ def test_highlights_are_bent_not_cut():
 
 
 def test_fabrics_of_one_seed_are_one_fabric():
-    from humangs_jax.people.fabrics import sample_fabric, weave
+    from humangs_jax.people.fabrics import sample_fabric
 
     rng = np.random.default_rng(0)
     cloth = rng.uniform(-0.2, 0.2, (300, 4)).astype(np.float32)
     spots = Spots(cloth, cloth[:, :3])
     for kind in ("tee", "jeans", "coat", "tie"):
         fabric = sample_fabric(rng, kind, 0.3)
-        np.testing.assert_array_equal(weave(fabric)(spots), weave(fabric)(spots))
-        assert isinstance(Material(weave(fabric)), Material)
+        np.testing.assert_array_equal(fabric.colours(spots), fabric.colours(spots))
+        assert isinstance(Material(fabric.colours), Material)

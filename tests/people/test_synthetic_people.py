@@ -205,7 +205,7 @@ def test_patterns_stay_in_range_and_differ():
     seen = []
     for name, (_, make) in PATTERNS.items():
         base, other = fabrics.colour(0.6, 0.7, 0.5), fabrics.colour(0.1, 0.6, 0.8)
-        colours = make(np.random.default_rng(1), base, other)(spots)
+        colours = make(spots, np.random.default_rng(1), base, other)
         assert colours.shape == (500, 3) and np.isfinite(colours).all(), name
         assert colours.min() >= -0.05 and colours.max() <= 1.15, name
         seen.append(colours)

@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from experiments.people.overlap import OverlapMeter, winding_numbers
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, rest_pose, shape_body
 from humangs_jax.people import arms
 from humangs_jax.people import kinematics as kin
 from humangs_jax.people.arms import pose_hand
-from humangs_jax.people.overlap import OverlapMeter, winding_numbers
 from humangs_jax.people.poses import STANCES, sample_rotations, take_stance
 
 CLOSE = 1e-4
