@@ -84,7 +84,7 @@ def limits(poses) -> dict:
     from humangs_jax.people.kinematics import LIMITS
 
     angles = np.linalg.norm(np.stack(poses), axis=-1)
-    used = {joint: angles[:, joint].max() / limit for joint, limit in LIMITS.items()}
+    used = {joint: angles[:, joint].max() / limit for joint, limit in enumerate(LIMITS) if limit > 0}
     spread = np.rad2deg(np.stack(poses).std(0)).mean(1)
     return {
         "largest_share_of_a_limit": float(max(used.values())),

@@ -13,6 +13,7 @@ import numpy as np
 
 from humangs_jax.people.anatomy import WRIST
 from humangs_jax.people.fabrics import Fabric, sample_fabric
+from humangs_jax.people.noise import choice
 
 TOPS = ("tank", "tee", "longsleeve", "polo", "shirt", "blouse", "sweater", "turtleneck", "hoodie", "jersey")
 OUTER = ("jacket", "denim_jacket", "blazer", "cardigan", "vest", "puffer", "coat", "hooded_jacket")
@@ -111,8 +112,7 @@ def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
     if isinstance(specification, tuple):
         return rng.uniform(*specification)
     if isinstance(specification, Mapping):
-        odds = np.asarray(list(specification.values()), float)
-        return str(rng.choice(list(specification), p=odds / odds.sum()))
+        return choice(rng, specification)
     if isinstance(specification, OneOf):
         return rng.choice([drawn(rng, option, **named) for option in specification.options], p=specification.odds)
     return named.get(specification, specification)
@@ -345,12 +345,12 @@ def _extras(rng, style, male, years, worn):
 
     if not hooded and rng.random() < style.scarf:
         put("scarf", 0.35, thickness=rng.uniform(0.022, 0.038), tails=rng.choice([0.0, rng.uniform(0.15, 0.4)]))
-    choice = rng.random()
+    left = rng.random()
     for kind, odds in (style.headwear if male else {**style.headwear, "headscarf": 0.06}).items():
-        if choice < odds and not hooded and not (kind == "headscarf" and "scarf" in kinds):
+        if left < odds and not hooded and not (kind == "headscarf" and "scarf" in kinds):
             put(kind, 0.8, brim=rng.uniform(0.045, 0.085), backwards=float(kind == "cap" and rng.random() < 0.12))
             break
-        choice -= odds
+        left -= odds
     eyes = rng.random()
     if eyes < 0.2 + 0.15 * (years > 50):
         put("glasses", 1.0, size=rng.uniform(0.85, 1.2), squareness=rng.uniform(2, 6), wire=rng.uniform(0.0011, 0.0028))

@@ -16,6 +16,7 @@ from jax.scipy.special import ndtri
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.people.fabrics import ALBEDO_LIMIT
+from humangs_jax.people.noise import choice
 
 CELL = 0.025
 """Edge of a voxel of the occupancy grid, metres."""
@@ -68,8 +69,7 @@ class Lights:
 
 def sample_lights(rng: np.random.Generator) -> Lights:
     """A studio, an overcast or a sunny day, a lit room or a window; exposed and balanced by a camera that errs."""
-    odds = np.asarray([scene[0] for scene in SCENES.values()])
-    scene = list(SCENES.values())[rng.choice(len(SCENES), p=odds / odds.sum())]
+    scene = SCENES[choice(rng, {name: row[0] for name, row in SCENES.items()})]
     _, azimuths, heights, key, fill, sky_range, warmth, bounce = scene
     azimuth = rng.uniform(*azimuths) * rng.choice([-1, 1])
     angles = azimuth + np.asarray([0.0, rng.uniform(1.4, 2.4) * rng.choice([-1, 1]), np.pi + rng.uniform(-0.5, 0.5)])

@@ -213,7 +213,7 @@ def ball(rows: int, columns: int) -> tuple[Points, Faces]:
     return around(np.sin(down), azimuth, np.cos(down)), grid_faces(rows, columns, closed=True)
 
 
-def grid(rows: Field, columns: Field) -> tuple[Field, Field]:
+def grid(rows: Float[np.ndarray, " r"], columns: Float[np.ndarray, " c"]) -> tuple[Field, Field]:
     """Every row's value with every column's, row-major, (rows * columns,) each."""
     return np.repeat(rows, len(columns)), np.tile(columns, len(rows))
 
@@ -221,13 +221,13 @@ def grid(rows: Field, columns: Field) -> tuple[Field, Field]:
 def sweep(
     path: Float[np.ndarray, "m 3"],
     across: Float[np.ndarray, "*m 3"],
-    widths: Float[np.ndarray, "m 2"] | float,
+    widths: Float[np.ndarray, "m _"] | float,
     columns: int = 10,
     closed: bool = False,
 ) -> tuple[Points, Faces]:
     """Vertices (m columns, 3) and faces of a tube of elliptic sections along a path (m, 3).
 
-    across: direction(s) of the first half axis, made normal to the path. widths: half axes, metres; one for all, or (m, 2).
+    across: direction(s) of the first half axis, made normal to the path. widths: half axes, metres; one, or (m, 1 or 2).
     closed: the path's end joins its start; otherwise the ends are open (let the widths run out to close them).
     """
     tangent = unit(np.roll(path, -1, 0) - np.roll(path, 1, 0)) if closed else unit(np.gradient(path, axis=0))
@@ -246,7 +246,9 @@ def circle(count: int) -> Field:
     return np.arange(count) * (2 * np.pi / count)
 
 
-def around(radius: Field | float, angle: Field, height: Field, center: Field | tuple = (0, 0)) -> Points:
+def around(
+    radius: Field | float | int, angle: Field, height: Field, center: Float[np.ndarray, "2"] | tuple = (0, 0)
+) -> Points:
     """(n, 3) points at radii (n,) and angles (n,) around the vertical axis through center (x, z)."""
     return np.stack([center[0] + radius * np.sin(angle), height, center[1] + radius * np.cos(angle)], -1)
 
