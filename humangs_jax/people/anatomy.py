@@ -86,15 +86,12 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
     What was interpolated across a seam (armholes; the middle of trousers) is sharp there again. Arms are turned down, so that y
     runs along every limb. Only cloth with the trunk's girth has sleeves, only cloth with the legs' girth has legs.
     """
-    x, y, z = template.T
-    girth = cloth[:, 3]
+    x, y, girth = template[:, 0], template[:, 1], cloth[:, 3]
     on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(girth - TRUNK_GIRTH) < SAME_GIRTH)
     on_leg = (np.abs(girth - LEG_GIRTH) < SAME_GIRTH) & (y < -0.15) & (y > -1.3)
-    if not (on_arm.any() or on_leg.any()):
-        return cloth
     result = np.array(cloth)
     result[on_leg] = leg_coordinates(template[on_leg])
-    x, y, z = x[on_arm], y[on_arm], z[on_arm]
+    x, y, z = template[on_arm].T
     around = np.where(x < 0, -1.0, 1.0) * (y - ARM_HEIGHT)
     result[on_arm] = np.stack([around, ARM_HEIGHT - (np.abs(x) - SHOULDER), z, np.full_like(x, ARM_GIRTH)], -1)
     return result
@@ -112,9 +109,8 @@ def measure(
     """The `Anatomy` of a shaped body from its rest vertices (n, 3) and joints (j, 3)."""
     template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
     vertices = np.asarray(vertices, np.float32)
-    skin = Surface(
-        vertices, faces, weights, {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}
-    )
+    attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}
+    skin = Surface(vertices, faces, weights, attributes)
     levels = np.arange(-1.3, 0.5, 0.02) * 1.0
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)
     trunk_points = vertices[body & (template[:, 1] > -0.6)]

@@ -167,11 +167,6 @@ def fringe(rng: np.random.Generator, haircut: Haircut) -> Callable[[np.ndarray, 
     return above
 
 
-def over_ears(haircut: Haircut) -> bool:
-    """Whether the hair hides the ears."""
-    return haircut.cut in LONG_CUTS
-
-
 def ears(template: np.ndarray) -> np.ndarray:
     """(n,) whether a vertex is on the outer part of an ear."""
     x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]

@@ -213,12 +213,8 @@ def _top(rng, style, kind, male, waist, tucked, outer):
             details.add(detail)
     if tucked:
         details.add("tucked")
-    sizes = {
-        "sleeve": float(min(sleeve, WRIST - 0.01) if outer else sleeve),
-        "bottom": bottom,
-        "loose": min(loose, 0.2) if outer or tucked else loose,
-        "depth": rng.uniform(0.04, 0.095),
-    }
+    sleeve, loose = float(min(sleeve, WRIST - 0.01) if outer else sleeve), min(loose, 0.2) if outer or tucked else loose
+    sizes = {"sleeve": sleeve, "bottom": bottom, "loose": loose, "depth": rng.uniform(0.04, 0.095)}
     plainness = 0.55 if style == "formal" else PLAIN_TOPS.get(kind, 0.35)
     return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
 
@@ -263,10 +259,8 @@ def _dress(rng, outer):
         "waist": rng.uniform(-0.235, -0.165),
         "end": end,
         "flare": rng.uniform(0.015, 0.17),
-        "depth": rng.uniform(0.04, 0.1),
-        "loose": 0.1 if outer else rng.uniform(0.0, 0.4),
-        **_pleats(rng, kind),
     }
+    sizes |= {"depth": rng.uniform(0.04, 0.1), "loose": 0.1 if outer else rng.uniform(0.0, 0.4), **_pleats(rng, kind)}
     details = {neck} | ({"sash"} if rng.random() < 0.35 else set())
     return [Garment(kind, sample_fabric(rng, kind, 0.3), sizes, frozenset(details))]
 
@@ -285,14 +279,9 @@ def _outer(rng, style, worn):
         if not is_open and rng.random() < 0.4:
             details.add("sash")
     details |= {"blazer": {"lapels"}, "jacket": {"collar"}, "denim_jacket": {"collar"}}.get(kind, set())
-    sizes = {
-        "sleeve": 0.2 if kind == "vest" else WRIST - rng.uniform(0.0, 0.035),
-        "bottom": bottom,
-        "gap": rng.uniform(0.012, 0.05) if is_open else -1.0,
-        "spread": rng.uniform(0.05, 0.35),
-        "flare": rng.uniform(0.02, 0.1),
-        "loose": rng.uniform(0.2, 1.0),
-    }
+    sizes = {"sleeve": 0.2 if kind == "vest" else WRIST - rng.uniform(0.0, 0.035), "bottom": bottom}
+    sizes |= {"gap": rng.uniform(0.012, 0.05) if is_open else -1.0, "spread": rng.uniform(0.05, 0.35)}
+    sizes |= {"flare": rng.uniform(0.02, 0.1), "loose": rng.uniform(0.2, 1.0)}
     if kind == "vest":
         sizes["sleeve"] = rng.uniform(0.145, 0.165)
     fabric = sample_fabric(rng, kind, 0.9 if kind in ("blazer", "coat", "puffer") else 0.72)

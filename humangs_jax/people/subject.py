@@ -60,8 +60,7 @@ def describe(seed: int, body: BodyModel) -> Person:
     male, years = bool(rng.random() < 0.5), float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS))
     betas, stature = sample_shape(rng, body, male, years)
     garments = sample_outfit(np.random.default_rng([seed, 11]), male, years)
-    colours = np.random.default_rng([seed, 12])
-    complexion = sample_complexion(colours, male, years)
+    complexion = sample_complexion(np.random.default_rng([seed, 12]), male, years)
     haircut = sample_haircut(np.random.default_rng([seed, 13]), male, years, {g.kind for g in garments})
     lights = sample_lights(np.random.default_rng([seed, 14]))
     return Person(seed, betas, male, years, stature, complexion, haircut, garments, lights)
@@ -117,18 +116,12 @@ class SyntheticSubject:
 
     def posed_vertices(self, rotations: Rotations, translation: Vector) -> Points:
         """(n, 3) world positions of the mesh in a pose: rotations (j, 3), translation (3,)."""
-        transforms = self._transforms(rotations, translation)
-        blended = (self.surface.weights @ transforms[:, :3].reshape(len(transforms), 12)).reshape(-1, 3, 4)
-        return np.einsum("nij,nj->ni", blended[..., :3], self.surface.vertices) + blended[..., 3]
-
-    def _transforms(self, rotations, translation):
-        """(j, 4, 4) rest -> posed, by the pose prior's own kinematics: no compilation, the same on every backend."""
+        # by the pose prior's own kinematics: no compilation, the same on every backend
         world, positions = joint_positions(self.build, np.asarray(rotations, np.float64))
-        transforms = np.zeros((len(world), 4, 4))
-        transforms[:, :3, :3] = world
-        transforms[:, :3, 3] = positions - np.einsum("jab,jb->ja", world, self.build.joints) + translation
-        transforms[:, 3, 3] = 1
-        return transforms.astype(np.float32)
+        moved = positions - np.einsum("jab,jb->ja", world, self.build.joints) + translation
+        transforms = np.concatenate([world, moved[..., None]], -1).astype(np.float32)
+        blended = (self.surface.weights @ transforms.reshape(-1, 12)).reshape(-1, 3, 4)
+        return np.einsum("nij,nj->ni", blended[..., :3], self.surface.vertices) + blended[..., 3]
 
 
 _shape = jax.jit(shape_body)
@@ -149,7 +142,7 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
     )
     rng = np.random.default_rng([seed, 20])
     outfit = wardrobe.dress_up(rng, anatomy, person.garments)
-    if hair.over_ears(person.haircut) or any(g.kind == "headscarf" or "hood_up" in g.details for g in person.garments):
+    if person.haircut.cut in hair.LONG_CUTS or _hooded(person):
         outfit.removed = outfit.removed | hair.ears(template)
     hairs = _hair(np.random.default_rng([seed, 21]), anatomy, person, outfit.trunk)
     skin, cover = _visible_skin(anatomy, outfit)
@@ -202,16 +195,18 @@ def _visible_skin(anatomy: Anatomy, outfit: wardrobe.Outfit) -> tuple[Surface, n
     return Surface(bare.vertices, bare.faces, bare.weights, kept), bare.attributes["cover"]
 
 
+def _hooded(person):
+    return any(g.kind == "headscarf" or "hood_up" in g.details for g in person.garments)
+
+
 def _hair(rng, anatomy, person, over):
     """The pieces of hair; what a hat or hood covers is left out."""
     material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
-    if any("hood_up" in g.details or g.kind == "headscarf" for g in person.garments):
-        parts = hair.style(rng, anatomy, dataclasses.replace(person.haircut, cut="buzz"))
-        return [wardrobe.Piece(surface, material) for surface in parts]
-    pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, person.haircut, over)]
-    if not any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments):
-        return pieces
-    if pieces:  # the scalp's; tails, buns and beards hang out
+    hooded = _hooded(person)
+    haircut = dataclasses.replace(person.haircut, cut="buzz") if hooded else person.haircut
+    pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, haircut, over)]
+    hat = any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments)
+    if hat and pieces and not hooded:  # the scalp's; tails, buns and beards hang out
         hidden = hair.above_line(pieces[0].surface.attributes["template"], hair.CAP_LINE) > 0.008
         pieces[0] = dataclasses.replace(pieces[0], hidden=hidden).visible()
     return pieces
