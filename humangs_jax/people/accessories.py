@@ -3,6 +3,8 @@
 Swept tubes, sheets, boxes and outlines that follow one joint or the nearest skin.
 """
 
+import functools
+
 import numpy as np
 
 from humangs_jax.people import hair, tailoring
@@ -38,9 +40,7 @@ UP = np.asarray([0.0, 1.0, 0.0])
 def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float) -> list[tuple[Surface, Material]]:
     """Surfaces and materials of an accessory. ease: distance of the outermost layer from the trunk, metres."""
     kind, sizes, fabric = garment.kind, garment.sizes, garment.fabric
-    hat = lambda thickness, bumps, crown: hair.scalp_shell(
-        rng, anatomy, thickness, bumps, hair.CAP_LINE, rim=0.011, crown=crown
-    )
+    hat = functools.partial(hair.scalp_shell, rng, anatomy, line=hair.CAP_LINE, rim=0.011)
     if kind in ("glasses", "sunglasses"):
         return glasses(anatomy, sizes["size"], sizes["squareness"], sizes["wire"], kind == "sunglasses", fabric.base)
     if kind == "necklace":
@@ -78,9 +78,8 @@ def neck_ring(anatomy: Anatomy, lift: float) -> tuple[np.ndarray, np.ndarray]:
 def head_ring(anatomy: Anatomy, line: tuple) -> tuple[np.ndarray, np.ndarray]:
     """(RING, 3) rest points around the head at a hairline, from front over left, and outward directions."""
     template = anatomy.skin.attributes["template"]
-    near = (np.abs(hair.above_line(template, line)) < 0.012) & (
-        (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
-    )
+    no_ear = (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
+    near = no_ear & (np.abs(hair.above_line(template, line)) < 0.012)
     return _ring(anatomy, near, np.arctan2(template[:, 0], template[:, 2] - hair.SKULL[2]))
 
 

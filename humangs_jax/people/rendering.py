@@ -70,9 +70,8 @@ def render_view(
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """(h, w, 3) image on the background and (h, w) coverage of one camera, both in [0, 1]."""
     s, subject = SUPERSAMPLING, posed.subject
-    fragments = rasterize_mesh(
-        *padded(posed.vertices, subject.surface.faces), camera.resized(camera.width * s, camera.height * s)
-    )
+    fine = camera.resized(camera.width * s, camera.height * s)
+    fragments = rasterize_mesh(*padded(posed.vertices, subject.surface.faces), fine)
     ids = np.asarray(fragments.face_ids).reshape(-1)
     seen = np.flatnonzero(ids >= 0)
     weights = np.asarray(fragments.barycentrics).reshape(-1, 3)[seen]

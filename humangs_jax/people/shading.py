@@ -99,9 +99,8 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
     exposure, balance, green = 0.12 * normal(u[22]) + 0.06, 0.045 * normal(u[23]), 0.012 * normal(u[24])
     gain = jnp.clip(jnp.exp(exposure), 0.72, 1.35) * jnp.stack([1 + balance, 1 + green, 1 - balance])
     ground = bounce * color * (1 + within((-0.06, 0.06), u[25:28]))
-    return _lights(
-        jnp, within(azimuth, u[4]) * sign(u[5]) + turns, elevations, power, tint, warmth, color, ground, gain
-    )
+    angles = within(azimuth, u[4]) * sign(u[5]) + turns
+    return _lights(jnp, angles, elevations, power, tint, warmth, color, ground, gain)
 
 
 def _lights(numpy, angles, elevations, power, tint, warmth, sky, ground, gain):

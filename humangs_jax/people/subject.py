@@ -137,9 +137,8 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
     person = describe(seed, body)
     rest = _shape(body, jnp.asarray(person.betas))
     template, faces, weights, *_ = _host_arrays(body)
-    anatomy = anatomy_module.measure(
-        np.asarray(rest.vertices), np.asarray(rest.joints), template, faces, weights, body.parents
-    )
+    vertices, joints = np.asarray(rest.vertices), np.asarray(rest.joints)
+    anatomy = anatomy_module.measure(vertices, joints, template, faces, weights, body.parents)
     rng = np.random.default_rng([seed, 20])
     outfit = wardrobe.dress_up(rng, anatomy, person.garments)
     if person.haircut.cut in hair.LONG_CUTS or _hooded(person):
@@ -154,7 +153,7 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
         *hairs,
     ]
     surface = join([piece.surface for piece in pieces])
-    cover = np.concatenate([cover, np.full(len(surface.vertices) - len(cover), -1.0, np.float32)])
+    cover = np.pad(cover, (0, len(surface.vertices) - len(cover)), constant_values=-1.0)
     return SyntheticSubject(
         seed=seed,
         betas=person.betas,
@@ -192,7 +191,7 @@ def _visible_skin(anatomy: Anatomy, outfit: wardrobe.Outfit) -> tuple[Surface, n
     skin = anatomy.skin.with_attributes(cover=outfit.cover.astype(np.float32))
     bare = compact(skin, ~outfit.removed[skin.faces].all(1))
     kept = {name: bare.attributes[name] for name in ("template", "cloth")}
-    return Surface(bare.vertices, bare.faces, bare.weights, kept), bare.attributes["cover"]
+    return dataclasses.replace(bare, attributes=kept), bare.attributes["cover"]
 
 
 def _hooded(person):

@@ -8,6 +8,7 @@ a slice is its radius around the slice's centre at `ANGLES` angles, angle 0 at +
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -33,6 +34,11 @@ class Surface:
     def moved(self, vertices: Points) -> "Surface":
         """The same surface with other vertex positions."""
         return dataclasses.replace(self, vertices=np.asarray(vertices, np.float32))
+
+    def mapped(self, function: Callable[[np.ndarray], np.ndarray], faces: np.ndarray) -> "Surface":
+        """Other faces, and one function of every array over the vertices."""
+        attributes = {name: function(value) for name, value in self.attributes.items()}
+        return Surface(function(self.vertices), faces.astype(np.int32), function(self.weights), attributes)
 
     def with_attributes(self, **attributes: np.ndarray) -> "Surface":
         """The same surface with more (or other) attributes."""
@@ -115,13 +121,7 @@ def compact(surface: Surface, face_mask: Bool[np.ndarray, " f"]) -> Surface:
     faces = surface.faces[face_mask]
     used = np.zeros(len(surface.vertices), bool)
     used[faces] = True
-    index = np.cumsum(used) - 1
-    return Surface(
-        surface.vertices[used],
-        index[faces].astype(np.int32),
-        surface.weights[used],
-        {name: value[used] for name, value in surface.attributes.items()},
-    )
+    return surface.mapped(lambda values: values[used], (np.cumsum(used) - 1)[faces])
 
 
 def cut(surface: Surface, field: Field) -> Surface:
@@ -154,12 +154,7 @@ def cut(surface: Surface, field: Field) -> Surface:
         between = values[pairs[:, 0]] * (1 - at) + values[pairs[:, 1]] * at
         return np.concatenate([values, between.astype(values.dtype)])
 
-    grown = Surface(
-        extended(surface.vertices),
-        np.concatenate([whole, kept_tip, kept_base]).astype(np.int32),
-        extended(surface.weights),
-        {name: extended(value) for name, value in surface.attributes.items()},
-    )
+    grown = surface.mapped(extended, np.concatenate([whole, kept_tip, kept_base]))
     return compact(grown, np.ones(len(grown.faces), bool))
 
 
@@ -182,17 +177,11 @@ def turn_in_hems(surface: Surface, depth: float) -> Surface:
         return surface
     rim, local = np.unique(hems, return_inverse=True)
     local = local.reshape(-1, 2) + len(surface.vertices)
-    normals = vertex_normals(surface.vertices, surface.faces)
-    inner = surface.vertices[rim] - depth * normals[rim]
-    faces = np.concatenate(
-        [np.stack([hems[:, 1], hems[:, 0], local[:, 0]], 1), np.stack([hems[:, 1], local[:, 0], local[:, 1]], 1)]
-    )
-    return Surface(
-        np.concatenate([surface.vertices, inner]).astype(np.float32),
-        np.concatenate([surface.faces, faces]).astype(np.int32),
-        np.concatenate([surface.weights, surface.weights[rim]]),
-        {name: np.concatenate([value, value[rim]]) for name, value in surface.attributes.items()},
-    )
+    inner = surface.vertices[rim] - depth * vertex_normals(surface.vertices, surface.faces)[rim]
+    (a, b), (c, d) = hems.T, local.T
+    faces = np.concatenate([surface.faces, np.stack([b, a, c], 1), np.stack([b, c, d], 1)])
+    grown = surface.mapped(lambda values: np.concatenate([values, values[rim]]), faces)
+    return grown.moved(np.concatenate([surface.vertices, inner]))
 
 
 def grid_faces(rows: int, columns: int, closed: bool) -> Faces:

@@ -96,9 +96,9 @@ def _put(rng, outfit, cuts, fit, material, margin=HEM_MARGIN, finish=lambda surf
     outfit.add(surface, material)
 
 
-def _strip(rng, outfit, field, fit, material):
-    """A shell that hides nothing and that later layers do not hide."""
-    outfit.add(shell(rng, outfit.anatomy, [field], fit), material, layered=False)
+def _strip(rng, outfit, field, fit, material, layered=False):
+    """A shell that hides nothing. layered: see `Outfit.add`."""
+    outfit.add(shell(rng, outfit.anatomy, [field], fit), material, layered)
 
 
 Colouring = Callable[[Spots], np.ndarray]
@@ -139,7 +139,8 @@ def _zipped(colours, s, rng, sizes):
 def _sewn(garment: Garment, hems=(), sleeve=None, seams=True) -> Colouring:
     """The garment's fabric with hems, seams, prints and what is sewn on."""
     details, base = garment.details, garment.fabric.base
-    details = details | {"closed collar"} if "collar" in details and "open" not in details else details
+    if "collar" in details and "open" not in details:
+        details = details | {"closed collar"}
 
     def colours(s):
         rng = garment.fabric.rng(1)
@@ -167,12 +168,9 @@ def _neck(garment):
 def _top(rng, outfit, garment):
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
-    cuts = [
-        (tailoring.neckline, _neck(garment), sizes["depth"]),
-        (tailoring.sleeves, sleeve),
-        (tailoring.above, bottom),
-        *([(tailoring.front_opening, 0.03, 0.12)] if "open" in details else []),
-    ]
+    cuts: list[tuple] = [(tailoring.neckline, _neck(garment), sizes["depth"])]
+    cuts += [(tailoring.sleeves, sleeve), (tailoring.above, bottom)]
+    cuts += [(tailoring.front_opening, 0.03, 0.12)] if "open" in details else []
     fit = Fit(
         ease=max((0.008 if "tucked" in details else 0.012) + 0.016 * loose, outfit.trunk + LAYER),
         hang=rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 2.0,
@@ -200,12 +198,9 @@ def _outer(rng, outfit, garment):
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     gap, spread, bottom, loose = sizes["gap"], sizes["spread"], sizes["bottom"], sizes["loose"]
     long, padded = kind == "coat", kind in PADDED
-    cuts = [
-        (tailoring.neckline, "vee" if "lapels" in details else "crew", 0.09),
-        (tailoring.sleeves, sizes["sleeve"]),
-        (tailoring.above, WAIST - 0.045 if long else bottom),
-        *([(tailoring.front_opening, gap, spread)] if gap > 0 else []),
-    ]
+    cuts: list[tuple] = [(tailoring.neckline, "vee" if "lapels" in details else "crew", 0.09)]
+    cuts += [(tailoring.sleeves, sizes["sleeve"]), (tailoring.above, WAIST - 0.045 if long else bottom)]
+    cuts += [(tailoring.front_opening, gap, spread)] if gap > 0 else []
     ease = max(outfit.trunk + 0.009 + 0.008 * loose, 0.022 if padded else 0.0)
     fit = Fit(
         ease=ease,
@@ -230,9 +225,8 @@ def _outer(rng, outfit, garment):
             outfit.hide(lambda t: tailoring.hips_and_legs(t, WAIST, bottom), 0.02)
         outfit.add(tube, dataclasses.replace(material, draped=True))
     if "lapels" in details:
-        edge = max(gap, 0.004)
+        edge, low = max(gap, 0.004), rng.uniform(-0.16, -0.08)
         strip = dataclasses.replace(fit, ease=ease + 0.006, fold=0.0, hem=0.005, inner=ease + 0.003)
-        low = rng.uniform(-0.16, -0.08)
         dark = Material(lambda s: 0.88 * colours(s), sheen=0.06)  # seen against its pile
         _strip(rng, outfit, tailoring.lapel(outfit.template, edge, spread if gap > 0 else 0.0, low), strip, dark)
         _collar(rng, outfit, dark, strip, 0.001, 0.12, 0.17, max(edge, 0.03))
@@ -302,11 +296,8 @@ def _flare(sizes):
 def _dress(rng, outfit, garment):
     sizes = garment.sizes
     waist, end = sizes["waist"], sizes["end"]
-    cuts = [
-        (tailoring.neckline, _neck(garment), sizes["depth"]),
-        (tailoring.sleeves, sizes["sleeve"]),
-        (tailoring.above, waist - 0.02),
-    ]
+    neckline = tailoring.neckline, _neck(garment), sizes["depth"]
+    cuts = [neckline, (tailoring.sleeves, sizes["sleeve"]), (tailoring.above, waist - 0.02)]
     fit = Fit(ease=0.008, hang=1.0, sleeve=0.004 + 0.03 * sizes["loose"], fold=0.002)
     material = Material(_sewn(garment, (end + 0.02,), seams=False), wrinkles=0.3, sheen=0.05)
     _put(rng, outfit, cuts, fit, material, HEM_MARGIN + 0.02 * sizes["loose"])
@@ -358,14 +349,14 @@ def _belt(rng, outfit, garment):
     fit = Fit(ease=outfit.trunk + 0.009, hang=0.6, fold=0.0, hem=0.006, inner=outfit.trunk + 0.007)
     colours = lambda s: trimmings.buckled(garment.fabric.colours(s), s, top - 0.5 * width, width)
     field = tailoring.trousers(outfit.template, top, top - width)
-    outfit.add(shell(rng, outfit.anatomy, [field], fit), Material(colours, sheen=0.15))
+    _strip(rng, outfit, field, fit, Material(colours, sheen=0.15), layered=True)
 
 
 def _tie(rng, outfit, garment):
     field = tailoring.necktie(outfit.template, garment.sizes["length"], garment.sizes["width"])
     raised = outfit.trunk + 0.005 + outfit.fit.fold
     fit = dataclasses.replace(outfit.fit, ease=raised, inner=raised - 0.002, fold=0.0, hem=0.004)
-    outfit.add(shell(rng, outfit.anatomy, [field], fit), Material(garment.fabric.colours, sheen=0.15))
+    _strip(rng, outfit, field, fit, Material(garment.fabric.colours, sheen=0.15), layered=True)
 
 
 def _watch(rng, outfit, garment):
