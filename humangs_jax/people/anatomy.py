@@ -83,8 +83,8 @@ def leg_coordinates(template: np.ndarray) -> np.ndarray:
 def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
     """Cloth coordinates (n, 4) with those of arms and legs replaced by coordinates around the limb that the point is on.
 
-    What was interpolated across a seam (armholes; the middle of trousers) is sharp there again. Arms are turned down, so that y
-    runs along every limb. Only cloth with the trunk's girth has sleeves, only cloth with the legs' girth has legs.
+    They are sharp at seams (armholes; the middle of trousers). Arms are turned down, so that y runs along every limb. Only cloth
+    with the trunk's girth has sleeves, only cloth with the legs' girth has legs.
     """
     x, y, girth = template[:, 0], template[:, 1], cloth[:, 3]
     on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(girth - TRUNK_GIRTH) < SAME_GIRTH)

@@ -1,8 +1,7 @@
 """Arms that reach a goal and stay clear of the body, and hands.
 
-An arm draws many candidates within its limits and keeps the one whose wrist comes nearest to a goal (hanging, on the hip,
-waving, ...) among those whose forearm and hand stay out of the trunk, the head, the legs and the other arm. Hands blend a few
-gestures.
+An arm draws many candidates within its limits and keeps the one whose wrist comes nearest to a goal, among those whose forearm
+and hand stay out of the trunk, the head, the legs and the other arm. Hands blend a few gestures.
 """
 
 import dataclasses
@@ -22,9 +21,9 @@ MARGIN = 0.015
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """Target of a wrist.
+    """Target of a wrist. odds: of being drawn.
 
-    odds: of being drawn. place: of the left wrist relative to the shoulder in arm lengths, in axes of the chest.
+    place: of the left wrist relative to the shoulder in arm lengths, in axes of the chest.
     raised: range of the upper arm's elevation, 0 is horizontal. forward: of its turn towards the front. flexed: of the elbow.
     collar: how much the collar is raised.
     """

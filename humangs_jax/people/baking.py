@@ -1,8 +1,7 @@
-"""Dressed people as textured meshes: what a renderer needs that knows no materials (a device's, a scan's reader's).
+"""Dressed people as textured meshes, for renderers that know no materials; and as scans.
 
-The materials are evaluated once per texel, `SAMPLES` times a side, and averaged; texels between charts repeat the nearest
-chart, so that bilinear lookups and smaller copies of the texture stay clean at seams. Folds that are painted into the
-normals become a second texture. Skinning is cut down to a few joints per vertex.
+Texels between charts repeat the nearest chart, so that bilinear lookups and smaller copies of the texture stay clean at seams.
+Folds that are painted into the normals become a second texture. Skinning is cut down to a few joints per vertex.
 
 A scan is such a mesh in a folder, like a scanner's: scan.obj with material.mtl and material_0.png, scan.glb, and scan.json
 with seed, shape and pose. Metres, y up, texture coordinates with v up; a vertex is written once per chart that it is in.

@@ -37,7 +37,7 @@ MOST_MATERIALS = 32
 
 @pytree_dataclass
 class PeopleBank:
-    """Dressed people p, padded to one size and stacked. Padding repeats a vertex, and faces without area.
+    """Dressed people p, padded to one size (by a repeated vertex, and faces without area) and stacked.
 
     seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts, face_counts: (p,) without padding.
     vertices: (p, n, 3) at rest, metres. normals: (p, n, 3) unit. joint_ids, joint_weights: (p, n, k).
@@ -46,8 +46,7 @@ class PeopleBank:
     alike, dyeable (p, m): 1 where a piece is cloth that may have another colour.
     texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `baking.BakedSubject`).
     rotations: (p, q, j, 3) poses; nearest: (p, q) the pose that is most like each.
-    parents, mirrored_joints: static; the joint that is each one's mirror image. split: static, the range of the seeds. generator:
-    static, `seeds.GENERATOR_VERSION` of who made the people.
+    Static: parents; mirrored_joints: each joint's mirror image; split: range of the seeds; generator: `GENERATOR_VERSION`.
     """
 
     seeds: Int[Array, " p"]
@@ -119,11 +118,8 @@ def build_bank(
 
 def save_bank(path: str | Path, bank: PeopleBank) -> None:
     """Write one .npz, whole or not at all."""
-    fields = {name: np.asarray(getattr(bank, name)) for name in _ARRAYS}
-    fields |= {"parents": np.asarray(bank.parents), "mirrored_joints": np.asarray(bank.mirrored_joints)}
-    fields |= {"format": np.asarray(FORMAT), "version": np.asarray(VERSION), "split": np.asarray(bank.split)}
-    fields |= {"generator": np.asarray(bank.generator)}
-    write_npz(path, fields)
+    fields = {name: np.asarray(getattr(bank, name)) for name in (*_ARRAYS, *_STATIC)}
+    write_npz(path, fields | {"format": np.asarray(FORMAT), "version": np.asarray(VERSION)})
 
 
 def load_bank(path: str | Path) -> PeopleBank:

@@ -100,7 +100,7 @@ FEATURES = {
 
 
 def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut) -> Material:
-    """Skin with lips, cheeks, brows, lids, nostrils, stubble, nails, knuckles, freckles, and tones that vary over the body."""
+    """Skin with lips, cheeks, brows, lids, nostrils, stubble, knuckles, freckles, and tones that vary over the body."""
     cloud, blotches = Ripples(rng, 0.07), Ripples(rng, 0.25)
     features = {name: rng.uniform(*limits) for name, limits in FEATURES.items()}
     seed = int(rng.integers(1 << 20))
@@ -135,7 +135,7 @@ def _tinted(colours, tint, amount):
 
 
 def _hand(tones, result, x, y):
-    """Palms are paler, knuckles and finger tips redder, nails shine."""
+    """Palms are paler, knuckles and finger tips redder."""
     palm = np.clip((HAND_Y - y) / 0.012, 0, 1) * np.clip((x - 0.66) / 0.03, 0, 1)
     pale = 0.35 * tones.skin + 0.65 * np.asarray([0.82, 0.62, 0.53], np.float32)
     tip, knuckle = np.clip((x - 0.79) / 0.03, 0, 1), _bell((x, 0.745, 0.008)) * (1 - palm)
@@ -221,8 +221,7 @@ def eye_material(tones: Complexion) -> Material:
     def albedo(s: Spots):
         d = s.template
         angle = np.arccos(np.clip(d[:, 2] / np.maximum(np.linalg.norm(d, axis=1), 1e-6), -1, 1))
-        white = np.asarray([0.84, 0.82, 0.80], np.float32)
-        result = mix(white, tones.iris, band(angle, -1, 0.47, 0.05))
+        result = mix(np.asarray([0.84, 0.82, 0.80], np.float32), tones.iris, band(angle, -1, 0.47, 0.05))
         result = mix(result, tones.iris * 0.4, band(angle, 0.40, 0.48, 0.05))
         result = mix(result, np.asarray([0.02, 0.02, 0.02], np.float32), band(angle, -1, 0.21, 0.05))
         glint = np.sqrt((d[:, 0] - 0.15) ** 2 + (d[:, 1] - 0.2) ** 2)

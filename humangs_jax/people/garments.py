@@ -18,11 +18,10 @@ from humangs_jax.people.surfaces import (
     boundary_edges,
     circle,
     cut,
-    grid,
-    grid_faces,
     hanging,
     polar,
     smooth,
+    tube,
     turn_in_hems,
     unit,
     vertex_normals,
@@ -184,7 +183,7 @@ class Skirt:
 def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
     """A tube around the hips and both legs."""
     rows = max(3, int(np.ceil((cut_of.top - cut_of.bottom) / TUBE_STEP)) + 1)
-    template_y, angle = grid(np.linspace(cut_of.top, cut_of.bottom, rows), circle(TUBE_COLUMNS))
+    template_y, angle, faces = tube(np.linspace(cut_of.top, cut_of.bottom, rows), circle(TUBE_COLUMNS))
     height = rest_height(anatomy, template_y)
     outline = blurred(hanging(anatomy.hips_and_legs, 0.15))
     drop = cut_of.top - template_y
@@ -196,7 +195,7 @@ def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
     loose = np.clip(below / 0.25, 0, 1) * (drop / max(cut_of.top - cut_of.bottom, 1e-6)) ** 0.5
     radius = radius + loose * (cut_of.pleat_depth * pleats + 0.012 * (1 + 4 * cut_of.flare) * wave)
     vertices = around(radius, angle, height).astype(np.float32)
-    template, faces = around(0.16, angle, template_y, (0, 0.02)), grid_faces(rows, TUBE_COLUMNS, closed=True)
+    template = around(0.16, angle, template_y, (0, 0.02))
     surface = Surface(vertices, faces, _skirt_weights(anatomy, vertices, template_y))
     surface = surface.painted(template, template - [0, 0, 0.02], 0.16)
     if cut_of.gap > 0:

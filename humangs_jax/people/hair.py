@@ -20,14 +20,13 @@ from humangs_jax.people.surfaces import (
     blurred,
     circle,
     cut,
-    grid,
-    grid_faces,
     hanging,
     join,
     outlines,
     rigid,
     smooth,
     sweep,
+    tube,
     unit,
 )
 
@@ -199,9 +198,8 @@ def scalp_shell(
 ) -> Surface:
     """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the hairline.
 
-    bumps: share of the thickness, `bump_size` metres wide. crown: metres that the top rises above that. quiff: metres that the
-    hair stands up above the forehead. side: +1 or -1 for a parting on that side of the head, 0 for none. rim: metres that its
-    edge stands off.
+    bumps: share of the thickness, `bump_size` metres wide. crown, quiff: metres that the top and the front rise above that.
+    side: +1 or -1 for a parting on that side of the head, 0 for none. rim: metres that its edge stands off.
     """
     template = anatomy.skin.attributes["template"]
     above = above_line(template, line, shift)
@@ -258,7 +256,7 @@ def falling_tube(
     top = CROWN + (CROWN - SKULL[1]) * (scale - 1)
     dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))
     rows = np.concatenate([dome, np.arange(SKULL[1] - 0.02, min(bottom, 0.3), -0.022)])
-    row_height, angle = grid(rows, circle(TUBE_COLUMNS))
+    row_height, angle, faces = tube(rows, circle(TUBE_COLUMNS))
     height = to_rest(row_height)
     inner = center[1] + (height - center[1]) / scale
     brim, summit = to_rest(0.385), center[1] + (to_rest(top) - center[1]) / scale
@@ -275,9 +273,8 @@ def falling_tube(
     hem = np.interp(np.abs(signed), [0, 1.2, 1.75, 2.2, np.pi], lowest)
     hem = hem + 0.012 * ripples(rng, around(5, angle, 0 * angle), 1.5)
     flat = around(0.09, angle, row_height, SKULL[[0, 2]]).astype(np.float32)
-    surface = Surface(
-        vertices, grid_faces(len(rows), TUBE_COLUMNS, closed=True), _falling_weights(anatomy, vertices, row_height)
-    ).painted(flat, flat - np.asarray([0, 0, 0.02], np.float32), 0.09)
+    surface = Surface(vertices, faces, _falling_weights(anatomy, vertices, row_height))
+    surface = surface.painted(flat, flat - np.asarray([0, 0, 0.02], np.float32), 0.09)
     surface = cut(surface, np.minimum(opening(signed, row_height), row_height - hem))
     return finished(surface.moved(smooth(surface.vertices, surface.faces, 1, keep_hems=True)), 2, 0.008)
 

@@ -1,9 +1,8 @@
 """People on the fly: a pure, jittable function of a key, from a bank of dressed people to views to learn from.
 
 A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two similar poses of the
-person's own), light and cameras, and draws the views with the project's rasterizer. The same key gives the same bits on the
-same platform; only jax.numpy runs, on CPU, GPU and TPU. Differences from `rendering.render_view`: colours come from baked
-textures, normals are skinned instead of measured, vertices follow a few joints each.
+person's own), light and cameras. The same key gives the same bits on the same platform. Differences from
+`rendering.render_view`: colours come from baked textures, normals are skinned, vertices follow a few joints each.
 
     bank = load_bank("people.npz")
     example = jax.jit(on_the_fly_example, static_argnames="config")(bank, key, OnTheFlyConfig())

@@ -64,10 +64,8 @@ def sample_sequence(rng: np.random.Generator, build: kin.Build, frames: int = 60
 
 @dataclasses.dataclass(frozen=True)
 class Gait:
-    """Parameters of walking or turning.
-
-    cadence: strides a second. step: metres forward per step. bend: radians turned per step. width: metres from the line that
-    a foot keeps. lift: metres that a swinging foot is raised. turn_out: of the feet. swing: of the arms, radians.
+    """cadence: strides a second. step: metres forward per step. bend: radians turned per step. width: metres of a foot from the
+    line. lift: metres that a swinging foot is raised. turn_out: of the feet. swing: of the arms, radians.
     """
 
     cadence: float

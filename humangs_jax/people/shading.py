@@ -1,9 +1,8 @@
 """Soft light on posed surfaces, in JAX: sky and ground, three wide lights, occlusion and soft shadows, painted folds.
 
 Everything is diffuse or nearly so and fixed in the world: a point has one colour from wherever it is seen. Occlusion and the
-shadow of the key light come from a voxel grid that holds the posed person. Openness is how empty the grid is in front of a
-point; the shadow is what the grid holds on the way towards the light. Both are per vertex and smooth: no shadow map, no rays.
-Exposure and white balance differ from person to person, so that colours are no constants.
+shadow of the key light are per vertex, from a voxel grid that holds the posed person: how empty it is in front of a point, and
+what it holds on the way towards the light. Exposure and white balance differ from person to person.
 """
 
 import math

@@ -172,10 +172,7 @@ _HOST: dict[int, tuple] = {}
 
 
 def _host_arrays(body):
-    """Template, faces and weights as numpy; height of the mean body, and metres (s,) that a unit of each coefficient adds to it.
-
-    Kept for the body used last.
-    """
+    """Template, faces, weights; height of the mean body, metres (s,) that each coefficient adds. Kept for the body used last."""
     if id(body) not in _HOST:
         template, faces, weights = (np.asarray(a) for a in (body.template, body.faces, body.skinning_weights))
         top, bottom = np.argmax(template[:, 1]), np.argmin(template[:, 1])

@@ -198,13 +198,14 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
 
 def ball(rows: int, columns: int) -> tuple[Points, Faces]:
     """Unit vectors on a grid of polar angles (from +y) and azimuths (from +z), and its faces."""
-    down, azimuth = grid(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns)
-    return around(np.sin(down), azimuth, np.cos(down)), grid_faces(rows, columns, closed=True)
+    down, azimuth, faces = tube(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns)
+    return around(np.sin(down), azimuth, np.cos(down)), faces
 
 
-def grid(rows: Float[np.ndarray, " r"], columns: Float[np.ndarray, " c"]) -> tuple[Field, Field]:
-    """Every row's value with every column's, row-major, (rows * columns,) each."""
-    return np.repeat(rows, len(columns)), np.tile(columns, len(rows))
+def tube(levels: Float[np.ndarray, " r"], angles: Float[np.ndarray, " c"]) -> tuple[Field, Field, Faces]:
+    """The level and the angle of every vertex (n,) of a tube, row by row, and its faces."""
+    faces = grid_faces(len(levels), len(angles), closed=True)
+    return np.repeat(levels, len(angles)), np.tile(angles, len(levels)), faces
 
 
 def sweep(

@@ -189,11 +189,8 @@ def write_set(
 ) -> list[Path]:
     """Write people `first` .. `first + subjects - 1` of a split into `out`/SEED; folders that are there already are kept.
 
-    Arguments:
-        workers: processes that make people; more than one use the CPU, write the same files, and need the calling script
-            to be guarded by `if __name__ == "__main__"`.
-        body: the package's own if not given. progress: show a bar.
-
+    workers: processes that make people; more than one use the CPU, write the same files, and need the calling script to be
+    guarded by `if __name__ == "__main__"`. body: the package's own if not given. progress: show a bar.
     Returns the folders. Raises: ValueError if the people reach beyond the split, `out` was written with other settings or by
     another version of the generator, or (at the end, the others being written) some could not be made.
     """
