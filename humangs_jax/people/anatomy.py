@@ -15,8 +15,8 @@ from humangs_jax.people.surfaces import Outlines, Surface, blurred, outlines, ve
 BODY_NAME, BODY_VERTICES = "makehuman", 13380
 """The body that the cuts below were measured on."""
 
-WAIST, HIP, CROTCH, KNEE, ANKLE, FLOOR = -0.2, -0.33, -0.425, -0.764, -1.159, -1.2285
-ARM_HEIGHT, SHOULDER, ELBOW, WRIST = 0.096, 0.171, 0.411, 0.651
+WAIST, CROTCH, ANKLE, FLOOR = -0.2, -0.425, -1.159, -1.2285
+ARM_HEIGHT, SHOULDER, WRIST = 0.096, 0.171, 0.651
 """Heights (y) of the trunk and legs, and distances from the middle (|x|) of the arms, in template coordinates."""
 ARMHOLE = 0.185
 """Distance from the middle at which sleeves are sewn on."""

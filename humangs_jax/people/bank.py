@@ -39,7 +39,7 @@ MOST_MATERIALS = 32
 class PeopleBank:
     """Dressed people p, padded to one size (by a repeated vertex, and faces without area) and stacked.
 
-    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts, face_counts: (p,) without padding.
+    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts: (p,) without padding.
     vertices: (p, n, 3) at rest, metres. normals: (p, n, 3) unit. joint_ids, joint_weights: (p, n, k).
     faces: (p, f, 3). uvs: (p, f, 3, 2) texture coordinates of the corners, steps of 1 / `UV_STEPS`, v DOWN.
     face_pieces: (p, f) piece of each face; of the pieces m: sheen (p, m), groups (p, m): pieces of one number are dyed
@@ -53,7 +53,6 @@ class PeopleBank:
     betas: Float[Array, "p s"]
     joints: Float[Array, "p j 3"]
     vertex_counts: Int[Array, " p"]
-    face_counts: Int[Array, " p"]
     vertices: Float[Array, "p n 3"]
     normals: Float[Array, "p n 3"]
     joint_ids: UInt8[Array, "p n k"]
@@ -178,7 +177,6 @@ def _person(seed, body=None, *, texture_size, pose_count):
         "betas": subject.betas,
         "joints": subject.build.joints.astype(np.float32),
         "vertex_counts": np.int32(len(surface.vertices)),
-        "face_counts": np.int32(len(surface.faces)),
         "vertices": surface.vertices.astype(np.float32),
         "normals": vertex_normals(surface.vertices, surface.faces).astype(np.float16),
         "joint_ids": joint_ids,

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, shape_body
-from humangs_jax.core.array_types import Bool, Float, Int
+from humangs_jax.core.array_types import Float, Int
 from humangs_jax.people import anatomy as anatomy_module
 from humangs_jax.people import complexion, hair, wardrobe
 from humangs_jax.people.anatomy import Anatomy
@@ -89,16 +89,12 @@ def sample_shape(
     return betas.astype(np.float32), float(wanted)
 
 
-UNDER_CLOTH = 0.003
-"""Skin this far inside of a hem is meant to be covered, metres."""
-
-
 @dataclasses.dataclass(frozen=True)
 class SyntheticSubject:
     """A dressed person.
 
     seed. betas: (s,) shape of the body. surface: the mesh at rest with attributes `template`, `cloth`. face_materials: (f,)
-    indices into materials. lights. build: what the pose prior knows. under_cloth: (n,) skin vertices kept below a hem.
+    indices into materials. lights. build: what the pose prior knows.
     cover: (n,) metres that a vertex of the skin lies inside of a hem, negative on bare skin and on everything else.
     person: what all of this was built from.
     """
@@ -110,7 +106,6 @@ class SyntheticSubject:
     materials: tuple[Material, ...]
     lights: Lights
     build: Build
-    under_cloth: Bool[np.ndarray, " n"]
     cover: Field
     person: Person
 
@@ -162,7 +157,6 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
         materials=tuple(piece.material for piece in pieces),
         lights=person.lights,
         build=_build(anatomy, surface),
-        under_cloth=cover > UNDER_CLOTH,
         cover=cover,
         person=person,
     )
