@@ -9,7 +9,10 @@ and less in the rest.
 
 import argparse
 import json
+import sys
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
 CREASES = ("shoulder", "collar", "spine3", "pelvis", "hip")
 """Parts whose skin folds into itself where blend skinning bends it, whatever the pose is."""
@@ -28,9 +31,9 @@ def main() -> None:
 
     import numpy as np
 
+    from experiments.people.overlap import OverlapMeter
     from humangs_jax.body.library import load_body
     from humangs_jax.people.kinematics import Build
-    from humangs_jax.people.overlap import OverlapMeter
     from humangs_jax.people.poses import sample_rotations
     from humangs_jax.people.sequences import KINDS, sample_sequence
 
@@ -81,7 +84,7 @@ def limits(poses) -> dict:
     from humangs_jax.people.kinematics import LIMITS
 
     angles = np.linalg.norm(np.stack(poses), axis=-1)
-    used = {joint: angles[:, joint].max() / limit for joint, limit in LIMITS.items()}
+    used = {joint: angles[:, joint].max() / limit for joint, limit in enumerate(LIMITS) if limit > 0}
     spread = np.rad2deg(np.stack(poses).std(0)).mean(1)
     return {
         "largest_share_of_a_limit": float(max(used.values())),

@@ -86,7 +86,7 @@ def random_networks(config: Any) -> Any:
 
 def written_subject(folder: Path, config: Any, body: Any, seed: int = 0) -> Path:
     """The capture folder of a synthetic person with as many views as an example takes; made if it is not there."""
-    from humangs_jax.people import write_training_subject
+    from humangs_jax.people.writer import write_training_subject
 
     views = config.views.input_counts[0] + config.views.target_count
     path = folder / f"{config.model.conventions.image_size}_{views}"

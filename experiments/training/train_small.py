@@ -50,7 +50,7 @@ def main(
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import find_captures
     from humangs_jax.network.weights import fit_variables, load_weights
-    from humangs_jax.people import Layout, write_set
+    from humangs_jax.people.writer import Layout, write_set
     from humangs_jax.training.loop import train
     from humangs_jax.training.sources import training_people
 

@@ -88,7 +88,7 @@ class Synth:
     """Processes. Default: as many as cores."""
 
     def run(self) -> None:
-        from humangs_jax.people import Layout, write_set
+        from humangs_jax.people.writer import Layout, write_set
 
         extras = self.extras
         counts = {name: getattr(self, name) for name in ("subjects", "size", "views", "poses", "frames")}

@@ -76,7 +76,7 @@ class Train:
         from humangs_jax.body.library import load_body
         from humangs_jax.network.weights import load_weights
         from humangs_jax.objectives.loss_networks import load_loss_networks
-        from humangs_jax.people import find_people
+        from humangs_jax.people.manifest import find_people
         from humangs_jax.training.config import fitting_losses, read_config
         from humangs_jax.training.diagnose import diagnose_run
         from humangs_jax.training.loop import train

@@ -15,8 +15,8 @@ from humangs_jax.people.surfaces import Outlines, Surface, blurred, outlines, ve
 BODY_NAME, BODY_VERTICES = "makehuman", 13380
 """The body that the cuts below were measured on."""
 
-WAIST, HIP, CROTCH, KNEE, ANKLE, FLOOR = -0.2, -0.33, -0.425, -0.764, -1.159, -1.2285
-ARM_HEIGHT, SHOULDER, ELBOW, WRIST = 0.096, 0.171, 0.411, 0.651
+WAIST, CROTCH, ANKLE, FLOOR = -0.2, -0.425, -1.159, -1.2285
+ARM_HEIGHT, SHOULDER, WRIST = 0.096, 0.171, 0.651
 """Heights (y) of the trunk and legs, and distances from the middle (|x|) of the arms, in template coordinates."""
 ARMHOLE = 0.185
 """Distance from the middle at which sleeves are sewn on."""
@@ -83,18 +83,15 @@ def leg_coordinates(template: np.ndarray) -> np.ndarray:
 def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
     """Cloth coordinates (n, 4) with those of arms and legs replaced by coordinates around the limb that the point is on.
 
-    What was interpolated across a seam (armholes; the middle of trousers) is sharp there again. Arms are turned down, so that y
-    runs along every limb. Only cloth with the trunk's girth has sleeves, only cloth with the legs' girth has legs.
+    They are sharp at seams (armholes; the middle of trousers). Arms are turned down, so that y runs along every limb. Only cloth
+    with the trunk's girth has sleeves, only cloth with the legs' girth has legs.
     """
-    x, y, z = template.T
-    girth = cloth[:, 3]
+    x, y, girth = template[:, 0], template[:, 1], cloth[:, 3]
     on_arm = (np.abs(x) > ARMHOLE) & (y > -0.15) & (np.abs(girth - TRUNK_GIRTH) < SAME_GIRTH)
     on_leg = (np.abs(girth - LEG_GIRTH) < SAME_GIRTH) & (y < -0.15) & (y > -1.3)
-    if not (on_arm.any() or on_leg.any()):
-        return cloth
     result = np.array(cloth)
     result[on_leg] = leg_coordinates(template[on_leg])
-    x, y, z = x[on_arm], y[on_arm], z[on_arm]
+    x, y, z = template[on_arm].T
     around = np.where(x < 0, -1.0, 1.0) * (y - ARM_HEIGHT)
     result[on_arm] = np.stack([around, ARM_HEIGHT - (np.abs(x) - SHOULDER), z, np.full_like(x, ARM_GIRTH)], -1)
     return result
@@ -112,9 +109,8 @@ def measure(
     """The `Anatomy` of a shaped body from its rest vertices (n, 3) and joints (j, 3)."""
     template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
     vertices = np.asarray(vertices, np.float32)
-    skin = Surface(
-        vertices, faces, weights, {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}
-    )
+    attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}
+    skin = Surface(vertices, faces, weights, attributes)
     levels = np.arange(-1.3, 0.5, 0.02) * 1.0
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)
     trunk_points = vertices[body & (template[:, 1] > -0.6)]

@@ -1,17 +1,15 @@
 """Arms that reach a goal and stay clear of the body, and hands.
 
-An arm draws many candidates within its limits and keeps the one whose wrist comes nearest to a goal (hanging, on the hip,
-waving, ...) among those whose forearm and hand stay out of the trunk, the head, the legs and the other arm. Hands blend a few
-gestures.
+An arm draws many candidates within its limits and keeps the one whose wrist comes nearest to a goal, among those whose forearm
+and hand stay out of the trunk, the head, the legs and the other arm. Hands blend a few gestures.
 """
 
 import dataclasses
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float
 from humangs_jax.people import kinematics as kin
-from humangs_jax.people.surfaces import Field, Points
+from humangs_jax.people.noise import choice
 
 CANDIDATES = 400
 HAND_LENGTH = 0.6
@@ -23,9 +21,9 @@ MARGIN = 0.015
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """Target of a wrist.
+    """Target of a wrist. odds: of being drawn.
 
-    odds: of being drawn. place: of the left wrist relative to the shoulder in arm lengths, in axes of the chest.
+    place: of the left wrist relative to the shoulder in arm lengths, in axes of the chest.
     raised: range of the upper arm's elevation, 0 is horizontal. forward: of its turn towards the front. flexed: of the elbow.
     collar: how much the collar is raised.
     """
@@ -61,18 +59,11 @@ ARMS = (
 
 def draw_goal(rng: np.random.Generator) -> str:
     """The name of a goal."""
-    odds = np.asarray([goal.odds for goal in GOALS.values()])
-    return list(GOALS)[rng.choice(len(GOALS), p=odds / odds.sum())]
+    return choice(rng, {name: goal.odds for name, goal in GOALS.items()})
 
 
 def bend_arm(
-    rng: np.random.Generator,
-    build: kin.Build,
-    rotations: kin.Rotations,
-    goal: str,
-    side: int,
-    *,
-    other_arm: bool = False,
+    rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations, goal: str, side: int, other_arm: bool = False
 ) -> float:
     """Set collar, shoulder, elbow and wrist of one side (0 left, 1 right) in `rotations`; trunk, head and legs must be set.
 
@@ -104,10 +95,10 @@ def bend_arm(
     reach = np.linalg.norm(rest[elbow] - rest[shoulder]) + np.linalg.norm(rest[wrist] - rest[elbow])
     offset = np.asarray(wanted.place) * [1 - 2 * side, 1, 1] + rng.normal(0, 0.08, 3)
     target = positions[shoulder] + reach * world[kin.SPINE3] @ offset
-    capsules = body_capsules(build, world, positions) + (
-        arm_capsules(build, world, positions, 1 - side) if other_arm else []
-    )
-    clear = np.min([clearance(build, capsules, points) for points in _along(elbows, wrists, tips)], axis=0)
+    capsules = _body_capsules(build, world, positions)
+    if other_arm:
+        capsules += _arm_capsules(build, positions, 1 - side)
+    clear = np.min([_clearance(build, capsules, points) for points in _along(elbows, wrists, tips)], axis=0)
     beyond = np.maximum(np.linalg.norm(upper, axis=1) - kin.LIMITS[shoulder], 0)
     cost = np.linalg.norm(wrists - target, axis=1) + 20 * np.maximum(MARGIN - clear, 0) + 5 * beyond
     best = int(np.argmin(cost))
@@ -119,48 +110,41 @@ def bend_arm(
 def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
     """How far (metres) both forearms and hands are from the body and each other; negative if one is inside."""
     world, positions = kin.joint_positions(build, rotations)
-    body, worst = body_capsules(build, world, positions), np.inf
+    body, worst = _body_capsules(build, world, positions), np.inf
     for side in (0, 1):
-        _, _, elbow, wrist = ARMS[side]
-        tip = positions[wrist] + HAND_LENGTH * (positions[wrist] - positions[elbow])
-        points = np.concatenate(_along(positions[elbow][None], positions[wrist][None], tip[None]))
-        worst = min(worst, clearance(build, body + arm_capsules(build, world, positions, 1 - side), points).min())
+        points = np.stack(_along(*_forearm(positions, side)))
+        worst = min(worst, _clearance(build, body + _arm_capsules(build, positions, 1 - side), points).min())
     return float(worst)
 
 
-Capsule = tuple[np.ndarray, np.ndarray, float]
-"""Two ends (3,) and a radius, metres."""
+def _forearm(positions, side):
+    """Elbow, wrist and a point of the fingers (3,)."""
+    elbow, wrist = positions[list(ARMS[side][2:])]
+    return elbow, wrist, wrist + HAND_LENGTH * (wrist - elbow)
 
 
-def body_capsules(build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations) -> list[Capsule]:
-    """Trunk, legs and head of a posed body."""
+def _body_capsules(build, world, positions):
+    """Trunk, legs and head of a posed body: two ends (3,) and a radius each, metres."""
     sideways = 0.25 * (positions[kin.LEFT_HIP] - positions[kin.RIGHT_HIP])
     top = positions[kin.NECK] + world[kin.SPINE3] @ np.asarray([0, -0.06, 0])
     head = positions[kin.HEAD] + world[kin.HEAD] @ np.asarray([0, 0.09, 0.03])
-    return [
-        *(
-            (positions[kin.PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius)
-            for s in (-1.0, 0.0, 1.0)
-        ),
-        (positions[kin.LEFT_HIP], positions[kin.LEFT_KNEE], build.thigh_radius),
-        (positions[kin.RIGHT_HIP], positions[kin.RIGHT_KNEE], build.thigh_radius),
-        (positions[kin.LEFT_KNEE], positions[kin.LEFT_ANKLE], build.shin_radius),
-        (positions[kin.RIGHT_KNEE], positions[kin.RIGHT_ANKLE], build.shin_radius),
-        (head, head, HEAD_RADIUS),
-    ]
+    capsules = [(head, head, HEAD_RADIUS)]
+    for s in (-1.0, 0.0, 1.0):
+        capsules.append((positions[kin.PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius))
+    for hip, knee, ankle, _ in kin.LEGS:
+        capsules.append((positions[hip], positions[knee], build.thigh_radius))
+        capsules.append((positions[knee], positions[ankle], build.shin_radius))
+    return capsules
 
 
-def arm_capsules(
-    build: kin.Build, world: Float[np.ndarray, "j 3 3"], positions: kin.Rotations, side: int
-) -> list[Capsule]:
+def _arm_capsules(build, positions, side):
     """Upper arm, forearm and hand of one side."""
-    _, shoulder, elbow, wrist = ARMS[side]
-    tip = positions[wrist] + HAND_LENGTH * (positions[wrist] - positions[elbow])
+    elbow, _, tip = _forearm(positions, side)
     radius = build.arm_radius + 0.01
-    return [(positions[shoulder], positions[elbow], radius), (positions[elbow], tip, radius)]
+    return [(positions[ARMS[side][1]], elbow, radius), (elbow, tip, radius)]
 
 
-def clearance(build: kin.Build, capsules: list[Capsule], points: Points) -> Field:
+def _clearance(build, capsules, points):
     """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
     distances = []
     for a, b, radius in capsules:
@@ -175,11 +159,10 @@ def _along(elbows, wrists, tips):
     return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]
 
 
-FINGERS = ("index", "middle", "pinky", "ring")
-"""In the order of SMPL-X's joints; the thumb comes last."""
+FINGERS = ((0, 1.0), (1, 0.15), (3, -1.2), (2, -0.6))
+"""Index, middle, pinky, ring, in the order of SMPL-X's joints: place in `Gesture.curl`, share of the spread; then the thumb."""
 BONE_SHARE = (0.85, 1.0, 0.7)
 """Share of a finger's curl at each knuckle, from the palm outwards."""
-SPLAY = {"index": 1.0, "middle": 0.15, "ring": -0.6, "pinky": -1.2}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,19 +193,17 @@ GESTURES = {
 def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> None:
     """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a random gesture."""
     first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
-    odds = np.asarray([gesture.odds for gesture in GESTURES.values()])
-    goal = list(GESTURES.values())[rng.choice(len(odds), p=odds / odds.sum())]
+    goal = GESTURES[choice(rng, {name: gesture.odds for name, gesture in GESTURES.items()})]
     start, t = GESTURES["relaxed"], rng.beta(2.5, 1.0)
     mix = lambda a, b: (1 - t) * np.asarray(a) + t * np.asarray(b)
-    index, middle, ring, pinky = mix(start.curl, goal.curl)
-    curls = {"index": index, "middle": middle, "ring": ring, "pinky": pinky}
+    curls = mix(start.curl, goal.curl)
     spread, thumb = mix(start.spread, goal.spread), mix(start.thumb, goal.thumb) + rng.normal(0, 0.08)
-    for finger, name in enumerate(FINGERS):
-        curl = curls[name] * rng.uniform(0.85, 1.15) + rng.normal(0, 0.03)
+    for finger, (place, splay) in enumerate(FINGERS):
+        curl = curls[place] * rng.uniform(0.85, 1.15) + rng.normal(0, 0.03)
         for bone, share in enumerate(BONE_SHARE):
             # fingers do not bend backwards, and spread at the palm only
             bend = np.clip(curl * share * rng.uniform(0.9, 1.1), -0.1, kin.FINGER_LIMIT - 0.1)
-            aside = SPLAY[name] * spread if bone == 0 else 0.0
+            aside = splay * spread if bone == 0 else 0.0
             rotations[first + 3 * finger + bone] = np.asarray([0, -aside, -bend]) * mirror
     rotations[first + 12] = np.asarray([0.25 * thumb, 0.45 * thumb, -0.35 * thumb]) * mirror
     rotations[first + 13] = np.asarray([0.0, 0.35 * thumb, -0.1 * thumb]) * mirror

@@ -1,10 +1,9 @@
 """UV atlases: a mesh cut into charts that lie flat without folding over, packed into the unit square.
 
-A chart is a connected set of faces of one piece that look towards about the same side; it is projected along the mean of
-their normals, so that lengths shrink by a known, small factor and no texture is smeared. Where a chart folds over itself,
-the hidden faces become charts of their own: both sides of a fold are found by rasterizing the charts front to back and
-back to front. Charts are placed as bitmaps, the largest first, at the first free place. All charts have one scale, times
-the density that the caller asks for (faces may deserve more): a metre of surface gets about that many texels everywhere.
+A chart is a connected set of faces of one piece that look towards about the same side, projected along the mean of their
+normals. Where a chart folds over itself, the hidden faces become charts of their own: they are found by rasterizing the charts
+front to back and back to front. Charts are placed as bitmaps, the largest first, at the first free place. All have one scale,
+times the density that the caller asks for.
 
 Texture coordinates follow `rendering.mesh.texturing`: u to the right, v up.
 """
@@ -42,8 +41,7 @@ VERTEX_STEP, FACE_STEP = 32768, 32768
 class Atlas:
     """uvs: (u, 2) in [0, 1], v up. faces: (f, 3) indices into uvs. vertices: (u,) the mesh vertex of each uv.
 
-    charts: (f,) chart of each face. size: texels a side. texel: metres of (flat) chart per
-    texel where the density is 1.
+    charts: (f,) chart of each face. size: texels a side. texel: metres of (flat) chart per texel where the density is 1.
     """
 
     uvs: Float[np.ndarray, "u 2"]
@@ -67,16 +65,13 @@ def unwrap(
     pairs = pairs[pieces[pairs[:, 0]] == pieces[pairs[:, 1]]]
     sides = _choose_sides(normals, pairs)
     layer = np.zeros(len(faces), np.int64)
-    for _ in range(PEELINGS):
+    for peeling in range(PEELINGS + 1):
         charts = _connected(len(faces), pairs, sides + len(SIDES) * layer)
         flat = _flatten(vertices, faces, normals, charts, sides, density)
-        hidden = _hidden(flat, size)
+        hidden = _hidden(flat, size) if peeling < PEELINGS else np.zeros(len(faces), bool)
         if not hidden.any():
             break
         layer[hidden] += 1
-    else:
-        charts = _connected(len(faces), pairs, sides + len(SIDES) * layer)
-        flat = _flatten(vertices, faces, normals, charts, sides, density)
     return _pack(flat, size)
 
 
@@ -128,8 +123,7 @@ def _flatten(vertices, faces, normals, charts, sides, density):
     count = int(charts.max()) + 1
     keys, inverse = np.unique(charts.repeat(3) * len(vertices) + faces.reshape(-1), return_inverse=True)
     owner, vertex = keys // len(vertices), keys % len(vertices)
-    axis = np.stack([np.bincount(charts, weights=normals[:, i], minlength=count) for i in range(3)], 1)
-    axis = unit(axis)
+    axis = unit(np.stack([np.bincount(charts, weights=normals[:, i], minlength=count) for i in range(3)], 1))
     worst = np.full(count, np.inf)
     np.minimum.at(worst, charts, np.sum(normals * axis[charts], 1))
     some_side = np.zeros(count, np.int64)
@@ -140,18 +134,11 @@ def _flatten(vertices, faces, normals, charts, sides, density):
     up = np.cross(axis, right)
     flat = np.stack([np.sum(vertices[vertex] * side[owner], 1) for side in (right, up)], 1)
     flat = _turned(flat, owner, count)
-    low = np.stack([_extreme(np.minimum, flat[:, i], owner, count) for i in range(2)], 1)
-    heights = np.sum(vertices[vertex] * axis[owner], 1)
     enlarged = np.ones(count)
     enlarged[charts] = density
-    return _Flat(
-        ((flat - low[owner]) * enlarged[owner, None]).astype(np.float32),
-        heights,
-        inverse.reshape(-1, 3),
-        vertex,
-        owner,
-        charts,
-    )
+    points = ((flat - _extreme(np.minimum, flat, owner, count)[owner]) * enlarged[owner, None]).astype(np.float32)
+    heights = np.sum(vertices[vertex] * axis[owner], 1)
+    return _Flat(points, heights, inverse.reshape(-1, 3), vertex, owner, charts)
 
 
 def _turned(flat, owner, count, angles=8):
@@ -160,9 +147,8 @@ def _turned(flat, owner, count, angles=8):
     for angle in np.arange(angles) * (np.pi / angles):
         c, s = np.cos(angle), np.sin(angle)
         turned = flat @ np.asarray([[c, s], [-s, c]])
-        extent = [_extreme(np.maximum, turned[:, i], owner, count) - _extreme(np.minimum, turned[:, i], owner, count)
-                  for i in range(2)]  # fmt: skip
-        area = extent[0] * extent[1] + np.where(extent[0] < extent[1], 1e-9, 0)
+        width, height = (_extreme(np.maximum, turned, owner, count) - _extreme(np.minimum, turned, owner, count)).T
+        area = width * height + np.where(width < height, 1e-9, 0)
         better = area < best_area - 1e-12
         best_area = np.where(better, area, best_area)
         best = np.where(better[owner][:, None], turned, best)
@@ -170,9 +156,15 @@ def _turned(flat, owner, count, angles=8):
 
 
 def _extreme(function, values, owner, count):
-    result = np.full(count, np.inf if function is np.minimum else -np.inf)
+    """(charts, 2) the least or greatest values (u, 2) of each chart."""
+    result = np.full((count, 2), np.inf if function is np.minimum else -np.inf)
     function.at(result, owner, values)
     return result
+
+
+def _sizes(flat):
+    """Widths and heights of the charts, metres."""
+    return _extreme(np.maximum, flat.points, flat.point_charts, int(flat.charts.max()) + 1).T
 
 
 def _hidden(flat: _Flat, size):
@@ -190,12 +182,11 @@ def _hidden(flat: _Flat, size):
 
 def _shelves(flat, size):
     """Rough places (charts, 2) in texels and the scale (texels per metre): rows of charts of falling height."""
-    count = int(flat.charts.max()) + 1
-    width, height = (_extreme(np.maximum, flat.points[:, i], flat.point_charts, count) for i in range(2))
+    width, height = _sizes(flat)
     order = np.argsort(-height)
     scale = 0.9 * size / np.sqrt(np.sum(width * height))
     while True:
-        corners, x, y, row = np.zeros((count, 2)), 0.0, 0.0, 0.0
+        corners, x, y, row = np.zeros((len(width), 2)), 0.0, 0.0, 0.0
         for chart in order:
             w, h = width[chart] * scale + GUTTER, height[chart] * scale + GUTTER
             if x + w > size:
@@ -224,17 +215,13 @@ def texels(atlas: Atlas) -> tuple[Int[np.ndarray, "s s"], Float[np.ndarray, "s s
 
 def _pack(flat: _Flat, size) -> Atlas:
     """Charts as bitmaps of cells at the first free place, shrunk together until all fit."""
-    scale = size / np.sqrt(_box_areas(flat).sum())  # the boxes alone would fill the square: a start that is too large
+    scale = size / np.sqrt(
+        np.prod(_sizes(flat), 0).sum()
+    )  # the boxes alone would fill the square: a start that is too large
     while (corners := _place(flat, scale, size)) is None:
         scale *= SHRINKING
     uvs = (flat.points * scale + corners[flat.point_charts]) / size
     return Atlas(uvs.astype(np.float32), flat.faces.astype(np.int32), flat.vertices, flat.charts, size, 1 / scale)
-
-
-def _box_areas(flat):
-    count = int(flat.charts.max()) + 1
-    width, height = (_extreme(np.maximum, flat.points[:, i], flat.point_charts, count) for i in range(2))
-    return width * height
 
 
 def _place(flat, scale, size):

@@ -1,20 +1,27 @@
-"""Dressed people as textured meshes: what a renderer needs that knows no materials (a device's, a scan's reader's).
+"""Dressed people as textured meshes, for renderers that know no materials; and as scans.
 
-The materials are evaluated once per texel, `SAMPLES` times a side, and averaged; texels between charts repeat the nearest
-chart, so that bilinear lookups and smaller copies of the texture stay clean at seams. Folds that are painted into the
-normals become a second texture. Skinning is cut down to a few joints per vertex.
+Texels between charts repeat the nearest chart, so that bilinear lookups and smaller copies of the texture stay clean at seams.
+Folds that are painted into the normals become a second texture. Skinning is cut down to a few joints per vertex.
+
+A scan is such a mesh in a folder, like a scanner's: scan.obj with material.mtl and material_0.png, scan.glb, and scan.json
+with seed, shape and pose. Metres, y up, texture coordinates with v up; a vertex is written once per chart that it is in.
 """
 
 import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Bool, Float, Int, UInt8
+from humangs_jax.body.model import BodyPose
+from humangs_jax.core.array_types import Bool, Float, UInt8
+from humangs_jax.io.atomic import replace_folder
+from humangs_jax.io.text import write_json
 from humangs_jax.people.atlas import Atlas, texels, unwrap
 from humangs_jax.people.kinematics import HEAD
-from humangs_jax.people.rendering import paint, spots_at
+from humangs_jax.people.rendering import PosedSubject, light_points, paint, pose_subject, spots_at
 from humangs_jax.people.subject import SyntheticSubject
-from humangs_jax.people.surfaces import Faces, Points, vertex_normals
 
 JOINTS_PER_VERTEX = 6
 """Bodies have up to 7, smoothed garments up to 12; six lose at most 0.4 % of the weight, under a millimetre in any pose."""
@@ -32,54 +39,32 @@ SKIN, EYES = 0, 1
 
 @dataclasses.dataclass(frozen=True)
 class BakedSubject:
-    """A person at rest as a textured, skinned mesh.
+    """The textures of a person at rest.
 
-    seed, betas (s,): of the subject. vertices (n, 3) metres, normals (n, 3) unit, faces (f, 3).
-    joint_ids, joint_weights: (n, k), the joints that move a vertex, weights of sum 1. face_materials: (f,), face_sheen: (f,).
     atlas: texture coordinates. albedo: (t, t, 3) bytes, 255 is 1, row 0 on top (v = 1).
     slopes: (t, t, 3) bytes, gradients of painted folds, `SLOPE_ZERO` + steps of `SLOPE_STEP`, axes of `Spots.cloth`.
     """
 
-    seed: int
-    betas: Float[np.ndarray, " s"]
-    vertices: Points
-    normals: Points
-    faces: Faces
-    joint_ids: UInt8[np.ndarray, "n k"]
-    joint_weights: Float[np.ndarray, "n k"]
-    face_materials: Int[np.ndarray, " f"]
-    face_sheen: Float[np.ndarray, " f"]
     atlas: Atlas
     albedo: UInt8[np.ndarray, "t t 3"]
     slopes: UInt8[np.ndarray, "t t 3"]
 
 
-def bake_subject(
-    subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1, joints_per_vertex: int = JOINTS_PER_VERTEX
-) -> BakedSubject:
-    """The textured mesh of a subject; textures of texture_size texels a side, each the mean of samples x samples points.
+def bake_subject(subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1) -> BakedSubject:
+    """The textures of a subject, texture_size texels a side, each the mean of samples x samples points.
 
     Raises: ValueError if the size is no multiple of the packing's `atlas.CELLS`.
     """
-    surface = subject.surface
     atlas = unwrap_subject(subject, texture_size)
-    albedo, slopes = _bake(subject, atlas, samples)
-    ids, weights = strongest_joints(surface.weights, joints_per_vertex)
-    sheens = np.asarray([material.sheen for material in subject.materials], np.float32)
-    return BakedSubject(
-        seed=subject.seed,
-        betas=subject.betas,
-        vertices=surface.vertices,
-        normals=vertex_normals(surface.vertices, surface.faces),
-        faces=surface.faces,
-        joint_ids=ids,
-        joint_weights=weights,
-        face_materials=subject.face_materials,
-        face_sheen=sheens[subject.face_materials],
-        atlas=atlas,
-        albedo=np.round(255 * np.clip(albedo, 0, 1)).astype(np.uint8),
-        slopes=np.round(SLOPE_ZERO + np.clip(slopes / SLOPE_STEP, -127, 127)).astype(np.uint8),
-    )
+    ids, weights = texels(dataclasses.replace(atlas, size=texture_size * samples))
+    covered = ids >= 0
+    albedo, slopes = paint(subject, ids[covered], spots_at(subject, ids[covered], weights[covered]))
+    values = np.zeros((*ids.shape, 7), np.float32)
+    values[covered] = np.concatenate([albedo, slopes, np.ones((len(albedo), 1), np.float32)], axis=1)
+    sums = values.reshape(texture_size, samples, texture_size, samples, 7).sum((1, 3))
+    filled = fill_gaps(sums[..., :6] / np.maximum(sums[..., 6:], 1), sums[..., 6] > 0)
+    albedo, slopes = 255 * np.clip(filled[..., :3], 0, 1), np.clip(filled[..., 3:] / SLOPE_STEP, -127, 127)
+    return BakedSubject(atlas, np.round(albedo).astype(np.uint8), np.round(SLOPE_ZERO + slopes).astype(np.uint8))
 
 
 def unwrap_subject(subject: SyntheticSubject, size: int) -> Atlas:
@@ -108,15 +93,63 @@ def fill_gaps(image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"])
     return image[rows, columns]
 
 
-def _bake(subject, atlas, samples):
-    """Albedo and slopes (t, t, 3) of the texels."""
-    fine = dataclasses.replace(atlas, size=atlas.size * samples)
-    ids, weights = texels(fine)
-    covered = ids >= 0
-    albedo, slopes = paint(subject, ids[covered], spots_at(subject, ids[covered], weights[covered]))
-    values = np.zeros((*ids.shape, 7), np.float32)
-    values[covered] = np.concatenate([albedo, slopes, np.ones((len(albedo), 1), np.float32)], axis=1)
-    sums = values.reshape(atlas.size, samples, atlas.size, samples, 7).sum((1, 3))
-    known = sums[..., 6] > 0
-    filled = fill_gaps(sums[..., :6] / np.maximum(sums[..., 6:], 1), known)
-    return filled[..., :3], filled[..., 3:]
+SCAN, TEXTURE, PARAMETERS = "scan", "material_0.png", "scan.json"
+"""Names in a scan's folder: of the meshes (without ending), the texture of the OBJ, and what is known of the person."""
+
+
+def export_scan(
+    subject: SyntheticSubject,
+    folder: str | Path,
+    pose: BodyPose | None = None,
+    *,
+    lit: bool = False,
+    texture_size: int = 2048,
+    formats: Sequence[str] = ("obj", "glb"),
+) -> Path:
+    """Write a subject as a textured mesh, in a pose or (None) in the T-pose at rest; returns the folder.
+
+    lit: the texture carries the subject's light in that pose; otherwise it is albedo. Written whole or not at all; an
+    existing folder is replaced. Raises: ValueError if a format is neither "obj" nor "glb".
+    """
+    if unknown := set(formats) - {"obj", "glb"}:
+        raise ValueError(f"scans are written as obj or glb, not as {sorted(unknown)}")
+    pose = BodyPose(jnp.zeros((len(subject.build.joints), 3)), jnp.zeros(3)) if pose is None else pose
+    posed = pose_subject(subject, *(np.asarray(x, np.float32) for x in (pose.rotations, pose.translation)))
+    baked = bake_subject(subject, texture_size)
+    texture = lit_texture(posed, baked) if lit else baked.albedo
+    known = {"betas": subject.betas, "rotations": posed.rotations, "translation": posed.translation}
+    known = {"seed": subject.seed, "lit": lit} | {name: value.tolist() for name, value in known.items()}
+
+    def write(temporary: Path):
+        temporary.mkdir()
+        _write_mesh(temporary, posed.vertices[baked.atlas.vertices], baked, texture, formats)
+        write_json(temporary / PARAMETERS, known, indent=None)
+
+    replace_folder(folder, write)
+    return Path(folder)
+
+
+def lit_texture(posed: PosedSubject, baked: BakedSubject) -> UInt8[np.ndarray, "t t 3"]:
+    """(t, t, 3) the texture of a pose as its light makes it, seen from outside."""
+    ids, weights = texels(baked.atlas)
+    known = ids >= 0
+    albedo = baked.albedo[known].astype(np.float32) / 255
+    slopes = (baked.slopes[known].astype(np.float32) - SLOPE_ZERO) * SLOPE_STEP
+    colors = np.zeros((*ids.shape, 3), np.float32)
+    colors[known] = light_points(posed, ids[known], weights[known], albedo, slopes)
+    return np.round(255 * fill_gaps(colors, known)).astype(np.uint8)
+
+
+def _write_mesh(folder: Path, vertices: Float[np.ndarray, "u 3"], baked, texture, formats):
+    import trimesh
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+    image = Image.fromarray(texture)
+    simple = SimpleMaterial(image=image, diffuse=[255, 255, 255, 255])
+    physical = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
+    for kind, material in (("obj", simple), ("glb", physical)):
+        if kind in formats:
+            visual = TextureVisuals(uv=baked.atlas.uvs, material=material)
+            trimesh.Trimesh(vertices, baked.atlas.faces, visual=visual, process=False).export(folder / f"{SCAN}.{kind}")

@@ -18,11 +18,12 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.io.npz import read_npz, write_npz
-from humangs_jax.people.baking import BakedSubject, bake_subject
+from humangs_jax.people.baking import JOINTS_PER_VERTEX, bake_subject, strongest_joints
 from humangs_jax.people.kinematics import joint_positions
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.seeds import GENERATOR_VERSION, split_of
 from humangs_jax.people.subject import SyntheticSubject, make_subject
+from humangs_jax.people.surfaces import vertex_normals
 
 FORMAT, VERSION = "humangs-people", 1
 POSE_STREAM = 20
@@ -36,24 +37,22 @@ MOST_MATERIALS = 32
 
 @pytree_dataclass
 class PeopleBank:
-    """Dressed people p, padded to one size and stacked. Padding repeats a vertex, and faces without area.
+    """Dressed people p, padded to one size (by a repeated vertex, and faces without area) and stacked.
 
-    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts, face_counts: (p,) without padding.
+    seeds: (p,). betas: (p, s). joints: (p, j, 3) at rest, metres. vertex_counts: (p,) without padding.
     vertices: (p, n, 3) at rest, metres. normals: (p, n, 3) unit. joint_ids, joint_weights: (p, n, k).
     faces: (p, f, 3). uvs: (p, f, 3, 2) texture coordinates of the corners, steps of 1 / `UV_STEPS`, v DOWN.
     face_pieces: (p, f) piece of each face; of the pieces m: sheen (p, m), groups (p, m): pieces of one number are dyed
     alike, dyeable (p, m): 1 where a piece is cloth that may have another colour.
     texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `baking.BakedSubject`).
     rotations: (p, q, j, 3) poses; nearest: (p, q) the pose that is most like each.
-    parents, mirrored_joints: static; the joint that is each one's mirror image. split: static, the range of the seeds. generator:
-    static, `seeds.GENERATOR_VERSION` of who made the people.
+    Static: parents; mirrored_joints: each joint's mirror image; split: range of the seeds; generator: `GENERATOR_VERSION`.
     """
 
     seeds: Int[Array, " p"]
     betas: Float[Array, "p s"]
     joints: Float[Array, "p j 3"]
     vertex_counts: Int[Array, " p"]
-    face_counts: Int[Array, " p"]
     vertices: Float[Array, "p n 3"]
     normals: Float[Array, "p n 3"]
     joint_ids: UInt8[Array, "p n k"]
@@ -102,9 +101,7 @@ def build_bank(
     seeds = list(seeds)
     if not seeds:
         raise ValueError("no seeds")
-    for seed in seeds:
-        if split_of(seed) != split:
-            raise ValueError(f"seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
+    _check_range(seeds, split)
     from tqdm import tqdm
 
     make = functools.partial(_person, texture_size=texture_size, pose_count=pose_count)
@@ -120,11 +117,8 @@ def build_bank(
 
 def save_bank(path: str | Path, bank: PeopleBank) -> None:
     """Write one .npz, whole or not at all."""
-    fields = {name: np.asarray(getattr(bank, name)) for name in _ARRAYS}
-    fields |= {"parents": np.asarray(bank.parents), "mirrored_joints": np.asarray(bank.mirrored_joints)}
-    fields |= {"format": np.asarray(FORMAT), "version": np.asarray(VERSION), "split": np.asarray(bank.split)}
-    fields |= {"generator": np.asarray(bank.generator)}
-    write_npz(path, fields)
+    fields = {name: np.asarray(getattr(bank, name)) for name in (*_ARRAYS, *_STATIC)}
+    write_npz(path, fields | {"format": np.asarray(FORMAT), "version": np.asarray(VERSION)})
 
 
 def load_bank(path: str | Path) -> PeopleBank:
@@ -137,9 +131,7 @@ def load_bank(path: str | Path) -> PeopleBank:
     if missing := {*_ARRAYS, *_STATIC} - set(arrays):
         raise ValueError(f"{path}: a bank without {sorted(missing)}")
     split = str(arrays["split"])
-    for seed in arrays["seeds"].tolist():
-        if split_of(seed) != split:
-            raise ValueError(f"{path}: seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
+    _check_range(arrays["seeds"].tolist(), split, f"{path}: ")
     return PeopleBank(
         **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
         parents=tuple(arrays["parents"].tolist()),
@@ -152,48 +144,49 @@ def load_bank(path: str | Path) -> PeopleBank:
 _STATIC = ("parents", "mirrored_joints", "split", "generator")
 _ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in _STATIC)
 
-_shipped_body: list[BodyModel] = []
+
+def _check_range(seeds, split, where=""):
+    for seed in seeds:
+        if split_of(seed) != split:
+            raise ValueError(f"{where}seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
+
+
+@functools.cache
+def _shipped_body():
+    """For processes of their own."""
+    from humangs_jax.body.library import load_body
+
+    return load_body()
 
 
 def _person(seed, body=None, *, texture_size, pose_count):
     """One subject's share of the bank, unpadded: name -> array."""
-    if body is None:  # in a process of its own
-        if not _shipped_body:
-            from humangs_jax.body.library import load_body
-
-            _shipped_body.append(load_body())
-        body = _shipped_body[0]
-    subject = make_subject(seed, body)
-    samples = 2 if texture_size <= 512 else 1  # fine patterns are averaged where texels are coarse
-    return _arrays(subject, bake_subject(subject, texture_size, samples), pose_count)
-
-
-def _arrays(subject: SyntheticSubject, baked: BakedSubject, pose_count):
-    if len(subject.materials) > MOST_MATERIALS or len(baked.vertices) > np.iinfo(np.uint16).max:
-        raise ValueError(
-            f"seed {subject.seed}: {len(subject.materials)} pieces, {len(baked.vertices)} vertices: too many"
-        )
-    uvs = baked.atlas.uvs[baked.atlas.faces]
+    subject = make_subject(seed, _shipped_body() if body is None else body)
+    baked = bake_subject(subject, texture_size, 2 if texture_size <= 512 else 1)  # fine patterns on coarse texels
+    surface, atlas, materials = subject.surface, baked.atlas, subject.materials
+    if len(materials) > MOST_MATERIALS or len(surface.vertices) > np.iinfo(np.uint16).max:
+        raise ValueError(f"seed {seed}: {len(materials)} pieces, {len(surface.vertices)} vertices: too many")
+    uvs = atlas.uvs[atlas.faces]
     uvs = np.round(UV_STEPS * np.stack([uvs[..., 0], 1 - uvs[..., 1]], -1)).astype(np.uint16)
-    pad = lambda values: np.pad(np.asarray(values), (0, MOST_MATERIALS - len(subject.materials)))
-    identities = [id(material) for material in subject.materials]
+    pad = lambda values, kind: np.pad(np.asarray(values), (0, MOST_MATERIALS - len(materials))).astype(kind)
+    identities = [id(material) for material in materials]
     rotations = sample_poses(subject, pose_count)
+    joint_ids, joint_weights = strongest_joints(surface.weights, JOINTS_PER_VERTEX)
     return {
-        "seeds": np.int32(subject.seed),
-        "betas": baked.betas,
+        "seeds": np.int32(seed),
+        "betas": subject.betas,
         "joints": subject.build.joints.astype(np.float32),
-        "vertex_counts": np.int32(len(baked.vertices)),
-        "face_counts": np.int32(len(baked.faces)),
-        "vertices": baked.vertices.astype(np.float32),
-        "normals": baked.normals.astype(np.float16),
-        "joint_ids": baked.joint_ids,
-        "joint_weights": baked.joint_weights.astype(np.float16),
-        "faces": baked.faces.astype(np.uint16),
+        "vertex_counts": np.int32(len(surface.vertices)),
+        "vertices": surface.vertices.astype(np.float32),
+        "normals": vertex_normals(surface.vertices, surface.faces).astype(np.float16),
+        "joint_ids": joint_ids,
+        "joint_weights": joint_weights.astype(np.float16),
+        "faces": surface.faces.astype(np.uint16),
         "uvs": uvs,
-        "face_pieces": baked.face_materials.astype(np.uint8),
-        "sheen": pad([material.sheen for material in subject.materials]).astype(np.float32),
-        "groups": pad([identities.index(i) for i in identities]).astype(np.uint8),
-        "dyeable": pad([material.wrinkles > 0 for material in subject.materials]).astype(np.float32),
+        "face_pieces": subject.face_materials.astype(np.uint8),
+        "sheen": pad([material.sheen for material in materials], np.float32),
+        "groups": pad([identities.index(i) for i in identities], np.uint8),
+        "dyeable": pad([material.wrinkles > 0 for material in materials], np.float32),
         "texture": np.concatenate([baked.albedo, baked.slopes], axis=-1),
         "rotations": rotations,
         "nearest": _nearest(subject.build, rotations),
@@ -213,23 +206,21 @@ def _nearest(build, rotations):
     return np.argmin(away, axis=1).astype(np.int32)
 
 
+_BY_VERTEX, _BY_FACE = ("vertices", "normals", "joint_ids", "joint_weights"), ("faces", "uvs", "face_pieces")
+
+
 def _stacked(people, body: BodyModel, split) -> PeopleBank:
     vertices = -(-max(len(p["vertices"]) for p in people) // PAD_VERTICES) * PAD_VERTICES
     faces = -(-max(len(p["faces"]) for p in people) // PAD_FACES) * PAD_FACES
-    lengths = {"vertices": vertices, "normals": vertices, "joint_ids": vertices, "joint_weights": vertices}
-    lengths |= {"faces": faces, "uvs": faces, "face_pieces": faces}
 
     def padded(name, array):
-        if name not in lengths:
-            return array
-        extra = lengths[name] - len(array)
-        if name in ("faces", "uvs", "face_pieces"):
-            return np.pad(array, [(0, extra)] + [(0, 0)] * (array.ndim - 1))
-        return np.concatenate([array, np.repeat(array[:1], extra, axis=0)])
+        if name in _BY_FACE:
+            return np.pad(array, [(0, faces - len(array))] + [(0, 0)] * (array.ndim - 1))
+        if name in _BY_VERTEX:
+            return np.concatenate([array, np.repeat(array[:1], vertices - len(array), axis=0)])
+        return array
 
-    fields: dict[str, Any] = {}
-    for name in _ARRAYS:
-        fields[name] = jnp.asarray(np.stack([padded(name, p[name]) for p in people]))
+    fields: dict[str, Any] = {name: jnp.asarray(np.stack([padded(name, p[name]) for p in people])) for name in _ARRAYS}
     return PeopleBank(**fields, parents=body.parents, mirrored_joints=mirrored_joints(body.joint_names), split=split)
 
 

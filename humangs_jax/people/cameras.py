@@ -98,8 +98,7 @@ def camera_from(
 ) -> Camera:
     """A square camera of `size` pixels that looks at a posed person from an azimuth.
 
-    u: in [0, 1). count: vertices that are no padding. With probability close_share it is a close one, see `close_cameras`;
-    others see all of the person.
+    u: in [0, 1). count: vertices that are no padding. close_share: probability of a close camera; others see all of the person.
     """
     is_close, tilt, spread, outwards, place = u
     low, high = vertices.min(0), vertices.max(0)

@@ -60,12 +60,8 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
     made_up = not male and rng.random() < 0.55
     lips = skin * np.asarray([0.90, 0.64, 0.64])
     if made_up and rng.random() < 0.75:
-        dye = colour(
-            rng.choice([rng.uniform(0.94, 1.03), rng.uniform(0.935, 0.97)]),
-            rng.uniform(0.45, 0.8),
-            rng.uniform(0.35, 0.75),
-        )
-        lips = 0.3 * lips + 0.7 * dye
+        hue = rng.choice([rng.uniform(0.94, 1.03), rng.uniform(0.935, 0.97)])
+        lips = 0.3 * lips + 0.7 * colour(hue, rng.uniform(0.45, 0.8), rng.uniform(0.35, 0.75))
     grey = float(np.clip((years - 40) / 35, 0, 0.85))
     odds = (FAIR_ODDS + (DARK_ODDS - FAIR_ODDS) * np.clip((darkness - 0.22) / 0.2, 0, 1)) * (1 - grey)
     odds[4] += grey
@@ -96,36 +92,18 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class Features:
-    """Shapes of what is painted on a face: brows, lips, lids, nose. Metres, or factors around 1."""
-
-    brow_thickness: float
-    brow_arch: float
-    brow_height: float
-    lip_width: float
-    lip_fullness: float
-    eye_opening: float
-    nose: float
-
-
-def sample_features(rng: np.random.Generator) -> Features:
-    """Random features."""
-    return Features(
-        brow_thickness=rng.uniform(0.0024, 0.0056),
-        brow_arch=rng.uniform(0.2, 1.7),
-        brow_height=rng.uniform(-0.0025, 0.0025),
-        lip_width=rng.uniform(0.9, 1.14),
-        lip_fullness=rng.uniform(0.65, 1.25),
-        eye_opening=rng.uniform(0.85, 1.15),
-        nose=rng.uniform(0.85, 1.25),
-    )
+FEATURES = {
+    "brow_thickness": (0.0024, 0.0056), "brow_arch": (0.2, 1.7), "brow_height": (-0.0025, 0.0025), "lip_width": (0.9, 1.14),
+    "lip_fullness": (0.65, 1.25), "eye_opening": (0.85, 1.15), "nose": (0.85, 1.25),
+}  # fmt: skip
+"""Ranges of what is painted on a face: metres, or factors around 1."""
 
 
 def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut) -> Material:
-    """Skin with lips, cheeks, brows, lids, nostrils, stubble, nails, knuckles, freckles, and tones that vary over the body."""
+    """Skin with lips, cheeks, brows, lids, nostrils, stubble, knuckles, freckles, and tones that vary over the body."""
     cloud, blotches = Ripples(rng, 0.07), Ripples(rng, 0.25)
-    features, seed = sample_features(rng), int(rng.integers(1 << 20))
+    features = {name: rng.uniform(*limits) for name, limits in FEATURES.items()}
+    seed = int(rng.integers(1 << 20))
 
     def albedo(s: Spots):
         x, y, z = np.abs(s.template[:, 0]), s.template[:, 1], s.template[:, 2]
@@ -133,83 +111,52 @@ def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut)
         result = result * (1 - tones.tan * np.clip((x - 0.2) / 0.3, 0, 1) * (y > -0.1))[:, None]
         i = np.flatnonzero((x > 0.6) & (y > -0.1))
         if len(i):
-            result[i] = _hand(tones, result[i], x[i], y[i], z[i])
-        red = np.exp(-(((y + 0.764) / 0.05) ** 2)) * (y < -0.5) + np.exp(-(((x - 0.411) / 0.03) ** 2)) * (y > 0) * (
-            z < 0
-        )
-        result = mix(result, result * np.asarray([0.96, 0.82, 0.8]), 0.5 * red)
+            result[i] = _hand(tones, result[i], x[i], y[i])
+        knees, elbows = _bell((y, -0.764, 0.05)) * (y < -0.5), _bell((x, 0.411, 0.03)) * (y > 0) * (z < 0)
+        result = _tinted(result, (0.96, 0.82, 0.8), 0.5 * (knees + elbows))
         i = np.flatnonzero((y > 0.19) & (z > -0.14) & (x < 0.2))
         if len(i):
-            result[i] = _face(tones, haircut, features, result[i], x[i], y[i], z[i], s.template[i], seed)
+            front = np.clip((z[i] - 0.07) / 0.02, 0, 1)
+            result[i] = _cheeks_and_eyes(tones, features, result[i], x[i], y[i], front, s.template[i], seed)
+            result[i] = _aged(tones, result[i], x[i], y[i], front)
+            result[i] = _mouth_and_brows(tones, haircut, features, result[i], x[i], y[i], front, s.template[i], seed)
         return result
 
     return Material(albedo, wrinkles=0.0, sheen=0.25)
 
 
-def _hand(tones, result, x, y, z):
-    """Palms are paler, knuckles and finger tips redder, nails shine."""
+def _bell(*axes):
+    """(n,) 1 at a place, running out around it; axes: (coordinate (n,), place, width) of each."""
+    return np.exp(-sum(((x - place) / width) ** 2 for x, place, width in axes))
+
+
+def _tinted(colours, tint, amount):
+    return mix(colours, colours * np.asarray(tint), amount)
+
+
+def _hand(tones, result, x, y):
+    """Palms are paler, knuckles and finger tips redder."""
     palm = np.clip((HAND_Y - y) / 0.012, 0, 1) * np.clip((x - 0.66) / 0.03, 0, 1)
     pale = 0.35 * tones.skin + 0.65 * np.asarray([0.82, 0.62, 0.53], np.float32)
-    result = mix(result, pale, 0.55 * palm)
-    tip = np.clip((x - 0.79) / 0.03, 0, 1)
-    knuckle = np.exp(-(((x - 0.745) / 0.008) ** 2)) * (1 - palm)
-    return mix(result, result * np.asarray([0.98, 0.82, 0.8]), np.clip(0.5 * tip + 0.5 * knuckle, 0, 1))
+    tip, knuckle = np.clip((x - 0.79) / 0.03, 0, 1), _bell((x, 0.745, 0.008)) * (1 - palm)
+    return _tinted(mix(result, pale, 0.55 * palm), (0.98, 0.82, 0.8), np.clip(0.5 * tip + 0.5 * knuckle, 0, 1))
 
 
-def _face(tones, haircut, features, result, x, y, z, template, seed):
-    front = np.clip((z - 0.07) / 0.02, 0, 1)
-    signed = template[:, 0]
-    result = _flushed(tones, features, result, x, y, front, template, seed)
-    result = _eyes(tones, features, result, x, y, front)
-    result = _aged(tones, result, x, y, z, front)
-    width = 0.026 * features.lip_width
-    corner = np.clip(1 - (x / width) ** 2, 0, 1)
-    bow = 0.009 * features.lip_fullness * corner * (1 - 0.35 * np.exp(-((x / 0.005) ** 2)))
-    low = 0.0115 * features.lip_fullness * corner**0.7
-    lips = band(y, MOUTH_Y - low, MOUTH_Y + bow, 0.002) * (corner > 0) * (z > 0.08)
-    shine = 1 + 0.25 * np.exp(-(((y - MOUTH_Y + 0.006) / 0.003) ** 2) - (x / 0.01) ** 2)
-    result = mix(result, tones.lips * shine[:, None], 0.85 * lips)
-    line = band(y, MOUTH_Y - 0.0012, MOUTH_Y + 0.0012, 0.001) * (x < width) * (z > 0.08)
-    result = mix(result, tones.lips * 0.35, line)
-    nostril = np.exp(-(((x - 0.0085 * features.nose) / 0.004) ** 2) - (((y - 0.2845) / 0.0025) ** 2)) * (z > 0.1)
-    result = mix(result, result * 0.3, np.clip(nostril, 0, 1))
-    brow_line = 0.3485 + features.brow_height + features.brow_arch * (0.0045 - 18 * (x - 0.033) ** 2)
-    inside = band(x, 0.012, 0.05, 0.006)
-    hairs = 0.7 + 0.6 * lattice(np.stack([signed / 0.0016 + y / 0.004, y / 0.006], -1), seed + 3)
-    brow = (
-        band(np.abs(y - brow_line), -1, features.brow_thickness * np.clip(1.5 - x / 0.06, 0.4, 1), 0.002)
-        * inside
-        * front
-    )
-    result = mix(result, np.minimum(tones.hair, 0.42) * 0.75, np.clip(tones.brow * brow * hairs, 0, 1))
-    return _stubble(tones, haircut, result, x, y, z, lips, template, seed)
-
-
-def _flushed(tones, features, result, x, y, front, template, seed):
-    """Cheeks, nose and ears; freckles."""
-    cheeks = np.exp(-(((x - 0.043) / 0.02) ** 2) - (((y - 0.292) / 0.018) ** 2))
-    nose = 0.7 * np.exp(-((x / (0.012 * features.nose)) ** 2) - (((y - 0.295) / 0.012) ** 2))
-    result = mix(result, result * np.asarray([1.02, 0.82, 0.80]), 0.6 * front * np.clip(cheeks + nose, 0, 1))
-    blush = np.exp(-(((x - 0.050) / 0.018) ** 2) - (((y - 0.298 - 0.3 * (x - 0.05)) / 0.014) ** 2))
-    result = mix(result, result * np.asarray([1.05, 0.68, 0.70]), tones.blush * front * blush)
-    ears = (x > 0.0745) & (y > 0.27) & (y < 0.36)
-    result = mix(result, result * np.asarray([1.0, 0.8, 0.77]), 0.7 * ears)
+def _cheeks_and_eyes(tones, features, result, x, y, front, template, seed):
+    """Cheeks, nose and ears; freckles; sockets, make-up, lashes."""
+    cheeks = _bell((x, 0.043, 0.02), (y, 0.292, 0.018))
+    nose = 0.7 * _bell((x, 0, 0.012 * features["nose"]), (y, 0.295, 0.012))
+    result = _tinted(result, (1.02, 0.82, 0.80), 0.6 * front * np.clip(cheeks + nose, 0, 1))
+    blush = _bell((x, 0.050, 0.018), (y - 0.298, 0.3 * (x - 0.05), 0.014))
+    result = _tinted(result, (1.05, 0.68, 0.70), tones.blush * front * blush)
+    result = _tinted(result, (1.0, 0.8, 0.77), 0.7 * ((x > 0.0745) & (y > 0.27) & (y < 0.36)))
     if tones.freckles > 0:
-        spots = lattice(template / 0.0034, seed + 7)
-        where = np.exp(-(((y - 0.305) / 0.022) ** 2)) * front
-        result = mix(
-            result, result * np.asarray([0.72, 0.58, 0.48]), tones.freckles * where * band(spots, 0.68, 2, 0.1)
-        )
-    return result
-
-
-def _eyes(tones, features, result, x, y, front):
-    """Sockets, make-up, lashes."""
-    socket = np.exp(-(((x - EYE_X) / 0.017) ** 2) - (((y - EYE_Y) / 0.010) ** 2))
-    result = mix(result, result * np.asarray([0.72, 0.66, 0.66]), 0.7 * socket * front)
-    lid = np.exp(-(((x - EYE_X - 0.002) / 0.017) ** 2) - (((y - EYE_Y - 0.008) / 0.007) ** 2)) * (y > EYE_Y)
+        spots = _bell((y, 0.305, 0.022)) * front * band(lattice(template / 0.0034, seed + 7), 0.68, 2, 0.1)
+        result = _tinted(result, (0.72, 0.58, 0.48), tones.freckles * spots)
+    result = _tinted(result, (0.72, 0.66, 0.66), 0.7 * _bell((x, EYE_X, 0.017), (y, EYE_Y, 0.010)) * front)
+    lid = _bell((x - EYE_X, 0.002, 0.017), (y - EYE_Y, 0.008, 0.007)) * (y > EYE_Y)
     result = mix(result, tones.shadow_colour, tones.shadow * lid * front)
-    rim = np.sqrt(((x - EYE_X) / 0.0155) ** 2 + ((y - EYE_Y - 0.001) / (0.0075 * features.eye_opening)) ** 2)
+    rim = np.sqrt(((x - EYE_X) / 0.0155) ** 2 + ((y - EYE_Y - 0.001) / (0.0075 * features["eye_opening"])) ** 2)
     lashes = band(rim, 0.75, 1.08 + 0.18 * tones.liner, 0.15)
     result = mix(result, result * 0.22, 0.8 * lashes * (y > EYE_Y - 0.002) * front)
     wing = (
@@ -218,36 +165,45 @@ def _eyes(tones, features, result, x, y, front):
     return mix(result, result * 0.2, np.clip(tones.liner * (0.7 * lashes * (y < EYE_Y) + wing), 0, 1))
 
 
-def _aged(tones, result, x, y, z, front):
+def _aged(tones, result, x, y, front):
     """Folds beside nose and mouth, lines on the forehead, bags and crow's feet."""
     if tones.wrinkles <= 0:
         return result
     fold = np.abs(x - 0.0165 - 0.55 * (0.287 - y)) + 10 * (np.abs(y - 0.272) > 0.018)
-    forehead = np.abs(((y - 0.368 + 0.8 * x * x) / 0.0085) % 1 - 0.5) * 0.0085
-    lines = 0.8 * band(fold, -1, 0.0016, 0.002) + 0.55 * band(forehead, -1, 0.0008) * band(y, 0.36, 0.392, 0.006) * (
-        x < 0.045
-    )
-    bags = np.exp(-(((x - 0.028) / 0.013) ** 2) - (((y - 0.3165) / 0.004) ** 2))
-    feet = band(np.abs((y - EYE_Y) / np.maximum(x - 0.038, 1e-3) * 2 % 1 - 0.5), -1, 0.12, 0.1) * band(
-        x, 0.046, 0.056, 0.002
-    )
-    lines = lines + 0.5 * feet * (np.abs(y - EYE_Y) < 0.012)
-    return mix(
-        result,
-        result * np.asarray([0.68, 0.58, 0.55]),
-        np.clip(tones.wrinkles * front * (0.7 * lines + 0.45 * bags), 0, 0.8),
-    )
+    forehead = 0.55 * band(np.abs(((y - 0.368 + 0.8 * x * x) / 0.0085) % 1 - 0.5) * 0.0085, -1, 0.0008)
+    forehead = forehead * band(y, 0.36, 0.392, 0.006) * (x < 0.045)
+    feet = band(np.abs((y - EYE_Y) / np.maximum(x - 0.038, 1e-3) * 2 % 1 - 0.5), -1, 0.12, 0.1)
+    feet = feet * band(x, 0.046, 0.056, 0.002) * (np.abs(y - EYE_Y) < 0.012)
+    lines = 0.8 * band(fold, -1, 0.0016, 0.002) + forehead + 0.5 * feet
+    bags = _bell((x, 0.028, 0.013), (y, 0.3165, 0.004))
+    return _tinted(result, (0.68, 0.58, 0.55), np.clip(tones.wrinkles * front * (0.7 * lines + 0.45 * bags), 0, 0.8))
 
 
-def _stubble(tones, haircut, result, x, y, z, lips, template, seed):
-    """Roots of hair and beard, which also soften the edges of what grows there."""
+def _mouth_and_brows(tones, haircut, features, result, x, y, front, template, seed):
+    """Lips, nostrils, brows; roots of hair and beard, which also soften the edges of what grows there."""
+    width, ahead = 0.026 * features["lip_width"], template[:, 2] > 0.08
+    corner = np.clip(1 - (x / width) ** 2, 0, 1)
+    bow = 0.009 * features["lip_fullness"] * corner * (1 - 0.35 * _bell((x, 0, 0.005)))
+    low = 0.0115 * features["lip_fullness"] * corner**0.7
+    lips = band(y, MOUTH_Y - low, MOUTH_Y + bow, 0.002) * (corner > 0) * ahead
+    shine = 1 + 0.25 * _bell((y - MOUTH_Y, -0.006, 0.003), (x, 0, 0.01))
+    result = mix(result, tones.lips * shine[:, None], 0.85 * lips)
+    line = band(y, MOUTH_Y - 0.0012, MOUTH_Y + 0.0012, 0.001) * (x < width) * ahead
+    result = mix(result, tones.lips * 0.35, line)
+    nostril = _bell((x, 0.0085 * features["nose"], 0.004), (y, 0.2845, 0.0025)) * (template[:, 2] > 0.1)
+    result = mix(result, result * 0.3, np.clip(nostril, 0, 1))
+    arch = 0.3485 + features["brow_height"] + features["brow_arch"] * (0.0045 - 18 * (x - 0.033) ** 2)
+    hairs = 0.7 + 0.6 * lattice(np.stack([template[:, 0] / 0.0016 + y / 0.004, y / 0.006], -1), seed + 3)
+    brow = band(np.abs(y - arch), -1, features["brow_thickness"] * np.clip(1.5 - x / 0.06, 0.4, 1), 0.002)
+    brow = brow * band(x, 0.012, 0.05, 0.006) * front
+    result = mix(result, np.minimum(tones.hair, 0.42) * 0.75, np.clip(tones.brow * brow * hairs, 0, 1))
+
     grain = 0.7 + 0.6 * lattice(template / 0.0026, seed + 11)
     above = above_line(template, SHORT_LINE, haircut.receding)
     cover = np.clip((above + 0.006) / 0.016, 0, 1) * (1 - (np.abs(x) > 0.0765) * (y < 0.355))
-    scalp = {"bald": 0.12, "buzz": 0.8}.get(haircut.cut, 0.92)
+    scalp = 0.8 if haircut.cut == "buzz" else 0.92
     if haircut.cut == "bald":
-        fringe = np.clip((0.352 - y) / 0.012, 0, 1)
-        scalp = 0.1 + 0.5 * fringe
+        scalp = 0.1 + 0.5 * np.clip((0.352 - y) / 0.012, 0, 1)
     elif haircut.cut in LONG_CUTS:
         cover = cover * (above > 0.0)
     result = mix(result, tones.hair * 0.8, np.clip(scalp * cover * grain, 0, 1))
@@ -265,8 +221,7 @@ def eye_material(tones: Complexion) -> Material:
     def albedo(s: Spots):
         d = s.template
         angle = np.arccos(np.clip(d[:, 2] / np.maximum(np.linalg.norm(d, axis=1), 1e-6), -1, 1))
-        white = np.asarray([0.84, 0.82, 0.80], np.float32)
-        result = mix(white, tones.iris, band(angle, -1, 0.47, 0.05))
+        result = mix(np.asarray([0.84, 0.82, 0.80], np.float32), tones.iris, band(angle, -1, 0.47, 0.05))
         result = mix(result, tones.iris * 0.4, band(angle, 0.40, 0.48, 0.05))
         result = mix(result, np.asarray([0.02, 0.02, 0.02], np.float32), band(angle, -1, 0.21, 0.05))
         glint = np.sqrt((d[:, 0] - 0.15) ** 2 + (d[:, 1] - 0.2) ** 2)

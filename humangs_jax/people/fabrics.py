@@ -1,12 +1,13 @@
-"""Fabrics and materials: functions from points on a surface to colour.
+"""Fabrics and materials: colours of points on a surface.
 
 A material maps `Spots` (points on a surface) to albedo in [0, ALBEDO_LIMIT]. It is evaluated per pixel or texel, so it is
-crisp at any resolution. A `Fabric` is a choice (pattern, dyes, seed); `weave` turns it into colour at every point. Periods of
-patterns are metres on the cloth; the finest is a few millimetres.
+crisp at any resolution. A `Fabric` is a choice (pattern, dyes, seed). What else is random about it is drawn anew from its seed
+whenever it is asked for colours. Periods of patterns are metres on the cloth; the finest is a few millimetres.
 """
 
 import colorsys
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import numpy as np
@@ -41,9 +42,7 @@ class Spots:
         """(n,) metres around the trunk or limb, 0 in front; on the shoulders metres from the middle, back and front apart."""
         girth = self.cloth[:, 3]
         turned = np.arctan2(self.cloth[:, 0], self.cloth[:, 2]) * girth
-        flat = self._on_shoulders
-        if not flat.any():
-            return turned
+        flat = np.clip((self.cloth[:, 1] - 0.03) / 0.09, 0, 1) * self._on_trunk  # 0 where the cloth hangs
         x = self.cloth[:, 0]
         across = np.where(self.template[:, 2] > SHOULDER_RIDGE, x, np.sign(x) * np.pi * girth - x)
         return turned + flat * (across - turned)
@@ -59,12 +58,6 @@ class Spots:
         """(n,) whether this is cloth of a trunk, inside of the armholes."""
         return (np.abs(self.cloth[:, 3] - TRUNK_GIRTH) < SAME_GIRTH) & (np.abs(self.template[:, 0]) <= ARMHOLE)
 
-    @property
-    def _on_shoulders(self):
-        """(n,) 1 where a trunk's cloth lies flat, 0 where it hangs."""
-        height = np.clip((self.cloth[:, 1] - 0.03) / 0.09, 0, 1)
-        return height * self._on_trunk
-
 
 @dataclasses.dataclass(frozen=True)
 class Material:
@@ -77,6 +70,10 @@ class Material:
     wrinkles: float = 0.0
     sheen: float = 0.0
     draped: bool = False
+
+
+def _rgb(*values):
+    return np.asarray(values, np.float32)
 
 
 def colour(hue: float, saturation: float, value: float) -> Vector:
@@ -112,10 +109,8 @@ def accent(rng: np.random.Generator, base: Vector) -> Vector:
     return np.where(base.mean() > 0.45, base * 0.3, 0.3 + 0.55 * base).astype(np.float32)
 
 
-def mix(
-    a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], amount: Float[np.ndarray, " m"]
-) -> Float[np.ndarray, "m 3"]:
-    """Colours, of points (m, 3) or one for all (3,): `a` where amount is 0, `b` where it is 1."""
+def mix(a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], amount: Field) -> Points:
+    """Colours, of points (n, 3) or one for all (3,): `a` where amount (n,) is 0, `b` where it is 1."""
     return a + (b - a) * amount[:, None]
 
 
@@ -137,10 +132,9 @@ class Fabric:
         """Random numbers of the fabric's own; one stream for each feature."""
         return np.random.default_rng([self.seed, stream])
 
-
-def weave(fabric: Fabric) -> Callable[[Spots], np.ndarray]:
-    """The fabric's colour as a function of points: Spots -> (n, 3)."""
-    return PATTERNS[fabric.pattern][1](fabric.rng(0), fabric.base, fabric.other)
+    def colours(self, s: Spots) -> Points:
+        """(n, 3) the colours of points."""
+        return PATTERNS[self.pattern][1](s, self.rng(0), self.base, self.other)
 
 
 LEATHER_SHOES = ("flats", "sandals", "ankle_boots", "boots")
@@ -199,243 +193,178 @@ def _dye(rng, kind):
     return random_colour(rng)
 
 
-def plain(rng, base):
+# Patterns: (points, random numbers, two dyes) -> colours (n, 3). ---------------------------------------------------------
+
+
+def _lines(x, period, width, shift=0.0):
+    """(n,) 1 on lines of a width that are a period apart, metres; shift: in periods."""
+    return band((x / period + shift) % 1 * period, 0, width)
+
+
+def _grain(s, around, along, seed):
+    """(n,) lattice noise in cells of around x along metres."""
+    return lattice(np.stack([s.around / around, s.along / along], -1), seed)
+
+
+def _seed(rng):
+    return int(rng.integers(1 << 20))
+
+
+def plain(s, rng, base, _other):
     """One dye, slightly uneven."""
-    cloud = Ripples(rng, 0.12)
-    return lambda s: base * (1 + 0.03 * cloud(s.cloth[:, :3]))[:, None]
+    return base * (1 + 0.03 * Ripples(rng, 0.12)(s.cloth[:, :3]))[:, None]
 
 
-def stripes(rng, base, other, upright=False):
+def stripes(s, rng, base, other, upright=False):
     """Stripes around (or, upright, along) the limb."""
-    period = rng.choice([0.014, 0.02, 0.035, 0.055, 0.09])
-    share = rng.uniform(0.25, 0.6)
-
-    def albedo(s):
-        x = s.around if upright else s.along
-        phase = (x / period) % 1
-        return mix(base, other, band(phase * period, 0.0, share * period))
-
-    return albedo
+    period, share = rng.choice([0.014, 0.02, 0.035, 0.055, 0.09]), rng.uniform(0.25, 0.6)
+    return mix(base, other, _lines(s.around if upright else s.along, period, share * period))
 
 
-def checks(rng, base, other):
+def checks(s, rng, base, other):
     """Gingham or tartan."""
     period = rng.choice([0.03, 0.05, 0.08])
     third, thin = accent(rng, base), rng.random() < 0.6
-
-    def albedo(s):
-        across = band((s.around / period) % 1 * period, 0, period / 2)
-        along = band((s.along / period) % 1 * period, 0, period / 2)
-        result = mix(base, other, 0.5 * (across + along))
-        if thin:
-            lines = np.maximum(
-                band((s.around / period + 0.25) % 1 * period, 0, 0.004),
-                band((s.along / period + 0.25) % 1 * period, 0, 0.004),
-            )
-            result = mix(result, third, 0.7 * lines)
+    across, along = (_lines(x, period, period / 2) for x in (s.around, s.along))
+    result = mix(base, other, 0.5 * (across + along))
+    if not thin:
         return result
+    lines = np.maximum(*(_lines(x, period, 0.004, 0.25) for x in (s.around, s.along)))
+    return mix(result, third, 0.7 * lines)
 
-    return albedo
 
-
-def dots(rng, base, other):
+def dots(s, rng, base, other):
     """Polka dots in a triangular grid."""
     period, size = rng.choice([0.03, 0.045, 0.07]), rng.uniform(0.2, 0.34)
-
-    def albedo(s):
-        row = np.floor(s.along / period)
-        x = ((s.around / period + 0.5 * (row % 2)) % 1 - 0.5) * period
-        y = ((s.along / period) % 1 - 0.5) * period
-        return mix(base, other, band(np.sqrt(x * x + y * y), -1, size * period, 0.002))
-
-    return albedo
+    row = np.floor(s.along / period)
+    x = ((s.around / period + 0.5 * (row % 2)) % 1 - 0.5) * period
+    y = ((s.along / period) % 1 - 0.5) * period
+    return mix(base, other, band(np.sqrt(x * x + y * y), -1, size * period, 0.002))
 
 
-def flowers(rng, base, other):
+def flowers(s, rng, base, other):
     """Scattered blossoms of five petals in two dyes."""
-    period, seed, third = rng.choice([0.05, 0.075]), int(rng.integers(1 << 20)), accent(rng, base)
-
-    def albedo(s):
-        plane = np.stack([s.around, s.along], -1) / period
-        cell = np.floor(plane).astype(np.int64)
-        jitter = np.stack([hashed(cell, seed), hashed(cell, seed + 1)], -1) * 0.4 + 0.3
-        d = (plane - cell - jitter) * period
-        r, a = np.sqrt(np.sum(d * d, -1)), np.arctan2(d[:, 1], d[:, 0]) + 6 * hashed(cell, seed + 2)
-        petals = band(r, -1, period * (0.2 + 0.08 * np.cos(5 * a)), 0.002)
-        dye = mix(other, third, (hashed(cell, seed + 3) > 0.5).astype(np.float32))
-        result = mix(base, dye, petals)
-        return mix(result, np.asarray([0.85, 0.75, 0.3], np.float32), band(r, -1, period * 0.07, 0.002))
-
-    return albedo
+    period, seed, third = rng.choice([0.05, 0.075]), _seed(rng), accent(rng, base)
+    plane = np.stack([s.around, s.along], -1) / period
+    cell = np.floor(plane).astype(np.int64)
+    jitter = np.stack([hashed(cell, seed), hashed(cell, seed + 1)], -1) * 0.4 + 0.3
+    d = (plane - cell - jitter) * period
+    r, a = np.sqrt(np.sum(d * d, -1)), np.arctan2(d[:, 1], d[:, 0]) + 6 * hashed(cell, seed + 2)
+    petals = band(r, -1, period * (0.2 + 0.08 * np.cos(5 * a)), 0.002)
+    dye = mix(other, third, (hashed(cell, seed + 3) > 0.5).astype(np.float32))
+    return mix(mix(base, dye, petals), _rgb(0.85, 0.75, 0.3), band(r, -1, period * 0.07, 0.002))
 
 
-def mottled(rng, base, other):
+def mottled(s, rng, base, other):
     """Camouflage, batik, tie-dye: thresholded or soft noise."""
-    scale, seed = rng.choice([0.03, 0.06, 0.1]), int(rng.integers(1 << 20))
-    hard, third = rng.random() < 0.5, accent(rng, other)
-
-    def albedo(s):
-        p = s.cloth[:, :3] / scale
-        n = 0.65 * lattice(p, seed) + 0.35 * lattice(2.1 * p, seed + 1)
-        width = 0.02 if hard else 0.2
-        first = np.clip((n - 0.47) / width + 0.5, 0, 1)
-        second = np.clip((lattice(p * 1.2 + 7.7, seed + 2) - 0.62) / width + 0.5, 0, 1)
-        return mix(mix(base, other, first), third, 0.8 * second)
-
-    return albedo
+    scale, seed = rng.choice([0.03, 0.06, 0.1]), _seed(rng)
+    width, third = 0.02 if rng.random() < 0.5 else 0.2, accent(rng, other)
+    p = s.cloth[:, :3] / scale
+    n = 0.65 * lattice(p, seed) + 0.35 * lattice(2.1 * p, seed + 1)
+    first = np.clip((n - 0.47) / width + 0.5, 0, 1)
+    second = np.clip((lattice(p * 1.2 + 7.7, seed + 2) - 0.62) / width + 0.5, 0, 1)
+    return mix(mix(base, other, first), third, 0.8 * second)
 
 
-def melange(rng, base, other):
+def melange(s, rng, base, other):
     """Knit or tweed: fine grain."""
-    seed, share = int(rng.integers(1 << 20)), rng.uniform(0.2, 0.5)
-
-    def albedo(s):
-        fine = lattice(np.stack([s.around / 0.006, s.along / 0.009], -1), seed)
-        return mix(base, other, share * fine)
-
-    return albedo
+    seed, share = _seed(rng), rng.uniform(0.2, 0.5)
+    return mix(base, other, share * _grain(s, 0.006, 0.009, seed))
 
 
-def denim(rng, base, _other):
+def denim(s, rng, base, _other):
     """Faded on the front of the thighs and at creases, grained along the thread."""
-    cloud, seed = Ripples(rng, 0.15), int(rng.integers(1 << 20))
+    cloud, seed = Ripples(rng, 0.15), _seed(rng)
     fade, holes = rng.uniform(0.1, 0.6), rng.random() < 0.12
-
-    def albedo(s):
-        front = np.clip(s.cloth[:, 2] / 0.08, 0, 1) * np.exp(-(((s.along + 0.6) / 0.14) ** 2)) * (s.cloth[:, 3] < 0.14)
-        thread = lattice(np.stack([s.around / 0.003, s.along / 0.016], -1), seed) - 0.5
-        crease = np.clip(np.abs(lattice(np.stack([s.around / 0.09, s.along / 0.022], -1), seed + 1) - 0.5) * 8, 0, 1)
-        worn = np.exp(-(((s.along + 0.47) / 0.05) ** 2)) + 0.5 * np.exp(-(((s.along + 0.78) / 0.06) ** 2))
-        bright = 1 + 0.07 * cloud(s.cloth[:, :3]) + fade * front + 0.14 * thread + 0.5 * fade * worn * (1 - crease)
-        result = base * bright[:, None]
-        if holes:
-            at = ((s.along + 0.72) / 0.03) ** 2 + (s.around / 0.05) ** 2
-            frayed = band(at + 0.6 * lattice(np.stack([s.around / 0.02, s.along / 0.004], -1), seed + 2), -1, 0.8, 0.2)
-            result = mix(result, np.asarray([0.75, 0.74, 0.72], np.float32), 0.8 * frayed * (s.cloth[:, 2] > 0))
+    front = np.clip(s.cloth[:, 2] / 0.08, 0, 1) * np.exp(-(((s.along + 0.6) / 0.14) ** 2)) * (s.cloth[:, 3] < 0.14)
+    crease = np.clip(np.abs(_grain(s, 0.09, 0.022, seed + 1) - 0.5) * 8, 0, 1)
+    worn = np.exp(-(((s.along + 0.47) / 0.05) ** 2)) + 0.5 * np.exp(-(((s.along + 0.78) / 0.06) ** 2))
+    bright = 1 + 0.07 * cloud(s.cloth[:, :3]) + fade * front + 0.14 * (_grain(s, 0.003, 0.016, seed) - 0.5)
+    result = base * (bright + 0.5 * fade * worn * (1 - crease))[:, None]
+    if not holes:
         return result
-
-    return albedo
-
-
-def camouflage(rng, base, _other):
-    """Four earth, sand, town or sea colours in torn blots, larger ones below smaller ones."""
-    palettes = (
-        ((0.24, 0.26, 0.14), (0.10, 0.12, 0.07), (0.33, 0.24, 0.15), (0.52, 0.47, 0.32)),
-        ((0.68, 0.58, 0.42), (0.52, 0.42, 0.29), (0.40, 0.32, 0.22), (0.78, 0.70, 0.56)),
-        ((0.45, 0.46, 0.47), (0.14, 0.14, 0.15), (0.28, 0.29, 0.30), (0.72, 0.73, 0.74)),
-        ((0.14, 0.20, 0.32), (0.06, 0.08, 0.14), (0.24, 0.33, 0.46), (0.45, 0.54, 0.62)),
-    )
-    dyes = np.asarray(palettes[rng.choice(len(palettes), p=[0.5, 0.2, 0.2, 0.1])], np.float32)
-    scale, seed = rng.uniform(0.045, 0.09), int(rng.integers(1 << 20))
-
-    def albedo(s):
-        p = s.cloth[:, :3] / scale * np.asarray([0.8, 1.4, 0.8], np.float32)
-        warp = np.stack([lattice(2.3 * p + k, seed + k) for k in range(3)], -1) - 0.5
-        result = np.broadcast_to(dyes[0], (len(p), 3))
-        for k, level in ((1, 0.56), (2, 0.6), (3, 0.66)):
-            blots = lattice((0.8 + 0.35 * k) * (p + 0.9 * warp) + 11.3 * k, seed + 10 * k)
-            result = mix(result, dyes[k], np.clip((blots - level) / 0.03 + 0.5, 0, 1))
-        return result
-
-    return albedo
+    at = ((s.along + 0.72) / 0.03) ** 2 + (s.around / 0.05) ** 2
+    frayed = band(at + 0.6 * _grain(s, 0.02, 0.004, seed + 2), -1, 0.8, 0.2)
+    return mix(result, _rgb(0.75, 0.74, 0.72), 0.8 * frayed * (s.cloth[:, 2] > 0))
 
 
-def herringbone(rng, base, other):
+CAMOUFLAGES = np.asarray([
+    [[0.24, 0.26, 0.14], [0.10, 0.12, 0.07], [0.33, 0.24, 0.15], [0.52, 0.47, 0.32]],
+    [[0.68, 0.58, 0.42], [0.52, 0.42, 0.29], [0.40, 0.32, 0.22], [0.78, 0.70, 0.56]],
+    [[0.45, 0.46, 0.47], [0.14, 0.14, 0.15], [0.28, 0.29, 0.30], [0.72, 0.73, 0.74]],
+    [[0.14, 0.20, 0.32], [0.06, 0.08, 0.14], [0.24, 0.33, 0.46], [0.45, 0.54, 0.62]],
+], np.float32)  # fmt: skip
+"""Four colours each: earth, sand, town, sea."""
+
+
+def camouflage(s, rng, _base, _other):
+    """Torn blots of four colours, larger ones below smaller ones."""
+    dyes = CAMOUFLAGES[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])]
+    scale, seed = rng.uniform(0.045, 0.09), _seed(rng)
+    p = s.cloth[:, :3] / scale * _rgb(0.8, 1.4, 0.8)
+    warp = np.stack([lattice(2.3 * p + k, seed + k) for k in range(3)], -1) - 0.5
+    result = np.broadcast_to(dyes[0], (len(p), 3))
+    for k, level in ((1, 0.56), (2, 0.6), (3, 0.66)):
+        blots = lattice((0.8 + 0.35 * k) * (p + 0.9 * warp) + 11.3 * k, seed + 10 * k)
+        result = mix(result, dyes[k], np.clip((blots - level) / 0.03 + 0.5, 0, 1))
+    return result
+
+
+def herringbone(s, rng, base, other):
     """Zigzags of slanted threads."""
     period, pitch, share = rng.choice([0.03, 0.045]), rng.choice([0.008, 0.012]), rng.uniform(0.35, 0.7)
-
-    def albedo(s):
-        side = np.abs((s.around / period) % 2 - 1) * period
-        phase = ((s.along + side) / pitch) % 1
-        return mix(base, base + share * (other - base), band(phase * pitch, 0, 0.5 * pitch))
-
-    return albedo
+    side = np.abs((s.around / period) % 2 - 1) * period
+    return mix(base, base + share * (other - base), _lines(s.along + side, pitch, 0.5 * pitch))
 
 
-def argyle(rng, base, other):
+def argyle(s, rng, base, other):
     """Diamonds with thin lines across."""
     period, third = rng.choice([0.06, 0.09]), accent(rng, other)
-
-    def albedo(s):
-        x, y = s.around / period, s.along / (1.6 * period)
-        u, v = (x + y) % 1, (x - y) % 1
-        diamond = band(u * period, 0, period / 2) * band(v * period, 0, period / 2)
-        lines = np.maximum(band(((u + 0.25) % 1) * period, 0, 0.003), band(((v + 0.25) % 1) * period, 0, 0.003))
-        return mix(mix(base, other, diamond), third, 0.8 * lines)
-
-    return albedo
+    x, y = s.around / period, s.along / (1.6 * period)
+    u, v = (x + y) % 1, (x - y) % 1
+    diamond = band(u * period, 0, period / 2) * band(v * period, 0, period / 2)
+    lines = np.maximum(*(band(((w + 0.25) % 1) * period, 0, 0.003) for w in (u, v)))
+    return mix(mix(base, other, diamond), third, 0.8 * lines)
 
 
-def dip_dye(rng, base, other):
+def dip_dye(s, rng, base, other):
     """One dye runs into another along the garment, or in rings around a middle (tie-dye)."""
     rings, level, wide = rng.random() < 0.5, rng.uniform(-0.35, 0.0), rng.uniform(0.05, 0.25)
-    seed, third = int(rng.integers(1 << 20)), accent(rng, other)
-
-    def albedo(s):
-        wobble = lattice(s.cloth[:, :3] / 0.05, seed) - 0.5
-        if not rings:
-            return mix(base, other, np.clip((s.along + 0.05 * wobble - level) / wide + 0.5, 0, 1))
-        r = np.sqrt(s.around**2 + (s.along + 0.1) ** 2) + 0.06 * wobble
-        a = np.arctan2(s.around, s.along + 0.1)
-        twist = (r / 0.13 + a / np.pi) % 1
-        return mix(mix(base, other, np.clip(np.abs(twist - 0.5) * 4 - 0.5, 0, 1)), third, band(twist, 0.4, 0.6, 0.15))
-
-    return albedo
+    wobble, third = lattice(s.cloth[:, :3] / 0.05, _seed(rng)) - 0.5, accent(rng, other)
+    if not rings:
+        return mix(base, other, np.clip((s.along + 0.05 * wobble - level) / wide + 0.5, 0, 1))
+    r = np.sqrt(s.around**2 + (s.along + 0.1) ** 2) + 0.06 * wobble
+    twist = (r / 0.13 + np.arctan2(s.around, s.along + 0.1) / np.pi) % 1
+    return mix(mix(base, other, np.clip(np.abs(twist - 0.5) * 4 - 0.5, 0, 1)), third, band(twist, 0.4, 0.6, 0.15))
 
 
-def tweed(rng, base, other):
+def tweed(s, rng, base, other):
     """Woven in two threads of nearly one colour."""
-    seed, share = int(rng.integers(1 << 20)), rng.uniform(0.08, 0.25)
-
-    def albedo(s):
-        warp = lattice(np.stack([s.around / 0.004, s.along / 0.02], -1), seed)
-        weft = lattice(np.stack([s.around / 0.02, s.along / 0.004], -1), seed + 1)
-        return mix(base, other, share * warp * weft * 2)
-
-    return albedo
+    seed, share = _seed(rng), rng.uniform(0.08, 0.25)
+    return mix(base, other, share * _grain(s, 0.004, 0.02, seed) * _grain(s, 0.02, 0.004, seed + 1) * 2)
 
 
-def cable_knit(rng, base, _other):
+def cable_knit(s, rng, base, _other):
     """Plaits of thick yarn: light and dark, no second dye."""
     period = rng.choice([0.05, 0.07])
-
-    def albedo(s):
-        x, y = (s.around / period) % 1 - 0.5, s.along / 0.045
-        strand = np.sin(2 * np.pi * (y + 0.8 * np.abs(x))) * np.sign(x)
-        inside = band(np.abs(x) * period, -1, 0.3 * period)
-        ribs = np.cos(2 * np.pi * s.around / 0.008)
-        return base * (1 + 0.13 * strand * inside + 0.07 * ribs * (1 - inside))[:, None]
-
-    return albedo
+    x, y = (s.around / period) % 1 - 0.5, s.along / 0.045
+    strand = np.sin(2 * np.pi * (y + 0.8 * np.abs(x))) * np.sign(x)
+    inside = band(np.abs(x) * period, -1, 0.3 * period)
+    ribs = np.cos(2 * np.pi * s.around / 0.008)
+    return base * (1 + 0.13 * strand * inside + 0.07 * ribs * (1 - inside))[:, None]
 
 
-def colour_blocks(rng, base, other):
+def colour_blocks(s, rng, base, other):
     """A chest (or thigh) in another dye, with a line between."""
     level, wide, third = rng.uniform(-0.15, 0.06), rng.uniform(0.01, 0.03), accent(rng, other)
-
-    def albedo(s):
-        upper = mix(base, other, band(s.along, level, 9.0))
-        return mix(upper, third, band(s.along, level - wide, level))
-
-    return albedo
+    return mix(mix(base, other, band(s.along, level, 9.0)), third, band(s.along, level - wide, level))
 
 
 PATTERNS: dict[str, tuple[float, Callable]] = {
-    "plain": (0.05, lambda rng, a, b: plain(rng, a)),
-    "stripes": (0.2, stripes),
-    "upright": (0.08, lambda rng, a, b: stripes(rng, a, b, upright=True)),
-    "checks": (0.17, checks),
-    "dots": (0.06, dots),
-    "flowers": (0.09, flowers),
-    "mottled": (0.05, mottled),
-    "camouflage": (0.05, camouflage),
-    "melange": (0.03, melange),
-    "blocks": (0.09, colour_blocks),
-    "herringbone": (0.03, herringbone),
-    "argyle": (0.03, argyle),
-    "dip_dye": (0.04, dip_dye),
-    "cable_knit": (0.03, cable_knit),
-    "tweed": (0.0, tweed),
-    "denim": (0.0, denim),
-}
-"""Odds among fabrics that are not plain, and (rng, base, other) -> colour as a function of points."""
+    "plain": (0.05, plain), "stripes": (0.2, stripes), "upright": (0.08, functools.partial(stripes, upright=True)),
+    "checks": (0.17, checks), "dots": (0.06, dots), "flowers": (0.09, flowers), "mottled": (0.05, mottled),
+    "camouflage": (0.05, camouflage), "melange": (0.03, melange), "blocks": (0.09, colour_blocks),
+    "herringbone": (0.03, herringbone), "argyle": (0.03, argyle), "dip_dye": (0.04, dip_dye),
+    "cable_knit": (0.03, cable_knit), "tweed": (0.0, tweed), "denim": (0.0, denim),
+}  # fmt: skip
+"""Odds among fabrics that are not plain, and the pattern."""

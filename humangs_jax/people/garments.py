@@ -13,13 +13,15 @@ from humangs_jax.people.kinematics import LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER
 from humangs_jax.people.noise import ripples
 from humangs_jax.people.surfaces import (
     Surface,
+    around,
     blurred,
     boundary_edges,
+    circle,
     cut,
-    grid_faces,
     hanging,
     polar,
     smooth,
+    tube,
     turn_in_hems,
     unit,
     vertex_normals,
@@ -63,10 +65,14 @@ def shell(rng: np.random.Generator, anatomy: Anatomy, fields: list[np.ndarray], 
     )
     for i in range(len(fields)):
         surface = cut(surface, surface.attributes[f"field{i}"])
-    draped = _drape(rng, anatomy, surface, fit)
-    weights = smooth_weights(draped.weights, draped.faces, 4)
-    kept = {name: draped.attributes[name] for name in ("template", "cloth")}
-    return turn_in_hems(Surface(draped.vertices, draped.faces, weights, kept), fit.hem)
+    return finished(_drape(rng, anatomy, surface, fit), 4, fit.hem)
+
+
+def finished(surface: Surface, iterations: int, hem: float) -> Surface:
+    """A surface with smoothed weights, hems turned in by a depth (metres), and no attributes but `template` and `cloth`."""
+    weights = smooth_weights(surface.weights, surface.faces, iterations)
+    kept = {name: surface.attributes[name] for name in ("template", "cloth")}
+    return turn_in_hems(Surface(surface.vertices, surface.faces, weights, kept), hem)
 
 
 def smooth_weights(weights: np.ndarray, faces: np.ndarray, iterations: int) -> np.ndarray:
@@ -81,10 +87,23 @@ def _drape(rng, anatomy, surface, fit):
     below, arm, leg = (surface.attributes[name] for name in ("skin_point", "arm", "leg"))
     normals = unit(smooth(surface.attributes["normals"], surface.faces, 2))
     points = smooth(below, surface.faces, 8, keep_hems=True) + fit.ease * normals
-    points = _push_trunk(anatomy, points, arm, leg, fit)
-    for side in (0, 1):
-        points = _push_arm(anatomy, points, arm, side, fit)
-        points = points if fit.skirted else _push_leg(anatomy, points, leg, side, fit)
+    below_armpit = 1 - smoothstep(-0.03, 0.06, points[:, 1] - anatomy.joints[LEFT_SHOULDER, 1] + ARM_HEIGHT)
+    angle, radius = polar(points[:, [0, 2]], np.zeros((1, 2)))
+    wanted = hanging(anatomy.trunk, fit.hang).radius(points[:, 1], angle) + fit.ease
+    grown = radius + (1 - arm) * (1 if fit.skirted else 1 - leg) * below_armpit * np.maximum(wanted - radius, 0)
+    points = points.astype(np.float64)
+    points[:, [0, 2]] *= (grown / np.maximum(radius, 1e-4))[:, None]
+    for side, sign in ((0, 1), (1, -1)):
+        outline, along = anatomy.arms[side], np.abs(points[:, 0])
+        start, end = outline.levels[0] + 0.12, outline.levels[-1] - 0.1
+        wider = fit.ease, fit.sleeve * np.clip((along - start) / (end - start), 0, 1)
+        points = _push(points, (1, 2), along, outline, arm * (sign * points[:, 0] > 0), *wider)
+        if not fit.skirted:
+            shape = anatomy.legs[side]
+            inner = shape.with_radii(np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii))
+            wider = fit.ease, fit.leg * np.clip((-0.45 - points[:, 1]) / 0.65, 0, 1)
+            own = leg * (sign * points[:, 0] > 0)
+            points = _push(points, (0, 2), points[:, 1], hanging(inner, fit.leg_hang), own, *wider)
     points = smooth(points, surface.faces, 3, keep_hems=True)
     seat = _over_the_seat(surface.attributes["template"])
     if seat.any():
@@ -92,8 +111,7 @@ def _drape(rng, anatomy, surface, fit):
     outer = vertex_normals(points, surface.faces)
     cloth = smooth(surface.attributes["cloth"], surface.faces, 10, keep_hems=True)  # as the points were
     template = smooth(surface.attributes["template"], surface.faces, 8, keep_hems=True)
-    along_limbs = sewn_coordinates(cloth, template)
-    points = points + fold_heights(rng, along_limbs, arm, leg, fit)[:, None] * outer
+    points = points + _fold_heights(rng, sewn_coordinates(cloth, template), arm, leg, fit)[:, None] * outer
     distance = np.sum((points - below) * surface.attributes["normals"], -1)
     least = max(0.55 * fit.ease, fit.inner)
     points = points + np.maximum(least - distance, 0)[:, None] * surface.attributes["normals"]
@@ -111,7 +129,7 @@ def _over_the_seat(template):
     return np.exp(-((x / 0.045) ** 2)) * smoothstep(0.22, 0.28, -y) * (y > -0.5)
 
 
-def fold_heights(rng, cloth: np.ndarray, arm: np.ndarray, leg: np.ndarray, fit: Fit) -> np.ndarray:
+def _fold_heights(rng, cloth, arm, leg, fit):
     """(n,) metres outwards: soft waves, drapes that fall from chest and hips, rings where joints and cuffs gather cloth."""
     along, around = cloth[:, 1], np.arctan2(cloth[:, 0], cloth[:, 2]) * cloth[:, 3]
     heights = fit.fold * ripples(rng, cloth[:, :3], wavelength=0.11)
@@ -122,12 +140,9 @@ def fold_heights(rng, cloth: np.ndarray, arm: np.ndarray, leg: np.ndarray, fit: 
     heights = heights + 0.8 * fit.fold * drapes * (1 - arm) * np.where(leg > 0.5, 0.35, 1.0)
     slanted = along + 0.25 * around + 0.012 * ripples(rng, cloth[:, :3], wavelength=0.12)
     rings = np.sin(2 * np.pi * slanted / 0.055) * (0.6 + 0.4 * ripples(rng, cloth[:, :3], wavelength=0.1))
-    elbows = arm * (np.exp(-(((along + 0.14) / 0.07) ** 2)) + 0.8 * np.exp(-(((along + 0.34) / 0.06) ** 2)))
-    knees = leg * (
-        np.exp(-(((along + 0.79) / 0.07) ** 2))
-        + 1.3 * np.exp(-(((along + 1.12) / 0.07) ** 2))
-        + 0.6 * np.exp(-(((along + 0.46) / 0.05) ** 2))
-    )
+    bend = lambda height, wide: np.exp(-(((along + height) / wide) ** 2))
+    elbows = arm * (bend(0.14, 0.07) + 0.8 * bend(0.34, 0.06))
+    knees = leg * (bend(0.79, 0.07) + 1.3 * bend(1.12, 0.07) + 0.6 * bend(0.46, 0.05))
     heights = heights + 1.3 * fit.fold * rings * (elbows + knees)
     heights = heights * (1 - smoothstep(fit.calm - 0.08, fit.calm, along))
     if fit.quilt > 0:
@@ -135,49 +150,15 @@ def fold_heights(rng, cloth: np.ndarray, arm: np.ndarray, leg: np.ndarray, fit: 
     return heights
 
 
-def _push_trunk(anatomy, points, arm, leg, fit):
-    outline = hanging(anatomy.trunk, fit.hang)
-    angle, radius = polar(points[:, [0, 2]], np.zeros((1, 2)))
-    wanted = outline.radius(points[:, 1], angle) + fit.ease
-    below_armpit = 1 - smoothstep(-0.03, 0.06, anatomy_height(anatomy, points))
-    amount = (1 - arm) * (1 if fit.skirted else 1 - leg) * below_armpit
-    grown = radius + amount * np.maximum(wanted - radius, 0)
-    scale = grown / np.maximum(radius, 1e-4)
-    return np.stack([points[:, 0] * scale, points[:, 1], points[:, 2] * scale], -1)
-
-
-def anatomy_height(anatomy: Anatomy, points: np.ndarray) -> np.ndarray:
-    """(n,) heights of points relative to the shoulders, moved so that they are about template y on the trunk."""
-    shoulders = anatomy.joints[LEFT_SHOULDER, 1]
-    return points[:, 1] - shoulders + ARM_HEIGHT
-
-
-def _push_arm(anatomy, points, arm, side, fit):
-    outline = anatomy.arms[side]
-    along = np.abs(points[:, 0])
-    start, end = outline.levels[0] + 0.12, outline.levels[-1] - 0.1
-    extra = fit.sleeve * np.clip((along - start) / (end - start), 0, 1)
-    center = outline.center(along)
-    angle, radius = polar(points[:, [1, 2]], center)
-    wanted = outline.radius(along, angle) + fit.ease + extra
-    own = (points[:, 0] > 0) if side == 0 else (points[:, 0] < 0)
-    scale = 1 + own * arm * np.maximum(wanted - radius, 0) / np.maximum(radius, 1e-4)
-    across = center + (points[:, [1, 2]] - center) * scale[:, None]
-    return np.stack([points[:, 0], across[:, 0], across[:, 1]], -1)
-
-
-def _push_leg(anatomy, points, leg, side, fit):
-    shape = anatomy.legs[side]
-    inner = shape.with_radii(np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii))
-    outline = hanging(inner, fit.leg_hang)
-    center = outline.center(points[:, 1])
-    angle, radius = polar(points[:, [0, 2]], center)
-    down = np.clip((-0.45 - points[:, 1]) / 0.65, 0, 1)
-    wanted = outline.radius(points[:, 1], angle) + fit.ease + fit.leg * down
-    own = (points[:, 0] > 0) if side == 0 else (points[:, 0] < 0)
-    scale = 1 + own * leg * np.maximum(wanted - radius, 0) / np.maximum(radius, 1e-4)
-    across = center + (points[:, [0, 2]] - center) * scale[:, None]
-    return np.stack([across[:, 0], points[:, 1], across[:, 1]], -1)
+def _push(points, across, along, outline, amount, ease, extra):
+    """Points moved away from an axis to `ease + extra` metres outside of an outline; along: (n,) on it; across: other axes."""
+    center, across = outline.center(along), list(across)
+    angle, radius = polar(points[:, across], center)
+    missing = np.maximum(outline.radius(along, angle) + ease + extra - radius, 0)
+    scale = 1 + amount * missing / np.maximum(radius, 1e-4)
+    points = points.copy()
+    points[:, across] = center + (points[:, across] - center) * scale[:, None]
+    return points
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,27 +183,21 @@ class Skirt:
 def skirt(rng: np.random.Generator, anatomy: Anatomy, cut_of: Skirt) -> Surface:
     """A tube around the hips and both legs."""
     rows = max(3, int(np.ceil((cut_of.top - cut_of.bottom) / TUBE_STEP)) + 1)
-    template_y = np.linspace(cut_of.top, cut_of.bottom, rows)
-    y = rest_height(anatomy, template_y)
-    angle = np.arange(TUBE_COLUMNS) * (2 * np.pi / TUBE_COLUMNS)
+    template_y, angle, faces = tube(np.linspace(cut_of.top, cut_of.bottom, rows), circle(TUBE_COLUMNS))
+    height = rest_height(anatomy, template_y)
     outline = blurred(hanging(anatomy.hips_and_legs, 0.15))
-    height, around = (x.reshape(-1) for x in np.meshgrid(y, angle, indexing="ij"))
-    down = np.repeat((cut_of.top - template_y) / max(cut_of.top - cut_of.bottom, 1e-6), TUBE_COLUMNS)
-    drop = np.repeat(cut_of.top - template_y, TUBE_COLUMNS)
-    radius = outline.radius(height, around) + cut_of.ease + cut_of.flare * np.maximum(drop - cut_of.cling, 0)
-    radius = radius - UNDER_A_HEM * np.clip(1 - (drop - cut_of.cling) / 0.06, 0, 1) * (cut_of.cling > 0)
-    pleats = np.cos(cut_of.pleats * around) if cut_of.pleats else 0
-    wave = ripples(rng, np.stack([np.sin(around), 0.3 * height, np.cos(around)], -1), wavelength=0.9)
-    loose = np.clip((drop - cut_of.cling) / 0.25, 0, 1) * down**0.5
+    drop = cut_of.top - template_y
+    below = drop - cut_of.cling
+    radius = outline.radius(height, angle) + cut_of.ease + cut_of.flare * np.maximum(below, 0)
+    radius = radius - UNDER_A_HEM * np.clip(1 - below / 0.06, 0, 1) * (cut_of.cling > 0)
+    pleats = np.cos(cut_of.pleats * angle) if cut_of.pleats else 0
+    wave = ripples(rng, around(1, angle, 0.3 * height), wavelength=0.9)
+    loose = np.clip(below / 0.25, 0, 1) * (drop / max(cut_of.top - cut_of.bottom, 1e-6)) ** 0.5
     radius = radius + loose * (cut_of.pleat_depth * pleats + 0.012 * (1 + 4 * cut_of.flare) * wave)
-    vertices = np.stack([radius * np.sin(around), height, radius * np.cos(around)], -1).astype(np.float32)
-    template = np.stack([0.16 * np.sin(around), np.repeat(template_y, TUBE_COLUMNS), 0.02 + 0.16 * np.cos(around)], -1)
-    cloth = np.stack([template[:, 0], template[:, 1], template[:, 2] - 0.02, np.full(len(template), 0.16)], -1)
-    faces = grid_faces(rows, TUBE_COLUMNS, closed=True)
-    weights = _skirt_weights(anatomy, vertices, template[:, 1])
-    surface = Surface(
-        vertices, faces, weights, {"template": template.astype(np.float32), "cloth": cloth.astype(np.float32)}
-    )
+    vertices = around(radius, angle, height).astype(np.float32)
+    template = around(0.16, angle, template_y, (0, 0.02))
+    surface = Surface(vertices, faces, _skirt_weights(anatomy, vertices, template_y))
+    surface = surface.painted(template, template - [0, 0, 0.02], 0.16)
     if cut_of.gap > 0:
         front = np.where(vertices[:, 2] > 0, np.abs(vertices[:, 0]) - cut_of.gap - cut_of.spread * drop, 1.0)
         surface = cut(surface, front)
@@ -252,13 +227,8 @@ def _skirt_weights(anatomy, vertices, template_y):
     thigh = 0.96 * smoothstep(0.27, 0.47, -template_y)
     shin = 0.92 * smoothstep(0.68, 0.9, -template_y)
     legs = np.zeros_like(trunk)
-    for joint, share in (
-        (LEFT_HIP, left * (1 - shin)),
-        (LEFT_HIP + 1, (1 - left) * (1 - shin)),
-        (LEFT_KNEE, left * shin),
-        (LEFT_KNEE + 1, (1 - left) * shin),
-    ):
-        legs[:, joint] = share
+    for side, share in ((0, left), (1, 1 - left)):
+        legs[:, LEFT_HIP + side], legs[:, LEFT_KNEE + side] = share * (1 - shin), share * shin
     return (trunk * (1 - thigh)[:, None] + legs * thigh[:, None]).astype(np.float32)
 
 

@@ -9,23 +9,24 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.people.anatomy import Anatomy, smoothstep
-from humangs_jax.people.garments import nearest_weights, smooth_weights
+from humangs_jax.people.garments import finished, nearest_weights
 from humangs_jax.people.kinematics import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3
 from humangs_jax.people.noise import ripples
 from humangs_jax.people.outfits import HEADWEAR, drawn, row
 from humangs_jax.people.surfaces import (
     Surface,
+    around,
     ball,
     blurred,
+    circle,
     cut,
-    grid_faces,
     hanging,
     join,
     outlines,
     rigid,
     smooth,
     sweep,
-    turn_in_hems,
+    tube,
     unit,
 )
 
@@ -130,16 +131,14 @@ def style(rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: fl
     cut_name, thick, shift = haircut.cut, haircut.thickness, haircut.receding
     parts = []
     if cut_name in LONG_CUTS:
-        parts.append(
-            falling_tube(rng, anatomy, thick, haircut.bottom, fringe(rng, haircut), wave=haircut.wave, over=over)
-        )
+        opening = fringe(rng, haircut)
+        parts.append(falling_tube(rng, anatomy, thick, haircut.bottom, opening, wave=haircut.wave, over=over))
     elif cut_name in ("curly", "afro"):
         bumps, size = (0.3, 0.035) if cut_name == "curly" else (0.1, 0.05)
         parts.append(scalp_shell(rng, anatomy, thick, bumps, shift=shift, bump_size=size))
     elif cut_name == "quiff":
-        parts.append(
-            scalp_shell(rng, anatomy, thick, 0.2, shift=shift, quiff=rng.uniform(0.012, 0.026), side=haircut.side)
-        )
+        up = rng.uniform(0.012, 0.026)
+        parts.append(scalp_shell(rng, anatomy, thick, 0.2, shift=shift, quiff=up, side=haircut.side))
     elif cut_name not in ("buzz", "bald"):
         bumps = 0.22 if cut_name == "short" else 0.12
         parts.append(scalp_shell(rng, anatomy, thick, bumps, shift=shift, bump_size=0.035, side=haircut.side))
@@ -161,17 +160,10 @@ def fringe(rng: np.random.Generator, haircut: Haircut) -> Callable[[np.ndarray, 
 
     def above(azimuths, height):
         a = azimuths * haircut.side
-        ragged = (
-            0.0035 * np.sin(23 * a + phase[0]) + 0.0025 * np.sin(41 * a + phase[1]) + 0.003 * np.sin(9 * a + phase[2])
-        )
-        return height - np.interp(a, angles, heights) - ragged
+        waves = zip((0.0035, 0.0025, 0.003), (23, 41, 9), phase, strict=True)
+        return height - np.interp(a, angles, heights) - sum(size * np.sin(n * a + p) for size, n, p in waves)
 
     return above
-
-
-def over_ears(haircut: Haircut) -> bool:
-    """Whether the hair hides the ears."""
-    return haircut.cut in LONG_CUTS
 
 
 def ears(template: np.ndarray) -> np.ndarray:
@@ -206,9 +198,8 @@ def scalp_shell(
 ) -> Surface:
     """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the hairline.
 
-    bumps: share of the thickness, `bump_size` metres wide. crown: metres that the top rises above that. quiff: metres that the
-    hair stands up above the forehead. side: +1 or -1 for a parting on that side of the head, 0 for none. rim: metres that its
-    edge stands off.
+    bumps: share of the thickness, `bump_size` metres wide. crown, quiff: metres that the top and the front rise above that.
+    side: +1 or -1 for a parting on that side of the head, 0 for none. rim: metres that its edge stands off.
     """
     template = anatomy.skin.attributes["template"]
     above = above_line(template, line, shift)
@@ -229,7 +220,7 @@ def scalp_shell(
     raised = quiff * smoothstep(0.02, 0.085, z) * smoothstep(0.375, 0.41, y)
     points = points + raised[:, None] * np.asarray([0.0, 0.95, 0.35])
     points[:, 1] += crown * smoothstep(0.39, 0.42, surface.attributes["template"][:, 1])
-    return _finish(surface.moved(points), 0.006)
+    return finished(surface.moved(points), 2, 0.006)
 
 
 def falling_tube(
@@ -262,42 +253,30 @@ def falling_tube(
     points = skin.vertices[trunk]
     back = blurred(outlines(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.02), 2)
 
-    angle = np.arange(TUBE_COLUMNS) * (2 * np.pi / TUBE_COLUMNS)
     top = CROWN + (CROWN - SKULL[1]) * (scale - 1)
     dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))
     rows = np.concatenate([dome, np.arange(SKULL[1] - 0.02, min(bottom, 0.3), -0.022)])
-    row_height, around = (x.reshape(-1) for x in np.meshgrid(rows, angle, indexing="ij"))
+    row_height, angle, faces = tube(rows, circle(TUBE_COLUMNS))
     height = to_rest(row_height)
     inner = center[1] + (height - center[1]) / scale
     brim, summit = to_rest(0.385), center[1] + (to_rest(top) - center[1]) / scale
     vault = np.sqrt(np.clip(1 - np.clip((inner - brim) / (summit - brim), 0, 1) ** 2, 0, 1))  # the dome above the brim
-    radius = scale * vault * falling.radius(np.minimum(inner, brim), around)
-    below = smoothstep(0.0, 0.12, SKULL[1] - row_height)
-    radius = np.maximum(
-        radius,
-        (back.radius(height, around) + (0.034 + over) * smoothstep(-0.23, -0.17, -row_height)) * (row_height < 0.24),
-    )
-    radius = radius + below * wave * ripples(
-        rng, np.stack([3 * np.sin(around), height * 4, 3 * np.cos(around)], -1), 1.2
-    )
-    vertices = np.stack([center[0] + radius * np.sin(around), height, center[2] + radius * np.cos(around)], -1)
-    sides = np.abs((around + np.pi) % (2 * np.pi) - np.pi)
+    radius = scale * vault * falling.radius(np.minimum(inner, brim), angle)
+    on_back = back.radius(height, angle) + (0.034 + over) * smoothstep(-0.23, -0.17, -row_height)
+    radius = np.maximum(radius, on_back * (row_height < 0.24))
+    waves = ripples(rng, around(3, angle, height * 4), 1.2)
+    radius = radius + smoothstep(0.0, 0.12, SKULL[1] - row_height) * wave * waves
+    vertices = around(radius, angle, height, center[[0, 2]]).astype(np.float32)
+    signed = (angle + np.pi) % (2 * np.pi) - np.pi
     front = 0.15 if ends is None else ends
-    ends = np.interp(sides, [0, 1.2, 1.75, 2.2, np.pi], [front, front, max(bottom, front), bottom, bottom])
-    ends = ends + 0.012 * ripples(rng, np.stack([5 * np.sin(around), 0 * around, 5 * np.cos(around)], -1), 1.5)
-    signed = (around + np.pi) % (2 * np.pi) - np.pi
-    field = np.minimum(opening(signed, row_height), row_height - ends)
-    flat = np.stack([0.09 * np.sin(around), row_height, SKULL[2] + 0.09 * np.cos(around)], -1).astype(np.float32)
-    weights = _falling_weights(anatomy, vertices.astype(np.float32), row_height)
-    faces = grid_faces(len(rows), TUBE_COLUMNS, closed=True)
-    surface = Surface(vertices.astype(np.float32), faces, weights, {"template": flat})
-    surface = surface.with_attributes(
-        cloth=np.concatenate(
-            [flat - np.asarray([0, 0, 0.02], np.float32), np.full((len(flat), 1), 0.09, np.float32)], 1
-        )
-    )
-    surface = cut(surface, field)
-    return _finish(surface.moved(smooth(surface.vertices, surface.faces, 1, keep_hems=True)), 0.008)
+    lowest = [front, front, max(bottom, front), bottom, bottom]
+    hem = np.interp(np.abs(signed), [0, 1.2, 1.75, 2.2, np.pi], lowest)
+    hem = hem + 0.012 * ripples(rng, around(5, angle, 0 * angle), 1.5)
+    flat = around(0.09, angle, row_height, SKULL[[0, 2]]).astype(np.float32)
+    surface = Surface(vertices, faces, _falling_weights(anatomy, vertices, row_height))
+    surface = surface.painted(flat, flat - np.asarray([0, 0, 0.02], np.float32), 0.09)
+    surface = cut(surface, np.minimum(opening(signed, row_height), row_height - hem))
+    return finished(surface.moved(smooth(surface.vertices, surface.faces, 1, keep_hems=True)), 2, 0.008)
 
 
 def bun(rng, anatomy: Anatomy, radius: float, elevation: float) -> Surface:
@@ -322,7 +301,7 @@ def ponytail(rng, anatomy: Anatomy, length: float, knots: float = 0.0) -> Surfac
     if knots:
         radius = 0.85 * radius * (1 + 0.22 * np.cos(2 * np.pi * length * t / knots))
     columns = 14
-    vertices, faces = sweep(line, np.tile([1.0, 0.0, 0.0], (rows, 1)), np.stack([radius, radius], -1), columns)
+    vertices, faces = sweep(line, np.asarray([1.0, 0.0, 0.0]), radius[:, None], columns)
     weights = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
     follow = smoothstep(0.1, 1.0, np.repeat(t, columns)) * 0.8
     weights[:, HEAD], weights[:, SPINE3] = 1 - follow, follow
@@ -351,16 +330,9 @@ def beard(rng, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
     normals = unit(smooth(surface.attributes["normals"], surface.faces, 4))
     full = smoothstep(0.0, 0.016, surface.attributes["above"])
     chin = smoothstep(0.25, 0.225, surface.attributes["template"][:, 1])
-    grown = (
-        thickness * full * (0.6 + 0.8 * chin) * (1 + 0.25 * ripples(rng, surface.attributes["template"], 0.02)) + 0.0010
-    )
-    return _finish(surface.moved(surface.vertices + grown[:, None] * normals), 0.002)
-
-
-def _finish(surface, depth):
-    weights = smooth_weights(surface.weights, surface.faces, 2)
-    kept = {name: surface.attributes[name] for name in ("template", "cloth")}
-    return turn_in_hems(Surface(surface.vertices, surface.faces, weights, kept), depth)
+    bumps = 1 + 0.25 * ripples(rng, surface.attributes["template"], 0.02)
+    grown = thickness * full * (0.6 + 0.8 * chin) * bumps + 0.0010
+    return finished(surface.moved(surface.vertices + grown[:, None] * normals), 2, 0.002)
 
 
 def _painted(surface):

@@ -20,32 +20,10 @@ LEFT_FOOT, RIGHT_FOOT, NECK, LEFT_COLLAR, RIGHT_COLLAR, HEAD = range(10, 16)
 LEFT_SHOULDER, RIGHT_SHOULDER, LEFT_ELBOW, RIGHT_ELBOW, LEFT_WRIST, RIGHT_WRIST = range(16, 22)
 LEFT_EYE, RIGHT_EYE, LEFT_HAND, RIGHT_HAND, JOINTS = 23, 24, 25, 40, 55
 
-LIMITS = {
-    PELVIS: 1.0,
-    LEFT_HIP: 1.7,
-    RIGHT_HIP: 1.7,
-    SPINE1: 0.35,
-    SPINE2: 0.35,
-    SPINE3: 0.35,
-    LEFT_KNEE: 2.1,
-    RIGHT_KNEE: 2.1,
-    LEFT_ANKLE: 0.8,
-    RIGHT_ANKLE: 0.8,
-    LEFT_FOOT: 0.9,
-    RIGHT_FOOT: 0.9,
-    NECK: 0.5,
-    HEAD: 0.5,
-    LEFT_COLLAR: 0.35,
-    RIGHT_COLLAR: 0.35,
-    LEFT_SHOULDER: 2.3,
-    RIGHT_SHOULDER: 2.3,
-    LEFT_ELBOW: 2.4,
-    RIGHT_ELBOW: 2.4,
-    LEFT_WRIST: 0.8,
-    RIGHT_WRIST: 0.8,
-}
-"""Largest rotation angle of each joint in the prior; fingers: FINGER_LIMIT; jaw and eyes stay at rest."""
 FINGER_LIMIT = 1.5
+LIMITS = np.asarray([1.0, 1.7, 1.7, 0.35, 2.1, 2.1, 0.35, 0.8, 0.8, 0.35, 0.9, 0.9, 0.5, 0.35, 0.35, 0.5, 2.3, 2.3, 2.4, 2.4,
+                     0.8, 0.8, 0, 0, 0, *[FINGER_LIMIT] * 30])  # fmt: skip
+"""Largest rotation angle of each joint in the prior; jaw and eyes stay at rest."""
 
 MIRROR = np.asarray([1.0, -1.0, -1.0])
 """The rotation vector of the mirrored rotation (left and right exchanged)."""
@@ -121,14 +99,9 @@ def between(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"], t: float
     return rotation_vector(first @ rotation_matrix(t * step))
 
 
-def about_x(angle: float) -> Matrix:
-    """Rotation about x: legs and feet swing backwards, heels up, for positive angles."""
-    return rotation_matrix(np.asarray([angle, 0.0, 0.0]))
-
-
-def about_y(angle: float) -> Matrix:
-    """Rotation about the vertical: to the left for positive angles."""
-    return rotation_matrix(np.asarray([0.0, angle, 0.0]))
+def turned(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Matrix:
+    """The rotation about (x, y, z) by its length. About x: legs and feet swing backwards, heels up; about y: to the left."""
+    return rotation_matrix(np.asarray([x, y, z], float))
 
 
 def joint_positions(build: Build, rotations: Rotations) -> tuple[Float[np.ndarray, "j 3 3"], Rotations]:
@@ -147,19 +120,12 @@ def joint_positions(build: Build, rotations: Rotations) -> tuple[Float[np.ndarra
 def limited(rotations: Rotations) -> Rotations:
     """Rotation vectors (j, 3) shortened to the limits of their joints."""
     angle = np.linalg.norm(rotations, axis=1)
-    return rotations * np.minimum(1, _limit_angles() / np.maximum(angle, 1e-9))[:, None]
+    return rotations * np.minimum(1, LIMITS / np.maximum(angle, 1e-9))[:, None]
 
 
 def excess(rotations: Rotations, joints: tuple[int, ...]) -> float:
     """By how much (radians) the worst of some joints exceeds its limit; negative if none does."""
-    return float(np.max(np.linalg.norm(rotations[list(joints)], axis=1) - _limit_angles()[list(joints)]))
-
-
-def _limit_angles():
-    limit = np.zeros(JOINTS)
-    limit[list(LIMITS)] = list(LIMITS.values())
-    limit[LEFT_HAND:] = FINGER_LIMIT
-    return limit
+    return float(np.max(np.linalg.norm(rotations[list(joints)], axis=1) - LIMITS[list(joints)]))
 
 
 # Legs ----------------------------------------------------------------------------------------------------------------
@@ -187,7 +153,7 @@ def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
     """Position of the ankle, the ground at y = 0, and orientation of the foot. side: 0 left, 1 right."""
     _, _, ankle, ball = LEGS[side]
     a, b = build.joints[ankle], build.joints[ball]
-    turn, orientation = about_y(foot.yaw), about_y(foot.yaw) @ about_x(foot.pitch)
+    turn, orientation = turned(y=foot.yaw), turned(y=foot.yaw) @ turned(x=foot.pitch)
     if foot.pitch >= 0:
         pivot, offset = np.asarray([0.0, b[1] - build.sole, 0.0]), a - b
     else:
@@ -225,9 +191,9 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: tuple[F
         bend = _knee_angle(thigh, shin, np.linalg.norm(target - start))
         # knees point between where the pelvis and where the foot looks
         across = turn[:, 0] + orientation[:, 0]
-        chain = thigh + about_x(bend) @ shin
+        chain = thigh + turned(x=bend) @ shin
         upper = _frame(target - start, across) @ _frame(chain, np.asarray([1.0, 0.0, 0.0])).T
-        lower = upper @ about_x(bend)
+        lower = upper @ turned(x=bend)
         rotations[hip] = rotation_vector(turn.T @ upper)
         rotations[knee] = [bend, 0, 0]
         rotations[ankle] = rotation_vector(lower.T @ orientation)

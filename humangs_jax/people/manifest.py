@@ -39,24 +39,17 @@ def begin_set(folder: str | Path, split: str, settings: dict[str, Any]) -> None:
         write_manifest(folder, split, settings)
         return
     earlier, file = read_manifest(folder), folder / MANIFEST
-    if earlier["generator_version"] != GENERATOR_VERSION:
-        raise ValueError(
-            f"{file}: written by version {earlier['generator_version']} of the generator, this is version "
-            f"{GENERATOR_VERSION}: choose another folder"
-        )
-    if earlier["split"] != split:
-        raise ValueError(
-            f"{file}: people of the split '{earlier['split']}', now asked for '{split}': choose another folder"
-        )
-    changed = [
-        f"{name} {earlier['settings'].get(name)} -> {settings.get(name)}"
-        for name in sorted(settings.keys() | earlier["settings"].keys())
-        if earlier["settings"].get(name) != settings.get(name)
-    ]
-    if changed:
-        raise ValueError(
-            f"{file}: written with settings other than asked for now ({', '.join(changed)}): choose another folder"
-        )
+    pairs = {name: (earlier["settings"].get(name), settings.get(name)) for name in {**settings, **earlier["settings"]}}
+    changed = [f"{name} {old} -> {new}" for name, (old, new) in sorted(pairs.items()) if old != new]
+    version, problem = earlier["generator_version"], ""
+    if version != GENERATOR_VERSION:
+        problem = f"written by version {version} of the generator, this is version {GENERATOR_VERSION}"
+    elif earlier["split"] != split:
+        problem = f"people of the split '{earlier['split']}', now asked for '{split}'"
+    elif changed:
+        problem = f"written with settings other than asked for now ({', '.join(changed)})"
+    if problem:
+        raise ValueError(f"{file}: {problem}: choose another folder")
 
 
 def write_manifest(folder: str | Path, split: str, settings: dict[str, Any]) -> None:

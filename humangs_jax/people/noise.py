@@ -1,6 +1,14 @@
-"""Smooth random functions of position: sums of plane waves (cheap, band-limited) and lattice noise (irregular)."""
+"""Random choices; smooth random functions of position: plane waves (cheap, band-limited) and lattice noise (irregular)."""
+
+from collections.abc import Mapping
 
 import numpy as np
+
+
+def choice(rng: np.random.Generator, odds: Mapping[str, float | int]) -> str:
+    """One of the names, by its odds."""
+    shares = np.asarray(list(odds.values()), float)
+    return str(rng.choice(list(odds), p=shares / shares.sum()))
 
 
 def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float, waves: int = 6) -> np.ndarray:
@@ -35,10 +43,8 @@ class Folds:
     """
 
     def __init__(self, rng: np.random.Generator, wavelength: float = 0.09, directions: int = 6, upright: bool = False):
-        tilt, turn = (
-            rng.uniform(*((1.25, 1.57) if upright else (0.5, 1.5)), directions),
-            rng.uniform(0, 2 * np.pi, directions),
-        )
+        tilt = rng.uniform(*((1.25, 1.57) if upright else (0.5, 1.5)), directions)
+        turn = rng.uniform(0, 2 * np.pi, directions)
         k = np.stack([np.sin(tilt) * np.cos(turn), np.cos(tilt), np.sin(tilt) * np.sin(turn)], -1)
         self.directions = k.astype(np.float32)
         self.k = (k * (2 * np.pi / wavelength * rng.uniform(0.6, 1.4, (directions, 1)))).astype(np.float32)
@@ -67,7 +73,7 @@ def lattice(points: np.ndarray, seed: int) -> np.ndarray:
     total = np.zeros(len(points), np.float32)
     for corner in range(1 << points.shape[1]):
         bits = [(corner >> axis) & 1 for axis in range(points.shape[1])]
-        weight = np.ones(len(points), np.float32)
+        weight = np.float32(1)
         for axis, bit in enumerate(bits):
             weight = weight * (t[:, axis] if bit else 1 - t[:, axis])
         total += weight * hashed(cell + np.asarray(bits), seed)

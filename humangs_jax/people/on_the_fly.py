@@ -1,9 +1,8 @@
 """People on the fly: a pure, jittable function of a key, from a bank of dressed people to views to learn from.
 
 A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two similar poses of the
-person's own), light and cameras, and draws the views with the project's rasterizer. The same key gives the same bits on the
-same platform; only jax.numpy runs, on CPU, GPU and TPU. Differences from `rendering.render_view`: colours come from baked
-textures, normals are skinned instead of measured, vertices follow a few joints each.
+person's own), light and cameras. The same key gives the same bits on the same platform. Differences from
+`rendering.render_view`: colours come from baked textures, normals are skinned, vertices follow a few joints each.
 
     bank = load_bank("people.npz")
     example = jax.jit(on_the_fly_example, static_argnames="config")(bank, key, OnTheFlyConfig())
@@ -12,7 +11,6 @@ textures, normals are skinned instead of measured, vertices follow a few joints 
 
 import dataclasses
 import math
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -62,11 +60,8 @@ def between(a: Float[Array, "j 3"], b: Float[Array, "j 3"], amount: Float[Array,
     angle = jnp.arccos(jnp.clip(jnp.abs(cosine), 0, 1))
     near = angle < 1e-3
     sine = jnp.where(near, 1.0, jnp.sin(angle))
-    mixed = (
-        jnp.where(near, 1 - amount, jnp.sin((1 - amount) * angle) / sine) * p
-        + jnp.where(near, amount, jnp.sin(amount * angle) / sine) * q
-    )
-    return quaternion.to_axis_angle(mixed)
+    share = lambda t: jnp.where(near, t, jnp.sin(t * angle) / sine)
+    return quaternion.to_axis_angle(share(1 - amount) * p + share(amount) * q)
 
 
 def pose_person(
@@ -91,8 +86,7 @@ def _blend(transforms: Float[Array, "j 12"], ids: UInt8[Array, "n k"], weights: 
     return sum(weights[:, i : i + 1] * transforms[ids[:, i].astype(jnp.int32)] for i in range(ids.shape[1]))
 
 
-BACKGROUND = 1.0
-DARKEST_ALBEDO = 0.01
+BACKGROUND, DARKEST_ALBEDO = 1.0, 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -152,7 +146,7 @@ def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_T
     """Views of a person of the bank: inputs and targets."""
     numbers = _draw_numbers(bank, key, config)
     scene = scene_from(numbers, bank, config)
-    plans = _input_plan(numbers, config), _target_plan(numbers, config)
+    plans = _plans(numbers, config)
     if config.input_size == config.target_size:  # one loop over all views: half of the compilation
         both = jax.tree.map(lambda *parts: jnp.concatenate(parts), *plans)
         views = _views(bank, scene, both, config, config.input_size)
@@ -167,22 +161,11 @@ def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_T
 
 def _draw_numbers(bank, key, config):
     """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
-    inputs, targets = config.input_views, config.target_views
-    shapes = {
-        "person": (),
-        "poses": (config.poses, 2),
-        "lights": (LIGHT_NUMBERS,),
-        "dyed": (),
-        "dyes": (4, bank.groups.shape[1]),
-        "mirrored": (),
-        "mixed": (),
-        "input_azimuths": (2 + 2 * inputs,),
-        "input_poses": (inputs,),
-        "input_cameras": (inputs, CAMERA_NUMBERS),
-        "target_azimuths": (2 + 2 * targets,),
-        "target_poses": (targets,),
-        "target_cameras": (targets, CAMERA_NUMBERS),
-    }
+    shapes = {"person": (), "poses": (config.poses, 2), "lights": (LIGHT_NUMBERS,), "dyed": ()}
+    shapes |= {"dyes": (4, bank.groups.shape[1]), "mirrored": (), "mixed": ()}
+    for name, count in (("input", config.input_views), ("target", config.target_views)):
+        shapes |= {f"{name}_azimuths": (2 + 2 * count,), f"{name}_poses": (count,)}
+        shapes |= {f"{name}_cameras": (count, CAMERA_NUMBERS)}
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
     parts = jnp.split(jax.random.uniform(key, (ends[-1],)), ends[:-1])
     return {name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
@@ -217,50 +200,37 @@ def make_scene(
     return Scene(person, rotations, translations, vertices, corners, dye, lights)
 
 
-class _Plan(NamedTuple):
-    """Views to draw (v,): numbers for their cameras (v, c), azimuths, numbers of poses, shares of close cameras."""
-
-    cameras: Float[Array, "v c"]
-    azimuths: Float[Array, " v"]
-    poses: Int[Array, " v"]
-    close_shares: Float[Array, " v"]
-
-
-def _input_plan(numbers, config):
+def _plans(numbers, config):
+    """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares of close cameras (v,)."""
     azimuths = azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share)
-    mixed = numbers["mixed"] < config.mixed_pose_share
-    poses = jnp.where(mixed, pick(numbers["input_poses"], config.poses), 0)
-    return _Plan(numbers["input_cameras"], azimuths, poses, jnp.zeros(config.input_views))
+    own, other = (pick(numbers[name], config.poses) for name in ("input_poses", "target_poses"))
+    own = jnp.where(numbers["mixed"] < config.mixed_pose_share, own, 0)
+    anywhere, close = (
+        azimuths_from(numbers["target_azimuths"], 0.0, 1.0),
+        jnp.full(config.target_views, config.close_share),
+    )
+    inputs = numbers["input_cameras"], azimuths, own, jnp.zeros(config.input_views)
+    return inputs, (numbers["target_cameras"], anywhere, other, close)
 
 
-def _target_plan(numbers, config):
-    azimuths = azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
-    close_shares = jnp.full(config.target_views, config.close_share)
-    return _Plan(numbers["target_cameras"], azimuths, pick(numbers["target_poses"], config.poses), close_shares)
-
-
-def _views(bank, scene, plan: _Plan, config, size):
+def _views(bank, scene, plan, config, size):
     """Views of some of the scene's poses."""
 
     def view(plan):
-        vertices, count = scene.vertices[plan.poses], bank.vertex_counts[scene.person]
-        camera = camera_from(plan.cameras, vertices, count, plan.azimuths, plan.close_shares, size)
-        return *draw_view(bank, scene, plan.poses, camera, config), camera
+        u, azimuth, pose, close_share = plan
+        camera = camera_from(u, scene.vertices[pose], bank.vertex_counts[scene.person], azimuth, close_share, size)
+        return *draw_view(bank, scene, pose, camera, config), camera
 
-    images, masks, cameras = lax.map(view, plan, batch_size=_batch(config, len(plan.poses)))
-    return SubjectViews(
-        images, masks, cameras, scene.rotations[plan.poses], scene.translations[plan.poses], bank.betas[scene.person]
-    )
+    poses = plan[2]
+    batch = None if config.views_at_once == 1 else min(config.views_at_once, len(poses))
+    images, masks, cameras = lax.map(view, plan, batch_size=batch)
+    betas = bank.betas[scene.person]
+    return SubjectViews(images, masks, cameras, scene.rotations[poses], scene.translations[poses], betas)
 
 
 def _some(views, part):
     """Views of a range; betas have no axis of views."""
-    chosen = jax.tree.map(lambda x: x[part], replace(views, betas=None))
-    return replace(chosen, betas=views.betas)
-
-
-def _batch(config, count):
-    return None if config.views_at_once == 1 else min(config.views_at_once, count)
+    return replace(jax.tree.map(lambda x: x[part], replace(views, betas=None)), betas=views.betas)
 
 
 def draw_view(

@@ -13,6 +13,7 @@ import numpy as np
 
 from humangs_jax.people.anatomy import WRIST
 from humangs_jax.people.fabrics import Fabric, sample_fabric
+from humangs_jax.people.noise import choice
 
 TOPS = ("tank", "tee", "longsleeve", "polo", "shirt", "blouse", "sweater", "turtleneck", "hoodie", "jersey")
 OUTER = ("jacket", "denim_jacket", "blazer", "cardigan", "vest", "puffer", "coat", "hooded_jacket")
@@ -111,8 +112,7 @@ def drawn(rng: np.random.Generator, specification: Any, **named: float) -> Any:
     if isinstance(specification, tuple):
         return rng.uniform(*specification)
     if isinstance(specification, Mapping):
-        odds = np.asarray(list(specification.values()), float)
-        return str(rng.choice(list(specification), p=odds / odds.sum()))
+        return choice(rng, specification)
     if isinstance(specification, OneOf):
         return rng.choice([drawn(rng, option, **named) for option in specification.options], p=specification.odds)
     return named.get(specification, specification)
@@ -213,12 +213,8 @@ def _top(rng, style, kind, male, waist, tucked, outer):
             details.add(detail)
     if tucked:
         details.add("tucked")
-    sizes = {
-        "sleeve": float(min(sleeve, WRIST - 0.01) if outer else sleeve),
-        "bottom": bottom,
-        "loose": min(loose, 0.2) if outer or tucked else loose,
-        "depth": rng.uniform(0.04, 0.095),
-    }
+    sleeve, loose = float(min(sleeve, WRIST - 0.01) if outer else sleeve), min(loose, 0.2) if outer or tucked else loose
+    sizes = {"sleeve": sleeve, "bottom": bottom, "loose": loose, "depth": rng.uniform(0.04, 0.095)}
     plainness = 0.55 if style == "formal" else PLAIN_TOPS.get(kind, 0.35)
     return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
 
@@ -263,10 +259,8 @@ def _dress(rng, outer):
         "waist": rng.uniform(-0.235, -0.165),
         "end": end,
         "flare": rng.uniform(0.015, 0.17),
-        "depth": rng.uniform(0.04, 0.1),
-        "loose": 0.1 if outer else rng.uniform(0.0, 0.4),
-        **_pleats(rng, kind),
     }
+    sizes |= {"depth": rng.uniform(0.04, 0.1), "loose": 0.1 if outer else rng.uniform(0.0, 0.4), **_pleats(rng, kind)}
     details = {neck} | ({"sash"} if rng.random() < 0.35 else set())
     return [Garment(kind, sample_fabric(rng, kind, 0.3), sizes, frozenset(details))]
 
@@ -285,14 +279,9 @@ def _outer(rng, style, worn):
         if not is_open and rng.random() < 0.4:
             details.add("sash")
     details |= {"blazer": {"lapels"}, "jacket": {"collar"}, "denim_jacket": {"collar"}}.get(kind, set())
-    sizes = {
-        "sleeve": 0.2 if kind == "vest" else WRIST - rng.uniform(0.0, 0.035),
-        "bottom": bottom,
-        "gap": rng.uniform(0.012, 0.05) if is_open else -1.0,
-        "spread": rng.uniform(0.05, 0.35),
-        "flare": rng.uniform(0.02, 0.1),
-        "loose": rng.uniform(0.2, 1.0),
-    }
+    sizes = {"sleeve": 0.2 if kind == "vest" else WRIST - rng.uniform(0.0, 0.035), "bottom": bottom}
+    sizes |= {"gap": rng.uniform(0.012, 0.05) if is_open else -1.0, "spread": rng.uniform(0.05, 0.35)}
+    sizes |= {"flare": rng.uniform(0.02, 0.1), "loose": rng.uniform(0.2, 1.0)}
     if kind == "vest":
         sizes["sleeve"] = rng.uniform(0.145, 0.165)
     fabric = sample_fabric(rng, kind, 0.9 if kind in ("blazer", "coat", "puffer") else 0.72)
@@ -345,12 +334,12 @@ def _extras(rng, style, male, years, worn):
 
     if not hooded and rng.random() < style.scarf:
         put("scarf", 0.35, thickness=rng.uniform(0.022, 0.038), tails=rng.choice([0.0, rng.uniform(0.15, 0.4)]))
-    choice = rng.random()
+    left = rng.random()
     for kind, odds in (style.headwear if male else {**style.headwear, "headscarf": 0.06}).items():
-        if choice < odds and not hooded and not (kind == "headscarf" and "scarf" in kinds):
+        if left < odds and not hooded and not (kind == "headscarf" and "scarf" in kinds):
             put(kind, 0.8, brim=rng.uniform(0.045, 0.085), backwards=float(kind == "cap" and rng.random() < 0.12))
             break
-        choice -= odds
+        left -= odds
     eyes = rng.random()
     if eyes < 0.2 + 0.15 * (years > 50):
         put("glasses", 1.0, size=rng.uniform(0.85, 1.2), squareness=rng.uniform(2, 6), wire=rng.uniform(0.0011, 0.0028))

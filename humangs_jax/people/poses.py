@@ -10,6 +10,7 @@ import numpy as np
 
 from humangs_jax.people import kinematics as kin
 from humangs_jax.people.arms import bend_arm, draw_goal, pose_hand
+from humangs_jax.people.noise import choice
 
 TRIES = 20
 """Stances tried until one is within the limits of the joints; after that the person stands upright."""
@@ -30,35 +31,36 @@ class Stance:
     lean: float = 0.0
 
 
-def sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations) -> tuple[Stance, np.ndarray]:
-    """Set legs and pelvis in `rotations`, keeping the pelvis's heading. Returns the stance and the pelvis's position (3,)."""
-    names = list(STANCES)
-    odds = np.asarray([STANCES[name][0] for name in names])
-    heading = rotations[kin.PELVIS].copy()
+def sample_stance(rng: np.random.Generator, build: kin.Build, rotations: kin.Rotations) -> Stance:
+    """Set legs and pelvis in `rotations`, keeping the pelvis's heading; returns the stance."""
+    heading, width = rotations[kin.PELVIS, 1], build.hip_width / build.leg
     for _ in range(TRIES):
-        stance = STANCES[names[rng.choice(len(names), p=odds / odds.sum())]][1](rng, build.hip_width / build.leg)
-        pelvis, missed = take_stance(build, rotations, heading[1], stance)
+        stance = STANCES[choice(rng, {name: odds for name, (odds, _) in STANCES.items()})][1](rng, width)
+        _, missed = take_stance(build, rotations, heading, stance)
         if missed < 1e-6 and kin.excess(rotations, tuple(j for leg in kin.LEGS for j in leg)) < 0:
-            return stance, pelvis
-    stance = _stand(rng, build.hip_width / build.leg)
-    return stance, take_stance(build, rotations, heading[1], stance)[0]
+            return stance
+    stance = _stand(rng, width)
+    take_stance(build, rotations, heading, stance)
+    return stance
 
 
 def take_stance(build: kin.Build, rotations: kin.Rotations, heading: float, stance: Stance) -> tuple[kin.Vector, float]:
     """Set pelvis and legs. Returns the pelvis's position, the ground at y = 0, and the larger error of the two feet, metres."""
-    turn = kin.about_y(heading) @ kin.rotation_matrix(np.asarray([stance.tilt, 0.0, stance.roll]))
+    turn = kin.turned(y=heading) @ kin.turned(x=stance.tilt, z=stance.roll)
     rotations[kin.PELVIS] = kin.rotation_vector(turn)
-    left, right = (in_world(foot, build.leg, heading) for foot in stance.feet)
-    feet = left, right
+    feet = in_world(stance.feet, build.leg, heading)
     height = kin.highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg
     pelvis = np.asarray([0.0, height, 0.0])
     return pelvis, kin.place_feet(build, rotations, pelvis, feet)
 
 
-def in_world(foot: kin.Foot, leg: float, heading: float) -> kin.Foot:
-    """A foot of a stance (lengths in legs, unturned) in metres, turned by the heading."""
-    x, _, z = kin.about_y(heading) @ np.asarray([foot.x * leg, 0.0, foot.z * leg])
-    return kin.Foot(float(x), float(z), heading + foot.yaw, foot.pitch, foot.lift * leg)
+def in_world(feet: tuple[kin.Foot, kin.Foot], leg: float, heading: float) -> tuple[kin.Foot, kin.Foot]:
+    """The feet of a stance (lengths in legs, unturned) in metres, turned by the heading."""
+    placed = []
+    for foot in feet:
+        x, _, z = kin.turned(y=heading) @ np.asarray([foot.x * leg, 0.0, foot.z * leg])
+        placed.append(kin.Foot(float(x), float(z), heading + foot.yaw, foot.pitch, foot.lift * leg))
+    return placed[0], placed[1]
 
 
 def _pair(rng, width, *, spread=(0.0, 0.08), apart=(0.0, 0.06), turn_out=(-0.05, 0.35)):
@@ -80,12 +82,8 @@ def _contrapposto(rng, width):
     shift = rng.uniform(0.4, 1.0) * width * sign  # the standing foot comes below the pelvis
     feet = [dataclasses.replace(foot, x=foot.x + shift) for foot in feet]
     z = feet[relaxed].z + rng.uniform(0.0, 0.28)
-    feet[relaxed] = dataclasses.replace(
-        feet[relaxed],
-        z=z,
-        pitch=rng.choice([0.0, rng.uniform(0.1, 0.5)]),
-        yaw=feet[relaxed].yaw + sign * rng.uniform(0, 0.3),
-    )
+    pitch, yaw = rng.choice([0.0, rng.uniform(0.1, 0.5)]), feet[relaxed].yaw + sign * rng.uniform(0, 0.3)
+    feet[relaxed] = dataclasses.replace(feet[relaxed], z=z, pitch=pitch, yaw=yaw)
     return Stance(tuple(feet), sink=rng.uniform(0.0, 0.01), roll=-sign * rng.uniform(0.03, 0.12))
 
 
@@ -141,29 +139,21 @@ def _one_leg(rng, width):
     else:
         x, lift = x + sign * rng.uniform(0.2, 0.5), rng.uniform(0.05, 0.3)
     feet[raised] = kin.Foot(x, z, feet[raised].yaw, pitch, lift)
-    return Stance(
-        tuple(feet), sink=rng.uniform(0.0, 0.05), roll=sign * rng.uniform(0, 0.08), lean=rng.uniform(-0.05, 0.1)
-    )
+    sink, roll = rng.uniform(0.0, 0.05), sign * rng.uniform(0, 0.08)
+    return Stance(tuple(feet), sink=sink, roll=roll, lean=rng.uniform(-0.05, 0.1))
 
 
 def _tiptoe(rng, width):
     pitch = rng.uniform(0.3, 0.8)
-    return Stance(
-        tuple(dataclasses.replace(foot, pitch=pitch) for foot in _pair(rng, width)), sink=rng.uniform(0, 0.03)
-    )
+    feet = [dataclasses.replace(foot, pitch=pitch) for foot in _pair(rng, width)]
+    return Stance(tuple(feet), sink=rng.uniform(0, 0.03))
 
 
 STANCES: dict[str, tuple[float, Callable[[np.random.Generator, float], Stance]]] = {
-    "stand": (0.26, _stand),
-    "contrapposto": (0.2, _contrapposto),
-    "stride": (0.22, _stride),
-    "wide": (0.08, _wide),
-    "squat": (0.06, _squat),
-    "lunge": (0.05, _lunge),
-    "side lunge": (0.04, _side_lunge),
-    "one leg": (0.07, _one_leg),
+    "stand": (0.26, _stand), "contrapposto": (0.2, _contrapposto), "stride": (0.22, _stride), "wide": (0.08, _wide),
+    "squat": (0.06, _squat), "lunge": (0.05, _lunge), "side lunge": (0.04, _side_lunge), "one leg": (0.07, _one_leg),
     "tiptoe": (0.02, _tiptoe),
-}
+}  # fmt: skip
 """Name -> probability, and a function of a generator and the distance of a hip from the middle in legs."""
 
 
@@ -179,7 +169,7 @@ def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotation
     """(j, 3) rotation vectors of a random plausible pose; the lowest points of planted feet are at one height."""
     rotations = np.zeros((kin.JOINTS, 3))
     rotations[kin.PELVIS] = [0.0, rng.uniform(-0.7, 0.7), 0.0]
-    stance, _ = sample_stance(rng, build, rotations)
+    stance = sample_stance(rng, build, rotations)
     bend_trunk(rng, rotations, stance.lean, stance.roll)
     both, goal = rng.random() < BOTH_ARMS, draw_goal(rng)
     for side in (0, 1):

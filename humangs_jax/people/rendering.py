@@ -70,9 +70,8 @@ def render_view(
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
     """(h, w, 3) image on the background and (h, w) coverage of one camera, both in [0, 1]."""
     s, subject = SUPERSAMPLING, posed.subject
-    fragments = rasterize_mesh(
-        *padded(posed.vertices, subject.surface.faces), camera.resized(camera.width * s, camera.height * s)
-    )
+    fine = camera.resized(camera.width * s, camera.height * s)
+    fragments = rasterize_mesh(*padded(posed.vertices, subject.surface.faces), fine)
     ids = np.asarray(fragments.face_ids).reshape(-1)
     seen = np.flatnonzero(ids >= 0)
     weights = np.asarray(fragments.barycentrics).reshape(-1, 3)[seen]
@@ -107,17 +106,9 @@ def light_points(
     for start in range(0, len(face_ids), POINT_STEP):
         part = slice(start, start + POINT_STEP)
         ids = face_ids[part]
-        points = (
-            values[faces[ids]].reshape(-1, 15),
-            weights[part],
-            behind[ids],
-            albedo[part],
-            slopes[part],
-            sheen[ids],
-        )
-        spare = POINT_STEP - len(ids)
-        points = (np.pad(x, [(0, spare)] + [(0, 0)] * (x.ndim - 1)) for x in points)
-        colors.append(np.asarray(_light_points(subject.lights, *points))[: len(ids)])
+        points = values[faces[ids]].reshape(-1, 15), weights[part], behind[ids], albedo[part], slopes[part], sheen[ids]
+        full = (np.pad(x, [(0, POINT_STEP - len(ids))] + [(0, 0)] * (x.ndim - 1)) for x in points)
+        colors.append(np.asarray(_light_points(subject.lights, *full))[: len(ids)])
     return np.concatenate(colors)
 
 
@@ -136,10 +127,8 @@ def paint(subject: SyntheticSubject, face_ids: Int[np.ndarray, " n"], spots: Spo
     albedo, slope = np.empty((len(face_ids), 3), np.float32), np.zeros((len(face_ids), 3), np.float32)
     order = np.argsort(material_ids, kind="stable")
     bounds = np.searchsorted(material_ids[order], np.arange(len(subject.materials) + 1))
-    for k, material in enumerate(subject.materials):
-        chosen = order[bounds[k] : bounds[k + 1]]
-        if len(chosen) == 0:
-            continue
+    for k in np.unique(material_ids):
+        material, chosen = subject.materials[k], order[bounds[k] : bounds[k + 1]]
         own = Spots(spots.cloth[chosen], spots.template[chosen])
         albedo[chosen] = material.albedo(own)
         if material.wrinkles > 0:
@@ -193,10 +182,7 @@ def write_maps(
     maps: SurfaceMaps,
     camera: Camera,
 ) -> None:
-    """An OpenEXR file: R, G, B premultiplied by A, depth Z, position.X/Y/Z, the camera in the header.
-
-    image: as rendered on white.
-    """
+    """An OpenEXR file: R, G, B (image: on white) premultiplied by A, depth Z, position.X/Y/Z, the camera in the header."""
     rgba = np.concatenate([image - (1 - mask[..., None]), mask[..., None]], axis=-1)
     channels = {f"position.{axis}": maps.position[..., i] for i, axis in enumerate("XYZ")}
     K, cam_from_world = np.asarray(camera.K), np.asarray(camera.cam_from_world)

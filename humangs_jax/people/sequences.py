@@ -13,6 +13,7 @@ import numpy as np
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.people import kinematics as kin
 from humangs_jax.people.arms import ARMS, arm_clearance, bend_arm, draw_goal, pose_hand
+from humangs_jax.people.noise import choice
 from humangs_jax.people.poses import STANCES, bend_trunk, in_world
 
 FPS = 30.0
@@ -51,8 +52,7 @@ def sample_sequence(rng: np.random.Generator, build: kin.Build, frames: int = 60
     if frames < 1:
         raise ValueError(f"frames: expected at least 1, got {frames}")
     if kind is None:
-        odds = np.asarray([odds for odds, _ in KINDS.values()])
-        kind = list(KINDS)[rng.choice(len(KINDS), p=odds / odds.sum())]
+        kind = choice(rng, {name: odds for name, (odds, _) in KINDS.items()})
     if kind not in KINDS:
         raise ValueError(f"no kind of sequence {kind!r}: expected one of {', '.join(KINDS)}")
     rotations, pelvis, planted = KINDS[kind][1](rng, build, frames)
@@ -64,10 +64,8 @@ def sample_sequence(rng: np.random.Generator, build: kin.Build, frames: int = 60
 
 @dataclasses.dataclass(frozen=True)
 class Gait:
-    """Parameters of walking or turning.
-
-    cadence: strides a second. step: metres forward per step. bend: radians turned per step. width: metres from the line that
-    a foot keeps. lift: metres that a swinging foot is raised. turn_out: of the feet. swing: of the arms, radians.
+    """cadence: strides a second. step: metres forward per step. bend: radians turned per step. width: metres of a foot from the
+    line. lift: metres that a swinging foot is raised. turn_out: of the feet. swing: of the arms, radians.
     """
 
     cadence: float
@@ -125,17 +123,14 @@ def _step_along(rng, build, frames, gait):
     for i, p in enumerate(phase):
         once = 2 * np.pi * p
         roll = 0.05 * np.sin(once - 0.1) * min(1.0, gait.step / build.leg + 0.3)
-        turns[i] = kin.about_y(heading(p) - twist * np.cos(once)) @ kin.rotation_matrix(
-            np.asarray([0.4 * lean, 0, roll])
-        )
+        turns[i] = kin.turned(y=heading(p) - twist * np.cos(once)) @ kin.turned(x=0.4 * lean, z=roll)
         for joint, share in ((kin.SPINE1, 0.3), (kin.SPINE2, 0.4), (kin.SPINE3, 0.3)):
             rotations[i, joint] = np.asarray([0.6 * lean, 2 * twist * np.cos(once - 0.2), -0.8 * roll]) * share
         look = np.clip(1.2 * gait.bend, -0.5, 0.5)  # to where the path leads
-        rotations[i, kin.NECK] = [-0.3 * lean, 0.5 * look - 0.5 * twist * np.cos(once - 0.2), 0]
-        rotations[i, kin.HEAD] = [-0.3 * lean, 0.5 * look - 0.5 * twist * np.cos(once - 0.2), 0]
+        rotations[i, [kin.NECK, kin.HEAD]] = [-0.3 * lean, 0.5 * look - 0.5 * twist * np.cos(once - 0.2), 0]
     rotations[:, kin.PELVIS] = kin.rotation_vector(turns)
     centers = np.stack([track(p) for p in phase])
-    centers += np.stack([kin.about_y(heading(p))[:, 0] * s for p, s in zip(phase, sway, strict=True)])
+    centers += np.stack([kin.turned(y=heading(p))[:, 0] * s for p, s in zip(phase, sway, strict=True)])
     pelvis = _ride(build, turns, centers, feet)
     for i in range(frames):
         kin.place_feet(build, rotations[i], pelvis[i], feet[i])
@@ -147,9 +142,8 @@ def _path(heading, stride, first, last):
     """A function from the phase to the body's position (3,) on its path: the integral of the heading."""
     grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
     direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)
-    along = np.concatenate(
-        [np.zeros((1, 3)), np.cumsum(0.5 * (direction[1:] + direction[:-1]) * np.diff(grid)[:, None], 0)]
-    )
+    steps = 0.5 * (direction[1:] + direction[:-1]) * np.diff(grid)[:, None]
+    along = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, 0)])
     at = lambda p: np.asarray([np.interp(p, grid, along[:, k]) for k in range(3)])
     origin = at(first)
     return lambda p: stride * (at(p) - origin)
@@ -164,31 +158,22 @@ def _foot_at(build, gait, heading, track, side, phase):
     strike, off = HEEL_STRIKE * long if gait.step > 0.2 * build.leg else 0.0, TOE_OFF * (0.35 + 0.65 * long)
     if share < STANCE_SHARE:
         u = share / STANCE_SHARE
-        pitch = (
-            -strike * (1 - _ease(u / FLAT_FROM)) if u < FLAT_FROM else off * _rise((u - FLAT_UNTIL) / (1 - FLAT_UNTIL))
-        )
-        return dataclasses.replace(here, pitch=float(pitch))
+        late = off * _rise((u - FLAT_UNTIL) / (1 - FLAT_UNTIL))
+        return dataclasses.replace(here, pitch=float(-strike * (1 - _ease(u / FLAT_FROM)) if u < FLAT_FROM else late))
     u = (share - STANCE_SHARE) / (1 - STANCE_SHARE)
     s = _ease(u)
-    turned = (there.yaw - here.yaw) * s
-    return kin.Foot(
-        x=float(here.x + s * (there.x - here.x)),
-        z=float(here.z + s * (there.z - here.z)),
-        yaw=float(here.yaw + turned),
-        # the toes come up quickly, so that they clear the ground
-        pitch=float(off * (1 - _ease(min(1.0, u / 0.6))) - strike * _ease((u - 0.4) / 0.6)),
-        lift=float(gait.lift * np.sin(np.pi * _ease(u)) ** 2),
-    )
+    at = (float(a + s * (b - a)) for a, b in ((here.x, there.x), (here.z, there.z), (here.yaw, there.yaw)))
+    pitch = off * (1 - _ease(min(1.0, u / 0.6))) - strike * _ease((u - 0.4) / 0.6)  # quickly, to clear the ground
+    return kin.Foot(*at, pitch=float(pitch), lift=float(gait.lift * np.sin(np.pi * s) ** 2))
 
 
 def _footprint(build, gait, heading, track, side, down):
     """Position of the foot that comes down at a phase: beside the path, ahead of the pelvis in mid-stance."""
     middle = down + 0.5 * STANCE_SHARE
     yaw, sign = heading(middle), 1 - 2 * side
-    ahead = (
-        build.joints[kin.LEFT_FOOT, 2] - build.joints[kin.PELVIS, 2] - 0.04 * build.leg
-    )  # of the ball before the pelvis, standing
-    x, _, z = track(middle) + kin.about_y(yaw) @ np.asarray([sign * gait.width, 0.0, ahead])
+    # of the ball before the pelvis, standing
+    ahead = build.joints[kin.LEFT_FOOT, 2] - build.joints[kin.PELVIS, 2] - 0.04 * build.leg
+    x, _, z = track(middle) + kin.turned(y=yaw) @ np.asarray([sign * gait.width, 0.0, ahead])
     return kin.Foot(float(x), float(z), float(yaw + sign * gait.turn_out))
 
 
@@ -208,11 +193,8 @@ def _swing_arms(rng, build, rotations, phase, gait):
         forward = -sign * np.cos(2 * np.pi * (phase - 0.04))  # the left arm is back when the left heel comes down
         base = kin.rotation_matrix(stood[shoulder])
         for i, f in enumerate(forward):
-            rotations[i, shoulder] = kin.rotation_vector(
-                kin.rotation_matrix(np.asarray([-gait.swing * f, 0, 0])) @ base
-            )
-            flexed = stood[elbow] + np.asarray([0, -sign * 0.35 * gait.swing * (1 + f), 0])
-            rotations[i, elbow] = flexed
+            rotations[i, shoulder] = kin.rotation_vector(kin.turned(x=-gait.swing * f) @ base)
+            rotations[i, elbow] = stood[elbow] + np.asarray([0, -sign * 0.35 * gait.swing * (1 + f), 0])
             rotations[i, collar] = stood[collar] + np.asarray([0, -sign * 0.05 * f * min(1.0, gait.swing / 0.4), 0])
         rotations[:, wrist] = stood[wrist]
         rotations[:, hand_of[side]] = stood[hand_of[side]]
@@ -227,8 +209,7 @@ def _reach(rng, build, frames):
     name = rng.choice(["stand", "contrapposto", "wide", "stride"], p=[0.4, 0.2, 0.2, 0.2])
     heading = rng.uniform(-0.7, 0.7)
     stance = STANCES[name][1](rng, width)
-    left, right = (in_world(foot, build.leg, heading) for foot in stance.feet)
-    feet = left, right
+    feet = in_world(stance.feet, build.leg, heading)
     keys, times, t = [], [], 0.0
     while True:
         keys.append(_key_pose(rng, build, heading, stance, feet, keys[-1] if keys else None))
@@ -258,10 +239,10 @@ def _key_pose(rng, build, heading, stance, feet, before):
     sink = stance.sink * build.leg + (rng.uniform(0.05, 0.3) * build.leg if rng.random() < 0.3 else 0.0)
     stooped = sink / build.leg
     tilt, turned = 0.5 * stooped + rng.uniform(0, 0.05), rng.normal(0, 0.15)
-    turn = kin.about_y(heading + turned) @ kin.rotation_matrix(np.asarray([tilt, 0, stance.roll]))
+    turn = kin.turned(y=heading + turned) @ kin.turned(x=tilt, z=stance.roll)
     rotations[kin.PELVIS] = kin.rotation_vector(turn)
     middle = 0.5 * (feet[0].x + feet[1].x), 0.5 * (feet[0].z + feet[1].z)
-    back = kin.about_y(heading) @ np.asarray([rng.normal(0, 0.02), 0, rng.normal(-0.08, 0.02)]) * build.leg
+    back = kin.turned(y=heading) @ np.asarray([rng.normal(0, 0.02), 0, rng.normal(-0.08, 0.02)]) * build.leg
     center = np.asarray([middle[0] + back[0], 0.0, middle[1] + back[2]])
     height = kin.highest_pelvis(build, turn, center[0], center[2], feet, SPARE) - sink
     kin.place_feet(build, rotations, np.asarray([center[0], height, center[2]]), feet)
@@ -274,9 +255,8 @@ def _key_pose(rng, build, heading, stance, feet, before):
             bend_arm(rng, build, tried, goal, side, other_arm=side == 1)
             clear = _clear_of(build, tried, side)
             if before is not None:  # the way there counts as much as the place
-                clear = min(
-                    clear, *(_clear_of(build, kin.between(before[0], tried, t), side) for t in (0.25, 0.5, 0.75))
-                )
+                way = (kin.between(before[0], tried, t) for t in (0.25, 0.5, 0.75))
+                clear = min(clear, *(_clear_of(build, pose, side) for pose in way))
             if clear > best_clear:
                 best, best_clear = tried, clear
             if clear > 0.0:
@@ -303,9 +283,8 @@ def _ride(build, turns, centers, feet, sinks=None):
         kin.highest_pelvis(build, turn, center[0], center[2], both, SPARE)
         for turn, center, both in zip(turns, centers, feet, strict=True)
     ])  # fmt: skip
-    window = lambda values: np.lib.stride_tricks.sliding_window_view(
-        np.pad(values, SMOOTHING, mode="edge"), 2 * SMOOTHING + 1
-    )
+    views = np.lib.stride_tricks.sliding_window_view
+    window = lambda values: views(np.pad(values, SMOOTHING, mode="edge"), 2 * SMOOTHING + 1)
     weights = np.hanning(2 * SMOOTHING + 3)[1:-1]
     smooth = window(window(heights).min(-1)) @ (weights / weights.sum())
     pelvis = centers.copy()

@@ -1,9 +1,8 @@
 """Soft light on posed surfaces, in JAX: sky and ground, three wide lights, occlusion and soft shadows, painted folds.
 
 Everything is diffuse or nearly so and fixed in the world: a point has one colour from wherever it is seen. Occlusion and the
-shadow of the key light come from a voxel grid that holds the posed person. Openness is how empty the grid is in front of a
-point; the shadow is what the grid holds on the way towards the light. Both are per vertex and smooth: no shadow map, no rays.
-Exposure and white balance differ from person to person, so that colours are no constants.
+shadow of the key light are per vertex, from a voxel grid that holds the posed person: how empty it is in front of a point, and
+what it holds on the way towards the light. Exposure and white balance differ from person to person.
 """
 
 import math
@@ -16,6 +15,7 @@ from jax.scipy.special import ndtri
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.people.fabrics import ALBEDO_LIMIT
+from humangs_jax.people.noise import choice
 
 CELL = 0.025
 """Edge of a voxel of the occupancy grid, metres."""
@@ -68,8 +68,7 @@ class Lights:
 
 def sample_lights(rng: np.random.Generator) -> Lights:
     """A studio, an overcast or a sunny day, a lit room or a window; exposed and balanced by a camera that errs."""
-    odds = np.asarray([scene[0] for scene in SCENES.values()])
-    scene = list(SCENES.values())[rng.choice(len(SCENES), p=odds / odds.sum())]
+    scene = SCENES[choice(rng, {name: row[0] for name, row in SCENES.items()})]
     _, azimuths, heights, key, fill, sky_range, warmth, bounce = scene
     azimuth = rng.uniform(*azimuths) * rng.choice([-1, 1])
     angles = azimuth + np.asarray([0.0, rng.uniform(1.4, 2.4) * rng.choice([-1, 1]), np.pi + rng.uniform(-0.5, 0.5)])
@@ -99,9 +98,8 @@ def lights_from(u: Float[Array, " light_numbers"]) -> Lights:
     exposure, balance, green = 0.12 * normal(u[22]) + 0.06, 0.045 * normal(u[23]), 0.012 * normal(u[24])
     gain = jnp.clip(jnp.exp(exposure), 0.72, 1.35) * jnp.stack([1 + balance, 1 + green, 1 - balance])
     ground = bounce * color * (1 + within((-0.06, 0.06), u[25:28]))
-    return _lights(
-        jnp, within(azimuth, u[4]) * sign(u[5]) + turns, elevations, power, tint, warmth, color, ground, gain
-    )
+    angles = within(azimuth, u[4]) * sign(u[5]) + turns
+    return _lights(jnp, angles, elevations, power, tint, warmth, color, ground, gain)
 
 
 def _lights(numpy, angles, elevations, power, tint, warmth, sky, ground, gain):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, shape_body
-from humangs_jax.core.array_types import Bool, Float, Int
+from humangs_jax.core.array_types import Float, Int
 from humangs_jax.people import anatomy as anatomy_module
 from humangs_jax.people import complexion, hair, wardrobe
 from humangs_jax.people.anatomy import Anatomy
@@ -60,8 +60,7 @@ def describe(seed: int, body: BodyModel) -> Person:
     male, years = bool(rng.random() < 0.5), float(np.clip(YEARS[0] + 70 * rng.beta(1.15, 1.9), *YEARS))
     betas, stature = sample_shape(rng, body, male, years)
     garments = sample_outfit(np.random.default_rng([seed, 11]), male, years)
-    colours = np.random.default_rng([seed, 12])
-    complexion = sample_complexion(colours, male, years)
+    complexion = sample_complexion(np.random.default_rng([seed, 12]), male, years)
     haircut = sample_haircut(np.random.default_rng([seed, 13]), male, years, {g.kind for g in garments})
     lights = sample_lights(np.random.default_rng([seed, 14]))
     return Person(seed, betas, male, years, stature, complexion, haircut, garments, lights)
@@ -90,16 +89,12 @@ def sample_shape(
     return betas.astype(np.float32), float(wanted)
 
 
-UNDER_CLOTH = 0.003
-"""Skin this far inside of a hem is meant to be covered, metres."""
-
-
 @dataclasses.dataclass(frozen=True)
 class SyntheticSubject:
     """A dressed person.
 
     seed. betas: (s,) shape of the body. surface: the mesh at rest with attributes `template`, `cloth`. face_materials: (f,)
-    indices into materials. lights. build: what the pose prior knows. under_cloth: (n,) skin vertices kept below a hem.
+    indices into materials. lights. build: what the pose prior knows.
     cover: (n,) metres that a vertex of the skin lies inside of a hem, negative on bare skin and on everything else.
     person: what all of this was built from.
     """
@@ -111,24 +106,17 @@ class SyntheticSubject:
     materials: tuple[Material, ...]
     lights: Lights
     build: Build
-    under_cloth: Bool[np.ndarray, " n"]
     cover: Field
     person: Person
 
     def posed_vertices(self, rotations: Rotations, translation: Vector) -> Points:
         """(n, 3) world positions of the mesh in a pose: rotations (j, 3), translation (3,)."""
-        transforms = self._transforms(rotations, translation)
-        blended = (self.surface.weights @ transforms[:, :3].reshape(len(transforms), 12)).reshape(-1, 3, 4)
-        return np.einsum("nij,nj->ni", blended[..., :3], self.surface.vertices) + blended[..., 3]
-
-    def _transforms(self, rotations, translation):
-        """(j, 4, 4) rest -> posed, by the pose prior's own kinematics: no compilation, the same on every backend."""
+        # by the pose prior's own kinematics: no compilation, the same on every backend
         world, positions = joint_positions(self.build, np.asarray(rotations, np.float64))
-        transforms = np.zeros((len(world), 4, 4))
-        transforms[:, :3, :3] = world
-        transforms[:, :3, 3] = positions - np.einsum("jab,jb->ja", world, self.build.joints) + translation
-        transforms[:, 3, 3] = 1
-        return transforms.astype(np.float32)
+        moved = positions - np.einsum("jab,jb->ja", world, self.build.joints) + translation
+        transforms = np.concatenate([world, moved[..., None]], -1).astype(np.float32)
+        blended = (self.surface.weights @ transforms.reshape(-1, 12)).reshape(-1, 3, 4)
+        return np.einsum("nij,nj->ni", blended[..., :3], self.surface.vertices) + blended[..., 3]
 
 
 _shape = jax.jit(shape_body)
@@ -144,12 +132,11 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
     person = describe(seed, body)
     rest = _shape(body, jnp.asarray(person.betas))
     template, faces, weights, *_ = _host_arrays(body)
-    anatomy = anatomy_module.measure(
-        np.asarray(rest.vertices), np.asarray(rest.joints), template, faces, weights, body.parents
-    )
+    vertices, joints = np.asarray(rest.vertices), np.asarray(rest.joints)
+    anatomy = anatomy_module.measure(vertices, joints, template, faces, weights, body.parents)
     rng = np.random.default_rng([seed, 20])
     outfit = wardrobe.dress_up(rng, anatomy, person.garments)
-    if hair.over_ears(person.haircut) or any(g.kind == "headscarf" or "hood_up" in g.details for g in person.garments):
+    if person.haircut.cut in hair.LONG_CUTS or _hooded(person):
         outfit.removed = outfit.removed | hair.ears(template)
     hairs = _hair(np.random.default_rng([seed, 21]), anatomy, person, outfit.trunk)
     skin, cover = _visible_skin(anatomy, outfit)
@@ -161,7 +148,7 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
         *hairs,
     ]
     surface = join([piece.surface for piece in pieces])
-    cover = np.concatenate([cover, np.full(len(surface.vertices) - len(cover), -1.0, np.float32)])
+    cover = np.pad(cover, (0, len(surface.vertices) - len(cover)), constant_values=-1.0)
     return SyntheticSubject(
         seed=seed,
         betas=person.betas,
@@ -170,7 +157,6 @@ def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
         materials=tuple(piece.material for piece in pieces),
         lights=person.lights,
         build=_build(anatomy, surface),
-        under_cloth=cover > UNDER_CLOTH,
         cover=cover,
         person=person,
     )
@@ -180,10 +166,7 @@ _HOST: dict[int, tuple] = {}
 
 
 def _host_arrays(body):
-    """Template, faces and weights as numpy; height of the mean body, and metres (s,) that a unit of each coefficient adds to it.
-
-    Kept for the body used last.
-    """
+    """Template, faces, weights; height of the mean body, metres (s,) that each coefficient adds. Kept for the body used last."""
     if id(body) not in _HOST:
         template, faces, weights = (np.asarray(a) for a in (body.template, body.faces, body.skinning_weights))
         top, bottom = np.argmax(template[:, 1]), np.argmin(template[:, 1])
@@ -199,19 +182,21 @@ def _visible_skin(anatomy: Anatomy, outfit: wardrobe.Outfit) -> tuple[Surface, n
     skin = anatomy.skin.with_attributes(cover=outfit.cover.astype(np.float32))
     bare = compact(skin, ~outfit.removed[skin.faces].all(1))
     kept = {name: bare.attributes[name] for name in ("template", "cloth")}
-    return Surface(bare.vertices, bare.faces, bare.weights, kept), bare.attributes["cover"]
+    return dataclasses.replace(bare, attributes=kept), bare.attributes["cover"]
+
+
+def _hooded(person):
+    return any(g.kind == "headscarf" or "hood_up" in g.details for g in person.garments)
 
 
 def _hair(rng, anatomy, person, over):
     """The pieces of hair; what a hat or hood covers is left out."""
     material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
-    if any("hood_up" in g.details or g.kind == "headscarf" for g in person.garments):
-        parts = hair.style(rng, anatomy, dataclasses.replace(person.haircut, cut="buzz"))
-        return [wardrobe.Piece(surface, material) for surface in parts]
-    pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, person.haircut, over)]
-    if not any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments):
-        return pieces
-    if pieces:  # the scalp's; tails, buns and beards hang out
+    hooded = _hooded(person)
+    haircut = dataclasses.replace(person.haircut, cut="buzz") if hooded else person.haircut
+    pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, haircut, over)]
+    hat = any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments)
+    if hat and pieces and not hooded:  # the scalp's; tails, buns and beards hang out
         hidden = hair.above_line(pieces[0].surface.attributes["template"], hair.CAP_LINE) > 0.008
         pieces[0] = dataclasses.replace(pieces[0], hidden=hidden).visible()
     return pieces

@@ -8,6 +8,7 @@ a slice is its radius around the slice's centre at `ANGLES` angles, angle 0 at +
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 
@@ -34,6 +35,11 @@ class Surface:
         """The same surface with other vertex positions."""
         return dataclasses.replace(self, vertices=np.asarray(vertices, np.float32))
 
+    def mapped(self, function: Callable[[np.ndarray], np.ndarray], faces: np.ndarray) -> "Surface":
+        """Other faces, and one function of every array over the vertices."""
+        attributes = {name: function(value) for name, value in self.attributes.items()}
+        return Surface(function(self.vertices), faces.astype(np.int32), function(self.weights), attributes)
+
     def with_attributes(self, **attributes: np.ndarray) -> "Surface":
         """The same surface with more (or other) attributes."""
         return dataclasses.replace(self, attributes={**self.attributes, **attributes})
@@ -54,8 +60,7 @@ def rigid(vertices: Points, faces: Faces, joint: int, joints: int) -> Surface:
 def vertex_normals(vertices: Points, faces: Faces) -> Points:
     """(n, 3) area-weighted unit normals."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    face_normals = np.cross(b - a, c - a)
-    return unit(scatter_add(faces.T.reshape(-1), np.tile(face_normals, (3, 1)), len(vertices)))
+    return unit(scatter_add(faces.T.reshape(-1), np.tile(np.cross(b - a, c - a), (3, 1)), len(vertices)))
 
 
 def scatter_add(
@@ -86,9 +91,9 @@ def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
 
 
 def smooth(
-    values: Float[np.ndarray, "n c"], faces: Faces, iterations: int, strength: float = 0.5, keep_hems: bool = False
+    values: Float[np.ndarray, "n c"], faces: Faces, iterations: int, keep_hems: bool = False
 ) -> Float[np.ndarray, "n c"]:
-    """Laplacian smoothing of vertex values (n, c): each step moves a vertex towards the mean of its neighbours.
+    """Laplacian smoothing of vertex values (n, c): each step moves a vertex halfway towards the mean of its neighbours.
 
     keep_hems: vertices on the boundary only feel their neighbours on the boundary, so that hems stay crisp and do not shrink.
     """
@@ -107,7 +112,7 @@ def smooth(
     for _ in range(iterations):
         mean = scatter_add(target, values[source], count) / neighbours
         mean[lonely] = values[lonely]
-        values = values + strength * (mean - values)
+        values = values + 0.5 * (mean - values)
     return values.astype(np.float32)
 
 
@@ -116,13 +121,7 @@ def compact(surface: Surface, face_mask: Bool[np.ndarray, " f"]) -> Surface:
     faces = surface.faces[face_mask]
     used = np.zeros(len(surface.vertices), bool)
     used[faces] = True
-    index = np.cumsum(used) - 1
-    return Surface(
-        surface.vertices[used],
-        index[faces].astype(np.int32),
-        surface.weights[used],
-        {name: value[used] for name, value in surface.attributes.items()},
-    )
+    return surface.mapped(lambda values: values[used], (np.cumsum(used) - 1)[faces])
 
 
 def cut(surface: Surface, field: Field) -> Surface:
@@ -155,12 +154,7 @@ def cut(surface: Surface, field: Field) -> Surface:
         between = values[pairs[:, 0]] * (1 - at) + values[pairs[:, 1]] * at
         return np.concatenate([values, between.astype(values.dtype)])
 
-    grown = Surface(
-        extended(surface.vertices),
-        np.concatenate([whole, kept_tip, kept_base]).astype(np.int32),
-        extended(surface.weights),
-        {name: extended(value) for name, value in surface.attributes.items()},
-    )
+    grown = surface.mapped(extended, np.concatenate([whole, kept_tip, kept_base]))
     return compact(grown, np.ones(len(grown.faces), bool))
 
 
@@ -183,17 +177,11 @@ def turn_in_hems(surface: Surface, depth: float) -> Surface:
         return surface
     rim, local = np.unique(hems, return_inverse=True)
     local = local.reshape(-1, 2) + len(surface.vertices)
-    normals = vertex_normals(surface.vertices, surface.faces)
-    inner = surface.vertices[rim] - depth * normals[rim]
-    faces = np.concatenate(
-        [np.stack([hems[:, 1], hems[:, 0], local[:, 0]], 1), np.stack([hems[:, 1], local[:, 0], local[:, 1]], 1)]
-    )
-    return Surface(
-        np.concatenate([surface.vertices, inner]).astype(np.float32),
-        np.concatenate([surface.faces, faces]).astype(np.int32),
-        np.concatenate([surface.weights, surface.weights[rim]]),
-        {name: np.concatenate([value, value[rim]]) for name, value in surface.attributes.items()},
-    )
+    inner = surface.vertices[rim] - depth * vertex_normals(surface.vertices, surface.faces)[rim]
+    (a, b), (c, d) = hems.T, local.T
+    faces = np.concatenate([surface.faces, np.stack([b, a, c], 1), np.stack([b, c, d], 1)])
+    grown = surface.mapped(lambda values: np.concatenate([values, values[rim]]), faces)
+    return grown.moved(np.concatenate([surface.vertices, inner]))
 
 
 def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
@@ -210,42 +198,56 @@ def grid_faces(rows: int, columns: int, closed: bool) -> Faces:
 
 def ball(rows: int, columns: int) -> tuple[Points, Faces]:
     """Unit vectors on a grid of polar angles (from +y) and azimuths (from +z), and its faces."""
-    polar, around = np.meshgrid(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns, indexing="ij")
-    directions = np.stack([np.sin(polar) * np.sin(around), np.cos(polar), np.sin(polar) * np.cos(around)], -1)
-    return directions.reshape(-1, 3), grid_faces(rows, columns, closed=True)
+    down, azimuth, faces = tube(np.linspace(0, np.pi, rows), np.arange(columns) * 2 * np.pi / columns)
+    return around(np.sin(down), azimuth, np.cos(down)), faces
+
+
+def tube(levels: Float[np.ndarray, " r"], angles: Float[np.ndarray, " c"]) -> tuple[Field, Field, Faces]:
+    """The level and the angle of every vertex (n,) of a tube, row by row, and its faces."""
+    faces = grid_faces(len(levels), len(angles), closed=True)
+    return np.repeat(levels, len(angles)), np.tile(angles, len(levels)), faces
 
 
 def sweep(
     path: Float[np.ndarray, "m 3"],
-    across: Float[np.ndarray, "m 3"],
-    widths: Float[np.ndarray, "m 2"],
+    across: Float[np.ndarray, "*m 3"],
+    widths: Float[np.ndarray, "m _"] | float,
     columns: int = 10,
     closed: bool = False,
 ) -> tuple[Points, Faces]:
     """Vertices (m columns, 3) and faces of a tube of elliptic sections along a path (m, 3).
 
-    across: (m, 3) directions of the first half axis, made normal to the path. widths: (m, 2) half axes, metres.
+    across: direction(s) of the first half axis, made normal to the path. widths: half axes, metres; one, or (m, 1 or 2).
     closed: the path's end joins its start; otherwise the ends are open (let the widths run out to close them).
     """
     tangent = unit(np.roll(path, -1, 0) - np.roll(path, 1, 0)) if closed else unit(np.gradient(path, axis=0))
     first = unit(across - np.sum(across * tangent, -1, keepdims=True) * tangent)
-    second = np.cross(tangent, first)
-    angle = np.arange(columns) * (2 * np.pi / columns)
-    ring = (
-        np.cos(angle)[None, :, None] * (widths[:, :1] * first)[:, None]
-        + np.sin(angle)[None, :, None] * (widths[:, 1:] * second)[:, None]
-    )
+    second, widths = np.cross(tangent, first), np.broadcast_to(widths, (len(path), 2))
+    c, s = np.cos(circle(columns))[None, :, None], np.sin(circle(columns))[None, :, None]
+    ring = c * (widths[:, :1] * first)[:, None] + s * (widths[:, 1:] * second)[:, None]
     vertices = (path[:, None] + ring).reshape(-1, 3).astype(np.float32)
     rows = len(path) + closed
     faces = grid_faces(rows, columns, closed=True) % len(vertices)
     return vertices, np.ascontiguousarray(faces[:, ::-1])
 
 
+def circle(count: int) -> Field:
+    """(count,) angles all around from 0 on."""
+    return np.arange(count) * (2 * np.pi / count)
+
+
+def around(
+    radius: Field | float | int, angle: Field, height: Field, center: Float[np.ndarray, "2"] | tuple = (0, 0)
+) -> Points:
+    """(n, 3) points at radii (n,) and angles (n,) around the vertical axis through center (x, z)."""
+    return np.stack([center[0] + radius * np.sin(angle), height, center[1] + radius * np.cos(angle)], -1)
+
+
 ANGLES = 48
 EMPTY = 1e-3
 """Radius (metres) of a slice without points."""
 
-_GRID = np.arange(ANGLES) * (2 * np.pi / ANGLES)
+_GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
 _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
 """radius(a) = min over b of support(b) / cos(a - b)."""
@@ -321,15 +323,9 @@ def blurred(shape: Outlines, times: int = 1) -> Outlines:
     return shape.with_radii(radii)
 
 
-def hanging(shape: Outlines, slope: float, downwards: bool = True) -> Outlines:
-    """Cloth that hangs: it keeps the largest radius of the slices before it, less `slope` metres per metre.
-
-    downwards: before means above (larger level), else below.
-    """
+def hanging(shape: Outlines, slope: float) -> Outlines:
+    """Cloth that hangs: it keeps the largest radius of the slices above it, less `slope` metres per metre."""
     radii = shape.radii.copy()
-    order = range(len(radii) - 2, -1, -1) if downwards else range(1, len(radii))
-    step = 1 if downwards else -1
-    for i in order:
-        drop = slope * abs(shape.levels[i] - shape.levels[i + step])
-        radii[i] = np.maximum(radii[i], radii[i + step] - drop)
+    for i in range(len(radii) - 2, -1, -1):
+        radii[i] = np.maximum(radii[i], radii[i + 1] - slope * abs(shape.levels[i] - shape.levels[i + 1]))
     return shape.with_radii(radii)

@@ -1,10 +1,8 @@
 """What is sewn on or printed on a fabric: prints, buttons, zips, seams, pockets, ribs, bands, stripes, laces.
 
-Each function takes a colour function (Spots -> (n, 3)) and returns another one. Words are set in a 5 x 7 alphabet of the
-package's own; emblems are closed shapes.
+Each function takes colours (n, 3) at points and returns other ones. Words are set in a 5 x 7 alphabet of the package's own;
+emblems are closed shapes.
 """
-
-from collections.abc import Callable
 
 import numpy as np
 
@@ -12,7 +10,7 @@ from humangs_jax.core.array_types import Bool
 from humangs_jax.people.anatomy import ARMHOLE
 from humangs_jax.people.fabrics import Spots, accent, band, colour, mix
 from humangs_jax.people.noise import lattice
-from humangs_jax.people.surfaces import Field
+from humangs_jax.people.surfaces import Field, Points
 
 ROWS, ADVANCE = 7, 6
 """Cells of a letter: rows, and columns from one letter to the next."""
@@ -29,23 +27,11 @@ _ALPHABET = {
 }  # fmt: skip
 """Seven rows of five bits each, in hexadecimal."""
 
-WORDS = (
-    "OCEAN",
-    "NORTH",
-    "WILD",
-    "NOVA",
-    "CITY",
-    "PEAK",
-    "LOOP",
-    "SUNNY",
-    "TEAM",
-    "RIVER",
-    "ZERO",
-    "MAGIC",
-    "HELLO",
-    "FOX",
-)
+WORDS = ("OCEAN", "NORTH", "WILD", "NOVA", "CITY", "PEAK", "LOOP", "SUNNY", "TEAM", "RIVER", "ZERO", "MAGIC", "HELLO",
+         "FOX")  # fmt: skip
 EMBLEMS = ("disc", "star", "heart", "peaks", "sun", "diamond", "bolt", "ring")
+PRINTS = {"words": 0.3, "emblem": 0.22, "both": 0.22, "logo": 0.13, "picture": 0.13}
+"""Odds."""
 
 
 def bitmap(text: str) -> Bool[np.ndarray, "7 w"]:
@@ -65,10 +51,8 @@ def random_text(rng: np.random.Generator) -> str:
         return str(rng.choice(WORDS))
     if kind < 0.6:
         return str(rng.integers(1, 100)) if rng.random() < 0.5 else str(rng.integers(1950, 2030))
-    syllables = [
-        str(rng.choice(list("BDFGKLMNPRSTVZ"))) + str(rng.choice(list("AEIOU"))) for _ in range(rng.integers(2, 4))
-    ]
-    return "".join(syllables)
+    letters = lambda: str(rng.choice(list("BDFGKLMNPRSTVZ"))) + str(rng.choice(list("AEIOU")))
+    return "".join(letters() for _ in range(rng.integers(2, 4)))
 
 
 def written(cells: Bool[np.ndarray, "7 w"], x: Field, y: Field) -> Field:
@@ -111,35 +95,29 @@ def emblem(kind: str, x: Field, y: Field, points: int = 5) -> Field:
     return np.minimum(0.28 - np.abs(slant), 1 - np.abs(y))  # bolt
 
 
-Colouring = Callable[[Spots], np.ndarray]
-
-
 def _trunk(s: Spots):
     """(n,) 1 on the trunk, 0 on limbs."""
     return band(s.cloth[:, 3], 0.13, 1.0, 0.01)
 
 
-def printed(rng: np.random.Generator, fabric: Colouring, base: np.ndarray, number: bool = False) -> Colouring:
+def _darker(colours, share, where):
+    return mix(colours, colours * share, where)
+
+
+def printed(colours: Points, s: Spots, rng: np.random.Generator, base: np.ndarray, number: bool = False) -> Points:
     """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a scene."""
     ink = accent(rng, base)
     ink2 = accent(rng, ink)
-    kind = (
-        "number"
-        if number
-        else str(rng.choice(["words", "emblem", "both", "logo", "picture"], p=[0.3, 0.22, 0.22, 0.13, 0.13]))
-    )
-    text = str(rng.integers(0, 100)) if number else random_text(rng)
-    cells = bitmap(text)
+    kind = "number" if number else str(rng.choice(list(PRINTS), p=list(PRINTS.values())))
+    cells = bitmap(str(rng.integers(0, 100)) if number else random_text(rng))
     width = cells.shape[1] - 1
     cell = min(rng.uniform(0.17, 0.26) / width, 0.026 if number else 0.014)
     height = rng.uniform(-0.05, 0.02)
     shape, points = str(rng.choice(EMBLEMS)), int(rng.integers(5, 8))
     size, seed = rng.uniform(0.05, 0.085), int(rng.integers(1 << 20))
-    on_back = number or rng.random() < 0.25
-    framed = rng.random() < 0.3
-
-    def words(x, y):
-        return written(cells, x / cell + 0.5 * width, y / cell + 0.5 * ROWS)
+    on_back, framed = number or rng.random() < 0.25, rng.random() < 0.3
+    words = lambda x, y: written(cells, x / cell + 0.5 * width, y / cell + 0.5 * ROWS)
+    badge = lambda x, y, size: emblem(shape, x / size, y / size, points)
 
     def motif(result, x, y, where):
         if kind in ("words", "number"):
@@ -148,253 +126,162 @@ def printed(rng: np.random.Generator, fabric: Colouring, base: np.ndarray, numbe
                 result = mix(result, ink2, box * where)
             return mix(result, ink, words(x, y) * where)
         if kind == "logo":
-            inside = np.clip(emblem(shape, (x - 0.075) / 0.02, (y - 0.04) / 0.02, points) * 8 + 0.5, 0, 1)
-            return mix(result, ink, inside * where)
-        lift = 0.35 * size if kind == "both" else 0.0
-        inside = np.clip(emblem(shape, x / size, (y - lift) / size, points) * size / 0.0015 + 0.5, 0, 1)
+            return mix(result, ink, np.clip(badge(x - 0.075, y - 0.04, 0.02) * 8 + 0.5, 0, 1) * where)
         if kind == "picture":
             inside = band(np.maximum(np.abs(x), 0.8 * np.abs(y)), -1, 1.2 * size)
             scene = lattice(np.stack([x / 0.05, y / 0.03], -1), seed)
-            printed = mix(mix(ink, ink2, (scene > 0.45).astype(np.float32)), base, band(scene, 0.62, 2, 0.02))
-            return result + (printed - result) * (inside * where)[:, None]
-        result = mix(result, ink, inside * where)
+            drawn = mix(mix(ink, ink2, (scene > 0.45).astype(np.float32)), base, band(scene, 0.62, 2, 0.02))
+            return mix(result, drawn, inside * where)
+        inside = badge(x, y - 0.35 * size * (kind == "both"), size) * size / 0.0015 + 0.5
+        result = mix(result, ink, np.clip(inside, 0, 1) * where)
         if kind == "both":
             result = mix(result, ink2, words(x * 1.25, (y + size * 1.1 + 5 * cell) * 1.25) * where)
         return result
 
-    def albedo(s):
-        trunk, x, y = _trunk(s), 1.1 * s.template[:, 0], s.template[:, 1] - height
-        result = motif(fabric(s), x, y, trunk * (s.cloth[:, 2] > 0))
-        return motif(result, -x, y - 0.02, trunk * (s.cloth[:, 2] < 0)) if on_back else result
-
-    return albedo
+    trunk, x, y = _trunk(s), 1.1 * s.template[:, 0], s.template[:, 1] - height
+    result = motif(colours, x, y, trunk * (s.cloth[:, 2] > 0))
+    return motif(result, -x, y - 0.02, trunk * (s.cloth[:, 2] < 0)) if on_back else result
 
 
-def buttoned(rng: np.random.Generator, fabric: Colouring, base: np.ndarray, low: float, high: float) -> Colouring:
+def buttoned(colours: Points, s: Spots, rng: np.random.Generator, base: np.ndarray, low: float, high: float) -> Points:
     """A placket with buttons down the front."""
     ink = accent(rng, base) if rng.random() < 0.3 else colour(0.1, 0.1, rng.choice([0.12, 0.8]))
     pitch, size = rng.uniform(0.07, 0.1), rng.uniform(0.005, 0.0075)
-
-    def albedo(s):
-        x, y = s.cloth[:, 0], s.cloth[:, 1]
-        front = (s.cloth[:, 2] > 0) * _trunk(s) * band(y, low, high)
-        result = fabric(s)
-        result = mix(result, result * 0.6, band(np.abs(x - 0.002), 0.0135, 0.016) * front)
-        button = band(np.sqrt(x * x + ((y - low) % pitch - 0.5 * pitch) ** 2), -1, size) * front
-        return mix(result, ink, button)
-
-    return albedo
+    x, y = s.cloth[:, 0], s.cloth[:, 1]
+    front = (s.cloth[:, 2] > 0) * _trunk(s) * band(y, low, high)
+    button = band(np.sqrt(x * x + ((y - low) % pitch - 0.5 * pitch) ** 2), -1, size) * front
+    return mix(_darker(colours, 0.6, band(np.abs(x - 0.002), 0.0135, 0.016) * front), ink, button)
 
 
-def zipped(rng: np.random.Generator, fabric: Colouring, low: float, high: float, edge: float = 0.0) -> Colouring:
+def zipped(colours: Points, s: Spots, rng: np.random.Generator, low: float, high: float, edge: float = 0.0) -> Points:
     """A zip down the front (edge 0), or its halves along the edges of an open front at |x| = edge."""
     ink = colour(0.1, 0.05, rng.choice([0.15, 0.6, 0.75]))
-
-    def albedo(s):
-        front = (s.cloth[:, 2] > 0) * _trunk(s) * band(s.cloth[:, 1], low, high)
-        away = np.abs(np.abs(s.cloth[:, 0]) - edge)
-        result = fabric(s)
-        result = mix(result, result * 0.55, band(away, 0.004, 0.011) * front)
-        return mix(result, ink, band(away, -1, 0.0035) * front)
-
-    return albedo
+    front = (s.cloth[:, 2] > 0) * _trunk(s) * band(s.cloth[:, 1], low, high)
+    away = np.abs(np.abs(s.cloth[:, 0]) - edge)
+    return mix(_darker(colours, 0.55, band(away, 0.004, 0.011) * front), ink, band(away, -1, 0.0035) * front)
 
 
-def seamed(fabric: Colouring, strength: float = 0.2) -> Colouring:
+def _from_the_side(s):
+    """(n,) metres around the trunk or limb from its sides."""
+    return np.abs(np.abs(s.around) - 0.5 * np.pi * s.cloth[:, 3])
+
+
+def seamed(colours: Points, s: Spots) -> Points:
     """Seams down the sides of trunk and limbs and around the armholes."""
-
-    def albedo(s):
-        side = np.abs(np.abs(s.around) - 0.5 * np.pi * s.cloth[:, 3])
-        armhole = np.abs(np.abs(s.template[:, 0]) - ARMHOLE)
-        armhole = np.where(s.template[:, 1] > -0.02, armhole, 1.0)
-        line = np.maximum(band(side, -1, 0.0022), band(armhole, -1, 0.0024))
-        result = fabric(s)
-        return mix(result, result * (1 - strength), line)
-
-    return albedo
+    armhole = np.where(s.template[:, 1] > -0.02, np.abs(np.abs(s.template[:, 0]) - ARMHOLE), 1.0)
+    return _darker(colours, 0.8, np.maximum(band(_from_the_side(s), -1, 0.0022), band(armhole, -1, 0.0024)))
 
 
-def hemmed(
-    fabric: Colouring, heights: tuple[float, ...] = (), sleeve: float | None = None, strength: float = 0.2
-) -> Colouring:
+def hemmed(colours: Points, s: Spots, heights: tuple[float, ...] = (), sleeve: float | None = None) -> Points:
     """Stitching beside hems at heights y of trunk and legs, and at |x| = sleeve of the arms."""
-
-    def albedo(s):
-        line = np.zeros(len(s.template), np.float32)
-        on_arm = np.abs(s.template[:, 0]) > 0.2
-        for y in heights:
-            line = np.maximum(line, band(np.abs(s.template[:, 1] - y), 0.0, 0.002) * ~on_arm)
-        if sleeve is not None:
-            line = np.maximum(line, band(np.abs(np.abs(s.template[:, 0]) - sleeve), 0.0, 0.002) * on_arm)
-        result = fabric(s)
-        return mix(result, result * (1 - strength), line)
-
-    return albedo
+    x, y, _ = s.template.T
+    on_arm, line = np.abs(x) > 0.2, np.zeros(len(x), np.float32)
+    for height in heights:
+        line = np.maximum(line, band(np.abs(y - height), 0.0, 0.002) * ~on_arm)
+    if sleeve is not None:
+        line = np.maximum(line, band(np.abs(np.abs(x) - sleeve), 0.0, 0.002) * on_arm)
+    return _darker(colours, 0.8, line)
 
 
-def ribbed(fabric: Colouring, bottom: float, sleeve: float, width: float = 0.04) -> Colouring:
+def ribbed(colours: Points, s: Spots, bottom: float, sleeve: float, width: float = 0.04) -> Points:
     """Knitted bands at the hem and the cuffs: upright ribs, a little darker."""
-
-    def albedo(s):
-        on_arm = np.abs(s.template[:, 0]) > 0.2
-        cuff = on_arm & (np.abs(s.template[:, 0]) > sleeve - width)
-        hem = ~on_arm & (s.template[:, 1] < bottom + 1.3 * width)
-        inside = (cuff | hem).astype(np.float32)
-        ribs = 0.86 + 0.1 * np.cos(2 * np.pi * s.around / 0.009)
-        result = fabric(s)
-        return result + (result * ribs[:, None] - result) * inside[:, None]
-
-    return albedo
+    x = np.abs(s.template[:, 0])
+    inside = np.where(x > 0.2, x > sleeve - width, s.template[:, 1] < bottom + 1.3 * width)
+    ribs = 0.86 + 0.1 * np.cos(2 * np.pi * s.around / 0.009)
+    return _darker(colours, ribs[:, None], inside.astype(np.float32))
 
 
-def pocketed(rng: np.random.Generator, fabric: Colouring, kind: str) -> Colouring:
+def _outline(x, y, half_width, half_height):
+    return band(np.abs(np.maximum(np.abs(x) - half_width, np.abs(y) - half_height)), -1, 0.0018)
+
+
+def pocketed(colours: Points, s: Spots, rng: np.random.Generator, kind: str) -> Points:
     """Pockets as stitched outlines: on the chest, in a jacket's front, on jeans (front and back) or on the thighs (cargo)."""
     sides = rng.choice([1, 2]) if kind == "chest" else 2
     bright = 1.6 if kind == "jeans" and rng.random() < 0.5 else 0.6
-
-    def outline(x, y, half_width, half_height):
-        box = np.maximum(np.abs(x) - half_width, np.abs(y) - half_height)
-        return band(np.abs(box), -1, 0.0018)
-
-    def albedo(s):
-        x, y, front = s.template[:, 0], s.template[:, 1], s.cloth[:, 2] > 0
-        result = fabric(s)
-        if kind == "chest":
-            own = x > 0 if sides == 1 else np.abs(x) > 0
-            line = outline(np.abs(x) - 0.075, y - 0.0, 0.042, 0.048) * front * own * _trunk(s)
-        elif kind == "jacket":
-            line = band(np.abs(np.abs(x) - 0.09 + 0.3 * (y + 0.2)), -1, 0.0035) * band(y, -0.27, -0.15) * front
-        elif kind == "jeans":
-            curve = np.abs((np.abs(x) - 0.16) ** 2 + ((y + 0.25) * 0.9) ** 2 - 0.0065) / 0.16
-            fly = band(np.abs(x - 0.018), -1, 0.0018) * band(y, -0.36, -0.2)
-            line = np.maximum(band(curve, -1, 0.0022) * band(y, -0.36, -0.22), fly) * front
-            back = outline(np.abs(x) - 0.075, y + 0.315, 0.052, 0.06) * ~front
-            line = np.maximum(line, back)
-        else:
-            side = np.abs(np.abs(s.around) - 0.5 * np.pi * s.cloth[:, 3])
-            line = outline(side, y + 0.62, 0.06, 0.08) * (s.cloth[:, 3] < 0.12)
-            line = np.maximum(line, band(np.abs(y + 0.57), -1, 0.002) * (side < 0.06) * (s.cloth[:, 3] < 0.12))
-        return mix(result, np.clip(result * bright, 0, 0.85), 0.75 * line)
-
-    return albedo
+    x, y, front = s.template[:, 0], s.template[:, 1], s.cloth[:, 2] > 0
+    if kind == "chest":
+        own = x > 0 if sides == 1 else np.abs(x) > 0
+        line = _outline(np.abs(x) - 0.075, y - 0.0, 0.042, 0.048) * front * own * _trunk(s)
+    elif kind == "jacket":
+        line = band(np.abs(np.abs(x) - 0.09 + 0.3 * (y + 0.2)), -1, 0.0035) * band(y, -0.27, -0.15) * front
+    elif kind == "jeans":
+        curve = np.abs((np.abs(x) - 0.16) ** 2 + ((y + 0.25) * 0.9) ** 2 - 0.0065) / 0.16
+        fly = band(np.abs(x - 0.018), -1, 0.0018) * band(y, -0.36, -0.2)
+        line = np.maximum(band(curve, -1, 0.0022) * band(y, -0.36, -0.22), fly) * front
+        line = np.maximum(line, _outline(np.abs(x) - 0.075, y + 0.315, 0.052, 0.06) * ~front)
+    else:
+        side, on_leg = _from_the_side(s), s.cloth[:, 3] < 0.12
+        flap = band(np.abs(y + 0.57), -1, 0.002) * (side < 0.06)
+        line = np.maximum(_outline(side, y + 0.62, 0.06, 0.08), flap) * on_leg
+    return mix(colours, np.clip(colours * bright, 0, 0.85), 0.75 * line)
 
 
-def banded(fabric: Colouring, ink: np.ndarray, low: float, high: float) -> Colouring:
+def banded(colours: Points, s: Spots, ink: np.ndarray, low: float, high: float) -> Points:
     """A sash or waistband between two heights of the trunk."""
-
-    def albedo(s):
-        return mix(fabric(s), ink, band(s.cloth[:, 1], low, high) * band(s.cloth[:, 3], 0.1, 1.0, 0.01))
-
-    return albedo
+    return mix(colours, ink, band(s.cloth[:, 1], low, high) * band(s.cloth[:, 3], 0.1, 1.0, 0.01))
 
 
-def side_striped(rng: np.random.Generator, fabric: Colouring, base: np.ndarray) -> Colouring:
+def side_striped(colours: Points, s: Spots, rng: np.random.Generator, base: np.ndarray) -> Points:
     """One to three stripes down the outside of arms and legs."""
     ink, count = accent(rng, base), int(rng.integers(1, 4))
-    wide = 0.022 / count
-
-    def albedo(s):
-        outside = np.where(s.cloth[:, 3] > 0.1, np.abs(np.abs(s.around) - 0.5 * np.pi * s.cloth[:, 3]), 0)
-        turned = np.where(s.template[:, 0] > 0, s.around, -s.around)
-        outside = np.where(s.cloth[:, 3] < 0.12, turned - 0.5 * np.pi * s.cloth[:, 3], outside)
-        phase = (outside + 0.011) / wide
-        stripes = band((phase % 1) * wide, 0.0, 0.6 * wide) * (np.floor(phase) >= 0) * (np.floor(phase) < count)
-        return mix(fabric(s), ink, stripes * band(s.cloth[:, 3], 0.0, 0.12, 0.01))
-
-    return albedo
+    girth, wide = s.cloth[:, 3], 0.022 / count
+    turned = np.where(s.template[:, 0] > 0, s.around, -s.around)
+    outside = np.where(girth > 0.1, _from_the_side(s), 0)
+    outside = np.where(girth < 0.12, turned - 0.5 * np.pi * girth, outside)
+    phase = (outside + 0.011) / wide
+    stripes = band((phase % 1) * wide, 0.0, 0.6 * wide) * (np.floor(phase) >= 0) * (np.floor(phase) < count)
+    return mix(colours, ink, stripes * band(girth, 0.0, 0.12, 0.01))
 
 
-def quilted(fabric: Colouring, period: float) -> Colouring:
+def quilted(colours: Points, s: Spots, period: float) -> Points:
     """Dark stitched lines around the garment, between which it bulges."""
-
-    def albedo(s):
-        phase = (s.along / period) % 1
-        line = np.exp(-((np.minimum(phase, 1 - phase) * period / 0.006) ** 2))
-        result = fabric(s)
-        return mix(result, result * 0.55, line)
-
-    return albedo
+    phase = (s.along / period) % 1
+    return _darker(colours, 0.55, np.exp(-((np.minimum(phase, 1 - phase) * period / 0.006) ** 2)))
 
 
-def leather(rng: np.random.Generator, kind: str, base: np.ndarray, sole_height: float) -> Colouring:
+def leather(s: Spots, rng: np.random.Generator, kind: str, base: np.ndarray) -> Points:
     """Shoes: upper, a sole of another colour, laces on the instep, and what marks the kind."""
-    white = rng.random() < 0.75
-    trim = {"sneakers": colour(0.1, 0.05, 0.82 if white else 0.1)}.get(kind, base * rng.uniform(0.35, 0.6))
+    white, sneakers = rng.random() < 0.75, kind == "sneakers"
+    dark = base * rng.uniform(0.35, 0.6)
+    trim = colour(0.1, 0.05, 0.82 if white else 0.1) if sneakers else dark
     second = accent(rng, base) if rng.random() < 0.5 else trim
-    laced = kind == "sneakers" or (kind in ("flats", "ankle_boots") and rng.random() < 0.6)
-    swoosh, toe = rng.uniform(0.2, 0.8), kind == "sneakers" and rng.random() < 0.5
+    laced = sneakers or (kind in ("flats", "ankle_boots") and rng.random() < 0.6)
+    swoosh, toe = rng.uniform(0.2, 0.8), sneakers and rng.random() < 0.5
     if kind == "ankle_boots" and rng.random() < 0.3:
         base, trim = colour(0.095, 0.6, 0.6), colour(0.08, 0.6, 0.25)
-
-    def albedo(s):
-        y, x, z = s.cloth[:, 1], s.cloth[:, 0], s.cloth[:, 2]
-        result = np.broadcast_to(base, (len(y), 3)).astype(np.float32)
-        if kind == "sneakers":
-            side = band(np.abs(y - 0.045 - swoosh * (z - 0.04)), -1, 0.011, 0.003) * band(z, -0.05, 0.12, 0.003)
-            result = mix(result, second, side * (np.abs(x) > 0.022))
-            if toe:
-                result = mix(result, trim, band(z, 0.135, 1.0, 0.004))
-        if laced:
-            laces = (
-                band((z / 0.015) % 1 * 0.015, 0, 0.006)
-                * band(np.abs(x), -1, 0.019)
-                * band(z, 0.03, 0.11)
-                * band(y, 0.03, 1.0)
-            )
-            shaft = (
-                band((y / 0.017) % 1 * 0.017, 0, 0.006) * band(np.abs(x), -1, 0.019) * (z > 0.02) * band(y, 0.09, 1.0)
-            )
-            tongue = band(np.abs(x), -1, 0.026) * (z > 0.025) * band(z, -1, 0.115) * band(y, 0.03, 1.0)
-            result = mix(mix(result, result * 0.75, tongue), trim, np.maximum(laces, shaft))
-        return mix(result, trim if kind != "flats" else base * 0.3, band(y, -1, sole_height, 0.002))
-
-    return albedo
+    y, x, z = s.cloth[:, 1], np.abs(s.cloth[:, 0]), s.cloth[:, 2]
+    result = np.broadcast_to(base, (len(y), 3)).astype(np.float32)
+    if sneakers:
+        side = band(np.abs(y - 0.045 - swoosh * (z - 0.04)), -1, 0.011, 0.003) * band(z, -0.05, 0.12, 0.003)
+        result = mix(result, second, side * (x > 0.022))
+    if toe:
+        result = mix(result, trim, band(z, 0.135, 1.0, 0.004))
+    if laced:
+        narrow, high = band(x, -1, 0.019), band(y, 0.03, 1.0)
+        laces = band((z / 0.015) % 1 * 0.015, 0, 0.006) * narrow * band(z, 0.03, 0.11) * high
+        shaft = band((y / 0.017) % 1 * 0.017, 0, 0.006) * narrow * (z > 0.02) * band(y, 0.09, 1.0)
+        tongue = band(x, -1, 0.026) * (z > 0.025) * band(z, -1, 0.115) * high
+        result = mix(_darker(result, 0.75, tongue), trim, np.maximum(laces, shaft))
+    return mix(result, base * 0.3 if kind == "flats" else trim, band(y, -1, 0.004, 0.002))
 
 
-def darkened(fabric: Colouring, share: float) -> Colouring:
-    """The same cloth, seen against its pile."""
-    return lambda s: share * fabric(s)
-
-
-def below(fabric: Colouring, ink: np.ndarray, level: float) -> Colouring:
-    """Another colour below a height: turned-up trousers."""
-    return lambda s: mix(fabric(s), ink, band(s.template[:, 1], -9.0, level))
-
-
-def ribbed_shaft(fabric: Colouring) -> Colouring:
-    """Fine upright ribs of socks."""
-    return lambda s: fabric(s) * (0.94 + 0.06 * np.cos(2 * np.pi * s.around / 0.008))[:, None]
-
-
-def buckled(fabric: Colouring, middle: float, width: float) -> Colouring:
+def buckled(colours: Points, s: Spots, middle: float, width: float) -> Points:
     """A belt with stitched edges, holes and a buckle in front."""
-    metal, steel = colour(0.12, 0.3, 0.62), colour(0.6, 0.05, 0.6)
-
-    def albedo(s):
-        x, y, front = s.template[:, 0], s.template[:, 1] - middle, s.cloth[:, 2] > 0
-        result = fabric(s)
-        edge = band(np.abs(np.abs(y) - 0.38 * width), -1, 0.0012)
-        result = mix(result, result * 0.6, edge)
-        frame = np.maximum(np.abs(x) / 0.026, np.abs(y) / (0.56 * width))
-        result = mix(result, metal if width > 0.035 else steel, band(frame, 0.68, 1.02, 0.06) * front)
-        return mix(
-            result,
-            result * 0.3,
-            band(np.abs(x - 0.06) % 0.03, -1, 0.003) * band(np.abs(y), -1, 0.003) * (x > 0.03) * front,
-        )
-
-    return albedo
+    x, y, front = s.template[:, 0], s.template[:, 1] - middle, s.cloth[:, 2] > 0
+    metal = colour(0.12, 0.3, 0.62) if width > 0.035 else colour(0.6, 0.05, 0.6)
+    result = _darker(colours, 0.6, band(np.abs(np.abs(y) - 0.38 * width), -1, 0.0012))
+    frame = np.maximum(np.abs(x) / 0.026, np.abs(y) / (0.56 * width))
+    holes = band(np.abs(x - 0.06) % 0.03, -1, 0.003) * band(np.abs(y), -1, 0.003) * (x > 0.03)
+    return _darker(mix(result, metal, band(frame, 0.68, 1.02, 0.06) * front), 0.3, holes * front)
 
 
-def zipped_bag(rng: np.random.Generator, fabric: Colouring, base: np.ndarray) -> Colouring:
+def zipped_bag(colours: Points, s: Spots, rng: np.random.Generator, base: np.ndarray) -> Points:
     """A bag with a zip around the top, a front pocket and darker edges. Template: the bag's own unit box."""
     ink = colour(0.1, 0.05, rng.choice([0.1, 0.7]))
     second = accent(rng, base) if rng.random() < 0.3 else base * 0.8
-
-    def albedo(s):
-        x, y, z = s.template.T
-        result = mix(fabric(s), second, band(y, -0.8, 0.05, 0.02) * band(np.abs(x), -1, 0.72, 0.02) * (z > 0.3))
-        result = mix(result, ink, band(np.abs(y - 0.05), -1, 0.025, 0.02) * band(np.abs(x), -1, 0.72, 0.02) * (z > 0.3))
-        return mix(result, ink, band(np.abs(y - 0.72), -1, 0.025, 0.02) * (z > -0.2))
-
-    return albedo
+    x, y, z = s.template.T
+    pocket = band(np.abs(x), -1, 0.72, 0.02) * (z > 0.3)
+    result = mix(colours, second, band(y, -0.8, 0.05, 0.02) * pocket)
+    result = mix(result, ink, band(np.abs(y - 0.05), -1, 0.025, 0.02) * pocket)
+    return mix(result, ink, band(np.abs(y - 0.72), -1, 0.025, 0.02) * (z > -0.2))

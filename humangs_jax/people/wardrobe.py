@@ -7,7 +7,7 @@ import numpy as np
 
 from humangs_jax.people import accessories, tailoring, trimmings
 from humangs_jax.people.anatomy import CROTCH, WAIST, Anatomy, leg_coordinates
-from humangs_jax.people.fabrics import Material, weave
+from humangs_jax.people.fabrics import Material, Spots, band, mix
 from humangs_jax.people.garments import HEM_MARGIN, Fit, Skirt, shell, skirt
 from humangs_jax.people.outfits import BOTTOMS, DRESSES, OUTER, SHOES, SKIRTS, TOPS, Garment
 from humangs_jax.people.surfaces import Surface, compact
@@ -96,91 +96,69 @@ def _put(rng, outfit, cuts, fit, material, margin=HEM_MARGIN, finish=lambda surf
     outfit.add(surface, material)
 
 
-def _strip(rng, outfit, field, fit, material):
-    """A shell that hides nothing and that later layers do not hide."""
-    outfit.add(shell(rng, outfit.anatomy, [field], fit), material, layered=False)
+def _strip(rng, outfit, field, fit, material, layered=False):
+    """A shell that hides nothing. layered: see `Outfit.add`."""
+    outfit.add(shell(rng, outfit.anatomy, [field], fit), material, layered)
 
 
-@dataclasses.dataclass(frozen=True)
-class Trimming:
-    """A detail that is sewn on. kinds: garments that have it. detail: only those with this feature; None: all of them.
-
-    add: (random numbers, colours, garment) -> colours.
-    """
-
-    kinds: tuple[str, ...]
-    detail: str | None
-    add: Callable[[np.random.Generator, trimmings.Colouring, Garment], trimmings.Colouring]
-
-
-def _buttons(low=None):
-    """Buttons down the front, from a height or from the hem."""
-    return lambda rng, c, g: trimmings.buttoned(rng, c, g.fabric.base, g.sizes["bottom"] if low is None else low, 0.2)
-
-
-def _zip(rng, colours, garment):
-    return trimmings.zipped(rng, colours, garment.sizes["bottom"], 0.2, max(garment.sizes.get("gap", 0.0), 0.0))
-
-
-def _pockets(kind):
-    return lambda rng, colours, garment: trimmings.pocketed(rng, colours, kind)
-
-
-def _sash(rng, colours, garment):
-    waist = garment.sizes["waist"]
-    return trimmings.banded(colours, garment.fabric.other, waist - 0.01, waist + rng.uniform(0.02, 0.05))
-
-
-def _turn_up(rng, colours, garment):
-    pale = 0.5 * garment.fabric.base + 0.35
-    return trimmings.below(colours, pale.astype(np.float32), garment.sizes["end"] + 0.045)
-
+Colouring = Callable[[Spots], np.ndarray]
 
 PADDED = ("puffer", "vest")
-TRIMMINGS = (
-    Trimming(PADDED, None, lambda rng, c, g: trimmings.quilted(c, QUILT)),
-    Trimming(TOPS, "pocket", _pockets("chest")),
-    Trimming(("denim_jacket",), "pockets", _pockets("chest")),
-    Trimming(tuple(kind for kind in OUTER if kind != "denim_jacket"), "pockets", _pockets("jacket")),
-    Trimming(BOTTOMS, "pockets", _pockets("jeans")),
-    Trimming(("cargo",), None, _pockets("cargo")),
-    Trimming(("shirt", "blouse"), "closed collar", _buttons()),
-    Trimming(("denim_jacket", "blazer", "cardigan", "coat"), "closed", _buttons()),
-    Trimming(("polo",), None, _buttons(0.02)),
-    Trimming(("shirt_dress",), None, lambda rng, c, g: trimmings.buttoned(rng, c, g.fabric.base, g.sizes["end"], 0.2)),
-    Trimming(("hoodie",), "zip", _zip),
-    Trimming(("jacket", "puffer", "hooded_jacket", "vest"), None, _zip),
-    Trimming(("coat",), "sash", lambda rng, c, g: trimmings.banded(c, g.fabric.base * 0.6, WAIST - 0.02, WAIST + 0.02)),
-    Trimming(DRESSES, "sash", _sash),
-    Trimming(("jeans",), "turn_up", _turn_up),
-)
-"""In the order in which they are sewn on: they share the fabric's random numbers."""
+SEWN_ON = (
+    (PADDED, None, lambda c, s, rng, g: trimmings.quilted(c, s, QUILT)),
+    (TOPS, "pocket", lambda c, s, rng, g: trimmings.pocketed(c, s, rng, "chest")),
+    (("denim_jacket",), "pockets", lambda c, s, rng, g: trimmings.pocketed(c, s, rng, "chest")),
+    ({*OUTER} - {"denim_jacket"}, "pockets", lambda c, s, rng, g: trimmings.pocketed(c, s, rng, "jacket")),
+    (BOTTOMS, "pockets", lambda c, s, rng, g: trimmings.pocketed(c, s, rng, "jeans")),
+    (("cargo",), None, lambda c, s, rng, g: trimmings.pocketed(c, s, rng, "cargo")),
+    (("shirt", "blouse"), "closed collar", lambda c, s, rng, g: _buttoned(c, s, rng, g, g.sizes["bottom"])),
+    (("denim_jacket", "blazer", "cardigan", "coat"), "closed",
+     lambda c, s, rng, g: _buttoned(c, s, rng, g, g.sizes["bottom"])),
+    (("polo",), None, lambda c, s, rng, g: _buttoned(c, s, rng, g, 0.02)),
+    (("shirt_dress",), None, lambda c, s, rng, g: _buttoned(c, s, rng, g, g.sizes["end"])),
+    (("hoodie",), "zip", lambda c, s, rng, g: _zipped(c, s, rng, g.sizes)),
+    (("jacket", "puffer", "hooded_jacket", "vest"), None, lambda c, s, rng, g: _zipped(c, s, rng, g.sizes)),
+    (("coat",), "sash", lambda c, s, rng, g: trimmings.banded(c, s, g.fabric.base * 0.6, WAIST - 0.02, WAIST + 0.02)),
+    (DRESSES, "sash", lambda c, s, rng, g: trimmings.banded(
+        c, s, g.fabric.other, g.sizes["waist"] - 0.01, g.sizes["waist"] + rng.uniform(0.02, 0.05))),
+    (("jeans",), "turn_up", lambda c, s, rng, g: mix(
+        c, (0.5 * g.fabric.base + 0.35).astype(np.float32), band(s.template[:, 1], -9.0, g.sizes["end"] + 0.045))),
+)  # fmt: skip
+"""What is sewn on: kinds of garments that have it; the detail that they need for it, None: all have it; and a function of
+colours, points, random numbers and the garment. In this order: they share the fabric's random numbers."""
 
 
-def _trimmed(colours, garment):
-    """Colours with the garment's trimmings."""
-    rng, details = garment.fabric.rng(2), garment.details
+def _buttoned(colours, s, rng, garment, low):
+    return trimmings.buttoned(colours, s, rng, garment.fabric.base, low, 0.2)
+
+
+def _zipped(colours, s, rng, sizes):
+    return trimmings.zipped(colours, s, rng, sizes["bottom"], 0.2, max(sizes.get("gap", 0.0), 0.0))
+
+
+def _sewn(garment: Garment, hems=(), sleeve=None, seams=True) -> Colouring:
+    """The garment's fabric with hems, seams, prints and what is sewn on."""
+    details, base = garment.details, garment.fabric.base
     if "collar" in details and "open" not in details:
         details = details | {"closed collar"}
-    for trimming in TRIMMINGS:
-        if garment.kind in trimming.kinds and (trimming.detail is None or trimming.detail in details):
-            colours = trimming.add(rng, colours, garment)
+
+    def colours(s):
+        rng = garment.fabric.rng(1)
+        result = trimmings.hemmed(garment.fabric.colours(s), s, hems, sleeve)
+        result = trimmings.seamed(result, s) if seams else result
+        if "ribbed" in details and sleeve is not None:
+            result = trimmings.ribbed(result, s, garment.sizes["bottom"], garment.sizes["sleeve"])
+        if details & {"print", "number"}:
+            result = trimmings.printed(result, s, rng, base, "number" in details)
+        if "side_stripe" in details:
+            result = trimmings.side_striped(result, s, rng, base)
+        rng = garment.fabric.rng(2)
+        for kinds, detail, sew in SEWN_ON:
+            if garment.kind in kinds and (detail is None or detail in details):
+                result = sew(result, s, rng, garment)
+        return result
+
     return colours
-
-
-def _sewn(garment, bottom=None, sleeve=None):
-    """The garment's fabric with hems, seams, prints and trimmings."""
-    base, own = garment.fabric.base, garment.fabric.rng(1)
-    hems = () if bottom is None else (bottom + 0.018,)
-    colours = trimmings.hemmed(weave(garment.fabric), hems, None if sleeve is None else sleeve - 0.016)
-    colours = trimmings.seamed(colours)
-    if "ribbed" in garment.details and bottom is not None and sleeve is not None:
-        colours = trimmings.ribbed(colours, bottom, sleeve)
-    if "print" in garment.details or "number" in garment.details:
-        colours = trimmings.printed(own, colours, base, number="number" in garment.details)
-    if "side_stripe" in garment.details:
-        colours = trimmings.side_striped(own, colours, base)
-    return _trimmed(colours, garment)
 
 
 def _neck(garment):
@@ -190,12 +168,9 @@ def _neck(garment):
 def _top(rng, outfit, garment):
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
-    cuts = [
-        (tailoring.neckline, _neck(garment), sizes["depth"]),
-        (tailoring.sleeves, sleeve),
-        (tailoring.above, bottom),
-        *([(tailoring.front_opening, 0.03, 0.12)] if "open" in details else []),
-    ]
+    cuts: list[tuple] = [(tailoring.neckline, _neck(garment), sizes["depth"])]
+    cuts += [(tailoring.sleeves, sleeve), (tailoring.above, bottom)]
+    cuts += [(tailoring.front_opening, 0.03, 0.12)] if "open" in details else []
     fit = Fit(
         ease=max((0.008 if "tucked" in details else 0.012) + 0.016 * loose, outfit.trunk + LAYER),
         hang=rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 2.0,
@@ -204,7 +179,8 @@ def _top(rng, outfit, garment):
         inner=outfit.trunk + 0.5 * LAYER if outfit.trunk else 0.0,
         skirted=True,
     )
-    material = Material(_sewn(garment, bottom, sleeve if sleeve > 0.2 else None), 0.25 + 0.45 * loose, sheen=0.04)
+    colours = _sewn(garment, (bottom + 0.018,), sleeve - 0.016 if sleeve > 0.2 else None)
+    material = Material(colours, 0.25 + 0.45 * loose, sheen=0.04)
     _put(rng, outfit, cuts, fit, material, HEM_MARGIN + 0.03 * loose)
     outfit.trunk, outfit.fit = fit.ease, fit
     if kind in ("shirt", "polo", "blouse") and "collar" in details:
@@ -222,12 +198,9 @@ def _outer(rng, outfit, garment):
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     gap, spread, bottom, loose = sizes["gap"], sizes["spread"], sizes["bottom"], sizes["loose"]
     long, padded = kind == "coat", kind in PADDED
-    cuts = [
-        (tailoring.neckline, "vee" if "lapels" in details else "crew", 0.09),
-        (tailoring.sleeves, sizes["sleeve"]),
-        (tailoring.above, WAIST - 0.045 if long else bottom),
-        *([(tailoring.front_opening, gap, spread)] if gap > 0 else []),
-    ]
+    cuts: list[tuple] = [(tailoring.neckline, "vee" if "lapels" in details else "crew", 0.09)]
+    cuts += [(tailoring.sleeves, sizes["sleeve"]), (tailoring.above, WAIST - 0.045 if long else bottom)]
+    cuts += [(tailoring.front_opening, gap, spread)] if gap > 0 else []
     ease = max(outfit.trunk + 0.009 + 0.008 * loose, 0.022 if padded else 0.0)
     fit = Fit(
         ease=ease,
@@ -239,24 +212,22 @@ def _outer(rng, outfit, garment):
         skirted=True,
         inner=outfit.trunk + 0.5 * LAYER,
     )
-    colours = _sewn(garment, bottom, sizes["sleeve"] if kind != "vest" else None)
+    colours = _sewn(garment, (bottom + 0.018,), sizes["sleeve"] - 0.016 if kind != "vest" else None)
     wrinkles = 0.15 if kind == "blazer" else 0.3 + 0.2 * loose
     material = Material(colours, wrinkles, sheen=0.12 if padded else 0.05)
     _put(rng, outfit, cuts, fit, material, 0.03)
     outfit.trunk, outfit.fit = ease, fit
     if long:
         width = max(outfit.legs, ease) + 0.002
-        tube = skirt(
-            rng, outfit.anatomy, Skirt(WAIST + 0.02, bottom, width, sizes["flare"], 5, 0.008, gap, 0.5 * spread)
-        )
+        cut_of = Skirt(WAIST + 0.02, bottom, width, sizes["flare"], 5, 0.008, gap, 0.5 * spread)
+        tube = skirt(rng, outfit.anatomy, cut_of)
         if gap < 0:
             outfit.hide(lambda t: tailoring.hips_and_legs(t, WAIST, bottom), 0.02)
         outfit.add(tube, dataclasses.replace(material, draped=True))
     if "lapels" in details:
-        edge = max(gap, 0.004)
+        edge, low = max(gap, 0.004), rng.uniform(-0.16, -0.08)
         strip = dataclasses.replace(fit, ease=ease + 0.006, fold=0.0, hem=0.005, inner=ease + 0.003)
-        low = rng.uniform(-0.16, -0.08)
-        dark = Material(trimmings.darkened(colours, 0.88), sheen=0.06)
+        dark = Material(lambda s: 0.88 * colours(s), sheen=0.06)  # seen against its pile
         _strip(rng, outfit, tailoring.lapel(outfit.template, edge, spread if gap > 0 else 0.0, low), strip, dark)
         _collar(rng, outfit, dark, strip, 0.001, 0.12, 0.17, max(edge, 0.03))
     elif "hood" in details or kind == "hooded_jacket":
@@ -281,7 +252,7 @@ def _trousers(rng, outfit, garment):
         fold=0.0012 if kind in ("leggings", "slim") else 0.0025 + 0.0035 * loose,
         calm=9.0 if tucked else outfit.lowest + 0.02,
     )
-    material = Material(_sewn(garment, end), wrinkles=0.15 + 0.4 * loose, sheen=0.03)
+    material = Material(_sewn(garment, (end + 0.018,)), wrinkles=0.15 + 0.4 * loose, sheen=0.03)
     in_two_legs = lambda surface: surface.with_attributes(cloth=leg_coordinates(surface.attributes["template"]))
     margin = HEM_MARGIN + 0.03 * loose * (kind in ("wide", "shorts"))
     _put(rng, outfit, [(tailoring.trousers, top, end)], fit, material, margin, in_two_legs, tucked)
@@ -306,12 +277,12 @@ def _skirt(rng, outfit, garment):
     top, end = sizes["top"], sizes["end"]
     ease = outfit.trunk + 0.004 if tucked else 0.004
     cling = 0.0 if tucked else max(0.0, top - outfit.lowest + 0.02)  # as far as the top reaches
-    colours = trimmings.hemmed(weave(garment.fabric), (end + 0.02,))
-    colours = trimmings.banded(colours, garment.fabric.base * 0.8, top - 0.035, top)
+    colours = _sewn(garment, (end + 0.02,), seams=False)
+    waistband = lambda s: trimmings.banded(colours(s), s, garment.fabric.base * 0.8, top - 0.035, top)
     tube = Skirt(top, end, ease, _flare(sizes), int(sizes["pleats"]), sizes["depth"], cling=cling)
     surface = skirt(rng, outfit.anatomy, tube)
     outfit.hide(lambda t: tailoring.hips_and_legs(t, top, end), 0.0, tucked)
-    outfit.add(surface, Material(colours, wrinkles=0.35, sheen=0.05, draped=True))
+    outfit.add(surface, Material(waistband, wrinkles=0.35, sheen=0.05, draped=True))
     outfit.legs = ease + 0.02
     if not tucked:
         _let_hang_over(outfit, 0.055)
@@ -325,14 +296,10 @@ def _flare(sizes):
 def _dress(rng, outfit, garment):
     sizes = garment.sizes
     waist, end = sizes["waist"], sizes["end"]
-    cuts = [
-        (tailoring.neckline, _neck(garment), sizes["depth"]),
-        (tailoring.sleeves, sizes["sleeve"]),
-        (tailoring.above, waist - 0.02),
-    ]
+    neckline = tailoring.neckline, _neck(garment), sizes["depth"]
+    cuts = [neckline, (tailoring.sleeves, sizes["sleeve"]), (tailoring.above, waist - 0.02)]
     fit = Fit(ease=0.008, hang=1.0, sleeve=0.004 + 0.03 * sizes["loose"], fold=0.002)
-    colours = _trimmed(trimmings.hemmed(weave(garment.fabric), (end + 0.02,)), garment)
-    material = Material(colours, wrinkles=0.3, sheen=0.05)
+    material = Material(_sewn(garment, (end + 0.02,), seams=False), wrinkles=0.3, sheen=0.05)
     _put(rng, outfit, cuts, fit, material, HEM_MARGIN + 0.02 * sizes["loose"])
     outfit.trunk, outfit.fit = fit.ease, fit
     tube = Skirt(waist, end, 0.010, _flare(sizes), int(sizes["pleats"]), sizes["depth"])
@@ -345,7 +312,8 @@ def _dress(rng, outfit, garment):
 
 
 def _socks(rng, outfit, garment):
-    material = Material(trimmings.ribbed_shaft(weave(garment.fabric)), wrinkles=0.1)
+    ribs = lambda s: (0.94 + 0.06 * np.cos(2 * np.pi * s.around / 0.008))[:, None]
+    material = Material(lambda s: garment.fabric.colours(s) * ribs(s), wrinkles=0.1)
     fit = Fit(ease=0.003, fold=0.001, hem=0.003)
     _put(rng, outfit, [(tailoring.shaft, garment.sizes["height"])], fit, material, 0.008)
 
@@ -353,8 +321,9 @@ def _socks(rng, outfit, garment):
 def _shoes(rng, outfit, garment):
     sizes, anatomy = garment.sizes, outfit.anatomy
     height, sole = sizes["height"], sizes["sole"]
-    colours = trimmings.leather(garment.fabric.rng(2), garment.kind, garment.fabric.base, 0.004)
-    material = Material(colours, sheen=0.2 if garment.kind != "sneakers" else 0.08)
+    fabric, kind = garment.fabric, garment.kind
+    colours = lambda s: trimmings.leather(s, fabric.rng(2), kind, fabric.base)
+    material = Material(colours, sheen=0.2 if kind != "sneakers" else 0.08)
     if garment.kind == "sandals":
         outfit.add(accessories.pair_of_shoes(anatomy, 0.024, sole, 0.004), material, layered=False)
         for field in tailoring.sandal_straps(outfit.template):
@@ -378,42 +347,39 @@ def _unhidden_legs(piece):
 def _belt(rng, outfit, garment):
     top, width = garment.sizes["top"], garment.sizes["width"]
     fit = Fit(ease=outfit.trunk + 0.009, hang=0.6, fold=0.0, hem=0.006, inner=outfit.trunk + 0.007)
-    colours = trimmings.buckled(weave(garment.fabric), top - 0.5 * width, width)
+    colours = lambda s: trimmings.buckled(garment.fabric.colours(s), s, top - 0.5 * width, width)
     field = tailoring.trousers(outfit.template, top, top - width)
-    outfit.add(shell(rng, outfit.anatomy, [field], fit), Material(colours, sheen=0.15))
+    _strip(rng, outfit, field, fit, Material(colours, sheen=0.15), layered=True)
 
 
 def _tie(rng, outfit, garment):
     field = tailoring.necktie(outfit.template, garment.sizes["length"], garment.sizes["width"])
     raised = outfit.trunk + 0.005 + outfit.fit.fold
     fit = dataclasses.replace(outfit.fit, ease=raised, inner=raised - 0.002, fold=0.0, hem=0.004)
-    outfit.add(shell(rng, outfit.anatomy, [field], fit), Material(weave(garment.fabric), sheen=0.15))
+    _strip(rng, outfit, field, fit, Material(garment.fabric.colours, sheen=0.15), layered=True)
 
 
 def _watch(rng, outfit, garment):
     field = tailoring.bracelet(outfit.template, garment.sizes["side"], 0.628, 0.650)
-    _strip(rng, outfit, field, Fit(ease=0.003, fold=0.0, hem=0.002), Material(weave(garment.fabric), sheen=0.3))
+    _strip(rng, outfit, field, Fit(ease=0.003, fold=0.0, hem=0.002), Material(garment.fabric.colours, sheen=0.3))
 
 
 def _bag(rng, outfit, garment):
     """A backpack or a shoulder bag, and its straps, which lie on what is worn."""
-    cloth, size, on_back = weave(garment.fabric), garment.sizes["size"], garment.kind == "backpack"
-    bag = trimmings.zipped_bag(garment.fabric.rng(2), cloth, garment.fabric.base)
+    fabric, size, on_back = garment.fabric, garment.sizes["size"], garment.kind == "backpack"
+    bag = lambda s: trimmings.zipped_bag(fabric.colours(s), s, fabric.rng(2), fabric.base)
     if on_back:
         surface, material, sheen = accessories.backpack(outfit.anatomy, size, outfit.trunk), Material(bag, 0.1), 0.0
         straps = tailoring.straps(outfit.template, -0.16, -0.03)
     else:
         side, outer = garment.sizes["side"], max(outfit.trunk, min(outfit.legs, 0.02))
-        surface, material, sheen = (
-            accessories.shoulder_bag(outfit.anatomy, size, side, outer),
-            Material(bag, 0.0, 0.12),
-            0.12,
-        )
+        surface = accessories.shoulder_bag(outfit.anatomy, size, side, outer)
+        material, sheen = Material(bag, 0.0, 0.12), 0.12
         straps = tailoring.sash(outfit.template, -side * 0.105, side * 0.165, 0.014)
     outfit.add(surface, material, layered=False)
     raised = outfit.trunk + 0.009 + 1.5 * outfit.fit.fold
     flat = {"ease": raised, "inner": raised - 0.002, "fold": 0.0, "hem": 0.006, "quilt": 0.0, "skirted": True}
-    _strip(rng, outfit, straps, dataclasses.replace(outfit.fit, **flat), Material(cloth, sheen=sheen))
+    _strip(rng, outfit, straps, dataclasses.replace(outfit.fit, **flat), Material(fabric.colours, sheen=sheen))
 
 
 def _accessory(rng, outfit, garment):

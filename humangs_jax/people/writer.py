@@ -4,7 +4,7 @@ out/manifest.json                    settings of the set and finished subjects, 
 out/SEED/                            a capture (docs/capture_format.md): views of one person in one or several poses
 out/SEED/held_out/                   a capture of its own with the views that reconstruction may not see
 out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
-out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see `scans`
+out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see `baking`
 out/SEED/depth/NAME.png, maps/NAME.exr    where asked for, see `maps`; also in held_out/
 """
 
@@ -24,11 +24,11 @@ from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import replace_folder
+from humangs_jax.people.baking import export_scan
 from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
 from humangs_jax.people.manifest import begin_set, write_manifest
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.rendering import PosedSubject, pose_subject, render_maps, render_view, write_depth, write_maps
-from humangs_jax.people.scans import export_scan
 from humangs_jax.people.seeds import seeds_of
 from humangs_jax.people.sequences import sample_sequence
 from humangs_jax.people.subject import SyntheticSubject, make_subject
@@ -163,7 +163,7 @@ def write_subject(
     """A capture of `input_views` evenly spread photos of a standing person, and `held_out/` with other views.
 
     The held-out capture shows the same pose (frame 0) from `held_out_views` other cameras, then each of `novel_poses` other
-    poses (frames 1, 2, ...) from as many. Written whole or not at all; an existing folder is replaced.
+    poses (frames 1, 2, ...) from as many.
     """
     layout = Layout(image_size, views=input_views, held_out_views=held_out_views, novel_poses=novel_poses)
     write_person(folder, seed, body, layout)
@@ -172,7 +172,7 @@ def write_subject(
 def write_training_subject(
     folder: str | Path, seed: int, *, body: BodyModel, image_size: int = 256, poses: int = 2, views: int = 12
 ) -> None:
-    """ONE capture of `poses` frames with `views` views each, azimuths evenly spread with jitter. Written whole or not at all."""
+    """ONE capture of `poses` frames with `views` views each, azimuths evenly spread with jitter."""
     write_person(folder, seed, body, Layout(image_size, poses=poses, views=views))
 
 
@@ -189,11 +189,8 @@ def write_set(
 ) -> list[Path]:
     """Write people `first` .. `first + subjects - 1` of a split into `out`/SEED; folders that are there already are kept.
 
-    Arguments:
-        workers: processes that make people; with more than one they always use the CPU. The
-            files are the same. More than one needs the calling script to be guarded by `if __name__ == "__main__"`.
-        body: the package's own if not given. progress: show a bar.
-
+    workers: processes that make people; more than one use the CPU, write the same files, and need the calling script to be
+    guarded by `if __name__ == "__main__"`. body: the package's own if not given. progress: show a bar.
     Returns the folders. Raises: ValueError if the people reach beyond the split, `out` was written with other settings or by
     another version of the generator, or (at the end, the others being written) some could not be made.
     """

@@ -14,17 +14,11 @@ from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture, Source
-from humangs_jax.people import (
-    ON_THE_FLY,
-    SPLITS,
-    OnTheFlyConfig,
-    PeopleBank,
-    build_bank,
-    find_people,
-    load_bank,
-    on_the_fly_source,
-    save_bank,
-)
+from humangs_jax.people.bank import PeopleBank, build_bank, load_bank, save_bank
+from humangs_jax.people.manifest import find_people
+from humangs_jax.people.on_the_fly import ON_THE_FLY, OnTheFlyConfig
+from humangs_jax.people.seeds import SPLITS
+from humangs_jax.people.source import on_the_fly_source
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.sharding import batch_sharding
 

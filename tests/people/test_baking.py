@@ -10,7 +10,7 @@ import pytest
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
-from humangs_jax.people import atlas, baking, cameras, rendering, scans, subject, writer
+from humangs_jax.people import atlas, baking, cameras, rendering, subject, writer
 from humangs_jax.people.seeds import DEMO
 from humangs_jax.rendering.mesh.texturing import render_textured_mesh, sample_texture
 
@@ -84,7 +84,7 @@ def test_corners_of_the_atlas_are_those_of_the_mesh(person, baked):
 
 def test_the_texture_says_what_the_materials_say(person, baked):
     rng = np.random.default_rng(0)
-    faces = rng.integers(len(baked.faces), size=4000)
+    faces = rng.integers(len(person.surface.faces), size=4000)
     weights = rng.dirichlet(np.ones(3), size=4000).astype(np.float32)
     albedo, slopes = rendering.paint(person, faces, rendering.spots_at(person, faces, weights))
     uv = sum(weights[:, i : i + 1] * baked.atlas.uvs[baked.atlas.faces[faces, i]] for i in range(3))
@@ -129,9 +129,9 @@ def read_mesh(path) -> Any:
 def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
     posed = writer.sample_pose(person, 0)
     pose = BodyPose(jnp.asarray(posed.rotations), jnp.asarray(posed.translation))
-    folder = scans.export_scan(person, tmp_path / "scan", pose, lit=True, texture_size=SIZE)
+    folder = baking.export_scan(person, tmp_path / "scan", pose, lit=True, texture_size=SIZE)
     assert not list(tmp_path.glob(".*"))
-    known = json.loads((folder / scans.PARAMETERS).read_text())
+    known = json.loads((folder / baking.PARAMETERS).read_text())
     assert known["seed"] == person.seed and known["lit"]
     np.testing.assert_allclose(known["rotations"], posed.rotations)
     textures = []
@@ -143,7 +143,7 @@ def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
         np.testing.assert_allclose(mesh.visual.uv, baked.atlas.uvs, atol=1e-6)
         material = mesh.visual.material
         texture = np.asarray(material.image if name.endswith("obj") else material.baseColorTexture)[..., :3]
-        np.testing.assert_array_equal(texture, scans.lit_texture(posed, baked))
+        np.testing.assert_array_equal(texture, baking.lit_texture(posed, baked))
         textures.append(texture)
     camera = cameras.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([0.5]), 128)[0]
     direct, mask = rendering.render_view(posed, camera)
@@ -155,7 +155,7 @@ def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
 
 
 def test_a_scan_without_a_pose_is_at_rest_in_albedo(person, baked, tmp_path):
-    folder = scans.export_scan(person, tmp_path / "rest", texture_size=SIZE, formats=("glb",))
+    folder = baking.export_scan(person, tmp_path / "rest", texture_size=SIZE, formats=("glb",))
     assert sorted(file.name for file in folder.iterdir()) == ["scan.glb", "scan.json"]
     mesh = read_mesh(folder / "scan.glb")
     np.testing.assert_allclose(mesh.vertices, person.surface.vertices[baked.atlas.vertices], atol=1e-6)
@@ -164,15 +164,15 @@ def test_a_scan_without_a_pose_is_at_rest_in_albedo(person, baked, tmp_path):
 
 def test_a_scan_is_written_whole_or_not_at_all(person, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="obj or glb"):
-        scans.export_scan(person, tmp_path / "scan", formats=("ply",))
+        baking.export_scan(person, tmp_path / "scan", formats=("ply",))
 
     def fail(*_):
         raise OSError("disk full")
 
     (tmp_path / "scan").mkdir()
     (tmp_path / "scan" / "old").touch()
-    monkeypatch.setattr(scans, "_write_mesh", fail)
+    monkeypatch.setattr(baking, "_write_mesh", fail)
     with pytest.raises(OSError, match="disk full"):
-        scans.export_scan(person, tmp_path / "scan", texture_size=SIZE)
+        baking.export_scan(person, tmp_path / "scan", texture_size=SIZE)
     assert [path.name for path in tmp_path.iterdir()] == ["scan"]
     assert (tmp_path / "scan" / "old").exists()

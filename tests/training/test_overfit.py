@@ -20,7 +20,7 @@ from humangs_jax.network import presets
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
-from humangs_jax.people import write_subject
+from humangs_jax.people.writer import write_subject
 from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.optimizer import OptimizerConfig
 from humangs_jax.training.state import init_state
