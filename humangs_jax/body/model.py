@@ -28,6 +28,7 @@ class BodyModel:
     faces: (f, 3) vertex indices, counter-clockwise seen from outside.
     uvs, uv_faces: (u, 2) texture coordinates (v up) and (f, 3) indices into them, or None.
     collapse_order, collapse_into: (n,) or None: progressive decimation, see `humangs_jax.body.decimation`.
+    spacing: (n,) or None: distance to neighbouring vertices relative to the mesh that was subdivided, see `body.subdivision`.
     parents: static, parent of each joint, -1 for the root. joint_names, shape_names, name: static.
     """
 
@@ -41,6 +42,7 @@ class BodyModel:
     uv_faces: Int[Array, "f 3"] | None = None
     collapse_order: Int[Array, " n"] | None = None
     collapse_into: Int[Array, " n"] | None = None
+    spacing: Float[Array, " n"] | None = None
     parents: tuple[int, ...] = static_field(default=())
     joint_names: tuple[str, ...] = static_field(default=())
     shape_names: tuple[str, ...] = static_field(default=())

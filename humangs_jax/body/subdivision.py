@@ -11,6 +11,8 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.pytree import replace
 
+SMALLEST_AREA = 1e-12
+"""Metres^2: vertices without faces have no area."""
 FINEST = 64
 """Edges are made at most this many times shorter: finer asks for billions of faces, and is a length in another unit."""
 
@@ -19,7 +21,8 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
     """The body with edges of its template at most `longest` metres; the original vertices stay first, in their order.
 
     Faces are cut into two, three or four along the midpoints of their long edges, consistently on both sides. Texture
-    coordinates and decimation order are dropped: they belong to the original mesh.
+    coordinates and decimation order are dropped: they belong to the original mesh. `spacing` is the root of the area around a
+    vertex over what it was: 1/2 where every edge has been halved.
 
     Raises: ValueError if `longest` is not positive, or less than 1/64 of the longest edge.
     """
@@ -28,6 +31,7 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
     names = ("template", "shape_directions", "pose_directions", "skinning_weights")
     linear = {name: np.asarray(value) for name in names if (value := getattr(body, name)) is not None}
     faces = np.asarray(body.faces)
+    linear["area"] = vertex_areas(linear["template"], faces)
     while True:
         edges, edge_of_side = _edges(faces)
         lengths = np.linalg.norm(linear["template"][edges[:, 0]] - linear["template"][edges[:, 1]], axis=-1)
@@ -43,6 +47,7 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
         middle = {name: 0.5 * (x[edges[long, 0]] + x[edges[long, 1]]) for name, x in linear.items()}
         linear = {name: np.concatenate([x, middle[name].astype(x.dtype)]) for name, x in linear.items()}
         faces = _cut(faces, midpoint[edge_of_side])
+    spacing = np.sqrt(vertex_areas(linear["template"], faces) / np.maximum(linear.pop("area"), SMALLEST_AREA))
     added = len(linear["template"]) - len(body.template)
     regressor = jnp.pad(body.joint_regressor, ((0, 0), (0, added)))  # joints follow the original vertices
     return replace(
@@ -50,11 +55,19 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
         **{name: jnp.asarray(x) for name, x in linear.items()},
         faces=jnp.asarray(faces, body.faces.dtype),
         joint_regressor=regressor,
+        spacing=jnp.asarray(spacing, body.template.dtype),
         uvs=None,
         uv_faces=None,
         collapse_order=None,
         collapse_into=None,
     )
+
+
+def vertex_areas(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """A third of the area of the faces around each vertex (n, 3), metres^2."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
+    return np.bincount(faces.ravel(), np.repeat(areas / 3, 3), len(vertices))
 
 
 def _edges(faces):

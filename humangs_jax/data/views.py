@@ -52,11 +52,17 @@ def pad_views(views: SubjectViews, count: int) -> SubjectViews:
 
 
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
-    """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it."""
+    """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it.
+
+    Its `spacing` is relative to the mesh that the weights were trained with: 1 unless `execution.longest_edge` asks for more.
+    """
     vertices, edge = config.conventions.body_vertices, config.conventions.longest_edge
     if vertices is not None and vertices < len(body.template):
         body = decimate(body, vertices)
-    return body if edge is None else split_long_edges(body, edge)
+    if edge is not None:
+        body = split_long_edges(body, edge)
+    body = replace(body, spacing=None)
+    return body if config.execution.longest_edge is None else split_long_edges(body, config.execution.longest_edge)
 
 
 def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
@@ -93,6 +99,7 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
         view_count=views.view_count,
         posed_normals=jax.vmap(normals)(posed),
         canonical_normals=normals(rest.vertices),
+        spacing=body.spacing,
     )
 
 

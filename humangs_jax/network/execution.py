@@ -28,6 +28,8 @@ class Execution:
     attention and of products with weights ("dots"). On a CPU only a `scan` recomputes: XLA merges what is computed twice
     outside of loops.
     vertex_capacity: vertices for which a view is read at most, None: all.
+    longest_edge: metres to which edges of the body are split beyond what the weights were trained with, None for no more.
+    Gaussians then shrink with the distance between vertices, so that they cover as much as before.
     raster: buffers of the mesh rasterizer.
     """
 
@@ -55,6 +57,12 @@ class Execution:
     )
     vertex_capacity: int | None = knob(
         None, cost="vertices beyond it are dropped and counted", gain="no gain measured", measured=MEASURED
+    )
+    longest_edge: float | None = knob(
+        None,
+        cost="three times the Gaussians at 0.017",
+        gain="detail where photos have more than the vertices of the body",
+        measured="refinement.md",
     )
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
 

@@ -23,7 +23,8 @@ class HumanGSInputs:
     position of each pixel, normalised units, 1 on background. depth_maps: (v, h, w) rasterized z, normalised units, -1
     on background. foreground: (v, h, w) pixels of the person (used where tokens are "foreground"). view_count: the number of
     real views, which come first; the others are padding and change nothing. None: all are real. posed_normals: (v, n, 3)
-    unit, used with shells. canonical_normals: (n, 3) unit, used where the decoder's frame is "normal".
+    unit, used with shells. canonical_normals: (n, 3) unit, used where the decoder's frame is "normal". spacing: (n,) distance
+    between vertices relative to the mesh that the weights were trained with; None: 1.
     """
 
     images: Float[Array, "v h w 3"]
@@ -36,6 +37,7 @@ class HumanGSInputs:
     view_count: Int[Array, ""] | None = None
     posed_normals: Float[Array, "v n 3"] | None = None
     canonical_normals: Float[Array, "n 3"] | None = None
+    spacing: Float[Array, " n"] | None = None
 
     @property
     def present(self) -> Bool[Array, " v"]:

@@ -87,7 +87,9 @@ class VertexDecoder:
             return cast(RawGaussians, self._module(features).apply(variables, entering))
 
         raw = run.stage("raw heads", heads, {"local": features.local, "global_token": features.global_token})
-        return run.stage("canonical Gaussians", lambda raw: self._assemble(raw, features, canonical, unit), raw)
+        return run.stage(
+            "canonical Gaussians", lambda raw: self._assemble(raw, features, canonical, unit, inputs.spacing), raw
+        )
 
     def _module(self, features: VertexFeatures):
         return DecoderModule(self, 0 if features.shells is None else features.shells.distances.shape[0])
@@ -98,8 +100,12 @@ class VertexDecoder:
         features = features if self.frame == "normal" else replace(features, normals=None)
         return decoder_input(features, inputs.canonical_vertices / subject_unit(inputs.canonical_vertices))
 
-    def _assemble(self, raw: "RawGaussians", features: VertexFeatures, canonical: Array, unit: Array) -> HumanGSOutputs:
+    def _assemble(
+        self, raw: "RawGaussians", features: VertexFeatures, canonical: Array, unit: Array, spacing: Array | None
+    ) -> HumanGSOutputs:
         at_vertices = activate(raw, self, features)
+        if spacing is not None:
+            at_vertices = replace(at_vertices, scales=at_vertices.scales * spacing[:, None, None])
         flat = lambda x: x.reshape(-1, *x.shape[2:])
         return HumanGSOutputs(
             gaussians=Gaussians(

@@ -41,7 +41,6 @@ class RefineConfig:
 
     held_out: share of the pixels, in square blocks, or of the photos where there are at least `HELD_OUT_PHOTOS`, that no step
     sees. Their error decides which state of the run is returned. checks: how often it is measured in a run.
-    growth: share of the Gaussians, those with the largest gradients, that are split in two during the run.
     seed: order of the photos, blocks.
     """
 
@@ -64,7 +63,6 @@ class RefineConfig:
     poses: bool = False
     held_out: float = 0.05
     checks: int = 5
-    growth: float = knob(0.0, cost="more Gaussians", gain="detail in photos of 512 pixels and more", measured=MEASURED)
     seed: int = 0
 
     def __post_init__(self):
@@ -76,7 +74,7 @@ class RefineConfig:
             raise ValueError(f"RefineConfig: {', '.join(wrong)} must be at least 1")
         if self.seconds is not None and not self.seconds > 0:
             raise ValueError(f"RefineConfig: seconds must be positive, got {self.seconds}")
-        shares = {name: getattr(self, name) for name in ("final_rate", "decay", "held_out", "growth")}
+        shares = {name: getattr(self, name) for name in ("final_rate", "decay", "held_out")}
         if wrong := [name for name, value in shares.items() if not 0 <= value <= 1]:
             raise ValueError(f"RefineConfig: {', '.join(wrong)} must be in [0, 1]")
         if not self.held_out < 1 or not self.visible > 0 or self.checks < 1:

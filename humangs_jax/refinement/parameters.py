@@ -18,8 +18,9 @@ from humangs_jax.rendering.gaussians import Gaussians
 
 SMALLEST_SCALE = 1e-6
 """Metres; keeps the logarithm finite for flat Gaussians."""
-LOGIT_MARGIN = 0.005
-"""Colours and opacities are pulled this far inside (0, 1): at 0 and 1 the gradient of the sigmoid vanishes."""
+COLOR_MARGIN, OPACITY_MARGIN = 0.005, 0.001
+"""How far both are pulled inside (0, 1), where the gradient of the sigmoid does not vanish; opacities less than the smallest that
+is drawn, 1/255, so that what is hidden stays hidden."""
 PULLED = ("means", "log_scales")
 """Parameters that `RefineConfig.decay` draws back to the start."""
 ADAM = optax.scale_by_adam()
@@ -43,13 +44,13 @@ class Parameters:
 
 
 def parameters_of(gaussians: Gaussians, views: int, joints: int) -> Parameters:
-    """Inverse of `gaussians_of`, within `LOGIT_MARGIN`; poses unchanged."""
+    """Inverse of `gaussians_of`, within `COLOR_MARGIN` and `OPACITY_MARGIN`; poses unchanged."""
     return Parameters(
         gaussians.means,
         gaussians.quats,
         jnp.log(jnp.maximum(gaussians.scales, SMALLEST_SCALE)),
-        inverse_sigmoid(gaussians.opacities, LOGIT_MARGIN),
-        inverse_sigmoid(gaussians.colors, LOGIT_MARGIN),
+        inverse_sigmoid(gaussians.opacities, OPACITY_MARGIN),
+        inverse_sigmoid(gaussians.colors, COLOR_MARGIN),
         jnp.zeros((views, joints, 3)),
         jnp.zeros((views, 3)),
     )

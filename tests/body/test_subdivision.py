@@ -5,7 +5,8 @@ import pytest
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import shape_body
-from humangs_jax.body.subdivision import split_long_edges
+from humangs_jax.body.subdivision import split_long_edges, vertex_areas
+from humangs_jax.core.pytree import replace
 
 LONGEST = 0.05
 JOINT_TOLERANCE = 1e-6  # metres: joints are regressed from the same vertices
@@ -63,3 +64,26 @@ def test_nothing_happens_where_nothing_is_long(coarse):
 def test_impossible_lengths_are_refused(coarse, longest):
     with pytest.raises(ValueError, match="longest edge"):
         split_long_edges(coarse, longest)
+
+
+def test_spacing_says_how_much_closer_vertices_are():
+    """A flat square of two triangles: all edges halved twice, then spacing is a quarter inside and at the rim."""
+    body = load_body()
+    square = np.asarray([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
+    n = len(square)
+    flat = replace(
+        body,
+        template=jnp.asarray(square),
+        shape_directions=jnp.zeros((n, 3, 1)),
+        joint_regressor=jnp.zeros((55, n)),
+        skinning_weights=jnp.ones((n, 55)) / 55,
+        faces=jnp.asarray([[0, 1, 2], [0, 2, 3]]),
+    )
+    coarse, fine = split_long_edges(flat, 0.8), split_long_edges(flat, 0.4)
+    assert len(coarse.template) == 9 and len(fine.template) == 25
+    around = lambda mesh: vertex_areas(np.asarray(mesh.template), np.asarray(mesh.faces))
+    np.testing.assert_allclose(around(fine).sum(), 1, rtol=1e-6)
+    # the four corners keep their faces' shape: a quarter of the length is a sixteenth of the area
+    np.testing.assert_allclose(fine.spacing[:n], 0.25, rtol=1e-5)
+    np.testing.assert_allclose(coarse.spacing[:n], 0.5, rtol=1e-5)
+    assert split_long_edges(flat, 10.0).spacing == pytest.approx(1.0)

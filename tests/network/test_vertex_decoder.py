@@ -3,8 +3,11 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+from network_cases import TINY, random_inputs
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
+from humangs_jax.network.parts import Pass
 from humangs_jax.network.reader import VertexFeatures
 from humangs_jax.network.shells import Shells
 from humangs_jax.network.vertex_decoder import (
@@ -139,3 +142,16 @@ def test_frames_turn_smoothly_with_the_normal():
     near /= np.linalg.norm(near, axis=-1, keepdims=True)
     a, b = (quaternion.to_matrix(normal_frames(jnp.asarray(x, jnp.float32))) for x in (normals, near))
     assert np.abs(a - b).max() < 0.05
+
+
+def test_scales_follow_the_spacing_of_vertices_and_nothing_else_does():
+    inputs = random_inputs(vertices=4)
+    decoder = VertexDecoder(hidden=8, tight=1, free=1)
+    features = VertexFeatures(jnp.ones((4, 3)), jnp.ones(2))
+    run = Pass(TINY)
+    variables = decoder.init(jax.random.key(0), features, inputs, run)
+    spacing = jnp.asarray([1.0, 0.5, 0.25, 2.0])
+    as_trained = decoder.apply(variables, features, inputs, run).gaussians
+    finer = decoder.apply(variables, features, replace(inputs, spacing=spacing), run).gaussians
+    np.testing.assert_allclose(finer.scales, as_trained.scales * jnp.repeat(spacing, 2)[:, None], rtol=1e-6)
+    assert jax.tree.all(jax.tree.map(np.array_equal, replace(finer, scales=0), replace(as_trained, scales=0)))

@@ -157,7 +157,7 @@ def test_crops_show_the_same_pixels(person):
         ({"steps": None, "seconds": None}, "steps, seconds"),
         ({"steps": 0}, "steps"),
         ({"seconds": 0.0}, "seconds"),
-        ({"growth": 2.0}, "growth"),
+        ({"decay": 2.0}, "decay"),
         ({"visible": 0.0}, "visible"),
     ],
 )

@@ -1,0 +1,254 @@
+"""What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colours.
+
+    python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 1 2 5 15] [--sizes 256 512]
+        [--views 4] [--page docs/refinement.md] [--plot docs/images/refinement.png] [--sheet docs/images/refinement_people.png]
+
+People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random colours" from
+as many round Gaussians of random colours on the vertices of the body. Scores are those of `evaluation/results.py` and, of the
+views, "psnr_outline": PSNR in the band of 3 pixels (of 256) to either side of the true outline, and "fog": share of the true
+mask where the rendering's alpha lies between 0.05 and 0.9. 0 seconds are the start. A later run continues: finished people in
+the JSON with the same settings are not computed again.
+
+Seconds do not count compilation, which is the same for people with photos of one size. Two devices where there are two cores.
+"""
+
+import argparse
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import markdown_table, publish, write_json
+from experiments.evaluation.options import add_people_options, check_people_options, load_network, settings_of
+from experiments.evaluation.results import TASK_NAMES, kept_rows, mean_scores
+
+STARTS = ("network", "random colours")
+SHOWN = {
+    "psnr": ("PSNR", 2),
+    "psnr_foreground": ("on the person", 2),
+    "psnr_outline": ("outline", 2),
+    "fog": ("fog", 3),
+}
+BAND = 3 / 256
+"""Half the width of the band at the outline, of the image's side."""
+FOG = (0.05, 0.9)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_people_options(parser, subjects=8)
+    parser.add_argument("--seconds", type=float, nargs="+", default=[1, 2, 5, 15], help="lengths of the runs")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="sides of the photos in pixels")
+    parser.add_argument("--views", type=int, nargs="+", default=[4], help="numbers of photos")
+    parser.add_argument("--starts", nargs="+", choices=STARTS, default=["network"], help="what is refined")
+    parser.add_argument("--plot", type=Path, help="draw PSNR against seconds here")
+    parser.add_argument(
+        "--sheet", type=Path, help="truth, feed-forward and the longest run of every person, largest size"
+    )
+    arguments = parser.parse_args()
+    check_people_options(parser, arguments)
+    from humangs_jax.cli.options import use_all_cores
+
+    use_all_cores()
+    report = evaluate(arguments)
+    text = section(report)
+    print(text)
+    if arguments.page:
+        publish(arguments.page, "refinement", text, report)
+    if arguments.plot:
+        plot(arguments.plot, report)
+
+
+def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Rows of all people, written to the JSON after each."""
+    from tqdm import tqdm
+
+    from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
+    from humangs_jax.body.library import load_body
+    from humangs_jax.people.seeds import seeds_of
+
+    body, (variables, config, digest) = load_body(), load_network(arguments)
+    settings = settings_of(arguments, digest, config.tokens, None)
+    settings |= {name: getattr(arguments, name) for name in ("seconds", "sizes", "views", "starts")}
+    rows, images = kept_rows(arguments.json, settings, "cells"), {}
+    held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
+    seeds = seeds_of(arguments.split, arguments.first, arguments.subjects)
+    for seed in tqdm(seeds, desc="people"):
+        if seed in rows and not arguments.sheet:
+            continue
+        row: dict[str, Any] = {}
+        for size in arguments.sizes:
+            subject = make_evaluation_subject(seed, body, arguments.views, size, held_out)
+            for count in arguments.views:
+                for start in arguments.starts:
+                    cell, drawn = measure(variables, config, subject, count, start, arguments.seconds)
+                    row[f"{size} {count} {start}"] = cell
+                    if start == "network" and count == max(arguments.views):
+                        images[seed] = drawn
+        rows[seed] = row
+        if arguments.json:
+            write_json(arguments.json, report_of(rows, settings, seeds))
+    if arguments.sheet:
+        write_sheet(arguments.sheet, images)
+    return report_of(rows, settings, seeds)
+
+
+def measure(variables, config, subject, count, start, seconds):
+    """Scores by seconds and task, and (truth, feed-forward, refined) of the first held-out view."""
+    import jax
+
+    from humangs_jax.avatar.reconstruct import reconstruct
+    from humangs_jax.refinement.config import RefineConfig
+    from humangs_jax.refinement.refine import refine_with_report
+
+    inputs = subject.inputs(count)
+    avatar = reconstruct(variables, config, inputs)
+    if start != "network":
+        avatar = random_start(avatar, subject.seed)
+    devices = min(len(jax.devices()), count)
+    mesh = jax.make_mesh((devices,), ("photos",), devices=jax.devices()[:devices]) if devices > 1 else None
+    scores, first = score_all(avatar, subject.held_out)
+    cell, last = {"0": scores}, first
+    for length in seconds:
+        settings = RefineConfig(seconds=length, steps=None, views_per_step=devices)
+        refined = refine_with_report(avatar, inputs, settings, mesh=mesh)
+        scores, last = score_all(refined.avatar, subject.held_out)
+        about = {"steps": refined.steps, "compile_seconds": round(refined.compile_seconds, 1), "kept": refined.kept}
+        cell[f"{length:g}"] = scores | {"run": about | {"photos_psnr": refined.psnr[1]}}
+    return cell, (subject.held_out.images[0], first, last)
+
+
+def random_start(avatar, seed):
+    """Round Gaussians of random colours where the body's surface is, as many as the avatar has."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from humangs_jax.core.pytree import replace
+
+    rng = np.random.default_rng(seed)
+    count = len(avatar.gaussians.means)
+    means = jnp.repeat(avatar.rest_vertices, count // len(avatar.rest_vertices), axis=0)
+    gaussians = replace(
+        avatar.gaussians,
+        means=means + jnp.asarray(0.005 * rng.normal(size=means.shape), jnp.float32),
+        quats=jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (count, 1)),
+        scales=jnp.full((count, 3), 0.01),
+        opacities=jnp.full(count, 0.5),
+        colors=jnp.asarray(rng.random((count, 3)), jnp.float32),
+    )
+    return replace(avatar, gaussians=gaussians)
+
+
+def score_all(avatar, held_out):
+    """Scores by task, with those of this page, and the first image."""
+    import numpy as np
+
+    from experiments.evaluation.subjects import task_views
+    from humangs_jax.avatar.evaluate import score
+    from humangs_jax.avatar.frames import capture_renderings
+
+    drawn = capture_renderings(avatar, held_out)[1]
+    rgb = np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in drawn])
+    alpha = np.stack([np.asarray(r.alpha) for r in drawn])
+    scores = {}
+    for task, views in task_views(held_out).items():
+        if len(views):
+            truth = held_out.select(views)
+            own = dataclasses.asdict(score(rgb[views], truth))
+            inside = truth.masks > 0.5
+            partly = (alpha[views] > FOG[0]) & (alpha[views] < FOG[1]) & inside
+            own["fog"] = float(partly.sum() / max(inside.sum(), 1))
+            own["psnr_outline"] = float(
+                np.mean([outline_psnr(*pair) for pair in zip(rgb[views], truth.images, inside, strict=True)])
+            )
+            scores[task] = own
+    return scores, rgb[0]
+
+
+def outline_psnr(predicted, truth, inside):
+    """dB in the band to either side of the outline of a mask."""
+    import numpy as np
+    from scipy.ndimage import distance_transform_edt
+
+    distance = np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside))
+    band = distance <= BAND * len(inside)
+    return -10 * np.log10(np.mean(np.square(predicted - truth)[band]))
+
+
+def report_of(rows, settings, seeds):
+    """What the JSON holds."""
+    done = [seed for seed in seeds if seed in rows]
+    means: dict[str, Any] = {}
+    for name in rows[done[0]]:
+        means[name] = {}
+        for seconds in rows[done[0]][name]:
+            cells = [rows[seed][name][seconds] for seed in done]
+            means[name][seconds] = {
+                task: mean_scores(cell[task] for cell in cells) for task in TASK_NAMES if task in cells[0]
+            }
+            gains = [
+                rows[seed][name][seconds]["novel"]["psnr"] - rows[seed][name]["0"]["novel"]["psnr"] for seed in done
+            ]
+            means[name][seconds]["least_gain"] = min(gains)
+    people = [{"seed": seed, "cells": rows[seed]} for seed in done]
+    return {"settings": settings, "means": means, "subjects": people, "others": []}
+
+
+def section(report):
+    """The table of the page."""
+    header = ["photos", "start", "seconds", "task", *(heading for heading, _ in SHOWN.values()), "least gain"]
+    rows = []
+    for name, lengths in report["means"].items():
+        size, count, start = name.split(" ", 2)
+        for seconds, cell in lengths.items():
+            for task, title in TASK_NAMES.items():
+                if task in cell:
+                    numbers = [f"{cell[task][key]:.{digits}f}" for key, (_, digits) in SHOWN.items()]
+                    least = f"{cell['least_gain']:.2f}" if task == "novel" and seconds != "0" else ""
+                    rows.append([f"{count} of {size} px", start, seconds, title, *numbers, least])
+    settings, people = report["settings"], len(report["subjects"])
+    about = f"Means over {people} people of the {settings['split']} seeds; PSNR in dB; least gain: of any person."
+    return f"{about}\n\n{markdown_table(header, rows, 'llll' + 'r' * (len(SHOWN) + 1))}"
+
+
+def plot(path, report):
+    """PSNR of the whole image and on the person against seconds."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6))
+    for axis, key in zip(axes, ("psnr", "psnr_foreground"), strict=True):
+        for i, (name, lengths) in enumerate(report["means"].items()):
+            size, count, start = name.split(" ", 2)
+            for task, style in zip(TASK_NAMES, ("o-", "s--"), strict=True):
+                values = [cell[task][key] for cell in lengths.values() if task in cell]
+                label = f"{count} photos of {size} px, {start}: {TASK_NAMES[task]}"
+                axis.plot([float(x) for x in lengths][: len(values)], values, style, ms=4, color=f"C{i}", label=label)
+        axis.set(xlabel="seconds", ylabel="PSNR, dB", title="whole image" if key == "psnr" else SHOWN[key][0])
+        axis.set_xscale("symlog", linthresh=1)
+        axis.grid(alpha=0.3)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=7)
+    figure.tight_layout(rect=(0, 0.2, 1, 1))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def write_sheet(path, images):
+    """Truth, feed-forward and refined, two people a row."""
+    import numpy as np
+
+    from experiments.evaluation.pictures import cropped
+    from humangs_jax.avatar.sheets import contact_sheet
+
+    tiles = np.stack([cropped(image) for seed in images for image in images[seed]])
+    headers = ("truth", "feed-forward", "refined") * min(2, len(images))
+    contact_sheet(tiles, path, headers=headers, columns=len(headers))
+
+
+if __name__ == "__main__":
+    main()
