@@ -114,6 +114,8 @@ def test_wrong_options_are_one_line_too(folder, tmp_path, monkeypatch, capsys):
         ("animate", tmp_path / "no_avatar.npz", "--out", tmp_path / "a.txt"),
         ("export", folder / "body.npz", "--out", tmp_path / "a.ply"),
         ("reconstruct", folder, "--weights", folder / "body.npz", "--out", tmp_path / "a.npz"),
+        ("reconstruct", folder, "--refine", "soon", "--out", tmp_path / "a.npz"),
+        ("refine", tmp_path / "no_avatar.npz", folder, "--limit", "0s"),
         ("synth", "--subjects", "0", "--out", tmp_path / "people"),
     ):
         code, _, error = run(monkeypatch, capsys, *arguments)
@@ -128,7 +130,8 @@ def test_from_photos_to_images(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for arguments in (
         ("reconstruct", folder, "--out", "avatar.npz"),
-        ("render", "avatar.npz", "--out", "views", "--views", "2", "--size", "64", "--exr"),
+        ("refine", "avatar.npz", folder, "--limit", "2steps", "--image-size", "64", "--out", "refined.npz"),
+        ("render", "refined.npz", "--out", "views", "--views", "2", "--size", "64", "--exr"),
         ("export", "avatar.npz", "--out", "avatar.ply"),
         ("check", folder, "--out", "check.png"),
     ):

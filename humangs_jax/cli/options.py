@@ -1,5 +1,6 @@
 """What several commands share: checks of options, which raise an error of one line that names the option, and devices."""
 
+import contextlib
 import os
 import re
 from pathlib import Path
@@ -38,8 +39,11 @@ def refine_limits(text: str) -> dict[str, Any]:
 def use_all_cores() -> None:
     """Let JAX see a CPU of several cores as several devices; has no effect on GPUs and TPUs.
 
-    A CPU device runs one program on one core, so photos are shared among devices. Call it before JAX is first used.
+    A CPU device runs one program on one core, so photos are shared among devices. Where JAX is in use already, nothing changes.
     """
     import jax
 
-    jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
+    with contextlib.suppress(RuntimeError):
+        jax.config.update(
+            "jax_num_cpu_devices", len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+        )
