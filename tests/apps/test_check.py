@@ -67,6 +67,7 @@ def capture(change=lambda matrix: matrix, masks=True, empty_masks=False, **array
     return capture_from_arrays(**{**values, **arrays})
 
 
+@pytest.mark.slow
 def test_a_right_capture_has_full_overlap_and_no_warning(tmp_path):
     report = check_capture(capture(), tmp_path / "check.png")
     assert report.ok and len(report.views) == 3

@@ -108,6 +108,7 @@ def test_five_arrays_say_what_the_deformation_says():
     np.testing.assert_allclose(np.linalg.norm(plain.quats, axis=-1), 1, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_skinning_is_differentiable_in_avatar_and_pose():
     avatar, pose = make_avatar(), make_pose()
     loss = lambda pose, scales: jnp.sum(covariances(skin(avatar, pose))[:, 0, 1] * 100) + jnp.sum(scales)
@@ -164,6 +165,7 @@ def test_animate_names_what_it_cannot_use(change, message):
         animate(avatar, pose)
 
 
+@pytest.mark.slow
 def test_values_stay_what_they_are_inside_transformations():
     avatar, pose = make_avatar(), make_pose()
     bad = replace(pose, translation=pose.translation.at[0].set(jnp.nan))

@@ -304,6 +304,7 @@ def check_gradients(case):
         assert errors[-1] < AGREEMENT, f"{group}: {errors}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", FAST, ids=str)
 def test_gradients_agree_with_differences(case):
     check_gradients(case)

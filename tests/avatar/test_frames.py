@@ -21,6 +21,7 @@ def blobs(count=80):
     return Gaussians(*(jnp.asarray(a, jnp.float32) for a in arrays))
 
 
+@pytest.mark.slow
 def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
     plans, gaussians = [], blobs()
     real = frames.plan_buffers

@@ -52,6 +52,7 @@ def subject_views(seed, views=2):
     )
 
 
+@pytest.mark.slow
 def test_vmap_over_subjects_is_a_loop(body, network):
     variables, config = network
     subjects = [subject_views(seed) for seed in range(2)]
@@ -147,6 +148,7 @@ def test_photos_that_are_not_numbers_are_an_error(body, network):
         reconstruct(variables, config, bytes_)
 
 
+@pytest.mark.slow
 def test_the_body_is_decimated_to_what_the_weights_want(body, network):
     variables, config = network
     avatar = reconstruct(
@@ -175,6 +177,7 @@ def capture_of(body, seed, views):
     )
 
 
+@pytest.mark.slow
 def test_a_batch_of_people_with_different_numbers_of_views(body, network):
     variables, config = network
     captures = [capture_of(body, seed, views) for seed, views in enumerate((2, 1))]

@@ -153,6 +153,7 @@ def test_a_rim_stays_a_rim():
     assert len({a for a, _ in edges}) == len(edges)  # one closed loop, each corner entered and left once
 
 
+@pytest.mark.slow
 def test_what_is_hidden_goes_first():
     outer, faces = sphere(rings=20)
     inner, inner_faces = sphere(rings=8, radius=0.4)

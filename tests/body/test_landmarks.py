@@ -38,6 +38,7 @@ def test_the_shipped_body_has_all_but_most_of_the_face(body, kind):
     np.testing.assert_allclose(sums, np.asarray(model.known, float), atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("correctives", [False, True])
 def test_landmarks_are_the_posed_bodys(body, correctives):
     rng = np.random.default_rng(0)

@@ -174,6 +174,7 @@ print("equal")
 """
 
 
+@pytest.mark.slow
 def test_batches_lie_on_the_devices_as_the_sharding_says():
     environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=4", "JAX_PLATFORMS": "cpu"}
     root = os.path.dirname(os.path.dirname(os.path.dirname(os.path.abspath(__file__))))

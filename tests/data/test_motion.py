@@ -337,6 +337,7 @@ def test_motions_are_pytrees():
     assert doubled.fps == 24.0 and float(doubled.translations.max()) == 2
 
 
+@pytest.mark.slow
 def test_the_shipped_walk(tmp_path):
     """On the ground in every frame, a smooth loop, arms down, legs in turn."""
     from humangs_jax.body.library import load_body

@@ -216,6 +216,7 @@ def empty_inputs(views, size, vertices=20):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("tokens", ["all", "foreground"])
 def test_encoder_of_the_tiny_preset(tokens):
     config = tiny().with_execution(tokens=tokens)

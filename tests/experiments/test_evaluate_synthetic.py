@@ -71,6 +71,7 @@ def mean_psnr(drawn, truth, chosen):
     return np.mean(-10 * np.log10(errors.mean(axis=(1, 2, 3))))
 
 
+@pytest.mark.slow
 def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch):
     """People, reconstruction and drawing are real; every reported number is that of the images that were drawn."""
     made, drawn, expected = [], [], {}

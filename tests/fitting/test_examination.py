@@ -46,6 +46,7 @@ def with_points(keypoints, change):
     return dataclasses.replace(keypoints, points=points, confidences=confidences)
 
 
+@pytest.mark.slow
 def test_a_good_fit(good):
     examination = examine(*good)
     assert examination.report.ok and examination.report.swaps == () and examination.report.undetermined == ()
@@ -149,6 +150,7 @@ def test_frames_without_views(good):
     assert examination.report.ok and examination.report.undetermined == ()
 
 
+@pytest.mark.slow
 def test_the_table_is_of_the_views_that_fit_worst():
     capture, keypoints = person(21, 9, 3)
 

@@ -43,6 +43,7 @@ def fitted(folder):
     return fit_photos(load_photos(folder[0]), folder[1], default_body())
 
 
+@pytest.mark.slow
 def test_views_are_sorted_by_their_frames(folder, fitted):
     errors = 1000 * np.linalg.norm(np.asarray(fitted.fit.joints) - folder[2], axis=-1)
     assert errors.mean() < 10
@@ -122,6 +123,7 @@ def test_folders_that_cannot_be_replaced_are_refused_before_the_fit(folder, tmp_
     assert check_place(here, None, overwrite=True) == here  # files are replaced one by one
 
 
+@pytest.mark.slow
 def test_frames_that_views_hardly_show_are_named(folder):
     points, confidences = folder[1].points, folder[1].confidences.copy()
     frames = load_photos(folder[0]).frames

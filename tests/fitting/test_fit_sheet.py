@@ -38,6 +38,7 @@ def sheet(tmp_path_factory):
     return read_image(path)[0], examination
 
 
+@pytest.mark.slow
 def test_discs_are_where_the_keypoints_are(sheet):
     image, _ = sheet
     top = image.shape[0] - 512 - GAP

@@ -34,6 +34,7 @@ def test_keypoints_without_noise():
         assert mean_mm(fit, joints, i) < EXACT_MM, pose
 
 
+@pytest.mark.slow
 def test_keypoints_with_noise(noisy):
     joints, _, _, fit = noisy
     for i, pose in enumerate(NAMES):
@@ -51,6 +52,7 @@ def test_limits_are_kept(noisy):
         assert violations(prior, rotations, slack=0.15) == []
 
 
+@pytest.mark.slow
 def test_outliers_are_told_apart():
     joints, _, seen = observe(NAMES, seed=1, noise=2.0, outliers=0.2)
     fit = fit_landmarks(model_of(), seen, CONFIG)
@@ -58,6 +60,7 @@ def test_outliers_are_told_apart():
         assert mean_mm(fit, joints, i) < OUTLIER_MM, pose
 
 
+@pytest.mark.slow
 def test_a_view_without_keypoints_is_left_out(noisy):
     joints, _, seen, _ = noisy
     blind = replace(seen, confidences=seen.confidences.at[:, 1].set(0.0), points=seen.points.at[:, 1].set(1e6))
@@ -65,6 +68,7 @@ def test_a_view_without_keypoints_is_left_out(noisy):
     assert mean_mm(fit, joints) < 1.5 * NOISY_MM
 
 
+@pytest.mark.slow
 def test_a_frame_without_keypoints_is_as_the_prior_has_it_and_the_others_do_not_mind(noisy):
     joints, _, seen, whole = noisy
     blind = replace(seen, confidences=seen.confidences.at[2].set(0.0))
@@ -106,6 +110,7 @@ def still():
     return joints[0], seen, fit_landmarks(model_of(), seen, CONFIG)
 
 
+@pytest.mark.slow
 def test_what_one_view_does_not_determine_is_told(still):
     joints, seen, fit = still
     found = fit_uncertainty(model_of(), seen, fit, CONFIG)

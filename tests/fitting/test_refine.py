@@ -94,6 +94,7 @@ def keypoints(confidence=1.0):
     return Keypoints(points.astype(np.float32), np.full(points.shape[:2], confidence, np.float32), COCO_17)
 
 
+@pytest.mark.slow
 def test_silhouettes_mend_cameras_focal_length_and_pose():
     refined = refine_capture(disturbed(), config=CONFIG)
     report = refined.report
@@ -110,6 +111,7 @@ def test_silhouettes_mend_cameras_focal_length_and_pose():
     assert "kept: refined" in text and "focal length x 0.9" in text and "front" in text
 
 
+@pytest.mark.slow
 def test_keypoints_alone_mend_them_too_and_with_masks_both_errors_fall():
     alone = refine_capture(dataclasses.replace(disturbed(), masks=None), keypoints=keypoints(), config=CONFIG)
     assert alone.report.kept and "silhouette_iou" not in alone.report.errors

@@ -73,6 +73,7 @@ def bare(tmp_path_factory, body, truth):
     return fit_scan(path, body=body, joints=given_joints(truth), clothed=False, config=QUICK)
 
 
+@pytest.mark.slow
 def test_a_bare_body_is_found_whatever_its_scale_turn_and_place(bare, truth):
     assert off(bare, truth).mean() < 8
     assert np.quantile(np.abs(bare.distances), 0.9) < 0.003
@@ -91,6 +92,7 @@ def test_the_result_stands_in_our_world(bare, truth):
     assert root[2, 2] > 0.9  # facing +z
 
 
+@pytest.mark.slow
 def test_clothes_are_outside(body, truth, tmp_path):
     """A layer of 15 mm that leaves the hands bare: the body is found under it, not in it."""
     surface = body_surface(body, NAMES, 13380)
@@ -158,6 +160,7 @@ def test_joints_are_put_in_order():
     assert known.sum() == 1 and points[known > 0].tolist() == [[1, 2, 3]]
 
 
+@pytest.mark.slow
 def test_the_search_has_the_turn_and_the_scale_among_its_starts(body, truth):
     vertices, _, _, place = truth
     surface = body_surface(body, ("nose",), 1500)

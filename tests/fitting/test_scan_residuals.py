@@ -72,6 +72,7 @@ def test_hands_are_what_is_not_covered(problem):
     assert covered[owner == "left_knee"].min() > 0.99
 
 
+@pytest.mark.slow
 def test_columns_of_the_jacobian_are_derivatives(problem, case):
     """XLA's CPU compiler got them wrong where the distances were sums over an axis."""
     matches, given, tolerances, state = case

@@ -32,6 +32,7 @@ def test_images_show_the_scan_upright_and_in_its_colours(tmp_path, up):
     assert inside[:, 0].min() > 0.3 and inside[:, 1:].max() < 0.1
 
 
+@pytest.mark.slow
 def test_what_a_detector_sees_comes_back_as_joints_of_the_scan(tmp_path):
     vertices = blocks(tmp_path / "scan.ply")
     folder = render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=4, size=64)

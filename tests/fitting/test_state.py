@@ -123,6 +123,7 @@ def test_states_are_found_again_from_their_poses(capture, origin):
             np.testing.assert_allclose(getattr(again, name), getattr(state, name), atol=2e-4)
 
 
+@pytest.mark.slow
 def test_poses_have_derivatives_at_zero_and_near_half_a_turn(origin):
     jacobian = jax.jacfwd(lambda state: pose_of(origin, state).rotations)(zero_state(origin))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jacobian))

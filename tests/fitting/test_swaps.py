@@ -35,6 +35,7 @@ def changed(keypoints, order=None, flipped=()):
     return Keypoints(points, confidences, keypoints.set)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("views", [2, 3, 4, 8])
 def test_nothing_is_found_where_nothing_is_wrong(views):
     for seed in range(4):

@@ -25,6 +25,7 @@ def truth(joints):
     return rows, joints[:, [model_of().joint_names.index(name) for name in names]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [plain, robust], ids=["plain", "robust"])
 @pytest.mark.parametrize("views", [2, 5])
 def test_exact_points_are_found(method, views):
@@ -36,6 +37,7 @@ def test_exact_points_are_found(method, views):
     assert (np.asarray(counts)[:, ~KNOWN] == 0).all()
 
 
+@pytest.mark.slow
 def test_a_wrong_view_is_left_out():
     joints, seen = scene(views=4)
     off = replace(seen, points=seen.points.at[:, 2].add(80.0))

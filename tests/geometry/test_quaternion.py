@@ -38,6 +38,7 @@ def test_matrices_are_rotations_and_convert_back(seed, batch):
     assert close(back * jnp.sign(jnp.sum(back * q, -1, keepdims=True)), q)
 
 
+@pytest.mark.slow
 @given(seeds, batches, st.sampled_from(["any", "same", "opposite", "almost opposite"]))
 def test_between_turns_one_direction_into_the_other_the_short_way(seed, batch, case):
     a, b = (unit(seed + i, batch)[..., :3] for i in range(2))
@@ -77,6 +78,7 @@ def test_derivative_at_no_rotation_is_the_generator():
     assert close(jax.jacobian(quaternion.from_axis_angle)(jnp.zeros(3))[1:], 0.5 * jnp.eye(3))
 
 
+@pytest.mark.slow
 def test_zero_quaternion_is_the_identity_with_finite_gradient():
     assert close(quaternion.normalize(jnp.zeros(4)), jnp.asarray(quaternion.IDENTITY))
     gradient = jax.grad(lambda q: quaternion.to_matrix(quaternion.normalize(q)).sum())(jnp.zeros(4))

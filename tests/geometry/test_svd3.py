@@ -12,6 +12,7 @@ FLOAT32_TOLERANCE = 2e-5  # a dozen roundings of 6e-8 in each of six sweeps, rel
 FLOAT64_TOLERANCE = 1e-13
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float32, FLOAT32_TOLERANCE), (np.float64, FLOAT64_TOLERANCE)])
 @settings(deadline=None, max_examples=20)
 @given(seed=st.integers(0, 2**31), stretch=st.floats(0, 6))

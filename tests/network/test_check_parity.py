@@ -68,6 +68,7 @@ def test_the_oracle_is_the_published_network():
     assert len(errors) == 17 and max(errors.values()) < 2e-7, errors  # stored as float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", VARIANTS)
 def test_every_option_of_the_network(name, tmp_path, monkeypatch, capsys):
     options = VARIANTS[name]
@@ -79,6 +80,7 @@ def test_every_option_of_the_network(name, tmp_path, monkeypatch, capsys):
     assert max(result["stages"].values()) < 2e-7, result  # the numbers are stored as float32
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_other_precisions(dtype, tmp_path, monkeypatch, capsys):
     triple = write_triple(tmp_path, dataclasses.replace(SMALL, layers=2, class_token=True))

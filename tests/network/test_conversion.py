@@ -145,6 +145,7 @@ def test_every_missing_tensor_is_named(options, monkeypatch):
             load_checkpoint("x")
 
 
+@pytest.mark.slow
 def test_every_wrong_shape_is_noticed(monkeypatch):
     from humangs_jax.network import conversion
 

@@ -52,6 +52,7 @@ def variables_of(config):
 # shapes
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(presets.PRESETS))
 def test_presets_have_the_shapes_they_promise(name):
     """Traced at full size, nothing is computed."""
@@ -78,6 +79,7 @@ def test_the_published_network_has_99_million_parameters():
     assert round(sum(leaf.size for leaf in jax.tree.leaves(params)) / 1e6) == 99
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("views", "vertices", "tight", "free", "joints"), [(1, 5, 1, 0, None), (3, 40, 0, 2, 7), (6, 1, 2, 3, 55)]
 )
@@ -90,6 +92,7 @@ def test_any_number_of_views_vertices_and_gaussians(views, vertices, tight, free
     assert (outputs.skinning_offsets is None) if joints is None else (outputs.skinning_offsets.shape == (count, joints))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("class_token", [True, False])
 @pytest.mark.parametrize("sample_rgb", [True, False])
 def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
@@ -114,6 +117,7 @@ def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
 # values
 
 
+@pytest.mark.slow
 def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
     inputs = random_inputs()
     inputs = replace(inputs, images=jnp.full_like(inputs.images, 0.7))
@@ -140,6 +144,7 @@ def test_deeper_blocks_begin_smaller():
     assert np.isclose(kernel.std(), 0.02 / np.sqrt(2 * 4), rtol=0.05)
 
 
+@pytest.mark.slow
 def test_the_order_of_the_views_does_not_matter():
     """Maps are permuted with the views, everything pooled stays."""
     inputs, order = random_inputs(), jnp.asarray([1, 0])
@@ -155,6 +160,7 @@ def test_the_order_of_the_views_does_not_matter():
     assert close(encoding.global_token, other_encoding.global_token) and close(outputs, other_outputs)
 
 
+@pytest.mark.slow
 def test_foreground_tokens_are_all_tokens_when_everything_is_foreground():
     inputs = random_inputs()
     patches = 2 * (32 // 8) ** 2
@@ -163,6 +169,7 @@ def test_foreground_tokens_are_all_tokens_when_everything_is_foreground():
     assert close(run(variables, inputs, config), run(variables, inputs, ALL_TOKENS))
 
 
+@pytest.mark.slow
 def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     inputs = random_inputs()
     foreground = np.zeros((2, 32, 32), bool)
@@ -183,6 +190,7 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     assert packing.count == 3 and np.array_equal(packing.indices, [6, 7, 10])
 
 
+@pytest.mark.slow
 def test_bfloat16_is_close():
     variables, inputs = variables_of(ALL_TOKENS), random_inputs()
     encoding, outputs = run(variables, inputs, ALL_TOKENS.with_execution(dtype="bfloat16"))
@@ -230,6 +238,7 @@ def padded(inputs, views):
 PUBLISHED_LIKE = ALL_TOKENS.with_conventions(pool="all", pixel_grid="mixed")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("train", [False, True])
 @pytest.mark.parametrize("config", [TINY.with_execution(token_capacity=64), PUBLISHED_LIKE])
 def test_padding_views_change_nothing(config, train):
@@ -251,6 +260,7 @@ def test_subjects_with_different_numbers_of_views_share_a_batch():
         assert close(jax.tree.map(lambda x, i=index: x[i], together), jax.jit(apply)(subject), 10 * FLOAT32_TOLERANCE)
 
 
+@pytest.mark.slow
 def test_views_are_read_only_for_the_vertices_they_see():
     inputs = random_inputs()
     inputs = replace(inputs, depth_maps=inputs.depth_maps.at[0, :, :16].set(-1.0))

@@ -18,6 +18,7 @@ def convolved(grid, kernel, bias):
     return sum(taps) + bias
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["inside", "border", "corners", "outside"])
 def test_reading_before_the_convolution_is_reading_after_it(where):
     rng = np.random.default_rng(0)
@@ -37,6 +38,7 @@ def test_reading_before_the_convolution_is_reading_after_it(where):
     assert (np.abs(ours).max() > 0) == (where != "outside")
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_wherever_one_reads():
     positions = jnp.asarray([[2.0, 2.0], [-1.0, 0.0], [-0.5, 4.5], [1e30, 0], [np.nan, 1], [WIDTH - 1, HEIGHT - 1]])
     grid = jnp.asarray(np.random.default_rng(1).normal(size=(HEIGHT, WIDTH, CHANNELS)), jnp.float32)

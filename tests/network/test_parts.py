@@ -50,6 +50,7 @@ def test_the_papers_parts_are_parts():
         paper_parts(CONFIG.architecture)
 
 
+@pytest.mark.slow
 def test_another_reader_is_trained_and_saved_like_the_papers(tmp_path):
     variables, inputs = init_humangs(jax.random.key(0), CONFIG), random_inputs()
     assert set(variables["params"]["reader"]) == {"query", "key"}

@@ -92,6 +92,7 @@ def test_gradients_of_reads_do_not_depend_on_the_capacity():
         assert np.allclose(ours, reference, atol=1e-6) and np.abs(reference).max() > 0
 
 
+@pytest.mark.slow
 def test_photo_colors_are_grey_where_nothing_is_seen():
     images = jnp.zeros((2, 4, 4, 3)).at[0].set(jnp.asarray([1.0, 0, 0])).at[1].set(jnp.asarray([0, 0, 1.0]))
     pixels = jnp.full((2, 3, 2), 2.0)

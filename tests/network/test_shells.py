@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
@@ -53,6 +54,7 @@ def lateral(points, cameras):
     return 4 * np.sqrt(1 - np.minimum(cosine, 1) ** 2)
 
 
+@pytest.mark.slow
 def test_hull_and_share_tell_how_far_the_coat_reaches():
     arguments = scene()
     shells = read(arguments)
@@ -78,6 +80,7 @@ def test_colours_are_of_the_views_that_face_the_point():
     assert np.all(shells.seen[:, :3] <= 1) and np.all(shells.seen[level, 0] > 0.02)
 
 
+@pytest.mark.slow
 def test_one_view_leaves_the_back_grey_and_unseen():
     arguments = scene(views=1)
     shells = read(arguments)
@@ -85,6 +88,7 @@ def test_one_view_leaves_the_back_grey_and_unseen():
     assert np.allclose(shells.colors[back], UNSEEN_COLOR) and not np.any(shells.seen[back])
 
 
+@pytest.mark.slow
 def test_absent_views_and_points_out_of_the_image_say_nothing():
     arguments = scene()
     fewer = jax.tree.map(lambda x: x[:2], arguments[:-1])
@@ -98,6 +102,7 @@ def test_absent_views_and_points_out_of_the_image_say_nothing():
     assert np.all(nothing.colors == UNSEEN_COLOR)
 
 
+@pytest.mark.slow
 def test_batches_by_vmap_and_gradients_are_finite():
     arguments = scene()
     two = jax.tree.map(lambda x: jnp.stack([x, x]), arguments)

@@ -26,6 +26,7 @@ def loss(variables, execution):
 value_and_grad = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnames="execution")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [{"scan": True}, {"remat": "dots"}, {"scan": True, "remat": "full"}], ids=str)
 def test_blocks_may_be_looped_over_and_recomputed(how):
     execution = Execution(**how)

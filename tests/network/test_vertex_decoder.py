@@ -3,6 +3,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from network_cases import TINY, random_inputs
 
 from humangs_jax.core.pytree import replace
@@ -84,6 +85,7 @@ def shells_of(colors):
     return Shells(jnp.asarray([0.0, 0.1, 0.2]), colors, seen, hull, hull)
 
 
+@pytest.mark.slow
 def test_gaussians_choose_their_shell_and_its_colour():
     colors = jnp.asarray(np.random.default_rng(5).uniform(0.1, 0.9, (2, 3, 3)), jnp.float32)
     features = VertexFeatures(jnp.zeros((2, 1)), shells=shells_of(colors), normals=NORMALS)

@@ -152,6 +152,7 @@ def test_a_network_that_grows_keeps_the_opacities_and_colours_it_has_learnt(more
     assert np.allclose(a[:, :both], b[:, :both], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_geometry_starts_anew_in_another_frame_alone():
     old, new = grown()
     variables = random_variables(old, 3)

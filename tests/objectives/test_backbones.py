@@ -39,6 +39,7 @@ def pooled(layer, x):
     return feature_maps(identity, ((Conv("0", 3, 3, 1, 1, 0), layer),), x)[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layer", [Pool(2, 2, True), Pool(2, 2), Pool(), Pool(ceil=True)])
 @pytest.mark.parametrize("size", [(7, 8), (9, 6), (5, 3)])
 def test_pools_against_their_definition(layer, size):
@@ -52,12 +53,14 @@ def test_pools_against_their_definition(layer, size):
     np.testing.assert_allclose(pooled(layer, jnp.asarray(x)), expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_of_equal_maxima_the_first_has_the_gradient():
     image = jnp.asarray([[1.0, 2.0, 3.0, 3.0], [2.0, 2.0, 3.0, 3.0]])[..., None] * jnp.ones(3)
     gradient = jax.grad(lambda x: pooled(Pool(2, 2), x).sum())(image)
     assert np.array_equal(gradient[..., 0], [[0, 1, 1, 0], [0, 0, 0, 0]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layer", [Pool(2, 2, True), Pool(2, 2), Pool(), Pool(ceil=True)])
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_what_is_not_finite_stays_so(layer, bad):

@@ -50,6 +50,7 @@ def relative(found, expected):
     return np.linalg.norm(np.asarray(found) - expected) / np.linalg.norm(expected)
 
 
+@pytest.mark.slow
 @NETS
 def test_the_numbers_and_gradients_of_torch(net):
     expected = np.load(DATA / "torch_losses.npz")
@@ -71,6 +72,7 @@ def test_the_numbers_of_torch_in_float64(net):
     assert gradient.dtype == np.float64 and relative(gradient, expected[f"{net}_gradient"]) < STORED
 
 
+@pytest.mark.slow
 @NETS
 def test_equal_images_have_no_distance_and_no_gradient(net):
     weights, (image, _) = made_up(net), pair(net)
@@ -98,6 +100,7 @@ def test_where_all_features_are_zero_gradients_are_finite():
     assert value > 0 and np.isfinite(gradient).all()
 
 
+@pytest.mark.slow
 def test_weights_in_bfloat16():
     weights, images = made_up("alex"), pair("alex")
     (value, _), gradient = with_gradient(jax.tree.map(lambda x: x.astype(jnp.bfloat16), weights), *images)

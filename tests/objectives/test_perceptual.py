@@ -51,6 +51,7 @@ def test_the_golden_numbers(vgg):
     np.testing.assert_allclose(losses[1], alone, rtol=FLOAT32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", ["float32", "float64"])
 def test_the_numbers_and_gradients_of_torch(dtype):
     expected = np.load(DATA / "torch_losses.npz")
@@ -64,6 +65,7 @@ def test_the_numbers_and_gradients_of_torch(dtype):
     assert error < slopes * np.linalg.norm(expected["perceptual_gradient"])
 
 
+@pytest.mark.slow
 def test_equal_images_have_no_loss_and_a_finite_gradient(vgg):
     image, _ = pair()
     for x in (image, jnp.ones_like(image), jnp.zeros_like(image)):
@@ -76,6 +78,7 @@ def test_no_gradient_reaches_the_target(vgg):
     assert not jax.jit(jax.grad(perceptual_loss, 2))(vgg, predicted, target).any()
 
 
+@pytest.mark.slow
 def test_weights_in_bfloat16(vgg):
     narrow = jax.tree.map(lambda x: x.astype(jnp.bfloat16), vgg)
     value = jax.jit(perceptual_loss)(narrow, *pair())

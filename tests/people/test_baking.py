@@ -45,6 +45,7 @@ def flat_areas(uvs, faces):
     return 0.5 * (ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0])
 
 
+@pytest.mark.slow
 def test_charts_do_not_overlap_and_keep_their_winding(baked, shown):
     areas = flat_areas(baked.atlas.uvs, baked.atlas.faces) * SIZE**2
     assert areas.min() > -1e-3
@@ -126,6 +127,7 @@ def read_mesh(path) -> Any:
     return trimesh.load(path, process=False, force="mesh")
 
 
+@pytest.mark.slow
 def test_scans_are_read_back_as_they_were(person, baked, tmp_path):
     posed = writer.sample_pose(person, 0)
     pose = BodyPose(jnp.asarray(posed.rotations), jnp.asarray(posed.translation))

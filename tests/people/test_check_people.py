@@ -38,6 +38,7 @@ def faults(body, posed, camera):
     return pixels, dict(zip(check_people.FAULTS, np.asarray(counts) / pixels, strict=True))
 
 
+@pytest.mark.slow
 def test_a_dressed_person_has_hardly_any_fault(body, posed, camera):
     pixels, shares = faults(body, posed, camera)
     assert pixels > 500
@@ -63,6 +64,7 @@ def test_holes_in_cloth_are_counted(body, posed, camera):
     assert shares["hollow"] + shares["gaps"] > 0.02
 
 
+@pytest.mark.slow
 def test_a_sheet_is_drawn_twice_alike(tmp_path, monkeypatch):
     import imageio.v3 as iio
 

@@ -65,6 +65,7 @@ def example(bank):
     return jitted_example(bank, jax.random.key(1), config=CONFIG)
 
 
+@pytest.mark.slow
 def test_banks_hold_people_of_one_split_only(bank, body, tmp_path):
     for seeds, split in (([TEST[0]], "train"), ([5, TEST[0]], "train"), ([DEMO[0]], "train"), ([5], "test")):
         with pytest.raises(ValueError, match="belongs to the range"):
@@ -106,6 +107,7 @@ def test_keys_choose_among_the_people_of_the_bank(bank):
     np.testing.assert_array_equal(bank.seeds, SEEDS)
 
 
+@pytest.mark.slow
 def test_a_key_is_an_example_bit_for_bit(bank, example):
     again = jitted_example(bank, jax.random.key(1), config=CONFIG)
     for a, b in zip(jax.tree.leaves(again), jax.tree.leaves(example), strict=True):
@@ -145,6 +147,7 @@ def test_batches_by_vmap_are_the_examples(bank, example):
     np.testing.assert_allclose(batch.inputs.cameras.cam_from_world[1], example.inputs.cameras.cam_from_world, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("platform", ["cuda", "tpu"])
 def test_it_lowers_for_accelerators(bank, platform):
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (bank, jax.random.key(0)))
@@ -156,6 +159,7 @@ def test_it_lowers_for_accelerators(bank, platform):
     assert "callback" not in exported.mlir_module()
 
 
+@pytest.mark.slow
 def test_masks_are_the_share_of_covered_samples(bank, scene):
     camera = draw(scene, bank, 0, 0.0, SIZE)
     _, mask = draw_view(bank, scene, jnp.int32(0), camera)
@@ -192,6 +196,7 @@ def views_of(bank, scene, camera):
     return SubjectViews(blank, blank[..., 0], batched, rotations, translations, bank.betas[scene.person])
 
 
+@pytest.mark.slow
 def test_bare_skin_is_where_the_body_is(bank, scene, body):
     """Depth and position maps are the body's: where no cloth is, the picture shows that very surface."""
     camera = draw(scene, bank, 1, 0.0, SIZE)

@@ -28,6 +28,7 @@ def people(body):
     return [describe(DEMO[i], body) for i in range(400)]
 
 
+@pytest.mark.slow
 def test_a_description_is_the_same_every_time(body, people):
     again = describe(DEMO[7], body)
     np.testing.assert_array_equal(again.betas, people[7].betas)
@@ -71,6 +72,7 @@ def test_clothes_go_together(people):
             assert not set(kinds) & set(outfits.DRESSES + outfits.SKIRTS)
 
 
+@pytest.mark.slow
 def test_every_kind_of_garment_and_hair_can_be_built(body, people):
     missing = set(outfits.KINDS) | set(CUTS) | {"full", "goatee", "moustache", "hood_up", "hood", "lapels", "open"}
     for person in people:
@@ -132,6 +134,7 @@ def test_a_chest_print_faces_the_viewer_and_a_sleeve_has_its_own_coordinates():
     np.testing.assert_array_equal(again.cloth, spots.cloth)
 
 
+@pytest.mark.slow
 def test_shadows_fall_away_from_the_light():
     grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 33), np.linspace(-0.4, 0.4, 33)), -1).reshape(-1, 2)
     floor = np.stack([grid[:, 0], np.zeros(len(grid)), grid[:, 1]], -1)

@@ -49,6 +49,7 @@ def views(posed):
     return result
 
 
+@pytest.mark.slow
 def test_a_seed_is_a_person_bit_for_bit(body, people, posed, views):
     again = subject.make_subject(SEEDS[0], body)
     np.testing.assert_array_equal(again.surface.vertices, people[0].surface.vertices)

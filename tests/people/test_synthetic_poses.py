@@ -161,6 +161,7 @@ def test_winding_numbers_count_how_often_a_mesh_goes_around():
     np.testing.assert_allclose(winding_numbers(points, *twice), [2, 1, 0, 0], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_hardly_any_of_the_body_is_inside_itself(body, drawn):
     meter = OverlapMeter(body, 1000)
     assert meter.at_rest.mean() < 0.02  # mouth and eyes

@@ -55,6 +55,7 @@ def feet(body, drawn):
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_planted_soles_are_on_the_ground_and_do_not_slide(drawn, feet, case):
     sequence, vertices = drawn[case], feet[case]

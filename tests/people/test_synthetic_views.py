@@ -61,6 +61,7 @@ def fast(monkeypatch, made=None):
     monkeypatch.setattr(writer, "write_person", write_person)
 
 
+@pytest.mark.slow
 def test_a_written_person_has_all_views_in_all_forms(folder, body):
     person = folder / f"{DEMO[0]:07d}"
     capture = load_capture(person, body=body)
@@ -139,6 +140,7 @@ def test_the_loader_shrinks_a_set_to_smaller_sizes(folder, body):
         find_people(folder)
 
 
+@pytest.mark.slow
 def test_sequences_are_written_with_their_motion_and_a_scan(tmp_path, body):
     layout = writer.Layout(SIZE, poses=3, views=1, frames=20, scan_texture=128)
     (person,) = writer.write_set(tmp_path, 1, layout, "demo", 2, body=body, progress=False)
@@ -287,6 +289,7 @@ def test_written_training_people_are_training_people(first, count):
                 assert len(written) == count and {split_of(seed) for seed in written} == {split}
 
 
+@pytest.mark.slow
 @given(st.integers(0, 999), st.sampled_from(["validation", "test", "demo"]))
 @settings(deadline=None, max_examples=20)
 def test_a_training_bank_takes_nobody_of_another_split(number, other):

@@ -88,6 +88,7 @@ def run(folder, *options):
     return json.loads(out.read_text()), done.stdout
 
 
+@pytest.mark.slow
 def test_reports_times_beside_the_yardstick_and_errors(files):
     result, printed = run(files, "--reference", files / "reference.npz", "--yardstick", files, "--repeats", "2")
     assert all(result[key] > 0 for key in TIMES)
@@ -111,6 +112,7 @@ def test_reports_times_beside_the_yardstick_and_errors(files):
     assert f"| {result['psnr']:.1f} |" in printed and f"| {result['scene']} {SIZE}" in printed
 
 
+@pytest.mark.slow
 def test_draws_in_float64_without_a_yardstick(files):
     result, _ = run(files, "--reference", files / "reference.npz", "--float64", "--repeats", "0")
     assert result["yardstick"] is None and result["ratio"] is None and result["forward_ms"] is None

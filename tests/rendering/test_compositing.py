@@ -92,6 +92,7 @@ def test_empty_lists_leave_their_tiles_blank():
         assert not features[tile].any() and (transmittance[tile] == 1).all()
 
 
+@pytest.mark.slow
 def test_a_batch_is_drawn_as_one():
     batch = [make(seed) for seed in (1, 2)]
     splats, lists = jax.tree.map(lambda *leaves: jnp.stack(leaves), *batch)

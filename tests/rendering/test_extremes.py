@@ -44,6 +44,7 @@ SUM_ROUNDING = 1e-13
 CASES = [pytest.param(case, id=name, marks=pytest.mark.slow if case.slow else ()) for name, case in cases.CASES.items()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES)
 def test_case(case):
     # With bounds divided by 3 two cases fail, for reasons that stand: bfloat16 itself rounds by 2^-9, half of its bound; for the
@@ -199,6 +200,7 @@ def test_coincident_depths_keep_the_order_of_their_indices():
     np.testing.assert_allclose(image, cases.reference_in_float64(scene)[0].rgb, rtol=0, atol=cases.IMAGE)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.bfloat16, np.float16])
 def test_narrow_gaussians_give_a_float32_image_eagerly(dtype):
     scene = cases.narrow_everything(dtype)

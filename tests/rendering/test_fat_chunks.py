@@ -128,6 +128,7 @@ def assert_equal_in_float32(splats, lists, grid, config, per_step=1024):
     return ours, expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("dtype", "tile_size", "per_step"), [(np.float64, 8, 1024), (np.float64, 16, PER_STEP), (np.float32, 16, 1024)]
 )
@@ -145,6 +146,7 @@ def test_equals_the_other_schedule(dtype, tile_size, per_step):
         assert not ours[0][0].any() and (ours[1][0] == 1).all()  # the empty list
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dtype", "seed"), [(np.float64, 0), (np.float32, 1), (np.float32, 2)])
 def test_equals_the_other_schedule_on_scenes(dtype, seed):
     with jax.enable_x64(dtype == np.float64):
@@ -158,6 +160,7 @@ def test_equals_the_other_schedule_on_scenes(dtype, seed):
             assert_equal(ours, expected, lists.counts)
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 2**16),
     lengths=st.lists(st.sampled_from([0, 1, K - 1, K, K + 1, 2 * K, 3 * K + 7, 4 * K]), min_size=6, max_size=6),
@@ -180,6 +183,7 @@ def test_a_batch_is_one_call():
             assert_equal([o[i] for o in together], expected, lists.counts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("stop", [0.0, 1e-4])
 def test_opaque_to_the_last_bit(dtype, stop):

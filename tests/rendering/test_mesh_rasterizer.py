@@ -265,6 +265,7 @@ def test_near_plane_drops_and_counts():
     assert (draw(SQUARE * np.float32(1e-3), SQUARE_FACES, flat_camera()).face_ids == -1).all()
 
 
+@pytest.mark.slow
 def test_bad_faces_are_harmless():
     """Points, segments, NaN, infinity and coordinates near the largest float leave the other faces as they are."""
     bad = np.array([[7, 7, 1], [np.nan, 7, 1], [7, np.inf, 1], [3e38, 3e38, 1], [4.5, 4.5, 0.5], [8.5, 8.5, 0.5]])
@@ -291,6 +292,7 @@ def test_faces_without_area_cover_nothing():
     assert (ids == -1).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-6, 1e6])
 def test_units_do_not_matter(scale):
     vertices, faces = sphere()
@@ -332,6 +334,7 @@ def test_images_of_one_pixel_and_meshes_of_nothing():
 # --------------------------------------------------------------------------------------------- transformations
 
 
+@pytest.mark.slow
 def test_vmap_equals_loop_and_steps_do_not_matter():
     vertices, faces = sphere()
     cameras = orbit(

@@ -64,6 +64,7 @@ def test_golden_crops_can_tell_the_shader_apart(golden):
         assert np.abs(np.asarray(other) - golden["position_map_gouraud"][0]).max() > 1000 * GOURAUD_ERROR
 
 
+@pytest.mark.slow
 def test_map_of_the_posed_mesh_itself_is_where_the_rays_hit():
     """With the posed vertices as the canonical ones; two views in one `vmap`."""
     rng = np.random.default_rng(0)
@@ -89,6 +90,7 @@ def test_vertex_normals():
     np.testing.assert_array_equal(normals[6:], 0)
 
 
+@pytest.mark.slow
 def test_float64(golden):
     with jax.enable_x64(True):
         posed, canonical, faces = (jnp.asarray(np.asarray(x)) for x in mesh(golden))

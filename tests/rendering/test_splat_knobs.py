@@ -33,6 +33,7 @@ def knobs(**values):
     return dataclasses.replace(SMALL, **values)
 
 
+@pytest.mark.slow
 def test_visibility_is_the_largest_weight():
     """With one colour channel that only Gaussian i has, that channel is the weight of i."""
     with jax.enable_x64(True):
@@ -49,6 +50,7 @@ def test_visibility_is_the_largest_weight():
         assert empty.visibility is not None and empty.visibility.shape == (0,)
 
 
+@pytest.mark.slow
 def test_visibility_passes_no_gradient():
     gaussians, config = random_gaussians(3, np.float32), knobs(visibility=True)
     gradient = jax.grad(lambda g: jnp.sum(render(g, camera(np.float32), config).visibility))(gaussians)
@@ -69,6 +71,7 @@ def wall_before(gaussians):
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), wall, gaussians)
 
 
+@pytest.mark.slow
 def test_seen_from_keeps_what_any_camera_sees():
     with jax.enable_x64(True):
         scene = wall_before(few(random_gaussians(4), np.arange(15, COUNT)))
@@ -84,6 +87,7 @@ def test_seen_from_keeps_what_any_camera_sees():
         assert difference < 1e-2
 
 
+@pytest.mark.slow
 def test_opacity_min_drops_the_faint():
     with jax.enable_x64(True):
         gaussians = random_gaussians(5)
@@ -93,6 +97,7 @@ def test_opacity_min_drops_the_faint():
         np.testing.assert_allclose(dropped.rgb, expected.rgb, atol=FLOAT64)
 
 
+@pytest.mark.slow
 def test_extent_cuts_whole_tiles_only():
     with jax.enable_x64(True):
         gaussians = replace(random_gaussians(6), opacities=jnp.full(COUNT, 0.9))
@@ -109,6 +114,7 @@ def test_extent_cuts_whole_tiles_only():
         )
 
 
+@pytest.mark.slow
 def test_scale_draws_the_smaller_image():
     with jax.enable_x64(True):
         gaussians, view = random_gaussians(7), camera(width=2 * WIDTH, height=2 * HEIGHT)
@@ -125,6 +131,7 @@ def test_scale_draws_the_smaller_image():
         )
 
 
+@pytest.mark.slow
 def test_narrow_products_round_only_gradients():
     gaussians, view = random_gaussians(8, np.float32), camera(np.float32)
     gaussians = replace(gaussians, means=gaussians.means.at[10].set(gaussians.means[15]))  # none at the near plane
@@ -140,6 +147,7 @@ def test_narrow_products_round_only_gradients():
         assert 0 < error < BFLOAT16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "most"), [("near_exact", 0.01), ("fast", 0.05), ("inria", 0.02)])
 def test_presets_draw_nearly_the_same(name, most):
     gaussians, view = few(random_gaussians(9, np.float32), np.arange(15, COUNT)), camera(np.float32)
@@ -149,6 +157,7 @@ def test_presets_draw_nearly_the_same(name, most):
     assert 0 < np.abs(ours.rgb - exact.rgb).mean() < most
 
 
+@pytest.mark.slow
 def test_one_plan_serves_an_animation():
     gaussians, view = random_gaussians(10, np.float32), camera(np.float32)
     drawn = jax.jit(lambda *arguments: render(*arguments), static_argnums=2)  # with a cache of its own
@@ -160,6 +169,7 @@ def test_one_plan_serves_an_animation():
     assert drawn._cache_size() == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 3])
 def test_shares_partition_the_pairs(count):
     gaussians = random_gaussians(2, np.float32)

@@ -117,6 +117,7 @@ def test_gradients_are_derivatives():
             np.testing.assert_allclose(jnp.vdot(slope, direction), difference, rtol=1e-4, atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [SplatConfig(), SplatConfig(tile_size=5, block=3, chunk=1)],
@@ -129,6 +130,7 @@ def test_the_schedule_does_not_change_the_image(config):
         assert_close(render(gaussians, camera(), config, background()), expected, FLOAT64)
 
 
+@pytest.mark.slow
 def test_every_knob_means_the_same_as_in_the_reference():
     config = dataclasses.replace(
         CHUNKS, near=2.5, eps2d=0.1, alpha_min=0.05, alpha_max=0.8, transmittance_stop=0.02, jacobian_margin=0.0
@@ -267,6 +269,7 @@ def test_extremes_are_finite(name):
     assert (rendering.alpha.max() == 0) == (name in UNSEEN)
 
 
+@pytest.mark.slow
 def test_empty_scenes_show_the_background():
     behind = random_gaussians(0, np.float32)
     behind = replace(behind, means=behind.means.at[:, 2].set(-1.0))
@@ -277,6 +280,7 @@ def test_empty_scenes_show_the_background():
     assert (render(behind, camera(np.float32)).rgb == 1).all()  # white by default
 
 
+@pytest.mark.slow
 def test_one_pixel():
     with jax.enable_x64(True):
         gaussians, view = random_gaussians(0), camera(width=1, height=1)
@@ -292,6 +296,7 @@ def test_lowers_for_every_platform(gradient):
     assert "callback" not in exported.mlir_module()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 0.5])
 def test_the_two_halves_are_the_whole(scale):
     gaussians, view = random_gaussians(0, np.float32), camera(np.float32)

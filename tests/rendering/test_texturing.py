@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -94,6 +95,7 @@ def test_supersampling_measures_coverage():
     np.testing.assert_allclose(depth, np.where(expected > 0, 3.0, 0.0), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_supersampling_is_the_mean_of_a_finer_image():
     supersample = 3
     texture = jax.random.uniform(jax.random.key(1), (5, 5, 3))
@@ -108,6 +110,7 @@ def test_supersampling_is_the_mean_of_a_finer_image():
     assert ((alpha > 0) & (alpha < 1)).any()
 
 
+@pytest.mark.slow
 def test_vmap_over_views_and_gradient_of_the_texture():
     texture = jax.random.uniform(jax.random.key(2), (4, 4, 3))
     K = jnp.asarray([[8.0, 0, 4.5], [0, 8.0, 3.5], [0, 0, 1]])

@@ -13,6 +13,7 @@ from humangs_jax.rendering.tiling import TileGrid
 FEW = settings(max_examples=10, deadline=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2, 63, 64, 65, 1000, 70_000])
 def test_cumsum_is_exact(n):
     x = np.random.default_rng(n).integers(0, min(1 << 18, (1 << 30) // n), n).astype(np.int32)
@@ -94,6 +95,7 @@ def test_pixel_positions_are_those_of_the_image():
     np.testing.assert_array_equal(tiling.tiles_to_image(jnp.asarray(tiles), grid), np.stack([x, y], axis=-1))
 
 
+@pytest.mark.slow
 def test_everything_batches():
     counts = jnp.asarray(np.random.default_rng(0).integers(0, 4, (3, 20)), jnp.int32)
 

@@ -29,6 +29,7 @@ def checkpoints(tmp_path):
     checkpoints.close()
 
 
+@pytest.mark.slow
 def test_restores_the_bits_into_the_same_structure(checkpoints, same):
     checkpoints.save(state_at(3))
     assert same(checkpoints.restore(state_at(0)), state_at(3))

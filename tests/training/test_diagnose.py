@@ -95,6 +95,7 @@ PLANTED += [pytest.param(what, np.inf, marks=pytest.mark.slow) for what in IN_BA
 """An infinite camera may show nothing at all, which is finite."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("what", "value"), PLANTED)
 def test_a_bad_number_in_the_batch_is_named_and_where_it_enters(body, batch, variables, what, value):
     path, index, place, stage = IN_BATCH[what]
@@ -159,6 +160,7 @@ def test_moments_and_averages_are_looked_at(body, batch, variables):
     assert "averaged parameters: decoder.trunk_0.bias, 1 entries, first at [3]" in str(faults[-1])
 
 
+@pytest.mark.slow
 def test_every_parameter_of_every_preset_has_a_stage():
     for preset in PRESETS.values():
         variables = jax.eval_shape(lambda preset=preset: init_humangs(jax.random.key(0), preset()))
@@ -209,6 +211,7 @@ def test_going_back_the_last_stage_with_good_gradients_behind_it_is_blamed():
     assert dataclasses.replace(diagnosis, stages=tuple(worse)).fault == Fault("forward", "loss", number("", 1))
 
 
+@pytest.mark.slow
 def test_numbers_of_arrays():
     leaf = Leaf.of("x", np.asarray([[3.0, np.inf], [np.nan, -4.0]], np.float32))
     assert leaf == Leaf("x", 2, (0, 1), -4.0, 3.0, 3.5, 5.0) and leaf.magnitude == 4

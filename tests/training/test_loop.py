@@ -31,6 +31,7 @@ def whole(body, captures, variables, tmp_path_factory):
     return train(CONFIG, body, captures[:2], out, stop_at=4, **options), out
 
 
+@pytest.mark.slow
 def test_resume_after_two_steps_ends_bit_for_bit_where_four_steps_end(body, captures, variables, tmp_path, whole, same):
     options = {"validation": captures[2:], "variables": variables, "progress": False}
     state = train(CONFIG, body, captures[:2], tmp_path, stop_at=2, **options)

@@ -35,6 +35,7 @@ def filled(value):
     return jax.tree.map(lambda x: jnp.full_like(x, value), PARAMS)
 
 
+@pytest.mark.slow
 def test_weight_decay_acts_on_two_axes_and_more():
     assert decayed(PARAMS) == {"kernel": True, "bias": False, "texture": True, "scale": False}
     params, _ = stepped(filled(0.0))

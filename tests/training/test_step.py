@@ -127,6 +127,7 @@ def test_subjects_worked_on_at_once_or_one_after_the_other_give_the_same_gradien
 WITH_NETWORKS = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "title"), [("perceptual", "VGG-19"), ("lpips", "LPIPS")])
 def test_a_loss_without_its_network_is_an_error_not_a_number(body, source, variables, name, title):
     loss = dataclasses.replace(CONFIG.loss, **{name: 1.0})
