@@ -23,11 +23,17 @@ class Demo:
     """Network weights (.safetensors). Default: the shipped ones."""
     size: int = 256
     """Side of the animation's frames in pixels."""
+    refine: float = 10.0
+    """Seconds for which the avatar is fitted to its photos; 0 for none."""
 
     def run(self) -> None:
+        require_at_least(0, refine=self.refine)
+        use_all_cores()
         from humangs_jax.apps.demo import run_demo
+        from humangs_jax.refinement.config import RefineConfig
 
-        run_demo(self.out, weights=self.weights, frame_size=self.size)
+        refine = RefineConfig(seconds=self.refine) if self.refine else None
+        run_demo(self.out, weights=self.weights, frame_size=self.size, refine=refine)
 
 
 @dataclasses.dataclass(frozen=True)

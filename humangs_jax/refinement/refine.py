@@ -195,6 +195,8 @@ class _Run:
         after = self.loss(best, self.all)
         kept = after[0] < before[0]
         refined = replace(self.avatar, gaussians=gaussians_of(best.parameters)) if kept else self.avatar
+        if self.mesh is not None:  # back from all devices to the default one
+            refined = jax.tree.map(jnp.asarray, jax.device_get(refined))
         after = after if kept else before
         pairs = tuple(zip(before, after, strict=True))
         return Refinement(refined, done, seconds, compile_seconds, pairs[0], pairs[1], kept, interrupted)

@@ -8,6 +8,7 @@ import pytest
 from humangs_jax.apps.demo import run_demo
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.io.exr import read_exr
+from humangs_jax.refinement.config import RefineConfig
 
 PRODUCTS = {
     "animation.gif",
@@ -17,6 +18,7 @@ PRODUCTS = {
     "inputs.png",
     "novel_views.exr",
     "novel_views.png",
+    "refined.png",
     "report.json",
 }
 LEAST = {"psnr": 27.0, "ssim": 0.94, "psnr_foreground": 18.1, "baseline_psnr": 20.4}
@@ -49,7 +51,7 @@ def video_frames(path):
 @pytest.fixture(scope="module")
 def out(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
-    run_demo(folder / "demo_out", frame_size=FRAME_SIZE)
+    run_demo(folder / "demo_out", frame_size=FRAME_SIZE, refine=RefineConfig(steps=12, seconds=None, checks=1))
     assert [p.name for p in folder.iterdir()] == ["demo_out"]  # nothing else is left behind
     return folder / "demo_out"
 
@@ -62,6 +64,8 @@ def test_the_report_holds_what_is_promised(out):
     report = json.loads((out / "report.json").read_text())
     assert all(report[name] >= least for name, least in LEAST.items()), report
     assert report["psnr"] > report["baseline_psnr"]
+    assert report["refined"]["psnr"] > report["psnr"] + 0.5  # 1.7 dB after 50 steps
+    assert report["refined"]["psnr_foreground"] > report["psnr_foreground"] + 0.5
     assert report["psnr_foreground"] > report["baseline_psnr_foreground"]
     assert {"reconstruct", "animate", "render_held_out"} <= set(report["timings"])
     assert {"compile", "run"} == set(report["timings"]["reconstruct"])
@@ -69,7 +73,7 @@ def test_the_report_holds_what_is_promised(out):
 
 
 def test_images_show_a_person(out):
-    for name in ("inputs.png", "novel_views.png"):
+    for name in ("inputs.png", "novel_views.png", "refined.png"):
         image = iio.imread(out / name)
         assert image.std() > 20 and (image == 255).all(-1).mean() > 0.3, name
     frames = iio.imread(out / "animation.gif").astype(float)

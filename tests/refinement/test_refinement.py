@@ -1,6 +1,9 @@
 """Refinement on a toy person: a body whose Gaussians differ in colour from its photos."""
 
 import dataclasses
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -173,3 +176,43 @@ def test_wrong_captures_are_named(body, person):
     few = dataclasses.replace(capture, poses=replace(capture.poses, rotations=capture.poses.rotations[:, :20]))
     with pytest.raises(ValueError, match="20 joints, the avatar has 55"):
         refinement.refine(avatar, few)
+
+
+SHARED = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import jax
+jax.config.update("jax_platforms", "cpu")
+jax.config.update("jax_num_cpu_devices", 2)
+import dataclasses
+import numpy as np
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.library import load_body
+from humangs_jax.refinement.refine import refine_with_report
+from test_refinement import STEPS, toy_avatar, toy_capture
+body = decimate(load_body(), 400)
+avatar = toy_avatar(body, 0.0)
+capture = toy_capture(body, toy_avatar(body, 0.15), views=2)
+config = dataclasses.replace(STEPS, steps=3, views_per_step=2)
+alone = refine_with_report(avatar, capture, config)
+shared = refine_with_report(avatar, capture, config, mesh=jax.make_mesh((2,), ("photos",)))
+assert alone.kept and shared.kept
+assert shared.avatar.gaussians.means.devices() == alone.avatar.gaussians.means.devices()
+for a, b in zip(jax.tree.leaves(shared.avatar), jax.tree.leaves(alone.avatar), strict=True):
+    np.testing.assert_allclose(a, b, atol=float(sys.argv[2]))
+"""
+
+
+@pytest.mark.slow
+def test_devices_share_the_photos_of_a_step():
+    done = subprocess.run(
+        [sys.executable, "-c", SHARED, str(Path(__file__).parent), str(VMAP_TOLERANCE)], capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_mesh_that_does_not_divide_the_photos_is_named(person):
+    with pytest.raises(ValueError, match="views_per_step 3"):
+        config = dataclasses.replace(STEPS, views_per_step=3)
+        mesh = jax.sharding.AbstractMesh((2,), ("photos",))
+        refinement.refine(*person, config, mesh=mesh)
