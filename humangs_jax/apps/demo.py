@@ -43,9 +43,9 @@ def run_demo(
 
     refine: how the avatar is fitted to its photos; None: not at all.
 
-    Files: inputs.png, novel_views.png (truth, feed-forward, error), novel_views.exr, animation.mp4 and .gif, avatar.npz, avatar.ply,
-    report.json; with `refine` also refined.png (truth, feed-forward, refined), and animation and avatar are the refined ones. All
-    of them appear at the end together; nothing is left behind by a run that fails.
+    Files: inputs.png, novel_views.png (truth, feed-forward, error), novel_views.exr, animation.mp4 and .gif, avatar.npz,
+    avatar.ply, report.json; with `refine` also refined.png (truth, feed-forward, refined), and animation and avatar are the
+    refined ones. All of them appear at the end together; nothing is left behind by a run that fails.
     """
     out = Path(out)
     started, report = time.perf_counter(), {}
