@@ -32,6 +32,7 @@ def page() -> str:
     from humangs_jax.network.execution import Execution
     from humangs_jax.network.vertex_decoder import VertexDecoder
     from humangs_jax.people.on_the_fly import OnTheFlyConfig
+    from humangs_jax.refinement.config import RefineConfig
     from humangs_jax.rendering.mesh.rasterizer import RasterConfig
     from humangs_jax.rendering.splat_config import SplatConfig
     from humangs_jax.training.config import TrainConfig
@@ -43,6 +44,7 @@ def page() -> str:
         VertexDecoder,
         SplatConfig,
         RasterConfig,
+        RefineConfig,
         TrainConfig,
         OnTheFlyConfig,
     )

@@ -9,7 +9,7 @@ views, "psnr_outline": PSNR in the band of 3 pixels (of 256) to either side of t
 mask where the rendering's alpha lies between 0.05 and 0.9. 0 seconds are the start. A later run continues: finished people in
 the JSON with the same settings are not computed again.
 
-Seconds do not count compilation, which is the same for people with photos of one size. Two devices where there are two cores.
+Seconds do not count compilation. One device: one core of a CPU.
 """
 
 import argparse
@@ -49,9 +49,6 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     check_people_options(parser, arguments)
-    from humangs_jax.cli.options import use_all_cores
-
-    use_all_cores()
     report = evaluate(arguments)
     text = section(report)
     print(text)
@@ -97,8 +94,6 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def measure(variables, config, subject, count, start, seconds):
     """Scores by seconds and task, and (truth, feed-forward, refined) of the first held-out view."""
-    import jax
-
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.refinement.config import RefineConfig
     from humangs_jax.refinement.refine import refine_with_report
@@ -107,13 +102,10 @@ def measure(variables, config, subject, count, start, seconds):
     avatar = reconstruct(variables, config, inputs)
     if start != "network":
         avatar = random_start(avatar, subject.seed)
-    devices = min(len(jax.devices()), count)
-    mesh = jax.make_mesh((devices,), ("photos",), devices=jax.devices()[:devices]) if devices > 1 else None
     scores, first = score_all(avatar, subject.held_out)
     cell, last = {"0": scores}, first
     for length in seconds:
-        settings = RefineConfig(seconds=length, steps=None, views_per_step=devices)
-        refined = refine_with_report(avatar, inputs, settings, mesh=mesh)
+        refined = refine_with_report(avatar, inputs, RefineConfig(seconds=length))
         scores, last = score_all(refined.avatar, subject.held_out)
         about = {"steps": refined.steps, "compile_seconds": round(refined.compile_seconds, 1), "kept": refined.kept}
         cell[f"{length:g}"] = scores | {"run": about | {"photos_psnr": refined.psnr[1]}}

@@ -122,10 +122,7 @@ def _write_products(
 
 def _refine(avatar, inputs, truth, feed_forward, config, sheet: Path) -> tuple[Avatar, dict[str, Any]]:
     """The refined avatar, and what the report says of it; draws both beside the truth."""
-    devices = min(len(jax.devices()), inputs.view_count)
-    mesh = jax.make_mesh((devices,), ("photos",), devices=jax.devices()[:devices]) if devices > 1 else None
-    config = dataclasses.replace(config, views_per_step=devices)
-    run = refine_with_report(avatar, inputs, config, mesh=mesh, progress=True)
+    run = refine_with_report(avatar, inputs, config, progress=True)
     drawn = np.stack([np.asarray(r.rgb) for r in capture_renderings(run.avatar, truth)[1]])
     rows = np.stack([truth.images, feed_forward, np.clip(drawn, 0, 1)], axis=1).reshape(-1, *drawn.shape[1:])
     contact_sheet(np.clip(rows, 0, 1), sheet, headers=("truth", "feed-forward", "refined") * 2, columns=6)

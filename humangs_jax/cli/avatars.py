@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from humangs_jax.cli.options import refine_limits, require_at_least, require_parent, require_suffix, use_all_cores
+from humangs_jax.cli.options import refine_limits, require_at_least, require_parent, require_suffix
 
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
@@ -28,7 +28,6 @@ class Demo:
 
     def run(self) -> None:
         require_at_least(0, refine=self.refine)
-        use_all_cores()
         from humangs_jax.apps.demo import run_demo
         from humangs_jax.refinement.config import RefineConfig
 
@@ -56,8 +55,6 @@ class Reconstruct:
 
     def run(self) -> None:
         limits = None if self.refine is None else refine_limits(self.refine)
-        if limits is not None:
-            use_all_cores()
         from humangs_jax.avatar.reconstruct import reconstruct
         from humangs_jax.data.capture import load_capture
         from humangs_jax.network.weights import load_weights
@@ -94,7 +91,6 @@ class Refine:
 
     def run(self) -> None:
         limits = refine_limits(self.limit)
-        use_all_cores()
         from humangs_jax.avatar.avatar import Avatar
         from humangs_jax.data.capture import load_capture
 
@@ -106,15 +102,10 @@ class Refine:
 
 def _refined(avatar: "Avatar", photos: "Capture", **settings: Any) -> "Avatar":
     """Refine with a progress bar, and print what it took."""
-    import jax
-
     from humangs_jax.refinement.config import RefineConfig
     from humangs_jax.refinement.refine import refine_with_report
 
-    devices = len(jax.devices())
-    mesh = jax.make_mesh((devices,), ("photos",)) if devices > 1 else None
-    config = RefineConfig(views_per_step=devices, **settings)
-    refinement = refine_with_report(avatar, photos, config, mesh=mesh, progress=True)
+    refinement = refine_with_report(avatar, photos, RefineConfig(**settings), progress=True)
     print(refinement.summary())
     return refinement.avatar
 

@@ -1,7 +1,5 @@
-"""What several commands share: checks of options, which raise an error of one line that names the option, and devices."""
+"""Options that several commands share: checks, which raise an error of one line that names the option, and parsing."""
 
-import contextlib
-import os
 import re
 from pathlib import Path
 from typing import Any
@@ -34,16 +32,3 @@ def refine_limits(text: str) -> dict[str, Any]:
     if not number > 0 or (in_steps and number != int(number)):
         raise ValueError(f'{text!r}: expected how long to refine, as in "15s" or "100steps"')
     return {"steps": int(number), "seconds": None} if in_steps else {"steps": None, "seconds": number}
-
-
-def use_all_cores() -> None:
-    """Let JAX see a CPU of several cores as several devices; has no effect on GPUs and TPUs.
-
-    A CPU device runs one program on one core, so photos are shared among devices. Where JAX is in use already, nothing changes.
-    """
-    import jax
-
-    with contextlib.suppress(RuntimeError):
-        jax.config.update(
-            "jax_num_cpu_devices", len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-        )

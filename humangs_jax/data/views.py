@@ -60,8 +60,7 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     if vertices is not None and vertices < len(body.template):
         body = decimate(body, vertices)
     if edge is not None:
-        body = split_long_edges(body, edge)
-    body = replace(body, spacing=None)
+        body = replace(split_long_edges(body, edge), spacing=None)
     return body if config.execution.longest_edge is None else split_long_edges(body, config.execution.longest_edge)
 
 

@@ -10,7 +10,7 @@ from humangs_jax.data.views import SubjectViews
 
 MARGIN = 8
 """Pixels around the mask: the window of structural similarity has 11, and Gaussians beyond the outline cost alpha there."""
-MULTIPLE = 32
+MULTIPLE = 16
 """Sides of crops are multiples of it, so that few sizes are compiled."""
 COVERED = 0.02
 """Coverage from which a pixel counts as the person's."""

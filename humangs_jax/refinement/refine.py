@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
@@ -159,6 +159,11 @@ class _Run:
             held = held_out_blocks(views, config.held_out, config.seed)
         self.all = photos_of(views, everything)
         self.seen, self.held = photos_of(views, ~held), photos_of(views, held)
+        if mesh is not None:  # where each step leaves its results: other places would compile the step twice
+            everywhere = NamedSharding(Mesh(mesh.devices, mesh.axis_names), PartitionSpec())
+            self.avatar, self.all, self.seen, self.held = jax.device_put(
+                (self.avatar, self.all, self.seen, self.held), everywhere
+            )
         useful = np.flatnonzero(np.asarray(~held).any(axis=(1, 2)))
         self.order = _order(useful, config.views_per_step, np.random.default_rng(config.seed))
 
@@ -204,7 +209,7 @@ class _Run:
     def step(self, state: RefineState, passed: float) -> tuple[RefineState, bool]:
         """The state after one step, and whether something did not fit into the buffers."""
         chosen = next(self.order)
-        photos = jax.tree.map(lambda x: x[chosen], self.seen)
+        photos = _compiled(_chosen)(self.seen, chosen)
         state, _, overflow = _compiled(refine_step)(
             state, self.avatar, photos, passed, self.config, self.splat, self.mesh
         )
@@ -219,6 +224,10 @@ class _Run:
         """How much of the run is over, in [0, 1]."""
         limits = ((steps, self.config.steps), (seconds, self.config.seconds))
         return min(1.0, max(done / limit for done, limit in limits if limit is not None))
+
+
+def _chosen(photos, views):
+    return jax.tree.map(lambda x: x[views], photos)
 
 
 def _order(views: np.ndarray, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
