@@ -21,18 +21,15 @@ BLOCK = 8
 def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectViews:
     """The photos, cut to the person by windows of one size, with the cameras that see the windows.
 
-    Photos whose longer side exceeds `image_size` are reduced to it. Without masks nothing is cut, and the masks are empty.
+    Photos whose longer side exceeds `image_size` are reduced to it. Raises: ValueError without masks.
     """
-    images, cameras = capture.images, capture.cameras
-    masks = np.zeros(images.shape[:3], np.float32) if capture.masks is None else capture.masks
-    height, width = images.shape[1:3]
-    if image_size is not None and max(height, width) > image_size:
-        from skimage.transform import resize
-
-        height, width = (max(1, round(side * image_size / max(height, width))) for side in images.shape[1:3])
-        images = np.stack([resize(x, (height, width, 3), anti_aliasing=True) for x in images])
-        masks = np.stack([resize(x, (height, width), anti_aliasing=True) for x in masks])
-        cameras = cameras.resized(width, height)
+    if capture.masks is None:
+        raise ValueError("crop_to_person: the capture has no masks")
+    if image_size is not None and max(capture.images.shape[1:3]) > image_size:
+        capture = capture.resized(image_size)
+    images, cameras, masks = capture.images, capture.cameras, capture.masks
+    assert masks is not None
+    height, width = masks.shape[1:]
     boxes = [_bounds(mask) for mask in masks]
     rows, columns = (_window([box[axis] for box in boxes], size) for axis, size in enumerate((height, width)))
     crop = lambda arrays: np.stack(

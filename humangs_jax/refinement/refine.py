@@ -81,14 +81,13 @@ def refine_with_report(
     """Fit an avatar to the photos of a capture, and say what it took.
 
     Arguments:
-        avatar: of the person in the photos, on the body of the capture. capture: photos in any poses; without masks the
-            background is compared, too. mesh: of one axis, whose devices share the `views_per_step` photos of a step.
-        progress: show a bar.
+        avatar: of the person in the photos, on the body of the capture. capture: photos with masks, in any poses. mesh: of one
+            axis, whose devices share the `views_per_step` photos of a step. progress: show a bar.
 
     Ctrl-C ends the run; the best state until then is returned.
 
-    Raises: ValueError if the capture has no view or its poses have another number of joints than the avatar, or if the devices
-    of the mesh do not divide `views_per_step`.
+    Raises: ValueError if the capture has no view or no masks, its poses have another number of joints than the avatar, or
+    the devices of the mesh do not divide `views_per_step`.
     """
     config = config or RefineConfig()
     _check(avatar, capture, config, mesh)
@@ -261,6 +260,8 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
 def _check(avatar, capture, config, mesh):
     if capture.view_count == 0:
         raise ValueError("refine: the capture has 0 views; at least one photo is needed")
+    if capture.masks is None:
+        raise ValueError("refine: the capture has no masks; without them the background would be fitted, too")
     joints = capture.poses.rotations.shape[1]
     if joints != len(avatar.parents):
         raise ValueError(f"refine: the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}")

@@ -173,6 +173,8 @@ def test_wrong_captures_are_named(body, person):
     avatar, capture = person
     with pytest.raises(ValueError, match="0 views"):
         refinement.refine(avatar, capture.select([]))
+    with pytest.raises(ValueError, match="no masks"):
+        refinement.refine(avatar, dataclasses.replace(capture, masks=None))
     few = dataclasses.replace(capture, poses=replace(capture.poses, rotations=capture.poses.rotations[:, :20]))
     with pytest.raises(ValueError, match="20 joints, the avatar has 55"):
         refinement.refine(avatar, few)
