@@ -40,7 +40,7 @@ class RefineConfig:
     photo is refined, too; the avatar is then for corrected poses, which are not returned.
 
     held_out: share of the pixels, in square blocks, or of the photos where there are at least `HELD_OUT_PHOTOS`, that no step
-    sees. Their error decides which state of the run is returned. checks: how often it is measured in a run.
+    sees. Their PSNR decides which state of the run is returned. checks: how often it is measured in a run.
     seed: order of the photos, blocks.
     """
 
