@@ -194,8 +194,7 @@ class _Run:
                     psnr = self.loss(state, self.held)[1]
                     if psnr > highest or not config.held_out:
                         best, highest = state, psnr
-                bar.n = int(100 * passed)
-                bar.refresh()
+                bar.update(int(100 * passed) - bar.n)
         except KeyboardInterrupt:
             interrupted = True
         bar.close()
