@@ -167,6 +167,7 @@ class _Run:
             self.avatar, self.all, self.seen, self.held = jax.device_put(
                 (self.avatar, self.all, self.seen, self.held), everywhere
             )
+        self.any_held = bool(np.asarray(held).any())  # a small crop may have no block to hold out
         useful = np.flatnonzero(np.asarray(~held).any(axis=(1, 2)))
         self.order = _order(useful, config.views_per_step, np.random.default_rng(config.seed))
 
@@ -192,7 +193,7 @@ class _Run:
                 if passed >= (checked + 1) / config.checks:
                     checked = int(passed * config.checks)
                     psnr = self.loss(state, self.held)[1]
-                    if psnr > highest or not config.held_out:
+                    if psnr > highest or not self.any_held:
                         best, highest = state, psnr
                 bar.update(int(100 * passed) - bar.n)
         except KeyboardInterrupt:

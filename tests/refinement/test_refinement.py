@@ -68,6 +68,11 @@ def toy_capture(body, avatar, views=3, moving=False):
     return dataclasses.replace(capture, images=images, masks=np.stack([np.asarray(r.alpha) for r in drawn]))
 
 
+def test_a_share_that_holds_nothing_out_keeps_the_last_state(person):
+    report = refinement.refine_with_report(*person, dataclasses.replace(STEPS, held_out=1e-6))
+    assert report.kept and report.loss[1] < 0.8 * report.loss[0]
+
+
 @pytest.fixture(scope="module")
 def person(body):
     """The avatar to be refined, and photos of the same one in other colours."""
