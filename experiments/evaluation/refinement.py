@@ -1,7 +1,7 @@
 """What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colours.
 
-    python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 1 2 5 15] [--sizes 256 512]
-        [--views 4] [--page docs/refinement.md] [--plot docs/images/refinement.png] [--sheet docs/images/refinement_people.png]
+    python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 2 5 15] [--sizes 256 512]
+        [--views 4] [--longest-edge 0.017] [--page docs/refinement.md] [--plot PLOT] [--sheet SHEET]
 
 People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random colours" from
 as many round Gaussians of random colours on the vertices of the body. Scores are those of `evaluation/results.py` and, of the
@@ -39,10 +39,13 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_people_options(parser, subjects=8)
-    parser.add_argument("--seconds", type=float, nargs="+", default=[1, 2, 5, 15], help="lengths of the runs")
+    parser.add_argument("--seconds", type=float, nargs="+", default=[2, 5, 15], help="lengths of the runs")
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="sides of the photos in pixels")
     parser.add_argument("--views", type=int, nargs="+", default=[4], help="numbers of photos")
     parser.add_argument("--starts", nargs="+", choices=STARTS, default=["network"], help="what is refined")
+    parser.add_argument(
+        "--longest-edge", type=float, help="split the body's edges to this, metres; table refinement_finer"
+    )
     parser.add_argument("--plot", type=Path, help="draw PSNR against seconds here")
     parser.add_argument(
         "--sheet", type=Path, help="truth, feed-forward and the longest run of every person, largest size"
@@ -53,7 +56,8 @@ def main() -> None:
     text = section(report)
     print(text)
     if arguments.page:
-        publish(arguments.page, "refinement", text, report)
+        name = "refinement" if arguments.longest_edge is None else "refinement_finer"
+        publish(arguments.page, name, text, {"settings": report["settings"], "means": report["means"]})
     if arguments.plot:
         plot(arguments.plot, report)
 
@@ -67,8 +71,9 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     from humangs_jax.people.seeds import seeds_of
 
     body, (variables, config, digest) = load_body(), load_network(arguments)
+    config = config.with_execution(longest_edge=arguments.longest_edge)
     settings = settings_of(arguments, digest, config.tokens, None)
-    settings |= {name: getattr(arguments, name) for name in ("seconds", "sizes", "views", "starts")}
+    settings |= {name: getattr(arguments, name) for name in ("seconds", "sizes", "views", "starts", "longest_edge")}
     rows, images = kept_rows(arguments.json, settings, "cells"), {}
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
     seeds = seeds_of(arguments.split, arguments.first, arguments.subjects)

@@ -49,7 +49,7 @@ class Reconstruct:
     """The patches of the photos that the network reads: all, or those that show the person, which is several times
     faster. For weights trained with the other setting it is an approximation (docs/performance_reconstruction.md)."""
     dtype: Literal["as_trained", "float32", "bfloat16"] = "as_trained"
-    """Number type of the encoder's matrix products. bfloat16 is faster on GPU and TPU."""
+    """Number type of the encoder's matrix products ("as_trained": float32). bfloat16 is faster on GPU and TPU."""
     refine: str | None = None
     """Fit the avatar to the photos afterwards for so long: seconds ("15s") or steps ("100steps"); see `humangs refine`."""
 
@@ -79,7 +79,7 @@ class Refine:
     avatar: Positional[Path]
     """File written by `humangs reconstruct` from these photos."""
     capture: Positional[Path]
-    """Folder with capture.json: more or larger photos than the network saw are welcome."""
+    """Folder with capture.json: may have more or larger photos than the network saw."""
     out: Path = Path("refined.npz")
     """The avatar file to write."""
     limit: str = "15s"
@@ -87,7 +87,7 @@ class Refine:
     image_size: int | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     refine_poses: bool = False
-    """Let the pose of each photo move a little, too: for poses from `humangs fit`, which are millimetres off."""
+    """Also refine the pose of each photo: for poses from `humangs fit`, which are millimetres off."""
 
     def run(self) -> None:
         limits = refine_limits(self.limit)

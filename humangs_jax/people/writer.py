@@ -190,7 +190,7 @@ def write_set(
     """Write people `first` .. `first + subjects - 1` of a split into `out`/SEED; folders that are there already are kept.
 
     workers: processes that make people; more than one use the CPU, write the same files, and need the calling script to be
-    guarded by `if __name__ == "__main__"`. body: the package's own if not given. progress: show a bar.
+    guarded by `if __name__ == "__main__"`. body: default: the body that comes with the package. progress: show a bar.
     Returns the folders. Raises: ValueError if the people reach beyond the split, `out` was written with other settings or by
     another version of the generator, or (at the end, the others being written) some could not be made.
     """

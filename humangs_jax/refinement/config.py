@@ -28,29 +28,25 @@ class LearningRates:
 class RefineConfig:
     """How `refine` fits an avatar to its photos.
 
-    steps, seconds: the run ends after so many steps or so many seconds, not counting compilation, whichever is first; None for
-    no such limit. image_size: longer side to which larger photos are reduced, pixels; None: as they are. views_per_step:
-    photos that are drawn for a step.
+    steps, seconds: limits of the run; it ends at the first that is reached. None: no limit. Compilation does not count.
+    image_size: photos whose longer side is larger are reduced to it, pixels; None: photos as they are. views_per_step: photos
+    drawn in a step.
 
     structural, silhouette: weights of the structural dissimilarity, and of |alpha - mask|, beside the L1 distance of colours.
     rates: see `LearningRates`. final_rate: share of the rates that is left at the end.
 
-    decay: share of the way back to the start that means and log scales go in a step. visible: weight on some pixel of some photo
-    from which a Gaussian moves at the full rate: what no photo sees stays as it was. poses: whether the body pose of each
-    photo is refined, too; the avatar is then for corrected poses, which are not returned.
+    decay: each step moves means and log scales back towards the start by this share of the distance. visible: a Gaussian whose
+    largest weight on a pixel of the photos is at least this moves at the full rate, others more slowly; what no photo shows
+    stays. poses: also refine the body pose of each photo. The corrected poses are not returned.
 
-    held_out: share of the pixels, in square blocks, or of the photos where there are at least `HELD_OUT_PHOTOS`, that no step
-    sees. Their PSNR decides which state of the run is returned. checks: how often it is measured in a run.
-    seed: order of the photos, blocks.
+    held_out: share of the pixels, in square blocks, that no step sees; with `HELD_OUT_PHOTOS` photos or more, one whole photo
+    instead; 0: nothing. The state of the run with the highest PSNR there is returned. checks: how often it is measured.
+    seed: of the order of the photos and of the blocks.
     """
 
-    steps: int | None = knob(
-        None, cost="blurred at few, no gain beyond some 100 for 4 photos", gain="time in proportion", measured=MEASURED
-    )
-    seconds: float | None = knob(5.0, cost="blurred at few, no gain beyond some 15 s", gain="time", measured=MEASURED)
-    image_size: int | None = knob(
-        None, cost="detail of the photos", gain="half the time of a step at half the size", measured=MEASURED
-    )
+    steps: int | None = knob(None, cost="blur at few", gain="time in proportion", measured=MEASURED)
+    seconds: float | None = knob(5.0, cost="blur at few", gain="time", measured=MEASURED)
+    image_size: int | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
     views_per_step: int = knob(
         1, cost="fewer steps in the same time; less noise", gain="one photo for each device", measured=MEASURED
     )

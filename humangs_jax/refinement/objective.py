@@ -1,6 +1,6 @@
 """What refinement minimises: the difference of an avatar's renderings from the photos.
 
-Every view has a pose of its own, since the Gaussians are skinned to it: photos of a moving person are nothing special.
+The Gaussians are skinned to the pose of each photo, so the photos may show different poses.
 """
 
 import jax
@@ -48,7 +48,7 @@ def photos_of(views: SubjectViews, counted: Bool[Array, "v h w"]) -> Photos:
 def posed_gaussians(parameters: Parameters, avatar: Avatar, photo: Photos, poses: bool = True) -> Gaussians:
     """The Gaussians in the pose of one photo (without the axis v), corrected as far as it has been refined.
 
-    poses: whether gradients reach the pose. They pass through the transforms of all Gaussians, a fifth of a step's time.
+    poses: whether gradients reach the pose; they pass through the transforms of all Gaussians, which takes time.
     """
     if not poses:
         parameters = replace(
@@ -114,7 +114,7 @@ def photos_gradient(
             (value, rendering), gradient = jax.value_and_grad(loss, has_aux=True)(parameters)
             return gradient, value, rendering.overflow
 
-        # not in a loop: a CPU runs the loops of the renderer up to three times slower inside of another one
+        # unrolled: a CPU runs the loops of the renderer more slowly inside of another loop
         each = [one(jax.tree.map(lambda x, i=i: x[i], photos)) for i in range(len(photos.images))]
         return jax.tree.map(lambda *x: sum(x[1:], x[0]), *each)
 

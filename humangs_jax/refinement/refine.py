@@ -33,7 +33,7 @@ from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, plan_buffers, render
 
 HELD_OUT_PHOTOS = 8
-"""From so many photos on one is held out instead of pixels: its error shows what the others do not agree on."""
+"""With this number of photos or more, one photo is held out, not pixels of each: a test of views that no step sees."""
 BUFFER_MARGIN = 1.5
 """Room in the renderer's buffers beyond the need of the start: Gaussians grow. What does not fit is counted, and the buffers
 are planned again."""
@@ -43,10 +43,11 @@ HOST_SETTINGS = {"image_size": None, "views_per_step": 1, "held_out": 0.0, "chec
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Refinement:
-    """avatar: the best state of the run. steps: done. seconds: of the run, after the compilation's compile_seconds.
+    """What `refine_with_report` returns.
 
-    loss: before and after, of all pixels of all photos. psnr: likewise, dB over the crops. kept: whether the run has improved
-    them; otherwise the avatar is the one it started from. interrupted: by Ctrl-C.
+    avatar: the best state of the run. steps: number of steps. seconds: of the run, without compilation (compile_seconds).
+    loss: before and after, over all photos. psnr: before and after, dB over the crops. kept: whether the loss has fallen; if
+    not, the avatar is unchanged. interrupted: whether Ctrl-C ended the run.
     """
 
     avatar: Avatar
@@ -80,7 +81,7 @@ def refine_with_report(
     mesh: Mesh | None = None,
     progress: bool = False,
 ) -> Refinement:
-    """Fit an avatar to the photos of a capture, and say what it took.
+    """`refine`, with the number of steps, the seconds and the gain.
 
     Arguments:
         avatar: of the person in the photos, on the body of the capture. capture: photos with masks, in any poses. mesh: of one

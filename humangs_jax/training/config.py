@@ -215,7 +215,7 @@ def fitting_losses(config: TrainConfig, networks: LossNetworks) -> TrainConfig:
         return config
     structural = max(config.loss.structural, LossConfig().structural)
     logger.warning(
-        "the loss %s is left out, its network is not given; structural dissimilarity (weight %g) takes its place",
+        "no network is given for the loss %s, so it is replaced by structural dissimilarity (weight %g)",
         " and ".join(missing),
         structural,
     )

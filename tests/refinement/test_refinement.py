@@ -20,7 +20,7 @@ from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.refinement import refine as refinement
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.crops import crop_to_person
+from humangs_jax.refinement.crops import BLOCK, crop_to_person
 from humangs_jax.refinement.parameters import gaussians_of, parameters_of
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import plan_buffers, render
@@ -221,3 +221,56 @@ def test_devices_share_the_photos_of_a_step():
 def test_a_mesh_of_two_axes_is_refused(person):
     with pytest.raises(ValueError, match="views_per_step 1"):
         refinement.refine(*person, STEPS, mesh=jax.make_mesh((1, 1), ("photos", "rows")))
+
+
+def run_of(person, config=STEPS, views=3):
+    avatar, capture = person
+    crops = crop_to_person(capture.select(range(views)))
+    return refinement._Run(avatar, crops, config, None, plan_buffers(avatar.gaussians, crops.cameras, margin=3.0))
+
+
+def test_of_many_photos_one_is_held_out_whole_and_never_drawn(person, monkeypatch):
+    monkeypatch.setattr(refinement, "HELD_OUT_PHOTOS", 3)
+    run = run_of(person, dataclasses.replace(STEPS, held_out=0.05, views_per_step=2))
+    held = np.asarray(run.held.counted).all(axis=(1, 2))
+    assert held.sum() == 1 and not np.asarray(run.held.counted)[~held].any()
+    np.testing.assert_array_equal(run.seen.counted, ~run.held.counted)
+    drawn = np.concatenate([next(run.order) for _ in range(5)])
+    assert set(drawn) == set(np.flatnonzero(~held))
+
+
+def test_blocks_are_held_out_of_steps_and_checked(person):
+    run = run_of(person, dataclasses.replace(STEPS, held_out=0.3))
+    held = np.asarray(run.held.counted)
+    np.testing.assert_array_equal(run.seen.counted, ~held)
+    assert 0.1 < held.mean() < 0.5
+    blocks = held[:, : held.shape[1] // BLOCK * BLOCK, : held.shape[2] // BLOCK * BLOCK]
+    blocks = blocks.reshape(len(held), -1, BLOCK, blocks.shape[2] // BLOCK, BLOCK)
+    np.testing.assert_array_equal(blocks.any(axis=(2, 4)), blocks.all(axis=(2, 4)))
+    assert set(np.concatenate([next(run.order) for _ in range(3)])) == {0, 1, 2}
+
+
+@pytest.mark.slow
+def test_refined_poses_explain_photos_of_poses_that_are_off(person):
+    avatar, _ = person
+    capture = toy_capture(person[1].body, avatar)
+    off = replace(capture.poses, translation=capture.poses.translation + 0.02)
+    config = dataclasses.replace(STEPS, steps=30, rates=dataclasses.replace(STEPS.rates, translations=2e-3))
+    run = lambda poses: refinement.refine_with_report(
+        avatar, dataclasses.replace(capture, poses=off), dataclasses.replace(config, poses=poses)
+    )
+    fixed, moved = run(False), run(True)
+    assert moved.psnr[1] > fixed.psnr[1] + 1
+    assert (
+        np.abs(moved.avatar.gaussians.means - avatar.gaussians.means).mean()
+        < np.abs(fixed.avatar.gaussians.means - avatar.gaussians.means).mean()
+    )
+
+
+@pytest.mark.slow
+def test_buffers_that_are_too_small_are_planned_again(person):
+    run = run_of(person)
+    run.splat = dataclasses.replace(run.splat, max_pairs=64, max_rows=64)
+    report = run.go(progress=False)
+    assert run.splat.max_pairs > 64
+    assert report.steps == STEPS.steps
