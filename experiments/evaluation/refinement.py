@@ -13,7 +13,6 @@ Seconds do not count compilation. One device: one core of a CPU.
 """
 
 import argparse
-import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -142,36 +141,33 @@ def score_all(avatar, held_out):
     """Scores by task, with those of this page, and the first image."""
     import numpy as np
 
-    from experiments.evaluation.subjects import task_views
-    from humangs_jax.avatar.evaluate import score
+    from experiments.evaluation.subjects import score_tasks, task_views
     from humangs_jax.avatar.frames import capture_renderings
 
     drawn = capture_renderings(avatar, held_out)[1]
     rgb = np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in drawn])
     alpha = np.stack([np.asarray(r.alpha) for r in drawn])
-    scores = {}
-    for task, views in task_views(held_out).items():
-        if len(views):
-            truth = held_out.select(views)
-            own = dataclasses.asdict(score(rgb[views], truth))
-            inside = truth.masks > 0.5
-            partly = (alpha[views] > FOG[0]) & (alpha[views] < FOG[1]) & inside
-            own["fog"] = float(partly.sum() / max(inside.sum(), 1))
-            own["psnr_outline"] = float(
-                np.mean([outline_psnr(*pair) for pair in zip(rgb[views], truth.images, inside, strict=True)])
-            )
-            scores[task] = own
+    tasks, scores = task_views(held_out), score_tasks(rgb, held_out, lambda predicted, truth: None)
+    for task, own in scores.items():
+        views = tasks[task]
+        inside = held_out.masks[views] > 0.5
+        partly = (alpha[views] > FOG[0]) & (alpha[views] < FOG[1]) & inside
+        bands = [outline_psnr(*view) for view in zip(rgb[views], held_out.images[views], inside, strict=True)]
+        own |= {"fog": float(partly.sum() / max(inside.sum(), 1)), "psnr_outline": float(np.mean(bands))}
     return scores, rgb[0]
 
 
 def outline_psnr(predicted, truth, inside):
     """dB in the band to either side of the outline of a mask."""
+    import jax.numpy as jnp
     import numpy as np
     from scipy.ndimage import distance_transform_edt
 
+    from humangs_jax.objectives.metrics import masked_psnr
+
     distance = np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside))
     band = distance <= BAND * len(inside)
-    return -10 * np.log10(np.mean(np.square(predicted - truth)[band]))
+    return float(masked_psnr(*(jnp.asarray(x, jnp.float32) for x in (predicted, truth, band))))
 
 
 def report_of(rows, settings, seeds):

@@ -15,7 +15,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.fitting.refine_rounds import RefineConfig, Scene, capture_origin, moved_capture
+from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene, capture_origin, moved_capture
 from humangs_jax.fitting.report import Change, FitReport, Stage, ViewReport, limit_violations
 from humangs_jax.fitting.residuals.colors import Likeness, color_residuals, likeness
 from humangs_jax.fitting.solve import Outcome, solve
@@ -30,11 +30,11 @@ LEAST_DIFFERENCE = 0.005
 """Least decrease of the loss that is kept: less than half a percent of the silhouettes is rounding of pixels."""
 LEAST_IOU = 0.6
 """Bodies in clothes overlap masks by more than this; less means that the start was too far off."""
-DEFAULT_CONFIG = RefineConfig()
+DEFAULT_CONFIG = CaptureRefineConfig()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Refinement:
+class RefinedCapture:
     """capture: the better one of start and result; the very start if `report.kept` is False."""
 
     capture: Capture
@@ -46,8 +46,8 @@ def refine_capture(
     *,
     keypoints: Keypoints | None = None,
     photometric: bool = False,
-    config: RefineConfig = DEFAULT_CONFIG,
-) -> Refinement:
+    config: CaptureRefineConfig = DEFAULT_CONFIG,
+) -> RefinedCapture:
     """Refine cameras (rotation, centre, focal length), shape and poses of a capture.
 
     Arguments: keypoints: of the capture's views. photometric: also by the photos' colours, with the weights that come with the
@@ -72,7 +72,7 @@ def refine_capture(
         best, score, psnrs, stage, line = _refine_by_colors(scene, best, score, before, config)
         stages.append(stage)
         notes.append(line)
-    return Refinement(best, _report(capture, best, before, score, psnrs, tuple(stages), notes))
+    return RefinedCapture(best, _report(capture, best, before, score, psnrs, tuple(stages), notes))
 
 
 def _check(capture, keypoints, photometric):
@@ -109,7 +109,7 @@ def _refine_by_colors(scene, capture, score, before, config):
     return capture, score, (first, now.psnr), stage, line
 
 
-def by_colors(found: Likeness, capture: Capture, config: RefineConfig) -> tuple[Capture, Outcome]:
+def by_colors(found: Likeness, capture: Capture, config: CaptureRefineConfig) -> tuple[Capture, Outcome]:
     """A capture with cameras and poses moved so that its avatar is more like the photos, and what the solver did."""
     origin = capture_origin(capture, found.views.cameras, config)
     noise = jnp.asarray(found.noise)

@@ -61,7 +61,7 @@ BARE = 5.0
 
 
 @dataclasses.dataclass(frozen=True)
-class RefineConfig:
+class CaptureRefineConfig:
     """Static settings of a refinement.
 
     std: how far off the start is expected to be. shared_focal: focal lengths that start equal stay equal. coefficients: of the
@@ -89,7 +89,7 @@ class RefineConfig:
 # The state of a capture ----------------------------------------------------------------------------------------------
 
 
-def capture_origin(capture: Capture, cameras: Camera, config: RefineConfig) -> Origin:
+def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfig) -> Origin:
     """The origin of a refinement. cameras: of the views, for images of any size."""
     body = capture.body
     named = [j for j, name in enumerate(body.joint_names) if name in BODY_NAMES]
@@ -197,7 +197,7 @@ class Score:
 class Scene:
     """What stays the same over the rounds: masks at the size that is looked at, keypoints, and the origin."""
 
-    def __init__(self, capture: Capture, keypoints: Keypoints | None, config: RefineConfig) -> None:
+    def __init__(self, capture: Capture, keypoints: Keypoints | None, config: CaptureRefineConfig) -> None:
         self.capture, self.config = capture, config
         small = max(capture.images.shape[1:3]) <= config.longest_side
         looked_at = capture if small else capture.resized(config.longest_side)

@@ -37,8 +37,16 @@ HELD_OUT_PHOTOS = 8
 BUFFER_MARGIN = 1.5
 """Room in the renderer's buffers beyond the need of the start: Gaussians grow. What does not fit is counted, and the buffers
 are planned again."""
-HOST_SETTINGS = {"image_size": None, "views_per_step": 1, "held_out": 0.0, "checks": 1, "seed": 0}
-"""Settings that no compiled program depends on."""
+HOST_SETTINGS = {
+    "steps": 1,
+    "seconds": None,
+    "image_size": None,
+    "views_per_step": 1,
+    "held_out": 0.0,
+    "checks": 1,
+    "seed": 0,
+}
+"""Settings that no compiled program depends on, with the values that programs are compiled for."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -152,8 +160,7 @@ class _Run:
         self, avatar: Avatar, views: SubjectViews, config: RefineConfig, mesh: Mesh | None, splat: SplatConfig
     ):
         self.avatar, self.config, self.mesh, self.splat = avatar, config, mesh, splat
-        # what programs depend on: those of a run of 5 s serve one of 15 s, too
-        self.compared = dataclasses.replace(config, steps=1, seconds=None, **HOST_SETTINGS)
+        self.compiled_for = dataclasses.replace(config, **HOST_SETTINGS)  # the same for runs of 5 s and of 15 s
         everything = jnp.ones(views.masks.shape, bool)
         count = len(views.images)
         if count >= HELD_OUT_PHOTOS and config.held_out:
@@ -176,7 +183,7 @@ class _Run:
         from tqdm import tqdm
 
         config, began = self.config, time.perf_counter()
-        state = _compiled(start)(self.avatar, self.all, self.compared, self.splat)
+        state = _compiled(start)(self.avatar, self.all, self.compiled_for, self.splat)
         before = self.loss(state, self.all)
         best, highest = state, self.loss(state, self.held)[1]
         self.step(state, 0.0)  # compiles
@@ -215,13 +222,13 @@ class _Run:
         chosen = next(self.order)
         photos = _compiled(_chosen)(self.seen, chosen)
         state, _, overflow = _compiled(refine_step)(
-            state, self.avatar, photos, passed, self.compared, self.splat, self.mesh
+            state, self.avatar, photos, passed, self.compiled_for, self.splat, self.mesh
         )
         return state, int(overflow) > 0
 
     def loss(self, state: RefineState, photos: Photos) -> tuple[float, float]:
         """Loss and PSNR over the pixels that count."""
-        loss, squared, _ = _compiled(photos_loss)(state.parameters, self.avatar, photos, self.compared, self.splat)
+        loss, squared, _ = _compiled(photos_loss)(state.parameters, self.avatar, photos, self.compiled_for, self.splat)
         return float(loss), float(decibels(squared))
 
     def passed(self, steps: int, seconds: float) -> float:

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 README = Path(__file__).parents[2] / "README.md"
 LEAST_PSNR = 26.3
@@ -15,7 +14,6 @@ def ten_lines():
     return README.read_text().split("```python\n")[1].split("```")[0]
 
 
-@pytest.mark.slow
 def test_the_ten_lines_run_as_they_stand():
     lines = ten_lines()
     assert 8 <= len([line for line in lines.splitlines() if line.strip()]) <= 10

@@ -19,7 +19,7 @@ from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.fitting.refine import by_colors, refine_capture
-from humangs_jax.fitting.refine_rounds import RefineConfig
+from humangs_jax.fitting.refine_rounds import CaptureRefineConfig
 from humangs_jax.fitting.residuals.colors import Likeness, draw
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
@@ -29,7 +29,7 @@ from humangs_jax.rendering.splat_config import SplatConfig
 from tests.fitting.fit_people import default_body, rotations_of
 
 SIZE, VIEWS = 192, 3
-CONFIG = RefineConfig(rounds=6, points=120)
+CONFIG = CaptureRefineConfig(rounds=6, points=120)
 
 
 @functools.cache
@@ -202,7 +202,7 @@ def test_colours_alone_turn_cameras_and_poses_back():
         images, jnp.ones((VIEWS, size, size)), start.cameras, *jax.tree.leaves(per_view(start)), jnp.zeros(3)
     )
     likeness = Likeness(avatar, views, 0.0, 0.05, config)
-    moved, outcome = by_colors(likeness, start, RefineConfig(color_steps=30, independent_colors=1000.0))
+    moved, outcome = by_colors(likeness, start, CaptureRefineConfig(color_steps=30, independent_colors=1000.0))
     assert float(outcome.after) < 0.2 * float(outcome.before)
     off = lambda c: float(jnp.mean(jnp.square(draw(avatar, per_view(c), c.cameras, config) - images)))
     assert off(moved) < 0.2 * off(start)

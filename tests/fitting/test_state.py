@@ -11,7 +11,7 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.fitting.refine_rounds import RefineConfig, capture_origin, moved_capture
+from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, capture_origin, moved_capture
 from humangs_jax.fitting.residuals.priors import pose_prior
 from humangs_jax.fitting.state import (
     StateStd,
@@ -47,7 +47,7 @@ def capture():
 
 @pytest.fixture(scope="module")
 def origin(capture):
-    return capture_origin(capture, capture.cameras, RefineConfig(coefficients=5))
+    return capture_origin(capture, capture.cameras, CaptureRefineConfig(coefficients=5))
 
 
 def random_state(origin, seed=0):

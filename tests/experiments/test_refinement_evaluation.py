@@ -1,0 +1,44 @@
+"""Scores and table of `experiments/evaluation/refinement.py`, without rendering anybody."""
+
+import numpy as np
+import pytest
+
+from experiments.evaluation.refinement import BAND, outline_psnr, report_of, section
+from humangs_jax.objectives.metrics import LARGEST_PSNR
+
+SIDE = 256
+TASKS = ("novel", "animation")
+
+
+def test_only_the_band_along_the_outline_counts():
+    inside = np.zeros((SIDE, SIDE), bool)
+    inside[64:192, 64:192] = True
+    truth = np.zeros((SIDE, SIDE, 3))
+    middle, corner, edge = truth.copy(), truth.copy(), truth.copy()
+    middle[100:150, 100:150] = 1
+    corner[:20, :20] = 1
+    edge[66, 100:110] = 0.5  # the third pixel inside
+    assert outline_psnr(middle, truth, inside) == outline_psnr(corner, truth, inside) == LARGEST_PSNR
+    width = round(BAND * SIDE)
+    band = 4 * 128 * 2 * width  # but for the corners, outside rounded and inside shared
+    expected = -10 * np.log10(10 * 0.25 / band)
+    assert outline_psnr(edge, truth, inside) == pytest.approx(expected, abs=0.1)
+
+
+def row(psnr):
+    scores = {"psnr": psnr, "ssim": 0.9, "psnr_foreground": 18.0, "foreground": 0.1, "psnr_outline": 15.0, "fog": 0.1}
+    return {task: scores for task in TASKS}
+
+
+def test_means_gains_and_the_table():
+    rows = {
+        1: {"256 4 network": {"0": row(20.0), "5": row(22.0)}},
+        2: {"256 4 network": {"0": row(24.0), "5": row(24.5)}},
+    }
+    report = report_of(rows, {"split": "test"}, [1, 2, 3])
+    cell = report["means"]["256 4 network"]["5"]
+    assert cell["novel"]["psnr"] == 23.25 and cell["least_gain"] == 0.5
+    assert [person["seed"] for person in report["subjects"]] == [1, 2]
+    table = section(report)
+    assert "| 4 of 256 px | network | 5 | new views, same pose | 23.25 | 18.00 | 15.00 | 0.100 | 0.50 |" in table
+    assert "| 4 of 256 px | network | 0 | new views, same pose | 22.00 | 18.00 | 15.00 | 0.100 |  |" in table
