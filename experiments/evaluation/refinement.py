@@ -29,9 +29,6 @@ SHOWN = {
     "psnr_outline": ("outline", 2),
     "fog": ("fog", 3),
 }
-BAND = 3 / 256
-"""Half the width of the band at the outline, of the image's side."""
-FOG = (0.05, 0.9)
 
 
 def main() -> None:
@@ -143,6 +140,7 @@ def score_all(avatar, held_out):
 
     from experiments.evaluation.subjects import score_tasks, task_views
     from humangs_jax.avatar.frames import capture_renderings
+    from humangs_jax.objectives.metrics import fog, outline_psnr
 
     drawn = capture_renderings(avatar, held_out)[1]
     rgb = np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in drawn])
@@ -150,24 +148,11 @@ def score_all(avatar, held_out):
     tasks, scores = task_views(held_out), score_tasks(rgb, held_out, lambda predicted, truth: None)
     for task, own in scores.items():
         views = tasks[task]
-        inside = held_out.masks[views] > 0.5
-        partly = (alpha[views] > FOG[0]) & (alpha[views] < FOG[1]) & inside
-        bands = [outline_psnr(*view) for view in zip(rgb[views], held_out.images[views], inside, strict=True)]
-        own |= {"fog": float(partly.sum() / max(inside.sum(), 1)), "psnr_outline": float(np.mean(bands))}
+        truths, masks = held_out.images[views], held_out.masks[views]
+        foggy = [float(fog(*view)) for view in zip(alpha[views], masks, strict=True)]
+        bands = [outline_psnr(*view) for view in zip(rgb[views], truths, masks, strict=True)]
+        own |= {"fog": float(np.mean(foggy)), "psnr_outline": float(np.mean(bands))}
     return scores, rgb[0]
-
-
-def outline_psnr(predicted, truth, inside):
-    """dB in the band to either side of the outline of a mask."""
-    import jax.numpy as jnp
-    import numpy as np
-    from scipy.ndimage import distance_transform_edt
-
-    from humangs_jax.objectives.metrics import masked_psnr
-
-    distance = np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside))
-    band = distance <= BAND * len(inside)
-    return float(masked_psnr(*(jnp.asarray(x, jnp.float32) for x in (predicted, truth, band))))
 
 
 def report_of(rows, settings, seeds):

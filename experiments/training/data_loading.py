@@ -90,7 +90,7 @@ def measure_on_the_fly(size: int, people: int, examples: int, body: Any) -> dict
     built = seconds(lambda: banks.append(build_bank(range(people), body, "train", texture_size=texture)))
     accelerator = jax.default_backend() != "cpu"
     views = INPUTS + TARGETS
-    wide = {"views_at_once": views, "pixels_per_step": 1 << 30} if accelerator else {}
+    wide: dict[str, Any] = {"views_at_once": views, "pixels_per_step": 1 << 30} if accelerator else {}
     config = OnTheFlyConfig(input_views=INPUTS, target_views=TARGETS, input_size=size, target_size=size, **wide)
     draw = lambda i: jax.block_until_ready(jitted_example(banks[0], jax.random.key(i), config))
     first = seconds(lambda: draw(0))

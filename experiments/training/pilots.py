@@ -3,7 +3,8 @@
     python experiments/training/pilots.py --bank runs/people.npz --people people --validation unseen --out runs/pilots
     python experiments/training/pilots.py ... --only "as it is" "rate 1e-3" --steps 150
 
-The variants change the training, starting from trained weights (`--start`), or with `--fresh` the network, from fresh weights.
+The variants change the training (`--of training`) or the terms against fog (`--of fog`), starting from trained weights
+(`--start`), or the network (`--of network`), from fresh weights.
 The learning rate of every run ends at 0. The table is written to docs/training.md, the numbers to
 OUT/pilots.json; runs that are in there are not repeated. About 3 CPU minutes a run of 60 steps.
 """
@@ -21,7 +22,13 @@ FIRST, TABLE = "as it is", "training_pilots"
 DOCS = Path(__file__).resolve().parents[2] / "docs" / "training.md"
 TOKENS = 1024
 """For 4 photos of 256 pixels."""
-COLUMNS = ("psnr", "psnr_mask", "ssim")
+COLUMNS = {
+    "psnr": ("PSNR, dB", 2),
+    "psnr_mask": ("on the person, dB", 2),
+    "psnr_outline": ("outline, dB", 2),
+    "fog": ("fog", 4),
+    "ssim": ("SSIM", 4),
+}
 
 
 def main() -> None:
@@ -29,15 +36,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bank", type=Path, required=True, help="the people.npz of a run with --on-the-fly")
     parser.add_argument(
-        "--people", type=Path, required=True, help="captures, mixed with the on-the-fly people by halves"
+        "--people", type=Path, help="captures, mixed with the on-the-fly people by halves; none: the latter alone"
     )
     parser.add_argument("--validation", type=Path, required=True, help="captures of other people")
     parser.add_argument("--out", type=Path, required=True, help="folder of the runs")
     parser.add_argument("--start", type=Path, help="weights to start from; the shipped ones if not given")
     parser.add_argument(
-        "--fresh",
-        action="store_true",
-        help="start from nothing; table training_pilots_fresh, which needs a --page with its markers",
+        "--of", choices=("training", "network", "fog"), default="training", help="what the runs differ in"
     )
     parser.add_argument("--steps", type=int, default=150, help="of each run")
     parser.add_argument("--only", nargs="+", help="names of the runs to make; all if not given")
@@ -79,6 +84,21 @@ def training_variants(base):
     }
 
 
+def fog_variants(base):
+    """Name -> (configuration, settings of the on-the-fly people): terms against fog, each alone, then together."""
+    loss = lambda **changes: (dataclasses.replace(base, loss=dataclasses.replace(base.loss, **changes)), {})
+    return {
+        FIRST: (base, {}),
+        "absolute errors": loss(squared=0.0, silhouette=0.0, absolute=0.2, outline=0.1),
+        "absolute coverage": loss(outline=0.1),
+        "depth": loss(depth=0.3),
+        "distortion": loss(distortion=1.0),
+        "opaque": loss(opaque=0.003),
+        "one shell": loss(shells=3.0),
+        "smooth offsets": loss(smooth=1.0),
+    }
+
+
 def network_variants(base):
     """Name -> (configuration, settings of the on-the-fly people): of the network, from nothing."""
     replace, model = dataclasses.replace, base.model
@@ -117,13 +137,13 @@ def run(arguments, parser) -> None:
         validate_every=arguments.steps,
         checkpoint_every=arguments.steps,
     )
-    runs = network_variants(base) if arguments.fresh else training_variants(base)
+    runs = {"training": training_variants, "network": network_variants, "fog": fog_variants}[arguments.of](base)
     names = arguments.only or list(runs)
     if unknown := set(names) - set(runs):
         parser.error(f"--only {sorted(unknown)}: expected names of {', '.join(runs)}")
-    start = None if arguments.fresh else file_digest(arguments.start) if arguments.start else "shipped"
+    start = None if arguments.of == "network" else file_digest(arguments.start) if arguments.start else "shipped"
     settings = {"steps": arguments.steps, "start": start, "bank": file_digest(arguments.bank)}
-    path, table = arguments.out / "pilots.json", TABLE + "_fresh" * arguments.fresh
+    path, table = arguments.out / "pilots.json", TABLE if arguments.of == "training" else f"{TABLE}_{arguments.of}"
     try:
         check_section(arguments.page, table)
     except (ValueError, OSError) as error:
@@ -134,7 +154,7 @@ def run(arguments, parser) -> None:
         if name in kept(path, settings, parser):
             continue
         config, on_the_fly = runs[name]
-        started = None if arguments.fresh else (variables, model)
+        started = None if arguments.of == "network" else (variables, model)
         row = pilot(arguments, config, on_the_fly, started, name.replace(" ", "_").replace(",", ""))
         row |= {"steps": config.steps, "config": json.loads(config_to_json(config)), "on_the_fly": on_the_fly}
         rows = kept(path, settings, parser) | {name: row}  # another process may have added to it
@@ -160,6 +180,7 @@ def pilot(arguments, config, on_the_fly, started, name) -> dict:
     from humangs_jax.data.loader import CaptureCache, find_captures
     from humangs_jax.data.views import gaussian_body
     from humangs_jax.network.weights import fit_variables
+    from humangs_jax.objectives.metrics import outline_psnr
     from humangs_jax.people.bank import load_bank
     from humangs_jax.people.on_the_fly import OnTheFlyConfig
     from humangs_jax.training.loop import train
@@ -167,12 +188,13 @@ def pilot(arguments, config, on_the_fly, started, name) -> dict:
     from humangs_jax.training.validation import validate, validation_examples
 
     body, begin = load_body(), time.process_time()
-    people = [
-        captured_people(find_captures(arguments.people), body),
-        on_the_fly_people(load_bank(arguments.bank), OnTheFlyConfig(**on_the_fly)),
-    ]
+    people = [on_the_fly_people(load_bank(arguments.bank), OnTheFlyConfig(**on_the_fly))]
+    if arguments.people:
+        people.insert(0, captured_people(find_captures(arguments.people), body))
     variables = None if started is None else fit_variables(*started, config.model)
-    state = train(config, body, mixed_people(people, [1, 1]), arguments.out / name, variables=variables, progress=False)
+    state = train(
+        config, body, mixed_people(people, [1] * len(people)), arguments.out / name, variables=variables, progress=False
+    )
     if int(state.step) < config.steps:
         raise SystemExit(f"interrupted at step {int(state.step)} of {name!r}; the same command goes on there")
     seconds = time.process_time() - begin
@@ -181,7 +203,13 @@ def pilot(arguments, config, on_the_fly, started, name) -> dict:
     compared = dataclasses.replace(config, views=views)
     cache = CaptureCache(find_captures(arguments.validation), body)
     examples = validation_examples(cache, compared, len(cache))
-    numbers, _ = validate(jax.device_get(state.variables), gaussian_body(body, config.model), examples, compared)
+    numbers, shown = validate(jax.device_get(state.variables), gaussian_body(body, config.model), examples, compared)
+    bands = [
+        outline_psnr(*view)
+        for example, images in zip(examples, shown, strict=True)
+        for view in zip(images, example.targets.images, example.targets.masks, strict=True)
+    ]
+    numbers["psnr_outline"] = sum(bands) / len(bands)
     return {key: numbers[key] for key in COLUMNS} | {"cpu_seconds": seconds}
 
 
@@ -190,12 +218,14 @@ def write_table(page: Path, rows: dict, table: str) -> None:
     from experiments.common.results import markdown_table, publish
 
     first = rows[FIRST]
-    lines, forms = [], {True: ("{:.2f}", "{:.2f}", "{:.4f}"), False: ("{:+.2f}", "{:+.2f}", "{:+.4f}")}
+    lines = []
     for name, row in rows.items():
-        scores = [row[key] if name == FIRST else row[key] - first[key] for key in COLUMNS]
-        texts = [form.format(score) for form, score in zip(forms[name == FIRST], scores, strict=True)]
+        texts = []
+        for key, (_, digits) in COLUMNS.items():
+            change = row[key] if name == FIRST else row[key] - first[key]
+            texts.append(f"{change:{'' if name == FIRST else '+'}.{digits}f}")
         lines.append([name, *texts, row["steps"], f"{row['cpu_seconds']:.0f}"])
-    header = ["run", "PSNR, dB", "in the foreground, dB", "SSIM", "steps", "CPU s"]
+    header = ["run", *(heading for heading, _ in COLUMNS.values()), "steps", "CPU s"]
     publish(page, table, markdown_table(header, lines), rows)
 
 

@@ -27,6 +27,12 @@ LONGEST_SIDE = 512
 LEAST_IOU = 0.5
 """Clothes and hair cover about a fifth of a silhouette that the body does not; half means another pose or camera."""
 SURELY_IOU = 0.6
+MOST_OUTSIDE = 0.05
+"""Share of the body's pixels: those outside of the mask take the background's colour."""
+WIDER = (
+    "{:.0%} of the body is outside the mask: it is wider than the person, or the pose is off; "
+    "`humangs fit CAPTURE --refine --fixed-cameras` fits shape and pose to the masks"
+)
 LEAST_INSIDE, SURELY_INSIDE = 0.5, 0.9
 """Share of the vertices in the frame: below the first it is a warning, the second is asked of an explanation."""
 LEAST_HEIGHT = 0.05
@@ -79,10 +85,13 @@ class BodyImage:
 
 @dataclasses.dataclass(frozen=True)
 class ViewCheck:
-    """One view. iou: of body and mask, None without masks. inside: share of the vertices in the image."""
+    """One view. iou: of body and mask, outside: share of the body's pixels that are not the mask's; None without masks.
+    inside: share of the vertices in the image.
+    """
 
     name: str
     iou: float | None
+    outside: float | None
     inside: float
     warnings: tuple[str, ...] = ()
 
@@ -101,10 +110,12 @@ class CheckReport:
     def __str__(self) -> str:
         """A table, then the warnings."""
         width = max(4, *(len(view.name) for view in self.views))
-        lines = [f"{'view':<{width}}  silhouette IoU  body in frame"]
+        lines = [f"{'view':<{width}}  silhouette IoU  body outside mask  body in frame"]
         for view in self.views:
             iou = "no mask" if view.iou is None else f"{view.iou:.3f}"
-            lines.append(f"{view.name:<{width}}  {iou:>14}  {view.inside:>12.0%}{'  !' if view.warnings else ''}")
+            outside = "" if view.outside is None else f"{view.outside:.1%}"
+            mark = "  !" if view.warnings else ""
+            lines.append(f"{view.name:<{width}}  {iou:>14}  {outside:>17}  {view.inside:>12.0%}{mark}")
         lines += [f"warning: {view.name}: {warning}" for view in self.views for warning in view.warnings]
         if self.ok:
             lines.append(
@@ -134,6 +145,8 @@ def check_capture(capture: Capture, out: str | Path) -> CheckReport:
             cause = _mistake_in_image(drawn, mask) or _mistake_in_space(draw, capture.cameras[i], translation, mask)
             explained = f"it would fit if {cause}"
             view = dataclasses.replace(view, warnings=view.warnings + ((explained,) if cause else ()))
+        elif view.outside is not None and view.outside > MOST_OUTSIDE:
+            view = dataclasses.replace(view, warnings=(WIDER.format(view.outside),))
         overlays.append(overlay(capture.images[i], drawn))
         views.append(view)
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
@@ -202,9 +215,15 @@ def _iou(drawn, mask):
     return float((covered & mask).sum() / union) if union else 0.0
 
 
+def _outside(drawn, mask):
+    covered = np.asarray(drawn.covered)
+    return float((covered & ~mask).sum() / max(covered.sum(), 1))
+
+
 def _judge(name, drawn, mask) -> ViewCheck:
     inside, before, height = float(drawn.inside), float(drawn.before), float(drawn.height)
     iou = None if mask is None else _iou(drawn, mask)
+    outside = None if mask is None else _outside(drawn, mask)
     warnings = []
     if before == 0:
         warnings.append("the body is behind the camera")
@@ -218,7 +237,7 @@ def _judge(name, drawn, mask) -> ViewCheck:
         warnings.append("the mask is empty")
     elif iou is not None and iou < LEAST_IOU:
         warnings.append(f"body and mask do not agree (IoU {iou:.2f})")
-    return ViewCheck(name, iou, inside, tuple(warnings))
+    return ViewCheck(name, iou, outside, inside, tuple(warnings))
 
 
 def _mistake_in_image(drawn, mask):

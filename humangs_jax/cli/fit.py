@@ -56,7 +56,9 @@ class Refinement:
     """Refinement of a capture that has a body."""
 
     refine: bool = False
-    """Improve cameras and poses; with --keypoints, against these too. The result is never worse than the start."""
+    """Improve cameras, shape and poses; with --keypoints, against these too. The result is never worse than the start."""
+    fixed_cameras: bool = False
+    """Move shape and poses only: for calibrated cameras, where the body is wider or narrower than the masks."""
     photometric: bool = False
     """Also compare photos and renderings of a reconstruction while refining."""
 
@@ -64,7 +66,7 @@ class Refinement:
 Way = Literal["--scan", "--refine", "--keypoints"]
 WAYS: dict[Way, set[str]] = {
     "--scan": {"keypoints", "person", "body", "joints", "views", "height", "bare"},
-    "--refine": {"keypoints", "person", "photometric"},
+    "--refine": {"keypoints", "person", "photometric", "fixed_cameras"},
     "--keypoints": {"person", "body", "smoothness"},
 }
 """The three ways to fit, by the option that chooses each, and their other options."""
@@ -145,12 +147,14 @@ class Fit:
         from humangs_jax.data.capture import load_capture
         from humangs_jax.fitting.files import check_place, write_fitted
         from humangs_jax.fitting.refine import refine_capture
+        from humangs_jax.fitting.refine_rounds import CaptureRefineConfig
 
         assert self.capture is not None  # `run` has checked it
         target = check_place(self.capture, self.out, self.overwrite)
         start = load_capture(self.capture)
         keypoints = self.detections.read(start)
-        refinement = refine_capture(start, keypoints=keypoints, photometric=self.refinement.photometric)
+        config = CaptureRefineConfig(fixed_cameras=self.refinement.fixed_cameras)
+        refinement = refine_capture(start, keypoints=keypoints, photometric=self.refinement.photometric, config=config)
         print(refinement.report)
         if not refinement.report.kept:
             print("nothing was written: refinement did not improve the capture")

@@ -13,7 +13,13 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.rendering.mesh.position_map import gouraud_position_map, plain_position_map, vertex_normals
+from humangs_jax.rendering.mesh.position_map import (
+    BACKGROUND,
+    BACKGROUND_DEPTH,
+    gouraud_position_map,
+    plain_position_map,
+    vertex_normals,
+)
 
 MASK_THRESHOLD = 0.5
 """A pixel belongs to the person when its mask is above this."""
@@ -25,7 +31,8 @@ class SubjectViews:
 
     images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) coverage in [0, 1]. cameras: a batch of v, metric.
     rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients. view_count: how many are
-    views, those after them are padding (see `pad_views`); None: all are.
+    views, those after them are padding (see `pad_views`); None: all are. depths: (v, h, w) mean z of the person in a pixel,
+    metres, where the mask is not 0; None: unknown.
     """
 
     images: Float[Array, "v h w 3"]
@@ -35,6 +42,7 @@ class SubjectViews:
     translations: Float[Array, "v 3"]
     betas: Float[Array, " s"]
     view_count: Int[Array, ""] | None = None
+    depths: Float[Array, "v h w"] | None = None
 
 
 def pad_views(views: SubjectViews, count: int) -> SubjectViews:
@@ -87,6 +95,12 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
 
     # one view after the other: a vmapped rasterizer would make every view pay for the fullest one
     position_maps, depth_maps = jax.lax.map(rasterize_view, (posed, cameras))
+    foreground = (views.masks > MASK_THRESHOLD) | (depth_maps >= 0)
+    if config.conventions.pixels == "person":
+        masked = jnp.any(views.masks > MASK_THRESHOLD, axis=(1, 2), keepdims=True)
+        foreground &= (views.masks > MASK_THRESHOLD) | ~masked
+        depth_maps = jnp.where(foreground, depth_maps, BACKGROUND_DEPTH)
+        position_maps = jnp.where(foreground[..., None], position_maps, BACKGROUND)
     return HumanGSInputs(
         images=views.images,
         cameras=views.cameras,
@@ -94,7 +108,7 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
         canonical_vertices=rest.vertices,
         position_maps=position_maps,
         depth_maps=depth_maps,
-        foreground=(views.masks > MASK_THRESHOLD) | (depth_maps >= 0),
+        foreground=foreground,
         view_count=views.view_count,
         posed_normals=jax.vmap(normals)(posed),
         canonical_normals=normals(rest.vertices),

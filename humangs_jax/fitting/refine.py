@@ -15,11 +15,11 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene, capture_origin, moved_capture
+from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene, capture_origin, moved_capture, start_state
 from humangs_jax.fitting.report import Change, FitReport, Stage, ViewReport, limit_violations
 from humangs_jax.fitting.residuals.colors import Likeness, color_residuals, likeness
 from humangs_jax.fitting.solve import Outcome, solve
-from humangs_jax.fitting.state import cameras_of, pose_of, zero_state
+from humangs_jax.fitting.state import cameras_of, pose_of
 from humangs_jax.geometry import quaternion
 
 LEAST_GAIN = 0.2
@@ -113,7 +113,7 @@ def by_colors(found: Likeness, capture: Capture, config: CaptureRefineConfig) ->
     """A capture with cameras and poses moved so that its avatar is more like the photos, and what the solver did."""
     origin = capture_origin(capture, found.views.cameras, config)
     noise = jnp.asarray(found.noise)
-    start = zero_state(origin)
+    start = start_state(origin, config)
     free = jax.tree.map(lambda leaf: jnp.ones(leaf.shape, bool), start)
     free = replace(free, betas=~free.betas, clothing=~free.clothing)  # the avatar has its own shape
     state, outcome = _solve_colors(found.avatar, found.views, origin, start, free, noise, config, found.splatting)

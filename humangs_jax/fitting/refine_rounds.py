@@ -65,7 +65,8 @@ class CaptureRefineConfig:
     """Static settings of a refinement.
 
     std: how far off the start is expected to be. shared_focal: focal lengths that start equal stay equal. coefficients: of the
-    shape, where the capture has fewer. rounds: number of matchings; steps: of the solver in each. points: of an outline.
+    shape, where the capture has fewer. fixed_cameras: only shape and poses move. rounds: number of matchings; steps: of the
+    solver in each. points: of an outline.
     independent: number of independent equations that all points of a view count for. reach: how far points look in the first and
     the last round, shares of the person's height in the image. robust_scales: multiples of the reach, outwards and inwards of
     the mask. longest_side: larger photos are shrunk to this many pixels. color_steps: of L-BFGS. independent_colors: as
@@ -75,6 +76,7 @@ class CaptureRefineConfig:
     std: StateStd = dataclasses.field(default_factory=StateStd)
     shared_focal: bool = True
     coefficients: int = 10
+    fixed_cameras: bool = False
     rounds: int = 10
     steps: int = 4
     points: int = 300
@@ -104,6 +106,12 @@ def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfi
         joints=joints,
         std=config.std,
     )
+
+
+def start_state(origin: Origin, config: CaptureRefineConfig) -> FitState:
+    """Zeros for what a refinement moves."""
+    state = zero_state(origin)
+    return replace(state, cameras=None) if config.fixed_cameras else state
 
 
 def moved_capture(capture: Capture, origin: Origin, state: FitState) -> Capture:
@@ -217,7 +225,7 @@ class Scene:
         """The state after all rounds, what the solver did in each (a batch), and the largest move of the last round, in
         expected standard deviations.
         """
-        config, state, outcomes, move = self.config, zero_state(self.origin), [], 0.0
+        config, state, outcomes, move = self.config, start_state(self.origin, self.config), [], 0.0
         first, last = config.reach
         for turn in range(config.rounds):
             evidence = self.look(state, self.height * first * (last / first) ** (turn / max(config.rounds - 1, 1)))

@@ -178,11 +178,11 @@ def state_of(origin: Origin, betas: Float[Array, " s"], pose: BodyPose) -> FitSt
 def cameras_of(origin: Origin, state: FitState) -> tuple[Float[Array, "v 3 3"], Float[Array, "v 4 4"]]:
     """K and cam_from_world of every view: a camera turns about its centre, in its own axes, and the centre moves.
 
-    Raises: ValueError if origin or state is without cameras.
+    A state without cameras leaves them where they are. Raises: ValueError if the origin is without cameras.
     """
     start, moved, std = origin.views, state.cameras, origin.std
     if moved is None:
-        raise ValueError("expected a state with cameras")
+        return start.K, start.cam_from_world
     turn = quaternion.matrix_from_axis_angle(math.radians(std.camera_rotation) * moved.rotations[start.camera])
     center = transform.invert_rigid(start.cam_from_world)[:, :3, 3] + std.camera_center * moved.centers[start.camera]
     rotation = jnp.matmul(turn, start.cam_from_world[:, :3, :3], precision=EXACT)

@@ -116,6 +116,8 @@ class VertexDecoder:
                 colors=flat(at_vertices.colors),
             ),
             tight_offsets=at_vertices.offsets[:, : self.tight],
+            free_offsets=at_vertices.offsets[:, self.tight :],
+            shell_spread=None if raw.shells is None else shell_spread(raw.shells, features),
             skinning_offsets=None if raw.skinning is None else flat(raw.skinning),
             dropped_tokens=jnp.zeros((), jnp.int32),
             dropped_reads=jnp.zeros((), jnp.int32) if features.dropped_reads is None else features.dropped_reads,
@@ -210,6 +212,13 @@ def activate(raw: RawGaussians, config: VertexDecoder, features: VertexFeatures 
             raise ValueError("decoder.residual_color needs a reader that gives photo_colors")
         colors = colors + inverse_sigmoid(seen, COLOR_MARGIN)
     return VertexGaussians(offsets, quats, jax.nn.softplus(scales), jax.nn.sigmoid(opacities), jax.nn.sigmoid(colors))
+
+
+def shell_spread(logits: Float[Array, "n k s"], features: VertexFeatures) -> Float[Array, "n k"]:
+    """Variance of the shells' distances under the weights of each Gaussian, normalised units."""
+    assert features.shells is not None
+    chosen, distances = jax.nn.softmax(logits, axis=-1), features.shells.distances
+    return chosen @ distances**2 - (chosen @ distances) ** 2
 
 
 def corrected_skinning_weights(

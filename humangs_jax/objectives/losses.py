@@ -2,12 +2,45 @@
 
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Float, Int
+
+FAR_SURFACE = 0.1
+"""Metres."""
 
 
 def squared_error(predicted: Float[Array, "*b"], target: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """Squared difference, elementwise; of images in [0, 1], or of coverages and masks."""
     return jnp.square(predicted - target)
+
+
+def surface_distance(
+    depth: Float[Array, "*b"], alpha: Float[Array, "*b"], target_depth: Float[Array, "*b"], mask: Float[Array, "*b"]
+) -> Float[Array, "*b"]:
+    """Distance between the surface drawn and the true one, in the unit of the depths, where both are the person's.
+
+    At most `FAR_SURFACE`: across an outline the nearest surfaces are different limbs.
+    """
+    return alpha * mask * jnp.minimum(jnp.abs(depth - target_depth), FAR_SURFACE)
+
+
+def ray_spread(alpha: Float[Array, "*b"], depth: Float[Array, "*b"], squared: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """Distortion of the weights w along a ray: sum over pairs of w_i w_j (z_i - z_j)^2, squared units of z.
+
+    alpha: the sum of w. depth, squared: mean of z and of its square, weighted by w. The loss of 2DGS
+    (https://arxiv.org/abs/2403.17888, eq. 13) with squared differences, after mip-NeRF 360 (https://arxiv.org/abs/2111.12077).
+    """
+    return 2 * alpha**2 * jnp.maximum(squared - depth**2, 0)
+
+
+def translucency(opacities: Float[Array, " g"]) -> Float[Array, " g"]:
+    """4 o (1 - o): 0 for opacities of 0 and 1, 1 between them."""
+    return 4 * opacities * (1 - opacities)
+
+
+def roughness(offsets: Float[Array, "n k 3"], faces: Int[Array, "f 3"]) -> Float[Array, "f 3"]:
+    """Squared difference of the offsets at the ends of every edge of the faces of a mesh, averaged over the k."""
+    corners = offsets[faces]
+    return jnp.mean(jnp.sum(jnp.square(corners - jnp.roll(corners, 1, axis=1)), axis=-1), axis=-1)
 
 
 def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:

@@ -9,6 +9,10 @@ from humangs_jax.objectives.ssim import SIGMA, WINDOW
 
 LARGEST_PSNR = 100.0
 """dB reported for equal images, whose PSNR is infinite and would spoil any mean."""
+FOG = (0.05, 0.9)
+"""Alphas between these are fog."""
+OUTLINE = 3 / 256
+"""Half the width of the band at the outline, of the image's side."""
 
 
 def decibels(mean_squared_error: Scalar) -> Scalar:
@@ -25,6 +29,23 @@ def masked_psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"],
     """PSNR in dB over the pixels of a mask, each counted by its coverage; 100 where the mask is empty."""
     errors = jnp.mean(jnp.square(jnp.clip(predicted, 0, 1) - target), axis=-1)
     return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
+
+
+def fog(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
+    """Share of the pixels of a mask where alpha is neither near 0 nor near 1, see `FOG`; 0 where the mask is empty."""
+    inside = mask > 0.5
+    partly = (alpha > FOG[0]) & (alpha < FOG[1]) & inside
+    return jnp.sum(partly) / jnp.maximum(jnp.sum(inside), 1)
+
+
+def outline_psnr(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray) -> float:
+    """PSNR in dB of two (h, w, 3) images in the band to either side of the outline of a mask (h, w), see `OUTLINE`."""
+    from scipy.ndimage import distance_transform_edt
+
+    inside = np.asarray(mask) > 0.5
+    distance = np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside))
+    band = jnp.asarray(distance <= OUTLINE * len(inside), jnp.float32)
+    return float(masked_psnr(jnp.asarray(predicted), jnp.asarray(target), band))
 
 
 def ssim(predicted: np.ndarray, target: np.ndarray) -> float:

@@ -20,6 +20,7 @@ from jax import lax
 from humangs_jax.body.skinning import joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int, Key, UInt8
 from humangs_jax.core.configuration import knob
+from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.loading.examples import Example
 from humangs_jax.data.views import SubjectViews
@@ -96,7 +97,7 @@ class OnTheFlyConfig:
     input_views, target_views; input_size, target_size: pixels a side. poses: poses per example; targets show any of them.
     mixed_pose_share: share of examples whose inputs show any of the poses too, each; otherwise all show the first.
     jitter, scattered_share: see `cameras.azimuths_from`. close_share: share of close cameras among the targets.
-    mirrored_share, dyed_share: of examples. supersampling: samples a side of each pixel.
+    mirrored_share, dyed_share: of examples. supersampling: samples a side of each pixel. depths: also of every view.
     views_at_once: views drawn side by side: 1 suits CPUs, all of them accelerators. pixels_per_step: of the person, that are
     coloured at a time: few for CPUs, whole images for accelerators.
     """
@@ -113,6 +114,7 @@ class OnTheFlyConfig:
     mirrored_share: float = 0.5
     dyed_share: float = 0.7
     supersampling: int = 2
+    depths: bool = False
     views_at_once: int = knob(
         1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md"
     )
@@ -223,9 +225,17 @@ def _views(bank, scene, plan, config, size):
 
     poses = plan[2]
     batch = None if config.views_at_once == 1 else min(config.views_at_once, len(poses))
-    images, masks, cameras = lax.map(view, plan, batch_size=batch)
+    images, masks, depths, cameras = lax.map(view, plan, batch_size=batch)
     betas = bank.betas[scene.person]
-    return SubjectViews(images, masks, cameras, scene.rotations[poses], scene.translations[poses], betas)
+    return SubjectViews(
+        images,
+        masks,
+        cameras,
+        scene.rotations[poses],
+        scene.translations[poses],
+        betas,
+        depths=depths if config.depths else None,
+    )
 
 
 def _some(views, part):
@@ -235,8 +245,10 @@ def _some(views, part):
 
 def draw_view(
     bank: PeopleBank, scene: Scene, pose: Int[Array, ""], camera: Camera, config: OnTheFlyConfig = ON_THE_FLY
-) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"]]:
-    """(h, w, 3) image on white and (h, w) coverage of one of the scene's poses, both in [0, 1]."""
+) -> tuple[Float[Array, "h w 3"], Float[Array, "h w"], Float[Array, "h w"]]:
+    """(h, w, 3) image on white and (h, w) coverage of one of the scene's poses, both in [0, 1], and (h, w) mean z of what
+    is covered, metres, 0 in the background.
+    """
     s = config.supersampling
     fine = camera.resized(camera.width * s, camera.height * s)
     vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
@@ -244,7 +256,9 @@ def draw_view(
     behind = seen_from_behind(vertices, faces, camera.center)
     colors = _light_pixels(bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step)
     covered = (fragments.face_ids >= 0).reshape(-1, 1).astype(colors.dtype)
-    return _box_average(colors, camera, s), _box_average(covered, camera, s)[..., 0]
+    z = _box_average(fragments.depth.reshape(-1, 1) * covered, camera, s)[..., 0]
+    coverage = _box_average(covered, camera, s)[..., 0]
+    return _box_average(colors, camera, s), coverage, safe_divide(z, coverage)
 
 
 def _box_average(samples, camera, s):
@@ -315,6 +329,7 @@ def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
         views,
         images=views.images[..., :, ::-1, :],
         masks=views.masks[..., :, ::-1],
+        depths=None if views.depths is None else views.depths[..., :, ::-1],
         cameras=replace(camera, K=K, cam_from_world=camera.cam_from_world * signs[:, None] * signs),
         rotations=views.rotations[..., jnp.asarray(joints), :] * flip,
         translations=views.translations * side,

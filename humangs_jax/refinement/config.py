@@ -5,6 +5,8 @@ import dataclasses
 from humangs_jax.core.configuration import knob
 
 MEASURED = "refinement.md"
+SPLITS = (0.0, 0.2, 0.4)
+"""Shares of a run after which Gaussians are split."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +41,8 @@ class RefineConfig:
     largest weight on a pixel of the photos is at least this moves at the full rate, others more slowly; what no photo shows
     stays. poses: also refine the body pose of each photo. The corrected poses are not returned.
 
+    growth: the number of Gaussians may grow by this factor: at `SPLITS` of the run those with the largest errors are split.
+
     held_out: share of the pixels, in square blocks, that no step sees; with `HELD_OUT_PHOTOS` photos or more, one whole photo
     instead; 0: nothing. The state of the run with the highest PSNR there is returned. checks: how often it is measured.
     seed: of the order of the photos and of the blocks.
@@ -57,6 +61,7 @@ class RefineConfig:
     decay: float = 2e-3
     visible: float = 0.02
     poses: bool = False
+    growth: float = knob(1.0, cost="time of a step", gain="detail", measured=MEASURED)
     held_out: float = 0.05
     checks: int = 5
     seed: int = 0
@@ -73,5 +78,7 @@ class RefineConfig:
         shares = {name: getattr(self, name) for name in ("final_rate", "decay", "held_out")}
         if wrong := [name for name, value in shares.items() if not 0 <= value <= 1]:
             raise ValueError(f"RefineConfig: {', '.join(wrong)} must be in [0, 1]")
+        if not 1 <= self.growth <= 16:
+            raise ValueError(f"RefineConfig: growth must be between 1 and 16, got {self.growth}")
         if not self.held_out < 1 or not self.visible > 0 or self.checks < 1:
             raise ValueError("RefineConfig: need held_out < 1, visible > 0 and checks >= 1")

@@ -25,8 +25,9 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.objectives.metrics import decibels
-from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.config import SPLITS, RefineConfig
 from humangs_jax.refinement.crops import crop_to_person, held_out_blocks
+from humangs_jax.refinement.density import photo_errors, split, with_room, without_clear
 from humangs_jax.refinement.objective import Photos, photos_gradient, photos_loss, photos_of, posed_gaussians
 from humangs_jax.refinement.parameters import RefineState, gaussians_of, init_state, parameters_of, update
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
@@ -159,7 +160,8 @@ class _Run:
     def __init__(
         self, avatar: Avatar, views: SubjectViews, config: RefineConfig, mesh: Mesh | None, splat: SplatConfig
     ):
-        self.avatar, self.config, self.mesh, self.splat = avatar, config, mesh, splat
+        self.avatar, self.config, self.mesh, self.splat = with_room(avatar, config.growth), config, mesh, splat
+        self.original = avatar
         self.compiled_for = dataclasses.replace(config, **HOST_SETTINGS)  # the same for runs of 5 s and of 15 s
         everything = jnp.ones(views.masks.shape, bool)
         count = len(views.images)
@@ -185,14 +187,19 @@ class _Run:
         config, began = self.config, time.perf_counter()
         state = _compiled(start)(self.avatar, self.all, self.compiled_for, self.splat)
         before = self.loss(state, self.all)
-        best, highest = state, self.loss(state, self.held)[1]
+        best, highest = (state, self.avatar), self.loss(state, self.held)[1]
         self.step(state, 0.0)  # compiles
+        if config.growth > 1:
+            self.denser(state)
         compile_seconds = time.perf_counter() - began
         began, done, interrupted = time.perf_counter(), 0, False
         bar = tqdm(total=100, desc="refine", unit="%", disable=not progress, bar_format="{l_bar}{bar}| {elapsed}")
         try:
-            passed, checked = 0.0, 0
+            passed, checked, splits = 0.0, 0, list(SPLITS) if config.growth > 1 else []
             while passed < 1:
+                if splits and passed >= splits[0]:
+                    state, self.avatar = self.denser(state)
+                    splits.pop(0)
                 state, overflow = self.step(state, passed)
                 done += 1
                 if overflow:
@@ -202,15 +209,19 @@ class _Run:
                     checked = int(passed * config.checks)
                     psnr = self.loss(state, self.held)[1]
                     if psnr > highest or not self.any_held:
-                        best, highest = state, psnr
+                        best, highest = (state, self.avatar), psnr
                 bar.update(int(100 * passed) - bar.n)
         except KeyboardInterrupt:
             interrupted = True
         bar.close()
         seconds = time.perf_counter() - began
-        after = self.loss(best, self.all)
+        state, self.avatar = best
+        after = self.loss(state, self.all)
         kept = after[0] < before[0]
-        refined = replace(self.avatar, gaussians=gaussians_of(best.parameters)) if kept else self.avatar
+        refined = self.original
+        if kept:
+            refined = replace(self.avatar, gaussians=gaussians_of(state.parameters))
+            refined = refined if config.growth == 1 else without_clear(refined, self.splat.alpha_min)
         if self.mesh is not None:  # back from all devices to the default one
             refined = jax.tree.map(jnp.asarray, jax.device_get(refined))
         after = after if kept else before
@@ -225,6 +236,12 @@ class _Run:
             state, self.avatar, photos, passed, self.compiled_for, self.splat, self.mesh
         )
         return state, int(overflow) > 0
+
+    def denser(self, state: RefineState) -> tuple[RefineState, Avatar]:
+        """The state and the avatar after the Gaussians with the largest errors were split."""
+        errors = _compiled(photo_errors)(state.parameters, self.avatar, self.seen, self.compiled_for, self.splat)
+        count = round((self.config.growth - 1) * len(self.original.gaussians.means) / len(SPLITS))
+        return _compiled(split)(state, self.avatar, errors, count)
 
     def loss(self, state: RefineState, photos: Photos) -> tuple[float, float]:
         """Loss and PSNR over the pixels that count."""
@@ -265,7 +282,7 @@ def _planned(avatar: Avatar, photos: SubjectViews | Photos) -> SplatConfig:
 @functools.cache
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
-    static = [name for name in ("config", "splat", "mesh") if name in inspect.signature(function).parameters]
+    static = [name for name in ("config", "splat", "mesh", "count") if name in inspect.signature(function).parameters]
     return jax.jit(function, static_argnames=static, compiler_options=options)
 
 

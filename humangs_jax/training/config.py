@@ -23,7 +23,13 @@ class LossConfig:
     squared: error of the colours. structural: structural dissimilarity at `structural_scales` sizes. silhouette:
     squared error of the coverage. tightness: squared tight offsets, normalised units. perceptual: difference of the
     features of VGG-19, lpips: learned distance of features; both need networks that the user has, see
-    `objectives.loss_networks`, and are not computed where their weight is 0.
+    `objectives.loss_networks`.
+
+    Against fog, which is what squared errors make of doubt: absolute, outline: absolute errors of colours and of coverage.
+    depth: distance between the surfaces seen, metres; needs on-the-fly people. distortion: spread of the weights along the
+    rays. opaque: 4 o (1 - o) of the opacities o. shells: spread of the distances that a Gaussian mixes, normalised units.
+    smooth: difference of the free offsets along the edges of the body, normalised units.
+    Perceptual terms and those against fog are computed only where their weight is not 0.
     random_background: share of the targets that are seen against one random colour instead of white, so that
     white Gaussians differ from missing ones.
     """
@@ -35,6 +41,13 @@ class LossConfig:
     tightness: float = 0.1
     perceptual: float = 0.0
     lpips: float = 0.0
+    absolute: float = 0.0
+    outline: float = 0.0
+    depth: float = 0.0
+    distortion: float = 0.0
+    opaque: float = 0.0
+    shells: float = 0.0
+    smooth: float = 0.0
     random_background: float = 0.5
 
 

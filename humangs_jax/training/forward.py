@@ -1,5 +1,7 @@
 """From an example to images: photos -> canonical Gaussians -> posed as each target -> drawn."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
@@ -7,6 +9,7 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.reconstruct import make_avatar
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews, prepare_inputs
@@ -14,6 +17,7 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.parts import HumanGSOutputs, Variables
 from humangs_jax.network.stages import StageCaller, call
+from humangs_jax.objectives.losses import ray_spread
 from humangs_jax.rendering.drawing import draw_projected
 from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.rendering.splatting import Rendering
@@ -51,6 +55,13 @@ def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
     return config.model.with_execution(token_capacity=-(-capacity * (views + 1) // (most + 1)))
 
 
+class DrawnTargets(NamedTuple):
+    """Renderings of the v targets. spread: (v, h, w) `losses.ray_spread` in square metres, None unless it has a weight."""
+
+    rendering: Rendering
+    spread: Float[Array, "v h w"] | None = None
+
+
 def draw_targets(
     outputs: HumanGSOutputs,
     body: BodyModel,
@@ -58,8 +69,8 @@ def draw_targets(
     backgrounds: Float[Array, "v 3"],
     config: TrainConfig,
     stage: StageCaller = call,
-) -> Rendering:
-    """The Gaussians in the pose and before the camera of every target: a `Rendering` with a leading axis of v."""
+) -> DrawnTargets:
+    """The Gaussians in the pose and before the camera of every target."""
     poses = (targets.rotations, targets.translations)
 
     def pose_all(outputs):
@@ -73,7 +84,14 @@ def draw_targets(
         def draw(arguments):
             one, opacity, color, camera, background = arguments
             gaussians = replace(like, opacities=opacity, colors=color)
-            return draw_projected(one, gaussians, camera, config.splat, background)
+            rendering = draw_projected(one, gaussians, camera, config.splat, background)
+            if not config.loss.distortion:
+                return DrawnTargets(rendering)
+            z = one.depths - jax.lax.stop_gradient(jnp.mean(one.depths))  # small numbers have small squares
+            gaussians = replace(gaussians, colors=jnp.stack([z, z**2, 0 * z], axis=-1))
+            moments = draw_projected(one, gaussians, camera, config.splat, jnp.zeros(3, z.dtype))
+            first, second = (safe_divide(moments.rgb[..., i], moments.alpha) for i in (0, 1))
+            return DrawnTargets(rendering, ray_spread(moments.alpha, first, second))
 
         return jax.lax.map(draw, (projected, opacities, colors, targets.cameras, backgrounds))
 
@@ -94,4 +112,5 @@ def predict(
 ) -> tuple[Rendering, HumanGSOutputs]:
     """What the trained network shows of an example's targets, on white, and the Gaussians that it shows."""
     outputs, _ = reconstruct_example(variables, body, example.inputs, config)
-    return draw_targets(outputs, body, example.targets, white_backgrounds(example.targets), config), outputs
+    drawn = draw_targets(outputs, body, example.targets, white_backgrounds(example.targets), config)
+    return drawn.rendering, outputs

@@ -57,6 +57,7 @@ def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -
             mixed_pose_share=views.mixed_pose_share,
             jitter=views.jitter,
             scattered_share=views.scattered_share,
+            depths=config.loss.depth > 0,
         )
         if jax.default_backend() != "cpu":  # whole images, all views at once
             most = max(views.input_counts) + views.target_count

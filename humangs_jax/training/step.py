@@ -17,15 +17,15 @@ from humangs_jax.data.views import SubjectViews
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.objectives.loss_networks import LossNetworks
-from humangs_jax.objectives.losses import squared_error, tightness
+from humangs_jax.objectives.losses import roughness, squared_error, surface_distance, tightness, translucency
 from humangs_jax.objectives.lpips import lpips
 from humangs_jax.objectives.metrics import psnr
 from humangs_jax.objectives.perceptual import perceptual_loss
 from humangs_jax.objectives.ssim import multiscale_structural_dissimilarity
-from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, Rendering
+from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
 from humangs_jax.training import sharding
 from humangs_jax.training.config import LossConfig, TrainConfig
-from humangs_jax.training.forward import draw_targets, reconstruct_example
+from humangs_jax.training.forward import DrawnTargets, draw_targets, reconstruct_example
 from humangs_jax.training.optimizer import GuardState, learning_rate, make_optimizer
 from humangs_jax.training.state import TrainState
 
@@ -33,6 +33,8 @@ SUBJECTS = "subjects"
 """Name of the vmap axis over the subjects that a device works on at once, along which batch statistics are shared."""
 COUNTS = ("dropped_tokens", "dropped_reads", "overflow")
 """Metrics that are sums over a batch; all others are means."""
+ALWAYS = ("squared", "structural", "silhouette", "tightness")
+"""Terms that are computed, for the log, whatever their weight."""
 NO_NETWORKS = LossNetworks()
 
 Metrics = dict[str, Shaped[Array, ""]]
@@ -54,39 +56,61 @@ def change_background(targets: SubjectViews, backgrounds: Float[Array, "v 3"]) -
 
 
 def loss_terms(
-    drawn: Rendering,
+    drawn: DrawnTargets,
     outputs: HumanGSOutputs,
     images: Float[Array, "v h w 3"],
     targets: SubjectViews,
     config: LossConfig,
     networks: LossNetworks = NO_NETWORKS,
+    faces: Int[Array, "f 3"] | None = None,
     stage: StageCaller = call,
 ) -> Metrics:
     """The unweighted terms of `LossConfig` by name, for renderings on the backgrounds of `images`.
 
-    Raises: ValueError if a term has a weight but its network is missing.
+    faces: of the body, for `smooth`. Raises: ValueError if a term has a weight but what it needs is missing.
     """
     dissimilarity = functools.partial(multiscale_structural_dissimilarity, scales=config.structural_scales)
+    masks = targets.masks
     terms: dict[str, Callable[..., Array]] = {
-        "squared": lambda rgb, alpha, tight_offsets: squared_error(rgb, images),
-        "structural": lambda rgb, alpha, tight_offsets: jax.vmap(dissimilarity)(rgb, images),
-        "silhouette": lambda rgb, alpha, tight_offsets: squared_error(alpha, targets.masks),
-        "tightness": lambda rgb, alpha, tight_offsets: tightness(tight_offsets),
+        "squared": lambda t: squared_error(t["rgb"], images),
+        "structural": lambda t: jax.vmap(dissimilarity)(t["rgb"], images),
+        "silhouette": lambda t: squared_error(t["alpha"], masks),
+        "tightness": lambda t: tightness(t["tight_offsets"]),
+        "absolute": lambda t: jnp.abs(t["rgb"] - images),
+        "outline": lambda t: jnp.abs(t["alpha"] - masks),
+        "opaque": lambda t: translucency(t["opacities"]),
+        "distortion": lambda t: t["spread"],
+        "shells": lambda t: _required(t["shell_spread"], "shells", "shell of the reader"),
+        "smooth": lambda t: roughness(t["free_offsets"], _required(faces, "smooth", "mesh")),
+        "depth": lambda t: surface_distance(
+            t["depth"], t["alpha"], _required(targets.depths, "depth", "depth of the targets"), masks
+        ),
+        "perceptual": lambda t: _each(
+            functools.partial(perceptual_loss, _required(networks.perceptual, "perceptual", "VGG-19")), t["rgb"], images
+        ),
+        "lpips": lambda t: _each(
+            functools.partial(lpips, _required(networks.lpips, "lpips", "LPIPS")), t["rgb"], images
+        ),
     }
-    if config.perceptual:
-        features = functools.partial(perceptual_loss, _required(networks.perceptual, "perceptual", "VGG-19"))
-        terms["perceptual"] = lambda rgb, alpha, tight_offsets: _each(features, rgb, images)
-    if config.lpips:
-        distance = functools.partial(lpips, _required(networks.lpips, "lpips", "LPIPS"))
-        terms["lpips"] = lambda rgb, alpha, tight_offsets: _each(distance, rgb, images)
-    learned = {"rgb": drawn.rgb, "alpha": drawn.alpha, "tight_offsets": outputs.tight_offsets}
-    mean = lambda term: lambda seen: jnp.mean(term(**seen))
-    return {name: stage(f"loss: {name}", mean(term), learned) for name, term in terms.items()}
+    rendering = drawn.rendering
+    learned = {
+        "rgb": rendering.rgb,
+        "alpha": rendering.alpha,
+        "depth": rendering.depth,
+        "spread": drawn.spread,
+        "opacities": outputs.gaussians.opacities,
+        "tight_offsets": outputs.tight_offsets,
+        "free_offsets": outputs.free_offsets,
+        "shell_spread": outputs.shell_spread,
+    }
+    used = [name for name in terms if name in ALWAYS or getattr(config, name)]
+    mean = lambda term: lambda seen: jnp.mean(term(seen))
+    return {name: stage(f"loss: {name}", mean(terms[name]), learned) for name in used}
 
 
 def _required(network, name, title):
     if network is None:
-        raise ValueError(f"loss.{name} is not 0, but there is no {title}: pass its weights, or use `fitting_losses`")
+        raise ValueError(f"loss.{name} is not 0, but there is no {title}")
     return network
 
 
@@ -119,15 +143,15 @@ def subject_loss(
     backgrounds = backgrounds.astype(targets.images.dtype)
     images = change_background(targets, backgrounds)
     drawn = draw_targets(outputs, body, targets, backgrounds, config, stage)
-    terms = loss_terms(drawn, outputs, images, targets, config.loss, networks, stage)
+    terms = loss_terms(drawn, outputs, images, targets, config.loss, networks, body.faces, stage)
     total = lambda terms: sum(getattr(config.loss, name) * term for name, term in terms.items())
     loss = stage("loss", total, terms)
     metrics = {
         **terms,
-        "psnr": jnp.mean(jax.vmap(psnr)(drawn.rgb, images)),
+        "psnr": jnp.mean(jax.vmap(psnr)(drawn.rendering.rgb, images)),
         "dropped_tokens": outputs.dropped_tokens,
         "dropped_reads": outputs.dropped_reads,
-        "overflow": jnp.sum(drawn.overflow),
+        "overflow": jnp.sum(drawn.rendering.overflow),
     }
     return loss, (batch_stats, metrics)
 

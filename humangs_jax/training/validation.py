@@ -17,13 +17,13 @@ from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, ViewSa
 from humangs_jax.network.parts import Variables
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import lpips
-from humangs_jax.objectives.metrics import masked_psnr, psnr
+from humangs_jax.objectives.metrics import fog, masked_psnr, psnr
 from humangs_jax.objectives.ssim import similarity_map
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.forward import predict
 
 NO_NETWORKS = LossNetworks()
-METRICS = ("psnr", "psnr_mask", "ssim", "dropped_tokens", "dropped_reads", "overflow")
+METRICS = ("psnr", "psnr_mask", "ssim", "fog", "dropped_tokens", "dropped_reads", "overflow")
 
 
 def validation_examples(cache: CaptureCache, config: TrainConfig, count: int) -> list[Example]:
@@ -47,8 +47,8 @@ def validation_examples(cache: CaptureCache, config: TrainConfig, count: int) ->
 def evaluate(
     variables: Variables, body: BodyModel, example: Example, config: TrainConfig, networks: LossNetworks = NO_NETWORKS
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
-    """The images of one example's targets and their mean psnr, psnr_mask (both dB), ssim, and lpips if its network is
-    there.
+    """The images of one example's targets and their mean psnr, psnr_mask (both dB), ssim, fog, and lpips if its network
+    is there.
     """
     drawn, outputs = predict(variables, body, example, config)
     images, masks = example.targets.images, example.targets.masks
@@ -57,6 +57,7 @@ def evaluate(
         "psnr": jnp.mean(jax.vmap(psnr)(shown, images)),
         "psnr_mask": jnp.mean(jax.vmap(masked_psnr)(shown, images, masks)),
         "ssim": jnp.mean(jax.vmap(similarity_map)(shown, images)),
+        "fog": jnp.mean(jax.vmap(fog)(drawn.alpha, masks)),
         "dropped_tokens": outputs.dropped_tokens.astype(shown.dtype),
         "dropped_reads": outputs.dropped_reads.astype(shown.dtype),
         "overflow": jnp.sum(drawn.overflow).astype(shown.dtype),

@@ -4,6 +4,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import binary_erosion
 
 from humangs_jax.apps import check as module
 from humangs_jax.apps.check import OUTLINE, ViewCheck, check_capture, draw_body, overlay, side_tints
@@ -174,6 +175,11 @@ def test_warnings_tell_what_is_wrong(tmp_path):
     assert "IoU 0." in warnings(translations=np.array([[0.0, 0.7, 0.0]]))
     assert "in metres?" in warnings(translations=-50 * behind[None])
     assert "mask is empty" in warnings(empty_masks=True)
+    right = capture()
+    slimmer = dataclasses.replace(right, masks=binary_erosion(right.masks > 0.5, iterations=2, axes=(1, 2)))
+    report = check_capture(slimmer, tmp_path / "check.png")
+    assert all(view.outside > 0.05 and "--fixed-cameras" in view.warnings[0] for view in report.views)
+    assert all(view.outside < 0.01 for view in check_capture(right, tmp_path / "check.png").views)
 
 
 def test_photos_are_shrunk_and_cameras_with_them(tmp_path, monkeypatch):
@@ -195,10 +201,17 @@ def test_each_view_shows_its_own_frame(tmp_path):
 
 
 def test_report_is_a_table():
-    report = module.CheckReport((ViewCheck("front", 0.5, 0.25, ("too small",)), ViewCheck("left-side", None, 1.0)))
+    report = module.CheckReport(
+        (ViewCheck("front", 0.5, 0.01, 0.25, ("too small",)), ViewCheck("left-side", None, None, 1.0))
+    )
     header, front, left, warning = str(report).splitlines()
-    assert header.split() == ["view", "silhouette", "IoU", "body", "in", "frame"]
-    assert front.split() == ["front", "0.500", "25%", "!"] and left.split() == ["left-side", "no", "mask", "100%"]
+    assert header.split() == ["view", "silhouette", "IoU", "body", "outside", "mask", "body", "in", "frame"]
+    assert front.split() == ["front", "0.500", "1.0%", "25%", "!"] and left.split() == [
+        "left-side",
+        "no",
+        "mask",
+        "100%",
+    ]
     assert warning == "warning: front: too small" and not report.ok
 
 

@@ -243,7 +243,11 @@ def compiled(case, dtype):
         drawn = draw_targets(outputs, as_jax(own_body), targets, white_backgrounds(targets), config)
         terms = loss_terms(drawn, outputs, targets.images, targets, config.loss)
         total = sum(getattr(config.loss, name) * term for name, term in terms.items())
-        return total, {"overflow": jnp.sum(drawn.overflow), "dropped": outputs.dropped_tokens, "alpha": drawn.alpha}
+        return total, {
+            "overflow": jnp.sum(drawn.rendering.overflow),
+            "dropped": outputs.dropped_tokens,
+            "alpha": drawn.rendering.alpha,
+        }
 
     differentiated = jax.jit(jax.value_and_grad(loss, has_aux=True), compiler_options=in_a_hurry())
     return differentiated.lower(point, fixed).compile(), point, fixed

@@ -9,8 +9,9 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.reconstruct import _assemble_compiled, reconstruct, reconstruct_batch, reconstruct_views
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays
-from humangs_jax.data.views import SubjectViews, pad_views, standardize
+from humangs_jax.data.views import SubjectViews, pad_views, prepare_inputs, standardize
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import tiny
@@ -50,6 +51,26 @@ def subject_views(seed, views=2):
         jnp.asarray(0.1 * rng.normal(size=(views, 3)), jnp.float32),
         jnp.asarray(rng.normal(size=4), jnp.float32),
     )
+
+
+def test_pixels_outside_the_masks_are_seen_by_no_vertex(body, network):
+    _, config = network
+    views = subject_views(0)
+    body_alone = replace(views, masks=0 * views.masks)
+    person = config.with_conventions(pixels="person")
+    whole, masked, unmasked = (
+        jax.jit(prepare_inputs, static_argnames="config")(body, *pair)
+        for pair in ((views, config), (views, person), (body_alone, person))
+    )
+    np.testing.assert_array_equal(masked.foreground, (views.masks > 0.5) & whole.foreground)
+    outside = (whole.depth_maps >= 0) & (views.masks <= 0.5)
+    assert outside.any()
+    assert (masked.depth_maps[outside] == -1).all() and (masked.position_maps[outside] == 1).all()
+    kept = ~np.asarray(outside)
+    np.testing.assert_array_equal(masked.depth_maps[kept], whole.depth_maps[kept])
+    # photos without masks are not empty: the body is all that is known of the person
+    np.testing.assert_array_equal(unmasked.depth_maps, whole.depth_maps)
+    np.testing.assert_array_equal(unmasked.foreground, whole.depth_maps >= 0)
 
 
 @pytest.mark.slow

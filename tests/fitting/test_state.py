@@ -92,6 +92,12 @@ def test_a_turned_camera_stays_in_its_place_by_its_std_and_focal_lengths_scale(c
     np.testing.assert_array_equal(K[:, :2, 2], capture.cameras.K[:, :2, 2])
 
 
+def test_a_state_without_cameras_leaves_them_where_they_are(capture, origin):
+    K, matrices = cameras_of(origin, replace(zero_state(origin), cameras=None))
+    np.testing.assert_array_equal(K, capture.cameras.K)
+    np.testing.assert_array_equal(matrices, capture.cameras.cam_from_world)
+
+
 def test_a_shifted_camera_shifts_in_both_views_that_are_its_own(capture, origin):
     state = zero_state(origin)
     state = moved(state, centers=state.cameras.centers.at[0].set(jnp.asarray([0.0, 2.0, 0.0])))

@@ -2,12 +2,22 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from rounding import bound
 
-from humangs_jax.objectives.losses import squared_error, tightness
-from humangs_jax.objectives.metrics import LARGEST_PSNR, masked_psnr, psnr, ssim
+from humangs_jax.objectives.losses import (
+    FAR_SURFACE,
+    ray_spread,
+    roughness,
+    squared_error,
+    surface_distance,
+    tightness,
+    translucency,
+)
+from humangs_jax.objectives.metrics import LARGEST_PSNR, fog, masked_psnr, outline_psnr, psnr, ssim
 
 FLOAT32 = 1e-6
+SQUARES = 1e-8  # rounding of squares of 0.1, of which small differences are taken
 DECIBELS = 1e-3  # logarithm of a float32 mean
 
 
@@ -53,3 +63,48 @@ def test_ssim_of_the_clipped_prediction():
 
 def test_without_tight_gaussians_there_is_no_tightness():
     np.testing.assert_array_equal(tightness(jnp.zeros((4, 0, 3))), np.zeros(4))
+
+
+def test_the_spread_of_a_ray_is_the_sum_over_pairs():
+    rng = np.random.default_rng(0)
+    weights, z = rng.random((5, 4)) / 5, 0.1 * rng.random((5, 4))
+    pairs = np.einsum("ri,rj,rij->r", weights, weights, (z[:, :, None] - z[:, None]) ** 2)
+    alpha = weights.sum(1)
+    depth, squared = ((weights * z**power).sum(1) / alpha for power in (1, 2))
+    np.testing.assert_allclose(
+        ray_spread(*map(jnp.asarray, (alpha, depth, squared))), pairs, rtol=FLOAT32, atol=SQUARES
+    )
+
+
+def test_surfaces_are_compared_where_both_are_the_persons():
+    depth, alpha, target, mask = jnp.asarray([[2.05, 2.05, 2.05, 5.0], [1, 0, 0.5, 1], [2, 2, 2, 2], [1, 1, 0, 1]])
+    distance = surface_distance(depth, alpha, target, mask)
+    np.testing.assert_allclose(distance, [0.05, 0, 0, FAR_SURFACE], atol=FLOAT32)
+
+
+def test_translucency_and_roughness_vanish_where_they_should():
+    np.testing.assert_allclose(translucency(jnp.asarray([0.0, 0.5, 1.0])), [0, 1, 0])
+    faces = jnp.asarray([[0, 1, 2]])
+    offsets = jnp.ones((3, 2, 3))
+    np.testing.assert_array_equal(roughness(offsets, faces), np.zeros((1, 3)))
+    rough = roughness(offsets.at[1, 0, 2].add(2.0), faces)
+    np.testing.assert_allclose(
+        np.sort(rough), [[0, 2, 2]], rtol=FLOAT32
+    )  # both edges at vertex 1, half of its Gaussians
+
+
+def test_fog_is_the_share_of_the_mask_that_is_neither_clear_nor_opaque():
+    alpha, mask = jnp.asarray([[0.0, 0.5, 1.0, 0.5]]), jnp.asarray([[1.0, 1.0, 1.0, 0.0]])
+    assert float(fog(alpha, mask)) == pytest.approx(1 / 3)
+    assert float(fog(alpha, 0 * mask)) == 0
+
+
+def test_the_outline_psnr_sees_the_band_alone():
+    mask = np.zeros((256, 256))
+    mask[64:192, 64:192] = 1
+    target = np.zeros((256, 256, 3))
+    far, near = target.copy(), target.copy()
+    far[128, 128] = far[:32] = 1.0
+    near[62:66] = 0.1
+    assert outline_psnr(far, target, mask) == LARGEST_PSNR
+    assert 20 < outline_psnr(near, target, mask) < 30

@@ -162,7 +162,7 @@ def test_it_lowers_for_accelerators(bank, platform):
 @pytest.mark.slow
 def test_masks_are_the_share_of_covered_samples(bank, scene):
     camera = draw(scene, bank, 0, 0.0, SIZE)
-    _, mask = draw_view(bank, scene, jnp.int32(0), camera)
+    _, mask, _ = draw_view(bank, scene, jnp.int32(0), camera)
     fine = camera.resized(2 * SIZE, 2 * SIZE)
     faces = bank.faces[scene.person].astype(jnp.int32)
     covered = np.asarray(rasterize(scene.vertices[0], faces, fine).face_ids) >= 0
@@ -182,7 +182,7 @@ def test_it_looks_like_the_rendering_on_the_host(bank, scene, body):
     posed = rendering.pose_subject(person, np.asarray(scene.rotations[0]), np.asarray(scene.translations[0]))
     np.testing.assert_allclose(scene.vertices[0][: len(posed.vertices)], posed.vertices, atol=SKIN_DEPTH)
     camera = draw(scene, bank, 0, 0.0, SIZE)
-    image, mask = draw_view(bank, scene, jnp.int32(0), camera)
+    image, mask, _ = draw_view(bank, scene, jnp.int32(0), camera)
     expected, coverage = rendering.render_view(posed, camera)
     assert np.abs(np.asarray(mask) - coverage).mean() < 1e-3
     assert -10 * np.log10(np.mean((np.asarray(image) - expected) ** 2)) > LIKE_RENDERED

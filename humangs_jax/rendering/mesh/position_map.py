@@ -18,6 +18,7 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.mesh.rasterizer import DEFAULT_CONFIG, RasterConfig, interpolate_attributes, rasterize_mesh
 
 BACKGROUND = 1.0
+BACKGROUND_DEPTH = -1.0
 LIGHT = (0.0, 1.0, 0.0)
 """Place of the point light, normalised units; the default of PyTorch3D, whose shader the release used."""
 AMBIENT, DIFFUSE, SPECULAR, SHININESS = 0.5, 0.3, 0.2, 64

@@ -1,0 +1,102 @@
+"""Adaptive density: Gaussians are split where the photos still differ from the rendering; those that nobody sees make room.
+
+Buffers keep their size. A slot that is not in use holds a Gaussian too clear to be drawn.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import replace
+from humangs_jax.geometry import quaternion
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.objective import Photos, posed_gaussians
+from humangs_jax.refinement.parameters import Parameters, RefineState
+from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.rendering.splatting import render
+
+CLEAR = 0.02
+"""A Gaussian of less opacity gives its slot away."""
+SMALLEST_SPLIT = 1e-3
+"""Metres: Gaussians whose longest axis is shorter are not split."""
+HALF = 0.5**0.5
+"""Standard deviation of the two halves, and their distance from the middle, relative to the whole: the same variance."""
+
+
+def with_room(avatar: Avatar, growth: float) -> Avatar:
+    """The avatar with `growth` times as many slots for Gaussians; the new ones are copies of the first, with opacity 0."""
+    count = len(avatar.gaussians.means)
+    slots = jnp.arange(round(growth * count))
+    index = jnp.where(slots < count, slots, 0)
+    gaussians = jax.tree.map(lambda x: x[index], avatar.gaussians)
+    gaussians = replace(gaussians, opacities=gaussians.opacities.at[count:].set(0.0))
+    return replace(avatar, gaussians=gaussians, skinning_weights=avatar.skinning_weights[index])
+
+
+def without_clear(avatar: Avatar, smallest: float) -> Avatar:
+    """The avatar without the Gaussians too clear to be drawn. On the host."""
+    kept = jnp.flatnonzero(avatar.gaussians.opacities >= smallest)
+    gaussians = jax.tree.map(lambda x: x[kept], avatar.gaussians)
+    return replace(avatar, gaussians=gaussians, skinning_weights=avatar.skinning_weights[kept])
+
+
+def photo_errors(
+    parameters: Parameters, avatar: Avatar, photos: Photos, config: RefineConfig, splat: SplatConfig
+) -> Float[Array, " g"]:
+    """Each Gaussian's share of the absolute errors of all photos: the sum over pixels of its weight there times the error.
+
+    The weights are the gradient of the image with respect to the colours, after Rota Bulo et al. 2024
+    (https://arxiv.org/abs/2404.06109).
+    """
+
+    def one(photo):
+        gaussians = posed_gaussians(parameters, avatar, photo)
+        image = lambda colors: render(replace(gaussians, colors=colors), photo.cameras, splat).rgb
+        rgb, pull_back = jax.vjp(image, gaussians.colors)
+        error = jnp.abs(rgb - photo.images) * photo.counted[..., None]
+        return jnp.sum(pull_back(error)[0], axis=-1)
+
+    return jnp.sum(jax.lax.map(one, photos), axis=0)
+
+
+def split(state: RefineState, avatar: Avatar, errors: Float[Array, " g"], count: int) -> tuple[RefineState, Avatar]:
+    """The `count` Gaussians with the largest errors, as far as there are clear ones whose slots they can have, in two.
+
+    The halves lie on the longest axis, with the same variance together. They inherit the rest, the moments of Adam too.
+    """
+    p = state.parameters
+    opacities, scales = jax.nn.sigmoid(p.opacity_logits), jnp.exp(p.log_scales)
+    longest = jnp.argmax(scales, axis=-1)
+    lengths = jnp.max(scales, axis=-1)
+    eligible = (opacities >= CLEAR) & (lengths >= SMALLEST_SPLIT)
+    errors, wholes = jax.lax.top_k(jnp.where(eligible, errors, 0.0), count)
+    clearness, slots = jax.lax.top_k(-opacities, count)
+    possible = (errors > 0) & (-clearness < CLEAR)
+    total = len(opacities)
+    slots = jnp.where(possible, slots, total)  # out of range: dropped
+    wholes = jnp.where(possible, wholes, total)
+    index = jnp.arange(total).at[slots].set(wholes, mode="drop")
+    sides = jnp.zeros(total).at[wholes].set(-1.0, mode="drop").at[slots].set(1.0, mode="drop")
+
+    axes = quaternion.to_matrix(quaternion.normalize(p.quats))
+    axis = jnp.take_along_axis(axes, longest[:, None, None], axis=-1)[..., 0] * lengths[:, None]
+    shift = sides[:, None] * HALF * axis[index]
+    halved = jnp.abs(sides)[:, None] * jnp.log(HALF) * jax.nn.one_hot(longest[index], 3)
+
+    def halves(parameters):
+        own = {
+            field.name: getattr(parameters, field.name)[index]
+            for field in dataclasses.fields(Parameters)
+            if field.name not in ("rotations", "translations")
+        }
+        own["means"] += shift
+        own["log_scales"] += halved
+        return replace(parameters, **own)
+
+    gathered = lambda x: x[index] if x.ndim and len(x) == total else x
+    adam = jax.tree.map(gathered, state.adam)
+    state = replace(state, parameters=halves(p), start=halves(state.start), trust=state.trust[index], adam=adam)
+    return state, replace(avatar, skinning_weights=avatar.skinning_weights[index])

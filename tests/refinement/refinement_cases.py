@@ -1,0 +1,50 @@
+"""A toy person: a body with one Gaussian a vertex, and photos of the same one in other colours."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import capture_renderings
+from humangs_jax.body.model import shape_body
+from humangs_jax.data.capture import capture_from_arrays
+from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.rendering.gaussians import Gaussians
+
+WIDTH, HEIGHT = 48, 64
+STEPS = RefineConfig(steps=12, seconds=None, held_out=0.0)
+
+
+def toy_avatar(body, shade):
+    rest = shape_body(body, jnp.zeros(2))
+    n = len(rest.vertices)
+    colors = jnp.clip(0.5 + 0.4 * jnp.sin(9 * rest.vertices) + shade, 0.05, 0.95)
+    gaussians = Gaussians(
+        rest.vertices, jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (n, 1)), jnp.full((n, 3), 0.03), jnp.full(n, 0.8), colors
+    )
+    return Avatar(
+        gaussians, body.skinning_weights, rest.vertices, rest.joints, body.faces, body.parents, body.joint_names
+    )
+
+
+def toy_capture(body, avatar, views=3, moving=False):
+    """Photos of an avatar, each in a pose of its own if `moving`."""
+    cameras = orbit(
+        jnp.asarray([0.0, 0.9, 0.0]),
+        3.6,
+        jnp.arange(float(views)),
+        0.1,
+        intrinsics_from_fov(np.pi / 6, WIDTH, HEIGHT),
+        WIDTH,
+        HEIGHT,
+    )
+    rng = np.random.default_rng(0)
+    rotations = 0.2 * rng.normal(size=(views, 55, 3)) * moving
+    arrays = dict(rotations=rotations, translations=np.zeros((views, 3)), frames=np.arange(views), body=body)
+    blank = np.ones((views, HEIGHT, WIDTH, 3))
+    capture = capture_from_arrays(blank, cameras.K, cameras.cam_from_world, masks=blank[..., 0], **arrays)
+    drawn = capture_renderings(avatar, capture)[1]
+    images = np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in drawn])
+    return dataclasses.replace(capture, images=images, masks=np.stack([np.asarray(r.alpha) for r in drawn]))
