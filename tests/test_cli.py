@@ -123,6 +123,7 @@ def test_wrong_options_are_one_line_too(folder, tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_from_photos_to_images(folder, tmp_path, monkeypatch, capsys):
     """reconstruct, render, animate, export and check, one after the other, as a user would."""
     import plyfile

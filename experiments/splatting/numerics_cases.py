@@ -319,13 +319,15 @@ def _cases() -> list[Case]:
         Case("images", "all behind the camera", behind, drawn=False),
         Case("images", "1 x 1", one(ordinary, 0, COUNT, 1, 1)),
         Case("images", "41 x 9", one(ordinary, 0, COUNT, 41, 9), slow=True),
-        Case("images", "7 x 30", one(ordinary, 0, COUNT, 7, 30)),
+        Case("images", "7 x 30", one(ordinary, 0, COUNT, 7, 30), slow=True),
         Case("order", "coincident depths", coincident),
         Case("order", "coincident depths, reversed", one(coincident, True)),
         *(Case("focal length", f"{f:.0e} px", one(seen_through, f, False)) for f in (1, 1e2, 1e4, 1e6)),
         *(Case("focal length", f"{f:.0e} px, zoomed", one(seen_through, f, True)) for f in (1, 1e2, 1e4, 1e6)),
         Case("dtypes", "bfloat16 Gaussians", one(narrow, jnp.bfloat16), IMAGE, BFLOAT16_GRADIENT, slow=True),
-        Case("dtypes", "bfloat16 everything", one(narrow_everything, jnp.bfloat16), IMAGE, BFLOAT16_GRADIENT),
+        Case(
+            "dtypes", "bfloat16 everything", one(narrow_everything, jnp.bfloat16), IMAGE, BFLOAT16_GRADIENT, slow=True
+        ),
         Case("dtypes", "float16 Gaussians", one(narrow, np.float16), IMAGE, FLOAT16_GRADIENT, slow=True),
     ]
 

@@ -12,6 +12,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
+from humangs_jax.objectives.metrics import OUTLINE
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.objective import Photos, posed_gaussians
 from humangs_jax.refinement.parameters import Parameters, RefineState
@@ -48,6 +49,7 @@ def photo_errors(
 ) -> Float[Array, " g"]:
     """Each Gaussian's share of the absolute errors of all photos: the sum over pixels of its weight there times the error.
 
+    Pixels near the outline do not count: more Gaussians there fit the masks of the photos, and are fur in other views.
     The weights are the gradient of the image with respect to the colours, after Rota Bulo et al. 2024
     (https://arxiv.org/abs/2404.06109).
     """
@@ -56,10 +58,17 @@ def photo_errors(
         gaussians = posed_gaussians(parameters, avatar, photo)
         image = lambda colors: render(replace(gaussians, colors=colors), photo.cameras, splat).rgb
         rgb, pull_back = jax.vjp(image, gaussians.colors)
-        error = jnp.abs(rgb - photo.images) * photo.counted[..., None]
+        inside = photo.counted & (eroded(photo.masks, round(OUTLINE * max(photo.masks.shape))) > 0.5)
+        error = jnp.abs(rgb - photo.images) * inside[..., None]
         return jnp.sum(pull_back(error)[0], axis=-1)
 
     return jnp.sum(jax.lax.map(one, photos), axis=0)
+
+
+def eroded(mask: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:
+    """The minimum of a mask over the square of pixels within `radius`."""
+    side = 2 * radius + 1
+    return jax.lax.reduce_window(mask, jnp.inf, jax.lax.min, (side, side), (1, 1), "SAME")
 
 
 def split(state: RefineState, avatar: Avatar, errors: Float[Array, " g"], count: int) -> tuple[RefineState, Avatar]:

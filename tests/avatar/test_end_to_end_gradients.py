@@ -384,6 +384,7 @@ def check_degenerate(case, degenerate, dtype):
         assert all(np.all(leaf == 0) for leaf in jax.tree.leaves(gradients["target_pose"]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degenerate", DEGENERATE, ids=lambda f: f.__name__)
 @pytest.mark.parametrize("case", FAST, ids=str)
 def test_gradients_are_finite_where_there_is_nothing_to_see(case, degenerate):

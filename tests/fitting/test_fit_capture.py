@@ -55,6 +55,7 @@ def test_views_are_sorted_by_their_frames(folder, fitted):
     assert json.loads(json.dumps(report.to_json()))["views"][0]["name"] == fitted.capture.names[0]
 
 
+@pytest.mark.slow
 def test_written_in_place_and_read_again(folder, fitted, tmp_path):
     path = copied(folder[0], tmp_path)
     described = (path / "capture.json").read_text()

@@ -124,6 +124,7 @@ def test_keypoints_alone_mend_them_too_and_with_masks_both_errors_fall():
     assert errors["silhouette_iou"].after > 0.95 and errors["keypoint_error_px"].after < 1.0
 
 
+@pytest.mark.slow
 def test_a_start_that_is_right_stays():
     refined = refine_capture(truth(), config=CONFIG)
     assert not refined.report.kept and refined.capture is truth()
@@ -131,6 +132,7 @@ def test_a_start_that_is_right_stays():
     assert "no sufficient improvement" in str(refined.report) and "moved:" not in str(refined.report)
 
 
+@pytest.mark.slow
 def test_a_single_view_with_a_mask_is_enough_and_the_others_stay():
     masks = np.zeros_like(truth().masks)
     masks[0] = truth().masks[0]

@@ -83,6 +83,7 @@ def test_a_bare_body_is_found_whatever_its_scale_turn_and_place(bare, truth):
     assert "given joints" in str(report)
 
 
+@pytest.mark.slow
 def test_the_result_stands_in_our_world(bare, truth):
     scan = bare.world_from_scan(truth[3](truth[0]))
     assert scan[:, 1].min() == pytest.approx(0, abs=0.01)

@@ -175,6 +175,7 @@ def draw(scene, bank, seed, close_share, size):
     return camera_from(u, scene.vertices[0], count, 2.1 * seed, close_share, size)
 
 
+@pytest.mark.slow
 def test_it_looks_like_the_rendering_on_the_host(bank, scene, body):
     person = make_subject(SEEDS[int(scene.person)], body)
     person = dataclasses.replace(person, lights=scene.lights)

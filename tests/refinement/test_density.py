@@ -105,7 +105,7 @@ def test_a_run_that_grows_returns_more_gaussians_and_a_better_image(person):
     count = len(avatar.gaussians.means)
     assert grown.kept and count < len(grown.avatar.gaussians.means) <= 1.6 * count
     assert len(grown.avatar.skinning_weights) == len(grown.avatar.gaussians.means)
-    assert grown.loss[1] < 0.8 * grown.loss[0]
+    assert grown.loss[1] < 0.9 * grown.loss[0]
 
 
 def test_growth_out_of_range_is_an_error():

@@ -139,6 +139,7 @@ def test_errors_of_gradients_see_bias_and_gain():
     assert benchmark.gradient_errors(-exact, exact)["cosine"] == pytest.approx(-1)
 
 
+@pytest.mark.slow
 def test_work_needed_agrees_with_brute_force(files):
     """Every pixel against every Gaussian, in float64."""
     scene = scenes.load_scene(files / "scene.npz", SIZE)

@@ -70,6 +70,7 @@ def flat_camera():
     return Camera.from_opencv(np.eye(3), np.eye(4), WIDTH, HEIGHT)
 
 
+@pytest.mark.slow
 def test_a_texel_per_pixel_gives_the_texture_back():
     texture = jax.random.uniform(jax.random.key(0), (HEIGHT, WIDTH, 3))
     vertices = rectangle(0, 0, WIDTH, HEIGHT, depth=2.0)

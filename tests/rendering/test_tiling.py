@@ -27,6 +27,7 @@ def test_cumsum_saturates_instead_of_wrapping():
     )
 
 
+@pytest.mark.slow
 @FEW
 @given(st.lists(st.integers(0, 5), min_size=40, max_size=40), st.sampled_from([1, 60, 250]))
 def test_expand_equals_repeat(counts, capacity):

@@ -121,6 +121,7 @@ IN_PARAMETERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", IN_PARAMETERS)
 def test_a_bad_parameter_is_named_and_the_stage_that_uses_it(body, batch, variables, path):
     state = init_state(CONFIG, variables)
@@ -137,6 +138,7 @@ EXPLODING = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", EXPLODING)
 def test_a_stage_that_overflows_from_finite_parameters_is_named(body, batch, variables, stage):
     state = init_state(CONFIG, variables)
@@ -146,6 +148,7 @@ def test_a_stage_that_overflows_from_finite_parameters_is_named(body, batch, var
     assert (fault.direction, fault.stage) == ("forward", stage)
 
 
+@pytest.mark.slow
 def test_moments_and_averages_are_looked_at(body, batch, variables):
     config = dataclasses.replace(CONFIG, ema_decay=0.9)
     state = init_state(config, variables)

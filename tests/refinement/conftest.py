@@ -1,0 +1,12 @@
+"""One size of buffers for all tests of the normal lane, so that they share compiled programs; slow tests plan their own."""
+
+import pytest
+
+from humangs_jax.refinement import refine
+from humangs_jax.rendering.splat_config import SplatConfig
+
+
+@pytest.fixture(autouse=True)
+def same_buffers(request, monkeypatch):
+    if request.node.get_closest_marker("slow") is None:
+        monkeypatch.setattr(refine, "_planned", lambda avatar, photos: SplatConfig(max_pairs=1 << 14, max_rows=1 << 13))
