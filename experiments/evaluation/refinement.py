@@ -1,7 +1,8 @@
 """What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colours.
 
     python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 2 5 15] [--sizes 256 512]
-        [--views 4] [--longest-edge 0.017] [--page docs/refinement.md] [--plot PLOT] [--sheet SHEET]
+        [--views 4] [--growth 1 1.5] [--longest-edge 0.017] [--page docs/refinement.md] [--table NAME] [--plot PLOT]
+        [--sheet SHEET]
 
 People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random colours" from
 as many round Gaussians of random colours on the vertices of the body. Scores are those of `evaluation/results.py` and, of the
@@ -13,6 +14,7 @@ Seconds do not count compilation. One device: one core of a CPU.
 """
 
 import argparse
+import itertools
 import sys
 from pathlib import Path
 from typing import Any
@@ -39,9 +41,9 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="sides of the photos in pixels")
     parser.add_argument("--views", type=int, nargs="+", default=[4], help="numbers of photos")
     parser.add_argument("--starts", nargs="+", choices=STARTS, default=["network"], help="what is refined")
-    parser.add_argument(
-        "--longest-edge", type=float, help="split the body's edges to this, metres; table refinement_finer"
-    )
+    parser.add_argument("--growth", type=float, nargs="+", default=[1.0], help="of the number of Gaussians")
+    parser.add_argument("--longest-edge", type=float, help="split the body's edges to this, metres")
+    parser.add_argument("--table", default="refinement", help="name of the table on the page")
     parser.add_argument("--plot", type=Path, help="draw PSNR against seconds here")
     parser.add_argument(
         "--sheet", type=Path, help="truth, feed-forward and the longest run of every person, largest size"
@@ -52,8 +54,7 @@ def main() -> None:
     text = section(report)
     print(text)
     if arguments.page:
-        name = "refinement" if arguments.longest_edge is None else "refinement_finer"
-        publish(arguments.page, name, text, {"settings": report["settings"], "means": report["means"]})
+        publish(arguments.page, arguments.table, text, {"settings": report["settings"], "means": report["means"]})
     if arguments.plot:
         plot(arguments.plot, report)
 
@@ -69,7 +70,9 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     body, (variables, config, digest) = load_body(), load_network(arguments)
     config = config.with_execution(longest_edge=arguments.longest_edge)
     settings = settings_of(arguments, digest, config.tokens, None)
-    settings |= {name: getattr(arguments, name) for name in ("seconds", "sizes", "views", "starts", "longest_edge")}
+    settings |= {
+        name: getattr(arguments, name) for name in ("seconds", "sizes", "views", "starts", "growth", "longest_edge")
+    }
     rows, images = kept_rows(arguments.json, settings, "cells"), {}
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
     seeds = seeds_of(arguments.split, arguments.first, arguments.subjects)
@@ -80,9 +83,10 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         for size in arguments.sizes:
             subject = make_evaluation_subject(seed, body, arguments.views, size, held_out)
             for count in arguments.views:
-                for start in arguments.starts:
-                    cell, drawn = measure(variables, config, subject, count, start, arguments.seconds)
-                    row[f"{size} {count} {start}"] = cell
+                for start, growth in itertools.product(arguments.starts, arguments.growth):
+                    cell, drawn = measure(variables, config, subject, count, start, growth, arguments.seconds)
+                    grown = "" if growth == 1 else f", {growth:g} x Gaussians"
+                    row[f"{size} {count} {start}{grown}"] = cell
                     if start == "network" and count == max(arguments.views):
                         images[seed] = drawn
         rows[seed] = row
@@ -93,7 +97,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     return report_of(rows, settings, seeds)
 
 
-def measure(variables, config, subject, count, start, seconds):
+def measure(variables, config, subject, count, start, growth, seconds):
     """Scores by seconds and task, and (truth, feed-forward, refined) of the first held-out view."""
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.refinement.config import RefineConfig
@@ -106,7 +110,7 @@ def measure(variables, config, subject, count, start, seconds):
     scores, first = score_all(avatar, subject.held_out)
     cell, last = {"0": scores}, first
     for length in seconds:
-        refined = refine_with_report(avatar, inputs, RefineConfig(seconds=length))
+        refined = refine_with_report(avatar, inputs, RefineConfig(seconds=length, growth=growth))
         scores, last = score_all(refined.avatar, subject.held_out)
         about = {"steps": refined.steps, "compile_seconds": round(refined.compile_seconds, 1), "kept": refined.kept}
         cell[f"{length:g}"] = scores | {"run": about | {"photos_psnr": refined.psnr[1]}}

@@ -88,6 +88,8 @@ class Refine:
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     refine_poses: bool = False
     """Also refine the pose of each photo: for poses from `humangs fit`, which are millimetres off."""
+    growth: float = 1.0
+    """The number of Gaussians may grow by this factor: those with the largest errors are split."""
 
     def run(self) -> None:
         limits = refine_limits(self.limit)
@@ -96,8 +98,10 @@ class Refine:
 
         require_parent(self.out)
         avatar, photos = Avatar.load(self.avatar), load_capture(self.capture)
-        _refined(avatar, photos, image_size=self.image_size, poses=self.refine_poses, **limits).save(self.out)
-        print(f"{self.out}: {len(avatar.gaussians.means):,} Gaussians refined on {photos.view_count} photos")
+        settings = {"image_size": self.image_size, "poses": self.refine_poses, "growth": self.growth}
+        refined = _refined(avatar, photos, **settings, **limits)
+        refined.save(self.out)
+        print(f"{self.out}: {len(refined.gaussians.means):,} Gaussians refined on {photos.view_count} photos")
 
 
 def _refined(avatar: "Avatar", photos: "Capture", **settings: Any) -> "Avatar":

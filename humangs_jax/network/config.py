@@ -53,12 +53,12 @@ class Conventions:
     """What the weights were trained with. No tensor's shape depends on it; with other values the answers are worse.
 
     image_size: side of the photos, pixels (the network takes any multiple of the patch size). tokens: patches that became
-    tokens. pixels: "person": where there are masks, only their pixels count: the body, where it covers the background, is seen by
-    no photo. position_map: its shading. ray_origins: the release divides camera centres by s, and the ray origins taken from them
-    once more, so that the moments of its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex
-    (paper) or over all (release). pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn.
-    body_vertices, longest_edge: number of vertices to which bodies are decimated, and metres to which their edges are split
-    afterwards; None for neither.
+    tokens. pixels: "person": where there are masks, only their pixels count. The body, where it covers the background, is then
+    seen by no photo, and Gaussians of vertices that all photos show off the person are dropped. position_map: its shading.
+    ray_origins: the release divides camera centres by s, and the ray origins taken from them once more, so that the moments of
+    its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex (paper) or over all (release).
+    pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn. body_vertices, longest_edge:
+    number of vertices to which bodies are decimated, and metres to which their edges are split afterwards; None for neither.
     """
 
     image_size: int = knob(

@@ -37,6 +37,11 @@ class Shells:
     hull: Float[Array, "n s"]
 
 
+def on_the_person(shells: Shells) -> Bool[Array, " n"]:
+    """Whether any photo shows the person at any distance along the normal of a vertex; true for what no photo contains."""
+    return jnp.any(shells.inside > 0, axis=1)
+
+
 def sample_shells(
     images: Float[Array, "v h w 3"],
     foreground: Bool[Array, "v h w"],

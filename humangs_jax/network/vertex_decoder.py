@@ -21,6 +21,7 @@ from humangs_jax.geometry import quaternion
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import HumanGSOutputs, Pass, Variables
 from humangs_jax.network.reader import VertexFeatures
+from humangs_jax.network.shells import Shells, on_the_person
 from humangs_jax.rendering.gaussians import Gaussians
 
 FREQUENCIES = (1, 2, 4, 8, 16, 32)
@@ -86,9 +87,11 @@ class VertexDecoder:
             entering = self._entering(replace(features, **learned), inputs)
             return cast(RawGaussians, self._module(features).apply(variables, entering))
 
+        # where the body is wider than the person, all photos show the background
+        drop = run.config.conventions.pixels == "person" and features.shells is not None
         raw = run.stage("raw heads", heads, {"local": features.local, "global_token": features.global_token})
         return run.stage(
-            "canonical Gaussians", lambda raw: self._assemble(raw, features, canonical, unit, inputs.spacing), raw
+            "canonical Gaussians", lambda raw: self._assemble(raw, features, canonical, unit, inputs.spacing, drop), raw
         )
 
     def _module(self, features: VertexFeatures):
@@ -101,9 +104,18 @@ class VertexDecoder:
         return decoder_input(features, inputs.canonical_vertices / subject_unit(inputs.canonical_vertices))
 
     def _assemble(
-        self, raw: "RawGaussians", features: VertexFeatures, canonical: Array, unit: Array, spacing: Array | None
+        self,
+        raw: "RawGaussians",
+        features: VertexFeatures,
+        canonical: Array,
+        unit: Array,
+        spacing: Array | None,
+        drop: bool,
     ) -> HumanGSOutputs:
         at_vertices = activate(raw, self, features)
+        if drop:
+            kept = on_the_person(cast(Shells, features.shells))[:, None]
+            at_vertices = replace(at_vertices, opacities=jnp.where(kept, at_vertices.opacities, 0.0))
         if spacing is not None:
             at_vertices = replace(at_vertices, scales=at_vertices.scales * spacing[:, None, None])
         flat = lambda x: x.reshape(-1, *x.shape[2:])

@@ -8,7 +8,7 @@ import pytest
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.pixel_aligned import UNSEEN_COLOR
-from humangs_jax.network.shells import sample_shells
+from humangs_jax.network.shells import on_the_person, sample_shells
 
 BODY, COAT = 0.5, 0.8
 """Radii of two spheres about the origin."""
@@ -122,3 +122,13 @@ def test_the_background_lends_no_colour():
     known = certain & ~outside & (np.asarray(shells.seen[:, 3]) > 0)
     assert np.allclose(shells.colors[outside, 3], UNSEEN_COLOR) and not np.any(shells.seen[outside, 3])
     assert np.sum(known) > 20 and np.allclose(shells.colors[known, 3, 2], 0, atol=1e-5)  # red and green, never white
+
+
+def test_a_vertex_is_on_the_person_if_any_photo_shows_the_person_at_any_distance():
+    whole, arguments = read(scene()), scene()
+    assert np.all(on_the_person(whole))
+    foreground = arguments[1]
+    nobody = read((arguments[0], jnp.zeros_like(foreground), *arguments[2:]))
+    assert not np.any(on_the_person(nobody))
+    one = read((arguments[0], foreground & (jnp.arange(VIEWS) == 0)[:, None, None], *arguments[2:]))
+    assert np.all(on_the_person(one))  # the body lies within the coat in every photo
