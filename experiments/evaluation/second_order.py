@@ -39,19 +39,23 @@ def main() -> None:
     arguments = parser.parse_args()
     check_people_options(parser, arguments)
     rows = measure_people(arguments)
-    header = ["seconds", *(f"{method}, {score}" for method in rows for score in ("all", "on the person"))]
-    table = []
-    for i, seconds in enumerate(arguments.seconds):
-        cells = [f"{rows[method][i][key]:.2f}" for method in rows for key in ("psnr", "psnr_foreground")]
-        table.append([f"{seconds:g}", *cells])
-    text = (
-        f"PSNR in dB of new views, {arguments.subjects} people, 4 photos of 256 px.\n\n{markdown_table(header, table)}"
-    )
+    text = section(rows, arguments)
     print(text)
     if arguments.json:
         write_json(arguments.json, rows)
     if arguments.page:
         publish(arguments.page, "refinement_second_order", text, rows)
+
+
+def section(rows, arguments):
+    """The table of the page."""
+    header = ["seconds", *(f"{method}, {score}" for method in rows for score in ("all", "on the person"))]
+    table = []
+    for i, seconds in enumerate(arguments.seconds):
+        cells = [f"{rows[method][i][key]:.2f}" for method in rows for key in ("psnr", "psnr_foreground")]
+        table.append([f"{seconds:g}", *cells])
+    about = f"PSNR in dB of new views, {arguments.subjects} people of the {arguments.split} seeds, 4 photos of 256 px."
+    return f"{about}\n\n{markdown_table(header, table)}"
 
 
 def measure_people(arguments):
