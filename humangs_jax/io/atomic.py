@@ -5,6 +5,7 @@ later process writes to the same place; an old folder that it had already moved 
 """
 
 import contextlib
+import errno
 import functools
 import os
 import platform
@@ -13,12 +14,16 @@ import shutil
 import time
 import uuid
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
 """A temporary file of another machine (on a shared disk) is abandoned when it was not touched for this long."""
+WRITERS = 8
+"""Processes that may replace one folder at the same time: so often the renames are tried."""
+TOLD = 12
+"""Entries of a folder that are named before it is deleted; the others are counted."""
 _TEMPORARY = re.compile(
     r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?"
 )
@@ -51,52 +56,94 @@ def replace_file(path: str | os.PathLike, write: Callable[[Path], object]) -> No
         temporary.unlink(missing_ok=True)
 
 
-def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object]) -> None:
+def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *, mark: str) -> None:
     """Calls write(temporary), which makes that folder, and renames it to `folder`; an existing one is replaced.
 
     The existing folder is moved aside first and deleted last, so its contents are never lost. Parents are made.
 
+    Arguments: mark: a file that all folders of this kind hold; a filled folder without it is not replaced.
     Raises: ValueError, see `check_replaceable`; whatever `write` raises.
     """
     folder = Path(folder)
-    check_replaceable(folder)
+    check_replaceable(folder, mark=mark)
     folder.parent.mkdir(parents=True, exist_ok=True)
     _sweep(folder.parent.resolve())
     tag = _tag()
     temporary, aside = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("new", "old"))
     try:
         write(temporary)
-        try:
-            if folder.is_dir():
-                folder.rename(aside)
-            temporary.rename(folder)
-        except BaseException:
-            if aside.is_dir() and not folder.exists():
-                aside.rename(folder)
-            raise
+        _exchange(folder, temporary, aside)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def check_replaceable(folder: str | os.PathLike, overwrite: bool = True, mark: str | None = None) -> None:
-    """Raises: ValueError for what `replace_folder` refuses: a symbolic link, a file, the working folder or one above it.
+def _exchange(folder, temporary, aside):
+    """Rename `folder` to `aside` and `temporary` to `folder`. Where another process is faster, its folder is replaced too."""
+    for left in reversed(range(WRITERS)):
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                folder.rename(aside)
+            temporary.rename(folder)
+            return
+        except BaseException as error:
+            if not folder.exists() and aside.is_dir():
+                aside.rename(folder)
+            if not left or not isinstance(error, OSError) or error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+            shutil.rmtree(aside, ignore_errors=True)  # replaced by the other process
 
-    mark: a file that all folders of this kind hold. Then the folder has to be empty or, with `overwrite`, of this kind.
+
+def check_replaceable(
+    folder: str | os.PathLike,
+    overwrite: bool = True,
+    mark: str | None = None,
+    inputs: Iterable[str | os.PathLike | None] = (),
+) -> None:
+    """Whether a folder can be replaced, to be asked before the work begins.
+
+    Arguments: mark: a file that all folders of this kind hold. Then the folder has to be empty or, with `overwrite`, of this
+    kind. inputs: what the work reads (None is left out); it may not lie in the folder, which would delete it.
+    Raises: ValueError for one of these, and for a symbolic link, a file, the working folder or one above it, a mount point, or a
+    folder beside which nothing can be written.
     """
     folder = Path(folder)
     if folder.is_symlink():
         raise ValueError(f"{folder}: is a symbolic link: expected the folder itself")
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"{folder}: is a file: expected a folder name")
-    if Path.cwd().is_relative_to(folder.resolve()):
+    place = folder.resolve()
+    if Path.cwd().is_relative_to(place):
         raise ValueError(f"{folder}: is the working folder or contains it: expected another folder")
+    if os.path.ismount(folder):
+        raise ValueError(f"{folder}: is a mount point, which cannot be renamed: expected a folder in it")
+    above = next(parent for parent in place.parents if parent.exists())
+    if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)):
+        raise ValueError(f"{folder}: cannot be made: {above} cannot be written to")
+    for path in (Path(path) for path in inputs if path is not None):
+        if place.exists() and any(real.is_relative_to(place) for real in (path.resolve(), path.absolute())):
+            raise ValueError(f"{folder}: {path} lies in it and would be deleted: expected another folder")
     if mark is None or not folder.is_dir() or not any(folder.iterdir()):
         return
-    if not overwrite:
-        raise ValueError(f"{folder}: the folder is not empty: choose another one or ask to overwrite it")
     if not (folder / mark).is_file():
         raise ValueError(f"{folder}: the folder holds no {mark}: refusing to overwrite something else")
+    if not overwrite:
+        problem = f"{folder}: the folder is not empty: choose another one or ask to overwrite it"
+        raise ValueError(f"{problem}, which deletes {contents(folder)}")
+
+
+def contents(folder: str | os.PathLike) -> str:
+    """What is in a folder, in a few words: "capture.json, images (60 files)"; empty if there is nothing."""
+    entries = sorted(Path(folder).iterdir(), key=lambda entry: entry.name) if Path(folder).is_dir() else []
+    told = [_told(entry) for entry in entries[:TOLD]]
+    return ", ".join(told) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
+
+
+def _told(entry):
+    if entry.is_symlink() or not entry.is_dir():
+        return entry.name
+    count = sum(len(files) for _, _, files in os.walk(entry))
+    return f"{entry.name} ({count} file{'' if count == 1 else 's'})"
 
 
 def add_files(folder: str | os.PathLike, write: Callable[[Path], object]) -> None:

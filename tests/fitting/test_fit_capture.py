@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -94,16 +95,30 @@ def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_p
     np.testing.assert_array_equal(again.cameras.cam_from_world, moved)
     np.testing.assert_array_equal(again.images, load_photos(folder[0]).images)
     assert not (target / "fit.npz").exists() and not (folder[0] / "body.npz").exists()
-    with pytest.raises(ValueError, match="not empty; --overwrite"):
+    with pytest.raises(
+        ValueError, match=r"the folder is not empty.*which deletes body\.npz, capture\.json, fit\.json, images "
+    ):
         check_place(folder[0], target, overwrite=False)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "diary.txt").write_text("mine")
-    with pytest.raises(ValueError, match="no capture"):
+    with pytest.raises(ValueError, match=r"holds no capture\.json"):
         check_place(folder[0], tmp_path / "other", overwrite=True)
     inside = target / "held_out"
     write_fitted(folder[0], inside, capture, fitted.report)
-    with pytest.raises(ValueError, match="lies inside of it"):
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):
         check_place(inside, target, overwrite=True)
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):  # the keypoints, say
+        check_place(folder[0], target, overwrite=True, inputs=(None, target / "images"))
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):  # a photo
+        check_place(linked(tmp_path / "linked", target), target, overwrite=True)
+
+
+def linked(folder, photos):
+    """A capture folder whose images are those of another one, through a link."""
+    folder.mkdir()
+    shutil.copyfile(photos / "capture.json", folder / "capture.json")
+    (folder / "images").symlink_to(photos / "images")
+    return folder
 
 
 def test_folders_that_cannot_be_replaced_are_refused_before_the_fit(folder, tmp_path, monkeypatch):
@@ -178,6 +193,4 @@ def test_a_body_whose_root_is_not_first_is_refused(folder):
 
 
 def copied(folder, tmp_path):
-    import shutil
-
     return shutil.copytree(folder, tmp_path / "me")

@@ -113,7 +113,7 @@ def import_cameras(
         checks = dataclasses.replace(checks, warnings=(*checks.warnings, NO_COMMON_FRAME))
     names = names_from_paths([photo.key + ".png" for photo in photos])
     check_names(names, len(photos), images)
-    replace_folder(out, lambda folder: _write(folder, converted, photos, names))
+    replace_folder(out, lambda folder: _write(folder, converted, photos, names), mark="capture.json")
     return ImportReport(
         out=out,
         format=calibration.format,
