@@ -139,7 +139,7 @@ class Animate:
         avatar, motion = Avatar.load(self.avatar), load_motion(self.motion)
         frames = motion_frames(avatar, motion, self.size, azimuth=self.azimuth, turn=self.turn)
         write_video(self.out, frames, motion.fps)
-        print(f"{self.out}: {len(frames)} frames at {motion.fps:g} frames per second")
+        print(f"{self.out}: {len(motion.translations)} frames at {motion.fps:g} frames per second")
 
 
 @dataclasses.dataclass(frozen=True)

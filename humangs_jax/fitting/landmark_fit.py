@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import itertools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -352,8 +353,8 @@ def smooth_motion(model: LandmarkModel, observations: Observations, fit: Landmar
     return _result(problem, fit.noise, state, fit.outcomes | {"motion": outcomes}, smoothness)
 
 
-def accelerations(joints: Float[Array, "m j 3"]) -> Float[Array, "n j 3"]:
-    """Of the frames but the first and the last (n = m - 2), metres per frame squared."""
+def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) -> Any:
+    """(m - 2, j, 3) of the frames but the first and the last, metres per frame squared."""
     return joints[2:] - 2 * joints[1:-1] + joints[:-2]
 
 

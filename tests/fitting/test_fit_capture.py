@@ -75,6 +75,17 @@ def test_written_in_place_and_read_again(folder, fitted, tmp_path):
     check_place(path, None, overwrite=True)
 
 
+def test_a_body_in_a_folder_of_its_own_is_written_and_read_again(folder, fitted, tmp_path):
+    path = copied(folder[0], tmp_path)
+    description = json.loads((path / "capture.json").read_text()) | {"body": "params/body.npz"}
+    (path / "capture.json").write_text(json.dumps(description))
+    for out in (None, tmp_path / "out"):
+        target = check_place(path, out, overwrite=False)
+        write_fitted(path, target, fitted.capture, fitted.report, fitted.record)
+        np.testing.assert_array_equal(load_capture(target).betas, fitted.capture.betas)
+        assert (target / "params" / "body.npz").is_file()
+
+
 def test_records_of_earlier_versions_are_read(folder, fitted, tmp_path):
     path = copied(folder[0], tmp_path)
     write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
