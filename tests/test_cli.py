@@ -204,6 +204,23 @@ def test_the_options_of_each_way_to_fit_exist():
         assert others | {way.removeprefix("--")} <= options
 
 
+def test_training_goes_on_from_weights_as_they_were_trained(tmp_path, monkeypatch, capsys):
+    """Their network and the way their Gaussians are drawn; the run's other knobs stay."""
+    from humangs_jax.network import presets, weights
+    from humangs_jax.training import loop, sources
+
+    started = []
+    model = presets.tiny().with_conventions(rendering="inria")
+    monkeypatch.setattr(weights, "load_weights", lambda path: ({}, model))
+    monkeypatch.setattr(sources, "training_people", lambda *arguments: None)
+    monkeypatch.setattr(loop, "train", lambda settings, *arguments, **options: started.append(settings))
+    for config in ("tiny", "published"):
+        code, _, error = run(monkeypatch, capsys, "train", "--config", config, "--init-weights", "w", "--out", tmp_path)
+        assert code == 0, error
+    assert all(settings.splat.square and settings.splat.radius_sigma == 3 for settings in started)
+    assert [settings.model.conventions.rendering for settings in started] == ["inria", "inria"]
+
+
 def test_import_of_what_is_no_calibration_is_one_line(folder, tmp_path, monkeypatch, capsys):
     code, _, err = run(
         monkeypatch,

@@ -50,7 +50,8 @@ from humangs_jax.fitting.state import (
     zero_state,
 )
 from humangs_jax.fitting.triangulation import triangulate_robustly
-from humangs_jax.geometry import quaternion
+from humangs_jax.geometry import quaternion, transform
+from humangs_jax.geometry.transform import EXACT
 
 STAGES = ("rigid", "points", "body", "hands")
 
@@ -167,9 +168,10 @@ def _rigid_starts(problem, observations, points, counts, kept) -> FitState:
     landmarks, joints = problem.landmarks_and_joints(resting)
     pelvis = joints[0]
     weights = trunk_weights(problem.model.names) * problem.known
+    product = functools.partial(jnp.matmul, precision=EXACT)
     turned = _kabsch(landmarks, points, weights * (counts >= 2))
     rotations = jnp.concatenate([turned[None], jnp.asarray(cube_rotations(), jnp.float32)])
-    positions = jax.vmap(lambda r: _position(observations, (landmarks - pelvis) @ r.T, weights))(rotations)
+    positions = jax.vmap(lambda r: _position(observations, product(landmarks - pelvis, r.T), weights))(rotations)
     vectors = quaternion.to_axis_angle(quaternion.from_matrix(rotations))
     start = lambda vector, position: replace(
         resting, global_orient=vector / math.radians(FREE.global_orient), transl=(position - pelvis) / FREE.transl
@@ -198,9 +200,11 @@ def _kabsch(a, b, weights):
     """The rotation about weighted centres that takes points a to b best; the identity where nothing is known."""
     share = weights / jnp.maximum(jnp.sum(weights), 1e-9)
     centered_a, centered_b = (x - jnp.sum(share[:, None] * x, axis=0) for x in (a, b))
-    u, _, vt = jnp.linalg.svd(jnp.einsum("k,ka,kb->ab", share, centered_b, centered_a) + 1e-9 * jnp.eye(3))
-    sign = jnp.sign(jnp.linalg.det(u @ vt))
-    return (u * jnp.stack([jnp.ones(()), jnp.ones(()), sign])) @ vt
+    u, _, vt = jnp.linalg.svd(
+        jnp.einsum("k,ka,kb->ab", share, centered_b, centered_a, precision=EXACT) + 1e-9 * jnp.eye(3)
+    )
+    sign = jnp.sign(jnp.linalg.det(jnp.matmul(u, vt, precision=EXACT)))
+    return jnp.matmul(u * jnp.stack([jnp.ones(()), jnp.ones(()), sign]), vt, precision=EXACT)
 
 
 def _position(observations, offsets, weights):
@@ -213,15 +217,15 @@ def _position(observations, offsets, weights):
     rows = rotation[:, None, :2] - xy[..., None] * rotation[:, None, 2:]
     right = xy * known[..., 2:] - known[..., :2]
     w = observations.confidences * weights
-    matrix = jnp.einsum("ck,ckia,ckib->ab", w, rows, rows)
-    vector = jnp.einsum("ck,ckia,cki->a", w, rows, right)
+    matrix = jnp.einsum("ck,ckia,ckib->ab", w, rows, rows, precision=EXACT)
+    vector = jnp.einsum("ck,ckia,cki->a", w, rows, right, precision=EXACT)
     scale = jnp.maximum(jnp.trace(matrix), 1e-9)
     return jnp.linalg.solve(matrix / scale + 1e-7 * jnp.eye(3), vector / scale)
 
 
 def _metres_per_pixel(seen, points, weights):
     """Metres per pixel at the person's distance."""
-    centers = -jnp.einsum("cba,cb->ca", seen.cam_from_world[:, :3, :3], seen.cam_from_world[:, :3, 3])
+    centers = transform.invert_rigid(seen.cam_from_world)[:, :3, 3]
     distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
     each = distance / seen.K[:, :1, 0]
     return jnp.sum(weights * each) / jnp.maximum(jnp.sum(weights), 1e-6) + 1e-4

@@ -1,7 +1,5 @@
 """Frames of an animation: one plan of buffers, made anew only for a frame that needs more room."""
 
-from types import SimpleNamespace
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.exr import read_exr
 from humangs_jax.io.images import read_image
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.splatting import render
+from humangs_jax.rendering.splatting import Rendering, render
 
 ROUNDING = 1e-6
 """float32; other buffers are other programs."""
@@ -43,7 +41,7 @@ def test_exr_colours_are_premultiplied(tmp_path):
     """A compositing program shows what was rendered when it adds (1 - alpha) times the background."""
     alpha = np.asarray([[0.0, 0.5, 1.0]], np.float32)
     onto_white = 0.25 * alpha[..., None] + (1 - alpha[..., None]) * np.ones(3, np.float32)
-    rendering = SimpleNamespace(rgb=onto_white, alpha=alpha, depth=np.zeros((1, 3), np.float32))
+    rendering = Rendering(jnp.asarray(onto_white), jnp.asarray(alpha), jnp.zeros((1, 3)), jnp.zeros((), jnp.int32))
     cameras = stack_cameras([Camera(jnp.eye(3), jnp.eye(4), 3, 1)])
     frames.write_renderings(tmp_path, cameras, [rendering], exr=True)
     (view,) = read_exr(tmp_path / "views.exr")

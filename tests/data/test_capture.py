@@ -191,7 +191,7 @@ def test_names_that_become_equal_stay_apart():
     assert names_from_paths(["a b.png", "a_b.png"]) == ("000_a_b", "001_a_b")
     assert names_from_paths(["x/a b.png", "y/a_b.png"]) == ("x_a_b", "y_a_b")
     assert names_from_paths(["a b.png", "c.png"]) == ("a_b", "c")
-    assert names_from_paths(["..png", ".a.png", "a.png"]) == ("000_.", "001_a", "002_a")
+    assert names_from_paths(["..png", ".a.png", "a.png"]) == ("000_000", "001_a", "002_a")
 
 
 def test_a_body_file_is_referred_to_by_a_relative_path(folder, tmp_path, monkeypatch):
