@@ -157,7 +157,7 @@ class Render:
     capture: Path | None = None
     """Take cameras and poses from this capture folder instead."""
     exr: bool = False
-    """Also write views.exr: float32 RGBA, depth Z and camera matrices, one part per view."""
+    """Also write views.exr: float32 RGBA (premultiplied), depth Z and camera matrices, one part per view."""
 
     def run(self) -> None:
         from humangs_jax.avatar.avatar import Avatar

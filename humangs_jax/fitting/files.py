@@ -27,7 +27,7 @@ from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
 from humangs_jax.data.photos import capture_folder, read_description
 from humangs_jax.fitting.report import FitReport
 from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
-from humangs_jax.io.atomic import check_replaceable, replace_folder
+from humangs_jax.io.atomic import add_files, check_replaceable, replace_folder
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.text import write_json
 
@@ -132,21 +132,8 @@ def write_fitted(
     description = read_description(source / "capture.json")
     contents = {"capture.json": _with_cameras(description, capture), REPORT_FILE: report.to_json()}
     name, arrays = description["body"], parameter_arrays(capture, target)
-    if target.resolve() == source.resolve():
-        if record is None:
-            (target / FIT_FILE).unlink(missing_ok=True)
-        else:
-            write_fit_record(target / FIT_FILE, record)
-        (target / name).parent.mkdir(parents=True, exist_ok=True)
-        write_npz(target / name, arrays, compressed=False)
-        for file, content in contents.items():
-            write_json(target / file, content)
-        return
 
-    def write(folder: Path):
-        folder.mkdir()
-        for file in sorted({view[key] for view in description["views"] for key in ("image", "mask") if key in view}):
-            _copy(source, folder, file)
+    def write_fit(folder: Path):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_npz(folder / name, arrays, compressed=False)
         for file, content in contents.items():
@@ -154,7 +141,16 @@ def write_fitted(
         if record is not None:
             write_fit_record(folder / FIT_FILE, record)
 
-    replace_folder(target, write, mark="capture.json")
+    def write(folder: Path):
+        folder.mkdir()
+        for file in sorted({view[key] for view in description["views"] for key in ("image", "mask") if key in view}):
+            _copy(source, folder, file)
+        write_fit(folder)
+
+    if target.resolve() == source.resolve():
+        add_files(target, write_fit, without=() if record is not None else (FIT_FILE,))
+    else:
+        replace_folder(target, write, mark="capture.json")
 
 
 def _with_cameras(description, capture):

@@ -49,9 +49,10 @@ class FittedCapture:
         mirrored = find_mirrored(self.model, self.observations, kind, fit, self.config)
         report = examine(self.capture, record.keypoints, mirrored=mirrored, **known).report
         seen = np.asarray(self.observations.confidences) * np.asarray(self.model.known) > 0
+        smooth = "motion" in fit.outcomes
         names = (name for name in (*STAGES, "person", "motion") if name in fit.outcomes)
         stages = tuple(Stage.of(stage, fit.outcomes[stage]) for stage in names)
-        warnings = (*report.warnings, *_blind_frames(seen), *_motion_warnings(fit, self.config.smoothness))
+        warnings = (*report.warnings, *_blind_frames(seen, smooth), *_motion_warnings(fit, self.config.smoothness))
         return dataclasses.replace(report, stages=stages, warnings=warnings)
 
 
@@ -88,12 +89,13 @@ def fit_photos(
     return FittedCapture(capture, record, fit, model, observations, config)
 
 
-def _blind_frames(seen):
-    """Warnings about frames (m, c, k) with few keypoints or a single view."""
+def _blind_frames(seen, smooth):
+    """Warnings about frames (m, c, k) with few keypoints or a single view. smooth: whether the motion is."""
+    taken = "interpolated between its neighbours" if smooth else "the prior's, not the photos'"
     for frame, views in enumerate(seen):
         points, cameras = int(views.any(0).sum()), int(views.any(1).sum())
         if points < FEW:
-            yield f"frame {frame}: {points} keypoints are seen: its pose is the prior's, not the photos'"
+            yield f"frame {frame}: {points} keypoints are seen: its pose is {taken}"
         elif cameras == 1:
             yield f"frame {frame}: seen by one view: distance and height are hardly determined"
 

@@ -88,7 +88,8 @@ def _exchange(folder, temporary, aside):
             return
         except BaseException as error:
             if not folder.exists() and aside.is_dir():
-                aside.rename(folder)
+                with contextlib.suppress(OSError):  # another process has made the folder meanwhile
+                    aside.rename(folder)
             if not left or not isinstance(error, OSError) or error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                 raise
             shutil.rmtree(aside, ignore_errors=True)  # replaced by the other process
@@ -110,7 +111,7 @@ def check_replaceable(
     folder = Path(folder)
     if folder.is_symlink():
         raise ValueError(f"{folder}: is a symbolic link: expected the folder itself")
-    if folder.exists() and not folder.is_dir():
+    if folder.is_file():
         raise ValueError(f"{folder}: is a file: expected a folder name")
     place = folder.resolve()
     if Path.cwd().is_relative_to(place):
@@ -123,9 +124,10 @@ def check_replaceable(
     for path in (Path(path) for path in inputs if path is not None):
         if place.exists() and any(real.is_relative_to(place) for real in (path.resolve(), path.absolute())):
             raise ValueError(f"{folder}: {path} lies in it and would be deleted: expected another folder")
-    if mark is None or not folder.is_dir() or not any(folder.iterdir()):
+    entries = _entries(folder)
+    if mark is None or not entries:
         return
-    if not (folder / mark).is_file():
+    if mark not in entries:
         raise ValueError(f"{folder}: the folder holds no {mark}: refusing to overwrite something else")
     if not overwrite:
         problem = f"{folder}: the folder is not empty: choose another one or ask to overwrite it"
@@ -134,9 +136,17 @@ def check_replaceable(
 
 def contents(folder: str | os.PathLike) -> str:
     """What is in a folder, in a few words: "capture.json, images (60 files)"; empty if there is nothing."""
-    entries = sorted(Path(folder).iterdir(), key=lambda entry: entry.name) if Path(folder).is_dir() else []
-    told = [_told(entry) for entry in entries[:TOLD]]
+    entries = _entries(folder)
+    told = [_told(Path(folder, entry)) for entry in entries[:TOLD]]
     return ", ".join(told) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
+
+
+def _entries(folder):
+    """Names in a folder, sorted; none if it does not exist (any more: another process may be replacing it)."""
+    try:
+        return sorted(os.listdir(folder))
+    except (FileNotFoundError, NotADirectoryError):
+        return []
 
 
 def _told(entry):
@@ -146,21 +156,34 @@ def _told(entry):
     return f"{entry.name} ({count} file{'' if count == 1 else 's'})"
 
 
-def add_files(folder: str | os.PathLike, write: Callable[[Path], object]) -> None:
-    """Calls write(temporary folder), then moves its files into `folder`, which is made if needed; other files there stay.
+def add_files(
+    folder: str | os.PathLike, write: Callable[[Path], object], *, without: Iterable[str | os.PathLike] = ()
+) -> None:
+    """Calls write(temporary folder), then moves its files to the same places in `folder`; other files there stay.
 
-    Nothing is moved if `write` raises.
+    The folder is made if needed. Nothing is moved if `write` raises; the moves follow each other at once, so that a kill seldom
+    falls between two. The folder may be a mount point or the working folder.
+
+    Arguments: without: files in the folder that no longer hold; they are removed before the first move.
     """
     folder = Path(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    _sweep(folder.parent.resolve())
-    temporary = folder.resolve().with_name(f".{folder.resolve().name}.new-{_tag()}")
+    inside = folder.is_dir()  # on the same disk, even if others hold the folder and what is beside it
+    if inside:
+        _sweep(folder.resolve())
+    else:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(folder.parent.resolve())
+    temporary = (folder if inside else folder.parent) / f".{folder.resolve().name}.new-{_tag()}"
     temporary.mkdir()
     try:
         write(temporary)
         folder.mkdir(exist_ok=True)
-        for file in temporary.iterdir():
-            file.replace(folder / file.name)
+        for file in without:
+            (folder / file).unlink(missing_ok=True)
+        for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
+            target = folder / file.relative_to(temporary)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            file.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

@@ -13,6 +13,7 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
 from humangs_jax.data.photos import load_photos
+from humangs_jax.fitting import files
 from humangs_jax.fitting.files import check_place, check_scan_folder, read_fit_record, write_fitted
 from humangs_jax.fitting.fit_capture import fit_photos
 from humangs_jax.fitting.scan_views import render_scan_views
@@ -73,6 +74,22 @@ def test_written_in_place_and_read_again(folder, fitted, tmp_path):
     with pytest.raises(ValueError, match=r"body\.npz exists: --overwrite"):
         check_place(path, None, overwrite=False)
     check_place(path, None, overwrite=True)
+
+
+def test_a_fit_in_place_is_written_whole_or_not_at_all(folder, fitted, tmp_path, monkeypatch):
+    """Cameras that were moved belong to the body that was found with them."""
+    path = copied(folder[0], tmp_path)
+    write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
+    before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
+    capture = dataclasses.replace(fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved))
+    with monkeypatch.context() as broken, pytest.raises(OSError, match="disk full"):
+        broken.setattr(files, "write_json", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+        write_fitted(path, path, capture, fitted.report)
+    assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
+    write_fitted(path, path, capture, fitted.report)
+    assert not (path / "fit.npz").exists()
+    np.testing.assert_array_equal(load_capture(path).cameras.cam_from_world, moved)
 
 
 def test_a_body_in_a_folder_of_its_own_is_written_and_read_again(folder, fitted, tmp_path):

@@ -33,6 +33,10 @@ def writes(text):
     return lambda temporary: folder_with(temporary, text)
 
 
+def writes_into(text):
+    return lambda temporary: (temporary / "a.txt").write_text(text)
+
+
 @pytest.fixture
 def dead_process():
     """The id of a process that has ended."""
@@ -78,6 +82,12 @@ def test_writes_replace_and_leave_nothing_temporary(tmp_path):
     assert (tmp_path / "deep" / "folder" / "a.txt").read_text() == "three"
     assert names(tmp_path) == ["deep", "file.txt"] and names(tmp_path / "deep") == ["folder"]
     assert names(tmp_path / "deep" / "folder") == ["a.txt", "mine.txt"]
+    deeper = lambda temporary: folder_with(temporary / "b" / "c", "four")
+    atomic.add_files(tmp_path / "deep" / "folder", deeper, without=("mine.txt", "none.txt"))
+    assert names(tmp_path / "deep" / "folder") == ["a.txt", "b"] and names(tmp_path / "deep") == ["folder"]
+    assert (tmp_path / "deep" / "folder" / "b" / "c" / "a.txt").read_text() == "four"
+    atomic.add_files(tmp_path / "deep" / "new", writes_into("five"))
+    assert (tmp_path / "deep" / "new" / "a.txt").read_text() == "five"
     with pytest.raises(FileNotFoundError, match="no such folder"):
         atomic.write_text(tmp_path / "none" / "file.txt", "text")
 
