@@ -108,7 +108,7 @@ def _motion_warnings(fit, smoothness):
         yield f"smoothness: {len(fit.noise)} frames have no acceleration: it changes nothing"
         return
     held, joints = float(fit.smoothness), np.asarray(fit.joints, float)
-    if not held < np.inf:
+    if not held:
         yield "smoothness: the keypoints contradict a smooth motion: frames are fitted one by one"
     elif held > 1.5 * smoothness:
         yield f"smoothness {smoothness:g}: the keypoints contradict it: accelerations are held to {held:g} instead"

@@ -82,8 +82,7 @@ class LandmarkFit:
 
     noise: (m,) std of the detections as the fit found it, pixels. state: in units of the problem's origin.
     outcomes: what the solver did, by stage; one per frame, except for "person", which has all frames, and "motion", one for
-    each of `MOTION_LEVELS`. smoothness: () the acceleration that the motion was held to, metres per frame squared; infinity: to
-    none.
+    each of `MOTION_LEVELS`. smoothness: () the acceleration that the motion was held to, metres per frame squared; 0: to none.
     """
 
     betas: Float[Array, " s"]
@@ -115,7 +114,7 @@ def _fit_frames(model, observations, config):
     start = replace(states, betas=jnp.median(states.betas, axis=0))
     residuals = lambda state: _person_residuals(problem, observations, state, config)
     state, outcomes["person"] = solve(residuals, start, config.person_steps, method="lbfgs", tolerance=config.tolerance)
-    return _result(problem, observations.noise, state, outcomes, jnp.asarray(jnp.inf))
+    return _result(problem, observations.noise, state, outcomes, jnp.zeros(()))
 
 
 def _result(problem, noise, state, outcomes, smoothness):
@@ -352,7 +351,7 @@ def smooth_motion(model: LandmarkModel, observations: Observations, fit: Landmar
 
     start = _bridged(problem, seen, fit.state)
     kept = jax.tree.map(lambda new, old: jnp.where(jnp.all(costs(start) <= limit), new, old), start, fit.state)
-    carry = (start, kept, jnp.asarray(jnp.inf))
+    carry = (start, kept, jnp.zeros(()))
     (_, state, smoothness), outcomes = jax.lax.scan(run, carry, config.smoothness * jnp.asarray(MOTION_LEVELS))
     return _result(problem, fit.noise, state, fit.outcomes | {"motion": outcomes}, smoothness)
 
