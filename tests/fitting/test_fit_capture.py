@@ -13,7 +13,7 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
 from humangs_jax.data.photos import load_photos
-from humangs_jax.fitting import files
+from humangs_jax.fitting import files, fit_capture
 from humangs_jax.fitting.files import check_place, check_scan_folder, read_fit_record, write_fitted
 from humangs_jax.fitting.fit_capture import fit_photos
 from humangs_jax.fitting.scan_views import render_scan_views
@@ -211,6 +211,16 @@ def test_a_damaged_record_is_one_error(folder, fitted, tmp_path, change, message
     np.savez(path / "fit.npz", **{name: value for name, value in arrays.items() if value is not None})
     with pytest.raises(CaptureError, match=message):
         read_fit_record(path / "fit.npz")
+
+
+def test_expressions_are_not_fitted_as_shape(folder, monkeypatch):
+    """Of SMPL-X, whose directions are those of the shape and then those of the face."""
+    fitted_to, body = [], default_body()
+    names = (*(f"shape_{i}" for i in range(body.shape_directions.shape[-1] - 1)), "expression_0")
+    monkeypatch.setattr(fit_capture, "landmark_model", lambda body, _: fitted_to.append(body) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        fit_photos(load_photos(folder[0]), folder[1], replace(body, shape_names=names))
+    assert fitted_to[0].shape_names == names[:-1] and fitted_to[0].shape_directions.shape[-1] == len(names) - 1
 
 
 def test_a_body_whose_root_is_not_first_is_refused(folder):
