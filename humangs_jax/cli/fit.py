@@ -130,7 +130,7 @@ class Fit:
             raise ValueError("--keypoints FILE is missing (or --refine, to improve the body that a capture has)")
         require_at_least(0, smoothness=self.smoothness)
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints, self.body))
-        tell_deleted(target, unless=self.capture)
+        tell_deleted(target, unless=target if self.out is None else self.capture)
         photos = load_photos(self.capture)
         keypoints = self.detections.read(photos)
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
@@ -149,7 +149,7 @@ class Fit:
 
         assert self.capture is not None  # `run` has checked it
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
-        tell_deleted(target, unless=self.capture)
+        tell_deleted(target, unless=target if self.out is None else self.capture)
         start = load_capture(self.capture)
         keypoints = self.detections.read(start)
         refinement = refine_capture(start, keypoints=keypoints, photometric=self.refinement.photometric)

@@ -150,6 +150,7 @@ def write_fitted(
     if target.resolve() == source.resolve():
         add_files(target, write_fit, without=() if record is not None else (FIT_FILE,))
     else:
+        check_place(source, target, overwrite=True)
         replace_folder(target, write, mark="capture.json")
 
 

@@ -107,7 +107,7 @@ def fit_landmarks(model: LandmarkModel, observations: Observations, config: FitC
 
 @functools.partial(jax.jit, static_argnames="config")
 def _fit_frames(model, observations, config):
-    """All stages but the last."""
+    """All stages but the motion."""
     problem = keypoint_problem(model, config)
     states, outcomes = jax.vmap(lambda seen: _fit_frame(problem, seen, config))(observations)
     observations = replace(observations, noise=_noise_found(problem, observations, states))
@@ -319,9 +319,10 @@ def smooth_motion(model: LandmarkModel, observations: Observations, fit: Landmar
 
     Arguments: observations: those of the fit. fit: without smooth motion, of at least three frames.
 
-    The result is that of the last of `MOTION_LEVELS` which follows the keypoints of every frame as well as the fit does: robust
-    costs may exceed the fit's by the number of unknowns, twice what the true poses of normal errors exceed it by (half the
-    square of the errors that a fit with as many unknowns absorbs). If none does, the fit itself.
+    The result is that of the last of `MOTION_LEVELS` which follows the keypoints of every frame as well as the fit does, up to
+    their noise: the robust cost of a frame may exceed the fit's by the number of its unknowns. That is twice what the true pose
+    exceeds it by on average, because a fit with p unknowns takes up p of the squared normal errors and half of them are the cost.
+    If no level does, the fit itself.
     """
     problem = keypoint_problem(model, config)
     seen = replace(observations, noise=fit.noise)

@@ -135,6 +135,8 @@ def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_p
     write_fitted(folder[0], inside, capture, fitted.report)
     with pytest.raises(ValueError, match="lies in it and would be deleted"):
         check_place(inside, target, overwrite=True)
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):
+        write_fitted(inside, target, capture, fitted.report)
     with pytest.raises(ValueError, match="lies in it and would be deleted"):  # the keypoints, say
         check_place(folder[0], target, overwrite=True, inputs=(None, target / "images"))
     with pytest.raises(ValueError, match="lies in it and would be deleted"):  # a photo
