@@ -176,11 +176,50 @@ def test_fit_says_what_is_missing(folder, tmp_path, monkeypatch, capsys, argumen
     assert not any(tmp_path.iterdir())
 
 
+def test_fit_deletes_no_folder_with_something_of_its_own_or_of_the_user(folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    capture = Path("out/capture.json")
+    for name in ("docs/me.obj", "docs/scan_fit.json", "papers/thesis.tex", "out/k.json", capture):
+        Path(name).parent.mkdir(exist_ok=True)
+        Path(name).write_text("mine")
+    shutil.copyfile(folder / "capture.json", capture)
+    before = sorted(tmp_path.rglob("*"))
+    for arguments, message in (
+        (("--scan", "docs/me.obj", "--out", "docs"), "docs/me.obj lies in it and would be deleted"),
+        (("--scan", "docs/me.obj", "--out", "papers"), "the folder holds no scan_fit.json"),
+        ((folder, "--keypoints", "out/k.json", "--out", "papers"), "the folder holds no capture.json"),
+        ((folder, "--keypoints", "out/k.json", "--out", "out"), "out/k.json lies in it and would be deleted"),
+        ((folder, "--keypoints", "k", "--body", "out/k.json", "--out", "out"), "out/k.json lies in it"),
+    ):
+        code, _, error = run(monkeypatch, capsys, "fit", *arguments, "--overwrite")
+        assert code == 2 and message in error and error.count("\n") == 1, (arguments, error)
+    assert sorted(tmp_path.rglob("*")) == before
+    code, printed, _ = run(monkeypatch, capsys, "fit", "--scan", "none.obj", "--out", "docs", "--overwrite")
+    assert code == 2 and "this is deleted: me.obj, scan_fit.json" in printed and sorted(tmp_path.rglob("*")) == before
+
+
 def test_the_options_of_each_way_to_fit_exist():
     parts = (fit.Detections, fit.Scan, fit.Refinement, fit.Fit)
     options = {field.name for part in parts for field in dataclasses.fields(part)}
     for way, others in fit.WAYS.items():
         assert others | {way.removeprefix("--")} <= options
+
+
+def test_training_goes_on_from_weights_as_they_were_trained(tmp_path, monkeypatch, capsys):
+    """Their network and the way their Gaussians are drawn; the run's other knobs stay."""
+    from humangs_jax.network import presets, weights
+    from humangs_jax.training import loop, sources
+
+    started = []
+    model = presets.tiny().with_conventions(rendering="inria")
+    monkeypatch.setattr(weights, "load_weights", lambda path: ({}, model))
+    monkeypatch.setattr(sources, "training_people", lambda *arguments: None)
+    monkeypatch.setattr(loop, "train", lambda settings, *arguments, **options: started.append(settings))
+    for config in ("tiny", "published"):
+        code, _, error = run(monkeypatch, capsys, "train", "--config", config, "--init-weights", "w", "--out", tmp_path)
+        assert code == 0, error
+    assert all(settings.splat.square and settings.splat.radius_sigma == 3 for settings in started)
+    assert [settings.model.conventions.rendering for settings in started] == ["inria", "inria"]
 
 
 def test_import_of_what_is_no_calibration_is_one_line(folder, tmp_path, monkeypatch, capsys):

@@ -61,6 +61,39 @@ def make_case(seed, body, model, frames, views, size=512) -> FitCase:
     )
 
 
+def walking(seeds, kind, frames, views, size=512):
+    """The landmark model of a keypoint set, and people of these seeds in the first frames of the shipped walk.
+
+    Cameras stand still all around.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    from humangs_jax.body.landmarks import landmark_model, pose_landmarks
+    from humangs_jax.body.library import load_body
+    from humangs_jax.body.model import BodyPose
+    from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
+    from humangs_jax.data.motion import load_motion
+    from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+
+    body, motion = load_body(), load_motion()
+    model = landmark_model(body, KEYPOINT_SETS[kind].names)
+    rotations, translations = (np.asarray(x)[:frames] for x in (motion.rotations, motion.translations))
+    pose_all = jax.jit(jax.vmap(lambda betas, r, t: pose_landmarks(model, betas, BodyPose(r, t)), (None, 0, 0)))
+    K = intrinsics_from_fov(1.0, size, size)
+    people = []
+    for seed in seeds:
+        rng = np.random.default_rng([seed, POSE_STREAM])
+        betas = rng.normal(0, 0.7, model.joint_directions.shape[-1]).astype(np.float32)
+        landmarks, joints = (np.asarray(x) for x in pose_all(betas, rotations, translations))
+        azimuths = rng.uniform(0, 2 * np.pi) + np.arange(views) * (2 * np.pi / views)
+        cameras = orbit(jnp.asarray(joints.mean((0, 1))), 3.4, jnp.asarray(azimuths, jnp.float32), 0.15, K, size, size)
+        still = lambda array: np.broadcast_to(np.asarray(array), (frames, *array.shape))
+        matrices = still(cameras.K), still(cameras.cam_from_world)
+        people.append(FitCase(betas, rotations, translations, joints, landmarks, *matrices))
+    return model, people
+
+
 def detect(case, seed, noise_px, outliers, outlier_px=100.0):
     """Keypoints (m, c, k, 2) as a detector with errors would give them: noise everywhere, a share displaced by up to so far."""
     rng = np.random.default_rng([seed, ERROR_STREAM])

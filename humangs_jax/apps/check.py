@@ -18,6 +18,7 @@ from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
@@ -184,13 +185,14 @@ def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
 
 @jax.jit
 def _body_image(vertices, faces, tints, camera) -> BodyImage:
-    points = vertices @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    points = transform.apply(camera.cam_from_world, vertices)
     before = points[:, 2] > 0
     xy = points[:, :2] / jnp.where(before, points[:, 2], 1.0)[:, None] * jnp.diagonal(camera.K)[:2] + camera.K[:2, 2]
     inside = before & (xy >= 0).all(-1) & (xy[:, 0] < camera.width) & (xy[:, 1] < camera.height)
     y = jnp.where(before, xy[:, 1], 0.0)
     rays = points / jnp.linalg.norm(points, axis=-1, keepdims=True)
-    normals = vertex_normals(vertices, faces) @ camera.cam_from_world[:3, :3].T
+    rotation = camera.cam_from_world[:3, :3]
+    normals = jnp.matmul(vertex_normals(vertices, faces), rotation.T, precision=transform.EXACT)
     light = AMBIENT + (1 - AMBIENT) * jnp.abs(jnp.sum(normals * rays, axis=-1, keepdims=True))
     fragments = rasterize_mesh(vertices, faces, camera)
     return BodyImage(

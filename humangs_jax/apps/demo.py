@@ -92,7 +92,9 @@ def _write_products(
         _say("refining on the four photos")
         avatar, refined = _refine(avatar, inputs, truth, ours, refine, out / "refined.png")
     _say("animating")
-    frames = _timed(timings, "animation_frames", lambda: motion_frames(avatar, motion, frame_size, 25.0, 40.0))
+    frames = _timed(
+        timings, "animation_frames", lambda: np.stack(list(motion_frames(avatar, motion, frame_size, 25.0, 40.0)))
+    )
 
     start = time.perf_counter()
     contact_sheet(inputs.images, out / "inputs.png", labels=[f"photo {i}" for i in range(inputs.view_count)])

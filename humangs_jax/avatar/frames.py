@@ -62,8 +62,8 @@ def draw_gaussians(
 
 def motion_frames(
     avatar: Avatar, motion: Motion, size: int, azimuth: float = 0.0, turn: float = 0.0, progress: bool = True
-) -> Float[np.ndarray, "m size size 3"]:
-    """Frames of a moving avatar, (m, size, size, 3) in [0, 1]. azimuth and turn in degrees."""
+) -> Iterator[Float[np.ndarray, "size size 3"]]:
+    """Frames of a moving avatar, each (size, size, 3) in [0, 1], drawn when asked for. azimuth and turn in degrees."""
     from tqdm import tqdm
 
     rest = RestBody(avatar.rest_vertices, avatar.rest_joints)
@@ -87,7 +87,7 @@ def motion_frames(
     )
     renderings = draw(avatar, (motion.pose(i) for i in range(count)), (cameras[i] for i in range(count)))
     bar = tqdm(renderings, total=count, desc="animate", unit="frame", disable=not progress)
-    return np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in bar])
+    return (np.clip(np.asarray(rendering.rgb), 0, 1) for rendering in bar)
 
 
 def turntable_renderings(avatar: Avatar, views: int, size: int) -> tuple[Camera, list[Rendering]]:
@@ -126,7 +126,7 @@ def capture_renderings(
 
 
 def write_renderings(out: str | os.PathLike, cameras: Camera, renderings: list[Rendering], exr: bool = False) -> int:
-    """Write view_000.png ... into a folder, and views.exr if asked. Returns the number of views."""
+    """Write renderings onto white as view_000.png ... into a folder, and views.exr if asked. Returns the number of views."""
     from humangs_jax.io.images import write_png
 
     out = Path(out)
@@ -134,20 +134,29 @@ def write_renderings(out: str | os.PathLike, cameras: Camera, renderings: list[R
     for i, rendering in enumerate(renderings):
         write_png(out / f"view_{i:03d}.png", np.asarray(rendering.rgb))
     if exr:
-        write_renderings_exr(out / "views.exr", cameras, renderings)
+        write_renderings_exr(out / "views.exr", cameras, renderings, background=1.0)
     return len(renderings)
 
 
-def write_renderings_exr(path: str | os.PathLike, cameras: Camera, renderings: list[Rendering]) -> None:
-    """Float32 RGBA as rendered, Z in metres and the camera's matrices, one part per view."""
+def write_renderings_exr(
+    path: str | os.PathLike, cameras: Camera, renderings: list[Rendering], background: float = 0.0
+) -> None:
+    """Float32 RGBA, premultiplied as compositing programs expect it, Z in metres and the camera's matrices, one part per view.
+
+    Arguments: background: the grey that they were rendered onto, which is taken away: colours are 0 where alpha is.
+    """
     from humangs_jax.io.exr import ExrView, write_exr
+
+    def premultiplied(rendering):
+        alpha = np.asarray(rendering.alpha)[..., None]
+        return np.concatenate([np.asarray(rendering.rgb) - np.float32(background) * (1 - alpha), alpha], axis=-1)
 
     write_exr(
         Path(path),
         [
             ExrView(
                 name=f"view_{i:03d}",
-                rgba=np.concatenate([np.asarray(r.rgb), np.asarray(r.alpha)[..., None]], axis=-1),
+                rgba=premultiplied(r),
                 depth=np.asarray(r.depth),
                 K=np.asarray(cameras.K[i]),
                 cam_from_world=np.asarray(cameras.cam_from_world[i]),

@@ -1,7 +1,9 @@
 """Frames -> a video file: .mp4 (H.264, plays everywhere) or .gif (256 colours for all frames, endless loop)."""
 
 import contextlib
+import itertools
 import subprocess
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 
@@ -19,35 +21,50 @@ PALETTE_FRAMES = 16
 """The palette of a GIF is chosen from this number of frames, evenly spaced."""
 
 
-def write_video(path: str | Path, frames: Float[np.ndarray, "m h w 3"], fps: float | int) -> None:
+def write_video(
+    path: str | Path, frames: Float[np.ndarray, "m h w 3"] | Iterable[Float[np.ndarray, "h w 3"]], fps: float | int
+) -> None:
     """Write frames in [0, 1] as .mp4 or .gif; the file appears whole or not at all.
 
-    H.264 wants even sides: odd ones get one more row or column, a copy of the last. A GIF of more than 50 frames a
-    second leaves out frames to keep its speed.
+    Frames are asked for one by one: an .mp4 keeps none in memory, a .gif one byte a channel. H.264 wants even sides: odd
+    ones get one more row or column, a copy of the last. A GIF of more than 50 frames a second leaves out frames to keep
+    its speed.
 
-    Raises: ValueError if there is no frame, a number is not finite, `fps` is not positive or the suffix another one;
-    OSError if the file cannot be written.
+    Raises: ValueError if there is no frame, they differ in size, a number is not finite, `fps` is not positive or the suffix
+    another one; OSError if the file cannot be written; what `frames` raises.
     """
     path = Path(path)
-    if len(frames) == 0 or 0 in frames.shape:
-        raise ValueError(f"{path}: expected at least one frame, got {len(frames)} of {frames.shape[1:3]}")
-    if not np.isfinite(frames).all():
-        raise ValueError(
-            f"{path}: frame {int(np.argwhere(~np.isfinite(frames))[0][0])} has numbers that are not finite"
-        )
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"{path}: expected a positive number of frames per second, got {fps}")
     writers = {".mp4": _write_mp4, ".gif": _write_gif}
     if path.suffix.lower() not in writers:
         raise ValueError(f"{path}: expected a name ending in .mp4 or .gif")
-    replace_file(path, lambda temporary: writers[path.suffix.lower()](temporary, frames, float(fps)))
+    checked = _checked(path, frames)
+    first = next(checked, None)
+    if first is None:
+        raise ValueError(f"{path}: expected at least one frame, got none")
+    frames = itertools.chain([first], checked)
+    replace_file(path, lambda temporary: writers[path.suffix.lower()](temporary, frames, float(fps), first.shape))
 
 
-def _write_mp4(path, frames, fps):
+def _checked(path, frames):
+    shape = None
+    for i, frame in enumerate(frames):
+        shape = frame.shape if shape is None else shape
+        if 0 in frame.shape:
+            raise ValueError(f"{path}: expected at least one frame of at least one pixel, got {frame.shape[:2]}")
+        if frame.shape != shape:
+            raise ValueError(f"{path}: frame {i} has shape {frame.shape}, expected that of the first, {shape}")
+        if not np.isfinite(frame).all():
+            raise ValueError(f"{path}: frame {i} has numbers that are not finite")
+        yield frame
+
+
+def _write_mp4(path, frames, fps, shape):
     """Through ffmpeg itself: imageio's writer does not tell when ffmpeg fails."""
     import imageio_ffmpeg
 
-    height, width = frames.shape[1:3]
+    height, width = shape[:2]
     odd = ((0, height % 2), (0, width % 2), (0, 0))
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error"]
     command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width + width % 2}x{height + height % 2}"]
@@ -70,15 +87,15 @@ def _write_mp4(path, frames, fps):
         raise OSError(f"{path}: ffmpeg failed: {' '.join(problem.split())}")
 
 
-def _write_gif(path, frames, fps):
+def _write_gif(path, frames, fps, _):
     from PIL import Image
 
     step = int(np.ceil(fps / LARGEST_GIF_FPS))
-    frames, fps = frames[::step], fps / step
-    chosen = frames[np.unique(np.linspace(0, len(frames) - 1, PALETTE_FRAMES).round().astype(int))]
+    kept, fps = [to_uint8(frame) for i, frame in enumerate(frames) if i % step == 0], fps / step
+    chosen = np.unique(np.linspace(0, len(kept) - 1, PALETTE_FRAMES).round().astype(int))
     # one palette for all frames: with one each, still surfaces flicker
-    palette = Image.fromarray(np.concatenate([to_uint8(x) for x in chosen])).quantize(256, Image.Quantize.MEDIANCUT)
-    images = [Image.fromarray(to_uint8(x)).quantize(palette=palette, dither=Image.Dither.NONE) for x in frames]
+    palette = Image.fromarray(np.concatenate([kept[i] for i in chosen])).quantize(256, Image.Quantize.MEDIANCUT)
+    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in kept]
     # durations are whole hundredths of a second; rounding the times, not the durations, keeps the speed
     times = np.rint(np.arange(len(images) + 1) * 100 / fps).astype(int)
     durations = [10 * int(x) for x in np.diff(times)]

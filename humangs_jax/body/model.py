@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from humangs_jax.body import skinning
 from humangs_jax.core.array_types import Array, Float, Int
-from humangs_jax.core.pytree import Batchable, pytree_dataclass, static_field
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 
 
@@ -99,6 +99,14 @@ def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
     directions = body.shape_directions[..., :used]
     vertices = body.template + jnp.einsum("nas,s->na", directions, betas, precision=skinning.EXACT)
     return RestBody(vertices, jnp.matmul(body.joint_regressor, vertices, precision=skinning.EXACT))
+
+
+def without_expression(body: BodyModel) -> BodyModel:
+    """The body without the directions of facial expressions, which come last in SMPL-X models: those are no shape of a person."""
+    count = sum(not name.startswith("expression_") for name in body.shape_names)
+    if not body.shape_names or count == len(body.shape_names):
+        return body
+    return replace(body, shape_directions=body.shape_directions[..., :count], shape_names=body.shape_names[:count])
 
 
 def pose_features(rotations: Float[Array, "j 3"]) -> Float[Array, " q"]:

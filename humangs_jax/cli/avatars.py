@@ -143,7 +143,7 @@ class Animate:
         avatar, motion = Avatar.load(self.avatar), load_motion(self.motion)
         frames = motion_frames(avatar, motion, self.size, azimuth=self.azimuth, turn=self.turn)
         write_video(self.out, frames, motion.fps)
-        print(f"{self.out}: {len(frames)} frames at {motion.fps:g} frames per second")
+        print(f"{self.out}: {len(motion.translations)} frames at {motion.fps:g} frames per second")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,7 +161,7 @@ class Render:
     capture: Path | None = None
     """Take cameras and poses from this capture folder instead."""
     exr: bool = False
-    """Also write views.exr: float32 RGBA, depth Z and camera matrices, one part per view."""
+    """Also write views.exr: float32 RGBA (premultiplied), depth Z and camera matrices, one part per view."""
 
     def run(self) -> None:
         from humangs_jax.avatar.avatar import Avatar

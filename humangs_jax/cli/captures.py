@@ -7,7 +7,7 @@ from typing import Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from humangs_jax.cli.options import require_at_least
+from humangs_jax.cli.options import require_at_least, tell_deleted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +40,8 @@ class ImportCameras:
         from humangs_jax.data.calibration.importing import import_cameras
 
         options = {name: value for name, value in vars(self).items() if name != "what"}
+        if self.overwrite and (self.out / "capture.json").is_file():
+            tell_deleted(self.out)
         print(import_cameras(**options))
 
 

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from humangs_jax.cli.options import require_at_least, require_parent
+from humangs_jax.cli.options import require_at_least, require_parent, tell_deleted
 
 LISTED = 5
 """Names of views in a warning, at most."""
@@ -88,8 +88,8 @@ class Fit:
     body: Path | None = None
     """Model file (SMPL-X .npz or .pkl). Default: the shipped body."""
     smoothness: float = 0.0
-    """Typical acceleration of joints in metres per frame squared, for sequences (0.005 at 30 frames a second). 0: frames
-    are fitted one by one."""
+    """Typical acceleration of joints in metres per frame squared, for sequences (walking at 24 frames a second: 0.02). 0:
+    frames are fitted one by one."""
     out: Path | None = None
     """Folder for the result. Default: the capture folder itself."""
     overwrite: bool = False
@@ -131,7 +131,8 @@ class Fit:
         if self.detections.keypoints is None:
             raise ValueError("--keypoints FILE is missing (or --refine, to improve the body that a capture has)")
         require_at_least(0, smoothness=self.smoothness)
-        target = check_place(self.capture, self.out, self.overwrite)
+        target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints, self.body))
+        tell_deleted(target, unless=target if self.out is None else self.capture)
         photos = load_photos(self.capture)
         keypoints = self.detections.read(photos)
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
@@ -150,7 +151,8 @@ class Fit:
         from humangs_jax.fitting.refine_rounds import CaptureRefineConfig
 
         assert self.capture is not None  # `run` has checked it
-        target = check_place(self.capture, self.out, self.overwrite)
+        target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
+        tell_deleted(target, unless=target if self.out is None else self.capture)
         start = load_capture(self.capture)
         keypoints = self.detections.read(start)
         config = CaptureRefineConfig(fixed_cameras=self.refinement.fixed_cameras)
@@ -184,7 +186,8 @@ class Fit:
             return
         if self.out is None:
             raise ValueError("--out FOLDER is missing: where the body of the scan goes")
-        check_scan_folder(self.out, self.overwrite)
+        check_scan_folder(self.out, self.overwrite, (scan.scan, scan.joints, scan.views, keypoints, self.body))
+        tell_deleted(self.out)
         joints = None if scan.joints is None else read_joints(scan.joints)
         if scan.views is not None:
             joints = joints_from_views(scan.views, self.detections.read(load_photos(scan.views)))
@@ -201,6 +204,8 @@ def _reading_warnings(keypoints):
     if keypoints.missing:
         names = ", ".join(keypoints.missing[:LISTED]) + (" ..." if len(keypoints.missing) > LISTED else "")
         yield f"no keypoints of {len(keypoints.missing)} views: {names}"
+    if keypoints.shifted:
+        yield f"frames and photos are counted from different numbers and were matched in order: {keypoints.shifted}"
     if keypoints.not_finite:
         yield f"{keypoints.not_finite} keypoints are not finite numbers and are ignored"
     if keypoints.far_outside:

@@ -11,6 +11,14 @@ def require_parent(path: Path, option: str = "--out") -> None:
         raise FileNotFoundError(f"{option} {path}: the folder {path.parent} does not exist")
 
 
+def tell_deleted(folder: Path, unless: Path | None = None) -> None:
+    """Say what --overwrite will delete in a folder that is replaced; nothing where it is the folder `unless`, or empty."""
+    from humangs_jax.io.atomic import contents
+
+    if (unless is None or folder.resolve() != unless.resolve()) and (found := contents(folder)):
+        print(f"--overwrite: once the work is done, {folder} is replaced; this is deleted: {found}", flush=True)
+
+
 def require_suffix(path: Path, suffixes: tuple[str, ...], option: str = "--out") -> None:
     """The name of a file ends as its format requires. Raises: ValueError."""
     if path.suffix.lower() not in suffixes:

@@ -77,6 +77,7 @@ class Train:
         from humangs_jax.network.weights import load_weights
         from humangs_jax.objectives.loss_networks import load_loss_networks
         from humangs_jax.people.manifest import find_people
+        from humangs_jax.rendering.splat_config import drawn_as
         from humangs_jax.training.config import fitting_losses, read_config
         from humangs_jax.training.diagnose import diagnose_run
         from humangs_jax.training.loop import train
@@ -91,7 +92,9 @@ class Train:
         if self.init_weights is not None:
             variables, model = load_weights(self.init_weights)
             model = dataclasses.replace(model, execution=settings.model.execution)
-            settings = dataclasses.replace(settings, model=model)
+            settings = dataclasses.replace(
+                settings, model=model, splat=drawn_as(settings.splat, model.conventions.rendering)
+            )
         body = load_body()
         people = training_people(self.data, self.on_the_fly, self.out, body)
         if self.diagnose:

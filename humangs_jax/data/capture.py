@@ -202,7 +202,7 @@ def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False)
     path = Path(path)
     _check_before_writing(capture)
     check_place(path, overwrite)
-    replace_folder(path, lambda folder: _write_folder(folder, capture, path))
+    replace_folder(path, lambda folder: _write_folder(folder, capture, path), mark="capture.json")
 
 
 def _assemble(photos, body, betas, rotations, translations, body_file):

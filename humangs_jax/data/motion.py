@@ -76,11 +76,30 @@ class Motion:
         return BodyPose(self.rotations[frame], self.translations[frame])
 
     def at_rate(self, fps: float | int) -> "Motion":
-        """The motion at another frame rate, by the nearest frames (halves: the later one)."""
-        count = max(1, round(len(self.translations) * fps / self.fps))
-        nearest = np.floor(np.arange(count) * self.fps / fps + 0.5).astype(int)
-        frames = np.clip(nearest, 0, len(self.translations) - 1)
-        return replace(self, rotations=self.rotations[frames], translations=self.translations[frames], fps=float(fps))
+        """The motion at another frame rate, between two frames interpolated: rotations on the shortest way, positions linearly.
+
+        Raises: ValueError for a rate that is not positive.
+        """
+        if not (np.isfinite(fps) and fps > 0):
+            raise ValueError(f"fps: expected a positive number of frames per second, got {fps}")
+        last = len(self.translations) - 1
+        count = max(1, round((last + 1) * fps / self.fps))
+        times = np.minimum(np.arange(count) * self.fps / fps, last)
+        low = np.floor(times).astype(int)
+        frames = self.rotations[low], self.translations[low]
+        if (times > low).any():
+            high = np.minimum(low + 1, last)
+            share = jnp.asarray(times - low, jnp.float32)
+            frames = _between(*frames, self.rotations[high], self.translations[high], share)
+        return replace(self, rotations=frames[0], translations=frames[1], fps=float(fps))
+
+
+@jax.jit
+def _between(rotations, translations, next_rotations, next_translations, share):
+    """Frames between frames; those with share 0 as they are."""
+    turned = quaternion.interpolate(rotations, next_rotations, share[:, None])
+    moved = translations + share[:, None] * (next_translations - translations)
+    return jnp.where(share[:, None, None] > 0, turned, rotations), moved
 
 
 def load_motion(
@@ -100,7 +119,8 @@ def load_motion(
             own (AMASS z, others y). Our own format and AIST++ are y-up and never turned by "auto".
         fps: frames per second in place of those in the file.
         hands: hand basis of an SMPL-X model, needed for hands of fewer than 45 numbers (principal coefficients) and for
-            `flat_hand_mean` False, which adds the mean hand (only to files that have hands).
+            `flat_hand_mean` False, which adds the mean hand (only to hands that a file has). Our own format holds
+            whole rotations: there is nothing to add.
 
     Raises: MotionError, one line naming file and key.
     """
@@ -157,6 +177,8 @@ def _joint_paths(rest_joints, parents, rotations, translations):
 
 
 def _ours(file):
+    if not file.flat_hand_mean:
+        raise MotionError(file.path, "rotations", "our own format holds whole rotations: expected flat_hand_mean=True")
     rotations = file.numbers("rotations", (None, None, 3))
     translations = file.numbers("translations", (len(rotations), 3))
     return rotations, translations, file.rate(("fps",), None), None
@@ -166,10 +188,13 @@ def _amass(file):
     poses = file.numbers("poses", (None, None))
     count, columns = poses.shape
     if columns == 3 * len(JOINT_NAMES):
-        rotations = poses.reshape(count, -1, 3)
+        body_and_face, *hands = np.split(poses, [columns - 2 * HAND_NUMBERS, columns - HAND_NUMBERS], axis=1)
+        hands = [file.with_mean(hand, side) for side, hand in enumerate(hands)]
+        rotations = np.concatenate([body_and_face, *hands], axis=1).reshape(count, -1, 3)
     elif columns in (BODY_NUMBERS, 72, BODY_NUMBERS + 2 * HAND_NUMBERS):
         # 66: body. 72: SMPL, whose last two joints are whole hands; we have fingers in their place. 156: body and fingers
         hands = np.split(poses[:, BODY_NUMBERS:], 2, axis=1) if columns == BODY_NUMBERS + 2 * HAND_NUMBERS else None
+        hands = hands and [file.with_mean(hand, side) for side, hand in enumerate(hands)]
         rotations = file.assemble(poses[:, :BODY_NUMBERS], hands=hands)
     else:
         raise MotionError(file.path, "poses", f"expected 165, 156, 72 or 66 columns, got {columns}")
@@ -289,7 +314,11 @@ class _MotionFile:
                 )
                 raise MotionError(self.path, key, problem)
             pose = pose @ np.asarray(self.hands.components)[side, : pose.shape[1]]
-        return pose if self.flat_hand_mean or self.hands is None else pose + np.asarray(self.hands.means)[side]
+        return self.with_mean(pose, side)
+
+    def with_mean(self, hand: Any, side: int) -> Any:
+        """A hand's pose (m, 45) from that of a file, which may be relative to the mean hand."""
+        return hand if self.flat_hand_mean or self.hands is None else hand + np.asarray(self.hands.means)[side]
 
     def assemble(self, body, face=None, hands=None):
         """(m, 55, 3) from (m, 66) and parts that may be None."""

@@ -225,10 +225,10 @@ def on_white_background(
 
 
 def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:
-    """File names without folder and suffix; with their folders where that alone is ambiguous."""
-    names = [Path(path).stem for path in paths]
-    if len(set(names)) < len(names):
-        names = ["_".join(Path(path).with_suffix("").parts) for path in paths]
-    if len(set(names)) < len(names):
-        names = [f"{i:03d}_{name}" for i, name in enumerate(names)]  # one photo used twice
-    return tuple(re.sub(r"[^\w.-]", "_", name).lstrip(".") or f"{i:03d}" for i, name in enumerate(names))
+    """File names without folder and suffix, in letters, digits, '.', '_' and '-'; with their folders where they are ambiguous."""
+    plain = lambda name, i: re.sub(r"[^\w.-]", "_", name).lstrip(".") or f"{i:03d}"
+    for name_of in (lambda path: path.stem, lambda path: "_".join(path.with_suffix("").parts)):
+        names = tuple(plain(name_of(Path(path)), i) for i, path in enumerate(paths))
+        if len(set(names)) == len(names):
+            return names
+    return tuple(f"{i:03d}_{name}" for i, name in enumerate(names))  # one photo used twice, "a b" and "a_b"

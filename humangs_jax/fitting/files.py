@@ -14,6 +14,7 @@ is) and body_in_scan.ply.
 
 import dataclasses
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
 from humangs_jax.data.photos import capture_folder, read_description
 from humangs_jax.fitting.report import FitReport
 from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
-from humangs_jax.io.atomic import check_replaceable, replace_folder
+from humangs_jax.io.atomic import add_files, check_replaceable, replace_folder
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.text import write_json
 
@@ -96,28 +97,28 @@ def read_fit_record(path: str | Path) -> FitRecord:
 # Captures ------------------------------------------------------------------------------------------------------------
 
 
-def check_place(source: str | Path, out: str | Path | None, overwrite: bool) -> Path:
+def check_place(
+    source: str | Path, out: str | Path | None, overwrite: bool, inputs: Iterable[str | Path | None] = ()
+) -> Path:
     """The folder that a fit of the capture `source` is written to, checked before the work begins.
 
-    Arguments: out: None: the capture folder itself.
+    Arguments: out: None: the capture folder itself, of which the body and the cameras are replaced. inputs: further files and
+    folders that the fit reads, None is left out; another folder that is replaced may hold none of them, nor a photo.
     Raises: ValueError if something would be overwritten without `overwrite`; see also `check_replaceable`.
     """
     source = capture_folder(source)
     target = source if out is None else Path(out)
-    filled = target.is_dir() and any(target.iterdir())
-    if target.resolve() == source.resolve():
-        body = target / read_description(source / "capture.json")["body"]
-        if body.exists() and not overwrite:
-            raise ValueError(f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere")
-    elif (target.is_file() or filled) and not overwrite:
-        raise ValueError(f"--out {target}: exists and is not empty; --overwrite replaces it")
-    elif filled and not (target / "capture.json").is_file():
-        raise ValueError(f"--out {target}: holds no capture.json: refusing to overwrite what is no capture")
-    if target.resolve() in source.resolve().parents:
-        raise ValueError(f"--out {target}: {source} lies inside of it, and would be lost")
+    description = read_description(source / "capture.json")
     if target.resolve() != source.resolve():
-        check_replaceable(target)
+        check_replaceable(target, overwrite, "capture.json", (source, *inputs, *_photo_files(source, description)))
+    elif (body := target / description["body"]).exists() and not overwrite:
+        raise ValueError(f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere")
     return target
+
+
+def _photo_files(folder, description):
+    """Images and masks of a capture."""
+    return [folder / view[key] for view in description["views"] for key in ("image", "mask") if key in view]
 
 
 def write_fitted(
@@ -131,27 +132,26 @@ def write_fitted(
     description = read_description(source / "capture.json")
     contents = {"capture.json": _with_cameras(description, capture), REPORT_FILE: report.to_json()}
     name, arrays = description["body"], parameter_arrays(capture, target)
-    if target.resolve() == source.resolve():
-        if record is None:
-            (target / FIT_FILE).unlink(missing_ok=True)
-        else:
-            write_fit_record(target / FIT_FILE, record)
-        write_npz(target / name, arrays, compressed=False)
-        for file, content in contents.items():
-            write_json(target / file, content)
-        return
 
-    def write(folder: Path):
-        folder.mkdir()
-        for file in sorted({view[key] for view in description["views"] for key in ("image", "mask") if key in view}):
-            _copy(source, folder, file)
+    def write_fit(folder: Path):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_npz(folder / name, arrays, compressed=False)
         for file, content in contents.items():
             write_json(folder / file, content)
         if record is not None:
             write_fit_record(folder / FIT_FILE, record)
 
-    replace_folder(target, write)
+    def write(folder: Path):
+        folder.mkdir()
+        for file in sorted({view[key] for view in description["views"] for key in ("image", "mask") if key in view}):
+            _copy(source, folder, file)
+        write_fit(folder)
+
+    if target.resolve() == source.resolve():
+        add_files(target, write_fit, without=() if record is not None else (FIT_FILE,))
+    else:
+        check_place(source, target, overwrite=True)
+        replace_folder(target, write, mark="capture.json")
 
 
 def _with_cameras(description, capture):
@@ -198,9 +198,9 @@ def save_scan_fit(folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BOD
         mesh.export(temporary / SCAN_MESH_FILE)
         write_json(temporary / SCAN_REPORT_FILE, place | fit.report.to_json(), indent=2)
 
-    replace_folder(folder, write)
+    replace_folder(folder, write, mark=SCAN_REPORT_FILE)
 
 
-def check_scan_folder(folder: Path, overwrite: bool) -> None:
+def check_scan_folder(folder: Path, overwrite: bool, inputs: Iterable[str | Path | None] = ()) -> None:
     """Raises: ValueError unless the folder is empty, or with `overwrite` a fit to a scan; see also `check_replaceable`."""
-    check_replaceable(folder, overwrite, SCAN_REPORT_FILE)
+    check_replaceable(folder, overwrite, SCAN_REPORT_FILE, inputs)

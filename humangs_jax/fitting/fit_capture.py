@@ -6,20 +6,28 @@ import functools
 import numpy as np
 
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model
-from humangs_jax.body.model import BodyModel
+from humangs_jax.body.model import BodyModel, without_expression
 from humangs_jax.data.capture import DEFAULT_BODY, Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.examination import examine
 from humangs_jax.fitting.files import FitRecord
-from humangs_jax.fitting.landmark_fit import STAGES, FitConfig, LandmarkFit, fit_landmarks
+from humangs_jax.fitting.landmark_fit import (
+    FEW,
+    MOTION_SCALE,
+    STAGES,
+    FitConfig,
+    LandmarkFit,
+    accelerations,
+    fit_landmarks,
+)
 from humangs_jax.fitting.report import FitReport, Stage
 from humangs_jax.fitting.residuals.keypoints import Observations, group_by_frame
 from humangs_jax.fitting.swaps import find_mirrored
 from humangs_jax.fitting.uncertainty import fit_uncertainty
 
-FEW = 6
-"""Keypoints below which a frame's pose is mostly the prior's."""
+FAR = 4.0
+"""A frame is far from its neighbours if it is so many times as far from their mean as they are from each other."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,8 +49,11 @@ class FittedCapture:
         mirrored = find_mirrored(self.model, self.observations, kind, fit, self.config)
         report = examine(self.capture, record.keypoints, mirrored=mirrored, **known).report
         seen = np.asarray(self.observations.confidences) * np.asarray(self.model.known) > 0
-        stages = tuple(Stage.of(stage, fit.outcomes[stage]) for stage in (*STAGES, "person"))
-        return dataclasses.replace(report, stages=stages, warnings=(*report.warnings, *_blind_frames(seen)))
+        smooth = "motion" in fit.outcomes
+        names = (name for name in (*STAGES, "person", "motion") if name in fit.outcomes)
+        stages = tuple(Stage.of(stage, fit.outcomes[stage]) for stage in names)
+        warnings = (*report.warnings, *_blind_frames(seen, smooth), *_motion_warnings(fit, self.config.smoothness))
+        return dataclasses.replace(report, stages=stages, warnings=warnings)
 
 
 def fit_photos(
@@ -66,7 +77,7 @@ def fit_photos(
         raise ValueError(
             f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}"
         )
-    model = landmark_model(body, keypoints.set.names)
+    model = landmark_model(without_expression(body), keypoints.set.names)
     observations, _ = group_by_frame(photos, keypoints)
     if not (np.asarray(observations.confidences) * np.asarray(model.known) > 0).any():
         raise ValueError("no view has a keypoint that the body has: nothing to fit")
@@ -78,11 +89,30 @@ def fit_photos(
     return FittedCapture(capture, record, fit, model, observations, config)
 
 
-def _blind_frames(seen):
-    """Warnings about frames (m, c, k) with few keypoints or a single view."""
+def _blind_frames(seen, smooth):
+    """Warnings about frames (m, c, k) with few keypoints or a single view. smooth: whether the motion is."""
+    taken = "interpolated between its neighbours" if smooth else "the prior's, not the photos'"
     for frame, views in enumerate(seen):
         points, cameras = int(views.any(0).sum()), int(views.any(1).sum())
         if points < FEW:
-            yield f"frame {frame}: {points} keypoints are seen: its pose is the prior's, not the photos'"
+            yield f"frame {frame}: {points} keypoints are seen: its pose is {taken}"
         elif cameras == 1:
             yield f"frame {frame}: seen by one view: distance and height are hardly determined"
+
+
+def _motion_warnings(fit, smoothness):
+    """Warnings about motion that was to be smooth."""
+    if not smoothness:
+        return
+    if len(fit.noise) < 3:
+        yield f"smoothness: {len(fit.noise)} frames have no acceleration: it changes nothing"
+        return
+    held, joints = float(fit.smoothness), np.asarray(fit.joints, float)
+    if not held:
+        yield "smoothness: the keypoints contradict a smooth motion: frames are fitted one by one"
+    elif held > 1.5 * smoothness:
+        yield f"smoothness {smoothness:g}: the keypoints contradict it: accelerations are held to {held:g} instead"
+    off = np.linalg.norm(accelerations(joints), axis=-1).mean(-1) / 2
+    around = np.linalg.norm(joints[2:] - joints[:-2], axis=-1).mean(-1)
+    for frame in 1 + np.flatnonzero(off > FAR * around / 2 + MOTION_SCALE * smoothness):
+        yield f"frame {frame}: {off[frame - 1]:.2f} m from where the frames beside it would have it: is it somebody else?"

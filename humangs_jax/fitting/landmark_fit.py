@@ -4,7 +4,8 @@
     points  body joints and shape against triangulated points; skipped by frames without any
     body    the same against the keypoints of every view
     hands   all joints that a keypoint depends on, with a smaller robust scale
-    person  all frames at once: one shape, the noise that was found, and smooth motion where requested
+    person  all frames at once: one shape, and the noise that was found
+    motion  where requested, the same with smooth motion, which is expected weakly first: see `smooth_motion`
 
 The first four are one program that runs with other weights and other free unknowns, because compilation dominates the time.
 """
@@ -13,6 +14,7 @@ import dataclasses
 import functools
 import itertools
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -36,10 +38,20 @@ from humangs_jax.fitting.residuals.keypoints import (
     trunk_weights,
 )
 from humangs_jax.fitting.residuals.priors import pose_prior
-from humangs_jax.fitting.solve import Outcome, solve
-from humangs_jax.fitting.state import FREE, FitState, betas_of, frame_axes, pose_of, usual_origin, zero_state
+from humangs_jax.fitting.solve import Outcome, half_squares, robust, solve
+from humangs_jax.fitting.state import (
+    FREE,
+    FitState,
+    betas_of,
+    frame_axes,
+    pose_of,
+    state_of,
+    usual_origin,
+    zero_state,
+)
 from humangs_jax.fitting.triangulation import triangulate_robustly
-from humangs_jax.geometry import quaternion
+from humangs_jax.geometry import quaternion, transform
+from humangs_jax.geometry.transform import EXACT
 
 STAGES = ("rigid", "points", "body", "hands")
 
@@ -69,7 +81,8 @@ class LandmarkFit:
     """A person in m frames. betas: (s,). poses: a batch of m. landmarks: (m, k, 3), joints: (m, j, 3) metres.
 
     noise: (m,) std of the detections as the fit found it, pixels. state: in units of the problem's origin.
-    outcomes: what the solver did, by stage; one per frame, except for "person", which has all frames.
+    outcomes: what the solver did, by stage; one per frame, except for "person", which has all frames, and "motion", one for
+    each of `MOTION_LEVELS`. smoothness: () the acceleration that the motion was held to, metres per frame squared; 0: to none.
     """
 
     betas: Float[Array, " s"]
@@ -79,23 +92,41 @@ class LandmarkFit:
     noise: Float[Array, " m"]
     state: FitState
     outcomes: dict[str, Outcome]
+    smoothness: Float[Array, ""]
 
 
-@functools.partial(jax.jit, static_argnames="config")
 def fit_landmarks(model: LandmarkModel, observations: Observations, config: FitConfig = FitConfig()) -> LandmarkFit:
     """Shape and poses of one person.
 
-    Arguments: observations: a batch of m frames. The result is finite for all finite observations; frames without keypoints
-    rest in the prior's usual pose.
+    Arguments: observations: a batch of m frames, in their order in time where motion is to be smooth. The result is finite for
+    all finite observations; frames without keypoints rest in the prior's usual pose, or with smooth motion are interpolated.
     """
+    fit = _fit_frames(model, observations, dataclasses.replace(config, smoothness=0.0))
+    return smooth_motion(model, observations, fit, config) if config.smoothness and len(fit.noise) > 2 else fit
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _fit_frames(model, observations, config):
+    """All stages but the motion."""
     problem = keypoint_problem(model, config)
     states, outcomes = jax.vmap(lambda seen: _fit_frame(problem, seen, config))(observations)
     observations = replace(observations, noise=_noise_found(problem, observations, states))
-    state, outcomes["person"] = _fit_person(problem, observations, states, config)
+    start = replace(states, betas=jnp.median(states.betas, axis=0))
+    residuals = lambda state: _person_residuals(problem, observations, state, config)
+    state, outcomes["person"] = solve(residuals, start, config.person_steps, method="lbfgs", tolerance=config.tolerance)
+    return _result(problem, observations.noise, state, outcomes, jnp.zeros(()))
+
+
+def _result(problem, noise, state, outcomes, smoothness):
     betas = betas_of(problem.origin, state)
-    poses = jax.vmap(lambda own: pose_of(problem.origin, own), in_axes=(frame_axes(state),))(state)
-    landmarks, joints = jax.vmap(lambda pose: pose_landmarks(model, betas, pose))(poses)
-    return LandmarkFit(betas, poses, landmarks, joints, observations.noise, state, outcomes)
+    poses = _poses(problem, state)
+    landmarks, joints = jax.vmap(lambda pose: pose_landmarks(problem.model, betas, pose))(poses)
+    return LandmarkFit(betas, poses, landmarks, joints, noise, state, outcomes, smoothness)
+
+
+def _poses(problem, state):
+    """The poses of a state of m frames, a batch."""
+    return jax.vmap(lambda own: pose_of(problem.origin, own), in_axes=(frame_axes(state),))(state)
 
 
 def keypoint_problem(model: LandmarkModel, config: FitConfig = FitConfig()) -> KeypointProblem:
@@ -136,9 +167,10 @@ def _rigid_starts(problem, observations, points, counts, kept) -> FitState:
     landmarks, joints = problem.landmarks_and_joints(resting)
     pelvis = joints[0]
     weights = trunk_weights(problem.model.names) * problem.known
+    product = functools.partial(jnp.matmul, precision=EXACT)
     turned = _kabsch(landmarks, points, weights * (counts >= 2))
     rotations = jnp.concatenate([turned[None], jnp.asarray(cube_rotations(), jnp.float32)])
-    positions = jax.vmap(lambda r: _position(observations, (landmarks - pelvis) @ r.T, weights))(rotations)
+    positions = jax.vmap(lambda r: _position(observations, product(landmarks - pelvis, r.T), weights))(rotations)
     vectors = quaternion.to_axis_angle(quaternion.from_matrix(rotations))
     start = lambda vector, position: replace(
         resting, global_orient=vector / math.radians(FREE.global_orient), transl=(position - pelvis) / FREE.transl
@@ -167,9 +199,11 @@ def _kabsch(a, b, weights):
     """The rotation about weighted centres that takes points a to b best; the identity where nothing is known."""
     share = weights / jnp.maximum(jnp.sum(weights), 1e-9)
     centered_a, centered_b = (x - jnp.sum(share[:, None] * x, axis=0) for x in (a, b))
-    u, _, vt = jnp.linalg.svd(jnp.einsum("k,ka,kb->ab", share, centered_b, centered_a) + 1e-9 * jnp.eye(3))
-    sign = jnp.sign(jnp.linalg.det(u @ vt))
-    return (u * jnp.stack([jnp.ones(()), jnp.ones(()), sign])) @ vt
+    u, _, vt = jnp.linalg.svd(
+        jnp.einsum("k,ka,kb->ab", share, centered_b, centered_a, precision=EXACT) + 1e-9 * jnp.eye(3)
+    )
+    sign = jnp.sign(jnp.linalg.det(jnp.matmul(u, vt, precision=EXACT)))
+    return jnp.matmul(u * jnp.stack([jnp.ones(()), jnp.ones(()), sign]), vt, precision=EXACT)
 
 
 def _position(observations, offsets, weights):
@@ -182,15 +216,15 @@ def _position(observations, offsets, weights):
     rows = rotation[:, None, :2] - xy[..., None] * rotation[:, None, 2:]
     right = xy * known[..., 2:] - known[..., :2]
     w = observations.confidences * weights
-    matrix = jnp.einsum("ck,ckia,ckib->ab", w, rows, rows)
-    vector = jnp.einsum("ck,ckia,cki->a", w, rows, right)
+    matrix = jnp.einsum("ck,ckia,ckib->ab", w, rows, rows, precision=EXACT)
+    vector = jnp.einsum("ck,ckia,cki->a", w, rows, right, precision=EXACT)
     scale = jnp.maximum(jnp.trace(matrix), 1e-9)
     return jnp.linalg.solve(matrix / scale + 1e-7 * jnp.eye(3), vector / scale)
 
 
 def _metres_per_pixel(seen, points, weights):
     """Metres per pixel at the person's distance."""
-    centers = -jnp.einsum("cba,cb->ca", seen.cam_from_world[:, :3, :3], seen.cam_from_world[:, :3, 3])
+    centers = transform.invert_rigid(seen.cam_from_world)[:, :3, 3]
     distance = jnp.linalg.norm(points - centers[:, None], axis=-1)
     each = distance / seen.K[:, :1, 0]
     return jnp.sum(weights * each) / jnp.maximum(jnp.sum(weights), 1e-6) + 1e-4
@@ -260,18 +294,94 @@ def _noise_found(problem, observations, states):
     return jax.vmap(of_frame)(observations, states)
 
 
-def _fit_person(problem, observations, states, config):
-    """All frames at once with one shape, and smooth motion."""
-    m = len(observations.noise)
+def _person_residuals(problem, observations, state, config):
+    """All frames at once with one shape."""
+    of_frame = lambda seen, own: frame_residuals(problem, seen, own, config.robust_scales[-1])
+    found = jax.vmap(of_frame, in_axes=(0, frame_axes(state)))(observations, state)
+    found["shape"] = problem.shape_weight * state.betas  # once, whatever the number of frames
+    return found
 
-    def residuals(state):
-        of_frame = lambda seen, own: frame_residuals(problem, seen, own, config.robust_scales[-1])
-        found = jax.vmap(of_frame, in_axes=(0, frame_axes(state)))(observations, state)
-        found["shape"] = problem.shape_weight * state.betas  # once, whatever the number of frames
-        if config.smoothness and m > 2:
-            joints = jax.vmap(lambda own: problem.landmarks_and_joints(own)[1], in_axes=(frame_axes(state),))(state)
-            found["motion"] = (joints[2:] - 2 * joints[1:-1] + joints[:-2]) / config.smoothness
-        return found
 
-    start = replace(states, betas=jnp.median(states.betas, axis=0))
-    return solve(residuals, start, config.person_steps, method="lbfgs", tolerance=config.tolerance)
+# Smooth motion -------------------------------------------------------------------------------------------------------
+
+MOTION_LEVELS = (64.0, 16.0, 4.0, 1.0)
+"""Multiples of the expected acceleration, one solve each. Weak ones first: frames that one view hardly determines come together
+before anything pulls hard."""
+MOTION_SCALE = 5.0
+"""Robust scale of accelerations, multiples of the expected one: a frame that shows somebody else hardly pulls the others."""
+FEW = 6
+"""Keypoints below which a frame's pose is mostly the prior's. Smooth motion interpolates it."""
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def smooth_motion(model: LandmarkModel, observations: Observations, fit: LandmarkFit, config: FitConfig) -> LandmarkFit:
+    """A fit whose joints move as smoothly as `config.smoothness` expects, and as its keypoints allow.
+
+    Arguments: observations: those of the fit. fit: without smooth motion, of at least three frames.
+
+    The result is that of the last of `MOTION_LEVELS` which follows the keypoints of every frame as well as the fit does, up to
+    their noise: the robust cost of a frame may exceed the fit's by the number of its unknowns. That is twice what the true pose
+    exceeds it by on average, because a fit with p unknowns takes up p of the squared normal errors and half of them are the cost.
+    If no level does, the fit itself.
+    """
+    problem = keypoint_problem(model, config)
+    seen = replace(observations, noise=fit.noise)
+    axes = frame_axes(fit.state)
+
+    def costs(state):
+        """(m,) of the keypoints of each frame."""
+        landmarks = jax.vmap(lambda own: problem.landmarks_and_joints(own)[0], in_axes=(axes,))(state)
+        errors = lambda each, points: half_squares(keypoint_residuals(model, each, points, config.robust_scales[-1]))
+        return jax.vmap(errors)(seen, landmarks)
+
+    observed = 2 * jnp.sum(seen.confidences * problem.known > 0, axis=(1, 2))
+    limit = costs(fit.state) + jnp.minimum(6 + 3 * len(problem.origin.joints), observed)
+
+    def run(carry, std):
+        state, kept, smoothness = carry
+
+        def residuals(y):
+            joints = jax.vmap(lambda own: problem.landmarks_and_joints(own)[1], in_axes=(axes,))(y)
+            motion = robust(accelerations(joints) / std, MOTION_SCALE)
+            return _person_residuals(problem, seen, y, config) | {"motion": motion}
+
+        state, outcome = solve(residuals, state, config.person_steps, method="lbfgs", tolerance=config.tolerance)
+        good = jnp.all(costs(state) <= limit)
+        kept, smoothness = jax.tree.map(lambda new, old: jnp.where(good, new, old), (state, std), (kept, smoothness))
+        return (state, kept, smoothness), outcome
+
+    start = _bridged(problem, seen, fit.state)
+    kept = jax.tree.map(lambda new, old: jnp.where(jnp.all(costs(start) <= limit), new, old), start, fit.state)
+    carry = (start, kept, jnp.zeros(()))
+    (_, state, smoothness), outcomes = jax.lax.scan(run, carry, config.smoothness * jnp.asarray(MOTION_LEVELS))
+    return _result(problem, fit.noise, state, fit.outcomes | {"motion": outcomes}, smoothness)
+
+
+def accelerations(joints: Float[Array, "m j 3"] | Float[np.ndarray, "m j 3"]) -> Any:
+    """(m - 2, j, 3) of the frames but the first and the last, metres per frame squared."""
+    return joints[2:] - 2 * joints[1:-1] + joints[:-2]
+
+
+def _bridged(problem, seen, state):
+    """The state with the poses of frames that show nothing interpolated between their nearest neighbours that show something."""
+    m = len(seen.noise)
+    shown = jnp.sum(jnp.any(seen.confidences * problem.known > 0, axis=1), axis=1) >= FEW
+    frames = jnp.arange(m)
+    before = jax.lax.cummax(jnp.where(shown, frames, -1))
+    after = jax.lax.cummin(jnp.where(shown, frames, m), reverse=True)
+    low, high = jnp.where(before < 0, after, before), jnp.where(after >= m, before, after)
+    low, high = (jnp.clip(x, 0, m - 1) for x in (low, high))
+    share = (frames - low) / jnp.maximum(high - low, 1)
+    poses, betas = _poses(problem, state), betas_of(problem.origin, state)
+    rotations, translations = poses.rotations, poses.translation
+    between = replace(
+        poses,
+        rotations=quaternion.interpolate(rotations[low], rotations[high], share[:, None]),
+        translation=translations[low] + share[:, None] * (translations[high] - translations[low]),
+    )
+    bridged = jax.vmap(lambda pose: state_of(problem.origin, betas, pose))(between)
+    pick = lambda new, old: jnp.where(shown.reshape(m, *[1] * (old.ndim - 1)), old, new)
+    moved = {
+        name: pick(getattr(bridged, name), getattr(state, name)) for name in ("global_orient", "transl", "body_pose")
+    }
+    return replace(state, **moved)

@@ -21,6 +21,7 @@ from humangs_jax.fitting.residuals.colors import Likeness, color_residuals, like
 from humangs_jax.fitting.solve import Outcome, solve
 from humangs_jax.fitting.state import cameras_of, pose_of
 from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.transform import EXACT
 
 LEAST_GAIN = 0.2
 """Share of the loss that a kept change removes. Masks of clothes are fitted a little better by wrong bodies: for four people who
@@ -177,9 +178,10 @@ def how_far(start: Capture, refined: Capture) -> dict[str, float]:
     rotations, transl_cm of the root.
     """
     a, b = start.cameras, refined.cameras
-    relative = jnp.matmul(b.cam_from_world[:, :3, :3], jnp.swapaxes(a.cam_from_world[:, :3, :3], -1, -2))
+    product = functools.partial(jnp.matmul, precision=EXACT)
+    relative = product(b.cam_from_world[:, :3, :3], jnp.swapaxes(a.cam_from_world[:, :3, :3], -1, -2))
     joints = lambda capture: quaternion.matrix_from_axis_angle(capture.poses.rotations)
-    between = jnp.matmul(jnp.swapaxes(joints(start), -1, -2), joints(refined))
+    between = product(jnp.swapaxes(joints(start), -1, -2), joints(refined))
     length = lambda x: float(np.linalg.norm(np.asarray(x), axis=-1).mean())
     degrees = lambda rotations: np.degrees(length(quaternion.to_axis_angle(quaternion.from_matrix(rotations))))
     return {

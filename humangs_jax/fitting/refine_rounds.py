@@ -14,7 +14,7 @@ import numpy as np
 
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, landmark_model, landmarks_from, pose_joints, pose_landmarks
-from humangs_jax.body.model import BodyModel, BodyPose, pose_body, pose_features, shape_body
+from humangs_jax.body.model import BodyModel, BodyPose, pose_body, pose_features, shape_body, without_expression
 from humangs_jax.body.skinning import EXACT
 from humangs_jax.body.surface_points import SurfacePoints, pose_points
 from humangs_jax.core.array_types import Array, Bool, Float
@@ -96,7 +96,7 @@ def capture_origin(capture: Capture, cameras: Camera, config: CaptureRefineConfi
     body = capture.body
     named = [j for j, name in enumerate(body.joint_names) if name in BODY_NAMES]
     joints = tuple(j for j in named or range(len(body.parents)) if body.parents[j] >= 0)
-    wanted = max(len(capture.betas), min(config.coefficients, body.shape_directions.shape[-1]))
+    wanted = max(len(capture.betas), min(config.coefficients, without_expression(body).shape_directions.shape[-1]))
     return Origin(
         betas=jnp.pad(jnp.asarray(capture.betas, jnp.float32), (0, wanted - len(capture.betas))),
         pose=capture.poses,

@@ -54,7 +54,7 @@ def render_scan_views(
     K = intrinsics_from_fov(FIELD_OF_VIEW, size, size)
     cameras = orbit(jnp.zeros(3), DISTANCE, angles, 0.1, K, size, size)
     drawn = _draw(align(vertices), np.asarray(mesh.faces), _colors(mesh), cameras, views)
-    replace_folder(out, lambda folder: _write(folder, drawn, cameras, align))
+    replace_folder(out, lambda folder: _write(folder, drawn, cameras, align), mark=SCAN_FILE)
     return out
 
 

@@ -61,6 +61,11 @@ def solve(
     Arguments: residuals: any pytree. steps: at most. tolerance: of the unknowns and, relatively, of the loss. free: pytree of
     booleans like start; the others stay. Returns the solution, or the start where that is no worse, and so finite numbers.
     """
+    with jax.default_matmul_precision("highest"):  # the solvers' own products, too
+        return _solve(residuals, start, steps, method, tolerance, free)
+
+
+def _solve(residuals, start, steps, method, tolerance, free):
     import lineax
     import optimistix
 

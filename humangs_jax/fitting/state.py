@@ -197,7 +197,7 @@ def clothing_thickness(origin: Origin, state: FitState, weights: Float[Array, "*
     """Metres by which masks reach beyond the body, at points with these skinning weights; 0 without clothing."""
     if origin.segment is None or state.clothing is None:
         return jnp.zeros(weights.shape[:-1])
-    return origin.std.clothing * jnp.matmul(weights, state.clothing[origin.segment])
+    return origin.std.clothing * jnp.matmul(weights, state.clothing[origin.segment], precision=EXACT)
 
 
 def scale_of(state: FitState) -> Float[Array, ""]:

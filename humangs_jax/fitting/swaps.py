@@ -123,6 +123,7 @@ def find_mirrored(
     given = Order.given(observations.points.shape[0], observations.points.shape[1])
     everywhere = dataclasses.replace(given, mirrored=~given.mirrored)
     mirrored = arranged(observations, np.asarray(kind.mirror), everywhere)
+    config = dataclasses.replace(config, smoothness=0.0)  # that stage comes later
     # the last stage in units of the expected noise: stage "person" has the noise that each fit found for itself
     cost, other = (float(x.outcomes["hands"].after.sum()) for x in (fit, fit_landmarks(model, mirrored, config)))
     better = other < MIRRORED_SHARE * cost or other < cost - MIRRORED_GAIN

@@ -11,6 +11,7 @@ import numpy as np
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.fitting.residuals.keypoints import Observations, focal_lengths, in_cameras
+from humangs_jax.geometry.transform import EXACT
 
 RIDGE = 1e-6
 """Share of the weights that pulls towards the cameras: parallel rays leave the distance open."""
@@ -82,8 +83,10 @@ def _rays(observations):
     rotation, translation = observations.cam_from_world[:, :3, :3], observations.cam_from_world[:, :3, 3]
     xy = (observations.points - observations.K[:, None, :2, 2]) / focal_lengths(observations)
     local = jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
-    directions = safe_normalize(jnp.einsum("cba,ckb->cka", rotation, local), jnp.asarray([0.0, 0.0, 1.0]))
-    return -jnp.einsum("cba,cb->ca", rotation, translation), directions
+    directions = safe_normalize(
+        jnp.einsum("cba,ckb->cka", rotation, local, precision=EXACT), jnp.asarray([0.0, 0.0, 1.0])
+    )
+    return -jnp.einsum("cba,cb->ca", rotation, translation, precision=EXACT), directions
 
 
 def _nearest(origins, directions, weights):
@@ -91,6 +94,6 @@ def _nearest(origins, directions, weights):
     center = jnp.mean(origins, axis=0)  # against rounding far from the world's origin
     across = jnp.eye(3) - directions[..., :, None] * directions[..., None, :]
     scale = weights / jnp.maximum(jnp.sum(weights, axis=0), 1e-12)
-    matrix = jnp.einsum("ck,ckab->kab", scale, across) + RIDGE * jnp.eye(3)
-    vector = jnp.einsum("ck,ckab,cb->ka", scale, across, origins - center)
+    matrix = jnp.einsum("ck,ckab->kab", scale, across, precision=EXACT) + RIDGE * jnp.eye(3)
+    vector = jnp.einsum("ck,ckab,cb->ka", scale, across, origins - center, precision=EXACT)
     return jnp.linalg.solve(matrix, vector[..., None])[..., 0] + center

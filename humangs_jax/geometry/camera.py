@@ -124,7 +124,7 @@ def look_at(eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, 
     right = safe_normalize(jnp.cross(forward, up), jnp.asarray([1.0, 0.0, 0.0]))
     down = jnp.cross(forward, right)
     rotation = jnp.stack([right, down, forward])
-    return Camera(K, transform.make(rotation, -rotation @ eye), width, height)
+    return Camera(K, transform.make(rotation, -jnp.matmul(rotation, eye, precision=transform.EXACT)), width, height)
 
 
 def orbit(
@@ -157,7 +157,7 @@ def pixel_rays(camera: Camera) -> tuple[Float[Array, "3"], Float[Array, "h w 3"]
     x, y = jnp.meshgrid(x, y)
     in_camera = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
     in_camera = in_camera / jnp.linalg.norm(in_camera, axis=-1, keepdims=True)  # z = 1: the norm is at least 1
-    return camera.center, in_camera @ camera.cam_from_world[:3, :3]
+    return camera.center, jnp.matmul(in_camera, camera.cam_from_world[:3, :3], precision=transform.EXACT)
 
 
 def plucker_rays(camera: Camera) -> Float[Array, "h w 6"]:

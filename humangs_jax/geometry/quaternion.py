@@ -136,3 +136,12 @@ def to_axis_angle(q: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
     turned = squared > SMALLEST_SQUARE
     sine = jnp.sqrt(jnp.where(turned, squared, 1.0))
     return q[..., 1:] * jnp.where(turned, 2 * jnp.arctan2(sine, q[..., :1]) / sine, 2.0)
+
+
+def interpolate(a: Float[Array, "*#b 3"], b: Float[Array, "*#b 3"], share: Float[Array, "*#b"]) -> Float[Array, "*b 3"]:
+    """The rotation vector that many shares of the shortest way from a to b: spherical linear interpolation (Shoemake 1985,
+    https://doi.org/10.1145/325165.325242).
+    """
+    start = from_axis_angle(a)
+    turn = to_axis_angle(multiply(from_axis_angle(-a), from_axis_angle(b)))
+    return to_axis_angle(multiply(start, from_axis_angle(share[..., None] * turn)))

@@ -5,6 +5,7 @@ later process writes to the same place; an old folder that it had already moved 
 """
 
 import contextlib
+import errno
 import functools
 import os
 import platform
@@ -13,12 +14,16 @@ import shutil
 import time
 import uuid
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
 """A temporary file of another machine (on a shared disk) is abandoned when it was not touched for this long."""
+WRITERS = 8
+"""Processes that may replace one folder at the same time: so often the renames are tried."""
+TOLD = 12
+"""Entries of a folder that are named before it is deleted; the others are counted."""
 _TEMPORARY = re.compile(
     r"\.(?P<name>.+)\.(?P<kind>new|old)-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-[0-9a-f]{8}(\.[^.]*)?"
 )
@@ -51,69 +56,134 @@ def replace_file(path: str | os.PathLike, write: Callable[[Path], object]) -> No
         temporary.unlink(missing_ok=True)
 
 
-def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object]) -> None:
+def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *, mark: str) -> None:
     """Calls write(temporary), which makes that folder, and renames it to `folder`; an existing one is replaced.
 
     The existing folder is moved aside first and deleted last, so its contents are never lost. Parents are made.
 
+    Arguments: mark: a file that all folders of this kind hold; a filled folder without it is not replaced.
     Raises: ValueError, see `check_replaceable`; whatever `write` raises.
     """
     folder = Path(folder)
-    check_replaceable(folder)
+    check_replaceable(folder, mark=mark)
     folder.parent.mkdir(parents=True, exist_ok=True)
     _sweep(folder.parent.resolve())
     tag = _tag()
     temporary, aside = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("new", "old"))
     try:
         write(temporary)
-        try:
-            if folder.is_dir():
-                folder.rename(aside)
-            temporary.rename(folder)
-        except BaseException:
-            if aside.is_dir() and not folder.exists():
-                aside.rename(folder)
-            raise
+        _exchange(folder, temporary, aside)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     shutil.rmtree(aside, ignore_errors=True)
 
 
-def check_replaceable(folder: str | os.PathLike, overwrite: bool = True, mark: str | None = None) -> None:
-    """Raises: ValueError for what `replace_folder` refuses: a symbolic link, a file, the working folder or one above it.
+def _exchange(folder, temporary, aside):
+    """Rename `folder` to `aside` and `temporary` to `folder`. Where another process is faster, its folder is replaced too."""
+    for left in reversed(range(WRITERS)):
+        try:
+            with contextlib.suppress(FileNotFoundError):
+                folder.rename(aside)
+            temporary.rename(folder)
+            return
+        except BaseException as error:
+            if not folder.exists() and aside.is_dir():
+                with contextlib.suppress(OSError):  # another process has made the folder meanwhile
+                    aside.rename(folder)
+            if not left or not isinstance(error, OSError) or error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+            shutil.rmtree(aside, ignore_errors=True)  # replaced by the other process
 
-    mark: a file that all folders of this kind hold. Then the folder has to be empty or, with `overwrite`, of this kind.
+
+def check_replaceable(
+    folder: str | os.PathLike,
+    overwrite: bool = True,
+    mark: str | None = None,
+    inputs: Iterable[str | os.PathLike | None] = (),
+) -> None:
+    """Whether a folder can be replaced, to be asked before the work begins.
+
+    Arguments: mark: a file that all folders of this kind hold. Then the folder has to be empty or, with `overwrite`, of this
+    kind. inputs: what the work reads (None is left out); it may not lie in the folder, which would delete it.
+    Raises: ValueError for one of these, and for a symbolic link, a file, the working folder or one above it, a mount point, or a
+    folder beside which nothing can be written.
     """
     folder = Path(folder)
     if folder.is_symlink():
         raise ValueError(f"{folder}: is a symbolic link: expected the folder itself")
-    if folder.exists() and not folder.is_dir():
+    if folder.is_file():
         raise ValueError(f"{folder}: is a file: expected a folder name")
-    if Path.cwd().is_relative_to(folder.resolve()):
+    place = folder.resolve()
+    if Path.cwd().is_relative_to(place):
         raise ValueError(f"{folder}: is the working folder or contains it: expected another folder")
-    if mark is None or not folder.is_dir() or not any(folder.iterdir()):
+    if os.path.ismount(folder):
+        raise ValueError(f"{folder}: is a mount point, which cannot be renamed: expected a folder in it")
+    above = next(parent for parent in place.parents if parent.exists())
+    if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)):
+        raise ValueError(f"{folder}: cannot be made: {above} cannot be written to")
+    for path in (Path(path) for path in inputs if path is not None):
+        if place.exists() and any(real.is_relative_to(place) for real in (path.resolve(), path.absolute())):
+            raise ValueError(f"{folder}: {path} lies in it and would be deleted: expected another folder")
+    entries = _entries(folder)
+    if mark is None or not entries:
         return
-    if not overwrite:
-        raise ValueError(f"{folder}: the folder is not empty: choose another one or ask to overwrite it")
-    if not (folder / mark).is_file():
+    if mark not in entries:
         raise ValueError(f"{folder}: the folder holds no {mark}: refusing to overwrite something else")
+    if not overwrite:
+        problem = f"{folder}: the folder is not empty: choose another one or ask to overwrite it"
+        raise ValueError(f"{problem}, which deletes {contents(folder)}")
 
 
-def add_files(folder: str | os.PathLike, write: Callable[[Path], object]) -> None:
-    """Calls write(temporary folder), then moves its files into `folder`, which is made if needed; other files there stay.
+def contents(folder: str | os.PathLike) -> str:
+    """What is in a folder, in a few words: "capture.json, images (60 files)"; empty if there is nothing."""
+    entries = _entries(folder)
+    told = [_told(Path(folder, entry)) for entry in entries[:TOLD]]
+    return ", ".join(told) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
 
-    Nothing is moved if `write` raises.
+
+def _entries(folder):
+    """Names in a folder, sorted; none if it does not exist (any more: another process may be replacing it)."""
+    try:
+        return sorted(os.listdir(folder))
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def _told(entry):
+    if entry.is_symlink() or not entry.is_dir():
+        return entry.name
+    count = sum(len(files) for _, _, files in os.walk(entry))
+    return f"{entry.name} ({count} file{'' if count == 1 else 's'})"
+
+
+def add_files(
+    folder: str | os.PathLike, write: Callable[[Path], object], *, without: Iterable[str | os.PathLike] = ()
+) -> None:
+    """Calls write(temporary folder), then moves its files to the same places in `folder`; other files there stay.
+
+    The folder is made if needed. Nothing is moved if `write` raises; the moves follow each other at once, so that a kill seldom
+    falls between two. The folder may be a mount point or the working folder.
+
+    Arguments: without: files in the folder that no longer hold; they are removed before the first move.
     """
     folder = Path(folder)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    _sweep(folder.parent.resolve())
-    temporary = folder.resolve().with_name(f".{folder.resolve().name}.new-{_tag()}")
+    inside = folder.is_dir()  # on the same disk, even if others hold the folder and what is beside it
+    if inside:
+        _sweep(folder.resolve())
+    else:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        _sweep(folder.parent.resolve())
+    temporary = (folder if inside else folder.parent) / f".{folder.resolve().name}.new-{_tag()}"
     temporary.mkdir()
     try:
         write(temporary)
         folder.mkdir(exist_ok=True)
-        for file in temporary.iterdir():
-            file.replace(folder / file.name)
+        for file in without:
+            (folder / file).unlink(missing_ok=True)
+        for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
+            target = folder / file.relative_to(temporary)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            file.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 

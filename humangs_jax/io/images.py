@@ -42,10 +42,10 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     return colours[..., 0] if (colours == colours[..., :1]).all() else colours.mean(axis=-1)
 
 
-def write_png(path: str | Path, image: Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w"]) -> None:
+def write_png(path: str | Path, image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"]) -> None:
     """Write colours or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside are clipped.
 
-    The file appears whole or not at all. Raises: OSError if it cannot be written.
+    A fourth channel is alpha. The file appears whole or not at all. Raises: OSError if it cannot be written.
     """
     from PIL import Image
 

@@ -125,7 +125,7 @@ def export_scan(
         _write_mesh(temporary, posed.vertices[baked.atlas.vertices], baked, texture, formats)
         write_json(temporary / PARAMETERS, known, indent=None)
 
-    replace_folder(folder, write)
+    replace_folder(folder, write, mark=PARAMETERS)
     return Path(folder)
 
 

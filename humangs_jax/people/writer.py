@@ -147,7 +147,7 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
             pose = BodyPose(jnp.asarray(posed[0].rotations), jnp.asarray(posed[0].translation))
             export_scan(subject, temporary / "scan", pose, lit=True, texture_size=layout.scan_texture)
 
-    replace_folder(folder, write)
+    replace_folder(folder, write, mark="capture.json")
 
 
 def write_subject(

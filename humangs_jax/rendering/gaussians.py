@@ -48,14 +48,14 @@ def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Fl
     quats = quaternion.normalize(gaussians.quats) if normalize_quats else gaussians.quats
     factors = quaternion.to_matrix(quats) * gaussians.scales[:, None, :]
     if gaussians.deformations is not None:
-        factors = gaussians.deformations @ factors
+        factors = jnp.matmul(gaussians.deformations, factors, precision=transform.EXACT)
     return factors
 
 
 def covariances(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:
     """World-space covariance matrices, metres^2."""
     factors = covariance_factors(gaussians, normalize_quats)
-    return jnp.einsum("gik,gjk->gij", factors, factors)
+    return jnp.einsum("gik,gjk->gij", factors, factors, precision=transform.EXACT)
 
 
 def factored(gaussians: Gaussians) -> Gaussians:
@@ -82,11 +82,14 @@ def skin_gaussians(
     """
     linear, means = transforms[:, :3, :3], transform.apply(transforms, gaussians.means)
     if mode == "affine":
-        deformations = linear if gaussians.deformations is None else linear @ gaussians.deformations
+        deformations = linear
+        if gaussians.deformations is not None:
+            deformations = jnp.matmul(linear, gaussians.deformations, precision=transform.EXACT)
         return replace(gaussians, means=means, deformations=deformations)
     if mode != "rotation":
         raise ValueError(f"skinning mode must be 'affine' or 'rotation', got {mode!r}")
     if gaussians.deformations is not None:
         raise ValueError("'rotation' skinning keeps quaternions only: these Gaussians are deformed already")
     rotations = quaternion.to_matrix(quaternion.normalize(gaussians.quats))
-    return replace(gaussians, means=means, quats=quaternion.from_matrix(linear @ rotations))
+    turned = jnp.matmul(linear, rotations, precision=transform.EXACT)
+    return replace(gaussians, means=means, quats=quaternion.from_matrix(turned))

@@ -90,8 +90,9 @@ def _project(gaussians, camera, config):
         [jnp.broadcast_to(jnp.eye(2, dtype=at.dtype), (*depths.shape, 2, 2)), -at[..., None]], axis=-1
     )
     jacobian = focal[:, None] * jacobian / depths[:, None, None]
-    image_from_world = jacobian @ camera.cam_from_world[:3, :3]
-    axes = image_from_world @ covariance_factors(gaussians, config.normalize_quats)
+    product = functools.partial(jnp.matmul, precision=transform.EXACT)
+    image_from_world = product(jacobian, camera.cam_from_world[:3, :3])
+    axes = product(image_from_world, covariance_factors(gaussians, config.normalize_quats))
     small = jnp.all(jnp.abs(axes) < LARGEST_FOOTPRINT, axis=(1, 2))
     return slopes * focal + center, jnp.where(small[:, None, None], axes, 0.0), depths, visible & small
 

@@ -131,3 +131,18 @@ SPLAT_PRESETS = {
 }
 """exact: every alpha of 1/255 and more, in float32. near_exact and fast: see docs/performance.md for their errors and
 gains. inria: the conventions of diff-gaussian-rasterization, which the published weights were trained with."""
+
+
+def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:
+    """The configuration with the conventions of drawing that weights record, "exact" or "inria".
+
+    It is returned as it is where it has none of the other conventions: other knobs are the user's.
+    """
+    wanted, other = (
+        SPLAT_PRESETS[name] for name in (("exact", "inria") if rendering == "exact" else ("inria", "exact"))
+    )
+    if all(getattr(config, name) != getattr(other, name) for name in ("jacobian_margin", "normalize_quats", "square")):
+        return config
+    names = [field.name for field in dataclasses.fields(config)]
+    differing = [name for name in names if getattr(wanted, name) != getattr(other, name)]
+    return dataclasses.replace(config, **{name: getattr(wanted, name) for name in differing})

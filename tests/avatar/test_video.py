@@ -1,4 +1,5 @@
 import subprocess
+import weakref
 
 import numpy as np
 import pytest
@@ -45,6 +46,28 @@ def test_frames_come_back(tmp_path, name):
     red = back[5, 12:20, 14:22].mean((0, 1))  # inside the square: the colours of the matrix that the file names
     np.testing.assert_allclose(red, [0.9, 0.1, 0.1], atol=0.03)
     assert [p.name for p in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
+def test_frames_are_taken_one_by_one(tmp_path, name):
+    """The same file as of an array, and an error in the middle leaves nothing."""
+    frames, alive = moving_square(12), []
+
+    def drawn():
+        for frame in frames:
+            alive.append(weakref.ref(copy := frame.copy()))
+            yield copy
+            del copy
+            assert sum(each() is not None for each in alive) <= 2
+
+    write_video(tmp_path / name, drawn(), 24.0)
+    data = (tmp_path / name).read_bytes()
+    write_video(tmp_path / name, frames, 24.0)
+    assert (tmp_path / name).read_bytes() == data
+    (tmp_path / name).unlink()
+    with pytest.raises(ValueError, match="frame 12 has shape"):
+        write_video(tmp_path / name, (f for f in (*frames, frames[0, 1:])), 24.0)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_mp4_says_its_speed_and_pixel_format(tmp_path):

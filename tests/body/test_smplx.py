@@ -13,7 +13,7 @@ import scipy.sparse
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.body.model import BodyPose, pose_body, shape_body, without_expression
 from humangs_jax.body.smplx import assemble_pose, load_hands, load_smplx
 
 DATA = Path(__file__).parent / "data"
@@ -90,6 +90,15 @@ def test_an_npz_is_read_as_it_is(tmp_path):
     assert body.template.dtype == jnp.float32
     with jax.enable_x64(True):
         assert np.array_equal(load_smplx(tmp_path / "SMPLX_NEUTRAL.npz").template, arrays["v_template"])
+
+
+def test_expressions_are_no_shape_of_a_person(tmp_path):
+    np.savez(tmp_path / "SMPLX_NEUTRAL.npz", **made_up_file())
+    body = load_smplx(tmp_path / "SMPLX_NEUTRAL.npz", shape_count=3, expression_count=2)
+    shape = without_expression(body)
+    assert shape.shape_names == ("shape_0", "shape_1", "shape_2")
+    np.testing.assert_array_equal(shape.shape_directions, body.shape_directions[..., :3])
+    assert without_expression(shape) is shape
 
 
 def test_current_files_hold_expressions_after_300_columns(tmp_path):

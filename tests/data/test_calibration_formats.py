@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.data.calibration.file_storage import parse_file_storage
+from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture_checks import CaptureError
 from tests.data import calibration_files as written
@@ -107,6 +108,21 @@ def test_easymocap_with_three_decimals(tmp_path):
     for view in json.loads((tmp_path / "out" / "capture.json").read_text())["views"]:
         r = np.asarray(view["cam_from_world"])[:3, :3]
         np.testing.assert_allclose(r @ r.T, np.eye(3), atol=1e-12)  # rounded no longer
+
+
+def test_a_camera_whose_name_ends_another_one_keeps_its_own_lens(tmp_path):
+    K, poses = written.scene()
+    written.write_easymocap(tmp_path / "cams", K, poses, NAMES, decimals=9)
+    for file in (tmp_path / "cams").iterdir():
+        text = file.read_text().replace(f"_{NAMES[0]}:", "_1:").replace(f"_{NAMES[1]}:", "_a_1:")
+        file.write_text(text.replace(f'"{NAMES[0]}"', '"1"').replace(f'"{NAMES[1]}"', '"a_1"'))
+    intri = tmp_path / "cams" / "intri.yml"
+    kept = [line for line in intri.read_text().splitlines()]
+    intri.write_text("\n".join([*kept, "dist_a_1: [0.2, 0.0, 0.0, 0.0, 0.0]", ""]))
+    cameras = {camera.name: camera for camera in read_calibration(tmp_path / "cams", lambda name: (0, 0)).cameras}
+    assert cameras["1"].distortion is None
+    assert cameras["a_1"].distortion is not None and cameras["a_1"].distortion[0] == 0.2
+    np.testing.assert_allclose(cameras["1"].cam_from_world[:3, :3], poses[0, :3, :3], atol=1e-6)
 
 
 @pytest.mark.parametrize("key", ["R", "Rot"])

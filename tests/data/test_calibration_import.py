@@ -205,6 +205,24 @@ def test_alpha_becomes_a_mask_when_undistorted(rig):
         np.testing.assert_allclose(image[2, 2], 1)
 
 
+def test_alpha_stays_beside_masks_when_undistorted(rig, tmp_path):
+    """The mask says what the person is; what alpha leaves out is white all the same."""
+    distort_rig(rig[0], [0.1, 0, 0, 0, 0])
+    for file in FILES:
+        pixels = np.zeros((written.HEIGHT, written.WIDTH, 4), np.uint8)
+        pixels[10:30, 20:40] = (255, 0, 0, 255)
+        Image.fromarray(pixels).save(rig[1] / file)
+    written.write_photos(tmp_path / "masks", FILES, grey=True)
+    for file in FILES:
+        Image.fromarray(np.full((written.HEIGHT, written.WIDTH), 255, np.uint8)).save(tmp_path / "masks" / file)
+    import_rig(rig, masks=tmp_path / "masks")
+    for view in views_of(rig[2]):
+        image, mask = read_view(rig[2], view, on_white=False)
+        assert mask is not None and mask[20, 30] == mask[5, 30] == 1
+        np.testing.assert_allclose(image[20, 30], [1, 0, 0])
+        np.testing.assert_allclose(image[5, 30], 1)
+
+
 # Conventions -------------------------------------------------------------------------------------------------------
 
 FLIP = np.diag([1.0, -1, -1, 1])

@@ -12,6 +12,7 @@ import pytest
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import CaptureError, capture_from_arrays, load_capture, save_capture
+from humangs_jax.data.photos import names_from_paths
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import read_image, write_png
 
@@ -184,6 +185,13 @@ def test_views_of_one_name_stay_apart(folder):
         edit_json(folder, lambda d, i=i: d["views"][i].update(image=f"cam{i + 1}/0000.png"))
     names = load(folder).names
     assert names == ("cam1_0000", "cam2_0000", "images_002")
+
+
+def test_names_that_become_equal_stay_apart():
+    assert names_from_paths(["a b.png", "a_b.png"]) == ("000_a_b", "001_a_b")
+    assert names_from_paths(["x/a b.png", "y/a_b.png"]) == ("x_a_b", "y_a_b")
+    assert names_from_paths(["a b.png", "c.png"]) == ("a_b", "c")
+    assert names_from_paths(["..png", ".a.png", "a.png"]) == ("000_000", "001_a", "002_a")
 
 
 def test_a_body_file_is_referred_to_by_a_relative_path(folder, tmp_path, monkeypatch):

@@ -44,6 +44,16 @@ def test_views_without_an_entry_are_missing(tmp_path):
     assert keypoints.confidences[0].all() and not keypoints.confidences[1].any()
 
 
+def test_frames_that_were_matched_in_order_are_told(tmp_path):
+    """OpenPose and ffmpeg on one video: the former counts from 0, the latter from 1."""
+    content = [entry(f"clip_{i:012d}", shift=i) for i in range(3)]
+    (tmp_path / "k.json").write_text(json.dumps(content))
+    keypoints = read_keypoints(tmp_path / "k.json", [f"clip_{i + 1:06d}" for i in range(3)], *SIZE)
+    assert keypoints.points[:, 0, 0].tolist() == [100.5, 101.5, 102.5] and keypoints.missing == ()
+    assert keypoints.shifted == "clip_000000000000 is view clip_000001"
+    assert read(tmp_path / "k.json", [entry("front"), entry("back")]).shifted == ""
+
+
 @pytest.mark.parametrize("index", [0, 1, 2])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, None])
 def test_points_that_are_not_finite_are_dropped_and_counted(tmp_path, index, value):

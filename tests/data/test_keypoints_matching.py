@@ -18,6 +18,18 @@ CAMERAS = ("images_cam0_000000", "images_cam0_000012", "images_cam1_000000", "im
         (["cam1_000000000012", "cam0_000000000000"], CAMERAS, [3, 0]),  # OpenPose on videos
         (["cam1/12"], CAMERAS, [3]),  # MMPose on videos
         (["000012.png"], CAMERAS, [None]),  # of which camera?
+        # a video's frames from 0 and photos from 1, or the other way round: in order, for each video by itself
+        (["f_000000000000", "f_000000000001", "f_000000000002"], ("f_001", "f_002", "f_003"), [0, 1, 2]),
+        (["f_1", "f_3", "f_2"], ("f_000", "f_001", "f_002"), [0, 2, 1]),
+        (["b/0", "a/1", "b/1", "a/2"], ("v_a_1", "v_b_1", "v_a_2", "v_b_2"), [1, 0, 3, 2]),
+        (["a_0.jpg", "a_1.jpg", "b_0.jpg", "b_1.jpg"], ("a_1", "a_2", "b_0", "b_1"), [0, 1, 2, 3]),
+        (["0", "1"], ("000001", "000002"), [0, 1]),
+        # who knows: the numbers as they are
+        (["f_0", "f_1", "f_2", "f_3"], ("f_1", "f_2", "f_3"), [None, 0, 1, 2]),
+        (["f_0", "f_1"], ("f_1", "f_2", "f_3"), [None, 0]),
+        (["f_0", "f_2", "f_3"], ("f_1", "f_2", "f_3"), [None, 1, 2]),
+        (["cam_2", "cam_3"], ("cam_1", "cam_2"), [1, None]),
+        (["cam_0"], ("cam_1",), [None]),
         (["frame_0"], ("0",), [None]),
         (["1"], ("cam_1", "11"), [None]),
         (["cam0/000000", "cam1/000000"], ("000000",), "both"),

@@ -208,6 +208,20 @@ def test_a_broken_folder_is_skipped_counted_and_named(folder, tmp_path, caplog):
     assert all(any(name in r.getMessage() for r in caplog.records) for name in ("few", "nomask", "torn"))
 
 
+def test_captures_of_another_body_are_left_out(tmp_path):
+    """Its joints and coefficients have the same shapes, and would be posed as those of the body that is trained on."""
+    write_subject(tmp_path / "ours", 1)
+    write_subject(tmp_path / "smplx", 2)
+    file = tmp_path / "smplx" / "body.npz"
+    with np.load(file) as arrays:
+        np.savez(file, **{**arrays, "body": "../SMPLX_NEUTRAL.npz"})
+    source = loader_of(CaptureCache(find_captures(tmp_path), small_body()), SAMPLING, SIZE, SIZE)
+    assert [greys(source.source.example(0, index, 2).inputs)[0][0] for index in range(4)] == [1] * 4
+    assert "body: '../SMPLX_NEUTRAL.npz', but all captures of a run" in source.source.cache.broken[tmp_path / "smplx"]
+    others = CaptureCache(find_captures(tmp_path), small_body(), body_file=tmp_path / "SMPLX_NEUTRAL.npz")
+    assert others.outline(1) is not None and others.outline(0) is None
+
+
 def test_nothing_but_broken_folders_is_an_error_of_the_loop(tmp_path):
     write_subject(tmp_path / "few", 5, views=3)
     source = loader_of(CaptureCache(find_captures(tmp_path), small_body()), SAMPLING, SIZE, SIZE)

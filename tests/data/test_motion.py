@@ -317,14 +317,47 @@ def test_grounded_stands_on_the_floor_at_the_origin():
     np.testing.assert_allclose(joints[..., 1].min(), sole, atol=FLOAT32)
 
 
-def test_at_rate_takes_the_nearest_frames():
+@pytest.mark.parametrize("columns", [165, 156])
+def test_amass_adds_the_mean_hand_where_asked(tmp_path, columns):
+    basis = HandBasis(jnp.asarray(random((2, 45), 5), jnp.float32), jnp.asarray(random((2, 45, 45), 6), jnp.float32))
+    path = write(tmp_path / "a.npz", poses=upright_poses(columns), trans=np.zeros((FRAMES, 3)), mocap_framerate=30)
+    flat, mean = (load_motion(path, hands=basis, flat_hand_mean=x).rotations.reshape(FRAMES, -1) for x in (True, False))
+    np.testing.assert_array_equal(mean[:, :75], flat[:, :75])
+    added = np.broadcast_to(np.asarray(basis.means).ravel(), (FRAMES, 90))
+    np.testing.assert_allclose(mean[:, 75:] - flat[:, 75:], added, atol=FLOAT32)
+    body = load_motion(
+        write(tmp_path / "b.npz", **(AMASS | {"poses": upright_poses(66)})), hands=basis, flat_hand_mean=False
+    )
+    assert not np.asarray(body.rotations)[:, 22:].any()  # no hands, nothing to add to
+    with pytest.raises(MotionError, match="our own format holds whole rotations"):
+        load_motion(write(tmp_path / "c.npz", **OURS), hands=basis, flat_hand_mean=False)
+
+
+def test_at_rate_keeps_frames_and_interpolates_between_them():
     motion = Motion(jnp.zeros((120, 2, 3)), jnp.arange(120.0)[:, None] * jnp.ones(3), 120.0)
     slow = motion.at_rate(30)
     assert slow.fps == 30.0 and list(np.asarray(slow.translations)[:, 0]) == list(range(0, 120, 4))
     fast = motion.at_rate(240.0)
-    assert list(np.asarray(fast.translations)[:6, 0]) == [0, 1, 1, 2, 2, 3]
+    assert list(np.asarray(fast.translations)[:6, 0]) == [0, 0.5, 1, 1.5, 2, 2.5]
     assert len(fast.translations) == 240 and float(fast.translations[-1, 0]) == 119
     assert len(motion.at_rate(0.5).translations) == 1
+    with pytest.raises(ValueError, match="fps: expected a positive"):
+        motion.at_rate(0)
+
+
+def test_at_rate_turns_at_an_even_speed():
+    """30 to 60: about a fixed axis, through half a turn where rotation vectors jump, and between opposite vectors."""
+    axis = np.asarray([0.6, 0.0, 0.8])
+    angles = np.asarray([2.9, 3.1, 3.3, 3.5])
+    vectors = (angles - 2 * np.pi * (angles > np.pi))[:, None, None] * axis
+    motion = Motion(jnp.asarray(vectors, jnp.float32), jnp.zeros((4, 3)), 30.0)
+    fast = motion.at_rate(60)
+    np.testing.assert_array_equal(fast.rotations[::2], motion.rotations)
+    wanted = quaternion.from_axis_angle(
+        jnp.asarray(np.minimum(2.9 + 0.1 * np.arange(8), 3.5)[:, None] * axis, jnp.float32)
+    )
+    got = quaternion.from_axis_angle(fast.rotations[:, 0])
+    np.testing.assert_allclose(np.abs(np.sum(got * wanted, axis=-1)), 1, atol=FLOAT32)
 
 
 def test_motions_are_pytrees():

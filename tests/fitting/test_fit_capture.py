@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
 from humangs_jax.data.photos import load_photos
+from humangs_jax.fitting import files, fit_capture
 from humangs_jax.fitting.files import check_place, check_scan_folder, read_fit_record, write_fitted
 from humangs_jax.fitting.fit_capture import fit_photos
 from humangs_jax.fitting.scan_views import render_scan_views
@@ -75,6 +77,33 @@ def test_written_in_place_and_read_again(folder, fitted, tmp_path):
     check_place(path, None, overwrite=True)
 
 
+def test_a_fit_in_place_is_written_whole_or_not_at_all(folder, fitted, tmp_path, monkeypatch):
+    """Cameras that were moved belong to the body that was found with them."""
+    path = copied(folder[0], tmp_path)
+    write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
+    before = {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+    moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
+    capture = dataclasses.replace(fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved))
+    with monkeypatch.context() as broken, pytest.raises(OSError, match="disk full"):
+        broken.setattr(files, "write_json", lambda *_: (_ for _ in ()).throw(OSError("disk full")))
+        write_fitted(path, path, capture, fitted.report)
+    assert {file: file.read_bytes() for file in path.rglob("*") if file.is_file()} == before
+    write_fitted(path, path, capture, fitted.report)
+    assert not (path / "fit.npz").exists()
+    np.testing.assert_array_equal(load_capture(path).cameras.cam_from_world, moved)
+
+
+def test_a_body_in_a_folder_of_its_own_is_written_and_read_again(folder, fitted, tmp_path):
+    path = copied(folder[0], tmp_path)
+    description = json.loads((path / "capture.json").read_text()) | {"body": "params/body.npz"}
+    (path / "capture.json").write_text(json.dumps(description))
+    for out in (None, tmp_path / "out"):
+        target = check_place(path, out, overwrite=False)
+        write_fitted(path, target, fitted.capture, fitted.report, fitted.record)
+        np.testing.assert_array_equal(load_capture(target).betas, fitted.capture.betas)
+        assert (target / "params" / "body.npz").is_file()
+
+
 def test_records_of_earlier_versions_are_read(folder, fitted, tmp_path):
     path = copied(folder[0], tmp_path)
     write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
@@ -95,16 +124,32 @@ def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_p
     np.testing.assert_array_equal(again.cameras.cam_from_world, moved)
     np.testing.assert_array_equal(again.images, load_photos(folder[0]).images)
     assert not (target / "fit.npz").exists() and not (folder[0] / "body.npz").exists()
-    with pytest.raises(ValueError, match="not empty; --overwrite"):
+    with pytest.raises(
+        ValueError, match=r"the folder is not empty.*which deletes body\.npz, capture\.json, fit\.json, images "
+    ):
         check_place(folder[0], target, overwrite=False)
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "diary.txt").write_text("mine")
-    with pytest.raises(ValueError, match="no capture"):
+    with pytest.raises(ValueError, match=r"holds no capture\.json"):
         check_place(folder[0], tmp_path / "other", overwrite=True)
     inside = target / "held_out"
     write_fitted(folder[0], inside, capture, fitted.report)
-    with pytest.raises(ValueError, match="lies inside of it"):
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):
         check_place(inside, target, overwrite=True)
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):
+        write_fitted(inside, target, capture, fitted.report)
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):  # the keypoints, say
+        check_place(folder[0], target, overwrite=True, inputs=(None, target / "images"))
+    with pytest.raises(ValueError, match="lies in it and would be deleted"):  # a photo
+        check_place(linked(tmp_path / "linked", target), target, overwrite=True)
+
+
+def linked(folder, photos):
+    """A capture folder whose images are those of another one, through a link."""
+    folder.mkdir()
+    shutil.copyfile(photos / "capture.json", folder / "capture.json")
+    (folder / "images").symlink_to(photos / "images")
+    return folder
 
 
 def test_folders_that_cannot_be_replaced_are_refused_before_the_fit(folder, tmp_path, monkeypatch):
@@ -171,6 +216,16 @@ def test_a_damaged_record_is_one_error(folder, fitted, tmp_path, change, message
         read_fit_record(path / "fit.npz")
 
 
+def test_expressions_are_not_fitted_as_shape(folder, monkeypatch):
+    """Of SMPL-X, whose directions are those of the shape and then those of the face."""
+    fitted_to, body = [], default_body()
+    names = (*(f"shape_{i}" for i in range(body.shape_directions.shape[-1] - 1)), "expression_0")
+    monkeypatch.setattr(fit_capture, "landmark_model", lambda body, _: fitted_to.append(body) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        fit_photos(load_photos(folder[0]), folder[1], replace(body, shape_names=names))
+    assert fitted_to[0].shape_names == names[:-1] and fitted_to[0].shape_directions.shape[-1] == len(names) - 1
+
+
 def test_a_body_whose_root_is_not_first_is_refused(folder):
     body = default_body()
     strange = replace(body, parents=(1, -1, *body.parents[2:]))
@@ -179,6 +234,4 @@ def test_a_body_whose_root_is_not_first_is_refused(folder):
 
 
 def copied(folder, tmp_path):
-    import shutil
-
     return shutil.copytree(folder, tmp_path / "me")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation, Slerp
 
 from humangs_jax.geometry import quaternion
 
@@ -84,3 +85,15 @@ def test_zero_quaternion_is_the_identity_with_finite_gradient():
     gradient = jax.grad(lambda q: quaternion.to_matrix(quaternion.normalize(q)).sum())(jnp.zeros(4))
     assert np.isfinite(gradient).all()
     assert np.isfinite(jax.grad(lambda m: quaternion.from_matrix(m).sum())(jnp.eye(3))).all()
+
+
+def test_interpolation_goes_the_shortest_way_at_an_even_speed():
+    """scipy's Slerp, through half a turn and between rotation vectors that are far apart but nearly one rotation."""
+    rng = np.random.default_rng(5)
+    a, b = rng.normal(0, 1.5, (2, 20, 3)).astype(np.float32)
+    a[0], b[0] = [0, 3.1, 0], [0, -3.1, 0]
+    a[1], b[1] = 0, 0
+    share = np.linspace(0, 1, 20, dtype=np.float32)
+    got = Rotation.from_rotvec(np.asarray(jax.jit(quaternion.interpolate)(a, b, share)))
+    ways = [Slerp([0, 1], Rotation.from_rotvec([x, y]))(t) for x, y, t in zip(a, b, share, strict=True)]
+    assert max((one.inv() * other).magnitude() for one, other in zip(got, ways, strict=True)) < 1e-5

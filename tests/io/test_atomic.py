@@ -3,11 +3,16 @@
 import os
 import subprocess
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
 
 from humangs_jax.io import atomic
+
+MARK = "a.txt"
+"""A file that all folders of these tests hold."""
 
 
 class Interrupted(BaseException):
@@ -26,6 +31,10 @@ def folder_with(path, text):
 
 def writes(text):
     return lambda temporary: folder_with(temporary, text)
+
+
+def writes_into(text):
+    return lambda temporary: (temporary / "a.txt").write_text(text)
 
 
 @pytest.fixture
@@ -56,7 +65,7 @@ def test_a_failed_write_changes_nothing(tmp_path, error):
     with pytest.raises(error):
         atomic.replace_file(tmp_path / "file.txt", fail_file)
     with pytest.raises(error):
-        atomic.replace_folder(tmp_path / "folder", fail_folder)
+        atomic.replace_folder(tmp_path / "folder", fail_folder, mark=MARK)
     with pytest.raises(error):
         atomic.add_files(tmp_path / "folder", lambda temporary: fail_file(temporary / "a.txt"))
     assert names(tmp_path) == ["file.txt", "folder"]
@@ -66,13 +75,19 @@ def test_a_failed_write_changes_nothing(tmp_path, error):
 def test_writes_replace_and_leave_nothing_temporary(tmp_path):
     for text in ("one", "two"):
         atomic.write_text(tmp_path / "file.txt", text)
-        atomic.replace_folder(tmp_path / "deep" / "folder", writes(text))
+        atomic.replace_folder(tmp_path / "deep" / "folder", writes(text), mark=MARK)
         assert (tmp_path / "file.txt").read_text() == (tmp_path / "deep" / "folder" / "a.txt").read_text() == text
     (tmp_path / "deep" / "folder" / "mine.txt").write_text("kept")
     atomic.add_files(tmp_path / "deep" / "folder", lambda temporary: atomic.write_text(temporary / "a.txt", "three"))
     assert (tmp_path / "deep" / "folder" / "a.txt").read_text() == "three"
     assert names(tmp_path) == ["deep", "file.txt"] and names(tmp_path / "deep") == ["folder"]
     assert names(tmp_path / "deep" / "folder") == ["a.txt", "mine.txt"]
+    deeper = lambda temporary: folder_with(temporary / "b" / "c", "four")
+    atomic.add_files(tmp_path / "deep" / "folder", deeper, without=("mine.txt", "none.txt"))
+    assert names(tmp_path / "deep" / "folder") == ["a.txt", "b"] and names(tmp_path / "deep") == ["folder"]
+    assert (tmp_path / "deep" / "folder" / "b" / "c" / "a.txt").read_text() == "four"
+    atomic.add_files(tmp_path / "deep" / "new", writes_into("five"))
+    assert (tmp_path / "deep" / "new" / "a.txt").read_text() == "five"
     with pytest.raises(FileNotFoundError, match="no such folder"):
         atomic.write_text(tmp_path / "none" / "file.txt", "text")
 
@@ -90,7 +105,7 @@ def test_an_interrupt_between_the_renames_loses_nothing(tmp_path, monkeypatch, r
 
     monkeypatch.setattr(Path, "rename", interrupted)
     with pytest.raises(Interrupted):
-        atomic.replace_folder(folder, writes("new"))
+        atomic.replace_folder(folder, writes("new"), mark=MARK)
     assert names(tmp_path) == ["folder"] and (folder / "a.txt").read_text() == "old"
 
 
@@ -103,7 +118,7 @@ def test_what_killed_processes_left_is_swept(tmp_path, dead_process):
     old = folder_with(leftover(target, "new", dead_process, machine="00000001"), "of another machine, long ago")
     os.utime(old, (0, 0))
     (tmp_path / ".hidden").write_text("not ours")
-    atomic.replace_folder(target, writes("new"))
+    atomic.replace_folder(target, writes("new"), mark=MARK)
     assert len(names(tmp_path)) == 4
     assert ".hidden" in names(tmp_path) and leftover(target, "new", os.getpid()).is_dir()
     assert leftover(target, "new", dead_process, machine="00000000").is_dir()
@@ -117,7 +132,7 @@ def test_a_folder_that_a_killed_process_moved_aside_is_put_back(tmp_path, dead_p
         raise OSError("disk full")
 
     with pytest.raises(OSError, match="disk full"):
-        atomic.replace_folder(target, fail)
+        atomic.replace_folder(target, fail, mark=MARK)
     assert names(tmp_path) == ["folder"] and (target / "a.txt").read_text() == "old"
 
 
@@ -134,5 +149,82 @@ def test_links_files_and_the_working_folder_are_refused_before_the_work(tmp_path
         (tmp_path / "real", "working folder"),
     ):
         with pytest.raises(ValueError, match=problem):
-            atomic.replace_folder(folder, never)
+            atomic.replace_folder(folder, never, mark=MARK)
     assert (tmp_path / "real" / "a.txt").read_text() == "old"
+
+
+def test_only_folders_of_the_kind_are_replaced_and_none_that_holds_an_input(tmp_path):
+    folder, thesis = folder_with(tmp_path / "docs", "of our kind"), tmp_path / "docs" / "thesis.tex"
+    thesis.write_text("dear")
+    (tmp_path / "docs" / "deep").mkdir()
+    (tmp_path / "docs" / "deep" / "b.txt").write_text("b")
+    assert atomic.contents(folder) == "a.txt, deep (1 file), thesis.tex" and atomic.contents(tmp_path / "none") == ""
+    never = lambda temporary: pytest.fail("the work has begun")
+    with pytest.raises(ValueError, match=r"holds no capture\.json: refusing"):
+        atomic.replace_folder(folder, never, mark="capture.json")
+    with pytest.raises(ValueError, match=r"which deletes a\.txt, deep \(1 file\), thesis\.tex"):
+        atomic.check_replaceable(folder, overwrite=False, mark=MARK)
+    atomic.check_replaceable(folder, mark=MARK, inputs=(tmp_path / "scan.obj", None))
+    (tmp_path / "link").symlink_to(thesis)
+    (folder / "linked").symlink_to(tmp_path / "elsewhere")
+    for given in (thesis, folder, folder / "deep" / "..", tmp_path / "link", folder / "linked"):
+        with pytest.raises(ValueError, match="lies in it and would be deleted"):
+            atomic.check_replaceable(folder, mark=MARK, inputs=(None, given))
+    assert thesis.read_text() == "dear"
+
+
+def test_places_where_nothing_can_be_written_are_refused_before_the_work(tmp_path, monkeypatch):
+    with pytest.raises(ValueError, match="mount point"):
+        atomic.check_replaceable("/proc")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="cannot be written to"):
+        atomic.check_replaceable(tmp_path / "file" / "deep" / "folder")
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    with pytest.raises(ValueError, match="cannot be written to"):
+        atomic.check_replaceable(tmp_path / "deep" / "folder")
+
+
+def test_several_writers_of_one_folder_end_with_one_of_theirs(tmp_path):
+    failed, target = [], tmp_path / "folder"
+
+    def write(number):
+        try:
+            for _ in range(20):
+                atomic.replace_folder(target, writes(str(number)), mark=MARK)
+        except Exception as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=write, args=(number,)) for number in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == [] and names(tmp_path) == ["folder"] and (target / "a.txt").read_text() in "0123"
+
+
+WRITE_FOR_EVER = """
+import sys
+from humangs_jax.io import atomic
+def write(folder):
+    folder.mkdir()
+    for name in ("a.txt", "b.txt"):
+        (folder / name).write_text("whole")
+print("writing", flush=True)
+while True:
+    atomic.replace_folder(sys.argv[1], write, mark="a.txt")
+"""
+
+
+def test_killed_at_any_moment_the_folder_is_whole_and_the_next_write_cleans_up(tmp_path):
+    target = folder_with(tmp_path / "folder", "old")
+    (target / "b.txt").write_text("old")
+    for milliseconds in (1, 3, 7, 11):
+        command = [sys.executable, "-c", WRITE_FOR_EVER, str(target)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+            process.stdout.readline()
+            time.sleep(milliseconds / 1000)
+            process.kill()
+        atomic._sweep.cache_clear()  # a new process sweeps
+        with pytest.raises(OSError, match="disk full"):
+            atomic.replace_folder(target, lambda temporary: (_ for _ in ()).throw(OSError("disk full")), mark=MARK)
+        assert names(tmp_path) == ["folder"] and names(target) == ["a.txt", "b.txt"]

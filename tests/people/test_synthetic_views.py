@@ -56,7 +56,7 @@ def fast(monkeypatch, made=None):
             made.append(seed)
         if seed % 10 == 7:
             raise ValueError("a hole at the hem")
-        replace_folder(folder, lambda f: (f.mkdir(), (f / "capture.json").write_text(str(seed))))
+        replace_folder(folder, lambda f: (f.mkdir(), (f / "capture.json").write_text(str(seed))), mark="capture.json")
 
     monkeypatch.setattr(writer, "write_person", write_person)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from splat_scenes import camera, random_gaussians
 
-from humangs_jax.rendering.splat_config import SPLAT_PRESETS
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig, drawn_as
 from humangs_jax.rendering.splatting import render
 
 SAME = 1e-9
@@ -19,6 +19,14 @@ SAME = 1e-9
 
 WIDTH, HEIGHT, TILE = 75, 53, 16
 INRIA = dataclasses.replace(SPLAT_PRESETS["inria"], block=4, chunk=4, chunk_backward=4)
+
+
+def test_drawing_as_weights_were_trained_keeps_the_other_knobs():
+    inria, own = SPLAT_PRESETS["inria"], SplatConfig(near=0.05, radius_sigma=2.5, block=16, max_pairs=1000)
+    assert drawn_as(own, "exact") is own
+    assert drawn_as(dataclasses.replace(inria, block=16), "inria") == dataclasses.replace(inria, block=16)
+    assert drawn_as(own, "inria") == dataclasses.replace(inria, block=16, max_pairs=1000)
+    assert drawn_as(dataclasses.replace(inria, chunk=4), "exact") == SplatConfig(chunk=4)
 
 
 def rotation(quat):

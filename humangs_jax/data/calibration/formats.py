@@ -186,7 +186,8 @@ def _read_easymocap(folder: Path) -> Calibration:
     outer = parse_file_storage(checked_text(extrinsic), extrinsic)
     names = outer.get("names", inner.get("names")) or _suffixes(inner)
     files = intrinsic, extrinsic
-    cameras = tuple(_map_camera(str(n), _of_camera(inner, n), _of_camera(outer, n), files, _behind(n)) for n in names)
+    of = lambda values, name: _of_camera(values, name, names)
+    cameras = tuple(_map_camera(str(n), of(inner, n), of(outer, n), files, _behind(n)) for n in names)
     return _calibration("EasyMocap calibration", extrinsic, cameras, up="+z")
 
 
@@ -197,7 +198,7 @@ def _read_camera_maps(values: Mapping[str, Any], file: Path) -> Calibration:
     cameras = [_map_camera(name, value, value, (file, file), before(name)) for name, value in nested.items()]
     if not nested:
         names = values.get("names") or _suffixes(values)
-        single = [(name, _of_camera(values, name)) for name in names]
+        single = [(name, _of_camera(values, name, names)) for name in names]
         cameras = [_map_camera(str(name), value, value, (file, file), _behind(name)) for name, value in single]
     return _calibration("calibration of K, R, T", file, tuple(cameras))
 
@@ -221,10 +222,12 @@ def _suffixes(values):
     return [key[2:] for key in values if key.startswith("K_")]
 
 
-def _of_camera(values, name):
-    """`K_01: ..` of all cameras -> `K: ..` of one."""
+def _of_camera(values, name, names):
+    """`K_01: ..` of all cameras -> `K: ..` of one. `dist_a_1` is of camera a_1, if there is one, and not of camera 1."""
     end = f"_{name}"
-    return {key[: -len(end)]: value for key, value in values.items() if key.endswith(end)}
+    longer = tuple(f"_{other}" for other in names if len(str(other)) > len(str(name)))
+    own = {key: value for key, value in values.items() if key.endswith(end) and not key.endswith(longer)}
+    return {key[: -len(end)]: value for key, value in own.items()}
 
 
 def _map_camera(name, inner, outer, files, field):

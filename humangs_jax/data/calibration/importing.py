@@ -9,6 +9,8 @@ import shutil
 from pathlib import Path
 from typing import get_args
 
+import numpy as np
+
 from humangs_jax.data.calibration.calibration import (
     ROTATION_TO_Y_UP,
     CalibratedCamera,
@@ -113,7 +115,7 @@ def import_cameras(
         checks = dataclasses.replace(checks, warnings=(*checks.warnings, NO_COMMON_FRAME))
     names = names_from_paths([photo.key + ".png" for photo in photos])
     check_names(names, len(photos), images)
-    replace_folder(out, lambda folder: _write(folder, converted, photos, names))
+    replace_folder(out, lambda folder: _write(folder, converted, photos, names), mark="capture.json")
     return ImportReport(
         out=out,
         format=calibration.format,
@@ -213,13 +215,17 @@ def _copy(folder, photo, name):
 
 
 def _undistort(folder, photo, name, camera):
-    """Photo and mask (or its alpha) as a pinhole sees them; pixels that it does not see are white and background."""
-    image, mask = read_checked(read_image, photo.image)
-    if photo.mask is not None:
-        mask = read_checked(read_grey, photo.mask)
+    """Photo and mask (or its alpha) as a pinhole sees them; pixels that it does not see are white and background.
+
+    A photo that has alpha besides its mask keeps it.
+    """
+    image, alpha = read_checked(read_image, photo.image)
+    mask = alpha if photo.mask is None else read_checked(read_grey, photo.mask)
     if camera.distortion is not None:
         image = undistort(image, camera.K, camera.distortion, fill=1.0)
-        mask = None if mask is None else undistort(mask, camera.K, camera.distortion, fill=0.0)
+        mask, alpha = (x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0) for x in (mask, alpha))
+    if photo.mask is not None and alpha is not None:
+        image = np.concatenate([image, alpha[..., None]], axis=-1)
     files = {"image": f"images/{name}.png"}
     write_png(folder / files["image"], image)
     if mask is not None:

@@ -25,6 +25,7 @@ class Keypoints:
     set: what the k points are. missing: names of the views that the file has nothing for.
     not_finite: points that were NaN or infinite in the file. far_outside: points more than half an image outside of it.
         Both kinds have confidence 0.
+    shifted: an image and its view, where they are counted from different numbers and were matched in order; else "".
     """
 
     points: Float[np.ndarray, "v k 2"]
@@ -33,6 +34,7 @@ class Keypoints:
     missing: tuple[str, ...] = ()
     not_finite: int = 0
     far_outside: int = 0
+    shifted: str = ""
 
 
 def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:

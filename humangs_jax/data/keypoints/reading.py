@@ -1,5 +1,6 @@
 """Keypoints of a capture's views: from a detector's file, the image of each view and the one person in it."""
 
+import dataclasses
 import re
 from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
@@ -69,7 +70,19 @@ def read_keypoints(
         )
     keypoints = _assemble(people, detections.set, names)
     _check_pixels(path, keypoints)
-    return keypoints
+    return dataclasses.replace(keypoints, shifted=_shifted(images, names))
+
+
+def _shifted(images: Sequence[DetectedImage | None], names: Sequence[str]) -> str:
+    """An image and its view whose numbers differ, because one is counted from 0 and the other from 1; "" if there is none."""
+    for image, name in zip(images, names, strict=True):
+        if image is not None:
+            numbers = [
+                re.findall(r"\d+", str(_stem(each) if isinstance(each, str) else each)) for each in (image.image, name)
+            ]
+            if all(numbers) and int(numbers[0][-1]) != int(numbers[1][-1]):
+                return f"{image.image} is view {name}"
+    return ""
 
 
 def _images_of_views(
@@ -189,10 +202,14 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     Images of keypoint files have names like "front.jpg", "cam0/000012.png" and "cam0_000000000012" (OpenPose counts a video's
     frames in twelve digits), or are mere numbers (COCO's image ids, the frames of a video).
 
+    Where a video's frames are counted from 0 and its photos from 1 (ffmpeg), or the other way round, there are as many of
+    either, without gaps, and they are matched in order, for each video by itself.
+
     Raises: ValueError if two images are of one view, or a number could mean two views.
     """
     numbered = _match_numbers([image for image in images if isinstance(image, int)], names)
-    views = [numbered.get(image) if isinstance(image, int) else _match_path(image, names) for image in images]
+    named = _match_paths([image for image in images if isinstance(image, str)], names)
+    views = [numbered.get(image) if isinstance(image, int) else named[image] for image in images]
     owner: dict[int, str | int] = {}
     for image, view in zip(images, views, strict=True):
         if view is None:
@@ -205,10 +222,42 @@ def match_views(images: Sequence[str | int], names: Sequence[str]) -> list[int |
     return views
 
 
-def _match_path(image: str, names: Sequence[str]) -> int | None:
-    """The view of a file name with as many of its folders as fit; then with numbers compared as numbers."""
+def _match_paths(images: Sequence[str], names: Sequence[str]) -> dict[str, int | None]:
+    """The views of file names."""
+    views = {image: _match_path(_stem(image), names) for image in images}
+    videos: dict[str, list[tuple[int, str]]] = {}
+    for image in views:
+        video, number = _split_number(str(_stem(image)))
+        if number is not None:
+            videos.setdefault(video, []).append((number, image))
+    of_view = [_split_number(name) for name in names]
+    for video, frames in videos.items():
+        frames.sort()
+        first, count = frames[0][0], len(frames)
+        counted = [number for number, _ in frames] == list(range(first, first + count))
+        if first > 1 or count < 2 or not counted or None not in (views[image] for _, image in frames):
+            continue
+        shifted = [_match_path(PurePosixPath(f"{video}{1 - first + i}"), names) for i in range(count)]
+        prefixes = {of_view[view][0] for view in shifted if view is not None}
+        if None not in shifted and len(prefixes) == 1 and sum(prefix in prefixes for prefix, _ in of_view) == count:
+            views |= {image: view for (_, image), view in zip(frames, shifted, strict=True)}
+    return views
+
+
+def _stem(image: str) -> PurePosixPath:
+    """The path of an image without the suffix of a photo."""
     path = PurePosixPath(image.replace("\\", "/"))
-    path = path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+    return path.with_suffix("") if path.suffix.lower() in IMAGE_SUFFIXES else path
+
+
+def _split_number(name: str) -> tuple[str, int | None]:
+    """A name without the number at its end, and that number."""
+    prefix = name.rstrip("0123456789")
+    return prefix, int(name[len(prefix) :]) if len(prefix) < len(name) else None
+
+
+def _match_path(path: PurePosixPath, names: Sequence[str]) -> int | None:
+    """The view of a file name with as many of its folders as fit; then with numbers compared as numbers."""
     keys = [_as_name("_".join(path.parts[i:])) for i in range(len(path.parts))]
     plain = [_plain(name) for name in names]
     for key in keys:
@@ -223,11 +272,7 @@ def _match_path(image: str, names: Sequence[str]) -> int | None:
 
 
 def _match_numbers(numbers: Sequence[int], names: Sequence[str]) -> dict[int, int]:
-    """The views of image numbers, by the last number in the names of the views.
-
-    Where a video's frames are counted from 0 and the photos from 1 (ffmpeg), or the other way round, there are as many of
-    either, without gaps, and they are matched in order.
-    """
+    """The views of image numbers, by the last number in the names of the views."""
     of_view = {i: int(found[-1]) for i, name in enumerate(names) if (found := re.findall(r"\d+", name))}
     shift = _shift(sorted(set(numbers)), sorted(of_view.values()), len(names))
     matched = {}

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.capture import load_capture, read_parameters
+from humangs_jax.data.capture import DEFAULT_BODY, load_capture, read_parameters
 from humangs_jax.data.capture_checks import CaptureError, body_parameters, checked_camera
 from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_views, shrink, subject_views
 from humangs_jax.data.loading.order import subject_order, view_generator
@@ -32,17 +32,23 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
     return tuple(folders)
 
 
-def read_outline(path: str | Path, body: BodyModel) -> StoredSubject:
+def read_outline(path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY) -> StoredSubject:
     """All of a capture but its pixels: parameters that belong to `body`, images and masks of no views but of the right size.
 
     Images are opened and their sizes compared; PNG files are checked by their checksums, others by decoding them.
-    Raises: ValueError naming file and field; without masks a capture cannot be learned from.
+
+    Arguments: body_file: where `body` comes from, see `Capture`.
+    Raises: ValueError naming file and field; without masks a capture cannot be learned from, and shape and poses of another
+    body mean nothing to this one.
     """
     folder = Path(path)
     file = folder / "capture.json"
     description = read_description(file)
     parameter_file = folder / description["body"]
-    _, betas, rotations, translations = read_parameters(parameter_file)
+    name, betas, rotations, translations = read_parameters(parameter_file)
+    if not _same_body(name, folder, body_file):
+        problem = f"{name!r}, but all captures of a run have one body, {str(body_file)!r}: expected parameters of that"
+        raise CaptureError(parameter_file, "body", problem)
     betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
     views, size = description["views"], None
     for view in views:
@@ -76,6 +82,13 @@ def read_outline(path: str | Path, body: BodyModel) -> StoredSubject:
     )
 
 
+def _same_body(name, folder, body_file):
+    """Whether a capture in `folder` that calls its body `name` has the one of `body_file`."""
+    if DEFAULT_BODY in (name, str(body_file)):
+        return name == str(body_file)
+    return (folder / name).resolve() == Path(body_file).resolve()
+
+
 def _check_image(file):
     """((width, height), whether there is an alpha channel)."""
     return read_checked(check_image, file)
@@ -85,14 +98,21 @@ class CaptureCache:
     """Capture folders: each is checked when first asked for; images are decoded when needed, and kept as bytes up to a limit.
 
     Several threads may ask at once. broken: folder -> what is wrong with it, in the order in which it was found.
+    body_file: where `body` comes from; captures that name another one are broken.
     """
 
-    def __init__(self, folders: Sequence[str | Path], body: BodyModel, limit_bytes: int = 4 << 30):
+    def __init__(
+        self,
+        folders: Sequence[str | Path],
+        body: BodyModel,
+        limit_bytes: int = 4 << 30,
+        body_file: str | Path = DEFAULT_BODY,
+    ):
         if not folders:
             raise ValueError("no capture folders")
         self.folders = tuple(Path(folder) for folder in folders)
         self.broken: dict[Path, str] = {}
-        self._body, self._free_bytes = body, limit_bytes
+        self._body, self._body_file, self._free_bytes = body, body_file, limit_bytes
         self._left_out: set[Path] = set()
         self._outlines: dict[Path, StoredSubject] = {}
         self._images: dict[tuple[Path, int], tuple[np.ndarray, np.ndarray]] = {}
@@ -110,7 +130,7 @@ class CaptureCache:
             if folder in self._outlines:
                 return self._outlines[folder]
         try:
-            outline = read_outline(folder, self._body)
+            outline = read_outline(folder, self._body, self._body_file)
         except (ValueError, OSError) as error:
             self.report(index, str(error))
             return None
@@ -123,7 +143,7 @@ class CaptureCache:
         with self._lock:
             outline = self._outlines.get(folder)
             decoded = {view: self._images[folder, view] for view in views if (folder, view) in self._images}
-        outline = read_outline(folder, self._body) if outline is None else outline
+        outline = read_outline(folder, self._body, self._body_file) if outline is None else outline
         if missing := [view for view in views if view not in decoded]:
             capture = load_capture(folder, body=self._body, views=missing)
             assert capture.masks is not None  # the outline has seen them

@@ -14,6 +14,7 @@ from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.residuals.priors import PosePrior, limit_residuals
 from humangs_jax.fitting.solve import robust
 from humangs_jax.fitting.state import FitState, Origin, betas_of, pose_of
+from humangs_jax.geometry.transform import EXACT
 
 NEAR = 0.05
 """Metres: depths are clamped to at least this."""
@@ -88,7 +89,7 @@ def found_noise(median: Array, expected: Array) -> Array:
 def in_cameras(observations: Observations, points: Float[Array, "k 3"]) -> Float[Array, "c k 3"]:
     """Points of the world in the coordinates of every camera."""
     rotation, translation = observations.cam_from_world[:, :3, :3], observations.cam_from_world[:, :3, 3]
-    return jnp.einsum("cab,kb->cka", rotation, points) + translation[:, None]
+    return jnp.einsum("cab,kb->cka", rotation, points, precision=EXACT) + translation[:, None]
 
 
 def focal_lengths(observations: Observations) -> Float[Array, "c 1 2"]:

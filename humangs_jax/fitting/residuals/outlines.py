@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
@@ -84,11 +85,11 @@ def view_body(vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: C
 @jax.jit
 def _look(vertices, faces, camera):
     rotation, focal = camera.cam_from_world[:3, :3], jnp.stack([camera.K[0, 0], camera.K[1, 1]])
-    seen = vertices @ rotation.T + camera.cam_from_world[:3, 3]
+    seen = transform.apply(camera.cam_from_world, vertices)
     depths = seen[:, 2]
     pixels = seen[:, :2] / jnp.where(depths > NEAREST_EDGE, depths, 1.0)[:, None] * focal + camera.K[:2, 2]
     # a plane through the camera with normal n is the line n . (x / fx, y / fy, 1) = 0 of the image
-    normals = (vertex_normals(vertices, faces) @ rotation.T)[:, :2] / focal
+    normals = jnp.matmul(vertex_normals(vertices, faces), rotation.T, precision=transform.EXACT)[:, :2] / focal
     normals = normals / jnp.maximum(jnp.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
     return pixels, depths, normals, rasterize_mesh(vertices, faces, camera).face_ids >= 0
 

@@ -25,6 +25,7 @@ from humangs_jax.fitting.scan_reading import Scan
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.fitting.solve import robust
 from humangs_jax.fitting.state import FitState, Origin, betas_of, pose_of, scale_of, usual_origin
+from humangs_jax.geometry.transform import EXACT
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 
 VERTICES = 7000
@@ -195,7 +196,8 @@ def one_sided(away: Float[Array, " r"], outside: Float[Array, " r"], inside: Flo
 
 def _height(problem, betas):
     points = problem.surface.points
-    top, bottom = (points.rest[i, 1] + points.directions[i, 1, : betas.shape[0]] @ betas for i in problem.ends)
+    height = lambda i: points.rest[i, 1] + jnp.dot(points.directions[i, 1, : betas.shape[0]], betas, precision=EXACT)
+    top, bottom = (height(i) for i in problem.ends)
     return top - bottom
 
 
