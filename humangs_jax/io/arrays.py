@@ -37,12 +37,16 @@ def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], b
 
 
 def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
-    """A tree of joints with names: the first is the root (-1), and each other one comes after its parent."""
+    """A tree of joints with names and one root, whose parent is -1."""
     check_limit("joints", len(parents), "joints")
-    if not all(type(parent) is int for parent in parents) or list(parents[:1]) != [-1]:
-        raise Refused("parents: expected the number of the parent of each joint, -1 for the first")
-    if not all(0 <= parent < joint for joint, parent in enumerate(parents[1:], 1)):
-        raise Refused("parents: expected joints that come after their parents")
+    count = len(parents)
+    if not all(type(parent) is int and -1 <= parent < count for parent in parents) or list(parents).count(-1) != 1:
+        raise Refused("parents: expected the number of the parent of each joint, -1 for one of them")
+    up = np.asarray([*(count if parent == -1 else parent for parent in parents), count])
+    for _ in range(count.bit_length()):
+        up = up[up]  # twice as far up each time
+    if (up != count).any():
+        raise Refused("parents: expected joints that all descend from the root")
     if len(names) != len(parents) or not all(isinstance(name, str) for name in names):
         raise Refused(f"joint_names: expected {len(parents)} names")
 

@@ -19,8 +19,8 @@ from typing import BinaryIO
 
 ENVIRONMENT = "HUMANGS_LIMITS"
 """Variable with other limits, such as "pixels=2e8,photos_outside=1"."""
-LONGEST_LINE = 1000
-"""Characters of an error; values of files are quoted in it."""
+LONGEST_LINE, LONGEST_REASON = 1000, 300
+"""Characters of an error, in which values of files are quoted, and of what a library says."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +91,9 @@ def _limits_of_text(text):
 # Errors --------------------------------------------------------------------------------------------------------------
 
 
-def _one_line(text: object) -> str:
+def _one_line(text: object, longest: int = LONGEST_LINE) -> str:
     line = " ".join(str(text).split())
-    return line if len(line) <= LONGEST_LINE else f"{line[:LONGEST_LINE]} ..."
+    return line if len(line) <= longest else f"{line[:longest]} ..."
 
 
 class FileError(ValueError):
@@ -141,7 +141,7 @@ def _why(kind, error):
     else:
         says_little = isinstance(error, LookupError | AssertionError | AttributeError | TypeError) or not str(error)
         reason = f"{type(error).__name__} {error}" if says_little else str(error)
-    return f"not a readable {kind}: {_one_line(reason)}"
+    return f"not a readable {kind}: {_one_line(reason, LONGEST_REASON)}"
 
 
 def check_limit(name: str, amount: int, unit: str) -> None:

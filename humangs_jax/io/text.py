@@ -2,12 +2,14 @@
 
 import json
 import os
-from typing import Any
+from typing import Any, TypeVar
 
+from humangs_jax.core.configuration import config_from_json
 from humangs_jax.io.atomic import write_text
 from humangs_jax.io.reading import FileError, Refused, limits, read_bytes, reading
 
-__all__ = ["FileError", "check_nesting", "parse_json", "read_json", "read_text", "write_json"]
+T = TypeVar("T")
+__all__ = ["FileError", "check_nesting", "parse_json", "read_configuration", "read_json", "read_text", "write_json"]
 
 
 def read_text(path: str | os.PathLike, limit: str = "text_bytes") -> str:
@@ -49,6 +51,15 @@ def check_nesting(value: Any) -> None:
 def _containers(value):
     values = value.values() if isinstance(value, dict) else value
     return [item for item in values if isinstance(item, list | dict)]
+
+
+def read_configuration(cls: type[T], path: str | os.PathLike) -> T:
+    """A configuration of class `cls` from its JSON, see `core.configuration`. Raises: FileNotFoundError; FileError."""
+    with reading(path, "configuration"):
+        try:
+            return config_from_json(cls, read_text(path))
+        except ValueError as error:
+            raise Refused(str(error)) from error
 
 
 def write_json(path: str | os.PathLike, value: Any, indent: int | None = 1) -> None:

@@ -18,6 +18,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.io.npz import read_npz, write_npz
+from humangs_jax.io.reading import reading
 from humangs_jax.people.baking import JOINTS_PER_VERTEX, bake_subject, strongest_joints
 from humangs_jax.people.kinematics import joint_positions
 from humangs_jax.people.poses import sample_rotations
@@ -122,7 +123,12 @@ def save_bank(path: str | Path, bank: PeopleBank) -> None:
 
 
 def load_bank(path: str | Path) -> PeopleBank:
-    """Read a bank. Raises: FileNotFoundError; OSError if it is no archive; ValueError if it holds no bank."""
+    """Read a bank. Raises: FileNotFoundError; FileError if it holds no bank."""
+    with reading(path, "bank of people"):
+        return _load_bank(path)
+
+
+def _load_bank(path):
     arrays, _ = read_npz(path)
     if str(arrays.get("format")) != FORMAT:
         raise ValueError(f"{path}: not a bank of people")
