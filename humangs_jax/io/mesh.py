@@ -39,7 +39,7 @@ def read_meshes(path: str | Path, textures: bool = False) -> list[Any]:
             _check_glb(data, textures)
         # text of other encodings would be guessed at for a long time
         stream = io.StringIO(data.decode("utf-8", "replace")) if kind == "obj" else io.BytesIO(data)
-        materials = {} if kind in ("stl", "off") else {"skip_materials": not textures}
+        materials: dict[str, Any] = {} if kind in ("stl", "off") else {"skip_materials": not textures}
         resolver = _folder_of(path) if textures else None
         # processing would silently drop what is not finite
         scene = trimesh.load_scene(stream, file_type=kind, resolver=resolver, process=False, **materials)
@@ -55,11 +55,14 @@ def read_meshes(path: str | Path, textures: bool = False) -> list[Any]:
 
 def _folder_of(path):
     """What trimesh asks for the files that a mesh names: materials and textures beside it."""
-    import trimesh
+    from trimesh.resolvers import Resolver
 
-    class Folder(trimesh.resolvers.Resolver):
-        def get(self, name: str) -> bytes:
-            file = inside(path.parent, name.strip())
+    class Folder(Resolver):
+        def __init__(self, folder: Path) -> None:
+            self.folder = folder
+
+        def get(self, key: str) -> bytes:
+            file = inside(self.folder, key.strip())
             if file.suffix.lower() == ".mtl":
                 return read_bytes(file, "slow_text_bytes")
             data = read_bytes(file, "image_bytes")
@@ -75,7 +78,7 @@ def _folder_of(path):
         def write(self, name: str, data: Any) -> None:
             raise Refused("nothing is written")
 
-    return Folder()
+    return Folder(path.parent)
 
 
 # GLB ------------------------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import os
 import stat
 from collections.abc import Generator
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 ENVIRONMENT = "HUMANGS_LIMITS"
 """Variable with other limits, such as "pixels=2e8,photos_outside=1"."""
@@ -77,8 +77,8 @@ def set_limits(new: Limits | None) -> None:
 
 
 def _limits_of_text(text):
-    changes = {}
-    kinds = {field.name: type(field.default) for field in dataclasses.fields(Limits)}
+    changes: dict[str, Any] = {}
+    kinds: dict[str, Any] = {field.name: type(field.default) for field in dataclasses.fields(Limits)}
     for part in filter(None, (part.strip() for part in text.split(","))):
         name, _, value = part.partition("=")
         try:

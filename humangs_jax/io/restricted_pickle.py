@@ -52,7 +52,7 @@ class StandIn:
                 self.state.update(part)
 
 
-class RestrictedUnpickler(pickle._Unpickler):  # ty: ignore[unresolved-attribute]  no C: nothing is hidden from this class
+class RestrictedUnpickler(pickle._Unpickler):  # the one without C: nothing in it is hidden from this class
     """Reads one pickle. names: what the (module, name) of a pickle stands for; what is in no table is refused.
 
     purpose: ends the message of a refusal. Strings of Python 2 are taken for latin1.
@@ -61,7 +61,7 @@ class RestrictedUnpickler(pickle._Unpickler):  # ty: ignore[unresolved-attribute
     def __init__(self, file: Any, names: Mapping[tuple[str, str], Any], purpose: str):
         super().__init__(file, encoding="latin1")
         self.names, self.purpose = names, purpose
-        self.dispatch = _Counted(self)
+        vars(self)["dispatch"] = _Counted(self)  # in place of the class's table
 
     def find_class(self, module: str, name: str) -> Any:
         """The stand-in for a name."""

@@ -15,6 +15,9 @@ from humangs_jax.training.config import tiny
 from humangs_jax.training.optimizer import OptimizerConfig, make_optimizer
 from humangs_jax.training.state import TrainState
 
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+"""Orbax leaves callbacks behind when a read fails."""
+
 
 def state_at(step, width=3):
     keys = jax.random.split(jax.random.key(step), 2)
