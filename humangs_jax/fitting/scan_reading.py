@@ -16,7 +16,7 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.keypoints.sets import FINGER_JOINTS, FINGERS
 from humangs_jax.io.mesh import read_meshes
 from humangs_jax.io.npz import read_npz
-from humangs_jax.io.reading import FileError
+from humangs_jax.io.reading import Refused, reading
 from humangs_jax.io.text import read_json
 
 VIEWS = 48
@@ -163,18 +163,14 @@ def read_joints(path: str | Path) -> dict[str, Float[np.ndarray, "3"]]:
     Raises: ValueError, naming the file, if it is neither, or a name or a point is not one.
     """
     path = Path(path)
-    try:
+    with reading(path, "file of joints"):
         joints = _joints_of_npz(path) if path.suffix == ".npz" else read_json(path)
         if not isinstance(joints, dict):
-            raise ValueError('expected {"left_hip": [x, y, z], ...}')
+            raise Refused('expected {"left_hip": [x, y, z], ...}')
         if not joints:
-            raise ValueError("no joints: expected three at least")
+            raise Refused("no joints: expected three at least")
         checked_joints(joints)
-    except FileError:
-        raise
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{path}: {error}") from error
-    return {name: np.asarray(point, np.float64) for name, point in joints.items()}
+        return {name: np.asarray(point, np.float64) for name, point in joints.items()}
 
 
 def _joints_of_npz(path):

@@ -107,10 +107,9 @@ def _check_glb(data: bytes, textures: bool) -> None:
     counts = [_count(accessor) for accessor in accessors]
     sizes = [COLUMNS[accessor["type"]] * COMPONENT_BYTES[accessor["componentType"]] for accessor in accessors]
     check_unpacked(len(data), sum(count * size for count, size in zip(counts, sizes, strict=True)))
-    corners = 0
-    for part in (part for mesh in content.get("meshes", []) for part in mesh["primitives"]):
-        corners += counts[part["attributes"]["POSITION"]] + (3 * counts[part["indices"]] if "indices" in part else 0)
-    check_limit("corners", corners, "corners of triangles")
+    of_mesh = [sum(_corners(part, counts) for part in mesh["primitives"]) for mesh in content.get("meshes", [])]
+    shown = [of_mesh[node["mesh"]] for node in content.get("nodes", []) if "mesh" in node]
+    check_limit("corners", max(sum(of_mesh), sum(shown)), "corners of triangles")
     if textures:
         for image in content.get("images", []):
             if "bufferView" in image:
@@ -127,6 +126,12 @@ def _view(view, binary):
     if view["buffer"] != 0 or type(step) is not int or step < 1:
         raise Refused("a view of numbers that are not in this file, or without a step")
     return binary[start : start + size]
+
+
+def _corners(part, counts):
+    """Corners of a part of a mesh, at least 1,000: that is what any part costs."""
+    indices = 3 * counts[part["indices"]] if "indices" in part else 0
+    return max(1000, indices + counts[part["attributes"]["POSITION"]])
 
 
 def _count(accessor):

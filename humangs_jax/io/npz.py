@@ -18,6 +18,8 @@ _ONE_AT_A_TIME = threading.Lock()
 """numpy reads the header of an array through Python's syntax trees, and CPython 3.11 counts the depth of these for all
 threads together: two at once are rarely, but then "AST constructor recursion depth mismatch" (python/cpython#106905)."""
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+LONGEST_HEADER = 512
+"""Characters; that of a plain array takes some hundred, and longer ones can exhaust Python's parser."""
 PLAIN_KINDS = "biufcSU"
 """Kinds of dtypes that are read: numbers and strings, no objects, no records."""
 
@@ -79,7 +81,7 @@ def _read_array(member: Any, size: int) -> np.ndarray | None:
     if version not in _HEADERS:
         raise Refused(f"version {version} of the npy format is not read")
     with _ONE_AT_A_TIME:
-        shape, columns_first, dtype = _HEADERS[version](member)
+        shape, columns_first, dtype = _HEADERS[version](member, max_header_size=LONGEST_HEADER)
     if dtype.hasobject:
         return None
     if dtype.kind not in PLAIN_KINDS or (dtype.itemsize == 0 and math.prod(shape) > 1):

@@ -62,7 +62,7 @@ def find_photo(folder: Path, name: str) -> Path | None:
 
 
 def _check_inside(folder, name):
-    with reading("", "path", CaptureError):
+    with reading(folder, "path", CaptureError):
         inside(folder, str(name), photo=True)
 
 
