@@ -41,7 +41,7 @@ def parse_json(text: str) -> Any:
 def check_nesting(value: Any) -> None:
     """Raises: Refused if lists and dicts contain each other more than `nesting` times."""
     level = [value]
-    for _ in range(limits().nesting + 1):
+    for _ in range(limits().nesting):
         level = [item for each in level if isinstance(each, list | dict) for item in _containers(each)]
         if not level:
             return

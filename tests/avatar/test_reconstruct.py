@@ -9,6 +9,7 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.reconstruct import _assemble_compiled, reconstruct, reconstruct_batch, reconstruct_views
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.views import SubjectViews, pad_views, standardize
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
@@ -116,6 +117,28 @@ def test_photos_of_any_size_become_squares_with_cameras_that_follow(body):
     before, _ = project(photos.cameras[1], point)
     after, _ = project(views.cameras[1], point)
     np.testing.assert_allclose(after, (np.asarray(before) + np.asarray([6, 0])) * SIZE / 48, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda c: {"poses": replace(c.poses, rotations=c.poses.rotations[:, :24])},
+            r"poses\.rotations: .*got \(1, 24, 3\)",
+        ),
+        (lambda c: {"poses": c.poses[0]}, r"poses\.rotations: expected shape"),
+        (lambda c: {"cameras": c.cameras[0]}, r"cameras\.K: expected shape \(2, 3, 3\), got \(3, 3\)"),
+        (lambda c: {"cameras": jax.tree.map(lambda x: x[:1], c.cameras)}, r"cameras\.K: expected shape \(2, 3, 3\)"),
+        (lambda c: {"frames": c.frames + 1}, "frames: expected 0 to 0"),
+        (lambda c: {"images": c.images * np.nan}, "images: expected numbers in"),
+        (lambda c: {"images": c.images * 255}, "images: expected numbers in"),
+        (lambda c: {"betas": np.full(3, np.inf, np.float32)}, "betas: expected finite numbers"),
+    ],
+)
+def test_captures_made_by_hand_are_checked(body, change, message):
+    whole = capture(body, SIZE, SIZE)
+    with pytest.raises(ValueError, match=f"reconstruct: capture: {message}"):
+        reconstruct({}, tiny(), dataclasses.replace(whole, **change(whole)))
 
 
 @pytest.mark.slow

@@ -166,7 +166,7 @@ def saved(name, write):
 
 
 def npz(name, arrays):
-    return saved(name, lambda path: np.savez_compressed(path.open("wb"), **arrays()))
+    return saved(name, lambda path: np.savez_compressed(path, **arrays()))
 
 
 def text(name, content):

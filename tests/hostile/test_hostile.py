@@ -86,6 +86,8 @@ def fault(case, result: dict) -> str:
 
 
 CASES = all_cases()
+READERS = sorted({case.reader for case in CASES})
+FUZZED = int(os.environ.get("HUMANGS_FUZZ_INPUTS", "10000"))
 
 
 @pytest.fixture(scope="module")
@@ -93,12 +95,14 @@ def results(tmp_path_factory):
     return run_cases(tmp_path_factory.mktemp("hostile"), [case.name for case in CASES])
 
 
-@pytest.mark.parametrize("reader", sorted({case.reader for case in CASES}))
+@pytest.mark.slow
+@pytest.mark.parametrize("reader", READERS)
 def test_every_file_ends_in_one_line(results, reader):
     faults = [fault(case, results[case.name]) for case in CASES if case.reader == reader]
     assert not any(faults), "\n".join(filter(None, faults))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("item", ITEMS)
 def test_each_item_of_the_list_stays_closed(results, item):
     mine = [case for case in CASES if case.item == item]
@@ -107,6 +111,17 @@ def test_each_item_of_the_list_stays_closed(results, item):
 
 def test_there_are_enough():
     assert len(CASES) >= 400
+
+
+@pytest.mark.slow
+def test_the_fuzzer_finds_nothing(tmp_path):
+    command = [sys.executable, str(HERE / "fuzz.py"), str(tmp_path), str(FUZZED)]
+    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1", "JAX_PLATFORMS": "cpu"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    figures = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert not [each for each in figures if each["found"]]
+    assert len(figures) >= 45 and all(each["inputs"] >= FUZZED for each in figures)
 
 
 def main():
