@@ -17,10 +17,10 @@ from typing import Annotated, Literal
 import tyro
 
 from humangs_jax.core.allocator import keep_freed_memory
-from humangs_jax.core.configuration import config_from_file
+from humangs_jax.io.text import read_configuration
 from humangs_jax.training.config import TrainConfig
 
-SMALL = config_from_file(TrainConfig, Path(__file__).resolve().parent / "small.json")
+SMALL = read_configuration(TrainConfig, Path(__file__).resolve().parent / "small.json")
 VALIDATION_SUBJECTS = 8
 
 

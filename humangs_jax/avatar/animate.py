@@ -29,7 +29,11 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
         raise ValueError(
             f"animate: expected one pose of {joints} joints, got {found}; use jax.vmap for a batch of poses"
         )
-    moves = {"pose.rotations": (pose.rotations, FINITE), "pose.translation": (pose.translation, FINITE)}
+    moves = {
+        "pose.rotations": (pose.rotations, FINITE),
+        "pose.translation": (pose.translation, FINITE),
+        "avatar.rest_joints": (avatar.rest_joints, FINITE),
+    }
     check_values("animate", gaussian_values(avatar.gaussians) | moves)
     return _animate(avatar, pose)
 

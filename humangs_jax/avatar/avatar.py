@@ -8,8 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.checks import ROUNDING
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.io.npz import write_npz
+from humangs_jax.io.arrays import check_array, check_checksum, check_indices, check_joints, checksum
+from humangs_jax.io.npz import read_npz, write_npz
+from humangs_jax.io.reading import FileError, Refused, reading
+from humangs_jax.io.text import parse_json
 from humangs_jax.rendering.gaussians import Gaussians
 
 FORMAT = "humangs-avatar"
@@ -56,53 +60,65 @@ class Avatar:
             "skinning": self.skinning,
             "rendering": self.rendering,
         }
-        values = {name: getattr(self.gaussians, name) for name in _ARRAYS[:5]}
-        values |= {name: getattr(self, name) for name in _ARRAYS[5:]}
-        write_npz(path, {"header": json.dumps(header)} | values)
+        values = {name: np.asarray(getattr(self.gaussians, name)) for name in _ARRAYS[:5]}
+        values |= {name: np.asarray(getattr(self, name)) for name in _ARRAYS[5:]}
+        write_npz(path, {"header": json.dumps(header | {"checksum": checksum(values)})} | values)
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> "Avatar":
         """Read what `save` wrote.
 
-        Raises: FileNotFoundError if there is no such file; ValueError, naming file and key, if it is no avatar of this
-        version, a key is missing, or shapes do not fit each other.
+        Raises: FileNotFoundError if there is no such file; FileError, naming file and key, if it is no avatar of this
+        version, a key is missing, shapes do not fit each other, numbers are not finite or out of range, indices do not
+        exist, or the contents are not those of the checksum in the header (which the first files do not have).
         """
-        try:
-            archive = np.load(path, allow_pickle=False)
-            header = json.loads(str(archive["header"]))
-        except FileNotFoundError:
-            raise FileNotFoundError(f"{path}: no such file") from None
-        except (KeyError, ValueError, OSError, TypeError, IndexError) as error:
-            raise ValueError(f"{path}: not an avatar file written by humangs ({error})") from None
-        if header.get("format") != FORMAT or header.get("version") != VERSION:
-            raise ValueError(
-                f"{path}: expected {FORMAT} version {VERSION}, got {header.get('format')} version {header.get('version')}"
-            )
-        if missing := [name for name in _ARRAYS if name not in archive]:
-            raise ValueError(f"{path}: missing keys {missing}")
-        arrays = {name: archive[name] for name in _ARRAYS}
-        g, j, n = len(arrays["means"]), len(header["parents"]), len(arrays["rest_vertices"])
-        f = len(arrays["faces"])
-        shapes = {
-            "means": (g, 3),
-            "quats": (g, 4),
-            "scales": (g, 3),
-            "opacities": (g,),
-            "colors": (g, 3),
-            "skinning_weights": (g, j),
-            "rest_vertices": (n, 3),
-            "rest_joints": (j, 3),
-            "faces": (f, 3),
-        }
-        for name, shape in shapes.items():
-            if arrays[name].shape != shape:
-                raise ValueError(f"{path}: {name}: expected shape {shape}, got {arrays[name].shape}")
-        loaded = {name: jnp.asarray(value) for name, value in arrays.items()}
-        return cls(
-            Gaussians(*(loaded[name] for name in _ARRAYS[:5])),
-            *(loaded[name] for name in _ARRAYS[5:]),
-            parents=tuple(header["parents"]),
-            joint_names=tuple(header["joint_names"]),
-            skinning=header["skinning"],
-            rendering=header.get("rendering", "exact"),  # the first files do not say
+        with reading(path, "avatar file"):
+            return _load(cls, path)
+
+
+def _load(cls, path):
+    try:
+        arrays, _ = read_npz(path)
+        header = parse_json(str(arrays["header"]))
+    except (FileError, KeyError) as error:
+        raise FileError(path, "", f"not an avatar file written by humangs ({error})") from error
+    if not isinstance(header, dict) or header.get("format") != FORMAT or header.get("version") != VERSION:
+        found = header if isinstance(header, dict) else {}
+        raise Refused(f"expected {FORMAT} version {VERSION}, got {found.get('format')} version {found.get('version')}")
+    if missing := [name for name in _ARRAYS if name not in arrays]:
+        raise Refused(f"missing keys {missing}")
+    check_joints(header["parents"], header["joint_names"])
+    skinning, rendering = header["skinning"], header.get("rendering", "exact")  # the first files do not say
+    if skinning not in ("affine", "rotation") or rendering not in ("exact", "inria"):
+        raise Refused(
+            f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation', 'exact' or 'inria'"
         )
+    g, j, n = (len(arrays[name]) for name in ("means", "rest_joints", "rest_vertices"))
+    if j != len(header["parents"]):
+        raise Refused(f"rest_joints: expected shape ({len(header['parents'])}, 3), got {arrays['rest_joints'].shape}")
+    unit = (-ROUNDING, 1 + ROUNDING)
+    ranges = {"scales": (0.0,), "opacities": unit, "skinning_weights": unit}
+    shapes = {
+        "means": (g, 3),
+        "quats": (g, 4),
+        "scales": (g, 3),
+        "opacities": (g,),
+        "colors": (g, 3),
+        "skinning_weights": (g, j),
+        "rest_vertices": (n, 3),
+        "rest_joints": (j, 3),
+    }
+    for name, shape in shapes.items():
+        check_array(name, arrays[name], shape, *ranges.get(name, ()))
+    check_indices("faces", arrays["faces"], (None, 3), n)
+    arrays = {name: arrays[name] for name in _ARRAYS}
+    check_checksum(header.get("checksum"), checksum(arrays))
+    loaded = {name: jnp.asarray(value) for name, value in arrays.items()}
+    return cls(
+        Gaussians(*(loaded[name] for name in _ARRAYS[:5])),
+        *(loaded[name] for name in _ARRAYS[5:]),
+        parents=tuple(header["parents"]),
+        joint_names=tuple(header["joint_names"]),
+        skinning=skinning,
+        rendering=rendering,
+    )

@@ -4,6 +4,7 @@ Programs are compiled once per bucket: numbers of views and of foreground tokens
 (`buffers.round_up`), and padding is masked.
 """
 
+import operator
 from collections.abc import Sequence
 
 import jax
@@ -130,6 +131,21 @@ def _most_needed(inputs, config):
 def _check(capture, name):
     if capture.view_count == 0:
         raise ValueError(f"{name}: 0 views; at least one photo is needed")
+    views, height, width = (*np.shape(capture.images), 0, 0, 0)[:3]
+    shapes = {
+        "images": (views, height, width, 3),
+        "masks": None if capture.masks is None else (views, height, width),
+        "frames": (views,),
+        "cameras.K": (views, 3, 3),
+        "cameras.cam_from_world": (views, 4, 4),
+        "poses.rotations": (capture.frame_count, len(capture.body.parents), 3),
+        "poses.translation": (capture.frame_count, 3),
+    }
+    for field, shape in shapes.items():
+        if shape is not None and (found := np.shape(operator.attrgetter(field)(capture))) != shape:
+            raise ValueError(f"reconstruct: {name}: {field}: expected shape {shape}, got {found}")
+    if not 0 <= np.min(capture.frames) <= np.max(capture.frames) < capture.frame_count:
+        raise ValueError(f"reconstruct: {name}: frames: expected 0 to {capture.frame_count - 1}, got {capture.frames}")
     arrays = {
         "images": (capture.images, UNIT),
         "masks": (capture.masks, UNIT),

@@ -5,7 +5,6 @@ largest few of each vertex in uint16, indices are uint16 where they fit. `read_b
 sum to 1.
 """
 
-import zipfile
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -14,13 +13,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.io.arrays import check_array, check_indices, check_joints
 from humangs_jax.io.npz import read_npz, write_npz
+from humangs_jax.io.reading import Refused, check_limit, open_file, reading
 
 FORMAT = "humangs-body-1"
 DIRECTION_STEP = 1e-5
 """Metres. int16 then spans +-0.33 m per unit of a shape coefficient; larger directions are stored as float32."""
 WEIGHT_STEPS = 65535
 UV_STEPS = 65535
+KEYS = {
+    *("format", "name", "template", "shape_directions", "faces", "parents", "joint_names", "shape_names"),
+    *("regressor_vertices", "regressor_values", "weight_joints", "weight_values"),
+}
+"""What every file has; some have texture coordinates and an order of collapses, too."""
 
 
 def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel:
@@ -62,10 +68,16 @@ def _sparse_rows(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return columns, np.take_along_axis(matrix, columns, axis=1)
 
 
-def _dense_rows(columns: np.ndarray, values: np.ndarray, width: int) -> np.ndarray:
-    matrix = np.zeros((len(columns), width), np.float64)
-    np.add.at(matrix, (np.arange(len(columns))[:, None], columns.astype(np.int64)), values)
-    return (matrix / matrix.sum(1, keepdims=True)).astype(np.float32)
+def _dense_rows(arrays: dict[str, np.ndarray], rows: str, columns: str, count: int, width: int) -> np.ndarray:
+    check_limit("plain_bytes", 8 * count * width, "bytes of a matrix")
+    check_indices(columns, arrays[columns], (count, None), width)
+    check_array(f"{rows}_values", arrays[f"{rows}_values"], arrays[columns].shape)
+    matrix = np.zeros((count, width), np.float64)
+    np.add.at(matrix, (np.arange(count)[:, None], arrays[columns].astype(np.int64)), arrays[f"{rows}_values"])
+    sums = matrix.sum(1, keepdims=True)
+    if not (sums > 0).all():
+        raise Refused(f"{rows}_values: expected rows with a sum above 0")
+    return (matrix / sums).astype(np.float32)
 
 
 def save_body(path: str | Path, body: BodyModel) -> None:
@@ -104,45 +116,56 @@ def save_body(path: str | Path, body: BodyModel) -> None:
 
 def is_body_file(path: str | Path) -> bool:
     """Whether a file is an npz with this format's mark."""
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as file:
-        return "format.npy" in file.namelist()
+    with reading(path, "body model file"), open_file(path) as file:
+        if file.read(2) != b"PK":
+            return False
+    return "format" in read_npz(path, lambda name: name == "format")[0]
 
 
 def read_body(path: str | Path) -> BodyModel:
     """Read what `save_body` wrote. Raises: ValueError, naming the file and the key, if it is something else."""
+    with reading(path, "body file"):
+        return _read_body(path)
+
+
+def _read_body(path):
     arrays, pickled = read_npz(path)
     if str(arrays.get("format")) != FORMAT:
         raise ValueError(f"{path}: not a '{FORMAT}' file (its keys: {sorted(arrays)})")
     if pickled:
         raise ValueError(f"{path}: key '{pickled[0]}' cannot be read without pickles")
-    try:
-        directions = np.moveaxis(arrays["shape_directions"], 0, -1)
-        if directions.dtype == np.int16:
-            directions = directions * DIRECTION_STEP
-        uvs = arrays.get("uvs")
-        if uvs is not None and uvs.dtype == np.uint16:
-            uvs = uvs / UV_STEPS
-        joints, vertices = len(arrays["parents"]), len(arrays["template"])
-        index = lambda key: jnp.asarray(arrays[key], jnp.int32) if key in arrays else None
-        return BodyModel(
-            template=jnp.asarray(arrays["template"], jnp.float32),
-            shape_directions=jnp.asarray(directions, jnp.float32),
-            pose_directions=None,
-            joint_regressor=jnp.asarray(
-                _dense_rows(arrays["regressor_vertices"], arrays["regressor_values"], vertices)
-            ),
-            skinning_weights=jnp.asarray(_dense_rows(arrays["weight_joints"], arrays["weight_values"], joints)),
-            faces=jnp.asarray(arrays["faces"], jnp.int32),
-            uvs=None if uvs is None else jnp.asarray(uvs, jnp.float32),
-            uv_faces=index("uv_faces"),
-            collapse_order=index("collapse_order"),
-            collapse_into=index("collapse_into"),
-            parents=tuple(int(p) for p in arrays["parents"]),
-            joint_names=tuple(str(name) for name in arrays["joint_names"]),
-            shape_names=tuple(str(name) for name in arrays["shape_names"]),
-            name=str(arrays["name"]),
-        )
-    except KeyError as error:
-        raise ValueError(f"{path}: key {error} is missing") from error
+    if missing := sorted(KEYS - set(arrays)):
+        raise Refused(f"key '{missing[0]}' is missing")
+    parents, joint_names = arrays["parents"].tolist(), [str(name) for name in arrays["joint_names"]]
+    check_joints(parents, joint_names)
+    joints, vertices, shapes = len(parents), len(arrays["template"]), len(arrays["shape_names"])
+    check_array("template", arrays["template"], (vertices, 3))
+    check_array("shape_directions", arrays["shape_directions"], (shapes, vertices, 3))
+    check_indices("faces", arrays["faces"], (None, 3), vertices)
+    directions = np.moveaxis(arrays["shape_directions"], 0, -1)
+    if directions.dtype == np.int16:
+        directions = directions * DIRECTION_STEP
+    uvs = arrays.get("uvs")
+    if uvs is not None:
+        check_array("uvs", uvs, (None, 2))
+        check_indices("uv_faces", arrays["uv_faces"], (len(arrays["faces"]), 3), len(uvs))
+        uvs = uvs / UV_STEPS if uvs.dtype == np.uint16 else uvs
+    for name in {"collapse_order", "collapse_into"} & set(arrays):
+        check_indices(name, arrays[name], (vertices,), vertices)
+    index = lambda key: jnp.asarray(arrays[key], jnp.int32) if key in arrays else None
+    return BodyModel(
+        template=jnp.asarray(arrays["template"], jnp.float32),
+        shape_directions=jnp.asarray(directions, jnp.float32),
+        pose_directions=None,
+        joint_regressor=jnp.asarray(_dense_rows(arrays, "regressor", "regressor_vertices", joints, vertices)),
+        skinning_weights=jnp.asarray(_dense_rows(arrays, "weight", "weight_joints", vertices, joints)),
+        faces=jnp.asarray(arrays["faces"], jnp.int32),
+        uvs=None if uvs is None else jnp.asarray(uvs, jnp.float32),
+        uv_faces=index("uv_faces"),
+        collapse_order=index("collapse_order"),
+        collapse_into=index("collapse_into"),
+        parents=tuple(parents),
+        joint_names=tuple(joint_names),
+        shape_names=tuple(str(name) for name in arrays["shape_names"]),
+        name=str(arrays["name"]),
+    )

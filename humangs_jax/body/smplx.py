@@ -8,8 +8,7 @@ the model's mean hand, which is added).
 The model's licence forbids redistribution: users bring the file.
 """
 
-import zipfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,8 @@ from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.io.npz import read_npz
+from humangs_jax.io.reading import FileError, open_file, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 
 SHAPE_COLUMNS, EXPRESSION_COLUMNS = 300, 100
@@ -40,16 +41,17 @@ class HandBasis:
 
 
 class _ModelFile:
-    """Arrays of a model file by key, with errors that name both."""
+    """Arrays of a model file by key, with errors that name both. wanted: which of an npz are read at all."""
 
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+    def __init__(self, path: str | Path, wanted: Callable[[str], bool]) -> None:
+        self.path, self.pickled = Path(path), ()
         if not self.path.exists():
             raise FileNotFoundError(f"{path}: no such body model file")
-        if zipfile.is_zipfile(self.path):
-            self.content: Mapping[str, Any] = np.load(self.path, allow_pickle=False)
-        elif self.path.suffix == ".npz":
-            raise ValueError(f"{path}: not a readable npz file")
+        with reading(path, "body model file"), open_file(path) as file:
+            start = file.read(2)
+        if start == b"PK" or self.path.suffix == ".npz":
+            content, self.pickled = read_npz(self.path, wanted)
+            self.content: Mapping[str, Any] = content
         else:
             self.content = read_pickle(self.path)
 
@@ -58,12 +60,14 @@ class _ModelFile:
 
     def read(self, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
         """The array under `key`; None in `shape` stands for any size."""
+        if key in self.pickled:
+            raise FileError(self.path, f"key '{key}'", "a pickled object, which is never read")
         if key not in self.content:
             raise ValueError(f"{self.path}: key '{key}' is missing (keys: {sorted(self.content)})")
         try:
             array = as_array(self.content[key])
-        except ValueError as error:  # numpy's message for a pickled object, or ours
-            raise ValueError(f"{self.path}: key '{key}': {error}") from error
+        except ValueError as error:
+            raise FileError(self.path, f"key '{key}'", error) from error
         fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
         if not fits:
             raise ValueError(f"{self.path}: key '{key}': expected shape {_written(shape)}, got {array.shape}")
@@ -92,7 +96,12 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
     shape ones, then the expression ones. Numbers are float32, or float64 under `jax.enable_x64`.
     Raises: FileNotFoundError; ValueError, naming file and key, for whatever does not fit the format.
     """
-    file = _ModelFile(path)
+    with reading(path, "body model file"):
+        return _load_smplx(path, shape_count, expression_count)
+
+
+def _load_smplx(path, shape_count, expression_count):
+    file = _ModelFile(path, lambda key: not key.startswith("hands_"))
     template = file.read("v_template", (None, 3))
     n = len(template)
     directions, names = _shape_directions(file, n, shape_count, expression_count)
@@ -142,12 +151,13 @@ def _parents(file: _ModelFile) -> tuple[int, ...]:
 
 def load_hands(path: str | Path) -> HandBasis:
     """Mean and principal components of the hand poses of an SMPL-X model file. Raises as `load_smplx`."""
-    file = _ModelFile(path)
-    number = lambda arrays: jnp.asarray(np.stack(arrays), jnp.result_type(float))
-    return HandBasis(
-        means=number([file.read(f"hands_mean{side}", (45,)) for side in "lr"]),
-        components=number([file.read(f"hands_components{side}", (45, 45)) for side in "lr"]),
-    )
+    with reading(path, "body model file"):
+        file = _ModelFile(path, lambda key: key.startswith("hands_"))
+        number = lambda arrays: jnp.asarray(np.stack(arrays), jnp.result_type(float))
+        return HandBasis(
+            means=number([file.read(f"hands_mean{side}", (45,)) for side in "lr"]),
+            components=number([file.read(f"hands_components{side}", (45, 45)) for side in "lr"]),
+        )
 
 
 def _part(name: str, values: Any, size: int, dtype: Any) -> Float[Array, " size"]:

@@ -11,12 +11,13 @@ import json
 import sys
 import types
 import typing
-from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 T = TypeVar("T")
 KIND = "kind"
 """Key of the class of a part."""
+LARGEST, LARGEST_INTEGER = sys.float_info.max, 1 << 63
+"""Numbers beyond these have no place in any configuration."""
 
 
 def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
@@ -53,17 +54,9 @@ def config_from_json(cls: type[T], text: str) -> T:
     """
     try:
         values = json.loads(text)
-    except json.JSONDecodeError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"the configuration is not JSON: {error}") from error
     return _build(cls, values, "config")
-
-
-def config_from_file(cls: type[T], path: Path) -> T:
-    """`config_from_json` of a file. Raises: OSError; ValueError, naming file and field."""
-    try:
-        return config_from_json(cls, path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
 
 
 def _build(annotation: Any, value: Any, path: str) -> Any:
@@ -98,7 +91,8 @@ def _find_part(kind, protocol, path):
     if not isinstance(kind, str) or "." not in kind:
         raise ValueError(expected)
     module, _, name = kind.rpartition(".")
-    if module not in sys.modules and module.startswith("humangs_jax."):
+    # beside the protocol: other modules may do something when they are imported
+    if module not in sys.modules and module.startswith(f"{protocol.__module__.rpartition('.')[0]}."):
         with contextlib.suppress(ImportError):
             importlib.import_module(module)
     if module not in sys.modules:
@@ -122,7 +116,10 @@ def _build_dataclass(cls, values, path):
     needed = [f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is dataclasses.MISSING]
     if missing := [name for name in needed if name not in fields]:
         raise ValueError(f"{path}.{missing[0]} is missing")
-    return cls(**fields)
+    try:
+        return cls(**fields)
+    except ArithmeticError as error:  # sizes of 0
+        raise ValueError(f"{path}: {cls.__name__}: {error}") from error
 
 
 def _named(annotation):
@@ -137,5 +134,5 @@ def _matches(value, annotation):
     if origin in (typing.Union, types.UnionType):
         return any(_matches(value, option) for option in typing.get_args(annotation))
     if annotation is float:
-        return isinstance(value, int | float) and not isinstance(value, bool)
-    return type(value) is annotation
+        return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST
+    return type(value) is annotation and (annotation is not int or abs(value) < LARGEST_INTEGER)

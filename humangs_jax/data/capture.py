@@ -44,6 +44,7 @@ from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import resized, write_png
 from humangs_jax.io.npz import read_npz, write_npz
+from humangs_jax.io.reading import FileError, reading
 
 DEFAULT_BODY = "makehuman"
 """Name of the body that comes with the package; any other `body` in body.npz is the path of a model file."""
@@ -179,16 +180,17 @@ def load_capture(
     Raises: CaptureError, one line naming file and field.
     """
     folder = capture_folder(path)
-    description = read_description(folder / "capture.json")
-    parameter_file = folder / description["body"]
-    body_file, betas, rotations, translations = read_parameters(parameter_file)
-    if body is None:
-        body = _load_model(parameter_file, body_file, folder)
-    betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
-    photos = read_photos(folder, description, views, len(rotations))
-    if body_file != DEFAULT_BODY:
-        body_file = str(folder / body_file)
-    return _assemble(photos, body, betas, rotations, translations, body_file)
+    with reading(folder / "capture.json", "capture", CaptureError):
+        description = read_description(folder / "capture.json")
+        parameter_file = folder / description["body"]
+        body_file, betas, rotations, translations = read_parameters(parameter_file)
+        if body is None:
+            body = _load_model(parameter_file, body_file, folder)
+        betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
+        photos = read_photos(folder, description, views, len(rotations))
+        if body_file != DEFAULT_BODY:
+            body_file = str(folder / body_file)
+        return _assemble(photos, body, betas, rotations, translations, body_file)
 
 
 def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False) -> None:
@@ -235,8 +237,8 @@ def read_parameters(file: Path) -> tuple[str, np.ndarray, np.ndarray, np.ndarray
         values, pickled = read_npz(file)
     except FileNotFoundError:
         raise CaptureError(file, "", "no such file (capture.json: body names it); `humangs fit` makes one") from None
-    except OSError as error:
-        raise CaptureError(file, "", error.strerror or error) from error
+    except FileError as error:
+        raise CaptureError("", "", error) from error
     if pickled:
         raise CaptureError(file, pickled[0], "expected numbers, got a pickled object")
     check_keys(values, BODY_KEYS, BODY_KEYS, file)

@@ -11,7 +11,8 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import check_replaceable
-from humangs_jax.io.text import FileError, parse_json, read_text
+from humangs_jax.io.reading import FileError, reading
+from humangs_jax.io.text import parse_json, read_text
 
 COLOUR_SLACK = 1e-3
 """Resampled images overshoot [0, 1] a little; values further outside have another range, for instance 0 to 255."""
@@ -30,18 +31,14 @@ def checked_text(file: Path, missing: str = "no such file") -> str:
         return read_text(file)
     except FileNotFoundError:
         raise CaptureError(file, "", missing) from None
-    except OSError as error:
-        raise CaptureError(file, "", f"cannot be read: {error.strerror or error}") from error
+    except FileError as error:
+        raise CaptureError("", "", error) from error
 
 
 def checked_json(file: Path, text: str | None = None, missing: str = "no such file") -> Any:
     """The value in a JSON file, or in its text where that is known."""
-    try:
+    with reading(file, "JSON file", CaptureError):
         return parse_json(checked_text(file, missing) if text is None else text)
-    except CaptureError:
-        raise
-    except ValueError as error:
-        raise CaptureError(file, "", error) from error
 
 
 def check_place(folder: Path, overwrite: bool) -> None:
@@ -69,7 +66,7 @@ def numbers(value: Any, file: object, field: str, shape: tuple[int, ...] | None 
         if array.dtype.kind not in "fiub":
             raise TypeError
         array = array.astype(np.float32)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         wanted = "numbers" if shape is None else f"{' x '.join(map(str, shape))} numbers"
         raise CaptureError(file, field, f"expected {wanted}") from None
     if shape is not None and array.shape != shape:

@@ -34,8 +34,9 @@ from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.io.npz import read_npz, write_npz
+from humangs_jax.io.reading import FileError, reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
-from humangs_jax.io.text import FileError, read_json
+from humangs_jax.io.text import read_json
 
 WALK = "walk.npz"
 BODY_NUMBERS = 3 * len(BODY_NAMES)  # 66
@@ -131,6 +132,11 @@ def load_motion(
     if path is None:
         with resources.as_file(resources.files("humangs_jax") / "assets" / WALK) as file:
             return load_motion(file, up=up, fps=fps)
+    with reading(path, "motion", MotionError):
+        return _load(path, up, fps, hands, flat_hand_mean)
+
+
+def _load(path, up, fps, hands, flat_hand_mean):
     file = _MotionFile(path, hands, flat_hand_mean)
     for key, read in _FORMATS.items():
         if key in file.values:
@@ -251,15 +257,9 @@ class _MotionFile:
         if self.path.is_dir() or suffix == ".json":
             self.values: Mapping[str, Any] = _read_json_frames(self.path)
         elif suffix in (".pkl", ".pickle"):
-            try:
-                self.values = read_pickle(self.path)
-            except ValueError as error:
-                raise MotionError("", "", error) from error  # names the file itself
+            self.values = read_pickle(self.path)
         else:
-            try:
-                self.values, self.pickled = read_npz(self.path)
-            except OSError as error:
-                raise MotionError(path, "", error.strerror or error) from error
+            self.values, self.pickled = read_npz(self.path)
 
     def numbers(self, key: str, shape: tuple[int | None, ...] | None, optional: bool = False) -> Any:
         """Finite float64 numbers; None in `shape` is any size but 0, None for it any shape with at least one frame."""
@@ -273,7 +273,7 @@ class _MotionFile:
             if array.dtype.kind not in "fiu":
                 raise ValueError
             array = array.astype(np.float64)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             raise MotionError(self.path, key, "expected numbers") from None
         if shape is not None:
             wanted = ", ".join("any" if size is None else str(size) for size in shape)
@@ -338,10 +338,7 @@ def _read_json_frames(path):
             raise MotionError(path, "", "no .json file in this folder")
     frames = []
     for file in files:
-        try:
-            frame = read_json(file)
-        except (OSError, ValueError) as error:
-            raise MotionError(file, "", f"not readable as JSON: {error}") from error
+        frame = read_json(file)
         if not isinstance(frame, dict):
             raise MotionError(file, "", f"expected a JSON object, got {type(frame).__name__}")
         if missing := set(frames[0] if frames else ()) - set(frame):

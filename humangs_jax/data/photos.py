@@ -17,6 +17,7 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_frame, checked_json, numbers
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import read_grey, read_image
+from humangs_jax.io.reading import FileError, inside, reading
 from humangs_jax.io.text import write_json
 
 FORMAT = "humangs-capture"
@@ -54,7 +55,8 @@ def load_photos(path: str | Path) -> Photos:
     Raises: CaptureError, one line naming file and field.
     """
     folder = capture_folder(path)
-    return read_photos(folder, read_description(folder / "capture.json"))
+    with reading(folder / "capture.json", "capture", CaptureError):
+        return read_photos(folder, read_description(folder / "capture.json"))
 
 
 def capture_folder(path: str | Path) -> Path:
@@ -69,7 +71,7 @@ def capture_folder(path: str | Path) -> Path:
 
 
 def read_description(file: Path) -> dict[str, Any]:
-    """capture.json with all keys and types checked, except the matrices."""
+    """capture.json with all keys and types checked, except the matrices. Its paths stay in the folder."""
     description = checked_json(file, missing="no such file: a capture is a folder with a capture.json")
     if not isinstance(description, dict):
         raise CaptureError(file, "", f"expected a JSON object, got {type(description).__name__}")
@@ -78,8 +80,10 @@ def read_description(file: Path) -> dict[str, Any]:
     if description.get("version") != VERSION:
         raise CaptureError(file, "version", f"expected {VERSION}, got {description.get('version')!r}")
     check_keys(description, TOP_KEYS, TOP_KEYS - {"background"}, file)
-    if not isinstance(description["body"], str):
-        raise CaptureError(file, "body", f"expected the name of an npz file, got {description['body']!r}")
+    body = description["body"]
+    if not isinstance(body, str) or Path(body).suffix != ".npz":  # fits write it: it must not be a photo
+        raise CaptureError(file, "body", f"expected the name of an npz file, got {body!r}")
+    check_inside(file, "body", body)
     check_background(description.get("background", "photo"), file)
     views = description["views"]
     if not isinstance(views, list) or not views:
@@ -91,7 +95,15 @@ def read_description(file: Path) -> dict[str, Any]:
         for key in ("image", "mask"):
             if key in view and not (isinstance(view[key], str) and view[key]):
                 raise CaptureError(file, f"views[{i}].{key}", f"expected the path of a file, got {view[key]!r}")
+            if key in view:
+                check_inside(file, f"views[{i}].{key}", view[key], photo=True)
     return description
+
+
+def check_inside(file: Path, field: str, name: str, photo: bool = False) -> None:
+    """Raises: CaptureError if a path that `file` names leaves its folder."""
+    with reading(f"{file}: {field}", "path", CaptureError):
+        inside(file.parent, name, photo)
 
 
 def write_description(folder: Path, views: Sequence[dict[str, Any]], background: Background = "photo") -> None:
@@ -211,10 +223,8 @@ def read_checked(reader: Callable[[Path], Any], file: Path) -> Any:
         return reader(file)
     except FileNotFoundError:
         raise CaptureError(file, "", "no such image file (capture.json names it)") from None
-    except OSError as error:
-        raise CaptureError(file, "", f"not a readable image: {error.strerror or error}") from error
-    except ValueError as error:
-        raise CaptureError(file, "", error) from error
+    except FileError as error:
+        raise CaptureError("", "", error) from error
 
 
 def on_white_background(

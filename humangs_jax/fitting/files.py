@@ -29,6 +29,7 @@ from humangs_jax.fitting.report import FitReport
 from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
 from humangs_jax.io.atomic import add_files, check_replaceable, replace_folder
 from humangs_jax.io.npz import read_npz, write_npz
+from humangs_jax.io.reading import reading
 from humangs_jax.io.text import write_json
 
 FIT_FILE, REPORT_FILE = "fit.npz", "fit.json"
@@ -68,10 +69,12 @@ def write_fit_record(path: str | Path, record: FitRecord) -> None:
 def read_fit_record(path: str | Path) -> FitRecord:
     """Read fit.npz, of earlier versions too. Raises: CaptureError naming file and key."""
     path = Path(path)
-    try:
-        values, pickled = read_npz(path)
-    except OSError as error:
-        raise CaptureError(path, "", error.strerror or error) from error
+    with reading(path, "fit.npz", CaptureError):
+        return _read_fit_record(path)
+
+
+def _read_fit_record(path):
+    values, pickled = read_npz(path)
     if pickled:
         raise CaptureError(path, pickled[0], "expected plain arrays, got a pickled object")
     values |= {new: values[old] for new, old in FORMER.items() if new not in values and old in values}

@@ -14,7 +14,9 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.keypoints.sets import FINGER_JOINTS, FINGERS
+from humangs_jax.io.mesh import read_meshes
 from humangs_jax.io.npz import read_npz
+from humangs_jax.io.reading import Refused, reading
 from humangs_jax.io.text import read_json
 
 VIEWS = 48
@@ -43,9 +45,10 @@ class Scan:
     hidden: float
 
 
-def read_mesh(path: str | Path) -> Any:
+def read_mesh(path: str | Path, textures: bool = False) -> Any:
     """A trimesh.Trimesh with all geometry of the file.
 
+    Arguments: textures: read them, too; without those that are not there.
     Raises: ValueError, naming the file, if it cannot be read, has no faces or corners that are not finite.
     """
     import trimesh
@@ -53,11 +56,7 @@ def read_mesh(path: str | Path) -> Any:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file: expected a mesh (OBJ, PLY, GLB, ...)")
-    try:
-        scene = trimesh.load_scene(path, process=False)  # processing would silently drop what is not finite
-    except Exception as error:  # every reader of trimesh has its own errors
-        raise ValueError(f"{path}: not a mesh that can be read: {' '.join(str(error).split())}") from error
-    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh) and len(part.faces)]
+    parts = read_meshes(path, textures)
     if not parts:
         raise ValueError(f"{path}: no faces: expected a triangle mesh (a point cloud has to be meshed before)")
     mesh: Any = parts[0] if len(parts) == 1 else trimesh.util.concatenate(parts)
@@ -164,16 +163,14 @@ def read_joints(path: str | Path) -> dict[str, Float[np.ndarray, "3"]]:
     Raises: ValueError, naming the file, if it is neither, or a name or a point is not one.
     """
     path = Path(path)
-    try:
+    with reading(path, "file of joints"):
         joints = _joints_of_npz(path) if path.suffix == ".npz" else read_json(path)
         if not isinstance(joints, dict):
-            raise ValueError('expected {"left_hip": [x, y, z], ...}')
+            raise Refused('expected {"left_hip": [x, y, z], ...}')
         if not joints:
-            raise ValueError("no joints: expected three at least")
+            raise Refused("no joints: expected three at least")
         checked_joints(joints)
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{path}: {error}") from error
-    return {name: np.asarray(point, np.float64) for name, point in joints.items()}
+        return {name: np.asarray(point, np.float64) for name, point in joints.items()}
 
 
 def _joints_of_npz(path):

@@ -21,6 +21,7 @@ from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.io.atomic import check_replaceable, replace_folder
 from humangs_jax.io.images import write_png
+from humangs_jax.io.reading import reading
 from humangs_jax.io.text import read_json, write_json
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
@@ -47,7 +48,7 @@ def render_scan_views(
     check_replaceable(out)
     if out.is_dir() and any(out.iterdir()):
         raise ValueError(f"{out}: the folder is not empty: expected a new one")
-    mesh = read_mesh(mesh_path)
+    mesh = read_mesh(mesh_path, textures=True)
     vertices = np.asarray(mesh.vertices, np.float64)
     align = _into_world(vertices[np.unique(mesh.faces)], up)
     angles = jnp.arange(views) * (2 * jnp.pi / views)
@@ -65,10 +66,8 @@ def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Flo
     Raises: ValueError if the folder is not one of these, or fewer than three landmarks are found.
     """
     folder = Path(folder)
-    try:
-        matrix = np.asarray(read_json(folder / SCAN_FILE)["world_from_scan"], np.float64)
-    except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"{folder / SCAN_FILE}: expected what render_scan_views writes: {error}") from error
+    with reading(folder / SCAN_FILE, "file of render_scan_views"):
+        matrix = np.asarray(read_json(folder / SCAN_FILE)["world_from_scan"], np.float64).reshape(4, 4)
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     align = Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
     observations, _ = group_by_frame(load_photos(folder), keypoints)

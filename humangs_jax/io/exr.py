@@ -15,6 +15,7 @@ import numpy as np
 from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.reading import Refused, check_limit, open_file, reading
 
 RGBA = ("R", "G", "B", "A")
 DEPTH = "Z"
@@ -79,25 +80,23 @@ def write_exr(path: str | Path, views: ExrView | Sequence[ExrView]) -> None:
 def read_exr(path: str | Path) -> list[ExrView]:
     """The views of a file, one per part; half floats become float32. A part without alpha is opaque, grey is repeated.
 
-    Raises: FileNotFoundError; OSError if it is no OpenEXR file or a damaged one; ValueError naming the part that has no
-    colours or whose K or cam_from_world is no matrix.
+    Raises: FileNotFoundError; FileError if it is no OpenEXR file, a damaged one, has more pixels than the limits allow, a part
+    without colours, or one whose K or cam_from_world is no matrix.
     """
     import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
 
     path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
-    if not OpenEXR.isOpenExrFile(str(path)):  # checked first: the reader prints to stderr before it raises
-        raise OSError(f"{path}: not an OpenEXR file")
-    try:
+    with reading(path, "OpenEXR file"):
+        open_file(path).close()  # OpenEXR opens it by name
+        if not OpenEXR.isOpenExrFile(str(path)):  # checked first: the reader prints to stderr before it raises
+            raise Refused("not an OpenEXR file")
         with OpenEXR.File(str(path), header_only=True) as file:
             count = len(file.parts)
+            check_limit("array_bytes", sum(_decoded_bytes(part) for part in file.parts), "bytes of pixels")
         with OpenEXR.File(str(path), separate_channels=True) as file:
             if len(file.parts) < count:  # the binding drops parts that it cannot decode, with no more than a print
-                raise OSError(f"{path}: damaged: {count - len(file.parts)} of {count} parts cannot be decoded")
+                raise Refused(f"damaged: {count - len(file.parts)} of {count} parts cannot be decoded")
             return [_from_part(part, path) for part in file.parts]
-    except RuntimeError as error:
-        raise OSError(f"{path}: not a readable OpenEXR file: {' '.join(str(error).split())}") from error
 
 
 def _to_part(view, name):
@@ -127,6 +126,15 @@ def _to_part(view, name):
         header["K"] = np.ascontiguousarray(view.K, np.float32)
         header["cam_from_world"] = np.ascontiguousarray(view.cam_from_world, np.float32)
     return OpenEXR.Part(header, channels, name)
+
+
+def _decoded_bytes(part):
+    """Of a part whose header is read: all channels in float32."""
+    (left, top), (right, bottom) = (tuple(int(x) for x in corner) for corner in part.header["dataWindow"])
+    width, height = right - left + 1, bottom - top + 1
+    check_limit("side", max(width, height), "pixels along a side")
+    check_limit("pixels", width * height, f"pixels ({width} x {height})")
+    return 4 * width * height * max(1, len(part.header["channels"]))
 
 
 def _from_part(part, path):

@@ -1,28 +1,36 @@
 """Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel) and JPEG, values as stored, no gamma.
 
-The orientation flag that phones write into JPEG files (EXIF) is ignored: calibrations refer to the stored pixels.
+The content decides, not the name: no other format is looked at. The orientation flag that phones write into JPEG files (EXIF) is
+ignored: calibrations refer to the stored pixels.
 """
 
-import subprocess
+import contextlib
+import io
+import struct
+import zlib
+from collections.abc import Generator, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.io.atomic import replace_file
+from humangs_jax.io.reading import FileError, Refused, check_limit, read_bytes, reading
 
+FORMATS = ("PNG", "JPEG")
+"""Pillow knows some forty more, one of which starts Ghostscript."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOUR_TYPES = {2: "rgb", 4: "grey and alpha", 6: "rgba"}
 """Colour types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
-
-_BROKEN = (SyntaxError, ValueError, EOFError)
-"""What Pillow raises for broken files, besides OSError and DecompressionBombError."""
+ADAM7 = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
+"""First row, first column and steps of the passes of an interlaced PNG (https://www.w3.org/TR/png-3/#8Interlace)."""
 
 
 def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
     """Colours and, where the file has an alpha channel, alpha. Grey images become three equal channels.
 
-    Raises: OSError if the file cannot be read as an image; FileNotFoundError (an OSError) if it is not there.
+    Raises: FileNotFoundError; FileError if the file cannot be read as a photo or has more pixels than the limit.
     """
     pixels = _read_pixels(path)
     if pixels.shape[-1] in (1, 3):
@@ -34,11 +42,11 @@ def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.n
 def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     """A one-channel image such as a mask; colour files are averaged.
 
-    Raises: OSError if the file cannot be read; ValueError if it has alpha besides the colours (which is meant?).
+    Raises: as `read_image`; FileError if it has alpha besides the colours (which is meant?).
     """
     colours, alpha = read_image(path)
     if alpha is not None and alpha.min() < 1:
-        raise ValueError("the image has an alpha channel besides its colours: expected one grey channel")
+        raise FileError(path, "", "the image has an alpha channel besides its colours: expected one grey channel")
     return colours[..., 0] if (colours == colours[..., :1]).all() else colours.mean(axis=-1)
 
 
@@ -67,64 +75,138 @@ def resized(image: Float[np.ndarray, "h w *c"], width: int, height: int) -> Floa
     return np.stack(planes, axis=-1).reshape(height, width, *image.shape[2:])
 
 
+@contextlib.contextmanager
+def open_image(path: str | Path) -> Generator[tuple[Any, bytes]]:
+    """A photo as a PIL.Image that is not decoded yet but within the limits, and the bytes of its file.
+
+    Raises: FileNotFoundError; FileError, also for whatever goes wrong inside.
+    """
+    with reading(path, "image"):
+        data = read_bytes(path, "image_bytes")
+        with image_in(data) as image:
+            yield image, data
+
+
+@contextlib.contextmanager
+def image_in(data: bytes) -> Generator[Any]:
+    """As `open_image`, of bytes. Raises: Refused; what Pillow raises for damaged images, which is of many types."""
+    from PIL import Image
+
+    if data[:2] == b"\xff\xd8":  # each scan may cost as much as all the pixels
+        check_limit("scans", data.count(b"\xff\xda"), "scans of a JPEG")
+    try:
+        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+            check_limit("pixels", image.width * image.height, f"pixels ({image.width} x {image.height})")
+            check_limit("side", max(image.size), "pixels along a side")
+            yield image
+    except Image.UnidentifiedImageError as error:
+        raise ValueError(f"neither {' nor '.join(FORMATS)}") from error
+
+
 def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
     """((width, height), whether there is an alpha channel). PNG files are checked by their checksums, others by decoding.
 
-    Raises: OSError if the file cannot be read as an image.
+    Raises: as `open_image`.
     """
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            found = image.size, "A" in image.getbands() or "transparency" in image.info
-            image.verify() if image.format == "PNG" else image.load()
-    except (*_BROKEN, Image.DecompressionBombError) as error:
-        raise OSError(str(error)) from error
+    with open_image(path) as (image, _):
+        found = image.size, "A" in image.getbands() or "transparency" in image.info
+        image.verify() if image.format == "PNG" else image.load()
     return found
 
 
 def image_size(path: str | Path) -> tuple[int, int]:
-    """Width and height in pixels, from the head of the file. Raises: OSError if it is not an image."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as image:
-            return image.size
-    except (*_BROKEN, Image.DecompressionBombError) as error:
-        raise OSError(str(error)) from error
+    """Width and height in pixels. Raises: as `open_image`."""
+    with open_image(path) as (image, _):
+        return image.size
 
 
 def _read_pixels(path):
     """(h, w, channels) float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels."""
-    from PIL import Image
-
-    with open(path, "rb") as file:
-        head = file.read(26)
-    if head[:8] == PNG_SIGNATURE and len(head) == 26 and head[24] == 16 and head[25] in PNG_COLOUR_TYPES:
-        return _read_deep_png(path, has_alpha=head[25] != 2)
-    try:
-        with Image.open(path) as image:
-            if image.mode.startswith("I"):  # 16-bit grey
-                return np.asarray(image, np.float32)[..., None] / np.float32(65535)
-            has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
-            pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
-    except (*_BROKEN, Image.DecompressionBombError) as error:
-        raise OSError(str(error)) from error
+    with open_image(path) as (image, data):
+        if data[:8] == PNG_SIGNATURE and data[24] == 16 and data[25] in PNG_COLOUR_TYPES:
+            return _decode_deep_png(data).astype(np.float32) / np.float32(65535)
+        if image.mode.startswith("I"):  # 16-bit grey
+            return np.asarray(image, np.float32)[..., None] / np.float32(65535)
+        has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+        pixels = np.asarray(image.convert("RGBA" if has_alpha else "RGB"))
     return pixels.astype(np.float32) / np.float32(255)
 
 
-def _read_deep_png(path, has_alpha):
-    """16 bits a channel through ffmpeg, which comes with imageio-ffmpeg: Pillow keeps the upper 8 bits only."""
-    import imageio_ffmpeg
-    from PIL import Image
+# 16 bits a channel: Pillow keeps the upper 8 only -----------------------------------------------------------------------
 
-    with Image.open(path) as image:
-        width, height = image.size
-    channels, layout = (4, "rgba64le") if has_alpha else (3, "rgb48le")
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", str(path), "-frames:v", "1"]
-    command += ["-f", "rawvideo", "-pix_fmt", layout, "-"]
-    done = subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=False)
-    if done.returncode or len(done.stdout) != 2 * width * height * channels:
-        raise OSError(f"not a readable 16-bit PNG: {done.stderr.decode(errors='replace').strip()}")
-    pixels = np.frombuffer(done.stdout, "<u2").reshape(height, width, channels)
-    return pixels.astype(np.float32) / np.float32(65535)
+
+BAND = 1024
+"""Rows that are decoded together."""
+
+
+def _decode_deep_png(data: bytes) -> UInt[np.ndarray, "h w c"]:
+    """The pixels of a PNG file of 16 bits a channel (https://www.w3.org/TR/png-3/)."""
+    chunks = list(_png_chunks(data))
+    width, height, _, colour_type, *methods = struct.unpack(">IIBBBBB", chunks[0][1])
+    if methods[:2] != [0, 0] or methods[2] > 1 or 0 in (width, height):
+        raise Refused("not a readable image: a PNG header with unknown methods")
+    channels = {2: 3, 4: 2, 6: 4}[colour_type]
+    passes = ADAM7 if methods[2] else ((0, 0, 1, 1),)
+    sizes = [(len(range(y, height, dy)), len(range(x, width, dx))) for y, x, dy, dx in passes]
+    lengths = [h * (1 + 2 * channels * w) if w else 0 for h, w in sizes]
+    stream = zlib.decompressobj()
+    raw = stream.decompress(b"".join(body for name, body in chunks if name == b"IDAT"), sum(lengths))
+    if len(raw) < sum(lengths):
+        raise EOFError("image file is truncated")
+    pixels, at = np.empty((height, width, channels), np.uint16), 0
+    for (y, x, dy, dx), (h, w), length in zip(passes, sizes, lengths, strict=True):
+        rows = np.frombuffer(raw, np.uint8, length, at)
+        if length:
+            pixels[y::dy, x::dx] = _unfiltered(rows.reshape(h, -1), 2 * channels).view(">u2").reshape(h, w, channels)
+        at += length
+    return pixels
+
+
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Name and contents of each chunk up to the end, checksums compared."""
+    at = 8
+    while at < len(data):
+        length, name = struct.unpack(">I4s", data[at : at + 8])
+        body, check = data[at + 8 : at + 8 + length], data[at + 8 + length : at + 12 + length]
+        if len(check) < 4 or zlib.crc32(name + body) != int.from_bytes(check, "big"):
+            raise ValueError(f"chunk {name!r} is damaged or cut off")
+        yield name, body
+        if name == b"IEND":
+            return
+        at += 12 + length
+
+
+def _unfiltered(rows: np.ndarray, step: int) -> np.ndarray:
+    """The bytes of rows (h, 1 + n) that begin with the number of their filter; `step` bytes are a pixel."""
+    if rows[:, 0].max() > 4:
+        raise ValueError("a filter that does not exist")
+    bands, above = [], np.zeros((rows.shape[1] - 1) // step * step, np.uint8)
+    for start in range(0, len(rows), BAND):
+        bands.append(_unfiltered_band(rows[start : start + BAND], above, step))
+        above = bands[-1][-1]
+    return np.concatenate(bands)
+
+
+def _unfiltered_band(rows: np.ndarray, row_above: np.ndarray, step: int) -> np.ndarray:
+    """A byte depends on those to the left, above, and above to the left: along a diagonal the pixels are independent.
+
+    Pixel x of row y is at [1 + x + y, 1 + y], so that a diagonal is a row in memory; before the first pixel there are zeros.
+    """
+    height, width = len(rows), len(row_above) // step
+    skewed = np.zeros((width + height + 1, height + 1, step), np.int16)
+    y, x = np.arange(height)[:, None], np.arange(width)
+    skewed[1 + x + y, 1 + y] = rows[:, 1:].reshape(height, width, step)
+    skewed[:width, 0] = row_above.reshape(width, step)
+    kinds = rows[:, :1]
+    for diagonal in range(1, width + height):
+        first, last = max(0, diagonal - width), min(height, diagonal)
+        here, kind = slice(1 + first, 1 + last), kinds[first:last]
+        left, above = skewed[diagonal - 1, here], skewed[diagonal - 1, first:last]
+        corner = skewed[diagonal - 2, first:last]
+        near = left + above - corner
+        a, b, c = (np.abs(near - each) for each in (left, above, corner))
+        paeth = np.where((a <= b) & (a <= c), left, np.where(b <= c, above, corner))
+        guess = np.select([kind == 1, kind == 2, kind == 3, kind == 4], [left, above, (left + above) >> 1, paeth], 0)
+        skewed[diagonal, here] += guess
+        skewed[diagonal, here] &= 255
+    return skewed[1 + x + y, 1 + y].astype(np.uint8).reshape(height, -1)

@@ -1,25 +1,29 @@
 """Tensors of a file that `torch.save` wrote, without torch and without running anything in it.
 
-The unpickler knows the calls which rebuild the tensors of a state dict and refuses every other name. What those calls return
-is immutable, so that no later instruction of the pickle can change it. A tensor comes out as a description: a view of a
-storage, whose numbers lie elsewhere in the file. Only the storages of wanted tensors are read.
+The unpickler (`restricted_pickle`) knows the calls which rebuild the tensors of a state dict and refuses every other name. What
+those calls return is immutable, so that no later instruction of the pickle can change it. A tensor comes out as a description: a
+view of a storage, whose numbers lie elsewhere in the file. Only the storages of wanted tensors are read.
 
 Both formats are read. Since torch 1.6 it is a zip archive of the pickle and one member per storage. Before (and in what
 the lpips wheel ships) it is a stream: three pickles of a magic number, a version and the byte order; the pickle itself;
 a pickled list of the storages' names; then of each storage the count of its numbers and the numbers.
 """
 
-import collections
+import io
 import math
+import mmap
 import os
-import pickle
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from humangs_jax.io.npz import open_archive
+from humangs_jax.io.reading import Refused, check_limit, open_file, reading
+from humangs_jax.io.restricted_pickle import Call, RestrictedUnpickler
 
 ZIP_START = b"PK\x03\x04"
 PICKLE_START = b"\x80"
@@ -28,6 +32,8 @@ MAGIC_NUMBER = 0x1950A86A20F9469CFC6C
 STREAM_VERSION = 1001
 LARGEST_RATIO = 16
 """Members may unpack to this many times the size of the file: torch does not compress at all."""
+LARGEST_SHARE = 4
+"""Tensors may take this many times the size of the file: bfloat16 is widened, and weights may be tied."""
 BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError, struct.error)
 """What zipfile raises for damaged, truncated, encrypted or exotic archives."""
 
@@ -84,89 +90,87 @@ def _counts(x: Any) -> bool:
     return type(x) is tuple and all(type(n) is int and n >= 0 for n in x)
 
 
-class _RebuildTensor:
-    __slots__ = ()
-
-    def __call__(self, storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _Tensor:
-        if not (isinstance(storage, _Storage) and _counts((offset,)) and _counts(shape) and _counts(strides)):
-            raise pickle.UnpicklingError("a tensor without a storage, or whose offset, shape or strides are no counts")
-        if len(shape) != len(strides):
-            raise pickle.UnpicklingError(f"a tensor with {len(shape)} axes and {len(strides)} strides")
-        return _Tensor(storage, offset, shape, strides)
-
-
-class _RebuildParameter:
-    __slots__ = ()
-
-    def __call__(self, tensor: Any, *_: Any) -> Any:
-        return tensor
+def _rebuild_tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _Tensor:
+    if not (isinstance(storage, _Storage) and _counts((offset,)) and _counts(shape) and _counts(strides)):
+        raise Refused("a tensor without a storage, or whose offset, shape or strides are no counts")
+    if len(shape) != len(strides):
+        raise Refused(f"a tensor with {len(shape)} axes and {len(strides)} strides")
+    if len(shape) > MOST_AXES:
+        raise Refused(f"a tensor with {len(shape)} axes")
+    return _Tensor(storage, offset, shape, strides)
 
 
-_ALLOWED = {
-    ("torch._utils", "_rebuild_tensor"): _RebuildTensor(),
-    ("torch._utils", "_rebuild_tensor_v2"): _RebuildTensor(),
-    ("torch._utils", "_rebuild_parameter"): _RebuildParameter(),
-    ("collections", "OrderedDict"): collections.OrderedDict,
+def _rebuild_parameter(tensor: Any, *_: Any) -> _Tensor:
+    if not isinstance(tensor, _Tensor):
+        raise Refused("a parameter that is no tensor")
+    return tensor
+
+
+def _ordered_dict(*arguments: Any) -> dict:
+    if arguments:  # items follow, but for those of Python 2.6
+        raise Refused("an ordered dict that is made of something")
+    return {}
+
+
+MOST_AXES = 32
+_NAMES: dict[tuple[str, str], Any] = {
+    ("torch._utils", "_rebuild_tensor"): Call(_rebuild_tensor),
+    ("torch._utils", "_rebuild_tensor_v2"): Call(_rebuild_tensor),
+    ("torch._utils", "_rebuild_parameter"): Call(_rebuild_parameter),
+    ("collections", "OrderedDict"): Call(_ordered_dict),
     **{("torch", name): _StorageType(name) for name in STORAGE_DTYPES},
 }
 
 
-class _StateDictUnpickler(pickle.Unpickler):
+class _StateDictUnpickler(RestrictedUnpickler):
     """Knows tensors, ordered dicts and storages; `kinds` is the type of each storage that it read."""
 
     def __init__(self, file: Any) -> None:
-        super().__init__(file)
+        super().__init__(file, _NAMES, "no part of a state dict")
         self.kinds: dict[str, str] = {}
-
-    def find_class(self, module: str, name: str) -> Any:
-        """The stand-in for a name of the pickle."""
-        if (module, name) not in _ALLOWED:
-            module = "builtins" if module == "__builtin__" else module  # its name in protocol 2, which torch writes
-            raise pickle.UnpicklingError(f"refused to load {module}.{name}: no part of a state dict")
-        return _ALLOWED[module, name]
 
     def persistent_load(self, pid: Any) -> _Storage:
         """A storage. The older format adds None, or says which part of another storage this one is."""
-        known = isinstance(pid, tuple) and len(pid) in (5, 6) and pid[0] == "storage"
+        known = type(pid) is tuple and len(pid) in (5, 6) and pid[0] == "storage"
         if not (known and isinstance(pid[1], _StorageType) and isinstance(pid[2], str)):
-            raise pickle.UnpicklingError("refused to load a persistent object that is no storage")
+            raise Refused("refused to load a persistent object that is no storage")
         if self.kinds.setdefault(pid[2], pid[1].name) != pid[1].name:
-            raise pickle.UnpicklingError(f"storage {pid[2]} is of two types")
+            raise Refused(f"storage {pid[2]} is of two types")
         part = pid[5] if len(pid) == 6 else None
         if part is None:
             return _Storage(pid[1].name, pid[2])
         if not (type(part) is tuple and len(part) == 3 and _counts(part[1:])):
-            raise pickle.UnpicklingError("a part of a storage whose place is no count")
+            raise Refused("a part of a storage whose place is no count")
         return _Storage(pid[1].name, pid[2], part[1])
 
 
 def _state_dict_tensors(content: Any, wanted: Callable[[str], bool]) -> tuple[dict[str, _Tensor], int]:
     """The wanted tensors of the state dict in what was unpickled, and how many others it has.
 
-    The state dict is what lies under one of `STATE_DICTS`, or else the content itself. Raises: ValueError.
+    The state dict is what lies under one of `STATE_DICTS`, or else the content itself. Raises: Refused.
     """
     label = next((key for key in STATE_DICTS if isinstance(content, dict) and isinstance(content.get(key), dict)), None)
     model = content if label is None else content[label]
     if not isinstance(model, dict) or (label is None and not any(isinstance(x, _Tensor) for x in model.values())):
         names = " or ".join(map(repr, STATE_DICTS))
-        raise ValueError(f"expected a state dict, or a dict with one under {names}")
+        raise Refused(f"expected a state dict, or a dict with one under {names}")
     if not all(isinstance(key, str) for key in model):
-        raise ValueError("the state dict has a key that is no string")
+        raise Refused("the state dict has a key that is no string")
     chosen = {key: x for key, x in model.items() if wanted(key)}
     for key, value in chosen.items():
         if not isinstance(value, _Tensor):
-            raise ValueError(f"{label or 'state_dict'}[{key!r}] is no tensor but {type(value).__name__}")
+            raise Refused(f"{label or 'state_dict'}[{key!r}] is no tensor but {type(value).__name__}")
     return chosen, len(model) - len(chosen)
 
 
 def _read_tensor(data: np.ndarray, key: str, tensor: _Tensor) -> np.ndarray:
-    """The numbers of a tensor from those of its storage, bounds checked. bfloat16 becomes float32. Raises: ValueError."""
+    """The numbers of a tensor from those of its storage, bounds checked. bfloat16 becomes float32. Raises: Refused."""
     storage, offset, shape, strides = tensor
     offset += storage.start
     last = offset + sum((n - 1) * stride for n, stride in zip(shape, strides, strict=True))
     count = math.prod(shape)  # views of parameters never repeat numbers: a larger one is a bomb
     if count > len(data) or (count and last >= len(data)):
-        raise ValueError(f"{key}: shape {shape} does not fit storage {storage.name} of {len(data)} numbers")
+        raise Refused(f"{key}: shape {shape} does not fit storage {storage.name} of {len(data)} numbers")
     if not count:
         return np.zeros(shape, data.dtype)
     steps = tuple(stride * data.itemsize for stride in strides)
@@ -186,94 +190,94 @@ def everything(key: str) -> bool:
 def read_torch_file(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[Tensors, int]:
     """The tensors of the state dict in a file whose name is wanted, and how many others there are.
 
-    bfloat16 comes as float32, everything else as it is stored. Raises: OSError; ValueError if the file is no checkpoint
-    or a damaged one, if its pickle asks for anything but tensors, or if a storage is missing or too short, naming it.
+    bfloat16 comes as float32, everything else as it is stored.
+    Raises: FileNotFoundError; FileError if the file is no checkpoint or a damaged one, if its pickle asks for more than
+    tensors, or if a storage is missing or too short, naming it.
     """
-    size = os.path.getsize(path)
-    with open(path, "rb") as file:
+    with reading(path, "torch file"), open_file(path) as file:
+        size = os.path.getsize(path)
         start = file.read(4)
         file.seek(0)
-        try:
-            if start.startswith(PICKLE_START):
-                return _read_stream(file, size, wanted)
-            if start != ZIP_START:
-                raise ValueError("neither of the formats that torch.save writes")
-            with zipfile.ZipFile(file) as archive:
-                return _read_archive(archive, size, wanted)
-        except BROKEN as error:
-            raise ValueError(f"{path}: a damaged torch file: {error}") from error
-        except ValueError as error:
-            raise ValueError(f"{path}: {error}") from error
-
-
-def _unpickle(unpickler: "_StateDictUnpickler") -> Any:
-    try:
-        return unpickler.load()
-    except BROKEN:
-        raise
-    except Exception as error:  # a broken pickle raises nearly anything
-        raise ValueError(str(error) or f"its pickle is damaged ({type(error).__name__})") from error
+        if start.startswith(PICKLE_START):
+            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                return _read_stream(content, size, wanted)
+        if start != ZIP_START:
+            raise Refused("neither of the formats that torch.save writes")
+        with open_archive(file, size) as archive:
+            return _read_archive(archive, size, wanted)
 
 
 def _read_archive(archive: zipfile.ZipFile, size: int, wanted: Wanted) -> tuple[Tensors, int]:
     if sum(member.file_size for member in archive.infolist()) > LARGEST_RATIO * size:
-        raise ValueError(f"its members unpack to more than {LARGEST_RATIO} times the size of the file")
-    names = archive.namelist()
+        raise Refused(f"its members unpack to more than {LARGEST_RATIO} times the size of the file")
+    names = set(archive.namelist())
     pickles = [name for name in names if name.count("/") == 1 and name.endswith("/data.pkl")]
     if len(pickles) != 1:
-        raise ValueError(f"expected one <name>/data.pkl inside, found {pickles}")
+        raise Refused(f"expected one <name>/data.pkl inside, found {len(pickles)}")
     root = pickles[0].removesuffix("data.pkl")
     if f"{root}byteorder" in names and archive.read(f"{root}byteorder").strip() != b"little":
-        raise ValueError("only little-endian checkpoints are supported")
-    with archive.open(pickles[0]) as file:
-        tensors, skipped = _state_dict_tensors(_unpickle(_StateDictUnpickler(file)), wanted)
+        raise Refused("only little-endian checkpoints are supported")
+    check_limit("text_bytes", archive.getinfo(pickles[0]).file_size, "bytes of a pickle")
+    content = _StateDictUnpickler(io.BytesIO(archive.read(pickles[0]))).load()
+    tensors, skipped = _state_dict_tensors(content, wanted)
 
     def read(key: str, storage: _Storage) -> np.ndarray:
         try:
             return np.frombuffer(archive.read(f"{root}data/{storage.name}"), storage.dtype)
         except (KeyError, ValueError, *BROKEN) as error:
-            raise ValueError(f"{key}: storage {storage.name} is missing or damaged: {error}") from error
+            raise Refused(f"{key}: storage {storage.name} is missing or damaged: {error}") from error
 
-    return _read_tensors(tensors, read), skipped
+    return _read_tensors(tensors, size, read), skipped
 
 
-def _read_stream(file: BinaryIO, size: int, wanted: Wanted) -> tuple[Tensors, int]:
-    if _unpickle(_StateDictUnpickler(file)) != MAGIC_NUMBER:
-        raise ValueError("a pickle, but neither of the formats that torch.save writes")
-    if (version := _unpickle(_StateDictUnpickler(file))) != STREAM_VERSION:
-        raise ValueError(f"version {version!r} of the older format, expected {STREAM_VERSION}")
-    machine = _unpickle(_StateDictUnpickler(file))
+def _read_stream(file: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
+    if _StateDictUnpickler(file).load() != MAGIC_NUMBER:
+        raise Refused("a pickle, but neither of the formats that torch.save writes")
+    if (version := _StateDictUnpickler(file).load()) != STREAM_VERSION:
+        raise Refused(f"version {version!r} of the older format, expected {STREAM_VERSION}")
+    machine = _StateDictUnpickler(file).load()
     if not (isinstance(machine, dict) and machine.get("little_endian") is True):
-        raise ValueError("only little-endian checkpoints are supported")
+        raise Refused("only little-endian checkpoints are supported")
     unpickler = _StateDictUnpickler(file)
-    tensors, skipped = _state_dict_tensors(_unpickle(unpickler), wanted)
+    tensors, skipped = _state_dict_tensors(unpickler.load(), wanted)
     places = _storage_places(file, size, unpickler.kinds)
 
     def read(key: str, storage: _Storage) -> np.ndarray:
         if storage.name not in places:
-            raise ValueError(f"{key}: storage {storage.name} is missing")
+            raise Refused(f"{key}: storage {storage.name} is missing")
         start, count = places[storage.name]
         file.seek(start)
         return np.frombuffer(file.read(count * storage.dtype.itemsize), storage.dtype)
 
-    return _read_tensors(tensors, read), skipped
+    return _read_tensors(tensors, size, read), skipped
 
 
-def _storage_places(file: BinaryIO, size: int, kinds: dict[str, str]) -> dict[str, tuple[int, int]]:
+def _storage_places(file: Any, size: int, kinds: dict[str, str]) -> dict[str, tuple[int, int]]:
     """Where in the stream the numbers of each storage begin, and how many they are."""
-    names, places = _unpickle(_StateDictUnpickler(file)), {}
+    names, places = _StateDictUnpickler(file).load(), {}
     if not (isinstance(names, list) and all(isinstance(name, str) and name in kinds for name in names)):
-        raise ValueError("its list of storages names one that no tensor has")
+        raise Refused("its list of storages names one that no tensor has")
     for name in names:
         (count,) = struct.unpack("<q", file.read(8))
         start = file.tell()
         end = start + count * _Storage(kinds[name], name).dtype.itemsize
         if count < 0 or end > size:
-            raise ValueError(f"storage {name} of {count} numbers does not fit the file: truncated?")
+            raise Refused(f"storage {name} of {count} numbers does not fit the file: truncated?")
         places[name] = start, count
         file.seek(end)
     return places
 
 
-def _read_tensors(tensors: dict[str, _Tensor], read: Callable[[str, _Storage], np.ndarray]) -> Tensors:
-    return {key: _read_tensor(read(key, tensor.storage), key, tensor) for key, tensor in tensors.items()}
+def _read_tensors(tensors: dict[str, _Tensor], size: int, read: Callable[[str, _Storage], np.ndarray]) -> Tensors:
+    """Each storage is read once, however many tensors share it; what they take together is bounded by the file's size."""
+    arrays, of_storage, left = {}, {}, LARGEST_SHARE * size
+    for key, tensor in tensors.items():
+        of_storage.setdefault(tensor.storage.name, []).append(key)
+    for keys in of_storage.values():
+        data = read(keys[0], tensors[keys[0]].storage)
+        for key in keys:
+            left -= math.prod(tensors[key].shape) * data.itemsize
+            arrays[key] = _read_tensor(data, key, tensors[key])
+            if left < 0:
+                raise Refused(f"{key}: the tensors take more than {LARGEST_SHARE} times the size of the file")
+    return {key: arrays[key] for key in tensors}

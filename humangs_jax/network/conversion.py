@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from humangs_jax.io.reading import reading
 from humangs_jax.io.tensor_file import is_safetensors, read_safetensors, read_tensors
 from humangs_jax.network.config import Architecture, HumanGSConfig, paper_parts
 from humangs_jax.network.encoder import PatchTransformer
@@ -258,6 +259,11 @@ def load_checkpoint(path: str | os.PathLike, head_width: int | None = None) -> C
     head_width: see `infer_config`. Raises: OSError; ValueError naming file and tensor if the file cannot be read or
     asks for more than tensors, or if a tensor of the network is missing, unknown, of the wrong shape or not finite.
     """
+    with reading(path, "checkpoint of the published network"):
+        return _load_checkpoint(path, head_width)
+
+
+def _load_checkpoint(path, head_width):
     state, skipped = read_state_dict(path)
     try:
         config = infer_config(state, head_width)

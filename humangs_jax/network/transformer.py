@@ -19,6 +19,8 @@ from humangs_jax.network.attention import NORM_EPSILON, PRODUCT, Attention
 from humangs_jax.network.execution import Execution
 
 INIT_STD = 0.02
+MOST_LAYERS = 256
+"""Every layer is traced: a file that says 100,000 would keep a machine busy for hours."""
 _POLICIES = {"full": None, "dots": jax.checkpoint_policies.save_only_these_names(PRODUCT)}
 
 
@@ -39,8 +41,10 @@ class TransformerConfig:
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
-        if self.layers < 1:
-            raise ValueError(f"layers {self.layers}: expected at least 1")
+        if not 1 <= self.layers <= MOST_LAYERS:
+            raise ValueError(f"layers {self.layers}: expected 1 to {MOST_LAYERS}")
+        if self.head_width < 1 or self.width < 1:
+            raise ValueError(f"width {self.width}, head_width {self.head_width}: expected at least 1")
         if self.width % self.head_width:
             raise ValueError(f"width {self.width} is not a multiple of head_width {self.head_width}")
 

@@ -1,8 +1,9 @@
 """Weights on disk: one safetensors file, tensors under their path in the variables, what they are in its header.
 
 Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format": "humangs-weights",
-"version": "2", "architecture": JSON, "conventions": JSON}. Files of version 1 (one "config", which said how the network ran, too)
-still load. float16 halves the file (and rounds to 11 bits); loading gives float32.
+"version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}; the first files have no checksum. Files of
+version 1 (one "config", which said how the network ran, too) still load. float16 halves the file (and rounds to 11 bits); loading
+gives float32.
 """
 
 import json
@@ -16,7 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.configuration import config_from_json, config_to_json
+from humangs_jax.io.arrays import check_checksum, checksum
 from humangs_jax.io.atomic import write_bytes
+from humangs_jax.io.reading import reading
 from humangs_jax.io.tensor_file import read_safetensors
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
 from humangs_jax.network.humangs import init_humangs
@@ -57,16 +60,16 @@ def save_weights(
             if np.abs(tensor).max(initial=0) > np.finfo(np.float16).max:
                 raise ValueError(f"{key}: overflows float16; store it as float32")
     recorded = {name: config_to_json(getattr(config, name)) for name in ("architecture", "conventions")}
+    stored = {key: np.ascontiguousarray(x, np.dtype(dtype)) for key, x in tensors.items()}
     metadata = {"format": FORMAT, "version": VERSION, **recorded}
-    data = save({key: np.ascontiguousarray(x, np.dtype(dtype)) for key, x in tensors.items()}, metadata)
-    write_bytes(path, data)
+    write_bytes(path, save(stored, metadata | {"checksum": checksum(stored, *recorded.values())}))
 
 
 def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, HumanGSConfig]:
     """Variables (float32) and configuration of a file, with default `Execution`; None loads the weights of this package.
 
     Raises: FileNotFoundError; ValueError if the file is not a weights file of this package, or a tensor is missing, unknown, of
-    the wrong shape or not finite, naming file and key.
+    the wrong shape or not finite, naming file and key; or if the contents are not those of the checksum.
     """
     if path is None:
         with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as shipped:
@@ -75,6 +78,11 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
             return load_weights(shipped)
     if not Path(path).is_file():
         raise FileNotFoundError(f"no weights file {path}")
+    with reading(path, "weights file"):
+        return _load_weights(path)
+
+
+def _load_weights(path):
     tensors, _, metadata = read_safetensors(path)
     if metadata.get("format") != FORMAT or metadata.get("version") not in ("1", VERSION):
         found = f"format {metadata.get('format')!r}, version {metadata.get('version')!r}"
@@ -90,7 +98,10 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
             tensors = {key.replace("params/readout/", "params/reader/"): x for key, x in tensors.items()}
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
-    return variables_from_tensors(tensors, config, str(path)), config
+    variables = variables_from_tensors(tensors, config, str(path))
+    recorded = (metadata.get(name, "") for name in ("architecture", "conventions"))
+    check_checksum(metadata.get("checksum"), checksum(tensors, *recorded))
+    return variables, config
 
 
 def fit_variables(variables: Variables, old: HumanGSConfig, new: HumanGSConfig) -> Variables:

@@ -17,7 +17,9 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.io.arrays import check_array, check_indices, check_joints
 from humangs_jax.io.npz import read_npz, write_npz
+from humangs_jax.io.reading import Refused, reading
 from humangs_jax.people.baking import JOINTS_PER_VERTEX, bake_subject, strongest_joints
 from humangs_jax.people.kinematics import joint_positions
 from humangs_jax.people.poses import sample_rotations
@@ -122,7 +124,12 @@ def save_bank(path: str | Path, bank: PeopleBank) -> None:
 
 
 def load_bank(path: str | Path) -> PeopleBank:
-    """Read a bank. Raises: FileNotFoundError; OSError if it is no archive; ValueError if it holds no bank."""
+    """Read a bank. Raises: FileNotFoundError; FileError if it holds no bank."""
+    with reading(path, "bank of people"):
+        return _load_bank(path)
+
+
+def _load_bank(path):
     arrays, _ = read_npz(path)
     if str(arrays.get("format")) != FORMAT:
         raise ValueError(f"{path}: not a bank of people")
@@ -130,6 +137,7 @@ def load_bank(path: str | Path) -> PeopleBank:
         raise ValueError(f"{path}: a bank of version {int(arrays['version'])}; this program reads version {VERSION}")
     if missing := {*_ARRAYS, *_STATIC} - set(arrays):
         raise ValueError(f"{path}: a bank without {sorted(missing)}")
+    _check_arrays(arrays)
     split = str(arrays["split"])
     _check_range(arrays["seeds"].tolist(), split, f"{path}: ")
     return PeopleBank(
@@ -143,6 +151,24 @@ def load_bank(path: str | Path) -> PeopleBank:
 
 _STATIC = ("parents", "mirrored_joints", "split", "generator")
 _ARRAYS = tuple(name for name in PeopleBank.__annotations__ if name not in _STATIC)
+
+
+def _check_arrays(arrays):
+    """Sizes that fit each other, real and finite numbers, indices that exist. Raises: Refused."""
+    sizes = {}
+    for name in _ARRAYS:
+        dimensions = PeopleBank.__annotations__[name].dim_str.split()
+        if arrays[name].ndim != len(dimensions):
+            raise Refused(f"{name}: expected shape ({', '.join(dimensions)}), got {arrays[name].shape}")
+        for dimension, size in zip(dimensions, arrays[name].shape, strict=True):
+            if sizes.setdefault(dimension, int(dimension) if dimension.isdigit() else size) != size:
+                raise Refused(f"{name}: expected {dimension} = {sizes[dimension]}, got shape {arrays[name].shape}")
+        check_array(name, arrays[name], arrays[name].shape)
+    bounds = {"faces": sizes["n"], "joint_ids": sizes["j"], "nearest": sizes["q"], "face_pieces": sizes["m"]}
+    for name, bound in bounds.items():
+        check_indices(name, arrays[name], arrays[name].shape, bound)
+    check_joints(arrays["parents"].tolist(), [""] * sizes["j"])
+    check_indices("mirrored_joints", arrays["mirrored_joints"], (sizes["j"],), sizes["j"])
 
 
 def _check_range(seeds, split, where=""):

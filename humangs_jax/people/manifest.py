@@ -17,10 +17,7 @@ FORMAT, VERSION = "humangs-synthetic", 2
 def read_manifest(folder: str | Path) -> dict[str, Any]:
     """What a set was made with. Raises: ValueError, one line naming the file, if it is no manifest of this format."""
     file = Path(folder) / MANIFEST
-    try:
-        content = read_json(file)
-    except (OSError, ValueError) as error:
-        raise ValueError(f"{file}: cannot be read: {error}") from error
+    content = read_json(file)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"{file}: format: expected a manifest of {FORMAT!r}")
     if content.get("version") not in (1, VERSION):

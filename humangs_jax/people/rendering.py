@@ -14,6 +14,7 @@ import numpy as np
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.exr import ExrView, write_exr
+from humangs_jax.io.images import open_image
 from humangs_jax.people import shading
 from humangs_jax.people.fabrics import Spots
 from humangs_jax.people.kinematics import Rotations, Vector
@@ -167,9 +168,7 @@ def write_depth(path: str | Path, depth: Float[np.ndarray, "h w"]) -> None:
 
 def read_depth(path: str | Path) -> Float[np.ndarray, "h w"]:
     """Metres, 0 where nothing is hit. Raises: OSError if the file cannot be read; ValueError if it is no 16-bit grey PNG."""
-    from PIL import Image
-
-    with Image.open(path) as image:
+    with open_image(path) as (image, _):
         if not image.mode.startswith("I"):
             raise ValueError(f"{path}: expected a 16-bit grey PNG, got mode {image.mode}")
         return (np.asarray(image).astype(np.float64) * DEPTH_UNIT).astype(np.float32)

@@ -1,27 +1,36 @@
 """Checkpoints of a run: the newest few and the best, each complete or not there, bit for bit what was saved.
 
+Each records a checksum of its arrays. A damaged one is never continued from: the newest good one is, and it is said.
+
 They are written while the run goes on, by all processes together, each what its devices hold; a run on other devices reads
 them as well.
 
 out/config.json          the configuration of the run
-out/checkpoints/STEP     Orbax checkpoints of the TrainState, with the score of their validation
+out/checkpoints/STEP             Orbax checkpoints of the TrainState, with the score of their validation
+out/checkpoints/damaged-STEP     those that could not be read, set aside
 """
 
 import contextlib
 import dataclasses
 import json
 import logging
+import zlib
 from collections.abc import Generator
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.io.atomic import write_text
+from humangs_jax.io.reading import FileError, Refused, reading
+from humangs_jax.io.text import read_json
 from humangs_jax.training.config import TrainConfig, read_config
 from humangs_jax.training.state import TrainState
 
+logger = logging.getLogger("humangs_jax.training")
 UNSCORED = -1e9
 """Score of a checkpoint that was saved before any validation: worse than every other."""
 ADJUSTABLE = ("log_every", "validate_every", "checkpoint_every", "keep_checkpoints", "microbatch_size")
@@ -50,8 +59,13 @@ class Checkpoints:
             create=not read_only,
             read_only=read_only,
         )
+        folder, self._read_only = Path(folder).resolve(), read_only
+        if unreadable := _without_score(folder):
+            if read_only:
+                raise FileError(unreadable[0], "", "a damaged checkpoint: continue the run to have it set aside")
+            _set_aside(unreadable)
         with _quiet():
-            self._manager = ocp.CheckpointManager(Path(folder).resolve(), options=options)
+            self._manager = ocp.CheckpointManager(folder, options=options)
 
     @property
     def steps(self) -> list[int]:
@@ -80,7 +94,7 @@ class Checkpoints:
             jax.default_backend() == "cpu"
         ):  # where what is written would be the very memory that the next step overwrites
             state = jax.tree.map(jnp.copy, state)
-        metrics = {"score": UNSCORED if score is None else float(score)}
+        metrics = {"score": UNSCORED if score is None else float(score), CHECKSUM: _checksum(state)}
         with _quiet():
             self._manager.save(step, args=self._ocp.args.StandardSave(_as_dict(state)), metrics=metrics)
 
@@ -90,24 +104,126 @@ class Checkpoints:
             self._manager.wait_until_finished()
 
     def restore(self, like: TrainState, step: int | None = None) -> TrainState:
-        """The state of a step (None: the newest). `like`: a state of the same run, for structure, shapes and devices.
+        """The state of a step (None: the newest good one). `like`: a state of the same run, for structure, shapes and devices.
 
-        Raises: FileNotFoundError if there is no such checkpoint; ValueError if it is of another model.
+        Newer checkpoints that are damaged are reported and set aside.
+        Raises: FileNotFoundError if there is no such checkpoint; FileError (a ValueError) if all are damaged or of another model.
         """
-        step = self._manager.latest_step() if step is None else step
-        if step is None or step not in self._manager.all_steps():
-            raise FileNotFoundError(
-                f"{self._manager.directory}: no checkpoint{'' if step is None else f' of step {step}'}"
-            )
-        abstract = jax.tree.map(self._ocp.utils.to_shape_dtype_struct, _as_dict(like))
-        with _quiet():
-            restored = self._manager.restore(step, args=self._ocp.args.StandardRestore(abstract))
-        return TrainState(**jax.tree.map(_placed_as, restored, _as_dict(like)))
+        self.wait()
+        folder = Path(self._manager.directory)
+        steps = self.steps[::-1] if step is None else [step] if step in self.steps else []
+        if not steps:
+            raise FileNotFoundError(f"{folder}: no checkpoint{'' if step is None else f' of step {step}'}")
+        damaged: list[Path] = []
+        for candidate in steps:
+            state, problem = self._restore(candidate, like)
+            if state is not None:
+                if damaged and not self._read_only:
+                    _set_aside(damaged)
+                    self._manager.reload()
+                return state
+            damaged.append(folder / str(candidate))
+            logger.warning("%s: going back to the checkpoint before", problem)
+        raise FileError(folder, "", f"none of {len(damaged)} checkpoints can be used, the last one tried: {problem}")
+
+    def _restore(self, step: int, like: TrainState) -> tuple[TrainState | None, str]:
+        """The state, or what is wrong; all processes come to the same result."""
+        path, wanted = Path(self._manager.directory) / str(step), _as_dict(like)
+        state, problem = None, ""
+        try:
+            with reading(path, "checkpoint"), _quiet():
+                described = self._ocp.StandardCheckpointHandler().metadata(
+                    self._manager.directory / str(step) / "default"
+                )
+                shapes = sorted(x.shape for x in jax.tree.leaves(getattr(described, "tree", described)))
+                if shapes != sorted(x.shape for x in jax.tree.leaves(wanted)):
+                    raise Refused("its arrays are those of another model")
+                abstract = jax.tree.map(self._ocp.utils.to_shape_dtype_struct, wanted)
+                restored = self._manager.restore(step, args=self._ocp.args.StandardRestore(abstract))
+                state = TrainState(**jax.tree.map(_placed_as, restored, wanted))
+        except (FileError, FileNotFoundError) as error:
+            problem = str(error)
+        recorded = (self._manager.metrics(step) or {}).get(CHECKSUM)
+        if state is not None and recorded not in (None, found := _checksum(state)):
+            state, problem = None, f"{path}: damaged: its arrays have the checksum {found}, recorded is {recorded}"
+        if jax.process_count() > 1:
+            from jax.experimental import multihost_utils
+
+            if not multihost_utils.process_allgather(np.asarray(state is not None)).all():
+                state, problem = None, problem or f"{path}: damaged, as another process found"
+        return state, problem
 
     def close(self) -> None:
         """Wait for what is being written, and release what Orbax holds."""
         with _quiet():
             self._manager.close()
+
+
+CHECKSUM = "checksum"
+"""Beside the score of a checkpoint; the first ones do not have it."""
+
+
+def _checksum(state: TrainState) -> str:
+    """64 bits, in hexadecimal, of all arrays: the sum of their words, each times an odd number that depends on its place.
+
+    Any one word that changes changes it. It does not depend on how arrays lie on devices: each process adds its own shards.
+    """
+    total = 0
+    for path, leaf in jax.tree_util.tree_leaves_with_path(_as_dict(state)):
+        of_leaf = zlib.crc32(jax.tree_util.keystr(path).encode()) | 1
+        total += of_leaf * sum(
+            _weighted_sum(shard, leaf.shape) for shard in leaf.addressable_shards if shard.replica_id == 0
+        )
+    total %= 1 << 64
+    if jax.process_count() > 1:
+        from jax.experimental import multihost_utils
+
+        halves = np.asarray([total >> 32, total & 0xFFFFFFFF], np.uint32)
+        total = sum((int(high) << 32) + int(low) for high, low in multihost_utils.process_allgather(halves)) % (1 << 64)
+    return f"{total:016x}"
+
+
+def _weighted_sum(shard: Any, shape: tuple[int, ...]) -> int:
+    data = np.asarray(shard.data)
+    words = data.reshape(-1).view(f"u{data.itemsize}").astype(np.uint64)
+    places = np.zeros(data.shape, np.uint64)
+    stride = 1
+    for axis in reversed(range(data.ndim)):
+        start = shard.index[axis].start or 0
+        along = (np.arange(data.shape[axis], dtype=np.uint64) + np.uint64(start)) * np.uint64(stride)
+        places += along.reshape([-1 if i == axis else 1 for i in range(data.ndim)])
+        stride *= shape[axis]
+    return int(((2 * places.reshape(-1) + 1) * words).sum(dtype=np.uint64))
+
+
+def _without_score(folder: Path) -> list[Path]:
+    """Checkpoints whose score cannot be read; Orbax would stop at the first of them."""
+    found = []
+    for step in folder.glob("[0-9]*"):
+        if step.name.isdecimal() and step.is_dir():
+            try:
+                score = read_json(step / "metrics" / "metrics")["score"]
+                found += [] if isinstance(score, int | float) else [step]
+            except (OSError, ValueError, LookupError, TypeError):
+                found.append(step)
+    return sorted(found)
+
+
+def _set_aside(steps: list[Path]) -> None:
+    """Rename damaged checkpoints, so that their steps can be saved again; nothing is deleted."""
+    if jax.process_index() == 0:
+        for step in steps:
+            aside = next(
+                p
+                for i in range(1 << 30)
+                if not (p := step.with_name(f"damaged-{step.name}" + f"-{i}" * (i > 0))).exists()
+            )
+            step.rename(aside)
+            logger.warning("%s: a damaged checkpoint, set aside as %s", step, aside.name)
+    if jax.process_count() > 1:
+        from jax.experimental import multihost_utils
+
+        multihost_utils.sync_global_devices("damaged checkpoints are set aside")
 
 
 def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> None:

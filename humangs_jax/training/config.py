@@ -5,8 +5,9 @@ import itertools
 import logging
 from pathlib import Path
 
-from humangs_jax.core.configuration import config_from_file, knob
+from humangs_jax.core.configuration import knob
 from humangs_jax.data.loader import ViewSampling
+from humangs_jax.io.text import read_configuration
 from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.objectives.loss_networks import LossNetworks
@@ -207,7 +208,7 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: neither a file nor one of the presets {', '.join(PRESETS)}")
     try:
-        return config_from_file(TrainConfig, path)
+        return read_configuration(TrainConfig, path)
     except ValueError as error:
         if "HumanGSConfig has no such field" not in str(error):
             raise

@@ -9,7 +9,6 @@ accelerator has too little.
 
 import dataclasses
 import functools
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -21,6 +20,8 @@ from humangs_jax.core.array_types import Key, PyTree, Scalar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import gaussian_body
+from humangs_jax.io.reading import reading
+from humangs_jax.io.text import parse_json, read_text
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.stages import Named, Recorder, inexact_leaves
 from humangs_jax.objectives.loss_networks import LossNetworks
@@ -169,8 +170,9 @@ def first_failed_step(log: Path) -> int | None:
     """Number of the first step that a log calls skipped or not finite, counted from 0; None if there is none."""
     if not log.is_file():
         return None
-    for line in log.read_text().splitlines():
-        record = json.loads(line)
-        if record.get("event") in FAILED:
-            return record["step"] - 1
-    return None
+    with reading(log, "log"):
+        for line in read_text(log).splitlines():
+            record = parse_json(line)
+            if record.get("event") in FAILED:
+                return int(record["step"]) - 1
+        return None

@@ -139,6 +139,28 @@ def test_photos_of_any_size_become_squares_with_cameras_that_follow(body):
     np.testing.assert_allclose(after, (np.asarray(before) + np.asarray([6, 0])) * SIZE / 48, atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda c: {"poses": replace(c.poses, rotations=c.poses.rotations[:, :24])},
+            r"poses\.rotations: .*got \(1, 24, 3\)",
+        ),
+        (lambda c: {"poses": c.poses[0]}, r"poses\.rotations: expected shape"),
+        (lambda c: {"cameras": c.cameras[0]}, r"cameras\.K: expected shape \(2, 3, 3\), got \(3, 3\)"),
+        (lambda c: {"cameras": jax.tree.map(lambda x: x[:1], c.cameras)}, r"cameras\.K: expected shape \(2, 3, 3\)"),
+        (lambda c: {"frames": c.frames + 1}, "frames: expected 0 to 0"),
+        (lambda c: {"images": c.images * np.nan}, "images: expected numbers in"),
+        (lambda c: {"images": c.images * 255}, "images: expected numbers in"),
+        (lambda c: {"betas": np.full(3, np.inf, np.float32)}, "betas: expected finite numbers"),
+    ],
+)
+def test_captures_made_by_hand_are_checked(body, change, message):
+    whole = capture(body, SIZE, SIZE)
+    with pytest.raises(ValueError, match=f"reconstruct: capture: {message}"):
+        reconstruct({}, tiny(), dataclasses.replace(whole, **change(whole)))
+
+
 @pytest.mark.slow
 def test_the_token_capacity_follows_the_photos(body, network):
     variables, config = network

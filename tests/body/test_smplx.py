@@ -168,7 +168,7 @@ def test_a_pickle_that_would_run_code_is_refused_by_name(tmp_path, protocol):
     (tmp_path / "model.pkl").write_bytes(
         pickle.dumps({**made_up_file(), "extra": Evil(str(marker))}, protocol=protocol)
     )
-    with pytest.raises(ValueError, match=r"model\.pkl.*'(posix|nt)\.mkdir'"):
+    with pytest.raises(ValueError, match=r"model\.pkl: refused to load (posix|nt)\.mkdir"):
         load_smplx(tmp_path / "model.pkl")
     assert not marker.exists()
 

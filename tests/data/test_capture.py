@@ -258,7 +258,11 @@ NOT_FINITE = [[float("nan"), 0, 5], [0, 9, 5], [0, 0, 1]]
 BAD = {
     "no capture.json": (lambda f: (f / "capture.json").unlink(), "capture.json", "no such file"),
     "invalid JSON": (lambda f: (f / "capture.json").write_text('{"a": 1,\n"b" 2}'), "capture.json", "line 2"),
-    "binary JSON": (lambda f: (f / "capture.json").write_bytes(b"\xff\xfe\0"), "capture.json", "cannot be read"),
+    "binary JSON": (
+        lambda f: (f / "capture.json").write_bytes(b"\xff\xfe\0"),
+        "capture.json",
+        "not a readable text file",
+    ),
     "a JSON list": (lambda f: (f / "capture.json").write_text("[]"), "capture.json", "expected a JSON object"),
     "format": (top(format="colmap"), "capture.json: format", "colmap"),
     "version": (top(version=2), "capture.json: version", "expected 1"),
@@ -278,7 +282,7 @@ BAD = {
         "images/001.png",
         "not a readable image",
     ),
-    "image a folder": (view(0, image="images"), "images", "not a readable image"),
+    "image a folder": (view(0, image="images"), "images", "is a folder"),
     "image sizes differ": (
         lambda f: (png("images/001.png", (9, 9, 3))(f), png("masks/001.png", (9, 9))(f)),
         "images/001.png: size",

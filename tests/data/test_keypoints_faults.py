@@ -185,7 +185,7 @@ def test_files_and_folders_that_are_not_there(tmp_path):
     with pytest.raises(CaptureError, match="no JSON file in this folder"):
         read_keypoints(tmp_path, NAMES, *SIZE)
     (tmp_path / "photo.json").write_bytes(b"\xff\xd8\xff")
-    with pytest.raises(CaptureError, match=r"photo\.json: cannot be read"):
+    with pytest.raises(CaptureError, match=r"photo\.json: not a readable text file"):
         read_keypoints(tmp_path, NAMES, *SIZE)
 
 

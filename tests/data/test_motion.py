@@ -273,7 +273,7 @@ def test_other_bad_files(tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     assert "no .json file" in message(tmp_path / "empty")
     (tmp_path / "broken.json").write_text("{")
-    assert "not readable as JSON" in message(tmp_path / "broken.json")
+    assert "not valid JSON" in message(tmp_path / "broken.json")
     (tmp_path / "list.json").write_text("[1]")
     assert "expected a JSON object" in message(tmp_path / "list.json")
     frames = [lhm_frame(0), {k: v for k, v in lhm_frame(1).items() if k != "trans"}]

@@ -141,13 +141,13 @@ def test_bad_files(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no.exr: no such file"):
         read_exr(tmp_path / "no.exr")
     (tmp_path / "bad.exr").write_bytes(b"hello" * 10)
-    with pytest.raises(OSError, match=r"bad.exr: not an OpenEXR file"):
+    with pytest.raises(ValueError, match=r"bad.exr: not an OpenEXR file"):
         read_exr(tmp_path / "bad.exr")
     write_exr(tmp_path / "whole.exr", [make_view(i) for i in range(3)])
     data = (tmp_path / "whole.exr").read_bytes()
     for share in (0.1, 0.5, 0.95):
         (tmp_path / "cut.exr").write_bytes(data[: int(share * len(data))])
-        with pytest.raises(OSError, match=r"cut.exr: (damaged: \d of 3 parts|not a readable OpenEXR file)"):
+        with pytest.raises(ValueError, match=r"cut.exr: (damaged: \d of 3 parts|not a readable OpenEXR file)"):
             read_exr(tmp_path / "cut.exr")
     with pytest.raises(FileNotFoundError, match="no such folder"):
         write_exr(tmp_path / "nowhere" / "a.exr", make_view(0))

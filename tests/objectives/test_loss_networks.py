@@ -118,13 +118,13 @@ def test_vgg19_of_matconvnet(old, tmp_path):
 def test_other_matlab_files(tmp_path):
     for content in ({"x": np.zeros(3)}, {"layers": np.zeros(3)}, {"layers": cell({"name": "x"})}):
         savemat(tmp_path / "a.mat", content)
-        with pytest.raises(ValueError, match=r"a\.mat is no network of MatConvNet"):
+        with pytest.raises(ValueError, match=r"a\.mat: (not a readable network of MatConvNet|no variable)"):
             load_vgg19(tmp_path / "a.mat")
     savemat(tmp_path / "a.mat", {"layers": cell({"type": "relu"})})
     with pytest.raises(ValueError, match=r"a\.mat: no tensor has a name like"):
         load_vgg19(tmp_path / "a.mat")
     (tmp_path / "a.mat").write_bytes((tmp_path / "a.mat").read_bytes()[:150])
-    with pytest.raises(ValueError, match=r"a\.mat is no network"):
+    with pytest.raises(ValueError, match=r"a\.mat: not a readable MATLAB file: cut off"):
         load_vgg19(tmp_path / "a.mat")
     (tmp_path / "a.mat").write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(400))
     with pytest.raises(ValueError, match=r"a\.mat: MATLAB files of version 7\.3 are not supported"):

@@ -1,16 +1,22 @@
 """Checkpoints: bit for bit, the newest and the best, and never those of another run."""
 
 import dataclasses
+import shutil
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from training_cases import without_upsampler
 
-from humangs_jax.training.checkpoint import Checkpoints, save_config
+from humangs_jax.io.reading import FileError
+from humangs_jax.training.checkpoint import Checkpoints, _checksum, save_config
 from humangs_jax.training.config import tiny
 from humangs_jax.training.optimizer import OptimizerConfig, make_optimizer
 from humangs_jax.training.state import TrainState
+
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+"""Orbax leaves callbacks behind when a read fails."""
 
 
 def state_at(step, width=3):
@@ -65,6 +71,93 @@ def test_nothing_to_restore_and_another_model_are_errors(checkpoints):
     checkpoints.save(state_at(1))
     with pytest.raises(FileNotFoundError, match="no checkpoint of step 7"):
         checkpoints.restore(state_at(0), 7)
+
+
+def flip_a_bit(step):
+    (file,) = (step / "default" / "d").iterdir()
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 4
+    file.write_bytes(data)
+
+
+def cut_off(step):
+    (file,) = (step / "default" / "d").iterdir()
+    file.write_bytes(file.read_bytes()[:40])
+
+
+def empty(step):
+    shutil.rmtree(step)
+    step.mkdir()
+
+
+def without_numbers(step):
+    shutil.rmtree(step / "default" / "d")
+
+
+def without_score(step):
+    (step / "metrics" / "metrics").write_text("{")
+
+
+def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path, same, caplog):
+    first = Checkpoints(tmp_path / "whole", keep=3)
+    for step in (1, 2, 3):
+        first.save(state_at(step))
+    first.close()
+    for damage in (flip_a_bit, cut_off, empty, without_numbers, without_score):
+        folder = tmp_path / damage.__name__
+        shutil.copytree(tmp_path / "whole", folder)
+        damage(folder / "3")
+        caplog.clear()
+        again = Checkpoints(folder, keep=3)
+        assert same(again.restore(state_at(0)), state_at(2)), damage
+        assert f"{folder / '3'}: " in caplog.text and "set aside as damaged-3" in caplog.text
+        again.save(state_at(3))  # its place is free
+        again.wait()
+        assert same(again.restore(state_at(0)), state_at(3)), damage
+        again.close()
+        assert sorted(path.name for path in folder.iterdir()) == ["1", "2", "3", "damaged-3"], damage
+
+
+def test_no_good_checkpoint_is_one_line_and_changes_nothing(tmp_path):
+    first = Checkpoints(tmp_path / "c", keep=3)
+    for step in (1, 2):
+        first.save(state_at(step))
+    first.close()
+    for step in (1, 2):
+        flip_a_bit(tmp_path / "c" / str(step))
+    again = Checkpoints(tmp_path / "c", keep=3)
+    with pytest.raises(FileError, match=r"c: none of 2 checkpoints can be used, .*c/1: ") as caught:
+        again.restore(state_at(0))
+    with pytest.raises(FileError, match=r"c/2: "):
+        again.restore(state_at(0), 2)
+    again.close()
+    assert "\n" not in str(caught.value)
+    assert sorted(path.name for path in (tmp_path / "c").iterdir()) == ["1", "2"]
+
+
+def test_a_checkpoint_of_another_model_is_refused_and_stays(tmp_path):
+    first = Checkpoints(tmp_path / "c")
+    first.save(state_at(1))
+    first.close()
+    again = Checkpoints(tmp_path / "c")
+    with pytest.raises(FileError, match=r"c/1: its arrays are those of another model"):
+        again.restore(state_at(0, width=5))
+    again.close()
+    assert [path.name for path in (tmp_path / "c").iterdir()] == ["1"]
+
+
+def test_the_checksum_sees_every_word_and_no_layout():
+    state = state_at(1)
+    kernel = state.params["dense"]["kernel"]
+    found = {_checksum(state)}
+    for index in range(kernel.size):
+        word = np.asarray(kernel).view(np.uint32).copy()
+        word.reshape(-1)[index] ^= 1
+        params = {"dense": state.params["dense"] | {"kernel": jnp.asarray(word.view(np.float32))}}
+        found.add(_checksum(dataclasses.replace(state, params=params)))
+    assert len(found) == kernel.size + 1
+    swapped = {"dense": state.params["dense"] | {"kernel": kernel[::-1]}}
+    assert _checksum(dataclasses.replace(state, params=swapped)) not in found
 
 
 def test_a_folder_belongs_to_one_configuration(tmp_path):

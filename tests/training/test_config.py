@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from humangs_jax.core.configuration import config_from_file, config_from_json, config_to_json
+from humangs_jax.core.configuration import config_from_json, config_to_json
+from humangs_jax.io.text import read_configuration
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training import config
 from humangs_jax.training.config import Stage, TrainConfig, fitting_losses, read_config, small, tiny
@@ -91,4 +92,4 @@ def test_nobody_to_train_on_is_an_error(tmp_path, body):
 
 def test_the_file_of_the_shipped_weights_run_is_the_preset():
     path = Path(__file__).parents[2] / "experiments" / "training" / "small.json"
-    assert config_from_file(TrainConfig, path) == small()
+    assert read_configuration(TrainConfig, path) == small()

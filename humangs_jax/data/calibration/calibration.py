@@ -12,6 +12,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import CaptureError, floats, numbers
+from humangs_jax.io.reading import limits
 
 ROUNDED_ROTATION = 5e-3
 """R R^T of matrices written with three decimals (EasyMocap) is this far from 1; they are replaced by the nearest rotation."""
@@ -127,7 +128,9 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
 def image_size(value: Any, file: object, field: str) -> tuple[int, int]:
     """Width and height in whole pixels."""
     width, height = floats(value, file, field, (2,)).tolist()
-    if not (width.is_integer() and height.is_integer() and width > 0 and height > 0):
+    if not (
+        width.is_integer() and height.is_integer() and min(width, height) > 0 and max(width, height) <= limits().side
+    ):
         raise CaptureError(file, field, f"expected width and height in pixels, got {width:g} x {height:g}")
     return int(width), int(height)
 

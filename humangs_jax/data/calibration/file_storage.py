@@ -12,11 +12,12 @@ import numpy as np
 import yaml
 
 from humangs_jax.data.capture_checks import CaptureError, checked_json
+from humangs_jax.io.reading import check_limit, limits, reading
 
 MATRIX = "opencv-matrix"
 YAML_TAG = "tag:yaml.org,2002:"
 """What `!!` stands for."""
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
 TIGHT_KEY = re.compile(r"([{,]\s*\w+):(?=\S)")
 """A key of a flow map with its value right behind the colon."""
 
@@ -27,6 +28,8 @@ def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
         if text.lstrip().startswith("{"):
             values = _matrices(checked_json(file, text), file, "")
         else:
+            with reading(file, "YAML file", CaptureError):
+                check_limit("slow_text_bytes", len(text), "characters of YAML")
             kept = ["" if line.startswith(("%", "---", "...")) else line for line in text.splitlines()]
             root = _Loader(TIGHT_KEY.sub(r"\1: ", "\n".join(kept))).get_single_node()
             values = {} if root is None else _value(root, file)
@@ -41,12 +44,19 @@ def parse_file_storage(text: str, file: Path) -> dict[str, Any]:
 
 
 class _Loader(yaml.SafeLoader):
+    depth = 0
+
     def compose_node(self, parent: Any, index: Any) -> Any:
         """The next node; no aliases, which a small file can nest to billions of values."""
         if self.check_event(yaml.AliasEvent):
             where = self.get_event().start_mark
             raise yaml.MarkedYAMLError(problem="aliases are not supported", problem_mark=where)
-        return super().compose_node(parent, index)
+        self.depth += 1
+        if self.depth > limits().nesting:
+            raise yaml.MarkedYAMLError(problem="nested too deeply", problem_mark=self.peek_event().start_mark)
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
 
 def _value(node: yaml.Node, file: Path) -> Any:

@@ -35,6 +35,7 @@ from humangs_jax.data.calibration.calibration import (
 from humangs_jax.data.calibration.colmap import read_colmap
 from humangs_jax.data.calibration.file_storage import parse_file_storage
 from humangs_jax.data.capture_checks import CaptureError, checked_json, checked_text, floats, required
+from humangs_jax.io.reading import reading
 
 EASYMOCAP_FILES = ("intri.yml", "extri.yml")
 FILES = ("transforms.json", "calibration_full.json", "calibration.json")
@@ -56,9 +57,8 @@ def read_calibration(source: Path, photo_size: Callable[[str], tuple[int, int]])
         raise CaptureError(source, "", "no such file or folder")
     if source.name in EASYMOCAP_FILES:
         source = source.parent
-    if source.is_dir():
-        return _read_folder(source, photo_size)
-    return _read_file(source, photo_size)
+    with reading(source, "calibration", CaptureError):
+        return _read_folder(source, photo_size) if source.is_dir() else _read_file(source, photo_size)
 
 
 def _read_folder(folder, photo_size):

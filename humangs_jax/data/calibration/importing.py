@@ -5,6 +5,7 @@ asks for it; capture.json names body.npz, which `humangs fit` makes.
 """
 
 import dataclasses
+import os
 import shutil
 from pathlib import Path
 from typing import get_args
@@ -148,8 +149,11 @@ def _check_folders(source, images, masks, out, overwrite):
         if folder is not None and not folder.is_dir():
             raise CaptureError(folder, "", "no such folder")
     check_place(out, overwrite)
+    inside = lambda path: Path(os.path.realpath(path)).is_relative_to(
+        os.path.realpath(out)
+    )  # resolve() raises for loops
     for path in (source, images, masks):
-        if path is not None and path.resolve().is_relative_to(out.resolve()):
+        if path is not None and inside(path):
             raise CaptureError(path, "", f"lies in {out}, which would be overwritten: expected another place")
 
 

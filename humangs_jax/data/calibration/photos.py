@@ -9,6 +9,7 @@ from humangs_jax.data.calibration.calibration import Calibration
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import image_size
+from humangs_jax.io.reading import inside, reading
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 """File types of photos."""
@@ -47,11 +48,22 @@ def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> t
 
 
 def find_photo(folder: Path, name: str) -> Path | None:
-    """The photo of a path that may lack its suffix, have another one, or begin with folders above `folder`."""
+    """The photo of a path that may lack its suffix, have another one, or begin with folders above `folder`.
+
+    Raises: CaptureError for a link to what is outside of the folder, see `io.reading.inside`.
+    """
     parts = PurePosixPath(name.replace("\\", "/")).parts
     parts = [part for part in parts if part not in (".", "..", "/")]
     found = (_any_suffix(folder.joinpath(*parts[start:])) for start in range(len(parts)))
-    return next((photo for photo in found if photo is not None), None)
+    photo = next((photo for photo in found if photo is not None), None)
+    if photo is not None:
+        _check_inside(folder, photo.relative_to(folder))
+    return photo
+
+
+def _check_inside(folder, name):
+    with reading(folder, "path", CaptureError):
+        inside(folder, str(name), photo=True)
 
 
 def _any_suffix(path):
@@ -110,6 +122,8 @@ def _of_cameras(calibration, images):
 
 def _folders_of_cameras(images, names):
     """For each camera, frame name -> photo."""
+    for name in names:  # of a file: "../.." would be any folder
+        _check_inside(images, name)
     return [{p.stem: p for p in _photos_in(images / name)} for name in names]
 
 

@@ -29,6 +29,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, checked_json
 from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, OPENPOSE_67, KeypointSet
 from humangs_jax.io.npz import read_npz
+from humangs_jax.io.reading import reading
 
 UNDERSTOOD = (
     "OpenPose's people, MMPose's instances, COCO's results (AlphaPose's too), COCO's images and annotations, or our npz"
@@ -137,7 +138,7 @@ def _floats(value: Any, file: Path, field: str) -> Float[np.ndarray, "..."]:
         if array.dtype.kind not in "fiuO":
             raise TypeError
         return array.astype(np.float64)
-    except (ValueError, TypeError):
+    except (ValueError, TypeError, OverflowError):
         raise CaptureError(file, field, "expected numbers, as many for each point") from None
 
 
@@ -356,10 +357,8 @@ def _saved_detections(file: Path) -> Detections:
 
     Raises: CaptureError.
     """
-    try:
+    with reading(file, "keypoint file", CaptureError):
         values, pickled = read_npz(file)
-    except OSError as error:
-        raise CaptureError(file, "", error.strerror or error) from error
     for key in ("points", "confidences", "set", "names"):
         if key not in values:
             raise CaptureError(file, key, "a pickled object, which is never read" if key in pickled else "missing")

@@ -13,6 +13,7 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.formats import DetectedImage, Detections, read_detections
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import KeypointSet
+from humangs_jax.io.reading import reading
 
 NORMALIZED = 2.0
 """If no coordinate of any view reaches this many pixels, they are no pixels but shares of the image."""
@@ -55,6 +56,11 @@ def read_keypoints(
     path = Path(path)
     if person is not None and person < 0:
         raise ValueError(f"--person {person}: expected 0 for the first person, 1 for the second, ...")
+    with reading(path, "keypoint file", CaptureError):
+        return _read(path, names, width, height, person)
+
+
+def _read(path, names, width, height, person):
     detections = read_detections(path)
     if detections.set is None:
         raise CaptureError(path, "", "nobody in any of its images: expected one person")

@@ -1,0 +1,203 @@
+"""Reading files that nobody trusts: one set of limits, one error line for every kind of damage. See docs/security.md.
+
+Readers open files through `open_file` or `read_bytes` and work inside `reading`:
+
+    with reading(path, "npz archive"):
+        ...
+
+Whatever is raised in there becomes one `FileError` line that names the file: `me.npz: not a readable npz archive: ...`. A helper
+that does not know the file raises `Refused`, whose text follows the name of the file as it is.
+"""
+
+import contextlib
+import dataclasses
+import os
+import stat
+from collections.abc import Generator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+ENVIRONMENT = "HUMANGS_LIMITS"
+"""Variable with other limits, such as "pixels=2e8,photos_outside=1"."""
+LONGEST_LINE, LONGEST_REASON = 1000, 300
+"""Characters of an error, in which values of files are quoted, and of what a library says."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Limits:
+    """What a file may cost. Each error line that a limit causes names it.
+
+    file_bytes: size of any file; text_bytes: of JSON and text; slow_text_bytes: of YAML and of the JSON in a GLB, whose readers
+        are slow. mesh_bytes: of a scan; image_bytes: of a photo before it is decoded.
+    array_bytes: all arrays of an archive unpacked, or of an EXR file. Below it a file may always unpack to plain_bytes, and
+        beyond that to `ratio` times its size. plain_bytes also bounds a sparse matrix made dense.
+    members: entries of an archive. opcodes: instructions of a pickle (8 s at the limit). nesting: of JSON, YAML and MATLAB.
+    pixels, side: of a photo, and along one of its sides. scans: passes of a progressive JPEG.
+    corners: of the triangles of a scan, every instance counted. joints: of a body.
+    photos_outside: whether photos and masks of a capture may lie outside of its folder.
+    """
+
+    file_bytes: int = 16 << 30
+    text_bytes: int = 64 << 20
+    slow_text_bytes: int = 1 << 20
+    mesh_bytes: int = 512 << 20
+    image_bytes: int = 256 << 20
+    array_bytes: int = 4 << 30
+    plain_bytes: int = 256 << 20
+    ratio: int = 100
+    members: int = 65_536
+    opcodes: int = 4_000_000
+    nesting: int = 64
+    pixels: int = 64_000_000
+    side: int = 32_768
+    scans: int = 64
+    corners: int = 60_000_000
+    joints: int = 1024
+    photos_outside: bool = False
+
+
+_current: Limits | None = None
+
+
+def limits() -> Limits:
+    """The limits in force: those of `set_limits`, else the default ones changed by the environment variable HUMANGS_LIMITS.
+
+    Raises: ValueError for a variable that is not understood.
+    """
+    global _current
+    if _current is None:
+        _current = _limits_of_text(os.environ.get(ENVIRONMENT, ""))
+    return _current
+
+
+def set_limits(new: Limits | None) -> None:
+    """Use other limits from now on; None: those of the environment again."""
+    global _current
+    _current = new
+
+
+def _limits_of_text(text):
+    changes: dict[str, Any] = {}
+    kinds: dict[str, Any] = {field.name: type(field.default) for field in dataclasses.fields(Limits)}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name, _, value = part.partition("=")
+        try:
+            changes[name] = kinds[name](float(value))
+        except (KeyError, ValueError, OverflowError):
+            raise ValueError(f"{ENVIRONMENT}: {part!r}: expected NAME=NUMBER with one of {', '.join(kinds)}") from None
+    return Limits(**changes)
+
+
+# Errors --------------------------------------------------------------------------------------------------------------
+
+
+def _one_line(text: object, longest: int = LONGEST_LINE) -> str:
+    line = " ".join(str(text).split())
+    return line if len(line) <= longest else f"{line[:longest]} ..."
+
+
+class FileError(ValueError):
+    """Something is wrong with a file; the message is one line: file, field, and what was expected. Empty parts are left out."""
+
+    def __init__(self, file: object, field: str, problem: object):
+        parts = [str(part) for part in (file, field, problem) if part]
+        super().__init__(_one_line(": ".join(parts)))
+
+
+class Refused(ValueError):
+    """What is wrong with the file that is being read, said by a function that does not know its name."""
+
+
+@contextlib.contextmanager
+def reading(path: object, kind: str, raises: type[FileError] = FileError) -> Generator[None]:
+    """Whatever goes wrong inside becomes one line that names the file.
+
+    Arguments: path: the file, for the message. kind: what it should be, as in "npz archive". raises: the class of the error.
+    Raises: `raises`; FileNotFoundError for a missing file where that is FileError.
+    """
+    try:
+        yield
+    except raises:
+        raise
+    except FileError as error:  # names its file already
+        raise raises("", "", error) from error
+    except FileNotFoundError as error:
+        missing = f"{error.filename or path}: no such file"
+        raise (FileNotFoundError(missing) if raises is FileError else raises("", "", missing)) from error
+    except Refused as error:
+        raise raises(path, "", error) from error
+    except Exception as error:  # readers of damaged files raise some twenty types
+        named = str(path) and str(error).startswith(f"{path}: ")
+        raise raises("" if named else path, "", str(error) if named else _why(kind, error)) from error
+
+
+def _why(kind, error):
+    if isinstance(error, MemoryError):
+        reason = "out of memory"
+    elif isinstance(error, RecursionError):
+        reason = "nested too deeply"
+    elif isinstance(error, OSError):
+        reason = error.strerror or str(error) or type(error).__name__
+    else:
+        says_little = isinstance(error, LookupError | AssertionError | AttributeError | TypeError) or not str(error)
+        reason = f"{type(error).__name__} {error}" if says_little else str(error)
+    return f"not a readable {kind}: {_one_line(reason, LONGEST_REASON)}"
+
+
+def check_limit(name: str, amount: int, unit: str) -> None:
+    """Raises: Refused, naming the limit, if that much is more than it allows."""
+    if amount > (most := getattr(limits(), name)):
+        raise Refused(f"{amount:,} {unit}: the limit {name} is {most:,} (docs/security.md)")
+
+
+# Opening -------------------------------------------------------------------------------------------------------------
+
+
+def open_file(path: str | os.PathLike, limit: str = "file_bytes") -> BinaryIO:
+    """Open a file whose size is within a limit. No devices and no pipes: these have no end.
+
+    Raises: OSError; Refused.
+    """
+    status = os.stat(path)
+    if stat.S_ISDIR(status.st_mode):
+        raise Refused("is a folder: expected a file")
+    if not stat.S_ISREG(status.st_mode):
+        raise Refused("is no regular file")
+    check_limit(limit, status.st_size, "bytes")
+    return open(path, "rb")
+
+
+def read_bytes(path: str | os.PathLike, limit: str = "file_bytes") -> bytes:
+    """The bytes of a file. Raises: as `open_file`."""
+    with open_file(path, limit) as file:
+        return file.read()
+
+
+def check_unpacked(size: int, unpacked: int) -> None:
+    """Raises: Refused if a file of `size` bytes must not become that much in memory."""
+    most = limits()
+    check_limit("array_bytes", unpacked, "bytes unpacked")
+    if unpacked > max(most.plain_bytes, most.ratio * size):
+        raise Refused(
+            f"{size:,} bytes unpack to {unpacked:,}: the limits plain_bytes {most.plain_bytes:,} and ratio {most.ratio} "
+            "(docs/security.md)"
+        )
+
+
+def inside(folder: str | os.PathLike, name: str, photo: bool = False) -> Path:
+    """The path `folder / name` that a file in the folder names, if it lies in there after symbolic links are followed.
+
+    Arguments: photo: it is one of a photo or mask, which the limit `photos_outside` lets lie elsewhere.
+    Raises: Refused.
+    """
+    path = Path(folder) / name
+    if photo and limits().photos_outside:
+        return path
+    try:
+        contained = path.resolve().is_relative_to(Path(folder).resolve())
+    except (OSError, ValueError, RuntimeError) as error:  # too long, a null character, a loop of links
+        raise Refused(f"{name!r} is no path: {error}") from error
+    if not contained:
+        how = f" ({ENVIRONMENT}=photos_outside=1 allows it)" if photo else ""
+        raise Refused(f"{name!r} lies outside of {folder}: expected a path in that folder{how}")
+    return path

@@ -1,0 +1,156 @@
+"""Arrays of avatars, bodies, motions, fits and banks: not finite, out of range, of other types and shapes."""
+
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import readers
+from hostile_cases import case
+
+from humangs_jax.body.library import save_body
+
+# Avatars and other arrays ----------------------------------------------------------------------------------------------------
+
+
+def arrays_case(kind, reader, arrays, change, item=7, expect="refused"):
+    def make(folder):
+        content = arrays()
+        change(content)
+        np.savez(folder / "a.npz", **content)
+        return folder / "a.npz"
+
+    case(kind, reader, make, expect, item)
+
+
+def put(name, value, index=(0,)):
+    def change(arrays):
+        arrays[name] = np.array(arrays[name])
+        arrays[name][index] = value
+
+    return change
+
+
+def cast(name, dtype):
+    return lambda arrays: arrays.update({name: np.asarray(arrays[name]).astype(dtype)})
+
+
+def header(**changes):
+    return lambda arrays: arrays.update(header=json.dumps(readers.AVATAR_HEADER | changes))
+
+
+AVATARS = {
+    **{f"NaN in {name}": put(name, np.nan) for name in readers.avatar_arrays() if name != "faces"},
+    **{f"inf in {name}": put(name, -np.inf) for name in readers.avatar_arrays() if name != "faces"},
+    "opacity 9": put("opacities", 9.0),
+    "opacity -1": put("opacities", -1.0),
+    "a negative scale": put("scales", -0.1),
+    "a skinning weight of -3": put("skinning_weights", -3.0),
+    "a corner of 2^30": put("faces", 1 << 30),
+    "a corner of -1": put("faces", -1),
+    "corners of half": cast("faces", np.float32),
+    **{f"complex {name}": cast(name, np.complex64) for name in ("means", "colors", "skinning_weights")},
+    "words": cast("means", str),
+    "bytes": cast("colors", "S4"),
+    "too large for float32": lambda arrays: arrays.update(means=np.full((6, 3), 1e300)),
+    "a circle of parents": header(parents=[-1, 2, 1]),
+    "a parent that is not there": header(parents=[-1, 7, 0]),
+    "two roots": header(parents=[-1, -1, 0]),
+    "parents of words": header(parents=["a", "b", "c"]),
+    "10^6 parents": header(parents=[-1] + [0] * 10**6),
+    "parents that are a number": header(parents=3),
+    "names of numbers": header(joint_names=[1, 2, 3]),
+    "too few names": header(joint_names=["a"]),
+    "another skinning": header(skinning="exec"),
+    "another rendering": header(rendering=["exact"]),
+    "a list for a header": lambda arrays: arrays.update(header="[]"),
+    "a deep header": lambda arrays: arrays.update(header="[" * 50_000),
+    "an array for a header": lambda arrays: arrays.update(header=np.zeros(5)),
+    "a false checksum": header(checksum="0" * 64),
+    "a checksum that is a number": header(checksum=7),
+    "no points": lambda arrays: arrays.update(means=np.float32(3)),
+}
+for kind, change in AVATARS.items():
+    item = 3 if "checksum" in kind else 7
+    arrays_case(kind, "avatar", readers.avatar_file, change, item)
+arrays_case("without a checksum", "avatar", readers.avatar_file, lambda arrays: None, 3, "read")
+
+
+def body_file():
+    with tempfile.TemporaryDirectory() as folder:
+        save_body(Path(folder) / "b.npz", readers.tiny_body())
+        with np.load(Path(folder) / "b.npz") as archive:
+            return dict(archive)
+
+
+BODIES = {
+    "corners outside": put("faces", 99),
+    "joints outside": put("weight_joints", 99),
+    "vertices outside": put("regressor_vertices", 99),
+    "NaN in the template": put("template", np.nan),
+    "NaN in the regressor": put("regressor_values", np.nan),
+    "weights of 0": lambda arrays: arrays.update(weight_values=np.zeros_like(arrays["weight_values"])),
+    "a circle of parents": put("parents", 1),
+    "10^6 parents": lambda arrays: arrays.update(parents=np.zeros(10**6, np.int16)),
+    "directions of another size": lambda arrays: arrays.update(shape_directions=np.zeros((3, 9, 3), np.int16)),
+    "a number for the template": lambda arrays: arrays.update(template=np.float32(1)),
+}
+for kind, change in BODIES.items():
+    arrays_case(kind, "body", body_file, change, 7)
+SMPLX = {
+    "corners outside": put("f", 99),
+    "NaN": put("v_template", np.nan),
+    "objects": lambda arrays: arrays.update(v_template=np.full((9, 3), None)),
+    "another tree": put("kintree_table", 9, (0, 3)),
+    "words": cast("weights", str),
+    "no vertices": lambda arrays: arrays.update(v_template=np.zeros((0, 3))),
+}
+for kind, change in SMPLX.items():
+    arrays_case(kind, "smplx npz", readers.smplx_arrays, change, 7)
+MOTION = {
+    "NaN": put("poses", np.nan),
+    "a rate of 0": lambda arrays: arrays.update(mocap_framerate=0.0),
+    "a rate of NaN": lambda arrays: arrays.update(mocap_framerate=np.nan),
+    "a rate of words": lambda arrays: arrays.update(mocap_framerate=np.asarray("fast")),
+    "no frames": lambda arrays: arrays.update(poses=np.zeros((0, 156)), trans=np.zeros((0, 3))),
+    "complex numbers": cast("poses", complex),
+    "another number of frames": lambda arrays: arrays.update(trans=np.zeros((9, 3))),
+}
+for kind, change in MOTION.items():
+    arrays_case(
+        kind,
+        "amass",
+        lambda: {"poses": np.zeros((3, 156)), "trans": np.zeros((3, 3)), "mocap_framerate": 120.0},
+        change,
+        6,
+    )
+arrays_case(
+    "names that are no list",
+    "joints npz",
+    lambda: {"points": np.zeros((2, 3))},
+    lambda a: a.update(names=np.asarray("x")),
+    6,
+)
+FITS = {
+    "another set": lambda arrays: arrays.update(set=np.asarray("mine")),
+    "NaN": put("points", np.nan),
+    "names of numbers": lambda arrays: arrays.update(names=np.zeros(2)),
+    "a shape that does not fit": lambda arrays: arrays.update(points=np.zeros((2, 3, 2))),
+    "one name": lambda arrays: arrays.update(names=np.asarray("x")),
+}
+for kind, change in FITS.items():
+    for reader, arrays in (("fit record", readers.fit_arrays), ("keypoints npz", readers.keypoint_arrays)):
+        arrays_case(kind, reader, arrays, change, 6, "either" if kind in ("NaN", "names of numbers") else "refused")
+BANKS = {
+    "a seed of another split": put("seeds", 10**9),
+    "seeds below 0": put("seeds", -5),
+    "another version": lambda arrays: arrays.update(version=np.asarray(99)),
+    "a version of words": lambda arrays: arrays.update(version=np.asarray("x")),
+    "no seeds": lambda arrays: arrays.update(seeds=np.asarray("x")),
+    "NaN": put("vertices", np.nan),
+    "corners outside": put("faces", 60_000),
+    "another number of people": lambda arrays: arrays.update(betas=np.zeros((9, 3), np.float32)),
+    "complex numbers": cast("texture", complex),
+}
+for kind, change in BANKS.items():
+    arrays_case(kind, "bank", readers.bank_arrays, change, 7)

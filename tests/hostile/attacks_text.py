@@ -1,0 +1,197 @@
+"""JSON, YAML, COLMAP and configurations: nesting, length, numbers that are none, parts that do not exist."""
+
+import json
+
+import readers
+from hostile_cases import case, setting, written
+from readers import SEEDS
+
+from humangs_jax.core.configuration import config_to_json
+from humangs_jax.training.config import tiny
+
+# JSON and YAML ----------------------------------------------------------------------------------------------------------
+
+JSON_READERS = {
+    **{"json": "a.json", "transforms": "transforms.json", "opencv json": "calibration_full.json", "openpose": "a.json"},
+    **{"coco": "a.json", "mmpose": "a.json", "lhm": "a.json", "joints json": "a.json", "configuration": "a.json"},
+    "manifest": "manifest.json",
+}
+DEEP = {
+    "lists in lists": "[" * 100_000 + "]" * 100_000,
+    "objects in objects": '{"a":' * 100_000 + "1" + "}" * 100_000,
+    "900 lists in lists": "[" * 900 + "]" * 900,
+    "a number of 5,000 digits": '{"frames": ' + "9" * 5000 + "}",
+    "characters that do not exist": b'{"a": "\xff\xfe"}',
+    "half a surrogate": '"\\ud800"',
+    "null": "null",
+    "a number": "3",
+    "a word": '"people"',
+    "a list of nothing": "[]",
+    "no keys": "{}",
+}
+for reader, name in JSON_READERS.items():
+    for kind, data in DEEP.items():
+        fine = reader == "json" and kind in (
+            "null",
+            "a number",
+            "a word",
+            "a list of nothing",
+            "no keys",
+            "half a surrogate",
+        )
+        expect = "read" if fine or (reader == "configuration" and kind == "no keys") else "refused"
+        case(kind, reader, written(name, data), expect, 6)
+for reader in ("json", "openpose", "transforms"):
+    case("100 MB", reader, written(JSON_READERS[reader], lambda: b"[" + b"1," * (50 << 20) + b"1]"), item=5)
+
+YAML = {
+    "lists in lists": "a: " + "[" * 3000 + "]" * 3000,
+    "maps in maps": "\n".join(" " * i + "a:" for i in range(2000)),
+    "keys of keys": "? " * 3000 + "a",
+    "a billion laughs": "a: &a [x,x]\n"
+    + "\n".join(f"{c}: &{c} [*{b},*{b}]" for b, c in zip("abcdefgh", "bcdefghi", strict=True)),
+    "2 MB": "K_a: 1\n" * 300_000,
+    "a number of 900,000 digits": "K_a: " + "1" * 900_000 + "x",
+    "a whole number of 900,000 digits": "K_a: " + "1" * 900_000,
+    "commas": "K_a: {" + "," * 200_000,
+    "python's objects": "K_a: !!python/object/apply:os.system ['touch OWNED']",
+    "another tag": "K_a: !!binary aGVsbG8=",
+    "a matrix of words": "K_a: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n   data: [a, b]",
+    "a matrix of 10^18": "K_a: !!opencv-matrix\n   rows: 1000000000\n   cols: 1000000000\n   dt: d\n   data: [1]",
+    "a matrix that is negative": "K_a: !!opencv-matrix\n   rows: -1\n   cols: -1\n   dt: d\n   data: [1]",
+    "a matrix of .Inf": "K_a: !!opencv-matrix\n   rows: .Inf\n   cols: 1\n   dt: d\n   data: [1]",
+    "names that are a number": readers.opencv_yaml() + "names: 3\n",
+    "names of nobody": readers.opencv_yaml() + "names: [x, y]\n",
+}
+for kind, data in YAML.items():
+    case(kind, "opencv yaml", written("cameras.yml", "%YAML:1.0\n---\n" + data), item=5 if "digits" not in kind else 6)
+
+
+# Numbers that are none --------------------------------------------------------------------------------------------------
+
+
+def json_case(kind, reader, name, value, item=6, expect="refused"):
+    case(kind, reader, written(name, json.dumps(value)), expect, item)
+
+
+for kind, bad in {
+    "10^400": 10**400,
+    "inf": float("inf"),
+    "NaN": float("nan"),
+    "words": "x",
+    "objects": {},
+    "ragged": [[1], 2],
+}.items():
+    matrix = [[bad, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+    frames = [{"file_path": "a.png", "transform_matrix": matrix}]
+    json_case(f"a matrix with {kind}", "transforms", "transforms.json", readers.transforms(frames=frames))
+    json_case(f"a focal length of {kind}", "transforms", "transforms.json", readers.transforms(fl_x=bad))
+    json_case(f"a size of {kind}", "transforms", "transforms.json", readers.transforms(w=bad))
+    views = readers.capture_description()["views"]
+    for key in ("K", "cam_from_world", "frame", "image"):
+        description = readers.capture_description(views=[{**views[0], key: bad}, views[1]])
+
+        def make(folder, description=description):
+            readers.write_capture(folder)
+            (folder / "capture.json").write_text(json.dumps(description))
+            return folder
+
+        case(f"{key} of {kind}", "capture", make, item=6)
+    person = {"pose_keypoints_2d": [bad] * 75}
+    json_case(f"keypoints of {kind}", "openpose", "000_keypoints.json", {"people": [person]})
+    json_case(f"keypoints of {kind}", "coco", "a.json", [{"file_name": "000.png", "keypoints": [bad] * 51}])
+    json_case(f"a score of {kind}", "mmpose", "a.json", [{"keypoints": [[1, 2]] * 17, "keypoint_scores": [bad] * 17}])
+    image = {"id": 1, "file_name": "000.png", "width": bad, "height": bad}
+    json_case(f"a size of {kind}", "coco annotations", "a.json", {"images": [image], "annotations": []})
+    json_case(f"a pose of {kind}", "lhm", "a.json", json.loads(readers.lhm()) | {"root_pose": [bad] * 3})
+    json_case(f"a joint of {kind}", "joints json", "a.json", {"left_hip": [bad, 0, 0]})
+
+COLMAP = {
+    "a point of inf": ("images.txt", "5.0 6.0 1", "5.0 6.0 inf"),
+    "a point of nan": ("images.txt", "5.0 6.0 1", "5.0 6.0 nan"),
+    "a point of 1e400": ("images.txt", "5.0 6.0 1", "5.0 6.0 1e400"),
+    "a point's number in words": ("points3D.txt", "1 0 0.9", "x 0 0.9"),
+    "a place of nan": ("points3D.txt", "0 0.9 0", "nan 0.9 0"),
+    "a quaternion of inf": ("images.txt", "0 1 0 0", "inf 1 0 0"),
+    "a quaternion of 0": ("images.txt", "0 1 0 0", "0 0 0 0"),
+    "a camera that is not there": ("images.txt", " 1 photos", " 7 photos"),
+    "a size of 10^30": ("cameras.txt", "10 12", f"{10**30} 12"),
+    "a size of 1.5": ("cameras.txt", "10 12", "1.5 12"),
+    "another lens": ("cameras.txt", "PINHOLE", "FISHEYE"),
+}
+for kind, (name, old, new) in COLMAP.items():
+
+    def make(folder, name=name, old=old, new=new):
+        readers.write_colmap(folder)
+        text = (folder / name).read_text()
+        assert old in text
+        (folder / name).write_text(text.replace(old, new, 1))
+        return folder
+
+    case(kind, "colmap", make, "either" if "place" in kind else "refused", 6)
+
+
+# Configurations and weights ------------------------------------------------------------------------------------------------
+
+
+def configuration(path, value):
+    def data():
+        content = json.loads(config_to_json(tiny()))
+        setting(path, value)(content)
+        return json.dumps(content)
+
+    return written("config.json", data)
+
+
+ENCODER = "model.architecture.encoder"
+CONFIGURATIONS = {
+    "100,000 layers": (f"{ENCODER}.transformer.layers", 100_000, 5),
+    "10^400 layers": (f"{ENCODER}.transformer.layers", 10**400, 6),
+    "no layers": (f"{ENCODER}.transformer.layers", 0, 6),
+    "heads of no width": (f"{ENCODER}.transformer.head_width", 0, 6),
+    "patches of 0": (f"{ENCODER}.patch_size", 0, 6),
+    "patches below 0": (f"{ENCODER}.patch_size", -4, 6),
+    "patches of half": (f"{ENCODER}.patch_size", 0.5, 6),
+    "another module": (f"{ENCODER}.kind", "antigravity.Encoder", 1),
+    "the command line": (f"{ENCODER}.kind", "humangs_jax.cli.__main__.Encoder", 1),
+    "another function": (f"{ENCODER}.kind", "os.system", 1),
+    "a field that does not exist": (f"{ENCODER}.evil", 1, 6),
+    "a list for a part": ("model.architecture.encoder", [], 6),
+    "a rate of 10^400": ("optimizer.learning_rate", 10**400, 6),
+}
+for kind, (path, value, item) in CONFIGURATIONS.items():
+    case(kind, "configuration", configuration(path, value), item=item)
+
+
+def weights_with(path, value):
+    """Honest weights whose recorded architecture is changed."""
+
+    def make(folder):
+        from safetensors import safe_open
+        from safetensors.numpy import save_file
+
+        file = SEEDS["weights"](folder)
+        with safe_open(file, "numpy") as content:
+            tensors, metadata = {key: content.get_tensor(key) for key in content.keys()}, content.metadata()  # noqa: SIM118
+        architecture = json.loads(metadata["architecture"])
+        setting(path, value)(architecture)
+        save_file(tensors, file, metadata | {"architecture": json.dumps(architecture)})
+        return file
+
+    return make
+
+
+for kind, (path, value, item) in CONFIGURATIONS.items():
+    if path.startswith(ENCODER + "."):
+        case(kind, "weights", weights_with(path.removeprefix("model.architecture."), value), item=item)
+
+
+def weights_changed(folder):
+    file = SEEDS["weights"](folder)
+    data = bytearray(file.read_bytes())
+    data[-7] ^= 1
+    file.write_bytes(data)
+    return file
+
+
+case("one flipped bit in a tensor", "weights", weights_changed, item=3)

@@ -1,0 +1,462 @@
+"""A fuzzer over every reader: python fuzz.py FOLDER INPUTS [READER ...] prints one JSON line a reader.
+
+Honest files are taken apart as their format has it (arrays of an archive, values of JSON, instructions of a pickle, chunks of a
+PNG, words of a text), a few parts are exchanged for hostile ones, and the file is put together again; or bytes change at random.
+What is found is shrunk by hypothesis, saved as FOLDER/found-READER, and becomes a case of `attacks_*.py`.
+"""
+
+import copy
+import io
+import itertools
+import json
+import pickletools
+import struct
+import sys
+import time
+import zipfile
+import zlib
+from pathlib import Path
+
+import worker
+
+worker.prepare()  # before JAX and the readers are imported
+
+import numpy as np  # noqa: E402
+import readers  # noqa: E402
+from hypothesis import HealthCheck, Phase, given, settings  # noqa: E402
+from hypothesis import strategies as st  # noqa: E402
+
+NUMBERS = [
+    0,
+    1,
+    -1,
+    2,
+    7,
+    255,
+    2**15,
+    2**31 - 1,
+    2**31,
+    2**32,
+    2**63,
+    -(2**63),
+    10**30,
+    0.5,
+    1e30,
+    1e400,
+    -1e400,
+    float("nan"),
+]
+VALUES = [
+    *NUMBERS,
+    None,
+    True,
+    "",
+    "x",
+    "..",
+    "../x",
+    "/",
+    "a\0b",
+    "1",
+    "nan",
+    [],
+    {},
+    [1, [2]],
+    {"a": 1},
+    [[]] * 9,
+    [0.0] * 51,
+]
+DTYPES = ("<f4", "<f8", ">f8", "<f2", "<i4", "<i8", "<u1", "<u4", "|b1", "<c8", "<U3", "|S3")
+SIZES = (0, 1, 2, 3, 4, 5, 9, 17, 55, 165)
+WORDS = [
+    *(
+        b"nan",
+        b"inf",
+        b"-1",
+        b"0",
+        b"1e400",
+        b"99999999999999999999",
+        b"9" * 400,
+        b"x",
+        b"",
+        b"\0",
+        b"\xff",
+        b"\n",
+        b"[",
+        b"{",
+        b"-",
+    ),
+    *(
+        b": ",
+        b"!!opencv-matrix",
+        b"!!python/object",
+        b"&a",
+        b"*a",
+        b"%YAML:1.0",
+        b"#",
+        b"/",
+        b"..",
+        b"f 1 2 3",
+        b"v 1 2 3",
+    ),
+]
+OPCODES = [bytes([each.code.encode("latin1")[0]]) for each in pickletools.opcodes]
+NAMES = [
+    *(
+        ("numpy", "dtype"),
+        ("numpy", "ndarray"),
+        ("numpy.core.multiarray", "_reconstruct"),
+        ("numpy.core.multiarray", "scalar"),
+    ),
+    *(
+        ("numpy._core.numeric", "_frombuffer"),
+        ("_codecs", "encode"),
+        ("scipy.sparse", "csc_matrix"),
+        ("chumpy.ch", "Ch"),
+    ),
+    *(
+        ("chumpy.reordering", "Select"),
+        ("copyreg", "_reconstructor"),
+        ("collections", "OrderedDict"),
+        ("torch", "FloatStorage"),
+    ),
+    *(
+        ("torch._utils", "_rebuild_tensor_v2"),
+        ("torch._utils", "_rebuild_parameter"),
+        ("os", "system"),
+        ("builtins", "object"),
+    ),
+]
+
+
+class Draw:
+    """Choices of hypothesis, in few words."""
+
+    def __init__(self, data):
+        self.data = data
+
+    def below(self, count):
+        return self.data.draw(st.integers(0, max(0, count - 1)))
+
+    def of(self, options):
+        return options[self.below(len(options))]
+
+    def value(self):
+        """Of JSON: one of those above, or two of them in a list or a dict."""
+        way = self.below(8)
+        some = [copy.deepcopy(self.of(VALUES)) for _ in range(2 if way > 5 else 1)]
+        return some if way == 6 else dict(zip("ab", some, strict=True)) if way == 7 else some[0]
+
+
+def mutated_bytes(data, draw):
+    data = bytearray(data)
+    for _ in range(1 + draw.below(4)):
+        at, way = draw.below(len(data) + 1), draw.below(6)
+        if way == 0 and at < len(data):
+            data[at] ^= 1 << draw.below(8)
+        elif way == 1:
+            data[at : at + 1] = bytes([draw.below(256)])
+        elif way == 2:
+            del data[at : at + 1 + draw.below(64)]
+        elif way == 3:
+            data[at:at] = draw.of(WORDS)
+        elif way == 4:
+            size = draw.of((1, 2, 4, 8))
+            data[at : at + size] = draw.of((b"\0", b"\xff", b"\x7f", b"\x80")) * size
+        else:
+            other = draw.below(len(data) + 1)
+            data[at:at] = data[other : other + 1 + draw.below(200)]
+    return bytes(data)
+
+
+def mutated_text(data, draw):
+    """Words and lines exchanged, doubled or left out."""
+    words = data.replace(b"\n", b" \n ").split(b" ")
+    for _ in range(1 + draw.below(4)):
+        at, way = draw.below(len(words)), draw.below(4)
+        if way == 0:
+            words[at] = draw.of(WORDS)
+        elif way == 1:
+            del words[at : at + 1 + draw.below(8)]
+        elif way == 2:
+            words[at:at] = words[at : at + 1 + draw.below(40)]
+        else:
+            words[at:at] = [draw.of(WORDS)] * (1 + draw.below(50))
+        words = words or [b""]
+    return b" ".join(words).replace(b" \n ", b"\n")
+
+
+def places(value, path=()):
+    yield path
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in items:
+        yield from places(item, (*path, key))
+
+
+def mutated_value(value, draw):
+    for _ in range(1 + draw.below(3)):
+        found = list(places(value))
+        path = draw.of(found)
+        if not path:
+            return draw.value()
+        parent = value
+        for key in path[:-1]:
+            parent = parent[key]
+        way = draw.below(4)
+        if way == 0 and isinstance(parent, dict):
+            del parent[path[-1]]
+        elif way == 1 and isinstance(parent, list):
+            parent[:] = parent[:1] * draw.of((0, 2, 50))
+        else:
+            parent[path[-1]] = draw.value()
+    return value
+
+
+def mutated_json(data, draw):
+    return json.dumps(mutated_value(json.loads(data), draw)).encode()
+
+
+def mutated_array(array, draw):
+    way = draw.below(5)
+    if way == 0:
+        return np.zeros([draw.of(SIZES) for _ in range(draw.below(5))], draw.of(DTYPES))
+    if way == 1 and array.dtype.kind in "fiu" and array.size:
+        array = array.copy()
+        bad = (0, 1, 9, 99) if array.dtype.kind in "iu" else (np.nan, np.inf, -np.inf, -1.0, 6e4)
+        array.reshape(-1)[draw.below(array.size)] = draw.of(bad)
+        return array
+    if way == 2:
+        return (
+            array.astype(draw.of(DTYPES[:9]), copy=False)
+            if array.dtype.kind in "fiub"
+            else np.asarray(draw.of(("", "x", "\0")))
+        )
+    if way == 3:
+        return array[None]
+    return array[: draw.below(len(array) + 1)] if array.ndim else np.zeros(3)
+
+
+def mutated_npz(data, draw):
+    with np.load(io.BytesIO(data)) as archive:
+        arrays = dict(archive)
+    for _ in range(1 + draw.below(3)):
+        key = draw.of(sorted(arrays)) if arrays else "x"
+        if draw.below(6) == 0:
+            arrays.pop(key, None)
+        elif key == "header" and "header" in arrays:
+            arrays[key] = np.asarray(mutated_json(str(arrays[key]).encode(), draw).decode("utf-8", "replace"))
+        else:
+            arrays[key] = mutated_array(arrays.get(key, np.zeros(3)), draw)
+    stream = io.BytesIO()
+    with np.errstate(all="ignore"):
+        np.savez(stream, **arrays)
+    return stream.getvalue()
+
+
+def mutated_pickle(data, draw):
+    ends = [place for _, _, place in pickletools.genops(data)] + [len(data)]
+    pieces = [data[a:b] for a, b in itertools.pairwise(ends)]
+    for _ in range(1 + draw.below(5)):
+        at, way = draw.below(len(pieces)), draw.below(6)
+        if way == 0:
+            del pieces[at : at + 1 + draw.below(3)]
+        elif way == 1:
+            other = draw.below(len(pieces))
+            pieces[at:at] = pieces[other : other + 1 + draw.below(10)]
+        elif way == 2:
+            pieces[at:at] = [draw.of(OPCODES)]
+        elif way == 3:
+            pieces[at] = b"c" + "\n".join((*draw.of(NAMES), "")).encode()
+        elif way == 4:
+            pieces[at] = draw.of(
+                (
+                    b"J" + struct.pack("<i", draw.of((-1, 0, 7, 2**31 - 1))),
+                    b"N",
+                    b"}",
+                    b"]",
+                    b")",
+                    b"X\1\0\0\0<",
+                    b"\x88",
+                )
+            )
+        else:
+            pieces[at:at] = [
+                draw.of((b"0", b"2", b"(", b"R", b"b", b"\x81", b"\x85", b"\x86", b"t", b"s", b"u", b"e"))
+            ] * (1 + draw.below(30))
+        pieces = pieces or [b"."]
+    return b"".join(pieces)
+
+
+def mutated_zip(data, draw):
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = draw.of([*(["archive/data.pkl"] * 3 if "archive/data.pkl" in members else ()), *members])
+    members[name] = mutated_pickle(members[name], draw) if name.endswith(".pkl") else mutated_bytes(members[name], draw)
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+def mutated_png(data, draw):
+    at, chunks = 8, []
+    while at + 12 <= len(data):
+        length, name = struct.unpack(">I4s", data[at : at + 8])
+        chunks.append((name, data[at + 8 : at + 8 + length]))
+        at += 12 + length
+    for _ in range(1 + draw.below(3)):
+        at = draw.below(len(chunks))
+        name, body = chunks[at]
+        way = draw.below(5)
+        if way == 0:
+            size = draw.of((0, 9, 10, 70_000)), draw.of((0, 12, 2**31))
+            body = struct.pack(">IIBB", *size, draw.of((1, 8, 16)), draw.below(8))
+            body += bytes([draw.below(2), draw.below(2), draw.below(3)])
+            chunks[0] = (b"IHDR", body)
+        elif way == 1:
+            name = draw.of((b"tRNS", b"PLTE", b"iCCP", b"zTXt", b"gAMA", b"eXIf", b"acTL", b"fcTL", b"IDAT", b"IEND"))
+            chunks[at:at] = [(name, draw.of((b"", b"\0", bytes(40), b"x\0\0" + zlib.compress(bytes(99)))))]
+        elif way == 2:
+            chunks[at] = name, mutated_bytes(body, draw)
+        elif way == 3:
+            chunks[at] = name, zlib.compress(mutated_bytes(bytes(400), draw))
+        else:
+            del chunks[at]
+        chunks = chunks or [(b"IEND", b"")]
+    out = b"\x89PNG\r\n\x1a\n"
+    return out + b"".join(struct.pack(">I", len(b)) + n + b + struct.pack(">I", zlib.crc32(n + b)) for n, b in chunks)
+
+
+def mutated_glb(data, draw):
+    length = struct.unpack_from("<I", data, 12)[0]
+    header = json.dumps(mutated_value(json.loads(data[20 : 20 + length]), draw)).encode()
+    header += b" " * (-len(header) % 4)
+    rest = data[20 + length :]
+    return (
+        struct.pack("<III", 0x46546C67, 2, 20 + len(header) + len(rest))
+        + struct.pack("<II", len(header), 0x4E4F534A)
+        + header
+        + rest
+    )
+
+
+def mutated_safetensors(data, draw):
+    length = struct.unpack_from("<Q", data)[0]
+    header, rest = json.loads(data[8 : 8 + length]), data[8 + length :]
+    notes = header.get("__metadata__", {})
+    if "architecture" in notes and draw.below(2):
+        key = draw.of(("architecture", "conventions"))
+        notes[key] = mutated_json(notes[key].encode(), draw).decode()
+    else:
+        header = mutated_value(header, draw)
+    header = json.dumps(header).encode()
+    return struct.pack("<Q", len(header)) + header + rest
+
+
+NPZ = (
+    "npz",
+    "smplx npz",
+    "hands",
+    "body",
+    "avatar",
+    "keypoints npz",
+    "motion npz",
+    "amass",
+    "thuman",
+    "joints npz",
+    "fit record",
+    "bank",
+)
+STRUCTURES = {
+    **dict.fromkeys(NPZ, mutated_npz),
+    **dict.fromkeys(
+        ("json", "configuration", "transforms", "opencv json", "openpose", "coco", "coco annotations"), mutated_json
+    ),
+    **dict.fromkeys(
+        ("mmpose", "lhm", "joints json", "manifest", "capture", "photos", "outline", "import"), mutated_json
+    ),
+    **dict.fromkeys(("pickle", "smplx pkl", "aist"), mutated_pickle),
+    **dict.fromkeys(("image", "depth"), mutated_png),
+    **dict.fromkeys(("opencv yaml", "easymocap", "colmap", "obj", "off", "log"), mutated_text),
+    **{
+        "torch zip": mutated_zip,
+        "glb": mutated_glb,
+        "safetensors": mutated_safetensors,
+        "weights": mutated_safetensors,
+    },
+}
+"""How the files of a reader are taken apart; those of the others change by bytes alone."""
+
+
+def checked(read, path, watch):
+    """Reads a file. Raises: AssertionError for anything but a result or one line that names the file."""
+
+    class Fuzzed:
+        name = reader = ""
+
+        @staticmethod
+        def make(folder):
+            return path
+
+    result = worker.run(Fuzzed, read, path if path.is_dir() else path.parent, watch, measured=False)
+    assert result["outcome"] in ("read", "refused"), f"{result['outcome']}: {result['message']}"
+    if result["outcome"] == "refused":
+        folder = path if path.is_dir() else path.parent
+        assert str(folder) in result["message"] and "\n" not in result["message"], result["message"]
+    return result["outcome"]
+
+
+def fuzz(name, folder, inputs, watch):
+    """Figures of one reader."""
+    place = folder / name.replace(" ", "_")
+    place.mkdir(parents=True)
+    path = readers.SEEDS[name](place)
+    file = readers.damaged_file(name, path)
+    honest, counts = file.read_bytes(), {"read": 0, "refused": 0}
+
+    @settings(
+        max_examples=inputs, deadline=None, database=None, phases=(Phase.generate, Phase.shrink), print_blob=False,
+        suppress_health_check=list(HealthCheck), report_multiple_bugs=False,
+    )  # fmt: skip
+    @given(st.data())
+    def run(data):
+        draw = Draw(data)
+        mutate = STRUCTURES.get(name, mutated_bytes) if draw.below(4) else mutated_bytes
+        try:
+            content = mutate(honest, draw)
+        except (OverflowError, TypeError, ValueError):  # values that the format itself cannot hold
+            content = mutated_bytes(honest, draw)
+        file.write_bytes(content)
+        try:
+            counts[checked(readers.READERS[name], path, watch)] += 1
+        except AssertionError:
+            (folder / f"found-{name.replace(' ', '_')}").write_bytes(content)
+            raise
+
+    start, found = time.perf_counter(), ""
+    try:
+        run()
+    except AssertionError as error:
+        found = str(error)[-900:]
+    return {
+        "reader": name,
+        "inputs": sum(counts.values()),
+        **counts,
+        "seconds": round(time.perf_counter() - start, 1),
+        "found": found,
+    }
+
+
+def main():
+    folder, inputs = Path(sys.argv[1]), int(sys.argv[2])
+    names = sys.argv[3:] or [name for name, seed in readers.SEEDS.items() if seed is not None]
+    folder.mkdir(parents=True, exist_ok=True)
+    worker.warm_up(readers, folder)
+    watch = worker.Watch()
+    worker.limit_memory()
+    for name in names:
+        print(json.dumps(fuzz(name, folder, inputs, watch)), flush=True)
+
+
+if __name__ == "__main__":
+    main()

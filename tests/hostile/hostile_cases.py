@@ -1,0 +1,143 @@
+"""What a hostile file is, the list of them, and damage of every kind to every honest file.
+
+`attacks_*.py` add those of each format to the list; `all_cases` imports them.
+"""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from readers import SEEDS, damaged_file
+
+
+@dataclasses.dataclass(frozen=True)
+class Case:
+    """reader: of `readers.READERS`. make: writes the file into a folder, returns its path. item: of test_hostile.ITEMS."""
+
+    name: str
+    reader: str
+    make: Callable[[Path], Path]
+    expect: str = "refused"
+    item: int = 0
+
+
+CASES: list[Case] = []
+NAMES: set[str] = set()
+
+
+def case(name, reader, make, expect="refused", item=0):
+    assert f"{reader}: {name}" not in NAMES, f"two cases {reader}: {name}"
+    NAMES.add(f"{reader}: {name}")
+    CASES.append(Case(f"{reader}: {name}", reader, make, expect, item))
+
+
+def written(name, data):
+    """Makes a file of bytes, of text, or of what a function returns."""
+
+    def make(folder):
+        content = data() if callable(data) else data
+        (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+        return folder / name
+
+    return make
+
+
+def setting(path, value):
+    """Changes one value of the JSON: path as in "accessors.0.count"."""
+
+    def change(content):
+        *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+        for part in parents:
+            content = content[part]
+        content[last] = value
+
+    return change
+
+
+# Damage to every honest file ------------------------------------------------------------------------------------------
+
+
+def changed(name, change):
+    """The honest file of a reader, its bytes changed."""
+
+    def make(folder):
+        path = SEEDS[name](folder)
+        file = damaged_file(name, path)
+        file.write_bytes(change(file.read_bytes()))
+        return path
+
+    return make
+
+
+def replaced(name, place):
+    """The honest file of a reader, something else in its place."""
+
+    def make(folder):
+        path = SEEDS[name](folder)
+        file = damaged_file(name, path)
+        file.unlink()
+        place(file)
+        return path
+
+    return make
+
+
+def flipped(seed):
+    def change(data):
+        data, random = bytearray(data), np.random.default_rng(seed)
+        for position in random.integers(len(data), size=1 + seed % 3):
+            data[position] ^= 1 << int(random.integers(8))
+        return bytes(data)
+
+    return change
+
+
+def huge(file):
+    with file.open("wb") as stream:
+        stream.truncate(1 << 40)  # takes no space
+
+
+NONSENSE = {
+    "empty": lambda data: b"",
+    "one byte": lambda data: b"\0",
+    "zeros": lambda data: bytes(4096),
+    "noise": lambda data: np.random.default_rng(7).bytes(4096),
+    "a web page": lambda data: b"<!DOCTYPE html><html><body>404 Not Found</body></html>\n",
+}
+PLACES = {
+    "missing": lambda file: None,
+    "a folder": lambda file: file.mkdir(),
+    "a pipe": os.mkfifo,
+    "a link to an endless device": lambda file: file.symlink_to("/dev/zero"),
+    "a link to itself": lambda file: file.symlink_to(file),
+    "of a terabyte": huge,
+}
+NOT_NOTICED = {"log"}
+"""A log that is missing or empty is that of a run without trouble."""
+
+for seed in (name for name, make in SEEDS.items() if make is not None):
+    for kind, change in NONSENSE.items():
+        case(kind, seed, changed(seed, change), "either" if seed in NOT_NOTICED else "refused")
+    for kind, place in PLACES.items():
+        case(kind, seed, replaced(seed, place), "either" if seed in NOT_NOTICED else "refused")
+    for share in (0.02, 0.3, 0.6, 0.9):
+        case(f"cut at {share:.0%}", seed, changed(seed, lambda data, s=share: data[: int(s * len(data))]), "either")
+    case("without its last byte", seed, changed(seed, lambda data: data[:-1]), "either")
+    case("with more behind it", seed, changed(seed, lambda data: data + b"\0 more" * 20), "either")
+    for i in range(4):
+        case(f"flipped bits {i}", seed, changed(seed, flipped(i)), "either")
+
+
+def all_cases() -> list[Case]:
+    """Every case, those of all modules."""
+    import attacks_archives  # noqa: F401
+    import attacks_arrays  # noqa: F401
+    import attacks_meshes  # noqa: F401
+    import attacks_paths  # noqa: F401
+    import attacks_photos  # noqa: F401
+    import attacks_pickles  # noqa: F401
+    import attacks_text  # noqa: F401
+
+    return CASES

@@ -1,0 +1,169 @@
+"""The room of untrusted files: its limits, its one error line, its paths."""
+
+import dataclasses
+import re
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+
+import pytest
+
+from humangs_jax.io import reading as module
+from humangs_jax.io.reading import (
+    FileError,
+    Limits,
+    Refused,
+    check_limit,
+    inside,
+    limits,
+    read_bytes,
+    reading,
+    set_limits,
+)
+from humangs_jax.io.text import parse_json, read_json
+
+DOCS = Path(__file__).parents[2] / "docs" / "security.md"
+
+
+@pytest.fixture(autouse=True)
+def usual_limits():
+    set_limits(None)
+    yield
+    set_limits(None)
+
+
+def test_the_page_lists_the_limits_in_force():
+    rows = re.findall(r"^\| `(\w+)` \| ([\d,]+) \|", DOCS.read_text(), re.MULTILINE)
+    found = {name: int(value.replace(",", "")) for name, value in rows}
+    assert found == {name: int(value) for name, value in dataclasses.asdict(Limits()).items()}
+
+
+def test_limits_are_those_of_the_environment(monkeypatch):
+    monkeypatch.setenv(module.ENVIRONMENT, "pixels=2e8, photos_outside=1")
+    assert limits() == Limits(pixels=200_000_000, photos_outside=True)
+    for text in ("pixel=3", "pixels", "pixels=many", "pixels=1e999"):
+        set_limits(None)
+        monkeypatch.setenv(module.ENVIRONMENT, text)
+        with pytest.raises(ValueError, match=rf"HUMANGS_LIMITS: '{text}': expected NAME=NUMBER"):
+            limits()
+
+
+def test_a_limit_is_named_and_can_be_changed(tmp_path):
+    (tmp_path / "a.json").write_text("[" + "1," * 100 + "1]")
+    assert len(read_json(tmp_path / "a.json")) == 101
+    set_limits(Limits(text_bytes=100))
+    with pytest.raises(FileError, match=r"a\.json: 203 bytes: the limit text_bytes is 100 \(docs/security\.md\)$"):
+        read_json(tmp_path / "a.json")
+    set_limits(Limits(nesting=2))
+    assert parse_json("[[1], {}]") == [[1], {}]
+    with pytest.raises(Refused, match="limit nesting is 2"):
+        parse_json('[{"a": [1]}]')
+    with pytest.raises(Refused, match="limit joints is"):
+        check_limit("joints", 2000, "joints")
+
+
+ZOO = [
+    *(RecursionError("maximum recursion depth exceeded"), MemoryError(), zipfile.BadZipFile("File is not a zip file")),
+    *(
+        zlib.error("Error -3"),
+        EOFError(),
+        KeyError("x"),
+        IndexError("list index out of range"),
+        OverflowError("too large"),
+    ),
+    *(struct.error("unpack requires a buffer"), UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte")),
+    *(
+        AttributeError("'list' object has no attribute 'items'"),
+        TypeError("unhashable"),
+        AssertionError(),
+        SyntaxError("broken"),
+    ),
+    *(
+        NotImplementedError("compression"),
+        RuntimeError("two\nlines"),
+        PermissionError(13, "Permission denied"),
+        ValueError("no"),
+    ),
+    *(
+        ZeroDivisionError("division by zero"),
+        StopIteration(),
+        Refused("expected something else"),
+        ValueError("x" * 10_000),
+    ),
+]
+
+
+@pytest.mark.parametrize("error", ZOO, ids=lambda error: type(error).__name__)
+def test_every_exception_is_one_line_that_names_the_file(error):
+    class Own(FileError):
+        pass
+
+    for kind in (FileError, Own):
+        with pytest.raises(kind) as caught, reading("folder/a.bin", "thing", kind):
+            raise error
+        text = str(caught.value)
+        assert text.startswith("folder/a.bin: ") and "\n" not in text and 20 < len(text) < 1100
+        with (
+            pytest.raises(Own, match=r"^folder/a\.bin: ") as outer,
+            reading("folder", "capture", Own),
+            reading("folder/a.bin", "thing"),
+        ):
+            raise error
+        assert str(outer.value) == text  # the inner file is named, once
+
+
+def test_missing_files_keep_their_type():
+    with pytest.raises(FileNotFoundError, match=r"^nowhere\.json: no such file$"):
+        read_json("nowhere.json")
+    with pytest.raises(KeyboardInterrupt), reading("a", "thing"):
+        raise KeyboardInterrupt
+
+
+def test_only_regular_files_of_bounded_size_are_opened(tmp_path):
+    import os
+
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for name in ("pipe", "zero", "."):
+        with pytest.raises(Refused):
+            read_bytes(tmp_path / name)
+    with open(tmp_path / "large", "wb") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(Refused, match="limit file_bytes"):
+        read_bytes(tmp_path / "large")
+
+
+def test_paths_stay_inside_of_their_folder(tmp_path):
+    folder = tmp_path / "me"
+    (folder / "images").mkdir(parents=True)
+    (tmp_path / "secret.png").write_bytes(b"")
+    (folder / "images" / "link.png").symlink_to(tmp_path / "secret.png")
+    (folder / "images" / "near.png").symlink_to(folder / "a.png")
+    (folder / "round").symlink_to(folder / "round")
+    for name in ("a.png", "images/a.png", "images/../a.png", "./a.png", "images/near.png"):
+        assert inside(folder, name) == folder / name
+    out = [
+        "../secret.png",
+        "/etc/passwd",
+        "images/link.png",
+        "images/../../secret.png",
+        "a\0b",
+        "round/x",
+        str(tmp_path),
+    ]
+    for name in out:
+        with pytest.raises(Refused, match=r"outside of|is no path"):
+            inside(folder, name)
+        with pytest.raises(Refused):
+            inside(folder, name, photo=True)
+    set_limits(Limits(photos_outside=True))
+    assert inside(folder, "../secret.png", photo=True) == folder / "../secret.png"
+    with pytest.raises(Refused, match="outside of"):
+        inside(folder, "../secret.png")  # what is no photo stays inside
+
+
+def test_a_linked_folder_is_its_own_folder(tmp_path):
+    (tmp_path / "real").mkdir()
+    (tmp_path / "me").symlink_to(tmp_path / "real")
+    assert inside(tmp_path / "me", "a.png") == tmp_path / "me" / "a.png"
