@@ -175,6 +175,7 @@ def motion_scores(browser: "Chromium", avatar: "Avatar", frames: int) -> tuple[f
     from humangs_jax.body.model import BodyPose
     from humangs_jax.geometry.camera import Camera
 
+    browser.resize(800, 600)
     browser.run(
         """document.getElementById("ground").checked && document.getElementById("ground").click();
         document.querySelector("#swatches button[title='#ffffff']").click();
@@ -186,6 +187,7 @@ def motion_scores(browser: "Chromium", avatar: "Avatar", frames: int) -> tuple[f
     view = browser.run("return humangs.view()")
     image = browser.screenshot()
     browser.run("document.body.classList.remove('hidden'); document.getElementById('ground').click();")
+    browser.resize(1280, 800)
     pose = BodyPose(jnp.asarray(view["rotations"], jnp.float32), jnp.asarray(view["translation"], jnp.float32))
     camera = Camera.from_opencv(
         np.asarray(view["K"]), np.asarray(view["cam_from_world"]), view["width"], view["height"]

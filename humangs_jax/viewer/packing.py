@@ -56,7 +56,9 @@ class Packed:
     data: bytes
 
 
-def pack(avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = None) -> Packed:
+def pack(
+    avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = None, motion_name: str = "motion"
+) -> Packed:
     """What the page holds of an avatar.
 
     Arguments: motion: of the avatar's joints. body: the model that the avatar's vertices are of, for sliders of its shape.
@@ -90,7 +92,7 @@ def pack(avatar: Avatar, motion: Motion | None = None, body: BodyModel | None = 
         step = max(float(np.abs(rotations).max()), SMALLEST_RANGE) / 32767
         arrays["rotations"] = np.rint(rotations / step).astype("<i2")
         arrays["translations"] = np.asarray(motion.translations, "<f4")
-        header["motion"] = {"frames": len(rotations), "fps": float(motion.fps), "step": step}
+        header["motion"] = {"name": motion_name, "frames": len(rotations), "fps": float(motion.fps), "step": step}
     if body is not None:
         _pack_shape(avatar, body, header, arrays)
     return _joined(header, arrays)

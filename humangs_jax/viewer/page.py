@@ -18,6 +18,7 @@ from importlib import resources
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.body.joints import PARENTS
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, RestBody
 from humangs_jax.core.configuration import config_from_json
@@ -36,20 +37,24 @@ LARGEST_FPS = 60.0
 _MARK = re.compile(r"\{\{(\w+)\}\}")
 
 
-def page_html(avatar: Avatar, motion: Motion | None = None, title: str = "avatar") -> str:
+def page_html(
+    avatar: Avatar, motion: Motion | None = None, title: str = "avatar", motion_name: str | None = None
+) -> str:
     """The page as text.
 
-    Arguments: motion: None for the walk that comes with the package (if the avatar has its joints). title: shown in the page.
+    Arguments: motion: None for the walk that comes with the package (if the avatar has its joints). title, motion_name: shown
+    in the page.
 
     Raises: ValueError, one line, for an avatar or a motion that cannot be drawn (see `packing.pack`).
     """
+    name = motion_name or ("walk" if motion is None else "motion")
     if motion is None:
         walk = load_motion()
         motion = walk if walk.rotations.shape[1] == len(avatar.parents) else None
     if motion is not None and motion.rotations.shape[1] == len(avatar.parents):
         motion = motion.at_rate(LARGEST_FPS) if motion.fps > LARGEST_FPS else motion
         motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
-    packed = pack(avatar, motion, known_body(avatar))
+    packed = pack(avatar, motion, known_body(avatar), name)
     header = json.dumps(packed.header, separators=(",", ":"))
     parts = {
         "title": html.escape(title),
@@ -59,9 +64,15 @@ def page_html(avatar: Avatar, motion: Motion | None = None, title: str = "avatar
     return _MARK.sub(lambda mark: parts[mark[1]], _template())
 
 
-def write_page(path: str | os.PathLike, avatar: Avatar, motion: Motion | None = None, title: str = "avatar") -> int:
+def write_page(
+    path: str | os.PathLike,
+    avatar: Avatar,
+    motion: Motion | None = None,
+    title: str = "avatar",
+    motion_name: str | None = None,
+) -> int:
     """Write the page; it appears whole or not at all. Returns its size in bytes. Raises: as `page_html`; OSError."""
-    text = page_html(avatar, motion, title)
+    text = page_html(avatar, motion, title, motion_name)
     write_text(path, text)
     return len(text.encode())
 
@@ -132,9 +143,9 @@ def page_server(text: str, port: int = 0) -> ThreadingHTTPServer:
 
 def known_body(avatar: Avatar) -> BodyModel | None:
     """The shipped body on the avatar's vertices, if the avatar is one of its people: what the sliders of shape need."""
-    body = load_body()
-    if len(avatar.parents) != len(body.parents):
+    if avatar.parents != PARENTS:
         return None
+    body = load_body()
     if len(avatar.rest_vertices) != len(body.template):
         body = gaussian_body(body, _shipped_network())
     same = np.array_equal(body.faces, avatar.faces) and len(avatar.gaussians.means) % len(body.template) == 0

@@ -81,6 +81,8 @@ function makeControls(app) {
     marks.push([summary, members.map(([, j]) => j)]);
     details.addEventListener("toggle", () => {  // 165 sliders: made when they are first seen
       if (details.childElementCount > 1) return;
+      const heads = Object.assign(document.createElement("div"), { className: "joint heads", innerHTML: "<div><b>x</b><b>y</b><b>z</b></div>" });
+      details.append(heads);
       for (const [name, j] of members) {
         const row = document.createElement("div"), caption = document.createElement("span"), axes = document.createElement("div");
         row.className = "joint";

@@ -11,7 +11,7 @@ async function start() {
   const distance = (0.54 * scene.height) / Math.tan(FIELD_OF_VIEW / 2) + 0.3 * scene.height;
   const orbit = makeOrbit([0, 0.5 * scene.height, 0], distance), home = { ...orbit };
   const app = {
-    scene, orbit, mode: scene.motion ? "motion" : "a", motionName: "walk", frame: 0, playing: Boolean(scene.motion), speed: 1,
+    scene, orbit, mode: scene.motion ? "motion" : "a", motionName: scene.header.motion?.name, frame: 0, playing: Boolean(scene.motion), speed: 1,
     degrees: scene.names.map(() => [0, 0, 0]), betas: scene.header.shape ? [...scene.header.shape.betas] : [],
     follow: true, look: { background: [1, 1, 1], ground: 1 },
     invalidate, setMode, setPlaying, setFrame, stepFrame, setShape, setMotion, framePerson, saveImage,

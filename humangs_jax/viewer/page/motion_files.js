@@ -192,7 +192,6 @@ function parseBvh(text) {
 // Our joints by the names of others, lower case without separators: CMU (cgspeed), Mixamo, LaFAN, MotionBuilder, Biovision.
 const BVH_NAMES = {
   pelvis: ["hips", "hip", "pelvis", "root"],
-  spine1: ["spine", "lowerback", "abdomen", "spine0"], spine2: ["spine1", "chest"], spine3: ["spine2", "chest2", "upperchest", "spine3"],
   neck: ["neck", "neck1"], head: ["head"],
   left_collar: ["leftshoulder", "leftcollar", "lcollar"], right_collar: ["rightshoulder", "rightcollar", "rcollar"],
   left_shoulder: ["leftarm", "leftuparm", "leftupperarm", "lshldr"], right_shoulder: ["rightarm", "rightuparm", "rightupperarm", "rshldr"],
@@ -222,6 +221,7 @@ function retargetBvh(bvh, scene) {
     const found = theirs.map((name) => plain.findIndex((p) => p === name || p === `mixamorig${name}`)).find((i) => i >= 0);
     if (found !== undefined && scene.names.includes(ours)) source[ours] = found;
   }
+  assignSpine(bvh, scene, source);
   const missing = NEEDED.filter((name) => source[name] === undefined);
   if (missing.length) throw new Error(`no joint for ${missing.join(", ")}: expected the names of CMU, Mixamo or LaFAN`);
 
@@ -266,6 +266,16 @@ function retargetBvh(bvh, scene) {
     translations.push(subtract(scaled(move, scale), rest("pelvis")));
   }
   return { quats, translations, fps: bvh.fps };
+}
+
+// Spines have one to five joints, called differently everywhere: ours are the first, the middle and the last of the file's.
+function assignSpine({ joints }, scene, source) {
+  const chain = [];
+  let at = joints[source.neck ?? source.head]?.parent ?? -1;
+  for (; at >= 0 && at !== source.pelvis; at = joints[at].parent) chain.unshift(at);
+  const last = chain.length - 1, ours = { spine3: last, spine1: last > 0 ? 0 : -1, spine2: last > 1 ? last >> 1 : -1 };
+  for (const [name, i] of Object.entries(ours))
+    if (at >= 0 && i >= 0 && scene.names.includes(name)) source[name] = chain[i];
 }
 
 function nextMapped(name, source) {
