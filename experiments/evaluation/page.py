@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 AZIMUTHS = (0.0, 1.1, 2.9)
 ELEVATIONS = (0.1, 0.5, -0.2)
 WALK_FRAME = 17
-FINE_EDGE = 0.0135
+FINE_EDGE = 0.017
 """Metres; the longest edge of a body that carries some 60,000 Gaussians."""
+KEPT_WEIGHTS = (2, 4, 6, 8)
 SHOWN = (
     ("least PSNR of nine views, dB", "whole"),
     ("on the person, dB", "person"),
@@ -62,7 +63,10 @@ def measure(arguments: argparse.Namespace, folder: Path, browser_type: "type[Chr
 
     avatars = {"avatar": Avatar.load(arguments.avatar) if arguments.avatar else shipped_person()}
     avatars["finer"] = shipped_person(FINE_EDGE)
-    numbers: dict[str, Any] = {"size": arguments.size}
+    numbers: dict[str, Any] = {
+        "size": arguments.size,
+        "weights_kept": truncation_scores(avatars["avatar"], arguments.size),
+    }
     for name, avatar in avatars.items():
         page = folder / f"{name}.html"
         row: dict[str, Any] = {"gaussians": len(avatar.gaussians.means), "bytes": write_page(page, avatar)}
@@ -195,6 +199,26 @@ def motion_scores(browser: "Chromium", avatar: "Avatar", frames: int) -> tuple[f
     return compare(image, avatar, camera, pose)
 
 
+def truncation_scores(avatar: "Avatar", size: int) -> dict[str, float]:
+    """PSNR on the person, dB, of `hg.render` with only so many skinning weights of each Gaussian, in the pose of the walk."""
+    import jax.numpy as jnp
+
+    from humangs_jax.avatar.animate import skin
+    from humangs_jax.core.pytree import replace
+    from humangs_jax.rendering.splatting import render
+
+    cameras, poses = test_views(avatar, size)
+    scores = {}
+    for kept in KEPT_WEIGHTS:
+        weights = avatar.skinning_weights
+        least = jnp.sort(weights, axis=1)[:, -kept][:, None]
+        weights = jnp.where(weights >= least, weights, 0.0)
+        fewer = replace(avatar, skinning_weights=weights / weights.sum(1, keepdims=True))
+        image = jnp.clip(render(skin(fewer, poses["walk"]), cameras[0]).rgb, 0, 1)
+        scores[str(kept)] = compare(image, avatar, cameras[0], poses["walk"])[1]
+    return scores
+
+
 def section(numbers: dict[str, Any]) -> str:
     """The table."""
     rows = [numbers["avatar"], numbers["finer"]]
@@ -204,7 +228,9 @@ def section(numbers: dict[str, Any]) -> str:
     lines.append(["first image after, s", *(f"{row['first_image_seconds']:.1f}" for row in rows)])
     lines.append([f"frames per second, {numbers['size']} px, software WebGL", *(f"{row['fps']:.1f}" for row in rows)])
     lines.append(["one sort by depth, ms", *(f"{row['sort_ms']:.1f}" for row in rows)])
-    return markdown_table(header, lines)
+    kept = [["PSNR on the person, dB", *(f"{value:.0f}" for value in numbers["weights_kept"].values())]]
+    heads = ["skinning weights kept", *numbers["weights_kept"]]
+    return markdown_table(header, lines) + "\n\n" + markdown_table(heads, kept)
 
 
 if __name__ == "__main__":

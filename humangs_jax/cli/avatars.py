@@ -208,7 +208,8 @@ class Export:
         if self.html is not None:
             from humangs_jax.viewer.page import write_page
 
-            size = write_page(self.html, avatar, motion, self.avatar.stem, self.motion and self.motion.stem)
+            name = None if self.motion is None else self.motion.stem
+            size = write_page(self.html, avatar, motion, self.avatar.stem, name)
             print(f"{self.html}: {len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
         if out is not None:
             gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(self.frame))
@@ -235,5 +236,6 @@ class View:
         from humangs_jax.viewer.page import page_html, serve
 
         motion = None if self.motion is None else load_motion(self.motion)
-        text = page_html(Avatar.load(self.avatar), motion, self.avatar.stem, self.motion and self.motion.stem)
+        name = None if self.motion is None else self.motion.stem
+        text = page_html(Avatar.load(self.avatar), motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)
