@@ -56,6 +56,9 @@ class Chromium:
         options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
         self.driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))
         self.driver.set_script_timeout(PATIENCE)
+        client = self.driver.command_executor
+        assert not isinstance(client, str)  # Chrome's is an object
+        client.client_config.timeout = PATIENCE + 30
         self.resize(width, height, pixel_ratio, mobile)
 
     def __enter__(self) -> "Chromium":

@@ -30,6 +30,7 @@ ELEVATIONS = (0.1, 0.5, -0.2)
 WALK_FRAME = 17
 FINE_EDGE = 0.017
 """Metres; the longest edge of a body that carries some 60,000 Gaussians."""
+MOTION_WINDOW = (480, 600)
 KEPT_WEIGHTS = (2, 4, 6, 8)
 SHOWN = (
     ("least PSNR of nine views, dB", "whole"),
@@ -179,15 +180,15 @@ def motion_scores(browser: "Chromium", avatar: "Avatar", frames: int) -> tuple[f
     from humangs_jax.body.model import BodyPose
     from humangs_jax.geometry.camera import Camera
 
-    browser.resize(800, 600)
+    browser.resize(*MOTION_WINDOW)
     browser.run(
         """document.getElementById("ground").checked && document.getElementById("ground").click();
         document.querySelector("#swatches button[title='#ffffff']").click();
-        document.body.classList.add("hidden");
-        await humangs.play(given[0]);
-        await humangs.settle();""",
-        frames,
+        document.body.classList.add("hidden");"""
     )
+    for _ in range(frames // 10):
+        browser.run("await humangs.play(10)")
+    browser.run("await humangs.settle()")
     view = browser.run("return humangs.view()")
     image = browser.screenshot()
     browser.run("document.body.classList.remove('hidden'); document.getElementById('ground').click();")

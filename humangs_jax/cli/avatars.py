@@ -175,30 +175,35 @@ class Render:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Export an avatar: a page that shows it moving in any browser (--html), or a 3DGS .ply for Gaussian viewers (--out)."""
+    """Export an avatar: a page that shows it moving in any browser (--html), or a file for Gaussian viewers (--out): 3DGS .ply,
+    .splat, or .glb with KHR_gaussian_splatting, in the T-pose or in one frame of a motion.
+    """
 
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     out: Path | None = None
-    """The .ply to write. Default: avatar.ply, if --html is not given."""
+    """The .ply, .splat or .glb to write. Default: avatar.ply, if --html is not given."""
     html: Path | None = None
     """The page to write: one .html file that needs no network (docs/viewer.md)."""
     motion: Path | None = None
-    """Page: the motion it plays (default: the shipped walk). .ply: pose it by this motion (default: T-pose)."""
+    """Page: the motion it plays (default: the shipped walk). --out: pose it by this motion (default: T-pose)."""
     frame: int = 0
-    """.ply: which frame of the motion."""
+    """--out: which frame of the motion."""
+    up: Literal["y", "-y", "z"] | None = None
+    """--out: the axis that points up in the file; the feet stand on 0. Default: -y, as splat viewers expect; .glb: y, as glTF
+    wants."""
     rest: bool = False
     """.ply: add the 45 zero f_rest fields that some importers (Unity) require."""
 
     def run(self) -> None:
         out = Path("avatar.ply") if self.out is None and self.html is None else self.out
-        for option, path, suffix in (("--out", out, ".ply"), ("--html", self.html, ".html")):
+        for option, path, suffixes in (("--out", out, (".ply", ".splat", ".glb")), ("--html", self.html, (".html",))):
             if path is not None:
                 require_parent(path, option)
-                require_suffix(path, (suffix,), option)
+                require_suffix(path, suffixes, option)
         from humangs_jax.avatar.animate import animate
         from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.avatar.export import write_ply
+        from humangs_jax.avatar.export import grounded_gaussians, turned, write_glb, write_ply, write_splat
         from humangs_jax.data.motion import load_motion
 
         avatar = Avatar.load(self.avatar)
@@ -212,9 +217,15 @@ class Export:
             size = write_page(self.html, avatar, motion, self.avatar.stem, name)
             print(f"{self.html}: {len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
         if out is not None:
+            suffix = out.suffix.lower()
             gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(self.frame))
-            write_ply(out, gaussians, spherical_harmonics_rest=self.rest)
-            print(f"{out}: {len(gaussians.means):,} Gaussians")
+            up = self.up or ("y" if suffix == ".glb" else "-y")
+            gaussians = turned(grounded_gaussians(gaussians), up)
+            if suffix == ".ply":
+                write_ply(out, gaussians, spherical_harmonics_rest=self.rest)
+            else:
+                {".splat": write_splat, ".glb": write_glb}[suffix](out, gaussians)
+            print(f"{out}: {len(gaussians.means):,} Gaussians, {up} up, feet on 0")
 
 
 @dataclasses.dataclass(frozen=True)
