@@ -63,9 +63,11 @@ _PUBLIC = {
     "save_weights": "network.weights",
     "seen_from": "rendering.splatting",
     "shape_body": "body.model",
+    "show": "viewer.page",
     "skin": "avatar.animate",
     "stack_cameras": "geometry.camera",
     "train": "training.loop",
+    "write_page": "viewer.page",
     "write_ply": "avatar.export",
 }
 

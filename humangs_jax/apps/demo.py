@@ -29,6 +29,7 @@ from humangs_jax.io.text import write_json
 from humangs_jax.network.weights import load_weights
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
+from humangs_jax.viewer.page import write_page
 
 VERSIONS = ("humangs_jax", "jax", "jaxlib", "flax", "numpy")
 
@@ -44,8 +45,8 @@ def run_demo(
     refine: how the avatar is fitted to its photos; None: not at all.
 
     Files: inputs.png, novel_views.png (truth, feed-forward, error), novel_views.exr, animation.mp4 and .gif, avatar.npz,
-    avatar.ply, report.json; with `refine` also refined.png (truth, feed-forward, refined), and animation and avatar are the
-    refined ones. All of them appear at the end together; nothing is left behind by a run that fails.
+    avatar.ply, avatar.html (see docs/viewer.md), report.json; with `refine` also refined.png (truth, feed-forward, refined), and
+    animation and avatar are the refined ones. All of them appear at the end together; nothing is left behind by a run that fails.
     """
     out = Path(out)
     started, report = time.perf_counter(), {}
@@ -104,6 +105,7 @@ def _write_products(
     write_video(out / "animation.gif", frames, motion.fps)
     avatar.save(out / "avatar.npz")
     write_ply(out / "avatar.ply", avatar.gaussians)
+    write_page(out / "avatar.html", avatar, motion)
     timings["write_files"] = {"seconds": round(time.perf_counter() - start, 3)}
 
     baseline = score(draw_painted_body(painted_body(inputs), truth), truth)

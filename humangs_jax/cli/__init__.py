@@ -11,7 +11,7 @@ from typing import Protocol
 
 import tyro
 
-from humangs_jax.cli.avatars import Animate, Demo, Export, Reconstruct, Refine, Render
+from humangs_jax.cli.avatars import Animate, Demo, Export, Reconstruct, Refine, Render, View
 from humangs_jax.cli.captures import ImportCameras, Synth
 from humangs_jax.cli.fit import Check, Fit
 from humangs_jax.cli.training import Convert, Train
@@ -37,6 +37,7 @@ COMMANDS: dict[str, Callable[..., Command]] = {
     "animate": Animate,
     "render": Render,
     "export": Export,
+    "view": View,
     "synth": Synth,
     "train": Train,
     "convert": Convert,

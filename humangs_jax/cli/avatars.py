@@ -179,33 +179,78 @@ class Render:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Export an avatar as a 3DGS .ply that Gaussian viewers open, in the T-pose or in one frame of a motion."""
+    """Export an avatar: a page that shows it moving in any browser (--html), or a file for Gaussian viewers (--out): 3DGS .ply,
+    .splat, or .glb with KHR_gaussian_splatting, in the T-pose or in one frame of a motion.
+    """
 
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
-    out: Path = Path("avatar.ply")
-    """The .ply to write."""
+    out: Path | None = None
+    """The .ply, .splat or .glb to write. Default: avatar.ply, if --html is not given."""
+    html: Path | None = None
+    """The page to write: one .html file that needs no network (docs/viewer.md)."""
     motion: Path | None = None
-    """Pose it by this motion."""
+    """Page: the motion it plays (default: the shipped walk). --out: pose it by this motion (default: T-pose)."""
     frame: int = 0
-    """Which frame of the motion."""
+    """--out: which frame of the motion."""
+    up: Literal["y", "-y", "z"] | None = None
+    """--out: the axis that points up in the file; the feet stand on 0. Default: -y, as splat viewers expect; .glb: y, as glTF
+    wants."""
     rest: bool = False
-    """Add the 45 zero f_rest fields that some importers (Unity) require."""
+    """.ply: add the 45 zero f_rest fields that some importers (Unity) require."""
 
     def run(self) -> None:
+        out = Path("avatar.ply") if self.out is None and self.html is None else self.out
+        for option, path, suffixes in (("--out", out, (".ply", ".splat", ".glb")), ("--html", self.html, (".html",))):
+            if path is not None:
+                require_parent(path, option)
+                require_suffix(path, suffixes, option)
         from humangs_jax.avatar.animate import animate
         from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.avatar.export import write_ply
+        from humangs_jax.avatar.export import grounded_gaussians, turned, write_glb, write_ply, write_splat
         from humangs_jax.data.motion import load_motion
 
-        require_parent(self.out)
-        require_suffix(self.out, (".ply",))
         avatar = Avatar.load(self.avatar)
-        gaussians = avatar.gaussians
-        if self.motion is not None:
-            motion = load_motion(self.motion)
-            if not 0 <= self.frame < len(motion.translations):
-                raise ValueError(f"--frame {self.frame}: {self.motion} has {len(motion.translations)} frames, from 0")
-            gaussians = animate(avatar, motion.pose(self.frame))
-        write_ply(self.out, gaussians, spherical_harmonics_rest=self.rest)
-        print(f"{self.out}: {len(gaussians.means):,} Gaussians")
+        motion = None if self.motion is None else load_motion(self.motion)
+        if motion is not None and not 0 <= self.frame < len(motion.translations):
+            raise ValueError(f"--frame {self.frame}: {self.motion} has {len(motion.translations)} frames, from 0")
+        if self.html is not None:
+            from humangs_jax.viewer.page import write_page
+
+            name = None if self.motion is None else self.motion.stem
+            size = write_page(self.html, avatar, motion, self.avatar.stem, name)
+            print(f"{self.html}: {len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
+        if out is not None:
+            suffix = out.suffix.lower()
+            gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(self.frame))
+            up = self.up or ("y" if suffix == ".glb" else "-y")
+            gaussians = turned(grounded_gaussians(gaussians), up)
+            if suffix == ".ply":
+                write_ply(out, gaussians, spherical_harmonics_rest=self.rest)
+            else:
+                {".splat": write_splat, ".glb": write_glb}[suffix](out, gaussians)
+            print(f"{out}: {len(gaussians.means):,} Gaussians, {up} up, feet on 0")
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Show an avatar moving in the browser: serves the page of `humangs export --html` on this machine until Ctrl-C."""
+
+    avatar: Positional[Path]
+    """File written by `humangs reconstruct`."""
+    motion: Path | None = None
+    """The motion it plays. Default: the shipped walk."""
+    port: int = 0
+    """Port on 127.0.0.1; 0 for any free one."""
+    browser: bool = True
+    """Open the browser; --no-browser only prints the address."""
+
+    def run(self) -> None:
+        from humangs_jax.avatar.avatar import Avatar
+        from humangs_jax.data.motion import load_motion
+        from humangs_jax.viewer.page import page_html, serve
+
+        motion = None if self.motion is None else load_motion(self.motion)
+        name = None if self.motion is None else self.motion.stem
+        text = page_html(Avatar.load(self.avatar), motion, self.avatar.stem, name)
+        serve(text, self.port, self.browser)

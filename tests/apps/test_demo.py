@@ -13,6 +13,7 @@ from humangs_jax.refinement.config import RefineConfig
 PRODUCTS = {
     "animation.gif",
     "animation.mp4",
+    "avatar.html",
     "avatar.npz",
     "avatar.ply",
     "inputs.png",

@@ -1,0 +1,238 @@
+"""The page that shows avatars (`humangs export --html`) against `hg.render`, in Chromium with software WebGL.
+
+    python experiments/evaluation/page.py --json OUT [--avatar AVATAR] [--page docs/viewer.md] [--frames 20]
+
+Needs Debian's chromium and chromium-driver. Exact views: three cameras times three poses (T-pose, a pose of the walk, a pose of
+the held-out capture) at --size pixels, screenshots against `hg.render` of the same camera and pose: PSNR of the whole image and
+of the person (pixels by alpha). "Motion": the page plays 100 frames on its own and is paused; its image is compared with
+`hg.render` from the camera and in the pose that it reports. Frames per second: a turning camera, posed, sorted and drawn without
+waiting for the screen, on software WebGL, of the avatar and of one with about 60,000 Gaussians (a body of shorter edges). Default
+avatar: the shipped person, feed-forward.
+"""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import add_outputs, markdown_table, write_outputs
+
+if TYPE_CHECKING:
+    from experiments.common.chromium import Chromium
+    from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.body.model import BodyPose
+    from humangs_jax.geometry.camera import Camera
+
+AZIMUTHS = (0.0, 1.1, 2.9)
+ELEVATIONS = (0.1, 0.5, -0.2)
+WALK_FRAME = 17
+FINE_EDGE = 0.017
+"""Metres; the longest edge of a body that carries some 60,000 Gaussians."""
+MOTION_WINDOW = (480, 600)
+KEPT_WEIGHTS = (2, 4, 6, 8)
+SHOWN = (
+    ("least PSNR of nine views, dB", "whole"),
+    ("on the person, dB", "person"),
+    ("after 100 frames of motion, dB", "motion_whole"),
+    ("on the person, dB", "motion_person"),
+)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--avatar", type=Path, help="an avatar file instead of the shipped person")
+    parser.add_argument("--size", type=int, default=512, help="side of the images in pixels")
+    parser.add_argument("--frames", type=int, default=20, help="images that are timed")
+    add_outputs(parser, "page")
+    arguments = parser.parse_args()
+    from experiments.common.chromium import Chromium, missing
+
+    if reason := missing():
+        parser.error(reason)
+    with tempfile.TemporaryDirectory() as folder:
+        numbers = measure(arguments, Path(folder), Chromium)
+    write_outputs(arguments, "page", section(numbers), numbers)
+
+
+def measure(arguments: argparse.Namespace, folder: Path, browser_type: "type[Chromium]") -> dict[str, Any]:
+    """All numbers, of the avatar and of the one with more Gaussians."""
+    from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.viewer.page import write_page
+
+    avatars = {"avatar": Avatar.load(arguments.avatar) if arguments.avatar else shipped_person()}
+    avatars["finer"] = shipped_person(FINE_EDGE)
+    numbers: dict[str, Any] = {
+        "size": arguments.size,
+        "weights_kept": truncation_scores(avatars["avatar"], arguments.size),
+    }
+    for name, avatar in avatars.items():
+        page = folder / f"{name}.html"
+        row: dict[str, Any] = {"gaussians": len(avatar.gaussians.means), "bytes": write_page(page, avatar)}
+        with browser_type() as browser:
+            browser.open(page)
+            row["first_image_seconds"] = browser.run("return humangs.firstImage") / 1000
+            views = view_scores(browser, avatar, arguments.size)
+            row["whole"], row["person"] = (min(pair[i] for pair in views.values()) for i in (0, 1))
+            row["views"] = views
+            row["motion_whole"], row["motion_person"] = motion_scores(browser, avatar, 100)
+            timed = browser.run(
+                "return humangs.benchmark(given[0])",
+                {"frames": arguments.frames, "width": arguments.size, "height": arguments.size},
+            )
+            row |= {"fps": timed["fps"], "sort_ms": timed["sort_ms"], "console": browser.problems()}
+        numbers[name] = row
+    return numbers
+
+
+def shipped_person(longest_edge: float | None = None) -> "Avatar":
+    """The person of the demo from four photos, feed-forward."""
+    from humangs_jax.avatar.reconstruct import reconstruct
+    from humangs_jax.data.capture import load_capture
+    from humangs_jax.data.photos import DEMO_CAPTURE
+    from humangs_jax.network.weights import load_weights
+
+    variables, config = load_weights()
+    config = config.with_execution(longest_edge=longest_edge)
+    return reconstruct(variables, config, load_capture(DEMO_CAPTURE))
+
+
+def test_views(avatar: "Avatar", size: int) -> "tuple[list[Camera], dict[str, BodyPose]]":
+    """Three cameras and three poses; all look at the person in the pose."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from humangs_jax.avatar.frames import VERTICAL_FOV
+    from humangs_jax.body.model import BodyPose
+    from humangs_jax.data.capture import load_capture
+    from humangs_jax.data.motion import load_motion
+    from humangs_jax.data.photos import DEMO_CAPTURE
+    from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
+
+    joints = len(avatar.parents)
+    poses = {
+        "T-pose": BodyPose(jnp.zeros((joints, 3)), jnp.zeros(3)),
+        "walk": load_motion().pose(WALK_FRAME),
+        "held out": load_capture(f"{DEMO_CAPTURE}/held_out").pose(0),
+    }
+    height = float(np.ptp(np.asarray(avatar.rest_vertices)[:, 1]))
+    cameras = orbit(
+        jnp.asarray(avatar.rest_vertices.mean(0)),
+        1.35 * 0.5 * height / np.tan(0.5 * VERTICAL_FOV),
+        jnp.asarray(AZIMUTHS),
+        jnp.asarray(ELEVATIONS),
+        intrinsics_from_fov(VERTICAL_FOV, size, size),
+        size,
+        size,
+    )
+    # the root moves from pose to pose: the cameras look at the T-pose's middle, so it is taken back there
+    poses = {name: BodyPose(pose.rotations, jnp.zeros(3)) for name, pose in poses.items()}
+    return [cameras[i] for i in range(len(AZIMUTHS))], poses
+
+
+def view_scores(browser: "Chromium", avatar: "Avatar", size: int) -> dict[str, tuple[float, float]]:
+    """PSNR of the whole image and of the person, dB, by pose and camera."""
+    cameras, poses = test_views(avatar, size)
+    scores = {}
+    browser.resize(size, size)
+    for name, pose in poses.items():
+        for index, camera in enumerate(cameras):
+            image = exact_image(browser, camera, pose)
+            scores[f"{name}, camera {index + 1}"] = compare(image, avatar, camera, pose)
+    browser.run("humangs.resume()")
+    browser.resize(1280, 800)
+    return scores
+
+
+def exact_image(browser: "Chromium", camera: "Camera", pose: "BodyPose") -> Any:
+    """The screenshot of one camera and pose on white, (h, w, 3)."""
+    import numpy as np
+
+    view = {name: np.asarray(getattr(camera, name), float).tolist() for name in ("K", "cam_from_world")}
+    view |= {"width": camera.width, "height": camera.height}
+    view |= {"rotations": np.asarray(pose.rotations, float).tolist()}
+    view |= {"translation": np.asarray(pose.translation, float).tolist()}
+    browser.run("humangs.draw(given[0])", view)
+    return browser.screenshot()[: camera.height, : camera.width]
+
+
+def compare(image: Any, avatar: "Avatar", camera: "Camera", pose: "BodyPose") -> tuple[float, float]:
+    """PSNR to `hg.render` of the whole image and of the person, dB."""
+    import jax.numpy as jnp
+
+    from humangs_jax.avatar.animate import skin
+    from humangs_jax.objectives import metrics
+    from humangs_jax.rendering.splat_config import SPLAT_PRESETS
+    from humangs_jax.rendering.splatting import render
+
+    rendering = render(skin(avatar, pose), camera, SPLAT_PRESETS[avatar.rendering])
+    truth, image = jnp.clip(rendering.rgb, 0, 1), jnp.asarray(image)
+    return float(metrics.psnr(image, truth)), float(metrics.masked_psnr(image, truth, rendering.alpha))
+
+
+def motion_scores(browser: "Chromium", avatar: "Avatar", frames: int) -> tuple[float, float]:
+    """The page plays by itself, sorted by its worker; then its image as `hg.render` draws it, person and floor apart."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from humangs_jax.body.model import BodyPose
+    from humangs_jax.geometry.camera import Camera
+
+    browser.resize(*MOTION_WINDOW)
+    browser.run(
+        """document.getElementById("ground").checked && document.getElementById("ground").click();
+        document.querySelector("#swatches button[title='#ffffff']").click();
+        document.body.classList.add("hidden");"""
+    )
+    for _ in range(frames // 10):
+        browser.run("await humangs.play(10)")
+    browser.run("await humangs.settle()")
+    view = browser.run("return humangs.view()")
+    image = browser.screenshot()
+    browser.run("document.body.classList.remove('hidden'); document.getElementById('ground').click();")
+    browser.resize(1280, 800)
+    pose = BodyPose(jnp.asarray(view["rotations"], jnp.float32), jnp.asarray(view["translation"], jnp.float32))
+    camera = Camera.from_opencv(
+        np.asarray(view["K"]), np.asarray(view["cam_from_world"]), view["width"], view["height"]
+    )
+    return compare(image, avatar, camera, pose)
+
+
+def truncation_scores(avatar: "Avatar", size: int) -> dict[str, float]:
+    """PSNR on the person, dB, of `hg.render` with only so many skinning weights of each Gaussian, in the pose of the walk."""
+    import jax.numpy as jnp
+
+    from humangs_jax.avatar.animate import skin
+    from humangs_jax.core.pytree import replace
+    from humangs_jax.rendering.splatting import render
+
+    cameras, poses = test_views(avatar, size)
+    scores = {}
+    for kept in KEPT_WEIGHTS:
+        weights = avatar.skinning_weights
+        least = jnp.sort(weights, axis=1)[:, -kept][:, None]
+        weights = jnp.where(weights >= least, weights, 0.0)
+        fewer = replace(avatar, skinning_weights=weights / weights.sum(1, keepdims=True))
+        image = jnp.clip(render(skin(fewer, poses["walk"]), cameras[0]).rgb, 0, 1)
+        scores[str(kept)] = compare(image, avatar, cameras[0], poses["walk"])[1]
+    return scores
+
+
+def section(numbers: dict[str, Any]) -> str:
+    """The table."""
+    rows = [numbers["avatar"], numbers["finer"]]
+    header = ["", *(f"{row['gaussians']:,} Gaussians" for row in rows)]
+    lines = [[label, *(f"{row[key]:.1f}" for row in rows)] for label, key in SHOWN]
+    lines.append(["size of the page, MB", *(f"{row['bytes'] / 1e6:.2f}" for row in rows)])
+    lines.append(["first image after, s", *(f"{row['first_image_seconds']:.1f}" for row in rows)])
+    lines.append([f"frames per second, {numbers['size']} px, software WebGL", *(f"{row['fps']:.1f}" for row in rows)])
+    lines.append(["one sort by depth, ms", *(f"{row['sort_ms']:.1f}" for row in rows)])
+    kept = [["PSNR on the person, dB", *(f"{value:.0f}" for value in numbers["weights_kept"].values())]]
+    heads = ["skinning weights kept", *numbers["weights_kept"]]
+    return markdown_table(header, lines) + "\n\n" + markdown_table(heads, kept)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,174 @@
+"""The page that shows an avatar: one HTML file that needs no network, on disk, on localhost or in a notebook.
+
+Its code lies beside this module in page/, as the browser runs it; here the files become one. The browser itself forbids the
+page all connections (Content-Security-Policy).
+"""
+
+import base64
+import contextlib
+import gzip
+import html
+import json
+import os
+import re
+import webbrowser
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib import resources
+
+import numpy as np
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.body.joints import PARENTS
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyModel, RestBody
+from humangs_jax.core.configuration import config_from_json
+from humangs_jax.data.motion import Motion, grounded, load_motion
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.io.atomic import write_text
+from humangs_jax.io.tensor_file import read_safetensors
+from humangs_jax.network.config import Conventions, HumanGSConfig
+from humangs_jax.network.weights import SHIPPED, config_of_version_1
+from humangs_jax.viewer.packing import fitted_shape, pack
+
+SCRIPTS = ("kinematics", "scene", "camera", "splatting", "motion_files", "controls", "main")
+SHADERS = ("whole.vert", "project.frag", "splat.vert", "splat.frag", "background.frag")
+LARGEST_FPS = 60.0
+"""Motions of more frames per second are thinned out: the page interpolates between frames."""
+_MARK = re.compile(r"\{\{(\w+)\}\}")
+
+
+def page_html(
+    avatar: Avatar, motion: Motion | None = None, title: str = "avatar", motion_name: str | None = None
+) -> str:
+    """The page as text.
+
+    Arguments: motion: None for the walk that comes with the package (if the avatar has its joints). title, motion_name: shown
+    in the page.
+
+    Raises: ValueError, one line, for an avatar or a motion that cannot be drawn (see `packing.pack`).
+    """
+    name = motion_name or ("walk" if motion is None else "motion")
+    if motion is None:
+        walk = load_motion()
+        motion = walk if walk.rotations.shape[1] == len(avatar.parents) else None
+    if motion is not None and motion.rotations.shape[1] == len(avatar.parents):
+        motion = motion.at_rate(LARGEST_FPS) if motion.fps > LARGEST_FPS else motion
+        motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
+    packed = pack(avatar, motion, known_body(avatar), name)
+    header = json.dumps(packed.header, separators=(",", ":"))
+    parts = {
+        "title": html.escape(title),
+        "header": header.replace("<", "\\u003c"),  # a joint's name may not end the script
+        "data": base64.b64encode(gzip.compress(packed.data, 9, mtime=0)).decode(),
+    }
+    return _MARK.sub(lambda mark: parts[mark[1]], _template())
+
+
+def write_page(
+    path: str | os.PathLike,
+    avatar: Avatar,
+    motion: Motion | None = None,
+    title: str = "avatar",
+    motion_name: str | None = None,
+) -> int:
+    """Write the page; it appears whole or not at all. Returns its size in bytes. Raises: as `page_html`; OSError."""
+    text = page_html(avatar, motion, title, motion_name)
+    write_text(path, text)
+    return len(text.encode())
+
+
+class NotebookPage:
+    """What `show` returns: notebooks draw it."""
+
+    def __init__(self, text: str, height: int):
+        self._text, self._height = text, height
+
+    def _repr_html_(self) -> str:
+        """An iframe that holds the whole page."""
+        style = f"width:100%;height:{self._height}px;border:1px solid #ddd;border-radius:8px"
+        return f'<iframe srcdoc="{html.escape(self._text)}" style="{style}" allowfullscreen></iframe>'
+
+
+def show(avatar: Avatar, motion: Motion | None = None, height: int = 560) -> NotebookPage:
+    """The avatar in a notebook, moving: the last expression of a cell, or `display(hg.show(avatar))`.
+
+    Arguments: motion: None for the shipped walk. height: pixels. The page becomes a part of the notebook's file (some 1.2 MB).
+
+    Raises: as `page_html`.
+    """
+    return NotebookPage(page_html(avatar, motion), height)
+
+
+def serve(text: str, port: int = 0, open_browser: bool = True) -> None:
+    """Serve a page on this machine only, until Ctrl-C.
+
+    Arguments: port: 0 for any free one. Raises: OSError, one line, if the port is taken.
+    """
+    try:
+        server = page_server(text, port)
+    except (OSError, OverflowError) as error:
+        raise OSError(f"--port {port}: {error}") from error
+    with server:
+        url = f"http://127.0.0.1:{server.server_address[1]}/"
+        print(f"{url} shows the avatar; Ctrl-C ends.", flush=True)
+        if open_browser:
+            webbrowser.open(url)
+        with contextlib.suppress(KeyboardInterrupt):
+            server.serve_forever()
+
+
+def page_server(text: str, port: int = 0) -> ThreadingHTTPServer:
+    """A server of one page on 127.0.0.1, not yet running."""
+    content = text.encode()
+
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self):
+            found = self.path.split("?")[0] in ("/", "/index.html")
+            self.send_response(200 if found else 404)
+            self.send_header("Content-Type", "text/html; charset=utf-8")
+            self.send_header("Content-Length", str(len(content) if found else 0))
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            if found:
+                with contextlib.suppress(ConnectionError):  # the browser was closed meanwhile
+                    self.wfile.write(content)
+
+        def log_message(self, format, *args):
+            """Nothing: one page, one user."""
+
+    server = ThreadingHTTPServer(("127.0.0.1", port), Page)
+    server.daemon_threads = True
+    return server
+
+
+def known_body(avatar: Avatar) -> BodyModel | None:
+    """The shipped body on the avatar's vertices, if the avatar is one of its people: what the sliders of shape need."""
+    if avatar.parents != PARENTS:
+        return None
+    body = load_body()
+    if len(avatar.rest_vertices) != len(body.template):
+        body = gaussian_body(body, _shipped_network())
+    same = np.array_equal(body.faces, avatar.faces) and len(avatar.gaussians.means) % len(body.template) == 0
+    return body if same and fitted_shape(avatar, body) is not None else None
+
+
+def _shipped_network() -> HumanGSConfig:
+    """The network of the shipped weights, without reading their tensors; the default one if none are shipped."""
+    with resources.as_file(resources.files("humangs_jax") / SHIPPED) as file:
+        metadata = read_safetensors(file, lambda key: False)[2] if file.exists() else {}
+    if "config" in metadata:
+        return config_of_version_1(metadata["config"])
+    return HumanGSConfig(conventions=config_from_json(Conventions, metadata.get("conventions", "{}")))
+
+
+def _template() -> str:
+    """index.html with styles, shaders and scripts in their places; the avatar's are still marked."""
+    folder = resources.files("humangs_jax") / "viewer" / "page"
+    read = lambda name: (folder / name).read_text(encoding="utf-8").strip()
+    parts = {
+        "style": read("style.css"),
+        "shaders": "\n".join(f'<script type="x-shader" id="{name}">\n{read(name)}\n</script>' for name in SHADERS),
+        "sorting": read("sorting.js"),  # runs twice: in the page, and as the text of a worker
+        "scripts": "\n".join(read(f"{name}.js") for name in SCRIPTS),
+    }
+    return _MARK.sub(lambda mark: parts.get(mark[1], mark[0]), read("index.html"))

@@ -1,0 +1,17 @@
+#version 300 es
+// alpha = min(alpha_max, opacity exp(-d^2 / 2)), nothing below alpha_min. Blended front to back: what is drawn counts
+// for as much as what lies before it lets through.
+precision highp float;
+
+in vec2 offset;
+flat in vec4 splat;
+uniform float alpha_min;
+uniform float alpha_max;
+out vec4 premultiplied;
+
+void main() {
+  float alpha = splat.a * exp(-0.5 * dot(offset, offset));
+  if (alpha < alpha_min) discard;
+  alpha = min(alpha, alpha_max);
+  premultiplied = vec4(splat.rgb * alpha, alpha);
+}

@@ -1,0 +1,397 @@
+"""The page in a browser: its images against `hg.render`, motions dropped onto it, its controls. Software WebGL.
+
+On Debian: `apt-get install chromium chromium-driver`.
+"""
+
+import base64
+import io
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from experiments.common import chromium
+from experiments.evaluation import page as evaluation
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.body.model import BodyPose, RestBody
+from humangs_jax.body.skinning import joint_transforms
+from humangs_jax.data.motion import Motion, grounded, load_motion, save_motion
+from humangs_jax.geometry import transform
+from humangs_jax.viewer.page import page_server, write_page
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(chromium.missing() is not None, reason=str(chromium.missing())),
+]
+
+WHOLE, PERSON = 55.0, 48.0
+"""dB. Asked for are 38 and 30; measured 65 and 56, which is what 8 bits of the screenshot leave (10 log10(12 255^2) = 58.9 where
+there is anything to round)."""
+SIZE = 384
+ANGLE = 2e-3
+"""Radians: motions are stored in steps of a ten thousandth, and a chain of joints adds them up."""
+
+
+@pytest.fixture(scope="module")
+def avatar():
+    return evaluation.shipped_person()
+
+
+@pytest.fixture(scope="module")
+def page_file(avatar, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "avatar.html"
+    assert write_page(path, avatar) < 2.5e6
+    return path
+
+
+@pytest.fixture(scope="module")
+def browser(page_file):
+    with chromium.Chromium() as browser:
+        browser.open(page_file)
+        yield browser
+
+
+@pytest.fixture(autouse=True)
+def _quiet_console(browser):
+    yield
+    assert browser.problems() == []
+
+
+def test_nine_views_are_those_of_render(browser, avatar):
+    scores = evaluation.view_scores(browser, avatar, SIZE)
+    assert len(scores) == 9
+    for view, (whole, person) in scores.items():
+        assert whole > WHOLE and person > PERSON, (view, whole, person)
+
+
+def test_so_is_its_own_image_after_a_hundred_frames_of_motion(browser, avatar):
+    whole, person = evaluation.motion_scores(browser, avatar, 100)
+    assert whole > WHOLE and person > PERSON
+    assert browser.run("return humangs.view().frame") > 0
+
+
+def test_the_page_asks_for_nothing(browser):
+    assert browser.run("return performance.getEntriesByType('resource').map((entry) => entry.name)") == []
+    with pytest.raises(RuntimeError, match="fetch"):
+        browser.run("await fetch('http://127.0.0.1:1/')")
+    assert len(browser.problems()) > 0  # the browser's own protest
+
+
+def test_localhost_shows_the_same_page(page_file):
+    import threading
+
+    server = page_server(page_file.read_text())
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        with chromium.Chromium() as browser:
+            browser.open(f"http://127.0.0.1:{server.server_address[1]}/")
+            assert browser.run("return humangs.gaussians") == 20376 and browser.problems() == []
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
+    """The taller person's joints are where the body model has them, and the person stands on the floor."""
+    browser.run(
+        """document.querySelector("[data-mode=rest]").click();
+        document.querySelector("#shape-section details").open = true;
+        const slider = document.querySelector("#shape input[title=height]");
+        slider.value = Number(slider.value) + 1;
+        slider.dispatchEvent(new Event("input"));
+        await humangs.settle();"""
+    )
+    taller, view = content_height(browser), browser.run("return humangs.view()")
+    browser.run("document.getElementById('reset-shape').click(); await humangs.settle();")
+    assert taller > content_height(browser) * 1.01
+    from humangs_jax.viewer.page import known_body
+
+    body = known_body(avatar)
+    assert body is not None
+    at = body.shape_names.index("height")
+    own = browser.run("return humangs.view()")["betas"]
+    assert view["betas"][at] == pytest.approx(own[at] + 1) and view["betas"][:at] == own[:at]
+
+
+def content_height(browser):
+    """Pixels between the highest and lowest point of the person, left of the panel."""
+    image = browser.screenshot()[:, :980]
+    colourful = np.ptp(image, axis=-1) > 0.15
+    rows = np.flatnonzero(colourful.any(axis=1))
+    return int(rows[-1] - rows[0])
+
+
+def test_a_joint_slider_turns_its_joint_and_reset_turns_it_back(browser):
+    browser.run(
+        """document.querySelector("[data-mode=rest]").click();
+        for (const group of document.querySelectorAll("#joints details")) group.open = true;
+        await new Promise((resolve) => setTimeout(resolve, 300));
+        const slider = document.querySelector("#joints input[title^='left elbow, about y']");
+        slider.value = -40;
+        slider.dispatchEvent(new Event("input"));
+        await humangs.settle();"""
+    )
+    turned = np.asarray(browser.run("return humangs.view().rotations"))
+    expected = np.zeros_like(turned)
+    expected[JOINT_NAMES.index("left_elbow"), 1] = np.radians(-40)
+    np.testing.assert_allclose(turned, expected, atol=1e-6)
+    browser.run("document.getElementById('reset-joints').click(); await humangs.settle();")
+    np.testing.assert_allclose(browser.run("return humangs.view().rotations"), 0, atol=1e-9)
+
+
+def test_keys_and_mouse_do_what_the_help_says(browser):
+    from selenium.webdriver.common.action_chains import ActionChains
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.common.keys import Keys
+
+    canvas = browser.driver.find_element(By.ID, "view")
+    press = lambda *keys: ActionChains(browser.driver).send_keys_to_element(canvas, *keys).perform()
+    state = lambda: browser.run("await new Promise(requestAnimationFrame); return humangs.view()")
+    browser.run("await humangs.settle()")
+    press("m")
+    press(" ")
+    assert state()["mode"] == "motion" and state()["playing"]
+    press(" ")
+    assert not state()["playing"]
+    press(Keys.ARROW_RIGHT)
+    frame = state()["frame"]
+    press(Keys.ARROW_RIGHT)
+    assert state()["frame"] == (frame + 1) % 48
+    press("a")
+    shoulder = np.asarray(state()["rotations"])[JOINT_NAMES.index("left_shoulder")]
+    np.testing.assert_allclose(shoulder, [0, 0, -np.radians(48)], atol=1e-6)
+    press("t")
+    before = np.asarray(state()["cam_from_world"])
+    np.testing.assert_allclose(state()["rotations"], 0, atol=1e-9)
+    drag = ActionChains(browser.driver).move_to_element_with_offset(canvas, -300, 0).click_and_hold()
+    drag.move_by_offset(120, 0).release().perform()
+    turned = np.asarray(state()["cam_from_world"])
+    # to the right: the camera goes to the left about the vertical axis, at the same distance from the target
+    assert np.degrees(np.arccos(np.clip(turned[2, :3] @ before[2, :3], -1, 1))) > 10
+    assert turned[2, 3] == pytest.approx(before[2, 3], abs=1e-4)
+    ActionChains(browser.driver).double_click(canvas).perform()
+    np.testing.assert_allclose(state()["cam_from_world"], before, atol=1e-6)
+
+
+# ---- motions that are dropped onto the page ----------------------------------------------------------------------------
+
+
+def drop(browser, name, content):
+    """Drops a file; returns the page's words about it."""
+    return browser.run(
+        """const bytes = Uint8Array.from(atob(given[1]), (c) => c.charCodeAt(0)), data = new DataTransfer();
+        data.items.add(new File([bytes], given[0]));
+        document.getElementById("message").textContent = "";
+        window.dispatchEvent(new DragEvent("drop", { dataTransfer: data, cancelable: true }));
+        while (!document.getElementById("message").textContent) await new Promise((resolve) => setTimeout(resolve, 20));
+        return document.getElementById("message").textContent;""",
+        name,
+        base64.b64encode(content).decode(),
+    )
+
+
+def shown_pose(browser, frame):
+    """Rotations and translation of a whole frame of the motion on the page."""
+    view = browser.run(
+        """document.querySelector("[data-mode=motion]").click();
+        const scrub = document.getElementById("scrub");
+        scrub.value = given[0];
+        scrub.dispatchEvent(new Event("input"));
+        await humangs.settle();
+        return humangs.view();""",
+        frame,
+    )
+    assert view["frame"] == frame
+    return np.asarray(view["rotations"]), np.asarray(view["translation"])
+
+
+def matrices(rotations):
+    return Rotation.from_rotvec(np.asarray(rotations, float).reshape(-1, 3)).as_matrix()
+
+
+def npz(**arrays):
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return file.getvalue()
+
+
+def random_motion(frames=4, columns=165, seed=3):
+    rng = np.random.default_rng(seed)
+    poses = rng.normal(0, 0.3, (frames, columns))
+    return poses, rng.normal(0, 0.2, (frames, 3))
+
+
+def z_up(poses):
+    """A person who stands along z, roughly."""
+    poses = poses.copy()
+    poses[:, :3] = Rotation.from_euler("x", 90, degrees=True).as_rotvec() + 0.1 * poses[:, :3]
+    return poses
+
+
+FILES = {
+    "ours": lambda poses, trans: {
+        "rotations": poses.reshape(-1, 55, 3).astype("f4"),
+        "translations": trans,
+        "fps": 24.0,
+    },
+    "amass z up": lambda poses, trans: {"poses": z_up(poses), "trans": trans, "mocap_framerate": 120.0},
+    "amass 156": lambda poses, trans: {
+        "poses": np.asfortranarray(z_up(poses[:, :156])),
+        "trans": trans,
+        "mocap_frame_rate": 60,
+    },
+    "amass 66": lambda poses, trans: {
+        "poses": poses[:, :66] * 0.3,
+        "trans": trans.astype("f4"),
+        "fps": np.asarray([30]),
+    },
+    "thuman": lambda poses, trans: {"global_orient": poses[:, :3] * 0.2, "body_pose": poses[:, 3:66], "transl": trans},
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_a_dropped_npz_is_read_as_python_reads_it(browser, avatar, tmp_path, kind):
+    arrays = FILES[kind](*random_motion())
+    content = npz(gender=np.asarray("neutral"), **arrays)
+    (tmp_path / "m.npz").write_bytes(content)
+    assert "4 frames" in drop(browser, "m.npz", content)
+    expected = grounded(load_motion(tmp_path / "m.npz"), RestBody(avatar.rest_vertices, avatar.rest_joints), PARENTS)
+    for frame in (0, 3):
+        rotations, translation = shown_pose(browser, frame)
+        np.testing.assert_allclose(matrices(rotations), matrices(expected.rotations[frame]), atol=1e-5)
+        np.testing.assert_allclose(translation, expected.translations[frame], atol=1e-4)
+
+
+MIXAMO = {
+    "pelvis": "mixamorig:Hips",
+    **{"spine1": "mixamorig:Spine", "spine2": "mixamorig:Spine1", "spine3": "mixamorig:Spine2"},
+    **{"neck": "mixamorig:Neck", "head": "mixamorig:Head"},
+    **{
+        f"{side}_{ours}": f"mixamorig:{side.title()}{theirs}"
+        for side in ("left", "right")
+        for ours, theirs in (
+            ("collar", "Shoulder"),
+            ("shoulder", "Arm"),
+            ("elbow", "ForeArm"),
+            ("wrist", "Hand"),
+            ("hip", "UpLeg"),
+            ("knee", "Leg"),
+            ("ankle", "Foot"),
+            ("foot", "ToeBase"),
+        )
+    },
+}
+CMU = {ours: theirs.split(":")[1] for ours, theirs in MIXAMO.items()}
+CMU |= {"spine1": "LowerBack", "spine2": "Spine", "spine3": "Spine1"}
+BODY = tuple(name for name in JOINT_NAMES if name in MIXAMO)
+
+
+def write_bvh(rest, poses, names, arms_down, turned):
+    """A BVH of a body in centimetres that lives in other rest frames: the arms by so many degrees down, the world turned."""
+    index = {name: JOINT_NAMES.index(name) for name in BODY}
+    parent = {name: None if name == "pelvis" else JOINT_NAMES[PARENTS[index[name]]] for name in BODY}
+    frames_of = {}
+    around = Rotation.from_euler("y", turned, degrees=True)
+    for name in BODY:  # rest frame: our rest -> the file's
+        side = 1 if name.startswith("left") else -1
+        down = arms_down if name.split("_")[-1] in ("shoulder", "elbow", "wrist") else 0
+        frames_of[name] = around * Rotation.from_euler("z", -side * down, degrees=True)
+    children = {name: [other for other in BODY if parent[other] == name] for name in BODY}
+    order: list = []
+
+    def lines(name, depth):
+        order.append(name)
+        tab = "\t" * depth
+        above, offset = parent[name], np.zeros(3)
+        if above is not None:
+            offset = frames_of[above].apply(rest[index[name]] - rest[index[above]])
+        move = "6 Xposition Yposition Zposition" if parent[name] is None else "3"
+        yield f"{tab}{'ROOT' if parent[name] is None else 'JOINT'} {names[name]}"
+        yield f"{tab}{{"
+        yield f"{tab}\tOFFSET {' '.join(f'{100 * x:.6f}' for x in offset)}"
+        yield f"{tab}\tCHANNELS {move} Zrotation Yrotation Xrotation"
+        for child in children[name]:
+            yield from lines(child, depth + 1)
+        if not children[name]:
+            yield f"{tab}\tEnd Site\n{tab}\t{{\n{tab}\t\tOFFSET 0 1 0\n{tab}\t}}"
+        yield f"{tab}}}"
+
+    text = ["HIERARCHY", *lines("pelvis", 0), "MOTION", f"Frames: {len(poses)}", "Frame Time: 0.0083333"]
+    for pose in poses:
+        world = {}
+        numbers = list(100 * np.asarray([0.1, 0.9, -0.2]))
+        for name in order:
+            own = Rotation.from_rotvec(pose[index[name]])
+            world[name] = own if parent[name] is None else world[parent[name]] * own
+            theirs = world[name] * frames_of[name].inv()
+            above = Rotation.identity() if parent[name] is None else world[parent[name]] * frames_of[parent[name]].inv()
+            numbers += list((above.inv() * theirs).as_euler("ZYX", degrees=True))
+        text.append(" ".join(f"{x:.6f}" for x in numbers))
+    return "\n".join(text).encode()
+
+
+def bone_directions(avatar, rotations):
+    """Unit vectors from each body joint to its children, by name."""
+    pose = BodyPose(jnp.asarray(rotations, jnp.float32), jnp.zeros(3))
+    transforms = joint_transforms(avatar.rest_joints, PARENTS, pose.rotations, pose.translation)
+    joints = np.asarray(transform.apply(transforms, avatar.rest_joints))
+    pairs = [(JOINT_NAMES.index(name), PARENTS[JOINT_NAMES.index(name)]) for name in BODY if name != "pelvis"]
+    bones = np.stack([joints[j] - joints[p] for j, p in pairs])
+    return bones / np.linalg.norm(bones, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(("names", "arms_down", "turned"), [(MIXAMO, 0, 0), (CMU, 48, 0), (MIXAMO, 40, 90)])
+def test_a_dropped_bvh_moves_the_bones_as_the_file_does(browser, avatar, names, arms_down, turned):
+    poses = random_motion(3)[0].reshape(3, 55, 3)
+    poses[:, [i for i, name in enumerate(JOINT_NAMES) if name not in BODY]] = 0
+    content = write_bvh(np.asarray(avatar.rest_joints, float), poses, names, arms_down, turned)
+    assert "3 frames" in drop(browser, "dance.bvh", content)
+    for frame in (0, 2):
+        rotations, _ = shown_pose(browser, frame)
+        ours, theirs = bone_directions(avatar, rotations), bone_directions(avatar, poses[frame])
+        assert np.arccos(np.clip((ours * theirs).sum(1), -1, 1)).max() < ANGLE
+        if arms_down == turned == 0:
+            np.testing.assert_allclose(matrices(rotations), matrices(poses[frame]), atol=ANGLE)
+
+
+BAD_FILES = {
+    "truncated.npz": (
+        npz(poses=np.zeros((2, 165)), trans=np.zeros((2, 3)), fps=30)[:-60],
+        "not an npz archive, or cut short",
+    ),
+    "keys.npz": (npz(joints=np.zeros((2, 3))), "expected the keys rotations (ours), poses (AMASS)"),
+    "width.npz": (
+        npz(poses=np.zeros((2, 30)), trans=np.zeros((2, 3)), fps=30),
+        "poses: expected frames of 165 or 156",
+    ),
+    "nan.npz": (
+        npz(poses=np.full((2, 66), np.nan), trans=np.zeros((2, 3)), fps=30),
+        "key poses: expected finite numbers",
+    ),
+    "rate.npz": (
+        npz(poses=np.zeros((2, 66)), trans=np.zeros((2, 3))),
+        "expected a positive number of frames per second",
+    ),
+    "notes.txt": (b"hello", "expected a motion as .npz (ours, AMASS) or .bvh"),
+    "words.bvh": (b"hello", "not a BVH file"),
+    "cut.bvh": (b"HIERARCHY ROOT Hips { OFFSET 0 0 0", "cut short"),
+    "strange.bvh": (
+        b"HIERARCHY ROOT Tail { OFFSET 0 0 0 CHANNELS 3 Zrotation Yrotation Xrotation } MOTION Frames: 1 Frame Time: 0.1 0 0 0",
+        "expected the names of CMU, Mixamo or LaFAN",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_file_that_is_no_motion_gets_one_line_and_changes_nothing(browser, name):
+    content, message = BAD_FILES[name]
+    before = browser.run("return document.getElementById('motion-name').textContent")
+    said = drop(browser, name, content)
+    assert said.startswith(name) and message in said and "\n" not in said
+    assert browser.run("return document.getElementById('motion-name').textContent") == before
+
+
+def test_python_writes_what_the_page_reads(browser, tmp_path):
+    save_motion(tmp_path / "ours.npz", Motion(jnp.zeros((2, 55, 3)), jnp.zeros((2, 3))))
+    assert "2 frames" in drop(browser, "ours.npz", (tmp_path / "ours.npz").read_bytes())

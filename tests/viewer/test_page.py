@@ -1,0 +1,148 @@
+"""The page as a file, on localhost and in a notebook; the commands that make it. What it draws: test_browser.py."""
+
+import html
+import json
+import re
+import sys
+import threading
+import urllib.error
+import urllib.request
+from http.server import ThreadingHTTPServer
+
+import jax.numpy as jnp
+import pytest
+from viewer.test_packing import small_avatar
+
+from humangs_jax import cli
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.motion import Motion, save_motion
+from humangs_jax.viewer import page
+
+
+@pytest.fixture(scope="module")
+def text():
+    return page.page_html(small_avatar(), title="<me> & {{data}}")
+
+
+def test_the_page_is_one_file_that_asks_nobody(text):
+    assert "connect-src 'none'" in text and "default-src 'none'" in text
+    assert re.findall(r'<\w[^>]*\b(?:src|href|action|data)="([^"]*)"', text) == ["data:,"]  # the icon
+    assert not re.search(r"https?:|@import|url\(|fetch\(|XMLHttpRequest|WebSocket|importScripts", text)
+
+
+def test_every_part_is_in_its_place_and_none_ends_a_script_early(text):
+    assert "{{" not in text.replace("{{data}}</", "")
+    assert text.count("<title>&lt;me&gt; &amp; {{data}}</title>") == 1
+    assert text.count("<script") == text.count("</script>") == 4 + len(page.SHADERS)
+    header = json.loads(re.search(r'id="header">(.*?)</script>', text, re.S)[1])
+    assert header["count"] == 24 and "motion" not in header  # the walk has 55 joints, this avatar 3
+
+
+def test_a_joint_may_have_any_name():
+    text = page.page_html(replace(small_avatar(), joint_names=("</script><b>", "b", "c")))
+    assert "</script><b>" not in text
+
+
+def test_fast_motions_are_thinned_out():
+    motion = Motion(jnp.zeros((8, 3, 3)), jnp.zeros((8, 3)), fps=240.0)
+    text = page.page_html(small_avatar(), motion, motion_name="run")
+    about = json.loads(re.search(r'id="header">(.*?)</script>', text, re.S)[1])["motion"]
+    assert (about["name"], about["frames"], about["fps"]) == ("run", 2, 60)
+
+
+def test_notebooks_hold_the_whole_page():
+    shown = page.show(small_avatar(), height=300)._repr_html_()
+    assert html.unescape(re.search(r'srcdoc="([^"]*)"', shown)[1]) == page.page_html(small_avatar())
+    assert "height:300px" in shown
+
+
+def test_the_server_serves_the_page_to_this_machine_and_nothing_else():
+    server = page.page_server("<p>é</p>")
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        assert server.server_address[0] == "127.0.0.1"
+        url = f"http://127.0.0.1:{server.server_address[1]}"
+        with urllib.request.urlopen(url + "/?x") as answer:
+            assert answer.read().decode() == "<p>é</p>" and "utf-8" in answer.headers["Content-Type"]
+        with pytest.raises(urllib.error.HTTPError, match="404") as refused:
+            urllib.request.urlopen(url + "/etc/passwd")
+        refused.value.close()
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def run(monkeypatch, capsys, *arguments):
+    """(exit code, stdout, stderr) of the command line, in this process."""
+    monkeypatch.setattr(sys, "argv", ["humangs", *map(str, arguments)])
+    try:
+        cli.main()
+        code = 0
+    except SystemExit as exit_:
+        code = exit_.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.fixture
+def avatar_file(tmp_path):
+    small_avatar().save(tmp_path / "me.npz")
+    return tmp_path / "me.npz"
+
+
+def test_export_writes_page_and_ply(avatar_file, tmp_path, monkeypatch, capsys):
+    written = tmp_path / "me.html", tmp_path / "me.ply"
+    code, out, err = run(monkeypatch, capsys, "export", avatar_file, "--html", written[0], "--out", written[1])
+    assert (code, err) == (0, "") and str(written[0]) in out and "MB" in out and str(written[1]) in out
+    assert written[0].read_text() == page.page_html(small_avatar(), title="me") and written[1].exists()
+
+
+def test_a_page_plays_the_motion_it_is_given(avatar_file, tmp_path, monkeypatch, capsys):
+    motion = Motion(jnp.zeros((2, 3, 3)), jnp.zeros((2, 3)))
+    save_motion(tmp_path / "still.npz", motion)
+    arguments = ("--html", tmp_path / "me.html", "--motion", tmp_path / "still.npz")
+    assert run(monkeypatch, capsys, "export", avatar_file, *arguments)[0] == 0
+    assert (tmp_path / "me.html").read_text() == page.page_html(small_avatar(), motion, "me", "still")
+
+
+def test_export_of_a_page_writes_nothing_else(avatar_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, capsys, "export", avatar_file, "--html", "p.html")[0] == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"me.npz", "p.html"}
+
+
+@pytest.mark.parametrize(
+    ("command", "message"),
+    [
+        (("export", "me.npz", "--html", "p.txt"), r"--html p\.txt: expected a name ending in \.html"),
+        (("export", "me.npz", "--html", "no/p.html"), r"--html no/p\.html: the folder no does not exist"),
+        (
+            ("export", "me.npz", "--html", "p.html", "--motion", "walk52.npz"),
+            "the motion has 52 joints, the avatar has 3",
+        ),
+        (("view", "nobody.npz"), r"nobody\.npz: no such file"),
+        (("view", "me.npz", "--port", "99999"), "--port 99999"),
+    ],
+)
+def test_bad_input_gets_one_line(command, message, avatar_file, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    save_motion(tmp_path / "walk52.npz", Motion(jnp.zeros((2, 52, 3)), jnp.zeros((2, 3))))
+    before = set(tmp_path.iterdir())
+    code, _, err = run(monkeypatch, capsys, *command)
+    assert code == 2 and err.count("\n") == 1 and re.search(message, err), err
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_view_opens_the_browser_and_ends_quietly(avatar_file, monkeypatch, capsys):
+    opened = []
+
+    def interrupted(server):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupted)
+    monkeypatch.setattr(page.webbrowser, "open", opened.append)
+    code, out, err = run(monkeypatch, capsys, "view", avatar_file)
+    assert (code, err) == (0, "") and len(opened) == 1 and opened[0] in out
+    assert run(monkeypatch, capsys, "view", avatar_file, "--no-browser")[0] == 0 and len(opened) == 1
