@@ -33,11 +33,12 @@ _ARRAYS = (
 
 @pytree_dataclass
 class Avatar:
-    """A person who can be animated: Gaussians in the T-pose (theta = 0), vertex-major, the k Gaussians of a vertex together.
+    """A person who can be animated: Gaussians in the T-pose (theta = 0).
 
-    gaussians: canonical, metres. skinning_weights: (g, j), rows sum to 1. rest_vertices: (n, 3) and rest_joints: (j, 3), the
-    shaped body in the T-pose. faces: (f, 3). parents: joint tree, root -1. skinning: "affine" or "rotation". rendering: the
-    splatting that the Gaussians were trained for, a name in `SPLAT_PRESETS`.
+    gaussians: canonical, metres; vertex-major, the k Gaussians of a vertex together, unless refinement has added some.
+    skinning_weights: (g, j), rows sum to 1. rest_vertices: (n, 3) and rest_joints: (j, 3), the shaped body in the T-pose. faces:
+    (f, 3). parents: joint tree, root -1. skinning: "affine" or "rotation". rendering: the splatting that the Gaussians were
+    trained for, a name in `SPLAT_PRESETS`.
     """
 
     gaussians: Gaussians
