@@ -51,8 +51,8 @@ YAML = {
     "a billion laughs": "a: &a [x,x]\n"
     + "\n".join(f"{c}: &{c} [*{b},*{b}]" for b, c in zip("abcdefgh", "bcdefghi", strict=True)),
     "2 MB": "K_a: 1\n" * 300_000,
-    "a number of 900,000 digits": "K_a: " + "1" * 900_000 + "x",
-    "a whole number of 900,000 digits": "K_a: " + "1" * 900_000,
+    "a number of 400,000 digits": "K_a: " + "1" * 400_000 + "x",
+    "a whole number of 400,000 digits": "K_a: " + "1" * 400_000,
     "commas": "K_a: {" + "," * 200_000,
     "python's objects": "K_a: !!python/object/apply:os.system ['touch OWNED']",
     "another tag": "K_a: !!binary aGVsbG8=",

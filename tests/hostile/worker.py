@@ -14,8 +14,8 @@ import traceback
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-MEMORY, RESIDENT, SECONDS = 3 << 30, 1 << 30, 10.0
-"""Bytes of address space, bytes that a file may make resident, seconds that it may take."""
+MEMORY, RESIDENT, SECONDS, WAITING = 3 << 30, 1 << 30, 10.0, 120.0
+"""Bytes of address space, bytes that a file may make resident, seconds of the processor and of the clock that it may take."""
 FORBIDDEN = (
     *("subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.forkpty", "pty.spawn"),
     *("socket.connect", "socket.bind", "socket.getaddrinfo", "urllib.Request", "webbrowser.open"),
@@ -78,10 +78,11 @@ def run(case, read, folder, watch, measured=True):
     path = case.make(folder)
     if measured:
         Path("/proc/self/clear_refs").write_text("5")  # forget the most that was resident so far
-    before, start = resident(), time.perf_counter()
+    before, start = resident(), time.process_time()
     result = {"name": case.name, "reader": case.reader, "path": str(path)}
     watch.folder, watch.seen = folder.resolve(), []
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, WAITING)
     try:
         read(path)
         result |= {"outcome": "read", "message": ""}
@@ -94,6 +95,7 @@ def run(case, read, folder, watch, measured=True):
     except BaseException as error:
         result |= {"outcome": "traceback", "message": "".join(traceback.format_exception(error))[-1500:]}
     finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
         signal.setitimer(signal.ITIMER_REAL, 0)
         watch.folder = None
     if watch.seen:
@@ -101,7 +103,7 @@ def run(case, read, folder, watch, measured=True):
     grown = resident() - before
     if grown > RESIDENT:
         result |= {"outcome": "memory", "message": f"{grown:,} bytes more resident"}
-    return result | {"seconds": round(time.perf_counter() - start, 4), "bytes": grown}
+    return result | {"seconds": round(time.process_time() - start, 4), "bytes": grown}
 
 
 def resident():
@@ -116,7 +118,7 @@ def limit_memory():
 
 
 def too_long(*_):
-    raise TooLong(f"more than {SECONDS:g} s")
+    raise TooLong(f"more than {SECONDS:g} s of the processor, or {WAITING:g} s")
 
 
 def prepare():
@@ -127,6 +129,7 @@ def prepare():
 
     jax.config.update("jax_platforms", "cpu")
     signal.signal(signal.SIGALRM, too_long)
+    signal.signal(signal.SIGPROF, too_long)
 
 
 def warm_up(readers, folder):
