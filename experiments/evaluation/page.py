@@ -1,6 +1,6 @@
 """The page that shows avatars (`humangs export --html`) against `hg.render`, in Chromium with software WebGL.
 
-    python experiments/evaluation/page.py --json OUT [--avatar AVATAR] [--page docs/viewer.md] [--frames 20]
+    python experiments/evaluation/page.py --json OUT [--avatar AVATAR] [--page PAGE] [--size 512] [--frames 20]
 
 Needs Debian's chromium and chromium-driver. Exact views: three cameras times three poses (T-pose, a pose of the walk, a pose of
 the held-out capture) at --size pixels, screenshots against `hg.render` of the same camera and pose: PSNR of the whole image and

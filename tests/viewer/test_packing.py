@@ -8,57 +8,18 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from viewer_cases import small_avatar, small_body
 
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.body.model import BodyModel, shape_body
+from humangs_jax.body.model import shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.viewer import packing
 
 STEP = 1 / 65535
-HALF = 0.5 * (1 + 1e-3)
-"""A rounded number is half a step off at most; the rest is for float32."""
-
-
-def small_body(n=6, j=3, s=2, seed=0):
-    rng = np.random.default_rng(seed)
-    f32 = lambda x: jnp.asarray(x, jnp.float32)
-    regressor = rng.random((j, n))
-    return BodyModel(
-        template=f32(rng.normal(size=(n, 3))),
-        shape_directions=f32(0.1 * rng.normal(size=(n, 3, s))),
-        pose_directions=None,
-        joint_regressor=f32(regressor / regressor.sum(1, keepdims=True)),
-        skinning_weights=f32(np.full((n, j), 1 / j)),
-        faces=jnp.asarray(rng.integers(0, n, (4, 3)), jnp.int32),
-        parents=tuple(range(-1, j - 1)),
-        joint_names=tuple("abcdefghijkl"[:j]),
-        shape_names=("wide", "tall"),
-    )
-
-
-def small_avatar(seed=0, per_vertex=4, weights=None, betas=(0.3, -1.2)):
-    body, rng = small_body(seed=seed), np.random.default_rng(seed)
-    f32 = lambda x: jnp.asarray(x, jnp.float32)
-    rest = shape_body(body, f32(betas))
-    g = per_vertex * len(body.template)
-    weights = rng.random((g, len(body.parents))) if weights is None else weights
-    return Avatar(
-        Gaussians(
-            f32(rng.normal(size=(g, 3))),
-            f32(rng.normal(size=(g, 4))),
-            f32(np.exp(rng.normal(size=(g, 3)) - 4)),
-            f32(rng.random(g)),
-            f32(rng.random((g, 3))),
-        ),
-        f32(weights / weights.sum(1, keepdims=True)),
-        rest.vertices,
-        rest.joints,
-        body.faces,
-        parents=body.parents,
-        joint_names=body.joint_names,
-    )
+HALF = 0.5 * (1 + 1e-6)
+"""A rounded number is half a step off at most; the rest is for rounding in float64."""
 
 
 def decoded(packed):
@@ -83,16 +44,15 @@ def decoded(packed):
 @given(st.integers(0, 10_000))
 def test_what_the_page_reads_is_the_avatar(seed):
     avatar = small_avatar(seed)
+    double = lambda x: np.asarray(x, np.float64)
     got, g = decoded(packing.pack(avatar)), avatar.gaussians
-    extent = np.ptp(np.asarray(g.means), axis=0)
-    assert (np.abs(got["means"] - g.means) <= HALF * STEP * extent + 1e-6).all()
-    logs = np.log(np.asarray(g.scales))
-    assert np.abs(np.log(got["scales"]) - logs).max() <= HALF * STEP * np.ptp(logs) + 1e-6
-    assert np.abs(got["opacities"] - g.opacities).max() <= HALF * STEP
-    assert np.abs(got["colors"] - g.colors).max() <= HALF * STEP
-    quats = np.asarray(g.quats) / np.linalg.norm(g.quats, axis=1, keepdims=True)
-    assert np.abs(got["quats"] - quats).max() <= HALF / 32767
-    assert np.abs(got["weights"] - avatar.skinning_weights).max() <= 3 * STEP
+    means, logs, quats = double(g.means), np.log(double(g.scales)), double(g.quats)
+    assert (np.abs(got["means"] - means) <= HALF * STEP * np.ptp(means, axis=0)).all()
+    assert np.abs(np.log(got["scales"]) - logs).max() <= HALF * STEP * np.ptp(logs)
+    assert np.abs(got["opacities"] - double(g.opacities)).max() <= HALF * STEP
+    assert np.abs(got["colors"] - double(g.colors)).max() <= HALF * STEP
+    assert np.abs(got["quats"] - quats / np.linalg.norm(quats, axis=1, keepdims=True)).max() <= HALF / 32767
+    assert np.abs(got["weights"] - double(avatar.skinning_weights)).max() <= 3 * STEP
 
 
 def test_colours_beyond_one_and_flat_gaussians_are_kept():

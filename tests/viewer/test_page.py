@@ -11,7 +11,7 @@ from http.server import ThreadingHTTPServer
 
 import jax.numpy as jnp
 import pytest
-from viewer.test_packing import small_avatar
+from viewer_cases import small_avatar
 
 from humangs_jax import cli
 from humangs_jax.core.pytree import replace
