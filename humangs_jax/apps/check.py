@@ -12,6 +12,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from humangs_jax.avatar.sheets import contact_sheet
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
@@ -86,7 +87,7 @@ class BodyImage:
 
 @dataclasses.dataclass(frozen=True)
 class ViewCheck:
-    """One view. iou: of body and mask, outside: share of the body's pixels that are not the mask's; None without masks.
+    """One view. iou: of body and mask, outside: share of the body's pixels more than one pixel off the mask; None without masks.
     inside: share of the vertices in the image.
     """
 
@@ -218,8 +219,8 @@ def _iou(drawn, mask):
 
 
 def _outside(drawn, mask):
-    covered = np.asarray(drawn.covered)
-    return float((covered & ~mask).sum() / max(covered.sum(), 1))
+    covered, near = np.asarray(drawn.covered), binary_dilation(mask)
+    return float((covered & ~near).sum() / max(covered.sum(), 1))
 
 
 def _judge(name, drawn, mask) -> ViewCheck:

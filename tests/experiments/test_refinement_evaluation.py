@@ -1,28 +1,8 @@
 """Scores and table of `experiments/evaluation/refinement.py`, without rendering anybody."""
 
-import numpy as np
-import pytest
+from experiments.evaluation.refinement import report_of, section
 
-from experiments.evaluation.refinement import BAND, outline_psnr, report_of, section
-from humangs_jax.objectives.metrics import LARGEST_PSNR
-
-SIDE = 256
 TASKS = ("novel", "animation")
-
-
-def test_only_the_band_along_the_outline_counts():
-    inside = np.zeros((SIDE, SIDE), bool)
-    inside[64:192, 64:192] = True
-    truth = np.zeros((SIDE, SIDE, 3))
-    middle, corner, edge = truth.copy(), truth.copy(), truth.copy()
-    middle[100:150, 100:150] = 1
-    corner[:20, :20] = 1
-    edge[66, 100:110] = 0.5  # the third pixel inside
-    assert outline_psnr(middle, truth, inside) == outline_psnr(corner, truth, inside) == LARGEST_PSNR
-    width = round(BAND * SIDE)
-    band = 4 * 128 * 2 * width  # but for the corners, outside rounded and inside shared
-    expected = -10 * np.log10(10 * 0.25 / band)
-    assert outline_psnr(edge, truth, inside) == pytest.approx(expected, abs=0.1)
 
 
 def row(psnr):

@@ -17,6 +17,7 @@ from humangs_jax.fitting import files, fit_capture
 from humangs_jax.fitting.files import check_place, check_scan_folder, read_fit_record, write_fitted
 from humangs_jax.fitting.fit_capture import fit_photos
 from humangs_jax.fitting.scan_views import render_scan_views
+from humangs_jax.io import reading
 
 SIZE = 16
 FRAMES = NAMES_WITHIN_LIMITS
@@ -115,7 +116,7 @@ def test_records_of_earlier_versions_are_read(folder, fitted, tmp_path):
     )
 
 
-def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_path):
+def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_path, monkeypatch):
     moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
     capture = dataclasses.replace(fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved))
     target = check_place(folder[0], tmp_path / "out", overwrite=False)
@@ -140,6 +141,7 @@ def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_p
         write_fitted(inside, target, capture, fitted.report)
     with pytest.raises(ValueError, match="lies in it and would be deleted"):  # the keypoints, say
         check_place(folder[0], target, overwrite=True, inputs=(None, target / "images"))
+    monkeypatch.setattr(reading, "_current", reading.Limits(photos_outside=True))
     with pytest.raises(ValueError, match="lies in it and would be deleted"):  # a photo
         check_place(linked(tmp_path / "linked", target), target, overwrite=True)
 

@@ -14,8 +14,9 @@ from humangs_jax.objectives.losses import (
     tightness,
     translucency,
 )
-from humangs_jax.objectives.metrics import LARGEST_PSNR, fog, masked_psnr, outline_psnr, psnr, ssim
+from humangs_jax.objectives.metrics import LARGEST_PSNR, OUTLINE, fog, masked_psnr, outline_psnr, psnr, ssim
 
+SIDE = 256
 FLOAT32 = 1e-6
 SQUARES = 1e-8  # rounding of squares of 0.1, of which small differences are taken
 DECIBELS = 1e-3  # logarithm of a float32 mean
@@ -99,12 +100,16 @@ def test_fog_is_the_share_of_the_mask_that_is_neither_clear_nor_opaque():
     assert float(fog(alpha, 0 * mask)) == 0
 
 
-def test_the_outline_psnr_sees_the_band_alone():
-    mask = np.zeros((256, 256))
-    mask[64:192, 64:192] = 1
-    target = np.zeros((256, 256, 3))
-    far, near = target.copy(), target.copy()
-    far[128, 128] = far[:32] = 1.0
-    near[62:66] = 0.1
-    assert outline_psnr(far, target, mask) == LARGEST_PSNR
-    assert 20 < outline_psnr(near, target, mask) < 30
+def test_only_the_band_along_the_outline_counts():
+    inside = np.zeros((SIDE, SIDE), bool)
+    inside[64:192, 64:192] = True
+    truth = np.zeros((SIDE, SIDE, 3))
+    middle, corner, edge = truth.copy(), truth.copy(), truth.copy()
+    middle[100:150, 100:150] = 1
+    corner[:20, :20] = 1
+    edge[66, 100:110] = 0.5  # the third pixel inside
+    assert outline_psnr(middle, truth, inside) == outline_psnr(corner, truth, inside) == LARGEST_PSNR
+    width = round(OUTLINE * SIDE)
+    band = 4 * 128 * 2 * width  # but for the corners, outside rounded and inside shared
+    expected = -10 * np.log10(10 * 0.25 / band)
+    assert outline_psnr(edge, truth, inside) == pytest.approx(expected, abs=0.1)

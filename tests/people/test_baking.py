@@ -172,9 +172,9 @@ def test_a_scan_is_written_whole_or_not_at_all(person, tmp_path, monkeypatch):
         raise OSError("disk full")
 
     (tmp_path / "scan").mkdir()
-    (tmp_path / "scan" / "old").touch()
+    (tmp_path / "scan" / "scan.json").touch()
     monkeypatch.setattr(baking, "_write_mesh", fail)
     with pytest.raises(OSError, match="disk full"):
         baking.export_scan(person, tmp_path / "scan", texture_size=SIZE)
     assert [path.name for path in tmp_path.iterdir()] == ["scan"]
-    assert (tmp_path / "scan" / "old").exists()
+    assert (tmp_path / "scan" / "scan.json").exists()
