@@ -95,7 +95,6 @@ def fog_variants(base):
         "distortion": loss(distortion=1.0),
         "opaque": loss(opaque=0.003),
         "one shell": loss(shells=3.0),
-        "smooth offsets": loss(smooth=1.0),
     }
 
 

@@ -128,7 +128,6 @@ class VertexDecoder:
                 colors=flat(at_vertices.colors),
             ),
             tight_offsets=at_vertices.offsets[:, : self.tight],
-            free_offsets=at_vertices.offsets[:, self.tight :],
             shell_spread=None if raw.shells is None else shell_spread(raw.shells, features),
             skinning_offsets=None if raw.skinning is None else flat(raw.skinning),
             dropped_tokens=jnp.zeros((), jnp.int32),

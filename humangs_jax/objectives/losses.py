@@ -2,7 +2,7 @@
 
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Float
 
 FAR_SURFACE = 0.1
 """Metres."""
@@ -35,12 +35,6 @@ def ray_spread(alpha: Float[Array, "*b"], depth: Float[Array, "*b"], squared: Fl
 def translucency(opacities: Float[Array, " g"]) -> Float[Array, " g"]:
     """4 o (1 - o): 0 for opacities of 0 and 1, 1 between them."""
     return 4 * opacities * (1 - opacities)
-
-
-def roughness(offsets: Float[Array, "n k 3"], faces: Int[Array, "f 3"]) -> Float[Array, "f 3"]:
-    """Squared difference of the offsets at the ends of every edge of the faces of a mesh, averaged over the k."""
-    corners = offsets[faces]
-    return jnp.mean(jnp.sum(jnp.square(corners - jnp.roll(corners, 1, axis=1)), axis=-1), axis=-1)
 
 
 def tightness(tight_offsets: Float[Array, "n k 3"]) -> Float[Array, " n"]:

@@ -29,7 +29,6 @@ class LossConfig:
     Against fog, which is what squared errors make of doubt: absolute, outline: absolute errors of colours and of coverage.
     depth: distance between the surfaces seen, metres; needs on-the-fly people. distortion: spread of the weights along the
     rays. opaque: 4 o (1 - o) of the opacities o. shells: spread of the distances that a Gaussian mixes, normalised units.
-    smooth: difference of the free offsets along the edges of the body, normalised units.
     Perceptual terms and those against fog are computed only where their weight is not 0.
     random_background: share of the targets that are seen against one random colour instead of white, so that
     white Gaussians differ from missing ones.
@@ -48,7 +47,6 @@ class LossConfig:
     distortion: float = 0.0
     opaque: float = 0.0
     shells: float = 0.0
-    smooth: float = 0.0
     random_background: float = 0.5
 
 

@@ -17,7 +17,7 @@ from humangs_jax.data.views import SubjectViews
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.objectives.loss_networks import LossNetworks
-from humangs_jax.objectives.losses import roughness, squared_error, surface_distance, tightness, translucency
+from humangs_jax.objectives.losses import squared_error, surface_distance, tightness, translucency
 from humangs_jax.objectives.lpips import lpips
 from humangs_jax.objectives.metrics import psnr
 from humangs_jax.objectives.perceptual import perceptual_loss
@@ -62,12 +62,11 @@ def loss_terms(
     targets: SubjectViews,
     config: LossConfig,
     networks: LossNetworks = NO_NETWORKS,
-    faces: Int[Array, "f 3"] | None = None,
     stage: StageCaller = call,
 ) -> Metrics:
     """The unweighted terms of `LossConfig` by name, for renderings on the backgrounds of `images`.
 
-    faces: of the body, for `smooth`. Raises: ValueError if a term has a weight but what it needs is missing.
+    Raises: ValueError if a term has a weight but what it needs is missing.
     """
     dissimilarity = functools.partial(multiscale_structural_dissimilarity, scales=config.structural_scales)
     masks = targets.masks
@@ -81,7 +80,6 @@ def loss_terms(
         "opaque": lambda t: translucency(t["opacities"]),
         "distortion": lambda t: t["spread"],
         "shells": lambda t: _required(t["shell_spread"], "shells", "shell of the reader"),
-        "smooth": lambda t: roughness(t["free_offsets"], _required(faces, "smooth", "mesh")),
         "depth": lambda t: surface_distance(
             t["depth"], t["alpha"], _required(targets.depths, "depth", "depth of the targets"), masks
         ),
@@ -100,7 +98,6 @@ def loss_terms(
         "spread": drawn.spread,
         "opacities": outputs.gaussians.opacities,
         "tight_offsets": outputs.tight_offsets,
-        "free_offsets": outputs.free_offsets,
         "shell_spread": outputs.shell_spread,
     }
     used = [name for name in terms if name in ALWAYS or getattr(config, name)]
@@ -143,7 +140,7 @@ def subject_loss(
     backgrounds = backgrounds.astype(targets.images.dtype)
     images = change_background(targets, backgrounds)
     drawn = draw_targets(outputs, body, targets, backgrounds, config, stage)
-    terms = loss_terms(drawn, outputs, images, targets, config.loss, networks, body.faces, stage)
+    terms = loss_terms(drawn, outputs, images, targets, config.loss, networks, stage)
     total = lambda terms: sum(getattr(config.loss, name) * term for name, term in terms.items())
     loss = stage("loss", total, terms)
     metrics = {

@@ -8,7 +8,6 @@ from rounding import bound
 from humangs_jax.objectives.losses import (
     FAR_SURFACE,
     ray_spread,
-    roughness,
     squared_error,
     surface_distance,
     tightness,
@@ -83,15 +82,8 @@ def test_surfaces_are_compared_where_both_are_the_persons():
     np.testing.assert_allclose(distance, [0.05, 0, 0, FAR_SURFACE], atol=FLOAT32)
 
 
-def test_translucency_and_roughness_vanish_where_they_should():
+def test_translucency_vanishes_for_opacities_of_0_and_1():
     np.testing.assert_allclose(translucency(jnp.asarray([0.0, 0.5, 1.0])), [0, 1, 0])
-    faces = jnp.asarray([[0, 1, 2]])
-    offsets = jnp.ones((3, 2, 3))
-    np.testing.assert_array_equal(roughness(offsets, faces), np.zeros((1, 3)))
-    rough = roughness(offsets.at[1, 0, 2].add(2.0), faces)
-    np.testing.assert_allclose(
-        np.sort(rough), [[0, 2, 2]], rtol=FLOAT32
-    )  # both edges at vertex 1, half of its Gaussians
 
 
 def test_fog_is_the_share_of_the_mask_that_is_neither_clear_nor_opaque():
