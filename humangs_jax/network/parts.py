@@ -52,10 +52,10 @@ class Encoding(NamedTuple):
 class HumanGSOutputs:
     """Canonical Gaussians of one subject.
 
-    gaussians: g = n * k of them, metric, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from the vertex, normalised units
-    (for the tightness loss). shell_spread: (n, k) variance of the distances that a Gaussian mixes, normalised units; None without
-    shells. skinning_offsets: (n * k, j) logits of the skinning head, or None (see `vertex_decoder.corrected_skinning_weights`).
-    dropped_tokens: foreground patches for which the token capacity had no room.
+    gaussians: g = n * k of them, metric, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from the vertex, normalised
+    units (for the tightness loss). shell_spread: (n, k) variance of the distances that a Gaussian mixes, normalised units; None
+    without shells. skinning_offsets: (n * k, j) logits of the skinning head, or None (see
+    `vertex_decoder.corrected_skinning_weights`). dropped_tokens: foreground patches for which the token capacity had no room.
     dropped_reads: vertices, summed over views, for which the vertex capacity had no room.
     """
 
