@@ -113,8 +113,9 @@ def refine_views(
 ) -> tuple[Avatar, Int[Array, ""]]:
     """The pure function behind `refine`: `steps` steps of one photo each, in turns, on all their pixels.
 
-    Static: config, splat (with `max_pairs`, see `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs that did
-    not fit. Batch over people whose arrays have the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
+    Static: config (its limits, held-out pixels and `growth` are not used), splat (with `max_pairs`, see `plan_buffers`), steps.
+    Returns the avatar and the (splat, tile) pairs that did not fit. Batch over people whose arrays have the same shapes with
+    `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
     """
     photos = photos_of(views, jnp.ones(views.masks.shape, bool))
     state = start(avatar, photos, config, splat)
