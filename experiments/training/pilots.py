@@ -225,7 +225,9 @@ def write_table(page: Path, rows: dict, table: str) -> None:
             texts.append(f"{change:{'' if name == FIRST else '+'}.{digits}f}")
         lines.append([name, *texts, row["steps"], f"{row['cpu_seconds']:.0f}"])
     header = ["run", *(heading for heading, _ in COLUMNS.values()), "steps", "CPU s"]
-    publish(page, table, markdown_table(header, lines), rows)
+    # the configurations stay in the runs' own file
+    numbers = {name: {key: value for key, value in row.items() if key != "config"} for name, row in rows.items()}
+    publish(page, table, markdown_table(header, lines), numbers)
 
 
 if __name__ == "__main__":
