@@ -16,7 +16,7 @@ from jax.core import Tracer
 from jax.sharding import Mesh
 
 from humangs_jax.core.array_types import Array, Bool, Float
-from humangs_jax.core.checks import check_values
+from humangs_jax.core.checks import FINITE, check_values
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.rendering import constants
 from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers, raise_on_overflow, with_default_buffers
@@ -115,7 +115,7 @@ def _render(
     gaussians, cameras, background = with_background(gaussians, cameras, background)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gaussians, cameras, background))):
         return draw(gaussians, cameras, background, with_default_buffers(gaussians, cameras, config), mesh, *more)
-    check_values("render", gaussian_values(gaussians) | camera_values(cameras))
+    check_values("render", gaussian_values(gaussians) | camera_values(cameras) | {"background": (background, FINITE)})
     if config.max_pairs is None:
         config = plan_buffers(gaussians, cameras, config, margin=1.0, mesh=mesh)
     rendering = _jitted(draw, len(more))(gaussians, cameras, background, config, mesh, *more)

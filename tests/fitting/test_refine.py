@@ -141,6 +141,7 @@ def test_a_single_view_with_a_mask_is_enough_and_the_others_stay():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
 
 
+@pytest.mark.slow
 def test_a_view_with_an_empty_mask_takes_no_part():
     masks = np.array(truth().masks)
     masks[1] = 0

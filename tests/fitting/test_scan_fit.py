@@ -105,6 +105,7 @@ def test_clothes_are_outside(body, truth, tmp_path):
     assert np.median(fit.distances) > 0
 
 
+@pytest.mark.slow
 def test_results_are_written_whole(bare, truth, tmp_path):
     save_scan_fit(tmp_path / "fit", bare)
     arrays, pickled = read_npz(tmp_path / "fit" / "body.npz")

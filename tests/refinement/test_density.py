@@ -100,6 +100,7 @@ def test_room_is_invisible_and_goes_again(person):
     jax.tree.map(np.testing.assert_array_equal, without_clear(roomy, 1 / 255), avatar)
 
 
+@pytest.mark.slow
 def test_a_run_that_grows_returns_more_gaussians_and_a_better_image(person):
     avatar, capture = person
     grown = refinement.refine_with_report(avatar, capture, dataclasses.replace(STEPS, growth=1.6))

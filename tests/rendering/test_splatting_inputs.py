@@ -76,6 +76,8 @@ def test_wrong_values_of_cameras_are_named():
     ):
         with pytest.raises(ValueError, match=words):
             render(scene(), replace(view, **change), CONFIG)
+    with pytest.raises(ValueError, match="render: background: expected finite numbers"):
+        render(scene(), view, CONFIG, background=jnp.full(3, np.nan))
 
 
 def test_inside_transformations_wrong_values_stay_what_they_are():
