@@ -201,7 +201,7 @@ def motion_scores(browser: "Chromium", avatar: "Avatar", frames: int) -> tuple[f
 
 
 def truncation_scores(avatar: "Avatar", size: int) -> dict[str, float]:
-    """PSNR on the person, dB, of `hg.render` with only so many skinning weights of each Gaussian, in the pose of the walk."""
+    """PSNR on the person, dB, of `hg.render` in a pose of the walk, by the number of skinning weights kept of each Gaussian."""
     import jax.numpy as jnp
 
     from humangs_jax.avatar.animate import skin

@@ -85,7 +85,7 @@ def training_variants(base):
 
 
 def fog_variants(base):
-    """Name -> (configuration, settings of the on-the-fly people): terms against fog, each alone, then together."""
+    """Name -> (configuration, settings of the on-the-fly people): terms against fog, each alone."""
     loss = lambda **changes: (dataclasses.replace(base, loss=dataclasses.replace(base.loss, **changes)), {})
     return {
         FIRST: (base, {}),

@@ -186,7 +186,7 @@ class Export:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     out: Path | None = None
-    """The .ply, .splat or .glb to write. Default: avatar.ply, if --html is not given."""
+    """File to write: .ply, .splat or .glb. Default: avatar.ply without --html, none with it."""
     html: Path | None = None
     """The page to write: one .html file that needs no network (docs/viewer.md)."""
     motion: Path | None = None

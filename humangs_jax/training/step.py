@@ -105,10 +105,10 @@ def loss_terms(
     return {name: stage(f"loss: {name}", mean(terms[name]), learned) for name in used}
 
 
-def _required(network, name, title):
-    if network is None:
+def _required(needed, name, title):
+    if needed is None:
         raise ValueError(f"loss.{name} is not 0, but there is no {title}")
-    return network
+    return needed
 
 
 def _each(compare, predicted, targets):

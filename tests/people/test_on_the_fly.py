@@ -160,13 +160,17 @@ def test_it_lowers_for_accelerators(bank, platform):
 
 
 @pytest.mark.slow
-def test_masks_are_the_share_of_covered_samples(bank, scene):
+def test_masks_are_the_share_of_covered_samples_and_depths_their_mean(bank, scene):
     camera = draw(scene, bank, 0, 0.0, SIZE)
-    _, mask, _ = draw_view(bank, scene, jnp.int32(0), camera)
+    _, mask, depth = draw_view(bank, scene, jnp.int32(0), camera)
     fine = camera.resized(2 * SIZE, 2 * SIZE)
     faces = bank.faces[scene.person].astype(jnp.int32)
-    covered = np.asarray(rasterize(scene.vertices[0], faces, fine).face_ids) >= 0
-    np.testing.assert_array_equal(mask, covered.reshape(SIZE, 2, SIZE, 2).mean((1, 3)))
+    fragments = rasterize(scene.vertices[0], faces, fine)
+    covered, z = np.asarray(fragments.face_ids) >= 0, np.asarray(fragments.depth)
+    by_pixel = lambda x: x.reshape(SIZE, 2, SIZE, 2).mean((1, 3))
+    np.testing.assert_array_equal(mask, by_pixel(covered))
+    share = np.where(mask > 0, mask, 1)
+    np.testing.assert_allclose(depth, by_pixel(np.where(covered, z, 0)) / share, rtol=1e-6)  # float32
 
 
 def draw(scene, bank, seed, close_share, size):

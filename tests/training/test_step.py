@@ -55,6 +55,25 @@ def test_a_step_moves_the_parameters_and_tells_of_it(body, source, variables):
     assert int(metrics["skipped"]) == int(metrics["dropped_tokens"]) == int(metrics["overflow"]) == 0
 
 
+AGAINST_FOG = {"absolute": 0.2, "outline": 0.1, "depth": 0.3, "distortion": 1.0, "opaque": 0.003, "shells": 3.0}
+
+
+@pytest.mark.slow
+def test_terms_against_fog_are_added_and_keep_gradients_finite(body, source, variables):
+    config = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, **AGAINST_FOG))
+    batch = source.batch_at(0)
+    with pytest.raises(ValueError, match=r"loss\.depth is not 0, but there is no depth of the targets"):
+        train_step(init_state(config, variables), batch, body, config)
+    batch = replace(batch, targets=replace(batch.targets, depths=2 * batch.targets.masks))
+    _, metrics = train_step(init_state(config, variables), batch, body, config)
+    weights = dataclasses.asdict(config.loss)
+    terms = [name for name in weights if name in metrics]
+    assert set(AGAINST_FOG) <= set(terms) and all(float(metrics[name]) > 0 for name in AGAINST_FOG)
+    expected = sum(weights[name] * float(metrics[name]) for name in terms)
+    assert float(metrics["loss"]) == pytest.approx(expected, rel=bound(FLOAT32))
+    assert 0 < float(metrics["grad_norm"]) < np.inf and int(metrics["nonfinite"]) == 0
+
+
 def test_a_bad_batch_costs_a_step_and_nothing_else(body, source, variables, same):
     batch = source.batch_at(0)
     broken = batch.targets.images.at[0, 0, 0, 0].set(jnp.nan)

@@ -288,7 +288,7 @@ BODY = tuple(name for name in JOINT_NAMES if name in MIXAMO)
 
 
 def write_bvh(rest, poses, names, arms_down, turned):
-    """A BVH of a body in centimetres that lives in other rest frames: the arms by so many degrees down, the world turned."""
+    """A BVH in centimetres whose rest pose differs from ours: arms lowered, the world turned, both in degrees."""
     index = {name: JOINT_NAMES.index(name) for name in BODY}
     parent = {name: None if name == "pelvis" else JOINT_NAMES[PARENTS[index[name]]] for name in BODY}
     frames_of = {}
