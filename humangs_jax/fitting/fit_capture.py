@@ -27,7 +27,7 @@ from humangs_jax.fitting.swaps import find_mirrored
 from humangs_jax.fitting.uncertainty import fit_uncertainty
 
 FAR = 4.0
-"""A frame is far from its neighbours if its distance from their midpoint exceeds this multiple of half the distance between them."""
+"""A frame is far from its neighbours if its distance from their midpoint exceeds this multiple of half their distance."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
