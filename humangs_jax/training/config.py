@@ -12,6 +12,7 @@ from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
+from humangs_jax.training.disturbances import Disturbances
 from humangs_jax.training.optimizer import OptimizerConfig
 
 logger = logging.getLogger(__name__)
@@ -78,6 +79,7 @@ class TrainConfig:
     model: HumanGSConfig = dataclasses.field(default_factory=presets.small)
     views: ViewSampling = dataclasses.field(default_factory=ViewSampling)
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
+    disturbances: Disturbances = dataclasses.field(default_factory=Disturbances)
     optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
     splat: SplatConfig = dataclasses.field(default_factory=SplatConfig)
     target_size: int = 128
@@ -136,12 +138,16 @@ def _changed(config, stage):
 
 def small() -> TrainConfig:
     """The shipped weights: some hours on a CPU of two cores."""
+    against_fog = LossConfig(
+        squared=0.5, absolute=0.15, silhouette=0.0, outline=0.1, depth=0.3, distortion=1.0, opaque=0.001
+    )
     return TrainConfig(
         views=ViewSampling(input_counts=(1, 2, 4, 4, 4, 6), target_count=3, mixed_pose_share=0.2),
-        loss=LossConfig(silhouette=0.3),
+        loss=against_fog,
+        disturbances=Disturbances(share=0.4),
         optimizer=OptimizerConfig(learning_rate=5e-4, warmup_steps=100),
         target_size=256,
-        steps=4000,
+        steps=20_000,
         ema_decay=0.998,
         validate_every=500,
         checkpoint_every=500,

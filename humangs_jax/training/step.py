@@ -25,6 +25,7 @@ from humangs_jax.objectives.ssim import multiscale_structural_dissimilarity
 from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
 from humangs_jax.training import sharding
 from humangs_jax.training.config import LossConfig, TrainConfig
+from humangs_jax.training.disturbances import disturb
 from humangs_jax.training.forward import DrawnTargets, draw_targets, reconstruct_example
 from humangs_jax.training.optimizer import GuardState, learning_rate, make_optimizer
 from humangs_jax.training.state import TrainState
@@ -35,6 +36,8 @@ COUNTS = ("dropped_tokens", "dropped_reads", "overflow")
 """Metrics that are sums over a batch; all others are means."""
 ALWAYS = ("squared", "structural", "silhouette", "tightness")
 """Terms that are computed, for the log, whatever their weight."""
+DISTURBED = 1
+"""Makes the key of a subject's disturbances from that of its backgrounds."""
 NO_NETWORKS = LossNetworks()
 
 Metrics = dict[str, Shaped[Array, ""]]
@@ -133,6 +136,8 @@ def subject_loss(
     stage: StageCaller = call,
 ) -> tuple[Scalar, tuple[PyTree, Metrics]]:
     """Loss of one subject, with the updated batch statistics and metrics. stage: see `network.stages`."""
+    if config.disturbances.share:
+        example = disturb(jax.random.fold_in(key, DISTURBED), example, body, config.disturbances)
     variables = {"params": params, "batch_stats": batch_stats}
     outputs, batch_stats = reconstruct_example(variables, body, example.inputs, config, True, axis_name, stage)
     targets = example.targets

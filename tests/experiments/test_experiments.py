@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
-TYPED = "training/train_small.py"
+TYPED = "training/train_shipped.py"
 """Its options are those of a configuration, which imports jax: run last."""
 SCRIPTS = sorted(
     (path.relative_to(EXPERIMENTS).as_posix() for path in EXPERIMENTS.rglob("*.py") if "__main__" in path.read_text()),

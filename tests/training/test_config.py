@@ -2,15 +2,13 @@
 
 import dataclasses
 import logging
-from pathlib import Path
 
 import pytest
 
 from humangs_jax.core.configuration import config_from_json, config_to_json
-from humangs_jax.io.text import read_configuration
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training import config
-from humangs_jax.training.config import Stage, TrainConfig, fitting_losses, read_config, small, tiny
+from humangs_jax.training.config import Stage, TrainConfig, fitting_losses, read_config, tiny
 from humangs_jax.training.sources import training_people
 
 STAGED = dataclasses.replace(
@@ -88,8 +86,3 @@ def test_a_loss_without_its_network_gives_way_and_says_so(caplog):
 def test_nobody_to_train_on_is_an_error(tmp_path, body):
     with pytest.raises(ValueError, match="nobody to train on"):
         training_people(None, 0, tmp_path, body)
-
-
-def test_the_file_of_the_shipped_weights_run_is_the_preset():
-    path = Path(__file__).parents[2] / "experiments" / "training" / "small.json"
-    assert read_configuration(TrainConfig, path) == small()

@@ -1,0 +1,129 @@
+"""What is wrong with real captures, added to the inputs of training: exposure, masks, cameras, poses and shape.
+
+The targets stay true. The network learns to place Gaussians well although its photos and bodies are a little off, by what
+`humangs fit` leaves.
+"""
+
+import dataclasses
+import math
+
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.body.model import BodyModel, shape_body
+from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.loader import Example
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry import quaternion, transform
+from humangs_jax.geometry.camera import Camera
+
+
+@dataclasses.dataclass(frozen=True)
+class Disturbances:
+    """Standard deviations of normal distributions, unless said otherwise; one draw for each photo, or for each example.
+
+    share: of the examples that are disturbed; 0: none, and no work. exposure: of a photo, natural logarithm of the gain.
+    tint: of each channel of a photo, likewise. mask_pixels: masks are eroded or dilated by up to this, uniform, and the colour
+    of some background appears there. camera_degrees: of a camera about the person. camera_metres: its shift, each axis.
+    pose_degrees: each axis of each joint, the same in all photos of an example, as are the following.
+    body_metres: each axis of the translation. betas: each shape coefficient; the wrong shape is also that of the targets.
+    """
+
+    share: float = 0.0
+    exposure: float = 0.08
+    tint: float = 0.03
+    mask_pixels: int = 2
+    camera_degrees: float = 0.25
+    camera_metres: float = 0.002
+    pose_degrees: float = 0.15
+    body_metres: float = 0.002
+    betas: float = 0.1
+
+    def __post_init__(self):
+        """Raises ValueError for a share outside of [0, 1]."""
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"disturbances.share {self.share}: expected 0 to 1")
+
+
+def disturb(key: Key, example: Example, body: BodyModel, config: Disturbances) -> Example:
+    """The example with disturbed inputs and betas, or as it is. Pure and jittable."""
+    choice_key, betas_key, views_key = jax.random.split(key, 3)
+
+    def disturbed(example):
+        inputs, targets = example.inputs, example.targets
+        betas = inputs.betas + config.betas * jax.random.normal(betas_key, inputs.betas.shape, inputs.betas.dtype)
+        pelvis = shape_body(body, betas).joints[0]
+        inputs = disturb_views(views_key, replace(inputs, betas=betas), pelvis, config)
+        return replace(example, inputs=inputs, targets=replace(targets, betas=betas))
+
+    chosen = jax.random.bernoulli(choice_key, config.share)
+    return jax.lax.cond(chosen, disturbed, lambda example: example, example)
+
+
+def disturb_views(key: Key, views: SubjectViews, pelvis: Float[Array, "3"], config: Disturbances) -> SubjectViews:
+    """Photos, masks, cameras and poses. pelvis: (3,) metres, in the rest pose: cameras turn about the posed one."""
+    photo_key, camera_key, pose_key, body_key = jax.random.split(key, 4)
+    normal = lambda key, like: jax.random.normal(key, like.shape, like.dtype)
+    rotations = views.rotations[0]
+    images, masks = disturb_photos(photo_key, views.images, views.masks, config)
+    return replace(
+        views,
+        images=images,
+        masks=masks,
+        cameras=disturb_cameras(camera_key, views.cameras, views.translations + pelvis, config),
+        rotations=views.rotations + math.radians(config.pose_degrees) * normal(pose_key, rotations),
+        translations=views.translations + config.body_metres * normal(body_key, views.translations[0]),
+    )
+
+
+def disturb_photos(
+    key: Key, images: Float[Array, "v h w 3"], masks: Float[Array, "v h w"], config: Disturbances
+) -> tuple[Float[Array, "v h w 3"], Float[Array, "v h w"]]:
+    """Photos on white whose exposure, tint and masks are off.
+
+    A photo is m f + (1 - m) of its mask m and the person's colour f. It becomes m' (m g f + (1 - m) b) + (1 - m') with the gain
+    g, the mask m' and the colour b of a background.
+    """
+    count = len(images)
+    gain_key, tint_key, radius_key, background_key = jax.random.split(key, 4)
+    gain = config.exposure * jax.random.normal(gain_key, (count, 1, 1, 1), images.dtype)
+    gain = jnp.exp(gain + config.tint * jax.random.normal(tint_key, (count, 1, 1, 3), images.dtype))
+    radii = jax.random.randint(radius_key, (count,), -config.mask_pixels, config.mask_pixels + 1)
+    backgrounds = jax.random.uniform(background_key, (count, 1, 1, 3), images.dtype)
+    cut = _grown(masks, radii, config.mask_pixels)
+    outside = 1 - masks[..., None]
+    seen = gain * (images - outside) + outside * backgrounds
+    return jnp.clip(cut[..., None] * (seen - 1) + 1, 0, 1), cut
+
+
+def _grown(masks, radii, most):
+    """Masks dilated by radii > 0 and eroded by radii < 0, in pixels; squares grow to squares."""
+    for radius in range(1, most + 1):
+        larger, smaller = _largest_near(masks), -_largest_near(-masks)
+        choice = radii[:, None, None]
+        masks = jnp.where(choice >= radius, larger, jnp.where(choice <= -radius, smaller, masks))
+    return masks
+
+
+def _largest_near(images):
+    """Maxima over 3 x 3 pixels; what is beyond the border repeats it."""
+    for axis in (1, 2):
+        size = images.shape[axis]
+        before = jnp.take(images, jnp.maximum(jnp.arange(size) - 1, 0), axis)
+        after = jnp.take(images, jnp.minimum(jnp.arange(size) + 1, size - 1), axis)
+        images = jnp.maximum(jnp.maximum(before, images), after)
+    return images
+
+
+def disturb_cameras(key: Key, cameras: Camera, centers: Float[Array, "v 3"], config: Disturbances) -> Camera:
+    """Cameras that are turned about centres (v, 3) of the world, and shifted."""
+    turn_key, shift_key = jax.random.split(key)
+    dtype = centers.dtype
+    turns = math.radians(config.camera_degrees) * jax.random.normal(turn_key, centers.shape, dtype)
+    shifts = config.camera_metres * jax.random.normal(shift_key, centers.shape, dtype)
+    rotations = quaternion.matrix_from_axis_angle(turns)
+    turned = jnp.einsum("vij,vj->vi", rotations, centers, precision="highest")
+    moves = transform.make(rotations, centers - turned + shifts)
+    moved = jnp.einsum("vij,vjk->vik", cameras.cam_from_world, moves, precision="highest")
+    return replace(cameras, cam_from_world=moved)
