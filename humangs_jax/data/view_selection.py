@@ -1,0 +1,77 @@
+"""Which photos of many to use: the few that together show most of the body's surface, facing it, close to it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.model import BodyModel
+from humangs_jax.body.subdivision import vertex_areas
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.views import SubjectViews, prepare_inputs, standardize
+from humangs_jax.network import presets
+from humangs_jax.network.inputs import subject_unit
+from humangs_jax.network.pixel_aligned import project_vertices, visible_vertices
+
+SIZE = 128
+"""Pixels a side of the depth maps: enough to know which side of the body a photo shows."""
+VERTICES = 2000
+"""Of the body that is looked at."""
+
+
+def select_views(capture: Capture, count: int) -> list[int]:
+    """The numbers of `count` photos, in ascending order, that together show the body best; all of them if there are no more.
+
+    Greedy: each next photo adds most to the sum, over the vertices, of area times the best `view_quality`. The sum
+    is submodular, so the choice reaches at least 63 % of the best one (Nemhauser, Wolsey, Fisher 1978,
+    https://doi.org/10.1007/BF01588971). What a photo shows outside its mask does not count.
+
+    Raises: ValueError for a count below 1.
+    """
+    if count < 1:
+        raise ValueError(f"select_views: expected at least 1 photo, got {count}")
+    if capture.view_count <= count:
+        return list(range(capture.view_count))
+    body = decimate(capture.body, VERTICES) if len(capture.body.template) > VERTICES else capture.body
+    quality = np.asarray(_quality(body, standardize(capture, SIZE)))
+    area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
+    return sorted(greedy_cover(quality * area, count))
+
+
+def greedy_cover(quality: Float[np.ndarray, "v n"], count: int) -> list[int]:
+    """Rows of a matrix, one after the other, each of which raises the sum of the columns' maxima most."""
+    chosen: list[int] = []
+    best = np.zeros(quality.shape[1])
+    for _ in range(min(count, len(quality))):
+        sums = np.maximum(quality, best).sum(axis=1)
+        sums[chosen] = -np.inf
+        chosen.append(int(np.argmax(sums)))
+        best = np.maximum(best, quality[chosen[-1]])
+    return chosen
+
+
+def view_quality(body: BodyModel, views: SubjectViews) -> Float[Array, "v n"]:
+    """How well every view shows every vertex, in [0, 1].
+
+    The cosine between normal and line of sight, times pixels per metre over the most of all views; 0 where the
+    vertex is hidden or outside of the mask.
+    """
+    config = presets.small().with_conventions(pixels="person")
+    inputs = prepare_inputs(body, views, config)
+    unit = subject_unit(inputs.canonical_vertices)
+    assert inputs.posed_normals is not None  # `prepare_inputs` computes them
+
+    def quality(camera, vertices, normals, depth_map):
+        pixels, depths = project_vertices(camera, vertices)
+        seen = visible_vertices(pixels, depths, depth_map, (camera.width, camera.height), "half_pixel")
+        towards = camera.center - vertices
+        facing = jnp.sum(towards * normals, -1) / jnp.maximum(jnp.linalg.norm(towards, axis=-1), 1e-6)
+        return jnp.where(seen, jnp.maximum(facing, 0) * camera.K[0, 0] / jnp.maximum(depths, 1e-6), 0)
+
+    cameras = views.cameras.in_units(unit)
+    shown = jax.vmap(quality)(cameras, inputs.posed_vertices / unit, inputs.posed_normals, inputs.depth_maps)
+    return shown / jnp.maximum(jnp.max(shown), 1e-6)
+
+
+_quality = jax.jit(view_quality)

@@ -1,0 +1,56 @@
+"""Which photos of many to use."""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.photos import DEMO_CAPTURE
+from humangs_jax.data.view_selection import greedy_cover, select_views
+
+GUARANTEE = 1 - 1 / np.e
+"""Of the greedy choice for a monotone submodular function."""
+
+
+def covered(quality, rows):
+    return quality[list(rows)].max(axis=0).sum()
+
+
+@given(arrays(float, (6, 5), elements=st.floats(0, 1)), st.integers(1, 4))
+def test_the_greedy_choice_keeps_its_guarantee(quality, count):
+    chosen = greedy_cover(quality, count)
+    assert len(set(chosen)) == count
+    best = max(covered(quality, rows) for rows in itertools.combinations(range(6), count))
+    assert covered(quality, chosen) >= GUARANTEE * best - 1e-9
+
+
+def test_repeated_photos_are_left_out(demo):
+    """Of four photos, three of which are one, two different ones show more."""
+    doubled = demo.select([0, 0, 2, 0])
+    chosen = select_views(doubled, 2)
+    assert 2 in chosen and len(set(chosen)) == 2
+
+
+def test_a_photo_without_the_person_is_not_chosen(demo):
+    views = demo.select(range(4))
+    empty = views.masks.copy()
+    empty[1] = 0
+    empty[1, :8, :8] = 1  # an empty mask would be no mask
+    chosen = select_views(dataclasses.replace(views, masks=empty), 3)
+    assert chosen == [0, 2, 3]
+
+
+def test_few_photos_are_all_taken_and_none_is_refused(demo):
+    assert select_views(demo.select(range(3)), 5) == [0, 1, 2]
+    with pytest.raises(ValueError, match="at least 1 photo, got 0"):
+        select_views(demo, 0)
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return load_capture(DEMO_CAPTURE)
