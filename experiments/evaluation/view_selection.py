@@ -94,8 +94,8 @@ def section(people, count):
     seconds = float(np.median([p["seconds"] for p in people]))
     rows = [[title, *(f"{means[key][n]:.2f}" for n in ("psnr", "psnr_foreground"))] for key, title in titles.items()]
     about = (
-        f"Means over {len(people)} people of the validation seeds, {PHOTOS} photos of 256 pixels at random azimuths, random choices "
-        f"{DRAWS} times each. The chosen ones are better for {better} of {len(people)}; choosing takes {seconds:.2f} s."
+        f"Means over {len(people)} people of the validation seeds, {PHOTOS} photos of 256 pixels at random azimuths; "
+        f"{DRAWS} random choices each. The chosen ones are better for {better} of {len(people)}; choosing takes {seconds:.2f} s."
     )
     return f"{about}\n\n{markdown_table(['photos', 'PSNR, dB', 'on the person, dB'], rows, 'lrr')}", means
 

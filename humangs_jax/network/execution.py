@@ -42,8 +42,11 @@ class Execution:
     token_capacity: int = knob(
         0, cost="tokens beyond it are dropped and counted", gain="time and memory", measured=MEASURED
     )
-    dtype: Literal["float32", "bfloat16"] = knob(
-        "float32", cost="1e-2 of relative error", gain="time on accelerators; none on CPUs", measured="parity.md"
+    dtype: Literal["float32", "bfloat16", "float16"] = knob(
+        "float32",
+        cost="bfloat16: 1e-2 of relative error; float16: 1e-3, not for training",
+        gain="time on accelerators; none on CPUs",
+        measured="stability.md",
     )
     attention: Literal["auto"] | AttentionKernel = knob(
         "auto", cost="none", gain="chunked: a third of the time on CPUs, memory linear in tokens", measured=MEASURED
@@ -69,4 +72,4 @@ class Execution:
     @property
     def compute_dtype(self) -> Any:
         """For Linen modules; None promotes inputs and parameters, so that float64 stays float64."""
-        return jnp.bfloat16 if self.dtype == "bfloat16" else None
+        return None if self.dtype == "float32" else jnp.dtype(self.dtype)

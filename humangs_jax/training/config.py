@@ -101,6 +101,10 @@ class TrainConfig:
         for name in (*counts, "checkpoint_every", "keep_checkpoints"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} {getattr(self, name)}: expected at least 1")
+        if self.model.execution.dtype == "float16":
+            raise ValueError(
+                "model.execution.dtype float16: gradients underflow; expected float32 or bfloat16 for training"
+            )
         starts = [stage.start for stage in self.stages]
         if starts and (starts[0] < 1 or starts != sorted(set(starts)) or starts[-1] >= self.steps):
             raise ValueError(f"stages start at {starts}: expected ascending steps between 1 and {self.steps - 1}")

@@ -191,15 +191,18 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
 
 
 @pytest.mark.slow
-def test_bfloat16_is_close():
+@pytest.mark.parametrize(
+    ("dtype", "tolerance"), [("bfloat16", BFLOAT16_TOLERANCE), ("float16", BFLOAT16_TOLERANCE / 4)]
+)
+def test_short_number_types_are_close(dtype, tolerance):
     variables, inputs = variables_of(ALL_TOKENS), random_inputs()
-    encoding, outputs = run(variables, inputs, ALL_TOKENS.with_execution(dtype="bfloat16"))
+    encoding, outputs = run(variables, inputs, ALL_TOKENS.with_execution(dtype=dtype))
     exact_encoding, exact = run(variables, inputs, ALL_TOKENS)
-    assert encoding.maps.dtype == jnp.bfloat16
+    assert encoding.maps.dtype == dtype
     scale = jnp.abs(exact_encoding.maps).max()
-    assert jnp.abs(encoding.maps.astype(jnp.float32) - exact_encoding.maps).max() < BFLOAT16_TOLERANCE * scale
-    assert close(outputs.gaussians.means, exact.gaussians.means, BFLOAT16_TOLERANCE)
-    assert close(outputs.gaussians.colors, exact.gaussians.colors, 2 * BFLOAT16_TOLERANCE)
+    assert jnp.abs(encoding.maps.astype(jnp.float32) - exact_encoding.maps).max() < tolerance * scale
+    assert close(outputs.gaussians.means, exact.gaussians.means, tolerance)
+    assert close(outputs.gaussians.colors, exact.gaussians.colors, 2 * tolerance)
 
 
 def test_unseen_vertices_are_grey_and_pool_nothing():

@@ -86,3 +86,8 @@ def test_a_loss_without_its_network_gives_way_and_says_so(caplog):
 def test_nobody_to_train_on_is_an_error(tmp_path, body):
     with pytest.raises(ValueError, match="nobody to train on"):
         training_people(None, 0, tmp_path, body)
+
+
+def test_float16_is_refused_for_training():
+    with pytest.raises(ValueError, match="float16: gradients underflow"):
+        dataclasses.replace(tiny(), model=tiny().model.with_execution(dtype="float16"))
