@@ -61,10 +61,12 @@ def evaluate(subjects, count):
         capture = capture_views(subject, body, [pose], views)
         photos, held_out = capture.select(range(PHOTOS)), capture.select(range(PHOTOS, PHOTOS + HELD_OUT))
 
-        def score(chosen, photos=photos, held_out=held_out):
+        assert held_out.masks is not None  # `capture_views` draws them
+
+        def score(chosen, photos=photos, held_out=held_out, masks=held_out.masks):
             drawn = capture_renderings(reconstruct(variables, config, photos.select(chosen)), held_out)[1]
             views = [(r.rgb, image) for r, image in zip(drawn, held_out.images, strict=True)]
-            on_person = [masked_psnr(*view, mask) for view, mask in zip(views, held_out.masks, strict=True)]
+            on_person = [masked_psnr(*view, mask) for view, mask in zip(views, masks, strict=True)]
             return {
                 "psnr": float(np.mean([psnr(*view) for view in views])),
                 "psnr_foreground": float(np.mean(on_person)),
