@@ -215,8 +215,8 @@ def splatting(arguments: argparse.Namespace) -> Iterator[Measurement]:
 def gsplat_runs(gaussians, camera):
     """The same image by gsplat (https://github.com/nerfstudio-project/gsplat), {} where it or torch with CUDA is missing."""
     try:
-        import torch  # ty: ignore[unresolved-import]
-        from gsplat import rasterization  # ty: ignore[unresolved-import]
+        import torch  # ty: ignore[import-not-found]
+        from gsplat import rasterization  # ty: ignore[import-not-found]
     except ImportError:
         return {}
     import numpy as np
