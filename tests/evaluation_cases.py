@@ -7,6 +7,8 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import Capture, capture_from_arrays
+from humangs_jax.objectives.backbones import Convolution, channels, convolutions
+from humangs_jax.objectives.lpips import BACKBONES, Lpips
 
 
 @functools.cache
@@ -25,6 +27,17 @@ def small_body():
         joint_names=("a", "b", "c"),
         shape_names=("wide", "tall"),
     )
+
+
+def random_lpips(net) -> Lpips:
+    """Drawn by numpy: JAX would compile a program for each of the many shapes."""
+    rng = np.random.default_rng(0)
+    weights = {}
+    for layer in convolutions(BACKBONES[net]):
+        shape = (layer.size, layer.size, layer.inputs, layer.outputs)
+        kernel = rng.standard_normal(shape, np.float32) * np.sqrt(2 / np.prod(shape[:3]), dtype=np.float32)
+        weights[layer.name] = Convolution(jnp.asarray(kernel), jnp.zeros(layer.outputs))
+    return Lpips(weights, tuple(jnp.ones(count) for count in channels(BACKBONES[net])), net)
 
 
 def ellipse(height, width, tall=0.35, wide=0.2, soft=True):

@@ -15,7 +15,8 @@ Row = dict[str, float | None]
 """Scores by name; None for what is missing."""
 ORDER = "mean over the images of a frame, then over the frames of a person, then over people"
 CONFIDENCE = 0.95
-RESAMPLES = 2000
+RESAMPLES, BLOCKS = 2000, 20
+"""Of the bootstrap, and in how many parts it is computed, for memory."""
 
 
 class Column(NamedTuple):
@@ -127,7 +128,8 @@ def bootstrap(values: Sequence[float], seed: int = 0) -> tuple[float | None, flo
     if len(values) < 2:
         return None, None
     generator, numbers = np.random.default_rng(seed), np.asarray(values, np.float64)
-    means = [numbers[generator.integers(len(numbers), size=len(numbers))].mean() for _ in range(RESAMPLES)]
+    drawn = lambda: generator.integers(len(numbers), size=(RESAMPLES // BLOCKS, len(numbers)))
+    means = np.concatenate([numbers[drawn()].mean(axis=1) for _ in range(BLOCKS)])
     low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return float(low), float(high)
 

@@ -14,8 +14,8 @@ OUTLINE = 3 / 256
 """Half the width of the band at the outline, of the image's side."""
 
 
-def decibels(mean_squared_error: Scalar) -> Scalar:
-    """PSNR of a mean squared error of values in [0, 1], at most 100 dB."""
+def decibels(mean_squared_error: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """PSNR of mean squared errors of values in [0, 1], at most 100 dB."""
     return -10 * jnp.log10(jnp.maximum(mean_squared_error, 10 ** (-LARGEST_PSNR / 10)))
 
 
@@ -44,8 +44,8 @@ def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Sca
     return jnp.where(union > 0, jnp.sum(drawn & inside) / jnp.maximum(union, 1), 1.0)
 
 
-def outline_band(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """1 in the band to either side of the outline of a mask, see `OUTLINE`, 0 elsewhere; on the host."""
+def outline_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
+    """1 in the band to either side of the outline of a mask (h, w), see `OUTLINE`, 0 elsewhere; on the host."""
     from scipy.ndimage import distance_transform_edt
 
     inside = np.asarray(mask) > 0.5

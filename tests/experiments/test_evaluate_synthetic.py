@@ -8,15 +8,14 @@ import sys
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from evaluation_cases import capture_from, random_lpips
 
-from experiments.evaluation import bodies, body_cases, results, subjects, synthetic
+from experiments.evaluation import bodies, body_cases, subjects, synthetic
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables, save_weights
-from humangs_jax.objectives.backbones import channels, random_weights
-from humangs_jax.objectives.lpips import BACKBONES, Lpips, lpips
+from humangs_jax.objectives.lpips import lpips
 
 SMALL = ("--held-out", "1", "--poses", "1", "--pose-views", "1", "--size", "48")
 
@@ -33,18 +32,17 @@ def run(script, monkeypatch, *arguments):
     script.main()
 
 
+@pytest.mark.slow
 def test_scores_by_task_are_means_over_views():
     """With LPIPS of any net; without weights it is missing."""
     rng, frames = np.random.default_rng(0), np.asarray([0, 0, 1])
     truth, drawn = rng.random((2, 3, 48, 48, 3)).astype(np.float32)
-    held_out = SimpleNamespace(images=truth, masks=np.ones((3, 48, 48), np.float32), frames=frames, view_count=3)
+    held_out = capture_from(truth, np.ones((3, 48, 48), np.float32), frames)
     found = subjects.score_tasks(drawn + 0.5, held_out)
     assert found["novel"]["psnr"] == pytest.approx(mean_psnr(drawn + 0.5, truth, frames == 0), abs=1e-4)
     assert found["animation"]["psnr"] == pytest.approx(mean_psnr(drawn + 0.5, truth, frames == 1), abs=1e-4)
     assert found["novel"]["lpips"] is None
-    assert results.table_row({**found["novel"], "baseline_lpips": None}).split().count("-") == 5
-    heads = tuple(jnp.ones(count) for count in channels(BACKBONES["alex"]))
-    weights = Lpips(random_weights(jax.random.key(0), BACKBONES["alex"]), heads, "alex")
+    weights = random_lpips("alex")
     found = subjects.score_tasks(drawn + 0.5, held_out, weights)["animation"]["lpips"]
     expected = jax.jit(lpips)(weights, np.clip(drawn[2] + 0.5, 0, 1), truth[2])
     assert found == pytest.approx(float(expected), rel=1e-5) and found > 0
