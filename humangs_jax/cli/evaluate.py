@@ -41,7 +41,7 @@ class Evaluate:
     protocol: Literal["humangs", "animatable-gaussians", "ghg", "giga", "lhm", "lhm++", "lvsm"] = "humangs"
     """Whose backgrounds, crops, networks and SSIM."""
     inputs: int | None = None
-    """How many photos are inputs, evenly spaced. Default: all, where a folder held_out lies beside them, else 4."""
+    """How many photos are inputs, evenly spaced. Default: 4."""
     indices: Path | None = None
     """JSON that says which views are inputs and targets: {"PERSON": {"context": [...], "target": [...]}}."""
     json: Path | None = None

@@ -15,7 +15,7 @@ from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.loading.examples import Source
@@ -77,8 +77,8 @@ def find_people(
     Arguments:
         source: a capture folder or a folder of them, a capture, cases, or a `Source`, whose examples give inputs and targets and
             whose parameters belong to `body` (default: the one that comes with the package).
-        inputs: how many photos are inputs: evenly spaced around the person, of one frame. Default: all photos of a capture that
-            has a folder held_out beside them, else 4. indices: says it by person instead.
+        inputs: how many photos are inputs: evenly spaced around the person, of the first view's frame. Default: 4, or all of them
+            where a capture with a folder held_out has fewer. indices: says it by person instead.
         reconstructs: whether the method needs inputs. One that does not, and is given neither `inputs` nor `indices`, is compared
             with every view of a capture that has nothing held out.
 
@@ -111,49 +111,70 @@ def read_indices(path: str | Path) -> Indices:
         for key in ("context", "target"):
             numbers = views.get(key) if isinstance(views, dict) else None
             if not isinstance(numbers, list) or any(type(i) is not int or i < 0 for i in numbers):
-                raise ValueError(f"{path}: {name}.{key}: expected a list of view numbers from 0, got {numbers!r}")
+                raise ValueError(
+                    f"{path}: {name}.{key}: expected a list of view numbers from 0, got {str(numbers)[:40]}"
+                )
     return content
 
 
 def _load(folder, inputs, indices, body, reconstructs):
     capture, held_out = load_capture(folder, body=body), folder / HELD_OUT
-    if indices is None and (held_out / "capture.json").is_file():
-        chosen = range(capture.view_count) if inputs is None else spread_views(capture, inputs)
-        return Case(folder.name, load_capture(held_out, body=capture.body), capture.select(list(chosen)))
-    return _split(folder.name, capture, inputs, indices, reconstructs)
+    if indices is not None or not (held_out / "capture.json").is_file():
+        return _split(folder.name, capture, inputs, indices, reconstructs)
+    first = int(np.sum(np.asarray(capture.frames) == capture.frames[0]))
+    count = min(DEFAULT_INPUTS, first) if inputs is None else inputs
+    chosen = spread_views(folder.name, capture.frames, np.asarray(capture.cameras.cam_from_world), count)
+    return Case(folder.name, load_capture(held_out, body=capture.body), capture.select(chosen))
 
 
 def _split(name, capture, inputs, indices, reconstructs):
     """Inputs and targets of one capture."""
-    every = range(capture.view_count)
+    cam_from_world = np.asarray(capture.cameras.cam_from_world)
+    chosen, targets = choose_views(name, capture.frames, cam_from_world, inputs, indices, reconstructs)
+    return Case(name, capture.select(targets), capture.select(chosen) if chosen else None)
+
+
+def choose_views(
+    name: str,
+    frames: Int[np.ndarray, " v"],
+    cam_from_world: Float[np.ndarray, "v 4 4"],
+    inputs: int | None = None,
+    indices: Indices | None = None,
+    reconstructs: bool = True,
+) -> tuple[list[int], list[int]]:
+    """The views of a person that are inputs, and those to compare with; see `find_people`.
+
+    Raises: ValueError naming the person.
+    """
+    count = len(frames)
     if indices is not None:
         if name not in indices:
             raise ValueError(f"indices: {name!r} is missing")
         chosen, targets = (list(indices[name].get(key, ())) for key in ("context", "target"))
-        if not targets or not all(0 <= i < capture.view_count for i in (*chosen, *targets)):
-            raise ValueError(
-                f"indices: {name}: expected views from 0 to {capture.view_count - 1} and at least one target"
-            )
-    elif inputs is None and not reconstructs:
-        return Case(name, capture)
-    else:
-        chosen = spread_views(capture, DEFAULT_INPUTS if inputs is None else inputs)
-        targets = [i for i in every if i not in chosen]
-        if not targets:
-            raise ValueError(f"{name}: {capture.view_count} views, all of them inputs: none is left to compare with")
-    return Case(name, capture.select(targets), capture.select(chosen) if chosen else None)
+        if not targets or not all(0 <= i < count for i in (*chosen, *targets)):
+            raise ValueError(f"indices: {name}: expected views from 0 to {count - 1} and at least one target")
+        return chosen, targets
+    if inputs is None and not reconstructs:
+        return [], list(range(count))
+    chosen = spread_views(name, frames, cam_from_world, DEFAULT_INPUTS if inputs is None else inputs)
+    targets = [i for i in range(count) if i not in chosen]
+    if not targets:
+        raise ValueError(f"{name}: {count} views, all of them inputs: none is left to compare with")
+    return chosen, targets
 
 
-def spread_views(capture: Capture, count: int) -> list[int]:
-    """Evenly spaced views of the first view's frame, that view first, around the person. Raises: ValueError for too few views."""
-    same = np.flatnonzero(np.asarray(capture.frames) == capture.frames[0])
+def spread_views(
+    name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int
+) -> list[int]:
+    """Views of the first view's frame, that one among them, evenly spaced around the person; in order. Raises: ValueError."""
+    same = np.flatnonzero(np.asarray(frames) == frames[0])
     if not 1 <= count <= len(same):
-        raise ValueError(f"{count} inputs: the capture has {len(same)} views of the first frame")
-    centers = np.asarray(capture.cameras.center)[same]
+        raise ValueError(f"{name}: {count} inputs, but {len(same)} views show the first frame")
+    centers = -np.einsum("vji,vj->vi", cam_from_world[same, :3, :3], cam_from_world[same, :3, 3])
     away = centers - centers.mean(axis=0)
     azimuths = np.arctan2(away[:, 0], away[:, 2])
     around = same[np.argsort((azimuths - azimuths[0]) % (2 * np.pi), kind="stable")]
-    return [int(around[i * len(same) // count]) for i in range(count)]
+    return sorted(int(around[i * len(same) // count]) for i in range(count))
 
 
 def _from_source(source, index, name, inputs, body):

@@ -82,7 +82,7 @@ class Evaluation:
         notes = [f"Each number is the {ORDER}."]
         if any(mean is not None and mean.low is not None for mean in self.means.values()):
             over = next(mean.over for mean in self.means.values() if mean is not None)
-            notes.append(f"In brackets: {CONFIDENCE:.0%} interval of the mean under resampling of {over} (bootstrap).")
+            notes.append(f"Intervals: {CONFIDENCE:.0%} of the mean under resampling of {over} (bootstrap).")
         for reason in dict.fromkeys(self.reasons.values()):
             scores = [COLUMNS[name].heading for name, why in self.reasons.items() if why == reason]
             notes.append(f"Missing: {', '.join(scores)}: {reason}.")
@@ -189,7 +189,7 @@ def evaluate(
             continue
         truth = case.truth.select(predicted.views)
         masks, alphas = masks and truth.masks is not None, alphas and predicted.alpha is not None
-        everything |= case.inputs is None and not isinstance(source, Case)
+        everything |= case.inputs is None and isinstance(source, str | Path | Capture)
         sides.add(truth.images.shape[2:0:-1])
         if case.inputs is not None:
             gallery.add_inputs(case.name, case.inputs.images)

@@ -84,8 +84,13 @@ def alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict[
     return {"iou": silhouette_iou(alpha, mask), "fog": fog(alpha, mask)}
 
 
-_lpips = jax.jit(lpips)
-_lpips_of_patches = jax.jit(jax.vmap(lpips, in_axes=(None, 0, 0)))
+def _precise_lpips(weights, predicted, truth, size=None):
+    with jax.default_matmul_precision("highest"):  # accelerators round the factors of convolutions by default
+        return lpips(weights, predicted, truth, size)
+
+
+_lpips = jax.jit(_precise_lpips)
+_lpips_of_patches = jax.jit(jax.vmap(_precise_lpips, in_axes=(None, 0, 0)))
 
 
 def score_image(
