@@ -43,9 +43,9 @@ from experiments.evaluation.results import (
     cell,
     finished,
     kept_rows,
-    mean_scores,
     printed_table,
 )
+from humangs_jax.evaluation.tables import mean_scores
 
 PAINTED = "painted default body"
 """Cell of a row that holds the scores of the baseline."""
@@ -78,10 +78,11 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     from tqdm import tqdm
 
     from experiments.evaluation.body_cases import as_it_is, body_cases
-    from experiments.evaluation.subjects import HeldOut, draw_avatar, lpips_scorer, make_evaluation_subject, score_tasks
-    from humangs_jax.avatar.evaluate import draw_painted_body, painted_body
+    from experiments.evaluation.subjects import HeldOut, make_evaluation_subject, score_tasks
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.body.library import load_body
+    from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
+    from humangs_jax.evaluation.cases import draw_views
     from humangs_jax.people.seeds import seeds_of
 
     seeds = seeds_of(arguments.split, arguments.first, arguments.subjects)
@@ -89,7 +90,7 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     settings = settings_of(arguments, digest, config.tokens, lpips)
     settings |= {"views": arguments.views, "device": jax.devices()[0].device_kind}
     rows = kept_rows(arguments.json, settings, "bodies")
-    cases, config, lpips_of = body_cases(body, config), as_it_is(config), lpips_scorer(lpips)
+    cases, config = body_cases(body, config), as_it_is(config)
     sizes = {
         name: {"body_vertices": len(x.body.template), "vertices": len(x.carrier.template)} for name, x in cases.items()
     }
@@ -101,19 +102,19 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
         subject = make_evaluation_subject(seed, body, [arguments.views], arguments.size, held_out)
         truth = subject.held_out
         painted = draw_painted_body(painted_body(subject.inputs(arguments.views)), truth)
-        row = {PAINTED: score_tasks(painted, truth, lpips_of)}
+        row = {PAINTED: score_tasks(painted, truth, lpips)}
         drawn["truth"] = truth.images
         for name, case in cases.items():
             other = subject.with_body(case.carrier)
             inputs = other.inputs(arguments.views)
             avatar, passes = timed(lambda inputs=inputs: jax.block_until_ready(reconstruct(variables, config, inputs)))
-            drawn[name], frames = timed(lambda avatar=avatar, other=other: draw_avatar(avatar, other.held_out))
+            drawn[name], frames = timed(lambda avatar=avatar, other=other: draw_views(avatar, other.held_out).images)
             seconds = {"reconstruct": passes, "frame": [x / truth.view_count for x in frames]}
             costs = {
                 f"{step}{mark}": x for step, pair in seconds.items() for mark, x in zip(("", "_cpu"), pair, strict=True)
             }
             costs["gaussians"] = len(avatar.gaussians.means)
-            row[name] = score_tasks(drawn[name], truth, lpips_of) | {COSTS: costs}
+            row[name] = score_tasks(drawn[name], truth, lpips) | {COSTS: costs}
         rows[seed] = row
 
     names = [PAINTED, *cases]

@@ -66,30 +66,21 @@ def measure(arguments: argparse.Namespace) -> dict[str, float]:
         targets = example.targets
         pictures = zip(*(np.asarray(x) for x in (drawn.rgb, drawn.alpha, targets.images, targets.masks)), strict=True)
         same = jnp.max(jnp.abs(targets.rotations - example.inputs.rotations[:1]), axis=(1, 2)) < 1e-3
-        rows += [
-            {
-                "psnr, pose of the photos" if pose else "psnr, other poses": psnr(picture[0], picture[2]),
-                **shares(*picture),
-            }
-            for pose, picture in zip(np.asarray(same), pictures, strict=True)
-        ]
+        for pose, picture in zip(np.asarray(same), pictures, strict=True):
+            found = shares(*picture)
+            rows.append({"psnr, pose of the photos" if pose else "psnr, other poses": found["psnr"], **found})
     names = sorted({name for row in rows for name in row}, reverse=True)
     means = {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
     total = means["squared error"]
     return {name: value / total if name.startswith("share") else value for name, value in means.items()}
 
 
-def psnr(picture, truth) -> float:
-    """In dB, of colours in [0, 1]."""
-    import numpy as np
-
-    return float(-10 * np.log10(np.mean((np.clip(picture, 0, 1) - truth) ** 2)))
-
-
 def shares(rgb, alpha, image, mask) -> dict[str, float]:
     """Squared error of one image by place, and its PSNR, also under the true coverage. (h, w, 3) and (h, w)."""
     import numpy as np
     from scipy import ndimage
+
+    from humangs_jax.objectives.metrics import psnr
 
     error = ((np.clip(rgb, 0, 1) - image) ** 2).mean(-1)
     inner = ndimage.binary_erosion(mask > 0.5, iterations=BAND)
@@ -98,8 +89,8 @@ def shares(rgb, alpha, image, mask) -> dict[str, float]:
     color = np.where(alpha[..., None] > LEAST_COVERAGE, color, image)
     covered = color * mask[..., None] + 1 - mask[..., None]
     return {
-        "psnr": psnr(rgb, image),
-        "psnr under the true coverage": psnr(covered, image),
+        "psnr": float(psnr(rgb, image)),
+        "psnr under the true coverage": float(psnr(covered, image)),
         "squared error": float(error.mean()),
         "share at the outline": float((error * ~(inner | outer)).mean()),
         "share in holes": float((error * (1 - alpha) * inner).mean()),

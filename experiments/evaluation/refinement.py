@@ -5,10 +5,8 @@
         [--sheet SHEET]
 
 People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random colours" from
-as many round Gaussians of random colours on the vertices of the body. Scores are those of `evaluation/results.py` and, of the
-views, "psnr_outline": PSNR in the band of 3 pixels (of 256) to either side of the true outline, and "fog": share of the true
-mask where the rendering's alpha lies between 0.05 and 0.9. 0 seconds are the start. A later run continues: finished people in
-the JSON with the same settings are not computed again.
+as many round Gaussians of random colours on the vertices of the body. Scores: docs/evaluation.md.
+0 seconds are the start. A later run continues: finished people in the JSON with the same settings are not computed again.
 
 Seconds do not count compilation. One device: one core of a CPU.
 """
@@ -22,7 +20,8 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import markdown_table, publish, write_json
 from experiments.evaluation.options import add_people_options, check_people_options, load_network, settings_of
-from experiments.evaluation.results import TASK_NAMES, kept_rows, mean_scores
+from experiments.evaluation.results import TASK_NAMES, kept_rows
+from humangs_jax.evaluation.tables import mean_scores
 
 STARTS = ("network", "random colours")
 SHOWN = {
@@ -139,24 +138,12 @@ def random_start(avatar, seed):
 
 
 def score_all(avatar, held_out):
-    """Scores by task, with those of this page, and the first image."""
-    import numpy as np
+    """Scores by task, and the first image."""
+    from experiments.evaluation.subjects import score_tasks
+    from humangs_jax.evaluation.cases import draw_views
 
-    from experiments.evaluation.subjects import score_tasks, task_views
-    from humangs_jax.avatar.frames import capture_renderings
-    from humangs_jax.objectives.metrics import fog, outline_psnr
-
-    drawn = capture_renderings(avatar, held_out)[1]
-    rgb = np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in drawn])
-    alpha = np.stack([np.asarray(r.alpha) for r in drawn])
-    tasks, scores = task_views(held_out), score_tasks(rgb, held_out, lambda predicted, truth: None)
-    for task, own in scores.items():
-        views = tasks[task]
-        truths, masks = held_out.images[views], held_out.masks[views]
-        foggy = [float(fog(*view)) for view in zip(alpha[views], masks, strict=True)]
-        bands = [outline_psnr(*view) for view in zip(rgb[views], truths, masks, strict=True)]
-        own |= {"fog": float(np.mean(foggy)), "psnr_outline": float(np.mean(bands))}
-    return scores, rgb[0]
+    drawn = draw_views(avatar, held_out)
+    return score_tasks(drawn.images, held_out, alpha=drawn.alpha), drawn.images[0]
 
 
 def report_of(rows, settings, seeds):

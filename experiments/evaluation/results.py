@@ -1,20 +1,20 @@
 """Results of the evaluation as data: what a row holds, means, rows kept from an unfinished run, tables.
 
 A person has a row {cell: {"novel": scores, "animation": scores}}, where a cell is a number of photos or a body. "novel" are
-held-out views in the pose of the photos, "animation" held-out views in poses that no photo shows. Scores are means over views:
-PSNR in dB, SSIM, LPIPS, PSNR on the person alone ("psnr_foreground", weighted by the true mask), the share of the image that
-the person takes ("foreground"), and those of the painted body ("baseline_").
+held-out views in the pose of the photos, "animation" held-out views in poses that no photo shows. Scores are means over views
+of those of `humangs_jax.evaluation` under the protocol "humangs", and those of the painted body ("baseline_").
 """
 
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from experiments.common.results import markdown_table
+from humangs_jax.evaluation.tables import mean_scores
 
 TASKS = ("novel", "animation")
 Scores = dict[str, float | None]
@@ -44,14 +44,6 @@ def cell(scores: Mapping[str, float | None], key: str) -> str:
     """One number with its digits."""
     value = scores.get(key)
     return "-" if value is None else f"{value:.{COLUMNS[key][1]}f}"
-
-
-def mean_scores(scores: Iterable[Scores]) -> Scores:
-    """Means over people; None for what some of them lack."""
-    listed = list(scores)
-    columns = {key: [one.get(key) for one in listed] for key in listed[0]}
-    known = {key: [value for value in values if value is not None] for key, values in columns.items()}
-    return {key: sum(values) / len(values) if len(values) == len(listed) else None for key, values in known.items()}
 
 
 def mean_cells(rows: Sequence[Row], names: Sequence[str]) -> Row:

@@ -7,19 +7,21 @@ have 8 bits as they would have on disk.
 """
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from experiments.evaluation.results import TASKS, Scores
-from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.evaluate import draw_painted_body, painted_body, score
-from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.data.capture import Capture
+from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
+from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.protocol import PROTOCOLS
+from humangs_jax.evaluation.scores import score_views
+from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.io.images import to_uint8
@@ -129,10 +131,6 @@ def _as_stored(capture):
     return dataclasses.replace(capture, **rounded)
 
 
-MeanLpips = Callable[[np.ndarray, np.ndarray], float | None]
-"""Of images (v, h, w, 3) against true ones; None where LPIPS has no weights."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Drawn:
     """The held-out views of a person as drawn: ours (v, h, w, 3) and the painted body (v, h, w, 3), in [0, 1]."""
@@ -145,12 +143,8 @@ def draw_person(variables: Variables, config: HumanGSConfig, subject: Evaluation
     """Reconstruct from that number of photos, and paint the body with the same ones."""
     inputs = subject.inputs(count)
     avatar = reconstruct(variables, config, inputs)
-    return Drawn(draw_avatar(avatar, subject.held_out), draw_painted_body(painted_body(inputs), subject.held_out))
-
-
-def draw_avatar(avatar: Avatar, views: Capture) -> np.ndarray:
-    """An avatar in the poses and from the cameras of a capture, (v, h, w, 3) in [0, 1]."""
-    return np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in capture_renderings(avatar, views)[1]])
+    ours = draw_views(avatar, subject.held_out).images
+    return Drawn(ours, draw_painted_body(painted_body(inputs), subject.held_out))
 
 
 def task_views(held_out: Capture) -> dict[str, np.ndarray]:
@@ -159,36 +153,22 @@ def task_views(held_out: Capture) -> dict[str, np.ndarray]:
     return dict(zip(TASKS, (np.flatnonzero(still), np.flatnonzero(~still)), strict=True))
 
 
-def score_tasks(pictures: np.ndarray, held_out: Capture, lpips_of: MeanLpips) -> dict[str, Scores]:
-    """Scores of one set of drawn held-out views, by task; tasks without views are left out."""
-    scores = {}
-    for task, views in task_views(held_out).items():
-        if len(views):
-            truth = held_out.select(views)
-            lpips = lpips_of(pictures[views], truth.images)
-            scores[task] = {**dataclasses.asdict(score(pictures[views], truth)), "lpips": lpips}
-    return scores
+def score_tasks(
+    drawn: np.ndarray, held_out: Capture, lpips: Lpips | None = None, alpha: np.ndarray | None = None
+) -> dict[str, Scores]:
+    """Mean scores of drawn held-out views (v, h, w, 3) by task, under the protocol "humangs"; tasks without views are left out.
+
+    alpha: their coverage (v, h, w), for fog and silhouettes.
+    """
+    net = "vgg" if lpips is None else lpips.net
+    protocol = dataclasses.replace(PROTOCOLS["humangs"], lpips=(net,))
+    rows = list(score_views(drawn, held_out, protocol, alpha, {} if lpips is None else {net: lpips}))
+    means = {task: mean_scores(rows[i] for i in views) for task, views in task_views(held_out).items() if len(views)}
+    return {task: scores | {"lpips": scores.pop(f"lpips_{net}")} for task, scores in means.items()}
 
 
-def score_person(drawn: Drawn, held_out: Capture, lpips_of: MeanLpips) -> dict[str, Scores]:
+def score_person(drawn: Drawn, held_out: Capture, lpips: Lpips | None = None) -> dict[str, Scores]:
     """Scores by task, those of the painted body beside ours under names with the prefix "baseline_"."""
-    ours, painted = (score_tasks(x, held_out, lpips_of) for x in (drawn.ours, drawn.painted))
+    ours, painted = (score_tasks(x, held_out, lpips) for x in (drawn.ours, drawn.painted))
     compared = ("psnr", "ssim", "psnr_foreground", "lpips")
     return {task: ours[task] | {f"baseline_{name}": painted[task][name] for name in compared} for task in ours}
-
-
-def lpips_scorer(weights: Lpips | None) -> MeanLpips:
-    """The mean LPIPS of images (v, h, w, 3), clipped to [0, 1], against true ones; None for any without weights."""
-    if weights is None:
-        return lambda predicted, truth: None
-    import jax
-
-    from humangs_jax.objectives.lpips import lpips
-
-    distance = jax.jit(lpips)
-
-    def mean(predicted, truth):
-        pairs = zip(np.clip(np.asarray(predicted), 0, 1), np.asarray(truth), strict=True)
-        return float(np.mean([distance(weights, *pair) for pair in pairs]))
-
-    return mean

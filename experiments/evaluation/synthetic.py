@@ -82,13 +82,7 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     from tqdm import tqdm
 
     from experiments.evaluation.pictures import plot_views, strip_of, write_sheet
-    from experiments.evaluation.subjects import (
-        HeldOut,
-        draw_person,
-        lpips_scorer,
-        make_evaluation_subject,
-        score_person,
-    )
+    from experiments.evaluation.subjects import HeldOut, draw_person, make_evaluation_subject, score_person
     from humangs_jax.body.library import load_body
     from humangs_jax.people.seeds import seeds_of
 
@@ -97,14 +91,14 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     settings = settings_of(arguments, digest, config.tokens, lpips)
     rows = kept_rows(arguments.json, settings, "by_views")
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
-    lpips_of, chosen, strips = lpips_scorer(lpips), headline(arguments.views), {}
+    chosen, strips = headline(arguments.views), {}
 
     def add(seed: int, counts: Sequence[int]) -> None:
         """The person's scores with these numbers of photos, into rows, and its images into strips."""
         subject = make_evaluation_subject(seed, body, counts, arguments.size, held_out)
         for count in counts:
             drawn = draw_person(variables, config, subject, count)
-            rows.setdefault(seed, {})[str(count)] = score_person(drawn, subject.held_out, lpips_of)
+            rows.setdefault(seed, {})[str(count)] = score_person(drawn, subject.held_out, lpips)
             if str(count) == chosen:
                 strips[seed] = strip_of(drawn, subject.held_out)
 

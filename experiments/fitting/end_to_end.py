@@ -80,16 +80,16 @@ def compare(variables, config, body, subject, arguments) -> dict:
 
     import numpy as np
 
-    from experiments.evaluation.subjects import draw_avatar
-    from humangs_jax.avatar.evaluate import score
     from humangs_jax.avatar.reconstruct import reconstruct
+    from humangs_jax.evaluation.cases import draw_views
+    from humangs_jax.evaluation.scores import score
 
     photos = subject.inputs(VIEWS)
     fitted, millimetres = fit_photos(photos, body, subject.seed, arguments)
     pictures = {}
     for name, inputs in (("true", photos), ("fitted", fitted)):
         views = dataclasses.replace(subject.held_out, poses=inputs.poses, betas=inputs.betas)
-        pictures[name] = draw_avatar(reconstruct(variables, config, inputs), views)
+        pictures[name] = draw_views(reconstruct(variables, config, inputs), views).images
     scores = {name: score(drawn, subject.held_out) for name, drawn in pictures.items()}
     if arguments.images:
         from humangs_jax.avatar.sheets import contact_sheet

@@ -15,7 +15,6 @@ import numpy as np
 
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.evaluate import draw_painted_body, painted_body, score
 from humangs_jax.avatar.export import write_ply
 from humangs_jax.avatar.frames import capture_renderings, motion_frames, write_renderings_exr
 from humangs_jax.avatar.reconstruct import reconstruct
@@ -24,6 +23,8 @@ from humangs_jax.avatar.video import write_video
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
+from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
+from humangs_jax.evaluation.scores import score
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.text import write_json
 from humangs_jax.network.weights import load_weights

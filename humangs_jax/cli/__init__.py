@@ -13,6 +13,7 @@ import tyro
 
 from humangs_jax.cli.avatars import Animate, Demo, Export, Reconstruct, Refine, Render, View
 from humangs_jax.cli.captures import ImportCameras, Synth
+from humangs_jax.cli.evaluate import Evaluate
 from humangs_jax.cli.fit import Check, Fit
 from humangs_jax.cli.training import Convert, Train
 from humangs_jax.core.allocator import keep_freed_memory
@@ -37,6 +38,7 @@ COMMANDS: dict[str, Callable[..., Command]] = {
     "animate": Animate,
     "render": Render,
     "export": Export,
+    "evaluate": Evaluate,
     "view": View,
     "synth": Synth,
     "train": Train,

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.network.convolution import convolve
 
@@ -159,38 +159,58 @@ def smallest_side(slices: Slices) -> int:
     return next(side for side in itertools.count(1) if fits(side))
 
 
-def feature_maps(weights: Weights, slices: Slices, image: Float[Array, "h w 3"]) -> list[Float[Array, "y x c"]]:
-    """The compared maps of an image whose colours are scaled as the network expects them.
+def feature_maps(
+    weights: Weights, slices: Slices, image: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
+) -> list[tuple[Float[Array, "y x c"], Int[Array, "2"] | None]]:
+    """The compared maps of an image whose colours are scaled as the network expects them, each with its size.
 
+    size: the image's own height and width, where it was padded below and right so that images of several sizes share a program.
+    The maps are then those of the image without padding, padded with zeros, and their sizes say where they end. Without it the
+    sizes are None.
     Computed in the dtype of the weights. Raises: ValueError for an image that is too small for the network.
     """
     height, width, _ = image.shape
     if min(height, width) < (least := smallest_side(slices)):
         raise ValueError(f"an image of {width} x {height} is too small for this network: {least} pixels a side needed")
-    maps, x = [], image.astype(weights["0"].kernel.dtype)
+    maps, x = [], _cleared(image.astype(weights["0"].kernel.dtype), size)
     for part in slices:
         for layer in part:
-            x = _apply(weights, layer, x)
-        maps.append(x)
+            x, size = _apply(weights, layer, x, size)
+        maps.append((x, size))
     return maps
 
 
-def _apply(weights, layer, x):
+def _cleared(x, size):
+    """A map with zeros beyond its size: what a convolution finds outside of an image."""
+    if size is None:
+        return x
+    inside = [jnp.arange(side) < n for side, n in zip(x.shape[:2], size, strict=True)]
+    return jnp.where((inside[0][:, None] & inside[1])[..., None], x, 0)
+
+
+def _apply(weights, layer, x, size):
     if isinstance(layer, Pool):
-        return _pool(layer, x)
+        up = layer.stride - 1 if layer.ceil else 0
+        # values are not negative, so a zero beyond the map changes no maximum
+        size = None if size is None else (size - layer.size + up) // layer.stride + 1
+        return _cleared(_pool(layer, x), size), size
     if isinstance(layer, Fire):
-        x = _convolve(weights, layer.squeeze, x)
-        return jnp.concatenate([_convolve(weights, part, x) for part in layer.expand], axis=-1)
-    return _convolve(weights, layer, x)
+        x, size = _convolve(weights, layer.squeeze, x, size)
+        parts = [_convolve(weights, part, x, size)[0] for part in layer.expand]
+        return jnp.concatenate(parts, axis=-1), size
+    return _convolve(weights, layer, x, size)
 
 
-def _convolve(weights, layer, x):
+def _convolve(weights, layer, x, size):
     kernel, bias = weights[layer.name].kernel, weights[layer.name].bias
+    size = None if size is None else (size + 2 * layer.padding - layer.size) // layer.stride + 1
     if (layer.size, layer.stride, layer.padding) == (3, 1, 1):
-        return jax.nn.relu(convolve(x[None], kernel)[0] + bias)
-    stride, padding = (layer.stride,) * 2, [(layer.padding, layer.padding)] * 2
-    y = jax.lax.conv_general_dilated(x[None], kernel, stride, padding, dimension_numbers=("NHWC", "HWIO", "NHWC"))
-    return jax.nn.relu(y[0] + bias)
+        y = convolve(x[None], kernel)[0]
+    else:
+        stride, padding = (layer.stride,) * 2, [(layer.padding, layer.padding)] * 2
+        y = jax.lax.conv_general_dilated(x[None], kernel, stride, padding, dimension_numbers=("NHWC", "HWIO", "NHWC"))
+        y = y[0]
+    return _cleared(jax.nn.relu(y + bias), size), size
 
 
 def _pool(layer, x):

@@ -8,7 +8,7 @@ with `jax.vmap`.
 
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Float, Scalar
+from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.core.numerics import at_least_float32, safe_sqrt
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.objectives.backbones import ALEXNET, SQUEEZENET, VGG16, Slices, Weights, feature_maps
@@ -35,20 +35,28 @@ def _unit(x: Float[Array, "y x c"]) -> Float[Array, "y x c"]:
 
 
 def lpips_distances(
-    weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]
+    weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
 ) -> Float[Array, " _"]:
     """The distance at each depth of the backbone: five for vgg and alex, seven for squeeze. See `lpips`."""
     images = at_least_float32((predicted, target))
     shift, scale = (jnp.asarray(x, images[0].dtype) for x in (SHIFT, SCALE))
     slices = BACKBONES[weights.net]
-    maps = [feature_maps(weights.backbone, slices, (2 * image - 1 - shift) / scale) for image in images]
-    pairs = zip(weights.heads, *map(at_least_float32, maps), strict=True)
-    return jnp.stack([jnp.mean(jnp.sum(head * jnp.square(_unit(x) - _unit(y)), axis=-1)) for head, x, y in pairs])
+    maps = [feature_maps(weights.backbone, slices, (2 * image - 1 - shift) / scale, size) for image in images]
+    distances = []
+    for head, (x, own), (y, _) in zip(weights.heads, *maps, strict=True):
+        x, y = at_least_float32((x, y))
+        different = jnp.sum(head * jnp.square(_unit(x) - _unit(y)), axis=-1)
+        distances.append(jnp.mean(different) if own is None else jnp.sum(different) / (own[0] * own[1]))
+    return jnp.stack(distances)
 
 
-def lpips(weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Scalar:
+def lpips(
+    weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
+) -> Scalar:
     """The distance of two images in [0, 1]; 0 for equal ones.
 
+    size: height and width of the images where both were padded below and right: the distance is that of the images without
+    padding, so that images of several sizes share a program.
     Raises: ValueError for images that are too small (16 pixels a side for vgg, 31 for alex, 25 for squeeze).
     """
-    return jnp.sum(lpips_distances(weights, predicted, target))
+    return jnp.sum(lpips_distances(weights, predicted, target, size))

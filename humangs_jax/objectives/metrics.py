@@ -5,7 +5,6 @@ import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Scalar
 from humangs_jax.core.numerics import safe_divide
-from humangs_jax.objectives.ssim import SIGMA, WINDOW
 
 LARGEST_PSNR = 100.0
 """dB reported for equal images, whose PSNR is infinite and would spoil any mean."""
@@ -15,8 +14,8 @@ OUTLINE = 3 / 256
 """Half the width of the band at the outline, of the image's side."""
 
 
-def decibels(mean_squared_error: Scalar) -> Scalar:
-    """PSNR of a mean squared error of values in [0, 1], at most 100 dB."""
+def decibels(mean_squared_error: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """PSNR of mean squared errors of values in [0, 1], at most 100 dB."""
     return -10 * jnp.log10(jnp.maximum(mean_squared_error, 10 ** (-LARGEST_PSNR / 10)))
 
 
@@ -38,23 +37,22 @@ def fog(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
     return jnp.sum(partly) / jnp.maximum(jnp.sum(inside), 1)
 
 
-def outline_psnr(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray) -> float:
-    """PSNR in dB of two (h, w, 3) images in the band to either side of the outline of a mask (h, w), see `OUTLINE`."""
+def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
+    """Intersection over union of the pixels where alpha and where the mask is above a half; 1 where both are empty."""
+    drawn, inside = alpha > 0.5, mask > 0.5
+    union = jnp.sum(drawn | inside)
+    return jnp.where(union > 0, jnp.sum(drawn & inside) / jnp.maximum(union, 1), 1.0)
+
+
+def outline_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
+    """1 in the band to either side of the outline of a mask (h, w), see `OUTLINE`, 0 elsewhere; on the host."""
     from scipy.ndimage import distance_transform_edt
 
     inside = np.asarray(mask) > 0.5
     distance = np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside))
-    band = jnp.asarray(distance <= OUTLINE * len(inside), jnp.float32)
-    return float(masked_psnr(jnp.asarray(predicted), jnp.asarray(target), band))
+    return (distance <= OUTLINE * len(inside)).astype(np.float32)
 
 
-def ssim(predicted: np.ndarray, target: np.ndarray) -> float:
-    """Structural similarity of two (h, w, 3) images by scikit-image, on the host: window 11, Gaussian weights."""
-    from skimage.metrics import structural_similarity
-
-    predicted, target = np.clip(np.asarray(predicted), 0, 1), np.asarray(target)
-    return float(
-        structural_similarity(
-            predicted, target, win_size=WINDOW, sigma=SIGMA, gaussian_weights=True, data_range=1, channel_axis=-1
-        )
-    )
+def outline_psnr(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray) -> float:
+    """PSNR in dB of two (h, w, 3) images in the `outline_band` of a mask (h, w)."""
+    return float(masked_psnr(jnp.asarray(predicted), jnp.asarray(target), jnp.asarray(outline_band(mask))))

@@ -34,7 +34,8 @@ def perceptual_errors(vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Floa
     target = jax.lax.stop_gradient(target)
     images = [255 * image for image in at_least_float32((predicted, target))]
     mean = jnp.asarray(MEAN_COLOR, images[0].dtype)
-    pairs = zip(*([image, *feature_maps(vgg.weights, VGG19, image - mean)] for image in images), strict=True)
+    maps = [[x for x, _ in feature_maps(vgg.weights, VGG19, image - mean)] for image in images]
+    pairs = zip(*([image, *features] for image, features in zip(images, maps, strict=True)), strict=True)
     return jnp.stack([jnp.mean(absolute(x - y)) for x, y in map(at_least_float32, pairs)])
 
 

@@ -8,15 +8,14 @@ import sys
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from evaluation_cases import capture_from, random_lpips
 
-from experiments.evaluation import bodies, body_cases, results, subjects, synthetic
+from experiments.evaluation import bodies, body_cases, subjects, synthetic
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables, save_weights
-from humangs_jax.objectives.backbones import channels, random_weights
-from humangs_jax.objectives.lpips import BACKBONES, Lpips, lpips
+from humangs_jax.objectives.lpips import lpips
 
 SMALL = ("--held-out", "1", "--poses", "1", "--pose-views", "1", "--size", "48")
 
@@ -33,20 +32,20 @@ def run(script, monkeypatch, *arguments):
     script.main()
 
 
-def test_lpips_is_missing_without_weights():
-    assert subjects.lpips_scorer(None)(np.zeros((1, 8, 8, 3)), np.ones((1, 8, 8, 3))) is None
-    row = {key: None if "lpips" in key else 0.5 for key in results.COLUMNS}
-    assert results.table_row(row).split().count("-") == 2
-
-
-def test_lpips_is_the_mean_over_views_of_clipped_images():
-    heads = tuple(jnp.ones(count) for count in channels(BACKBONES["alex"]))
-    weights = Lpips(random_weights(jax.random.key(0), BACKBONES["alex"]), heads, "alex")
-    truth, predicted = np.random.default_rng(0).random((2, 2, 32, 32, 3)).astype(np.float32)
-    predicted += 0.5
-    found = subjects.lpips_scorer(weights)(predicted, truth)
-    expected = [float(jax.jit(lpips)(weights, *pair)) for pair in zip(np.clip(predicted, 0, 1), truth, strict=True)]
-    assert np.isclose(found, np.mean(expected), rtol=1e-6) and found > 0
+@pytest.mark.slow
+def test_scores_by_task_are_means_over_views():
+    """With LPIPS of any net; without weights it is missing."""
+    rng, frames = np.random.default_rng(0), np.asarray([0, 0, 1])
+    truth, drawn = rng.random((2, 3, 48, 48, 3)).astype(np.float32)
+    held_out = capture_from(truth, np.ones((3, 48, 48), np.float32), frames)
+    found = subjects.score_tasks(drawn + 0.5, held_out)
+    assert found["novel"]["psnr"] == pytest.approx(mean_psnr(drawn + 0.5, truth, frames == 0), abs=1e-4)
+    assert found["animation"]["psnr"] == pytest.approx(mean_psnr(drawn + 0.5, truth, frames == 1), abs=1e-4)
+    assert found["novel"]["lpips"] is None
+    weights = random_lpips("alex")
+    found = subjects.score_tasks(drawn + 0.5, held_out, weights)["animation"]["lpips"]
+    expected = jax.jit(lpips)(weights, np.clip(drawn[2] + 0.5, 0, 1), truth[2])
+    assert found == pytest.approx(float(expected), rel=1e-5) and found > 0
 
 
 @pytest.mark.parametrize("script", [synthetic, bodies])
@@ -130,12 +129,11 @@ def test_bodies_see_the_same_photos_and_what_they_cost_is_noted(weights, tmp_pat
 
     monkeypatch.setattr(body_cases, "SMPLX_SEED_VERTICES", 600)
     monkeypatch.setattr("humangs_jax.avatar.reconstruct.reconstruct", reconstructed)
+    drawn = lambda avatar, views: held_out.append(views) or SimpleNamespace(images=drawings["ours"](views))
+    monkeypatch.setattr("humangs_jax.evaluation.cases.draw_views", drawn)
+    monkeypatch.setattr("humangs_jax.evaluation.baseline.painted_body", lambda inputs: None)
     monkeypatch.setattr(
-        subjects, "draw_avatar", lambda avatar, views: held_out.append(views) or drawings["ours"](views)
-    )
-    monkeypatch.setattr("humangs_jax.avatar.evaluate.painted_body", lambda inputs: None)
-    monkeypatch.setattr(
-        "humangs_jax.avatar.evaluate.draw_painted_body", lambda colors, views: drawings["painted"](views)
+        "humangs_jax.evaluation.baseline.draw_painted_body", lambda colors, views: drawings["painted"](views)
     )
     page, out, sheet = tmp_path / "page.md", tmp_path / "a.json", tmp_path / "bodies.png"
     page.write_text("<!-- table: evaluation_bodies -->\n<!-- end -->\n")

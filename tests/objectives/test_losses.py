@@ -13,7 +13,7 @@ from humangs_jax.objectives.losses import (
     tightness,
     translucency,
 )
-from humangs_jax.objectives.metrics import LARGEST_PSNR, OUTLINE, fog, masked_psnr, outline_psnr, psnr, ssim
+from humangs_jax.objectives.metrics import LARGEST_PSNR, OUTLINE, fog, masked_psnr, outline_psnr, psnr, silhouette_iou
 
 SIDE = 256
 FLOAT32 = 1e-6
@@ -55,10 +55,12 @@ def test_masked_psnr_looks_at_the_mask_alone():
     assert float(masked_psnr(predicted, target, jnp.zeros((8, 8)))) == LARGEST_PSNR
 
 
-def test_ssim_of_the_clipped_prediction():
-    target = np.random.default_rng(0).random((16, 16, 3))
-    target[0] = 1.0
-    assert ssim(np.where(target == 1.0, 3.0, target), target) == 1.0
+def test_silhouettes_are_compared_at_a_half():
+    mask = np.zeros((4, 6), np.float32)
+    mask[:, :3] = 0.6
+    alpha = np.roll(mask, 1, axis=1) + 0.4 * (mask == 0)
+    assert float(silhouette_iou(jnp.asarray(alpha), jnp.asarray(mask))) == pytest.approx(2 / 4)
+    assert float(silhouette_iou(jnp.zeros((4, 6)), jnp.zeros((4, 6)))) == 1
 
 
 def test_without_tight_gaussians_there_is_no_tightness():

@@ -1,6 +1,4 @@
-"""Scores of an avatar on photos of new views, and the simplest baseline to compare with."""
-
-import dataclasses
+"""The simplest baseline to compare an avatar with: the body, painted with the photos."""
 
 import jax
 import jax.numpy as jnp
@@ -15,33 +13,7 @@ from humangs_jax.network.pixel_aligned import (
     project_vertices,
     visible_vertices,
 )
-from humangs_jax.objectives import metrics
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
-
-
-@dataclasses.dataclass(frozen=True)
-class Scores:
-    """Means over views. psnr and psnr_foreground in dB, ssim by scikit-image, foreground: share of the true mask."""
-
-    psnr: float
-    ssim: float
-    psnr_foreground: float
-    foreground: float
-
-
-def score(predicted: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
-    """Compare images with a capture's photos, view by view. Raises ValueError if the capture has no masks."""
-    if truth.masks is None:
-        raise ValueError("the foreground PSNR needs a mask for every view")
-    views = range(truth.view_count)
-    images, masks = jnp.asarray(truth.images), jnp.asarray(truth.masks)
-    clipped = jnp.clip(jnp.asarray(predicted), 0, 1)
-    return Scores(
-        psnr=float(np.mean([metrics.psnr(clipped[i], images[i]) for i in views])),
-        ssim=float(np.mean([metrics.ssim(np.asarray(clipped[i]), truth.images[i]) for i in views])),
-        psnr_foreground=float(np.mean([metrics.masked_psnr(clipped[i], images[i], masks[i]) for i in views])),
-        foreground=float(np.mean(truth.masks)),
-    )
 
 
 def painted_body(inputs: Capture) -> Float[Array, "n 3"]:

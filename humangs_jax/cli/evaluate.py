@@ -1,0 +1,96 @@
+"""`humangs evaluate`: scores of reconstructions, avatars or any program's images under a protocol."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import OmitArgPrefixes, Positional
+
+from humangs_jax.cli.options import require_at_least, require_parent, require_suffix
+
+
+@dataclasses.dataclass(frozen=True)
+class LpipsFiles:
+    """Weights of LPIPS, each a file of the backbone and, if that has none, one of the heads (docs/loss_networks.md)."""
+
+    lpips_vgg: tuple[Path, ...] = ()
+    """LPIPS of vgg. Default: it is left out."""
+    lpips_alex: tuple[Path, ...] = ()
+    """LPIPS of alex."""
+    lpips_squeeze: tuple[Path, ...] = ()
+    """LPIPS of squeeze."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """Score new views of people against photos (docs/evaluation.md).
+
+    With --weights (or nothing: the shipped ones) people are reconstructed from input photos and compared on the other views;
+    --avatar compares avatars; --predictions compares images that any program has rendered, by their file names.
+    """
+
+    lpips: OmitArgPrefixes[LpipsFiles]
+    source: Positional[Path]
+    """A capture folder, or a folder of them."""
+    avatar: Path | None = None
+    """File written by `humangs reconstruct`, or a folder with PERSON.npz."""
+    weights: Path | None = None
+    """Network weights (.safetensors)."""
+    predictions: Path | None = None
+    """Folder with PERSON/VIEW.png, named like the photos; VIEW.png for one capture."""
+    protocol: Literal["humangs", "animatable-gaussians", "ghg", "giga", "lhm", "lhm++", "lvsm"] = "humangs"
+    """Whose backgrounds, crops, networks and SSIM."""
+    inputs: int | None = None
+    """How many photos are inputs, evenly spaced. Default: 4."""
+    indices: Path | None = None
+    """JSON that says which views are inputs and targets: {"PERSON": {"context": [...], "target": [...]}}."""
+    json: Path | None = None
+    """Write all numbers here."""
+    html: Path | None = None
+    """Write a page with inputs, truth, ours and error, worst first."""
+    csv: Path | None = None
+    """Write one line an image."""
+    markdown: Path | None = None
+    """Write a table of people."""
+    latex: Path | None = None
+    """Write the same table for LaTeX (package booktabs)."""
+    page_images: int = 120
+    """Images that the page shows."""
+
+    def run(self) -> None:
+        require_at_least(0, page_images=self.page_images)
+        if self.inputs is not None:
+            require_at_least(1, inputs=self.inputs)
+        files = {"json": self.json, "html": self.html, "csv": self.csv, "markdown": self.markdown, "latex": self.latex}
+        suffixes = {"json": ".json", "html": ".html", "csv": ".csv", "markdown": ".md", "latex": ".tex"}
+        for name, path in files.items():
+            if path is not None:
+                require_parent(path, f"--{name}")
+                require_suffix(path, (suffixes[name],), f"--{name}")
+        from humangs_jax.evaluation.run import evaluate
+        from humangs_jax.objectives.loss_networks import load_lpips
+
+        networks = []
+        for net in ("vgg", "alex", "squeeze"):
+            if found := getattr(self.lpips, f"lpips_{net}"):
+                if len(found) > 2:
+                    raise ValueError(
+                        f"--lpips-{net}: expected a backbone and at most one file of heads, got {len(found)}"
+                    )
+                networks.append(load_lpips(net, *found))
+        result = evaluate(
+            self.source,
+            avatar=self.avatar,
+            weights=self.weights,
+            predictions=self.predictions,
+            protocol=self.protocol,
+            inputs=self.inputs,
+            indices=self.indices,
+            lpips=networks,
+            page_images=self.page_images if self.html is not None else 0,
+            progress=True,
+        )
+        print(result.summary())
+        result.write(**files)
+        for path in filter(None, files.values()):
+            print(path)

@@ -1,0 +1,333 @@
+"""Who is compared with what: people from capture folders, captures or a `Source`, and the methods that predict their views."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import capture_renderings
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.core.array_types import Float, Int
+from humangs_jax.data.capture import Capture, load_capture
+from humangs_jax.data.loading.captures import find_captures
+from humangs_jax.data.loading.examples import Source
+from humangs_jax.data.photos import capture_folder
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.io.images import read_image
+from humangs_jax.io.text import read_json
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.parts import Variables
+
+HELD_OUT = "held_out"
+"""A capture in this folder of another one has views that are no inputs; `humangs synth` writes them."""
+DEFAULT_INPUTS = 4
+SUFFIXES = (".png", ".jpg", ".jpeg")
+Indices = Mapping[str, Mapping[str, Sequence[int]]]
+"""By person: "context", the views that are inputs, and "target", those to compare with, by their numbers in the capture."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Case:
+    """One person. truth: the views to compare with. inputs: the photos that a reconstruction may see; None: not known."""
+
+    name: str
+    truth: Capture
+    inputs: Capture | None = None
+
+
+class People(NamedTuple):
+    """Cases by name, each loaded when it is asked for."""
+
+    names: tuple[str, ...]
+    load: Callable[[int], Case]
+
+
+class Predicted(NamedTuple):
+    """What a method shows of a case's views: images (v, h, w, 3) in [0, 1], alpha (v, h, w) or None, and of which views;
+    missing: what was not found.
+    """
+
+    images: Float[np.ndarray, "v h w 3"]
+    alpha: Float[np.ndarray, "v h w"] | None
+    views: tuple[int, ...]
+    missing: tuple[str, ...] = ()
+
+
+Method = Callable[[Case, float], Predicted]
+"""(case, grey of the background) -> what it predicts."""
+
+
+def find_people(
+    source: str | Path | Capture | Case | Source | Iterable[Case],
+    inputs: int | None = None,
+    indices: Indices | None = None,
+    body: BodyModel | None = None,
+    reconstructs: bool = True,
+) -> People:
+    """The people of a source.
+
+    Arguments:
+        source: a capture folder or a folder of them, a capture, cases, or a `Source`, whose examples give inputs and targets and
+            whose parameters belong to `body` (default: the one that comes with the package).
+        inputs: how many photos are inputs: evenly spaced around the person, of the first view's frame. Default: 4, or all of them
+            where a capture with a folder held_out has fewer. indices: says it by person instead.
+        reconstructs: whether the method needs inputs. One that does not, and is given neither `inputs` nor `indices`, is compared
+            with every view of a capture that has nothing held out.
+
+    Raises: ValueError naming what is wrong; CaptureError when a capture is loaded.
+    """
+    if isinstance(source, Case):
+        return People((source.name,), lambda index: source)
+    if isinstance(source, Capture):
+        return People(("capture",), lambda index: _split("capture", source, inputs, indices, reconstructs))
+    if isinstance(source, str | Path):
+        folders = find_captures(capture_folder(source))
+        names = tuple(folder.name for folder in folders)
+        if indices is not None and (unknown := [name for name in indices if name not in names]):
+            raise ValueError(f"indices: {unknown[0]!r} is no capture in {source}")
+        load = lambda index: _load(folders[index], inputs, indices, body, reconstructs)
+        return People(names, load)
+    if isinstance(source, Source):
+        names = tuple(f"{index:04d}" for index in range(len(source)))
+        return People(names, lambda index: _from_source(source, index, names[index], inputs, body))
+    cases = list(source)
+    return People(tuple(case.name for case in cases), cases.__getitem__)
+
+
+def read_indices(path: str | Path) -> Indices:
+    """{person: {"context": [...], "target": [...]}} from a JSON file. Raises: FileError; ValueError naming file and key."""
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: expected an object with a person for each key, got {type(content).__name__}")
+    for name, views in content.items():
+        for key in ("context", "target"):
+            numbers = views.get(key) if isinstance(views, dict) else None
+            if not isinstance(numbers, list) or any(type(i) is not int or i < 0 for i in numbers):
+                raise ValueError(
+                    f"{path}: {name}.{key}: expected a list of view numbers from 0, got {str(numbers)[:40]}"
+                )
+    return content
+
+
+def _load(folder, inputs, indices, body, reconstructs):
+    capture, held_out = load_capture(folder, body=body), folder / HELD_OUT
+    if indices is not None or not (held_out / "capture.json").is_file():
+        return _split(folder.name, capture, inputs, indices, reconstructs)
+    first = int(np.sum(np.asarray(capture.frames) == capture.frames[0]))
+    count = min(DEFAULT_INPUTS, first) if inputs is None else inputs
+    chosen = spread_views(folder.name, capture.frames, np.asarray(capture.cameras.cam_from_world), count)
+    return Case(folder.name, load_capture(held_out, body=capture.body), capture.select(chosen))
+
+
+def _split(name, capture, inputs, indices, reconstructs):
+    """Inputs and targets of one capture."""
+    cam_from_world = np.asarray(capture.cameras.cam_from_world)
+    chosen, targets = choose_views(name, capture.frames, cam_from_world, inputs, indices, reconstructs)
+    return Case(name, capture.select(targets), capture.select(chosen) if chosen else None)
+
+
+def choose_views(
+    name: str,
+    frames: Int[np.ndarray, " v"],
+    cam_from_world: Float[np.ndarray, "v 4 4"],
+    inputs: int | None = None,
+    indices: Indices | None = None,
+    reconstructs: bool = True,
+) -> tuple[list[int], list[int]]:
+    """The views of a person that are inputs, and those to compare with; see `find_people`.
+
+    Raises: ValueError naming the person.
+    """
+    count = len(frames)
+    if indices is not None:
+        if name not in indices:
+            raise ValueError(f"indices: {name!r} is missing")
+        chosen, targets = (list(indices[name].get(key, ())) for key in ("context", "target"))
+        if not targets or not all(0 <= i < count for i in (*chosen, *targets)):
+            raise ValueError(f"indices: {name}: expected views from 0 to {count - 1} and at least one target")
+        return chosen, targets
+    if inputs is None and not reconstructs:
+        return [], list(range(count))
+    chosen = spread_views(name, frames, cam_from_world, DEFAULT_INPUTS if inputs is None else inputs)
+    targets = [i for i in range(count) if i not in chosen]
+    if not targets:
+        raise ValueError(f"{name}: {count} views, all of them inputs: none is left to compare with")
+    return chosen, targets
+
+
+def spread_views(
+    name: str, frames: Int[np.ndarray, " v"], cam_from_world: Float[np.ndarray, "v 4 4"], count: int
+) -> list[int]:
+    """Views of the first view's frame, that one among them, evenly spaced around the person; in order. Raises: ValueError."""
+    same = np.flatnonzero(np.asarray(frames) == frames[0])
+    if not 1 <= count <= len(same):
+        raise ValueError(f"{name}: {count} inputs, but {len(same)} views show the first frame")
+    centers = -np.einsum("vji,vj->vi", cam_from_world[same, :3, :3], cam_from_world[same, :3, 3])
+    away = centers - centers.mean(axis=0)
+    azimuths = np.arctan2(away[:, 0], away[:, 2])
+    around = same[np.argsort((azimuths - azimuths[0]) % (2 * np.pi), kind="stable")]
+    return sorted(int(around[i * len(same) // count]) for i in range(count))
+
+
+def _from_source(source, index, name, inputs, body):
+    count = inputs or (DEFAULT_INPUTS if DEFAULT_INPUTS in source.input_counts else source.input_counts[0])
+    example = source.example(0, index, count)
+    body = load_body() if body is None else body
+    return Case(name, capture_of(example.targets, body), capture_of(example.inputs, body))
+
+
+def capture_of(views: SubjectViews, body: BodyModel) -> Capture:
+    """Views of a source as a capture: equal poses are one frame, names are numbers."""
+    views = jax.tree.map(np.asarray, views)
+    count = len(views.images) if views.view_count is None else int(views.view_count)
+    poses = np.concatenate([views.rotations.reshape(len(views.images), -1), views.translations], axis=1)[:count]
+    _, first, frames = np.unique(poses, axis=0, return_index=True, return_inverse=True)
+    numbers = np.argsort(np.argsort(first))  # frames in the order in which they appear
+    first = np.sort(first)
+    return Capture(
+        images=np.asarray(views.images[:count], np.float32),
+        masks=np.asarray(views.masks[:count], np.float32),
+        cameras=jax.tree.map(lambda leaf: jnp.asarray(leaf[:count]), views.cameras),
+        frames=numbers[frames.ravel()].astype(np.int32),
+        body=body,
+        betas=views.betas,
+        poses=jax.vmap(BodyPose)(jnp.asarray(views.rotations[first]), jnp.asarray(views.translations[first])),
+        names=tuple(f"{i:03d}" for i in range(count)),
+    )
+
+
+# Methods -------------------------------------------------------------------------------------------------------------
+
+
+def draw_views(avatar: Avatar, views: Capture, background: float = 1.0) -> Predicted:
+    """An avatar in the poses and from the cameras of a capture."""
+    drawn = capture_renderings(avatar, views, jnp.full(3, background))[1]
+    images = np.stack([np.clip(np.asarray(rendering.rgb), 0, 1) for rendering in drawn])
+    alpha = np.stack([np.asarray(rendering.alpha) for rendering in drawn])
+    return Predicted(images, alpha, tuple(range(len(images))))
+
+
+def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
+    """One avatar, or a folder of them, PERSON.npz each; those that are not there are missing.
+
+    Raises: ValueError for one avatar and several people; OSError.
+    """
+    if not isinstance(avatar, Avatar) and Path(avatar).is_dir():
+        folder = Path(avatar)
+
+        def one_of(case: Case, background: float) -> Predicted:
+            file = folder / f"{case.name}.npz"
+            if not file.is_file():
+                return _nothing(case, (str(file),))
+            return draw_views(Avatar.load(file), case.truth, background)
+
+        return one_of
+    if people != 1:
+        raise ValueError(f"one avatar for {people} people: expected a folder with PERSON.npz for each")
+    loaded = avatar if isinstance(avatar, Avatar) else Avatar.load(avatar)
+    return lambda case, background: draw_views(loaded, case.truth, background)
+
+
+def weights_method(variables: Variables, config: HumanGSConfig) -> Method:
+    """Reconstruction from the inputs of a case."""
+
+    def method(case: Case, background: float) -> Predicted:
+        if case.inputs is None:
+            raise ValueError(f"{case.name}: no inputs to reconstruct from")
+        return draw_views(reconstruct(variables, config, case.inputs), case.truth, background)
+
+    return method
+
+
+def predictions_method(folder: str | Path, people: int) -> Method:
+    """Images that another program rendered: FOLDER/PERSON/VIEW.png (or .jpg), FOLDER/VIEW.png where there is one person.
+
+    VIEW is the file name of the true photo without its suffix, or view_NNN as `humangs render` numbers them. An alpha channel is
+    the coverage, and the colours are put on the background; without one the image is on the protocol's background already.
+    Raises: FileNotFoundError if the folder does not exist.
+    """
+    root = Path(folder)
+    if not root.is_dir():
+        raise FileNotFoundError(f"{root}: no such folder of predictions")
+
+    def method(case: Case, background: float) -> Predicted:
+        place = root / case.name if people > 1 or (root / case.name).is_dir() else root
+        files = {name: _prediction(place, name, i) for i, name in enumerate(case.truth.names)}
+        missing = tuple(str(place / f"{name}.png") for name, file in files.items() if file is None)
+        found = [(i, file) for i, file in enumerate(files.values()) if file is not None]
+        if not found:
+            return _nothing(case, missing)
+        size = case.truth.images.shape[1:3]
+        read = [_read_prediction(file, size, background) for _, file in found]
+        coverage = [alpha for _, alpha in read if alpha is not None]
+        if coverage and len(coverage) < len(read):
+            raise ValueError(
+                f"{place}: {len(coverage)} of {len(read)} images have an alpha channel: expected all or none"
+            )
+        images = np.stack([image for image, _ in read])
+        return Predicted(images, np.stack(coverage) if coverage else None, tuple(i for i, _ in found), missing)
+
+    return method
+
+
+def _prediction(place, name, index):
+    candidates = (place / f"{stem}{suffix}" for stem in (name, f"view_{index:03d}") for suffix in SUFFIXES)
+    return next((file for file in candidates if file.is_file()), None)
+
+
+def _read_prediction(file, size, background):
+    image, alpha = read_image(file)
+    if image.shape[:2] != size:
+        sizes = " x ".join(map(str, image.shape[1::-1])), " x ".join(map(str, size[::-1]))
+        raise ValueError(f"{file}: size {sizes[0]}, but the true image has {sizes[1]}: expected the same")
+    if alpha is not None:
+        image = image * alpha[..., None] + background * (1 - alpha[..., None])
+    return image, alpha
+
+
+def _nothing(case, missing):
+    return Predicted(case.truth.images[:0], None, (), missing)
+
+
+@functools.cache
+def shipped_weights() -> tuple[Variables, HumanGSConfig]:
+    """The network that comes with the package."""
+    from humangs_jax.network.weights import load_weights
+
+    return load_weights()
+
+
+def choose_method(
+    people: int,
+    avatar: str | Path | Avatar | None = None,
+    weights: str | Path | tuple[Variables, HumanGSConfig] | None = None,
+    predictions: str | Path | None = None,
+    method: Method | None = None,
+) -> tuple[str, Method]:
+    """What is asked for, by a name for reports; the shipped weights if nothing is. Raises: ValueError for more than one."""
+    given: dict[str, Any] = {"avatar": avatar, "weights": weights, "predictions": predictions, "method": method}
+    asked = [name for name, value in given.items() if value is not None]
+    if len(asked) > 1:
+        raise ValueError(f"{' and '.join(asked)}: expected one of them")
+    if avatar is not None:
+        name = "avatar" if isinstance(avatar, Avatar) else Path(avatar).name
+        return name, avatar_method(avatar, people)
+    if predictions is not None:
+        return Path(predictions).name, predictions_method(predictions, people)
+    if method is not None:
+        return getattr(method, "__name__", "method"), method
+    if isinstance(weights, str | Path):
+        from humangs_jax.network.weights import load_weights
+
+        return Path(weights).name, weights_method(*load_weights(weights))
+    if weights is None:
+        return "shipped weights", weights_method(*shipped_weights())
+    return "weights", weights_method(*weights)

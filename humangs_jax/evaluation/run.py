@@ -1,0 +1,244 @@
+"""One evaluator: people from any source, any method, any protocol -> scores of every image, tables and a page."""
+
+import dataclasses
+import functools
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.body.model import BodyModel
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.loading.examples import Source
+from humangs_jax.evaluation.cases import Case, Indices, Method, choose_method, find_people, read_indices
+from humangs_jax.evaluation.protocol import EvaluationProtocol, find_protocol
+from humangs_jax.evaluation.report import Gallery, page_html
+from humangs_jax.evaluation.scores import missing_reasons, on_background, score_names, score_views
+from humangs_jax.evaluation.tables import (
+    COLUMNS,
+    CONFIDENCE,
+    ORDER,
+    Mean,
+    Row,
+    Scored,
+    csv_text,
+    latex_table,
+    markdown_table,
+    overall_means,
+    person_means,
+    shown,
+    shown_mean,
+)
+from humangs_jax.io.atomic import write_text
+from humangs_jax.io.text import write_json
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.parts import Variables
+from humangs_jax.objectives.lpips import Lpips
+
+PAGE_IMAGES = 120
+"""Images that a page shows, the worst first; the others are rows of its table."""
+LISTED = 5
+"""Missing files that a line names."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Evaluation:
+    """What `evaluate` returns.
+
+    rows: one an image, in the order of the people. reasons: why scores are missing, by name. missing: predictions that were not
+    found. about: what was compared, for reports. gallery: the images of the page.
+    """
+
+    name: str
+    protocol: EvaluationProtocol
+    protocol_name: str
+    rows: tuple[Scored, ...]
+    reasons: dict[str, str]
+    missing: tuple[str, ...]
+    about: dict[str, Any]
+    gallery: Gallery
+
+    @functools.cached_property
+    def people(self) -> dict[str, Row]:
+        """Mean scores by person."""
+        return person_means(self.rows)
+
+    @functools.cached_property
+    def means(self) -> dict[str, Mean | None]:
+        """Mean scores over all, each with its interval."""
+        return overall_means(self.rows)
+
+    def summary(self) -> str:
+        """Lines for the terminal."""
+        lines = [f"{self.name}, protocol {self.protocol_name}: {self.about['counts']}"]
+        for name, mean in self.means.items():
+            if mean is not None:
+                lines.append(f"  {COLUMNS[name].heading:24} {shown_mean(mean, name)}")
+        return "\n".join([*lines, *self.notes()])
+
+    def notes(self) -> list[str]:
+        """What a reader must know besides."""
+        notes = [f"Each number is the {ORDER}."]
+        if any(mean is not None and mean.low is not None for mean in self.means.values()):
+            over = next(mean.over for mean in self.means.values() if mean is not None)
+            notes.append(f"Intervals: {CONFIDENCE:.0%} of the mean under resampling of {over} (bootstrap).")
+        for reason in dict.fromkeys(self.reasons.values()):
+            scores = [COLUMNS[name].heading for name, why in self.reasons.items() if why == reason]
+            notes.append(f"Missing: {', '.join(scores)}: {reason}.")
+        side = self.protocol.published_side
+        if side is not None and self.about["sides"] != [[side, side]]:
+            found = ", ".join(f"{width} x {height}" for width, height in self.about["sides"])
+            notes.append(
+                f"Published numbers of this protocol are of {side} x {side} pixels; these images have {found}."
+            )
+        if self.about["everything"]:
+            notes.append(
+                "Compared on all views of the captures: if some of them were inputs, name those that were not."
+            )
+        if self.missing:
+            notes.append(f"{_counted(len(self.missing), 'prediction', 'predictions')} missing: {_listed(self.missing)}")
+        return notes
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything but the images, as plain values."""
+        means = {name: None if mean is None else mean._asdict() for name, mean in self.means.items()}
+        return {
+            "name": self.name,
+            "protocol": {"name": self.protocol_name, "settings": _plain(self.protocol)},
+            "about": self.about,
+            "order": ORDER,
+            "means": means,
+            "missing_scores": self.reasons,
+            "missing_predictions": list(self.missing),
+            "people": self.people,
+            "images": [row._asdict() for row in self.rows],
+        }
+
+    def tables(self) -> tuple[list[str], list[list[str]]]:
+        """Header and rows: a person each, then the mean."""
+        names = [name for name, mean in self.means.items() if mean is not None]
+        header = ["person", *(COLUMNS[name].heading for name in names)]
+        rows = [[person, *(shown(row[name], name) for name in names)] for person, row in self.people.items()]
+        return header, [*rows, ["mean", *(shown_mean(self.means[name], name) for name in names)]]
+
+    def write(
+        self,
+        *,
+        json: str | os.PathLike | None = None,
+        html: str | os.PathLike | None = None,
+        csv: str | os.PathLike | None = None,
+        markdown: str | os.PathLike | None = None,
+        latex: str | os.PathLike | None = None,
+    ) -> None:
+        """Write what is named: all numbers; the page; a line an image; tables of people. Raises: OSError."""
+        if json is not None:
+            write_json(json, self.to_json())
+        if csv is not None:
+            write_text(csv, csv_text(self.rows))
+        if markdown is not None:
+            write_text(markdown, markdown_table(*self.tables()))
+        if latex is not None:
+            write_text(latex, latex_table(*self.tables()))
+        if html is not None:
+            write_text(html, page_html(self.to_json(), self.notes(), self.gallery))
+
+
+def evaluate(
+    source: str | Path | Capture | Case | Source | Iterable[Case],
+    *,
+    avatar: str | Path | Avatar | None = None,
+    weights: str | Path | tuple[Variables, HumanGSConfig] | None = None,
+    predictions: str | Path | None = None,
+    method: Method | None = None,
+    protocol: str | EvaluationProtocol = "humangs",
+    inputs: int | None = None,
+    indices: str | Path | Indices | None = None,
+    lpips: Sequence[Lpips] = (),
+    body: BodyModel | None = None,
+    page_images: int = PAGE_IMAGES,
+    progress: bool = False,
+) -> Evaluation:
+    """Score a method on the people of a source.
+
+        hg.evaluate("people", weights="weights.safetensors", protocol="lhm").write(json="scores.json", html="scores.html")
+
+    Arguments:
+        source, inputs, indices, body: see `cases.find_people`; indices may be a JSON file.
+        avatar: a file, or a folder with PERSON.npz. weights: a file, or (variables, config). predictions: a folder of images, see
+            `cases.predictions_method`. method: a function. One of them; the shipped weights if none is given.
+        protocol: a name in `PROTOCOLS`, or a protocol of one's own.
+        lpips: networks from `objectives.loss_networks.load_lpips`; LPIPS of a net that is not given is None, with the reason.
+        page_images: how many images are kept for the page, the worst ones.
+
+    Raises: ValueError or OSError, one line: unknown protocol, nothing to compare, sizes that differ, files that cannot be read.
+    """
+    rules = find_protocol(protocol)
+    networks = {weights.net: weights for weights in lpips}
+    choice = read_indices(indices) if isinstance(indices, str | Path) else indices
+    people = find_people(source, inputs, choice, body, avatar is None and predictions is None and method is None)
+    name, predict = choose_method(len(people.names), avatar, weights, predictions, method)
+    rows, missing, sides, shown_inputs = [], [], set(), []
+    masks, alphas, everything = True, True, False
+    gallery = Gallery(page_images)
+    for index in _progress(range(len(people.names)), progress):
+        case = people.load(index)
+        predicted = predict(case, rules.behind)
+        missing += predicted.missing
+        if not predicted.views:
+            continue
+        truth = case.truth.select(predicted.views)
+        masks, alphas = masks and truth.masks is not None, alphas and predicted.alpha is not None
+        everything |= case.inputs is None and isinstance(source, str | Path | Capture)
+        sides.add(truth.images.shape[2:0:-1])
+        if case.inputs is not None:
+            gallery.add_inputs(case.name, case.inputs.images)
+            shown_inputs.append(case.inputs.view_count)
+        try:
+            scored = list(score_views(predicted.images, truth, rules, predicted.alpha, networks))
+        except ValueError as error:
+            raise ValueError(f"{case.name}: {error}") from error
+        for i, scores in enumerate(scored):
+            row = Scored(case.name, int(truth.frames[i]), truth.names[i], scores)
+            mask = None if truth.masks is None else truth.masks[i]
+            gallery.add(len(rows), scores["psnr"], on_background(truth.images[i], mask, rules), predicted.images[i])
+            rows.append(row)
+    if not rows:
+        raise ValueError(f"no prediction was found; {len(missing)} were expected: {_listed(missing)}")
+    people_shown = {row.person for row in rows}
+    about = {
+        "source": str(source) if isinstance(source, str | Path) else type(source).__name__,
+        "counts": f"{_counted(len(rows), 'image', 'images')} of {_counted(len(people_shown), 'person', 'people')}",
+        "sides": sorted(map(list, sides)),
+        "inputs": sorted(set(shown_inputs)),
+        "everything": everything,
+    }
+    reasons = missing_reasons(rules, networks, masks, alphas)
+    unknown = [score for score in score_names(rules) if all(row.scores[score] is None for row in rows)]
+    reasons |= {
+        score: "no image is large enough, or shows enough of a person" for score in unknown if score not in reasons
+    }
+    label = protocol if isinstance(protocol, str) else "custom"
+    return Evaluation(name, rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
+
+
+def _progress(indices, progress):
+    from tqdm import tqdm
+
+    return tqdm(indices, desc="evaluate", unit="person", disable=not progress)
+
+
+def _listed(names):
+    return ", ".join(names[:LISTED]) + (", ..." if len(names) > LISTED else "")
+
+
+def _counted(count, one, many):
+    return f"{count} {one if count == 1 else many}"
+
+
+def _plain(value):
+    """Settings as JSON; the kind of a crop by the name of its class."""
+    if not dataclasses.is_dataclass(value):
+        return list(value) if isinstance(value, tuple) else value
+    fields = {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+    return fields if isinstance(value, EvaluationProtocol) else {"kind": type(value).__name__} | fields

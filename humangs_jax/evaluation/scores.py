@@ -1,0 +1,227 @@
+"""Scores of images against true ones under a protocol: pure jitted functions of one image, and the host's part around them.
+
+Images are padded below and right to few sizes (`buffers.round_up`) and their own size is passed along, so that an evaluation
+of photos and crops of any sizes compiles few programs. Padding changes no score: windows and pixels beyond the size do not
+count, and LPIPS sees zeros where its convolutions would.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
+from humangs_jax.data.capture import Capture
+from humangs_jax.evaluation.protocol import PROTOCOLS, EvaluationProtocol, WholeFrame
+from humangs_jax.evaluation.tables import Row, mean_scores
+from humangs_jax.objectives.backbones import smallest_side
+from humangs_jax.objectives.lpips import BACKBONES, Lpips, lpips
+from humangs_jax.objectives.metrics import decibels, fog, masked_psnr, outline_band, silhouette_iou
+from humangs_jax.objectives.ssim import SsimWindow, mean_similarity, similarity_map
+from humangs_jax.rendering.buffers import round_up
+
+PATCH, STRIDE = 64, 32
+"""Side and distance of the patches, pixels."""
+LEAST_FOREGROUND = 0.5
+"""Share of a patch that must be foreground, exceeded."""
+PATCHES_AT_ONCE = 16
+"""For LPIPS: as many pixels as one image of 256 x 256."""
+
+Networks = Mapping[str, Lpips]
+"""LPIPS by the name of its net."""
+
+
+@functools.partial(jax.jit, static_argnames="window")
+def pair_scores(
+    predicted: Float[Array, "h w 3"], truth: Float[Array, "h w 3"], size: Int[Array, "2"], window: SsimWindow
+) -> dict[str, Scalar]:
+    """psnr (dB) and ssim of two images in [0, 1], of which the first size[0] rows and size[1] columns count."""
+    rows, columns = (jnp.arange(side) < n for side, n in zip(truth.shape[:2], size, strict=True))
+    inside = (rows[:, None] & columns).astype(truth.dtype)
+    similarity = mean_similarity(similarity_map(predicted, truth, window), size - window.size + 1)
+    return {"psnr": masked_psnr(predicted, truth, inside), "ssim": similarity}
+
+
+@functools.partial(jax.jit, static_argnames="window")
+def person_scores(
+    predicted: Float[Array, "h w 3"],
+    truth: Float[Array, "h w 3"],
+    mask: Float[Array, "h w"],
+    band: Float[Array, "h w"],
+    size: Int[Array, "2"],
+    window: SsimWindow,
+) -> tuple[dict[str, Scalar], Bool[Array, "y x"]]:
+    """psnr_foreground, psnr_outline (both dB), patch_psnr, patch_ssim, of images as in `pair_scores`; and which patches count.
+
+    mask: coverage. band: 1 along its outline. Both 0 beyond the size. Without a patch that counts their scores are NaN.
+    """
+    shares = _patch_means(mask, PATCH)
+    within = [STRIDE * jnp.arange(side) + PATCH <= n for side, n in zip(shares.shape, size, strict=True)]
+    kept = (shares > LEAST_FOREGROUND) & within[0][:, None] & within[1]
+    errors = jnp.mean(jnp.square(predicted - truth), axis=-1)
+    similarities = jnp.mean(similarity_map(predicted, truth, window), axis=-1)
+    mean = lambda x: jnp.sum(jnp.where(kept, x, 0)) / jnp.sum(kept)
+    return {
+        "psnr_foreground": masked_psnr(predicted, truth, mask),
+        "psnr_outline": masked_psnr(predicted, truth, band),
+        "patch_psnr": mean(decibels(_patch_means(errors, PATCH))),
+        "patch_ssim": mean(_patch_means(similarities, PATCH - window.size + 1)),
+    }, kept
+
+
+def _patch_means(x, side):
+    """The mean of every square of that side, `STRIDE` apart."""
+    return lax.reduce_window(x, 0.0, lax.add, (side, side), (STRIDE, STRIDE), "VALID") / side**2
+
+
+@jax.jit
+def alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict[str, Scalar]:
+    """iou and fog of a rendering's coverage."""
+    return {"iou": silhouette_iou(alpha, mask), "fog": fog(alpha, mask)}
+
+
+def _precise_lpips(weights, predicted, truth, size=None):
+    with jax.default_matmul_precision("highest"):  # accelerators round the factors of convolutions by default
+        return lpips(weights, predicted, truth, size)
+
+
+_lpips = jax.jit(_precise_lpips)
+_lpips_of_patches = jax.jit(jax.vmap(_precise_lpips, in_axes=(None, 0, 0)))
+
+
+def score_image(
+    predicted: Float[np.ndarray, "h w 3"],
+    truth: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w"] | None,
+    alpha: Float[np.ndarray, "h w"] | None,
+    protocol: EvaluationProtocol,
+    networks: Networks,
+) -> Row:
+    """All scores of one image by name; None for what is not defined here, see `missing_reasons`.
+
+    predicted, truth: in [0, 1], on the protocol's background. mask: the true one. alpha: the prediction's coverage.
+    """
+    empty = mask is None or not (mask > 0.5).any()
+    predicted, window, row = np.clip(predicted, 0, 1), protocol.ssim, dict.fromkeys(score_names(protocol))
+    if protocol.masked and mask is not None:
+        predicted = predicted * mask[..., None] + protocol.behind * (1 - mask[..., None])
+    for crop, names in ((protocol.crop, ("psnr", "ssim")), (protocol.lpips_crop or protocol.crop, protocol.lpips)):
+        if empty and not isinstance(crop, WholeFrame):
+            continue
+        cut = lambda image, crop=crop: image if mask is None else crop.cut(image, mask, protocol.behind)
+        pair = [cut(image) for image in (predicted, truth)]
+        size, least = jnp.asarray(pair[0].shape[:2]), min(pair[0].shape[:2])
+        pair = [_padded(image) for image in pair]
+        if names is not protocol.lpips:
+            if least >= window.size:
+                row |= pair_scores(*pair, size, window)
+            continue
+        for net in protocol.lpips:
+            if net in networks and least >= smallest_side(BACKBONES[net]):
+                row[f"lpips_{net}"] = _lpips(networks[net], *pair, size)
+    if mask is not None:
+        row["foreground"] = np.mean(mask)
+        if alpha is not None:
+            row |= alpha_scores(_padded(alpha), _padded(mask))
+    if not empty:
+        frame = [_padded(x) for x in (predicted, truth, mask, outline_band(mask))]
+        scores, kept = person_scores(*frame, jnp.asarray(mask.shape), window)
+        kept = np.argwhere(kept)
+        row |= scores | {"patches": len(kept)}
+        if not len(kept):
+            row |= {"patch_psnr": None, "patch_ssim": None}
+        for net in protocol.lpips:
+            if net in networks and len(kept):
+                row[f"patch_lpips_{net}"] = _patch_lpips(networks[net], predicted, truth, STRIDE * kept)
+    return {name: None if value is None else float(value) for name, value in row.items()}
+
+
+def _padded(image):
+    """With zeros below and right, up to a size that many images share; on the device."""
+    missing = [(0, round_up(side) - side) for side in image.shape[:2]]
+    return jnp.asarray(np.pad(image, missing + [(0, 0)] * (image.ndim - 2)), jnp.float32)
+
+
+def _patch_lpips(weights, predicted, truth, corners):
+    """The mean over the patches with these upper left corners."""
+    pairs = [np.stack([x[i : i + PATCH, j : j + PATCH] for i, j in corners]) for x in (predicted, truth)]
+    total, count = 0.0, len(corners)
+    pairs = [np.pad(x, [(0, -count % PATCHES_AT_ONCE), (0, 0), (0, 0), (0, 0)], mode="edge") for x in pairs]
+    for start in range(0, count, PATCHES_AT_ONCE):
+        found = _lpips_of_patches(weights, *(x[start : start + PATCHES_AT_ONCE] for x in pairs))
+        total += float(jnp.sum(found[: count - start]))
+    return total / count
+
+
+def score_names(protocol: EvaluationProtocol) -> tuple[str, ...]:
+    """The scores of an image, in the order in which tables show them."""
+    nets = [f"lpips_{net}" for net in protocol.lpips]
+    person = ("psnr_foreground", "psnr_outline", "iou", "fog", "foreground")
+    return ("psnr", "ssim", *nets, *person, "patch_psnr", "patch_ssim", *(f"patch_{net}" for net in nets), "patches")
+
+
+def missing_reasons(protocol: EvaluationProtocol, networks: Networks, masks: bool, alpha: bool) -> dict[str, str]:
+    """Why scores are missing, by name. masks, alpha: whether truths have masks and predictions have alpha."""
+    reasons = {}
+    for name in score_names(protocol):
+        net = name.rpartition("lpips_")[2]
+        if "lpips" in name and net not in networks:
+            reasons[name] = f"no weights of LPIPS {net} were given (docs/loss_networks.md)"
+        elif name not in ("psnr", "ssim", f"lpips_{net}") and not masks:
+            reasons[name] = "the true images have no masks"
+        elif name in ("iou", "fog") and not alpha:
+            reasons[name] = "the predictions have no alpha channel"
+    return reasons
+
+
+def score_views(
+    predicted: Float[np.ndarray, "v h w 3"],
+    truth: Capture,
+    protocol: EvaluationProtocol = PROTOCOLS["humangs"],
+    alpha: Float[np.ndarray, "v h w"] | None = None,
+    networks: Networks | None = None,
+) -> Iterator[Row]:
+    """The scores of each view of a capture; see `score_image`. predicted: on the protocol's background.
+
+    Raises: ValueError if the sizes differ, or if the protocol needs masks that the capture lacks.
+    """
+    if predicted.shape != truth.images.shape:
+        raise ValueError(f"predicted images have shape {predicted.shape}, the true ones {truth.images.shape}")
+    if truth.masks is None and protocol.needs_masks:
+        raise ValueError("the protocol needs a mask for every view, and the capture has none")
+    for i in range(truth.view_count):
+        mask = None if truth.masks is None else np.asarray(truth.masks[i])
+        image = on_background(truth.images[i], mask, protocol)
+        yield score_image(predicted[i], image, mask, None if alpha is None else alpha[i], protocol, networks or {})
+
+
+def on_background(
+    image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"] | None, protocol: EvaluationProtocol
+) -> Float[np.ndarray, "h w 3"]:
+    """A photo of a capture, which is on white where its mask is known, as a protocol wants it."""
+    if protocol.background != "black" or mask is None:
+        return image
+    return np.clip(image - (1 - mask[..., None]), 0, 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scores:
+    """Means over views. psnr and psnr_foreground in dB, ssim by scikit-image, foreground: share of the true mask."""
+
+    psnr: float
+    ssim: float
+    psnr_foreground: float
+    foreground: float
+
+
+def score(predicted: Float[np.ndarray, "v h w 3"], truth: Capture) -> Scores:
+    """Compare images on white with a capture's photos. Raises: ValueError if the capture has no masks."""
+    if truth.masks is None:
+        raise ValueError("the foreground PSNR needs a mask for every view")
+    means = mean_scores(score_views(predicted, truth))
+    values = {field.name: means[field.name] for field in dataclasses.fields(Scores)}
+    return Scores(**{name: float("nan") if value is None else value for name, value in values.items()})

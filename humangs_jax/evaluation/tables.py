@@ -1,0 +1,177 @@
+"""Scores as data: means in a stated order, bootstrap intervals, and tables. Nothing here needs JAX.
+
+A mean is first over the images of a frame, then over the frames of a person, then over people: a person counts once, however
+often photographed. An interval is of the mean over people; with one person, over the frames; with one frame, over the images.
+"""
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Row = dict[str, float | None]
+"""Scores by name; None for what is missing."""
+ORDER = "mean over the images of a frame, then over the frames of a person, then over people"
+CONFIDENCE = 0.95
+RESAMPLES, BLOCKS = 2000, 20
+"""Of the bootstrap, and in how many parts it is computed, for memory."""
+
+
+class Column(NamedTuple):
+    """How a score is shown. better: "up", "down" or ""."""
+
+    heading: str
+    digits: int
+    better: str
+
+
+COLUMNS = {
+    "psnr": Column("PSNR", 2, "up"),
+    "ssim": Column("SSIM", 4, "up"),
+    "lpips_vgg": Column("LPIPS vgg", 4, "down"),
+    "lpips_alex": Column("LPIPS alex", 4, "down"),
+    "lpips_squeeze": Column("LPIPS squeeze", 4, "down"),
+    "psnr_foreground": Column("PSNR on the person", 2, "up"),
+    "psnr_outline": Column("PSNR at the outline", 2, "up"),
+    "iou": Column("IoU", 4, "up"),
+    "fog": Column("fog", 4, "down"),
+    "foreground": Column("share of the person", 3, ""),
+    "patch_psnr": Column("PSNR of patches", 2, "up"),
+    "patch_ssim": Column("SSIM of patches", 4, "up"),
+    "patch_lpips_vgg": Column("LPIPS vgg of patches", 4, "down"),
+    "patch_lpips_alex": Column("LPIPS alex of patches", 4, "down"),
+    "patch_lpips_squeeze": Column("LPIPS squeeze of patches", 4, "down"),
+    "patches": Column("patches", 1, ""),
+}
+
+
+class Scored(NamedTuple):
+    """An image's place and scores."""
+
+    person: str
+    frame: int
+    view: str
+    scores: Row
+
+
+class Mean(NamedTuple):
+    """A mean and its interval of `CONFIDENCE`; count: how many of `over` it is of. low and high are None for one."""
+
+    mean: float
+    low: float | None
+    high: float | None
+    count: int
+    over: str
+
+
+def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> Row:
+    """Means of the scores of some images or people; None for what one of them lacks."""
+    listed = list(rows)
+    columns = {name: [row.get(name) for row in listed] for name in listed[0]}
+    known = {name: [value for value in values if value is not None] for name, values in columns.items()}
+    return {name: sum(values) / len(values) if len(values) == len(listed) else None for name, values in known.items()}
+
+
+def known_mean(rows: Iterable[Mapping[str, float | None]], name: str) -> float | None:
+    """The mean of a score over those that have it, such as images with patches; None if none has."""
+    values = [value for row in rows if (value := row.get(name)) is not None]
+    return sum(values) / len(values) if values else None
+
+
+def grouped(rows: Sequence[Scored], key: Callable[[Scored], Any]) -> dict[Any, list[Scored]]:
+    """Rows by a key, in the order of first appearance."""
+    groups: dict[Any, list[Scored]] = {}
+    for row in rows:
+        groups.setdefault(key(row), []).append(row)
+    return groups
+
+
+def person_means(rows: Sequence[Scored]) -> dict[str, Row]:
+    """Scores by person: means over the images of a frame, then over frames."""
+    names = rows[0].scores
+    frames = {
+        place: {name: known_mean([row.scores for row in images], name) for name in names}
+        for place, images in grouped(rows, lambda row: (row.person, row.frame)).items()
+    }
+    people = dict.fromkeys(person for person, _ in frames)
+    return {
+        person: {name: known_mean([row for (who, _), row in frames.items() if who == person], name) for name in names}
+        for person in people
+    }
+
+
+def overall_means(rows: Sequence[Scored]) -> dict[str, Mean | None]:
+    """The mean of each score with its interval, see the head of this module; None for scores that no image has."""
+    people = person_means(rows)
+    frames = grouped(rows, lambda row: (row.person, row.frame))
+    if len(people) > 1:
+        over, units = "people", list(people.values())
+    elif len(frames) > 1:
+        over = "frames"
+        units = [
+            {name: known_mean([row.scores for row in images], name) for name in rows[0].scores}
+            for images in frames.values()
+        ]
+    else:
+        over, units = "images", [row.scores for row in rows]
+    found: dict[str, Mean | None] = {}
+    for name in rows[0].scores:
+        values = [value for unit in units if (value := unit[name]) is not None]
+        found[name] = Mean(float(np.mean(values)), *bootstrap(values), len(values), over) if values else None
+    return found
+
+
+def bootstrap(values: Sequence[float], seed: int = 0) -> tuple[float | None, float | None]:
+    """The percentile interval of the mean of some values under resampling (Efron, 1979); (None, None) for one value."""
+    if len(values) < 2:
+        return None, None
+    generator, numbers = np.random.default_rng(seed), np.asarray(values, np.float64)
+    drawn = lambda: generator.integers(len(numbers), size=(RESAMPLES // BLOCKS, len(numbers)))
+    means = np.concatenate([numbers[drawn()].mean(axis=1) for _ in range(BLOCKS)])
+    low, high = np.quantile(means, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+def shown(value: float | None, name: str) -> str:
+    """A score with its digits; a dash for a missing one."""
+    return "-" if value is None else f"{value:.{COLUMNS[name].digits}f}"
+
+
+def shown_mean(mean: Mean | None, name: str) -> str:
+    """A mean with its interval in brackets."""
+    if mean is None:
+        return "-"
+    interval = "" if mean.low is None else f" [{shown(mean.low, name)}, {shown(mean.high, name)}]"
+    return shown(mean.mean, name) + interval
+
+
+def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """The first column to the left, the others to the right."""
+    rule = ["---", *["---:"] * (len(header) - 1)]
+    escape = lambda cell: cell.replace("|", "\\|")
+    return "\n".join("| " + " | ".join(map(escape, row)) + " |" for row in (header, rule, *rows)) + "\n"
+
+
+_LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+
+
+def latex_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A tabular with rules of the package booktabs."""
+    special = _LATEX | {sign: f"\\{sign}" for sign in "&%$#_{}"}
+    line = lambda row: " & ".join("".join(special.get(c, c) for c in cell) for cell in row) + r" \\"
+    body = "\n".join(line(row) for row in rows)
+    begin = f"\\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}\n\\toprule\n{line(header)}\n\\midrule\n"
+    return f"{begin}{body}\n\\bottomrule\n\\end{{tabular}}\n"
+
+
+def csv_text(rows: Sequence[Scored]) -> str:
+    """One line an image, all digits; an empty cell for a missing score. Reads back with any spreadsheet."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    names = list(rows[0].scores)
+    writer.writerow(["person", "frame", "view", *names])
+    for row in rows:
+        writer.writerow([row.person, row.frame, row.view, *("" if (x := row.scores[n]) is None else x for n in names)])
+    return text.getvalue()

@@ -1,0 +1,298 @@
+"""The evaluator from source to report: which views are compared, predictions by file name, and what is wrong in one line."""
+
+import json
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from evaluation_cases import capture_from, random_views, small_body
+
+import humangs_jax as hg
+from humangs_jax import cli
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import save_capture
+from humangs_jax.data.loader import Example
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.evaluation.cases import Case, Predicted, find_people, read_indices, spread_views
+from humangs_jax.io.images import write_png
+
+NAMES = ("front", "left", "back", "right")
+
+
+@pytest.fixture(scope="module")
+def people():
+    """Two people of four views each, two of them of another frame; and what somebody predicted."""
+    made = {}
+    for i, name in enumerate(("ann", "bob")):
+        predicted, truth, masks = random_views(i, 4, 40, 32)
+        made[name] = capture_from(truth, masks, frames=[0, 0, 1, 1], names=NAMES), predicted
+    return made
+
+
+def cases(people):
+    return [Case(name, capture) for name, (capture, _) in people.items()]
+
+
+def predicting(people):
+    def method(case, background):
+        alpha = np.ones(case.truth.images.shape[:3], np.float32)
+        return Predicted(people[case.name][1], alpha, tuple(range(case.truth.view_count)))
+
+    return method
+
+
+def psnr(x, y):
+    return -10 * np.log10(np.square(x.astype(np.float64) - y).mean())
+
+
+def test_every_image_is_a_row_and_means_are_in_their_order(people, tmp_path):
+    found = hg.evaluate(cases(people), method=predicting(people), protocol="lhm")
+    expected = {name: [psnr(*pair) for pair in zip(p, c.images, strict=True)] for name, (c, p) in people.items()}
+    assert [(row.person, row.frame, row.view) for row in found.rows][1:3] == [("ann", 0, "left"), ("ann", 1, "back")]
+    scored = [row.scores["psnr"] for row in found.rows]
+    np.testing.assert_allclose(scored, [*expected["ann"], *expected["bob"]], atol=1e-4)
+    mean = found.means["psnr"]
+    assert mean.mean == pytest.approx(np.mean([np.mean(x) for x in expected.values()]), abs=1e-4)
+    assert mean.low < mean.mean < mean.high and mean.over == "people"
+    assert "lpips_squeeze" in found.reasons and found.means["lpips_squeeze"] is None
+    text = found.summary()
+    assert "8 images of 2 people" in text and "no weights of LPIPS squeeze were given" in text and "IoU" in text
+    files = {kind: tmp_path / f"a.{kind}" for kind in ("json", "html", "csv", "markdown", "latex")}
+    found.write(**files)
+    report = json.loads(files["json"].read_text())
+    assert report["means"]["psnr"]["mean"] == mean.mean and report["order"].startswith(
+        "mean over the images of a frame"
+    )
+    assert report["protocol"] == {
+        "name": "lhm",
+        "settings": {
+            "background": "white",
+            "crop": {"kind": "WholeFrame"},
+            "lpips_crop": None,
+            "masked": False,
+            "lpips": ["squeeze"],
+            "ssim": {"kind": "SsimWindow", "size": 11, "sigma": 1.5, "sample": False},
+            "published_side": None,
+        },
+    }
+    assert len(report["images"]) == 8 and report["images"][0]["scores"]["lpips_squeeze"] is None
+    assert files["csv"].read_text().count("\n") == 9 and files["markdown"].read_text().count("\n") == 5
+    assert files["latex"].read_text().count(r"\\") == 4
+    page = files["html"].read_text()
+    assert page.count("data:image/jpeg") == 3 * 8 and "http" not in page.replace("http-equiv", "")
+
+
+def test_a_page_keeps_the_worst(people):
+    found = hg.evaluate(cases(people), method=predicting(people), page_images=3)
+    order = np.argsort([row.scores["psnr"] for row in found.rows])
+    assert set(found.gallery.shots) == set(order[:3].tolist())
+
+
+def write_predictions(folder, people, alpha=False):
+    for name, (capture, predicted) in people.items():
+        (folder / name).mkdir(parents=True)
+        for view, image in zip(capture.names, predicted, strict=True):
+            pixels = np.concatenate([image, np.full((*image.shape[:2], 1), 1.0)], axis=-1) if alpha else image
+            write_png(folder / name / f"{view}.png", pixels)
+
+
+@pytest.fixture
+def folders(people, tmp_path, monkeypatch):
+    """The captures on disk; their body is the tiny one."""
+    for name, (capture, _) in people.items():
+        save_capture(tmp_path / "people" / name, capture)
+    load = hg.load_capture
+    monkeypatch.setattr(
+        "humangs_jax.evaluation.cases.load_capture", lambda path, body=None: load(path, body=body or small_body())
+    )
+    return tmp_path / "people"
+
+
+def test_predictions_are_found_by_file_name(people, folders, tmp_path):
+    """Those of one program with alpha, of another without; one that numbers them; some missing."""
+    for alpha in (False, True):
+        write_predictions(tmp_path / f"theirs{alpha}", people, alpha)
+        found = hg.evaluate(folders, predictions=tmp_path / f"theirs{alpha}")
+        expected = [psnr(np.rint(255 * p) / 255, np.rint(255 * c.images) / 255) for c, p in people.values()]
+        assert len(found.rows) == 8 and abs(np.mean([r.scores["psnr"] for r in found.rows]) - np.mean(expected)) < 0.5
+        assert ("iou" in found.reasons) is not alpha and (found.means["iou"] is not None) is alpha
+        assert any("Compared on all views" in note for note in found.notes())
+    one = tmp_path / "numbered"
+    one.mkdir()
+    for i, image in enumerate(people["bob"][1]):
+        write_png(one / f"view_{i:03d}.png", image)
+    assert len(hg.evaluate(folders / "bob", predictions=one).rows) == 4
+    (tmp_path / "theirsFalse" / "bob" / "left.png").unlink()
+    found = hg.evaluate(folders, predictions=tmp_path / "theirsFalse")
+    assert len(found.rows) == 7 and [file.endswith("bob/left.png") for file in found.missing] == [True]
+    assert "1 prediction missing:" in found.summary()
+
+
+def test_what_is_wrong_is_one_line(people, folders, tmp_path):
+    theirs = tmp_path / "theirs"
+    with pytest.raises(FileNotFoundError, match="no such folder of predictions"):
+        hg.evaluate(folders, predictions=theirs)
+    theirs.mkdir()
+    with pytest.raises(ValueError, match=r"no prediction was found; 8 were expected: .*ann/front\.png"):
+        hg.evaluate(folders, predictions=theirs)
+    write_predictions(theirs, {"ann": people["ann"]})
+    write_png(theirs / "ann" / "back.png", np.zeros((20, 30, 3)))
+    with pytest.raises(ValueError, match=r"ann/back\.png: size 30 x 20, but the true image has 32 x 40"):
+        hg.evaluate(folders, predictions=theirs)
+    write_png(theirs / "ann" / "back.png", np.zeros((40, 32, 4)))
+    with pytest.raises(ValueError, match="1 of 4 images have an alpha channel: expected all or none"):
+        hg.evaluate(folders, predictions=theirs)
+    with pytest.raises(ValueError, match="avatar and weights: expected one of them"):
+        hg.evaluate(folders, avatar=tmp_path, weights="w.safetensors")
+    with pytest.raises(ValueError, match=r"one avatar for 2 people: expected a folder with PERSON\.npz"):
+        hg.evaluate(folders, avatar=tmp_path / "a.npz")
+    with pytest.raises(ValueError, match=r"no prediction was found; 2 were expected: .*ann\.npz"):
+        hg.evaluate(folders, avatar=theirs)
+    with pytest.raises(ValueError, match="no protocol 'ours'"):
+        hg.evaluate(folders, predictions=theirs, protocol="ours")
+    masks = capture_from(people["ann"][0].images)
+    with pytest.raises(ValueError, match="ann: the protocol needs a mask for every view"):
+        hg.evaluate(Case("ann", masks), method=predicting(people), protocol="giga")
+
+
+def test_which_views_are_inputs_and_which_are_compared(people, folders, tmp_path):
+    capture = people["ann"][0]
+    one = lambda *arguments, **options: find_people(*arguments, **options).load(0)
+    case = one(capture, 2)
+    assert case.inputs.names == ("front", "left") and case.truth.names == ("back", "right")
+    assert one(folders, reconstructs=False).truth.names == NAMES and one(folders, 1).truth.names == NAMES[1:]
+    (tmp_path / "views.json").write_text('{"ann": {"context": [3, 0], "target": [1]}}')
+    indices = read_indices(tmp_path / "views.json")
+    case = one(folders, indices=indices)
+    assert case.inputs.names == ("right", "front") and case.truth.names == ("left",)
+    save_capture(folders / "ann" / "held_out", capture.select([3]))
+    case = one(folders)
+    assert case.inputs.names == ("front", "left") and case.truth.names == ("right",)
+    assert one(folders, 1).inputs.names == ("front",)
+    with pytest.raises(ValueError, match="indices: 'eve' is no capture in"):
+        one(folders, indices={"eve": {"context": [], "target": [0]}})
+    with pytest.raises(ValueError, match="indices: 'bob' is missing"):
+        find_people(folders, indices=indices).load(1)
+    with pytest.raises(ValueError, match="ann: expected views from 0 to 3 and at least one target"):
+        one(folders, indices={"ann": {"context": [0], "target": [4]}})
+    with pytest.raises(ValueError, match="capture: 3 inputs, but 2 views show the first frame"):
+        one(capture, 3)
+    for text in ("[]", '{"ann": {"context": [0]}}', '{"ann": {"context": [0.5], "target": [1]}}'):
+        (tmp_path / "views.json").write_text(text)
+        with pytest.raises(
+            ValueError, match=r"views\.json: (expected an object|ann\.(context|target): expected a list)"
+        ):
+            read_indices(tmp_path / "views.json")
+
+
+def test_inputs_stand_around_the_person():
+    cameras = np.asarray(capture_from(np.ones((12, 16, 16, 3), np.float32)).cameras.cam_from_world)
+    order = [0, 7, 2, 9, 4, 11, 6, 1, 8, 3, 10, 5]
+    found = spread_views("ann", np.zeros(12, int), cameras[order], 4)
+    assert found == sorted(found) and sorted(order[i] for i in found) == [0, 3, 6, 9]
+
+
+class People:
+    """A source of examples by number."""
+
+    input_counts = (2,)
+
+    def __init__(self, capture):
+        self._capture, self.broken = capture, {}
+
+    def __len__(self):
+        return 3
+
+    def example(self, seed, index, input_count):
+        return Example(self._views([0, 1]), self._views([2, 3, 0]))
+
+    def _views(self, chosen):
+        capture = self._capture.select(chosen)
+        poses = capture.poses
+        return SubjectViews(
+            images=jnp.asarray(capture.images),
+            masks=jnp.asarray(capture.masks),
+            cameras=capture.cameras,
+            rotations=poses.rotations[capture.frames],
+            translations=poses.translation[capture.frames],
+            betas=jnp.asarray(capture.betas),
+        )
+
+
+def test_a_source_gives_people(people):
+    """Views of equal poses are one frame, in the order of appearance."""
+    found = find_people(People(people["ann"][0]), body=small_body())
+    assert found.names == ("0000", "0001", "0002")
+    case = found.load(1)
+    assert case.truth.frames.tolist() == [0, 0, 1] and case.inputs.frames.tolist() == [0, 0]
+    np.testing.assert_array_equal(case.truth.poses.rotations[0], people["ann"][0].poses.rotations[1])
+    np.testing.assert_array_equal(case.truth.images[2], people["ann"][0].images[0])
+    seen = []
+
+    def method(case, background):
+        seen.append((case.name, background))
+        return Predicted(case.truth.images, None, (0, 1, 2))
+
+    found = hg.evaluate(People(people["ann"][0]), method=method, protocol="giga", body=small_body())
+    assert seen == [("0000", 0.0), ("0001", 0.0), ("0002", 0.0)] and len(found.rows) == 9
+
+
+def test_the_command(people, folders, tmp_path, monkeypatch, capsys):
+    write_predictions(tmp_path / "theirs", people, alpha=True)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["humangs", "evaluate", *map(str, arguments)])
+        try:
+            cli.main()
+            code = 0
+        except SystemExit as exit_:
+            code = exit_.code
+        return code, *capsys.readouterr()
+
+    out = tmp_path / "out"
+    out.mkdir()
+    options = ("--predictions", tmp_path / "theirs", "--protocol", "lhm++")
+    code, printed, error = run(
+        folders, *options, "--json", out / "a.json", "--html", out / "a.html", "--csv", out / "a.csv"
+    )
+    assert code == 0, error
+    assert "theirs, protocol lhm++: 8 images of 2 people" in printed and str(out / "a.html") in printed
+    assert json.loads((out / "a.json").read_text())["means"]["iou"]["count"] == 2
+    wrong = {
+        "--html": ("--html", tmp_path / "nowhere" / "a.html"),
+        "expected a name ending in .tex": ("--latex", out / "a.html"),
+        "--inputs 0": ("--inputs", 0),
+        "--lpips-alex: expected a backbone": ("--lpips-alex", "a", "b", "c"),
+        "no such file": ("--indices", out / "views.json"),
+    }
+    before = sorted(out.iterdir())
+    for said, arguments in wrong.items():
+        code, printed, error = run(folders, *options, *arguments)
+        assert code == 2 and printed == "" and error.count("\n") == 1, (said, error)
+        assert said in error or said == "no such file", error
+    assert sorted(out.iterdir()) == before
+
+
+@pytest.mark.slow
+def test_avatars_and_weights_are_drawn_on_the_protocols_background(tmp_path):
+    """The demo person: by weights, and by the avatar of the same photos: the same numbers."""
+    weights = hg.load_weights()
+    avatar = hg.reconstruct(*weights, hg.load_capture("demo_capture"))
+    avatar.save(tmp_path / "demo_capture.npz")
+    for protocol, background in (("humangs", 1.0), ("ghg", 0.0)):
+        by_weights = hg.evaluate("demo_capture", weights=weights, protocol=protocol, page_images=0)
+        by_avatar = hg.evaluate("demo_capture", avatar=tmp_path / "demo_capture.npz", protocol=protocol)
+        by_folder = hg.evaluate("demo_capture", avatar=tmp_path, protocol=protocol)
+        assert by_weights.rows == by_avatar.rows == by_folder.rows and len(by_weights.rows) == 6
+        assert by_weights.means["psnr"].mean > 24 and by_weights.means["iou"].mean > 0.9
+        corner = by_avatar.gallery.shots
+        assert len(corner) == 6 and by_weights.gallery.shots == {}
+        dimmed = replace(avatar.gaussians, opacities=jnp.zeros_like(avatar.gaussians.opacities))
+        nobody = hg.evaluate("demo_capture", avatar=replace(avatar, gaussians=dimmed), protocol=protocol)
+        truth = hg.load_capture("demo_capture/held_out")
+        expected = truth.images if background else np.clip(truth.images - (1 - truth.masks[..., None]), 0, 1)
+        if protocol == "humangs":
+            found = [row.scores["psnr"] for row in nobody.rows]
+            np.testing.assert_allclose(found, [psnr(x, np.ones_like(x)) for x in expected], atol=1e-3)
+        assert nobody.means["iou"].mean == 0
