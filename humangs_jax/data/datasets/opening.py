@@ -5,8 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.datasets.actorshq import find_actorshq, open_actorshq
 from humangs_jax.data.datasets.avatarrex import find_avatarrex, open_avatarrex
 from humangs_jax.data.datasets.bodies import FileBody
+from humangs_jax.data.datasets.dna_rendering import find_dna_rendering, open_dna_rendering
 from humangs_jax.data.datasets.scene_list import is_scene_list, open_scene_list
 from humangs_jax.data.datasets.subject import STORED_SIZE, Person, Subject
 from humangs_jax.data.datasets.thuman4 import find_thuman4, open_thuman4
@@ -14,6 +16,8 @@ from humangs_jax.data.datasets.thuman4 import find_thuman4, open_thuman4
 VIDEOS: dict[str, tuple[Callable[[Path], tuple[Path, ...]], Callable[[Path, FileBody], Subject]]] = {
     "thuman4": (find_thuman4, open_thuman4),
     "avatarrex": (find_avatarrex, open_avatarrex),
+    "actorshq": (find_actorshq, open_actorshq),
+    "dna-rendering": (find_dna_rendering, open_dna_rendering),
 }
 """Layout -> (its subjects in a folder, how one is opened)."""
 

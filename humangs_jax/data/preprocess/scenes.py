@@ -95,6 +95,11 @@ Tick = Callable[[], object]
 
 def write_scan(folder: Path, name: str, thuman: ThumanSet, body: FileBody, settings: Settings) -> None:
     """A scan as the settings say. Raises: ValueError naming file and key."""
+    _write(folder, name, scan_content(name, thuman, body, settings), body, settings)
+
+
+def scan_content(name: str, thuman: ThumanSet, body: FileBody, settings: Settings) -> "Content":
+    """What is written of a scan; its views are rendered when they are asked for. Raises: ValueError naming file and key."""
     fit = read_fit(thuman.fit_file(name), body)
     fitted = fitted_body(fit, body)
     mesh, faces = read_fit_mesh(fit.file.with_name(FIT_MESH))
@@ -119,8 +124,7 @@ def write_scan(folder: Path, name: str, thuman: ThumanSet, body: FileBody, setti
     }
     posed = dataclasses.replace(fitted, vertices=mesh)
     parameters = BodyParameters(fit.betas, fit.rotations[None], fit.translation[None])
-    content = Content(transform, [posed], faces, parameters, fit.scale, views(), known)
-    _write(folder, name, content, body, settings)
+    return Content(transform, [posed], faces, parameters, fit.scale, views(), known)
 
 
 def write_video(folder: Path, name: str, subject: Subject, body: FileBody, settings: Settings, tick: Tick) -> None:
