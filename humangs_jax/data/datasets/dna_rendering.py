@@ -4,7 +4,7 @@
     annotations/NAME_annots.smc   Camera_Parameter/CC/{K,D,RT}, Mask/C/mask/FRAME, SMPLx/{betas,expression,fullpose,transl}
 
 CC has two digits, C and FRAME have no zeros before. RT is world_from_cam, D is k1 k2 p1 p2 k3: photos and masks are undistorted.
-The mask is the greatest of its channels. fullpose: 55 x 3, hands relative to the mean hand (flat_hand_mean False), gendered model.
+The mask is the greatest channel. fullpose: 55 x 3, hands relative to the mean hand (flat_hand_mean False), gendered model.
 `scale` and colour calibration are unused, as in the readers of others. Needs the package h5py.
 """
 
@@ -56,7 +56,7 @@ class Smc:
         """What is under a key, or None. Links, which can lead into other files, are refused."""
         found = self.file
         for part in key.split("/"):
-            if not hasattr(found, "keys") or part not in found.keys():
+            if not hasattr(found, "keys") or part not in found:
                 return None
             if type(found.get(part, getlink=True)).__name__ != "HardLink":
                 raise Refused("refused a link")

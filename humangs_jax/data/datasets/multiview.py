@@ -201,5 +201,4 @@ def on_white(photo: Path, mask: Path) -> tuple[Float[np.ndarray, "h w 3"], Float
     if person.shape != image.shape[:2]:
         got = f"{person.shape[1]} x {person.shape[0]}, but its photo has {image.shape[1]} x {image.shape[0]}"
         raise CaptureError(mask, "size", f"{got}: expected the same")
-    image[~person] = 1.0
-    return image, person.astype(np.float32)
+    return np.where(person[..., None], image, np.float32(1)), person.astype(np.float32)

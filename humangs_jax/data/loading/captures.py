@@ -5,7 +5,7 @@ import logging
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
@@ -96,6 +96,7 @@ def _check_image(file):
     return read_checked(check_image, file)
 
 
+@runtime_checkable
 class StoredPerson(Protocol):
     """One person on disk, of a capture folder or of a data set (`datasets.subject.Person`)."""
 
