@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from humangs_jax.people.seeds import DEMO
 
-TIGHT = (DEMO[55], DEMO[11])
-"""People in tight clothes: a tank top and cropped trousers, a tank top and shorts."""
+TIGHT = (DEMO[271], DEMO[584])
+"""People in tight clothes: T-shirts and leggings."""
 HANDS = slice(25, 40), slice(40, 55)
 COLUMNS = 10
 """Shape directions, and as many of expression, of an old SMPL-X file."""

@@ -71,8 +71,14 @@ def read_cameras(file: Path) -> tuple[CalibratedCamera, ...]:
 
 
 def checked_cameras(calibration: Calibration) -> tuple[CalibratedCamera, ...]:
-    """Cameras of known sizes, rigid, and no farther than `FARTHEST` from the origin. Raises: CaptureError naming the camera."""
+    """Cameras of known sizes, rigid, no farther than `FARTHEST` from the origin, with names that can be those of folders.
+
+    Raises: CaptureError naming the camera.
+    """
     for camera in calibration.cameras:
+        if not re.fullmatch(r"[\w-][\w.-]*", camera.name):
+            problem = "expected a name of letters, digits, '.', '_' and '-', since photos lie in a folder of that name"
+            raise CaptureError(calibration.file, camera.name, problem)
         if camera.width is None or camera.height is None:
             raise CaptureError(calibration.file, f"{camera.name}.imgSize", "missing")
         checked_camera(camera.K, camera.cam_from_world, camera.width, camera.height, calibration.file, camera.name)

@@ -162,8 +162,9 @@ def scene_frames(file: Path, name: str, scene: Mapping[str, Any]) -> list[SceneF
 
 
 def _array(frame, key, file, at):
+    value = required(frame, key, file, at)
     try:
-        return np.asarray(required(frame, key, file, at))
+        return np.asarray(value)
     except ValueError:
         raise CaptureError(file, at + key, "expected rows of one length") from None
 
@@ -242,9 +243,8 @@ def scene_entry(name: str, mesh_transform: Float[np.ndarray, "4 4"], frames: Seq
 
 def rounded(array: Float[np.ndarray, "..."]) -> Any:
     """Nested lists of numbers of `SIGNIFICANT` digits."""
-    if array.ndim:
-        return [rounded(row) for row in array]
-    return float(f"{float(array):.{SIGNIFICANT}g}")
+    short = lambda x: [short(row) for row in x] if isinstance(x, list) else float(f"{x:.{SIGNIFICANT}g}")
+    return short(array.tolist())
 
 
 def write_arrays(

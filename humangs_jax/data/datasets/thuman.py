@@ -24,12 +24,14 @@ from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, PosedPerson, coefficients, posed_people
 from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, ArrayFile
+from humangs_jax.io.images import check_image
 from humangs_jax.io.mesh import read_meshes
 from humangs_jax.io.reading import Refused, reading
 from humangs_jax.io.text import read_text
 
 Kind = Literal["A", "B", "C"]
 PCA_NUMBERS, HAND_NUMBERS = 12, 45
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
 FIT, FIT_MESH = "smplx_param.pkl", "mesh_smplx.obj"
 TOLERANCE = 2e-3
 """Metres of the body, mean over vertices, up to which a fit reproduces mesh_smplx.obj. Rounding of OBJ files is far below;
@@ -206,13 +208,21 @@ def read_scan(file: str | Path) -> Scan:
         mesh = meshes[0]
         uvs = getattr(mesh.visual, "uv", None)
         image = getattr(getattr(mesh.visual, "material", None), "image", None)
-        if uvs is None or image is None:
-            raise Refused(
-                f"no {'texture coordinates' if uvs is None else 'texture image beside it'}: expected a textured scan"
-            )
+        if uvs is None:
+            raise Refused("no texture coordinates: expected a textured scan")
+        if image is None or max(image.size) <= 2:  # trimesh leaves out what it cannot read, or puts a placeholder there
+            _find_fault(Path(file).parent)
+            raise Refused("no texture image: expected a material (.mtl) beside the scan that names a PNG or JPEG file")
         vertices, uvs = np.asarray(mesh.vertices, np.float64), np.asarray(uvs, np.float32)
         for name, values in (("vertices", vertices), ("texture coordinates", uvs)):
             if not np.isfinite(values).all():
                 raise Refused(f"{name}: expected finite numbers")
         texture = np.asarray(image.convert("RGB"))
         return Scan(vertices, np.asarray(mesh.faces, np.int32), uvs, texture)
+
+
+def _find_fault(folder):
+    """Raises: FileError for the first image of a folder that cannot be read."""
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in PHOTO_SUFFIXES:
+            check_image(path)
