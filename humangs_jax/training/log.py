@@ -16,6 +16,8 @@ import numpy as np
 
 from humangs_jax.data.loader import Waiting
 from humangs_jax.io.atomic import write_text
+from humangs_jax.io.reading import Refused, reading
+from humangs_jax.io.text import parse_json, read_text
 from humangs_jax.training.state import TrainState
 
 FLUSH_SECONDS = 10
@@ -142,16 +144,22 @@ class Watch:
 
 
 def forget_after(path: Path, step: int) -> None:
-    """Drop the lines of later steps, and a last line that was not written to its end; the file changes whole or not."""
+    """Drop the lines of later steps, and a last line that was not written to its end; the file changes whole or not.
+
+    Raises: FileError for a file that is no log: no text, too large, or with another line that is no record.
+    """
     if not path.is_file():
         return
     kept = []
-    for line in path.read_text().splitlines():
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line)
-        except (json.JSONDecodeError, KeyError, TypeError):
-            continue
+    with reading(path, "log of a run"):
+        lines = read_text(path).splitlines()
+        for number, line in enumerate(lines, 1):
+            try:
+                if parse_json(line)["step"] <= step:
+                    kept.append(line)
+            except (ValueError, LookupError, TypeError) as error:
+                if number < len(lines):  # of the last one a kill may have left a part
+                    raise Refused(f"line {number}: expected an object with a step") from error
     write_text(path, "".join(f"{line}\n" for line in kept))
 
 

@@ -1,12 +1,15 @@
 """The log: what a killed run wrote too much goes, what went wrong is reported, TensorBoard reads the same numbers."""
 
 import json
+import re
 import struct
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from humangs_jax.data.loader import Waiting
+from humangs_jax.io.reading import FileError
 from humangs_jax.training.log import MANY_SKIPPED, RunLog, Watch, forget_after
 from humangs_jax.training.optimizer import GuardState
 from humangs_jax.training.state import TrainState
@@ -43,6 +46,19 @@ def test_lines_of_later_steps_and_half_written_ones_go(tmp_path):
     assert read(path) == whole[:3]
     assert [p.name for p in tmp_path.iterdir()] == ["log.jsonl"]
     forget_after(tmp_path / "none.jsonl", 2)
+
+
+def test_what_is_no_log_is_one_line_and_stays_as_it_is(tmp_path):
+    path = tmp_path / "log.jsonl"
+    for content in (
+        b"\xff\xfe",
+        b'{"step": 1}\n[' + b"[" * 10_000 + b'\n{"step": 2}\n',
+        b'{"step": 1}\nhello\n{"step": 2}\n',
+    ):
+        path.write_bytes(content)
+        with pytest.raises(FileError, match=re.escape(str(path))) as error:
+            forget_after(path, 2)
+        assert "\n" not in str(error.value) and path.read_bytes() == content
 
 
 def test_tensorboard_reads_the_numbers_and_the_images(tmp_path):
