@@ -6,8 +6,10 @@ out/tensorboard/    the numbers and the validation images, if tensorboardX is in
 """
 
 import json
+import logging
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from humangs_jax.io.reading import Refused, reading
 from humangs_jax.io.text import parse_json, read_text
 from humangs_jax.training.state import TrainState
 
+logger = logging.getLogger("humangs_jax.training")
 FLUSH_SECONDS = 10
 MANY_SKIPPED = 20
 """Number of consecutive skipped steps that is reported."""
@@ -91,9 +94,9 @@ class RunLog:
         if self._board is not None:
             self._board.add_image(name, (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8), done, dataformats="HWC")
 
-    def event(self, done: int, event: str, message: str, **numbers: float) -> None:
+    def event(self, done: int, event: str, message: str, **details: float | list[str]) -> None:
         """Something worth knowing, as a line and beside the progress bar."""
-        self._write({"step": done, "event": event} | numbers)
+        self._write({"step": done, "event": event} | details)
         if self._recording:
             self.bar.write(f"step {done}: {message}")
 
@@ -111,18 +114,18 @@ class Watch:
         self._skipped, self._nonfinite = int(state.opt_state.skipped), int(state.opt_state.nonfinite)
         self._in_a_row = 0
 
-    def __call__(self, done: int, metrics: dict[str, Any]) -> None:
-        """The metrics of the step that was just begun; done: steps with it."""
+    def __call__(self, done: int, metrics: dict[str, Any], bad_samples: Callable[[], list[str]] = list) -> None:
+        """The metrics of the step that was just begun; done: steps with it. bad_samples: asked if it failed, see `sources`."""
         # one step may wait behind the one that runs: enough to keep a device busy, and the run reacts to a signal soon
         self.look()
         names = ("skipped", "nonfinite", "loss", "grad_norm")
-        self._pending = done, {name: metrics[name] for name in names}
+        self._pending = done, {name: metrics[name] for name in names}, bad_samples
 
     def look(self) -> None:
         """Read the metrics of the pending step, and report it if it failed."""
         if self._pending is None:
             return
-        done, metrics = self._pending
+        done, metrics, bad_samples = self._pending
         self._pending = None
         numbers = {name: float(value) for name, value in jax.device_get(metrics).items()}
         skipped, nonfinite = int(numbers["skipped"]), int(numbers["nonfinite"])
@@ -132,12 +135,17 @@ class Watch:
         if not (was_skipped or was_nonfinite):
             return
         text = f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}"
+        samples = bad_samples()
+        details = numbers | ({"samples": samples} if samples else {})
+        text = "; ".join([text, *samples])
         if was_skipped:
-            self._log.event(done, "skipped", f"skipped ({text}), {skipped} so far", **numbers)
+            self._log.event(done, "skipped", f"skipped ({text}), {skipped} so far", **details)
         else:
             self._log.event(
-                done, "nonfinite", f"gradient entries that were not finite were replaced ({text})", **numbers
+                done, "nonfinite", f"gradient entries that were not finite were replaced ({text})", **details
             )
+        if samples and jax.process_index():  # whose log is not written
+            logger.warning("step %d: %s", done, text)
         if self._in_a_row == MANY_SKIPPED:
             advice = f"{MANY_SKIPPED} steps in a row were skipped: `humangs train --diagnose` names the first stage that fails"
             self._log.event(done, "stuck", advice)

@@ -10,6 +10,7 @@ Of several processes all must see the same folder `out`; one of them writes all 
 """
 
 import contextlib
+import functools
 import logging
 import signal
 import threading
@@ -29,7 +30,7 @@ from humangs_jax.training.checkpoint import Checkpoints, save_config
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.log import RunLog, Watch
 from humangs_jax.training.sharding import place, replicated, state_shardings, training_mesh, whole
-from humangs_jax.training.sources import MakeSource, captured_people, stage_loader
+from humangs_jax.training.sources import MakeSource, bad_samples, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import NO_NETWORKS, jitted_train_step, train_step
 from humangs_jax.training.validation import sheet, validate, validation_examples
@@ -103,8 +104,11 @@ def train(
             examples = [] if unseen is None else validation_examples(unseen, part, VALIDATED)
             batches = loader.batches(first, last, waiting=waiting)
             for step, batch in batches:
+                if step == first and mesh is None:  # for nothing: once, and the arrays are at hand
+                    for line in bad_samples(loader, step, batch):
+                        log.event(step, "sample", line, samples=[line])
                 state, metrics = train_step(state, batch, body, part, networks, mesh)
-                watch(done := step + 1, metrics)
+                watch(done := step + 1, metrics, functools.partial(bad_samples, loader, step))
                 stop = stopping(done)
                 if done % config.log_every == 0 or done == end or stop:
                     log.steps(done, jax.device_get(metrics), part.batch_size, waiting, len(loader.source.broken))

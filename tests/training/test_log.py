@@ -1,5 +1,6 @@
 """The log: what a killed run wrote too much goes, what went wrong is reported, TensorBoard reads the same numbers."""
 
+import dataclasses
 import json
 import re
 import struct
@@ -8,10 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.data.loader import Waiting
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Waiting, subject_order
 from humangs_jax.io.reading import FileError
+from humangs_jax.training.config import tiny
 from humangs_jax.training.log import MANY_SKIPPED, RunLog, Watch, forget_after
 from humangs_jax.training.optimizer import GuardState
+from humangs_jax.training.sources import bad_samples
 from humangs_jax.training.state import TrainState
 
 
@@ -93,6 +96,38 @@ def test_a_process_that_does_not_record_writes_nothing(tmp_path):
         log.event(1, "skipped", "skipped")
         log.image(1, "sheet", np.zeros((2, 2, 3)))
     assert list(tmp_path.iterdir()) == []
+
+
+@dataclasses.dataclass(frozen=True)
+class Spoilt(CaptureSource):
+    """Captures, of which example 3 is not finite and example 4 is not in [0, 1]."""
+
+    def example(self, seed, index, input_count):
+        example = super().example(seed, index, input_count)
+        if index == 3:
+            example.targets.images[0, 1, 2, 0] = np.nan
+        if index == 4:
+            example.inputs.masks[1] *= 255
+        return example
+
+
+def test_a_bad_sample_is_named(tmp_path, body, captures, capsys):
+    config = tiny()
+    cache, size = CaptureCache(captures, body), config.model.conventions.image_size
+    loader = Loader(Spoilt(cache, config.views, size, config.target_size), batch_size=2)
+    assert bad_samples(loader, 0) == bad_samples(loader, 0, loader.batch_at(0)) == []
+    (one,), (other,) = bad_samples(loader, 1), bad_samples(loader, 2, loader.batch_at(2))
+    order = [captures[i] for epoch in (0, 1) for i in subject_order(0, epoch, len(captures))]
+    assert one.endswith(f"the first at [0, 1, 2, 0]: nan ({order[3]})") and "sample 1: targets.images: " in one
+    assert "sample 0: inputs.masks: expected numbers in [0, 1]" in other and other.endswith(f"({order[4]})")
+    state = TrainState(jnp.asarray(0), {}, {}, GuardState(jnp.asarray(0), jnp.asarray(0), jnp.zeros(()), ()), None)
+    metrics = {"skipped": jnp.asarray(1), "nonfinite": jnp.asarray(1), "loss": jnp.asarray(jnp.nan)}
+    with RunLog(tmp_path, 0, 100, progress=False) as log:
+        watch = Watch(log, state)
+        watch(2, metrics | {"grad_norm": jnp.zeros(())}, lambda: bad_samples(loader, 1))
+        watch.look()
+    (event,) = read(tmp_path / "log.jsonl")
+    assert event["samples"] == [one] and one in capsys.readouterr().out
 
 
 def test_steps_that_went_wrong_are_told_by_number(tmp_path, capsys):
