@@ -22,6 +22,7 @@ import jax
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, Waiting
 from humangs_jax.data.views import gaussian_body
+from humangs_jax.io.atomic import only_writer
 from humangs_jax.io.images import write_png
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import save_weights
@@ -70,10 +71,15 @@ def train(
 
     Ctrl-C and SIGTERM finish the step, save and return; a second Ctrl-C interrupts at once.
     Raises: ValueError if `out` belongs to a run of another configuration, no capture can be used, devices and batch do not
-    divide each other, or the sizes of a later stage do not fit.
+    divide each other, or the sizes of a later stage do not fit; OSError if another process trains into `out`.
     """
     out, leading = Path(out), jax.process_index() == 0
     (out / "sheets").mkdir(parents=True, exist_ok=True)
+    with only_writer(out) if leading else contextlib.nullcontext():
+        return _train(config, body, training, out, leading, validation, variables, networks, fsdp, stop_at, progress)
+
+
+def _train(config, body, training, out, leading, validation, variables, networks, fsdp, stop_at, progress):
     save_config(out, config, write=leading)
     make_source = captured_people(training, body) if isinstance(training, Sequence) else training
     unseen = CaptureCache(validation, body) if validation else None

@@ -1,8 +1,8 @@
 """Kills every command that writes at random moments: python kills.py FOLDER [--moments 10] [--json FILE] [COMMAND ...]
 
-A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, some time after one, or at any
-time. Then no file under a final name may be half-written or lost, and the next run has to make what a run that nobody disturbed
-makes, and to remove what the killed one left. See `writers` for what the commands compute meanwhile.
+A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, some time after one, or at
+any time. Then no file under a final name may be half-written or lost, and the next run has to make what a run that nobody
+disturbed makes, and to remove what the killed one left. See `writers` for what the commands compute meanwhile.
 """
 
 import argparse
@@ -16,8 +16,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-import writers  # noqa: E402
-from writers import COMMANDS, Command, Moment  # noqa: E402
+import writers
+from writers import COMMANDS, Command, Moment
 
 LONGEST = 1.0
 """Seconds after a change of a file at which a run is killed, at most."""

@@ -1,9 +1,9 @@
 """Every command that writes, whole and real but for what it computes: each run is a process of its own, made by a fork.
 
-A process that has imported everything and started no backend of JAX is forked, so that a run takes a second instead of ten. What
-costs minutes (fits, reconstruction, rendering, training steps) is answered by stand-ins at once; options, checks, readers, writers,
-the training loop and its checkpoints are the package's own. A run tells the files that it changes, and can be killed at any
-of these moments.
+A process that has imported everything and started no backend of JAX is forked, so that a run takes a second instead of ten.
+What costs minutes (fits, reconstruction, rendering, training steps) is answered by stand-ins at once; options, checks, readers,
+writers, the training loop and its checkpoints are the package's own. A run tells the files that it changes, and can be killed
+at any of these moments.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ import shutil
 import signal
 import sys
 import time
+import traceback
 from pathlib import Path
 from types import SimpleNamespace
 from unittest import mock
@@ -42,6 +43,11 @@ LATE = (
     "tqdm",
     "grain",
 )
+WORK = {
+    *("reconstruct", "refine_with_report", "motion_frames", "turntable_renderings", "fit_photos", "refine_capture"),
+    *("fit_scan", "load_checkpoint", "make_subject", "train_step", "build_bank"),
+}
+"""Stand-ins for what takes long: nothing that is wrong with the place may be found only after these."""
 CHANGES = {
     "open": (),
     "os.rename": (2, 3),
@@ -76,7 +82,9 @@ class Command:
 CAPTURE = "--keypoints {inputs}/keypoints.npz --overwrite"
 RUN = ("run/checkpoints/*", "run/tensorboard/*")
 COMMANDS = (
-    Command("import", "import cameras {inputs}/transforms.json --images {inputs}/photos --out new --scale {v} --overwrite"),
+    Command(
+        "import", "import cameras {inputs}/transforms.json --images {inputs}/photos --out new --scale {v} --overwrite"
+    ),
     Command("fit in place", f"fit capture {CAPTURE}", copies=("capture",)),
     Command("fit elsewhere", f"fit {{inputs}}/capture {CAPTURE} --out fitted"),
     Command("fit --refine", "fit capture --refine --overwrite", copies=("capture",)),
@@ -94,19 +102,26 @@ COMMANDS = (
     Command("export glb", "export {inputs}/avatar{v}.npz --out me.glb"),
     Command("export html", "export {inputs}/avatar{v}.npz --html me.html"),
     Command(
-        "synth", "synth --out people --subjects 2 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1 --depth --maps",
+        "synth",
+        "synth --out people --subjects 2 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1 --depth --maps",
         first="synth --out people --subjects 1 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1 --depth --maps",
-    ),  # fmt: skip
+    ),
     Command(
-        "train", "train {inputs}/people --out run --config {inputs}/train.json --validation {inputs}/people", first=None,
-        varies=("run/log.jsonl",), own=RUN,
-    ),  # fmt: skip
+        "train",
+        "train {inputs}/people --out run --config {inputs}/train.json --validation {inputs}/people",
+        first=None,
+        varies=("run/log.jsonl",),
+        own=RUN,
+    ),
     Command(
-        "train --on-the-fly", "train --out run --on-the-fly 2 --config {inputs}/train.json", first=None,
-        varies=("run/log.jsonl",), own=RUN,
-    ),  # fmt: skip
+        "train --on-the-fly",
+        "train --out run --on-the-fly 2 --config {inputs}/train.json",
+        first=None,
+        varies=("run/log.jsonl",),
+        own=RUN,
+    ),
     Command("convert", "convert {inputs}/any.pt --out w.safetensors --losses l.safetensors"),
-)  # fmt: skip
+)
 
 
 # Stand-ins ------------------------------------------------------------------------------------------------------------
@@ -238,9 +253,8 @@ def stand_ins(variant):
     frames = lambda *_, **__: iter([np.asarray(r.rgb) for r in some_renderings(variant, 3)])
 
     def refined(capture, **_):
-        cameras = replace(
-            capture.cameras, K=capture.cameras.K + jnp.asarray([[0, 0, variant / 8], [0, 0, 0], [0, 0, 0]])
-        )
+        found = some_cameras(capture.view_count, 32).K  # whatever the start was
+        cameras = replace(capture.cameras, K=found + jnp.asarray([[0, 0, variant / 8], [0, 0, 0], [0, 0, 0]]))
         return RefinedCapture(replace(moved(capture), cameras=cameras), FitReport("refinement"))
 
     def person(seed, _body):
@@ -249,9 +263,11 @@ def stand_ins(variant):
     def posed(subject, index):
         random = random_of(subject.seed, index)
         return SimpleNamespace(
-            subject=subject, vertices=random.normal(size=(50, 3)).astype(np.float32),
-            rotations=np.zeros((len(body().parents), 3), np.float32), translation=np.zeros(3, np.float32),
-        )  # fmt: skip
+            subject=subject,
+            vertices=random.normal(size=(50, 3)).astype(np.float32),
+            rotations=np.zeros((len(body().parents), 3), np.float32),
+            translation=np.zeros(3, np.float32),
+        )
 
     def body():
         from humangs_jax.body.library import load_body
@@ -296,9 +312,12 @@ def stand_ins(variant):
     def shown(vertices, faces, tints, camera):
         image = random_of(variant, 3).random((camera.height, camera.width))
         return SimpleNamespace(
-            shaded=np.repeat(image[..., None], 3, -1), covered=image > 0.5,
-            inside=np.float32(1), before=np.float32(1), height=np.float32(0.8),
-        )  # fmt: skip
+            shaded=np.repeat(image[..., None], 3, -1),
+            covered=image > 0.5,
+            inside=np.float32(1),
+            before=np.float32(1),
+            height=np.float32(0.8),
+        )
 
     def in_scan(*_, **__):
         from humangs_jax.body.model import BodyPose
@@ -322,8 +341,11 @@ def stand_ins(variant):
     return (
         ("avatar.reconstruct", "reconstruct", avatar),
         ("network.weights", "load_weights", lambda *_: (None, tiny())),
-        ("refinement.refine", "refine_with_report", lambda *_, **__: Refinement(
-            avatar(), 1, 1.0, 0.0, (1.0, 0.5), (20.0, 21.0), True)),
+        (
+            "refinement.refine",
+            "refine_with_report",
+            lambda *_, **__: Refinement(avatar(), 1, 1.0, 0.0, (1.0, 0.5), (20.0, 21.0), True),
+        ),
         ("avatar.frames", "motion_frames", frames),
         ("avatar.frames", "turntable_renderings", lambda _, count, size: drawn(count, size)),
         ("apps.check", "_body_image", shown),
@@ -353,9 +375,14 @@ def stand_ins(variant):
         ("training.loop", "gaussian_body", lambda body, _: body),
         ("training.loop", "validate", validated),
         ("training.sources", "build_bank", bank),
-        ("training.sources", "on_the_fly_people", lambda _: importlib.import_module(
-            "humangs_jax.training.sources").captured_people([Path(os.environ["KILLS_INPUTS"]) / "people" / "a"], body())),
-    )  # fmt: skip
+        (
+            "training.sources",
+            "on_the_fly_people",
+            lambda _: importlib.import_module("humangs_jax.training.sources").captured_people(
+                [Path(os.environ["KILLS_INPUTS"]) / "people" / "a"], body()
+            ),
+        ),
+    )
 
 
 # Runs -----------------------------------------------------------------------------------------------------------------
@@ -363,7 +390,7 @@ def stand_ins(variant):
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
-    """When a run is killed: `seconds` after its `event`-th change of a file, at 0 just before that; event None: after the start."""
+    """When a run is killed: `seconds` after its `event`-th change of a file, at 0 just before it; event None: after the start."""
 
     event: int | None
     seconds: float
@@ -371,12 +398,13 @@ class Moment:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """How a run ended. code: None if it was killed. changes: (seconds since the start, event, path)."""
+    """How a run ended. code: None if it was killed. changes: (seconds since the start, event, path). work: stand-ins called."""
 
     code: int | None
     out: str
     errors: str
     changes: list
+    work: list
 
 
 class Changes:
@@ -415,9 +443,9 @@ def start(
     command: Command, place: Path, inputs: Path, variant: int, moment: Moment | None = None, most: int | None = None
 ):
     """Begins a run; most: bytes that a file may have, as on a disk that is full then. Returns what `end` wants."""
-    log = place.with_name(f"{place.name}.{variant}.log")
+    log = inputs.with_name("logs") / f"{place.name}.{variant}"  # not on a disk that is full
     shutil.rmtree(log, ignore_errors=True)
-    log.mkdir()
+    log.mkdir(parents=True)
     ready, tell = os.pipe()
     pid = os.fork()
     if pid:
@@ -432,6 +460,8 @@ def start(
         os.chdir(place)
         sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
         code = perform(command, place, inputs, variant, moment, tell, most, log)
+    except BaseException:
+        traceback.print_exc()
     finally:
         os._exit(code)
 
@@ -441,8 +471,10 @@ def perform(command, place, inputs, variant, moment, tell, most, log):
     from humangs_jax import cli
 
     os.environ["KILLS_INPUTS"] = str(inputs)
+    called = []
     for module, name, replacement in stand_ins(variant):
-        mock.patch.object(importlib.import_module(f"humangs_jax.{module}"), name, replacement).start()
+        noted = lambda *given, _name=name, _work=replacement, **named: (called.append(_name), _work(*given, **named))[1]
+        mock.patch.object(importlib.import_module(f"humangs_jax.{module}"), name, noted).start()
     sys.argv = ["humangs", *command.words(inputs, variant)]
     changes, code = Changes(place, moment, tell), 0
     if most is not None:
@@ -452,8 +484,6 @@ def perform(command, place, inputs, variant, moment, tell, most, log):
     except SystemExit as ending:
         code = ending.code
     except BaseException:
-        import traceback
-
         traceback.print_exc()
         code = 1
     sys.stdout.flush()
@@ -461,7 +491,7 @@ def perform(command, place, inputs, variant, moment, tell, most, log):
     if most is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     changes.place = "\0"  # what follows is not of the run
-    (log / "changes.json").write_text(json.dumps(changes.seen))
+    (log / "changes.json").write_text(json.dumps([changes.seen, sorted(WORK & set(called))]))
     return code
 
 
@@ -494,7 +524,7 @@ def end(begun) -> Run:
     changes = log / "changes.json"
     code = None if os.WIFSIGNALED(status) else os.waitstatus_to_exitcode(status)
     texts = [(log / name).read_text() if (log / name).exists() else "" for name in ("out", "errors")]
-    return Run(code, *texts, json.loads(changes.read_text()) if changes.exists() and code is not None else [])
+    return Run(code, *texts, *(json.loads(changes.read_text()) if changes.exists() and code is not None else ([], [])))
 
 
 def run(*arguments, **options) -> Run:
@@ -510,8 +540,6 @@ def prepare(inputs: Path) -> None:
             make_inputs(inputs)
             code = 0
         except BaseException:
-            import traceback
-
             traceback.print_exc()
         finally:
             os._exit(code)
@@ -590,7 +618,7 @@ def whole(path: Path) -> bool:
 
 
 def half_written(command: Command, place: Path, before: dict, after: dict) -> list[str]:
-    """What is wrong with a place between two states: files under final names that are neither old nor new, files that are lost."""
+    """What is wrong with a place between two states: files under final names that are neither old nor new, or lost."""
     final, other = snapshot(place)
     found = []
     for name, content in final.items():

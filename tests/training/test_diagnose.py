@@ -263,7 +263,8 @@ def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, t
 
     cache = CaptureCache(captures, body)
     train(CONFIG, body, source(3), tmp_path, variables=variables, stop_at=5, progress=False)
-    events = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines() if "samples" in line]
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    events = [line for line in lines if "samples" in line]
     assert [(event["step"], len(event["samples"])) for event in events] == [(4, 1)]
     assert "targets.images" in events[0]["samples"][0] and str(captures[0].parent) in events[0]["samples"][0]
     diagnosis = diagnose_run(tmp_path, body, source(3), variables=variables)
