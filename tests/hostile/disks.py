@@ -115,9 +115,7 @@ def full(command: Command, disk: Disk, inputs: Path) -> list[str]:
         found = [] if ending.code == 0 else refused(ending, targets(expected)) + changed(place, before)
         if disk.mounted:
             disk.leave(None)
-        again = writers.run(command, place, inputs, 2)
-        found += [] if again.code == 0 else [f"the next run: {again.code}: {again.errors[-400:]}"]
-        found += [f"after the next run: {fault}" for fault in writers.unlike(command, place, expected)]
+        found += writers.next_run(command, place, inputs, expected)
         faults += [f"full, {share:.0%} of {size} bytes free: {fault}" for fault in found]
     return faults
 

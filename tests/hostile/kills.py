@@ -62,9 +62,7 @@ def kill(command: Command, folder: Path, inputs: Path, count: int, seed: int = 0
         killed += disturbed.code is None
         left += bool(writers.snapshot(place)[1])
         found += writers.half_written(command, place, before, expected)
-        again = writers.run(command, place, inputs, 2)
-        found += [] if again.code == 0 else [f"the next run: exit status {again.code}: {again.errors[-500:]}"]
-        found += [f"after the next run: {fault}" for fault in writers.unlike(command, place, expected)]
+        found += writers.next_run(command, place, inputs, expected)
         faults += [f"{dataclasses.astuple(moment)}: {fault}" for fault in found]
     return {
         "changes_of_files": len(undisturbed.changes),
@@ -77,20 +75,20 @@ def kill(command: Command, folder: Path, inputs: Path, count: int, seed: int = 0
 
 
 def kill_all(folder: Path, count: int, names: list[str], record: Path | None = None, seed: int = 0) -> dict[str, dict]:
-    """Figures by command. A record is continued: what was killed before is added."""
+    """Figures by command. A record is continued: commands that are killed again replace what it has of them."""
     writers.import_everything()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     writers.prepare(folder / "inputs")
-    figures = {}
+    figures = json.loads(record.read_text())["commands"] if record is not None and record.exists() else {}
     for command in COMMANDS:
         if names and command.name not in names:
             continue
         figures[command.name] = kill(command, folder, folder / "inputs", count, seed)
         print(command.name, figures[command.name], flush=True)
         if record is not None:
-            rows = {"commands": figures, "killed": sum(each["killed"] for each in figures.values())}
-            record.write_text(json.dumps(rows, indent=1) + "\n")
+            totals = {key: sum(each[key] for each in figures.values()) for key in ("killed", "left_something")}
+            record.write_text(json.dumps({"commands": figures} | totals, indent=1) + "\n")
     return figures
 
 

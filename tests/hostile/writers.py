@@ -64,7 +64,8 @@ class Command:
     """arguments: with {inputs} for the folder of inputs and {v} for 1 or 2, the number of the variant.
 
     copies: inputs that are copied into the place first. first: arguments of the run that made what is there before, None for
-    nothing. varies: files that no two runs write equally, as patterns; `own`: those whose names differ, too.
+    nothing. varies: files that no two runs write equally, as patterns; `own`: those whose names differ, too. once: it refuses a
+    place where it has come to its end.
     """
 
     name: str
@@ -73,6 +74,7 @@ class Command:
     first: str | None = ""
     varies: tuple[str, ...] = ()
     own: tuple[str, ...] = ()
+    once: bool = False
 
     def words(self, inputs: Path, variant: int) -> list[str]:
         text = self.first if variant == 1 and self.first else self.arguments
@@ -89,7 +91,7 @@ COMMANDS = (
     Command("fit elsewhere", f"fit {{inputs}}/capture {CAPTURE} --out fitted"),
     Command("fit --refine", "fit capture --refine --overwrite", copies=("capture",)),
     Command("fit --scan", "fit --scan {inputs}/scan.obj --out body --overwrite"),
-    Command("fit --scan --views", "fit --scan {inputs}/scan.obj --views views", first=None),
+    Command("fit --scan --views", "fit --scan {inputs}/scan.obj --views views", first=None, once=True),
     Command("check", "check {inputs}/capture --out check.png"),
     Command("demo", "demo --out demo --refine 0 --size 16", varies=("demo/report.json",)),
     Command("reconstruct", "reconstruct {inputs}/capture --out me.npz"),
@@ -648,6 +650,14 @@ def unlike(command: Command, place: Path, expected: dict) -> list[str]:
     if (place / "run").is_dir():
         found += unlike_a_run(place / "run")
     return found
+
+
+def next_run(command: Command, place: Path, inputs: Path, expected: dict) -> list[str]:
+    """What is wrong with the run after one that was killed or failed, and with what is there then."""
+    finished = command.once and not unlike(command, place, expected)
+    ending = run(command, place, inputs, 2)
+    found = [] if ending.code == (2 if finished else 0) else [f"exit status {ending.code}: {ending.errors[-500:]}"]
+    return [f"the next run: {fault}" for fault in found + unlike(command, place, expected)]
 
 
 def unlike_a_run(out: Path) -> list[str]:
