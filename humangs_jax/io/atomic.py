@@ -173,9 +173,8 @@ def add_files(
     inside = folder.is_dir()  # on the same disk, even if others hold the folder and what is beside it
     if inside:
         _sweep(folder.resolve())
-    else:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(folder.parent.resolve())
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(folder.resolve().parent)  # also of one that was killed after it had made the folder
     temporary = (folder if inside else folder.parent) / f".{folder.resolve().name}.new-{_tag()}"
     try:
         with _naming(folder, temporary):

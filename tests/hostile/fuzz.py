@@ -5,7 +5,8 @@ PNG, words of a text), a few parts are exchanged for hostile ones, and the file 
 What is found is shrunk by hypothesis, saved as FOLDER/found-READER, and becomes a case of `attacks_*.py`.
 
 The readers take turns, `CHUNK` inputs at a time, until each has INPUTS. The record (default: FOLDER/record.json) has the figures
-of each reader; a later call with the same record goes on from there, and tries what was found again.
+of each reader; a later call with the same record goes on from there, and tries what was found again; so does, on another
+machine, one with --page docs/security.md, from docs/results/fuzz.json.
 """
 
 import argparse
@@ -462,10 +463,14 @@ def main():
     parser.add_argument("inputs", type=int)
     parser.add_argument("readers", nargs="*")
     parser.add_argument("--record", type=Path)
+    parser.add_argument("--page", type=Path, help="page whose table fuzz is written, with its docs/results/fuzz.json")
     arguments = parser.parse_args()
     folder, names = arguments.folder, arguments.readers or [name for name, make in readers.SEEDS.items() if make]
     record_file = arguments.record or folder / "record.json"
+    published = arguments.page and arguments.page.parent / "results" / "fuzz.json"
     record = json.loads(record_file.read_text()) if record_file.exists() else {}
+    if not record and published and published.exists():
+        record = json.loads(published.read_text())["numbers"]
     fresh = {"inputs": 0, "read": 0, "refused": 0, "chunks": 0, "seconds": 0.0}
     figures = {name: fresh | record.get(name, {}) | {"found": ""} for name in names}
     shutil.rmtree(folder / "honest", ignore_errors=True)
@@ -490,7 +495,23 @@ def main():
             gc.collect()
             if Path("/proc/self/maps").read_bytes().count(b"\n") > MOST_MAPPINGS:
                 os.execv(sys.executable, [sys.executable, *sys.argv])
+    if arguments.page is not None:
+        write_page(arguments.page, record | figures)
     print(json.dumps(figures))
+
+
+def write_page(page, figures):
+    sys.path.insert(0, str(worker.ROOT))
+    from experiments.common.results import markdown_table, publish
+
+    total = lambda key: sum(each[key] for each in figures.values())
+    header = ["readers", "mutated files", "fewest of a reader", "read", "refused in one line", "anything else"]
+    fewest, found = (
+        min(each["inputs"] for each in figures.values()),
+        sum(bool(each["found"]) for each in figures.values()),
+    )
+    rows = [[len(figures), f"{total('inputs'):,}", f"{fewest:,}", f"{total('read'):,}", f"{total('refused'):,}", found]]
+    publish(page, "fuzz", markdown_table(header, rows, "r" * len(header)), figures)
 
 
 if __name__ == "__main__":

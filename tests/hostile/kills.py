@@ -82,7 +82,7 @@ def kill_all(folder: Path, count: int, names: list[str], record: Path | None = N
     writers.prepare(folder / "inputs")
     figures = json.loads(record.read_text())["commands"] if record is not None and record.exists() else {}
     for command in COMMANDS:
-        if names and command.name not in names:
+        if (names and command.name not in names) or count == 0:
             continue
         figures[command.name] = kill(command, folder, folder / "inputs", count, seed)
         print(command.name, figures[command.name], flush=True)
@@ -98,10 +98,25 @@ def main():
     parser.add_argument("commands", nargs="*", help="default: all")
     parser.add_argument("--moments", type=int, default=10, help="for each command")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--json", type=Path, help="record of the figures by command; an earlier one is continued")
+    parser.add_argument("--page", type=Path, help="page whose table kills is written, with its docs/results/kills.json")
     arguments = parser.parse_args()
     figures = kill_all(arguments.folder, arguments.moments, arguments.commands, arguments.json, arguments.seed)
+    if arguments.page is not None:
+        write_page(arguments.page, figures)
     sys.exit(any(each["faults"] for each in figures.values()))
+
+
+def write_page(page: Path, figures: dict[str, dict]) -> None:
+    sys.path.insert(0, str(Path(__file__).parents[2]))
+    from experiments.common.results import markdown_table, publish
+
+    total = lambda key: sum(each[key] for each in figures.values())
+    header = ["commands that write", "changes of files in one run", "killed", "left a temporary name"]
+    header += ["half-written, lost, or the next run failed"]
+    faults = sum(len(each["faults"]) for each in figures.values())
+    rows = [[len(figures), total("changes_of_files"), total("killed"), total("left_something"), faults]]
+    publish(page, "kills", markdown_table(header, rows, "r" * len(header)), figures)
 
 
 if __name__ == "__main__":

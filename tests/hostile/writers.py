@@ -99,6 +99,7 @@ COMMANDS = (
     Command("animate mp4", "animate {inputs}/avatar1.npz --out me.mp4 --size 16"),
     Command("animate gif", "animate {inputs}/avatar1.npz --out me.gif --size 16"),
     Command("render", "render {inputs}/avatar1.npz --out views --views 3 --size 16 --exr"),
+    Command("render anew", "render {inputs}/avatar1.npz --out views --views 3 --size 16", first=None),
     Command("export ply", "export {inputs}/avatar{v}.npz --out me.ply"),
     Command("export splat", "export {inputs}/avatar{v}.npz --out me.splat"),
     Command("export glb", "export {inputs}/avatar{v}.npz --out me.glb"),

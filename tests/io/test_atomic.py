@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -173,6 +174,16 @@ def test_what_killed_processes_left_is_swept(tmp_path, dead_process):
     old = folder_with(leftover(target, "new", dead_process, machine="00000001"), "of another machine, long ago")
     os.utime(old, (0, 0))
     (tmp_path / ".hidden").write_text("not ours")
+    atomic.add_files(tmp_path / "other", writes_into("new"))
+    folder_with(
+        leftover(tmp_path / "other", "new", dead_process), "of one that was killed after it had made the folder"
+    )
+    atomic._sweep.cache_clear()  # a new process sweeps
+    atomic.add_files(tmp_path / "other", writes_into("newer"))
+    assert not leftover(tmp_path / "other", "new", dead_process).exists()
+    shutil.rmtree(tmp_path / "other")
+    folder_with(leftover(target, "new", dead_process), "half")
+    atomic._sweep.cache_clear()
     atomic.replace_folder(target, writes("new"), mark=MARK)
     assert len(names(tmp_path)) == 4
     assert ".hidden" in names(tmp_path) and leftover(target, "new", os.getpid()).is_dir()
