@@ -5,6 +5,7 @@ out/log.jsonl       one object per line; {"step", "loss", ...} while training, {
 out/tensorboard/    the numbers and the validation images, if tensorboardX is installed
 """
 
+import contextlib
 import json
 import logging
 import math
@@ -60,9 +61,11 @@ class RunLog:
     def __exit__(self, *_):
         self.bar.close()
         if self._lines is not None:
-            self._lines.close()
+            with _naming(self._lines.name):
+                self._lines.close()
         if self._board is not None:
-            self._board.close()
+            with _naming(self._board.logdir):
+                self._board.close()
 
     def steps(self, done: int, metrics: dict[str, Any], subjects: int, waiting: Waiting, broken: int) -> None:
         """Numbers of the last step done. subjects: per step; seconds and samples a second are since the last line."""
@@ -103,7 +106,8 @@ class RunLog:
     def _write(self, record):
         if self._lines is not None:  # JSON has no NaN
             finite = lambda x: x if not isinstance(x, float) or math.isfinite(x) else None
-            self._lines.write(json.dumps({name: finite(value) for name, value in record.items()}) + "\n")
+            with _naming(self._lines.name):
+                self._lines.write(json.dumps({name: finite(value) for name, value in record.items()}) + "\n")
 
 
 class Watch:
@@ -169,6 +173,15 @@ def forget_after(path: Path, step: int) -> None:
                 if number < len(lines):  # of the last one a kill may have left a part
                     raise Refused(f"line {number}: expected an object with a step") from error
     write_text(path, "".join(f"{line}\n" for line in kept))
+
+
+@contextlib.contextmanager
+def _naming(path):
+    """A full disk becomes an error that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _tensorboard(folder, step):

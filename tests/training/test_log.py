@@ -90,6 +90,15 @@ def test_numbers_that_are_not_finite_are_no_json(tmp_path):
     assert (tmp_path / "log.jsonl").read_text() == '{"step": 3, "event": "skipped", "loss": null, "grad_norm": 2.0}\n'
 
 
+def test_a_full_disk_names_the_log(tmp_path):
+    (tmp_path / "log.jsonl").symlink_to("/dev/full")
+    with (
+        pytest.raises(OSError, match=r"No space left on device: .*log\.jsonl"),
+        RunLog(tmp_path, 0, 10, progress=False) as log,
+    ):
+        log.event(3, "skipped", "skipped")
+
+
 def test_a_process_that_does_not_record_writes_nothing(tmp_path):
     with RunLog(tmp_path, 0, 10, recording=False) as log:
         log.steps(1, {"loss": jnp.ones(()), "psnr": jnp.ones(())}, 1, Waiting(), 0)
