@@ -20,6 +20,7 @@ import numpy as np
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.transform import EXACT
 from humangs_jax.io.atomic import replace_file, write_bytes
 from humangs_jax.rendering.gaussians import Gaussians, factored
 
@@ -48,7 +49,7 @@ def turned(gaussians: Gaussians, up: Up) -> Gaussians:
     if gaussians.deformations is not None:
         gaussians = factored(gaussians)
     turn = jnp.asarray(_TURNS[up], gaussians.quats.dtype)
-    means = gaussians.means @ quaternion.to_matrix(turn).T
+    means = jnp.matmul(gaussians.means, quaternion.to_matrix(turn).T, precision=EXACT)
     return replace(gaussians, means=means, quats=quaternion.multiply(turn, gaussians.quats))
 
 

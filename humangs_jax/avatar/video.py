@@ -84,7 +84,8 @@ def _write_mp4(path, frames, fps, shape):
                 ffmpeg.stdin.close()
         problem = ffmpeg.stderr.read().decode(errors="replace")
     if ffmpeg.returncode:
-        raise OSError(f"{path}: ffmpeg failed: {' '.join(problem.split())}")
+        problem = " ".join(problem.split()) or f"it ended with {ffmpeg.returncode}"
+        raise OSError(f"{path}: ffmpeg failed: {problem}")
 
 
 def _write_gif(path, frames, fps, _):

@@ -6,6 +6,7 @@ capture, a file, an option) ends in one line on stderr and exit code 2, with not
 
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Protocol
 
@@ -52,6 +53,7 @@ DESCRIPTION = "Animatable 3D Gaussian humans from a few photos with body poses."
 def main() -> None:
     """Entry point of the console script."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # XLA's notes would appear between our lines
+    warnings.filterwarnings("ignore", module="PIL")  # what is wrong with a photo is said in one line of ours
     keep_freed_memory()
     enable_compile_cache()
     try:

@@ -29,8 +29,10 @@ class Demo:
     def run(self) -> None:
         require_at_least(0, refine=self.refine)
         from humangs_jax.apps.demo import run_demo
+        from humangs_jax.io.atomic import check_writable
         from humangs_jax.refinement.config import RefineConfig
 
+        check_writable(self.out)
         refine = RefineConfig(seconds=self.refine) if self.refine else None
         run_demo(self.out, weights=self.weights, frame_size=self.size, refine=refine)
 
@@ -167,7 +169,9 @@ class Render:
         from humangs_jax.avatar.avatar import Avatar
         from humangs_jax.avatar.frames import capture_renderings, turntable_renderings, write_renderings
         from humangs_jax.data.capture import load_capture
+        from humangs_jax.io.atomic import check_writable
 
+        check_writable(self.out)
         avatar = Avatar.load(self.avatar)
         if self.capture is not None:
             cameras, renderings = capture_renderings(avatar, load_capture(self.capture))

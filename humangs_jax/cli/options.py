@@ -6,9 +6,14 @@ from typing import Any
 
 
 def require_parent(path: Path, option: str = "--out") -> None:
-    """The folder that a file will be written to exists. Raises: FileNotFoundError."""
+    """A file can be written: its folder exists and is no read-only one, it is no folder itself. Raises: OSError."""
+    from humangs_jax.io.atomic import check_writable
+
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{option} {path}: the folder {path.parent} does not exist")
+    if path.is_dir():
+        raise IsADirectoryError(f"{option} {path}: is a folder: expected the name of a file")
+    check_writable(path)
 
 
 def tell_deleted(folder: Path, unless: Path | None = None) -> None:

@@ -131,9 +131,9 @@ class Convert:
     """Type of the stored numbers; float16 halves the file."""
 
     def run(self) -> None:
-        from safetensors.numpy import save_file
+        from safetensors.numpy import save
 
-        from humangs_jax.io.atomic import replace_file
+        from humangs_jax.io.atomic import write_bytes
         from humangs_jax.network.conversion import LOSS_PREFIX, describe, load_checkpoint
         from humangs_jax.network.weights import save_weights
         from humangs_jax.objectives.loss_networks import collect_loss_networks
@@ -155,5 +155,5 @@ class Convert:
         if losses is None:
             print(f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*); --losses keeps them")
         else:
-            replace_file(losses, lambda path: save_file(networks, path))
+            write_bytes(losses, save(networks))
             print(f"{losses}: {' and '.join(names)}")

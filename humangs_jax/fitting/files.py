@@ -27,7 +27,7 @@ from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
 from humangs_jax.data.photos import capture_folder, read_description
 from humangs_jax.fitting.report import FitReport
 from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
-from humangs_jax.io.atomic import add_files, check_replaceable, replace_folder
+from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, replace_folder
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import reading
 from humangs_jax.io.text import write_json
@@ -107,7 +107,8 @@ def check_place(
 
     Arguments: out: None: the capture folder itself, of which the body and the cameras are replaced. inputs: further files and
     folders that the fit reads, None is left out; another folder that is replaced may hold none of them, nor a photo.
-    Raises: ValueError if something would be overwritten without `overwrite`; see also `check_replaceable`.
+    Raises: ValueError if something would be overwritten without `overwrite`; OSError for a place that cannot be written to; see
+    also `check_replaceable`.
     """
     source = capture_folder(source)
     target = source if out is None else Path(out)
@@ -116,6 +117,7 @@ def check_place(
         check_replaceable(target, overwrite, "capture.json", (source, *inputs, *_photo_files(source, description)))
     elif (body := target / description["body"]).exists() and not overwrite:
         raise ValueError(f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere")
+    check_writable(target)
     return target
 
 

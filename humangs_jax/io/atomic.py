@@ -14,7 +14,7 @@ import shutil
 import time
 import uuid
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
@@ -42,7 +42,7 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 def replace_file(path: str | os.PathLike, write: Callable[[Path], object]) -> None:
     """Calls write(temporary), which makes that file, and renames it to `path`. The temporary name has the same suffix.
 
-    Raises: FileNotFoundError if the folder does not exist; whatever `write` raises.
+    Raises: FileNotFoundError if the folder does not exist; OSError, naming `path`, if it cannot be written; what `write` raises.
     """
     path = Path(path)
     if not path.parent.is_dir():
@@ -50,10 +50,11 @@ def replace_file(path: str | os.PathLike, write: Callable[[Path], object]) -> No
     _sweep(path.parent.resolve())
     temporary = path.with_name(f".{path.stem}.new-{_tag()}{path.suffix}")
     try:
-        write(temporary)
-        temporary.replace(path)
+        with _naming(path, temporary):
+            write(temporary)
+            temporary.replace(path)
     finally:
-        temporary.unlink(missing_ok=True)
+        _delete(temporary)
 
 
 def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *, mark: str) -> None:
@@ -62,7 +63,7 @@ def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *
     The existing folder is moved aside first and deleted last, so its contents are never lost. Parents are made.
 
     Arguments: mark: a file that all folders of this kind hold; a filled folder without it is not replaced.
-    Raises: ValueError, see `check_replaceable`; whatever `write` raises.
+    Raises: ValueError, see `check_replaceable`; OSError, naming `folder`, if it cannot be written; whatever `write` raises.
     """
     folder = Path(folder)
     check_replaceable(folder, mark=mark)
@@ -71,8 +72,9 @@ def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *
     tag = _tag()
     temporary, aside = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("new", "old"))
     try:
-        write(temporary)
-        _exchange(folder, temporary, aside)
+        with _naming(folder, temporary):
+            write(temporary)
+            _exchange(folder, temporary, aside)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     shutil.rmtree(aside, ignore_errors=True)
@@ -162,30 +164,95 @@ def add_files(
     """Calls write(temporary folder), then moves its files to the same places in `folder`; other files there stay.
 
     The folder is made if needed. Nothing is moved if `write` raises; the moves follow each other at once, so that a kill seldom
-    falls between two. The folder may be a mount point or the working folder.
+    falls between two, and those of two processes do not mix. The folder may be a mount point or the working folder.
 
     Arguments: without: files in the folder that no longer hold; they are removed before the first move.
+    Raises: OSError, naming `folder`, if it cannot be written; whatever `write` raises.
     """
     folder = Path(folder)
     inside = folder.is_dir()  # on the same disk, even if others hold the folder and what is beside it
     if inside:
         _sweep(folder.resolve())
-    else:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        _sweep(folder.parent.resolve())
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(folder.resolve().parent)  # also of one that was killed after it had made the folder
     temporary = (folder if inside else folder.parent) / f".{folder.resolve().name}.new-{_tag()}"
-    temporary.mkdir()
     try:
-        write(temporary)
-        folder.mkdir(exist_ok=True)
-        for file in without:
-            (folder / file).unlink(missing_ok=True)
-        for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
-            target = folder / file.relative_to(temporary)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            file.replace(target)
+        with _naming(folder, temporary):
+            temporary.mkdir()
+            write(temporary)
+            folder.mkdir(exist_ok=True)
+            with _locked(folder, wait=True):
+                for file in without:
+                    (folder / file).unlink(missing_ok=True)
+                for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
+                    target = folder / file.relative_to(temporary)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    file.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def only_writer(folder: str | os.PathLike) -> Generator[None]:
+    """Keeps other processes out of a folder that one writes to for long. The lock ends with the process, however that ends.
+
+    Where folders cannot be locked (Windows, some network disks), nothing is checked.
+    Raises: BlockingIOError, an OSError, if another process holds the folder.
+    """
+    with _locked(Path(folder), wait=False):
+        yield
+
+
+@contextlib.contextmanager
+def _locked(folder, wait):
+    try:
+        import fcntl
+    except ImportError:  # Windows
+        yield
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            raise BlockingIOError(f"{folder}: another process is writing here: expected another folder") from None
+        except OSError:  # a disk without locks
+            pass
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextlib.contextmanager
+def _naming(path, temporary):
+    """A full or read-only disk and other errors of the temporary file or folder become errors of `path`."""
+    try:
+        yield
+    except OSError as error:
+        name = error.filename and os.fsdecode(error.filename)
+        if error.errno is not None and (name is None or Path(name).is_relative_to(temporary)):
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        if str(temporary) in str(error):  # what a writer says in a text of its own
+            raise OSError(str(error).replace(str(temporary), str(path))) from error
+        raise
+
+
+def _delete(file):
+    with contextlib.suppress(OSError):  # what ended the write is what is said
+        file.unlink(missing_ok=True)
+
+
+def check_writable(path: str | os.PathLike) -> None:
+    """Whether a file, or a folder with all above it, can be made, to be asked before the work begins.
+
+    Raises: FileNotFoundError, NotADirectoryError or PermissionError, which are OSErrors, naming `path`.
+    """
+    path = Path(path)
+    above = next(parent for parent in (path, *path.absolute().parents) if parent.exists())
+    if not above.is_dir() and above != path:
+        raise NotADirectoryError(f"{path}: cannot be made: {above} is no folder")
+    if not os.access(above if above.is_dir() else above.parent, os.W_OK | os.X_OK):
+        raise PermissionError(f"{path}: cannot be written: {above} is read-only or belongs to somebody else")
 
 
 def _tag():

@@ -18,6 +18,7 @@ from humangs_jax.core.configuration import knob
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.transform import EXACT
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import HumanGSOutputs, Pass, Variables
 from humangs_jax.network.reader import VertexFeatures
@@ -211,12 +212,12 @@ def activate(raw: RawGaussians, config: VertexDecoder, features: VertexFeatures 
     if raw.shells is not None:
         assert features is not None and features.shells is not None  # where the logits come from
         shells, chosen = features.shells, jax.nn.softmax(raw.shells, axis=-1)
-        offsets = offsets.at[..., 2].add(chosen @ shells.distances)
-        seen = jnp.einsum("nks,nsc->nkc", chosen, shells.colors)
+        offsets = offsets.at[..., 2].add(_mean(chosen, shells.distances))
+        seen = jnp.einsum("nks,nsc->nkc", chosen, shells.colors, precision=EXACT)
     if config.frame == "normal":
         assert features is not None and features.normals is not None  # such a network is given them
         frames = normal_frames(features.normals)[:, None]
-        offsets = jnp.einsum("nkij,nkj->nki", quaternion.to_matrix(frames), offsets)
+        offsets = jnp.einsum("nkij,nkj->nki", quaternion.to_matrix(frames), offsets, precision=EXACT)
         quats = quaternion.multiply(frames, quats)
     if config.residual_color:
         if seen is None:
@@ -229,7 +230,12 @@ def shell_spread(logits: Float[Array, "n k s"], features: VertexFeatures) -> Flo
     """Variance of the shells' distances under the weights of each Gaussian, normalised units."""
     assert features.shells is not None
     chosen, distances = jax.nn.softmax(logits, axis=-1), features.shells.distances
-    return chosen @ distances**2 - (chosen @ distances) ** 2
+    return _mean(chosen, distances**2) - _mean(chosen, distances) ** 2
+
+
+def _mean(weights, values):
+    """(n, k) means of (s,) values under weights (n, k, s): metres, that an accelerator may not round to 8 bits."""
+    return jnp.matmul(weights, values, precision=EXACT)
 
 
 def corrected_skinning_weights(

@@ -17,6 +17,7 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.core.workers import end_with_parent
 from humangs_jax.io.arrays import check_array, check_indices, check_joints
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import Refused, reading
@@ -112,7 +113,7 @@ def build_bank(
         people = list(bar(make(seed, body) for seed in seeds))
     else:
         context = multiprocessing.get_context("spawn")  # a forked process may hang in jax's threads
-        with concurrent.futures.ProcessPoolExecutor(processes, mp_context=context) as pool:
+        with concurrent.futures.ProcessPoolExecutor(processes, context, end_with_parent) as pool:
             people = list(bar(pool.map(make, seeds)))
     return _stacked(people, body, split)
 

@@ -49,9 +49,15 @@ class GeneratedSource:
 
     def drawn_key(self, seed: int, index: int) -> Key:
         """The key of the index-th example of a run: a random subject of the split, in its index-th appearance."""
+        return subject_key(self._person(seed, index), index)
+
+    def _person(self, seed, index):
         people = SPLITS[self.split]
-        number = int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(len(people)))
-        return subject_key(people[number], index)
+        return people[int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(len(people)))]
+
+    def describe(self, seed: int, index: int, input_count: int) -> str:
+        """See `Source`."""
+        return f"synthetic person {self._person(seed, index)} in appearance {index}"
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
         """See `Source`."""

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.core.workers import end_with_parent
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.geometry.camera import Camera
@@ -269,6 +270,7 @@ def _start_worker(body):
     import signal
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    end_with_parent()
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
     jax.config.update("jax_platforms", "cpu")
     from humangs_jax.body.library import load_body

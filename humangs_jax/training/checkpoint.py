@@ -64,8 +64,8 @@ class Checkpoints:
             if read_only:
                 raise FileError(unreadable[0], "", "a damaged checkpoint: continue the run to have it set aside")
             _set_aside(unreadable)
-        with _quiet():
-            self._manager = ocp.CheckpointManager(folder, options=options)
+        logging.getLogger("absl").addFilter(_not_of_orbax)
+        self._manager = ocp.CheckpointManager(folder, options=options)
 
     @property
     def steps(self) -> list[int]:
@@ -85,7 +85,7 @@ class Checkpoints:
     def save(self, state: TrainState, score: float | None = None) -> None:
         """Write the state under its step, in the background: see `wait`. The state may be donated afterwards.
 
-        A step that is there already is left as it is.
+        A step that is there already is left as it is. Raises: as `wait`, of this checkpoint or of the one before.
         """
         step = int(state.step)
         if step in self._manager.all_steps():
@@ -95,13 +95,20 @@ class Checkpoints:
         ):  # where what is written would be the very memory that the next step overwrites
             state = jax.tree.map(jnp.copy, state)
         metrics = {"score": UNSCORED if score is None else float(score), CHECKSUM: _checksum(state)}
-        with _quiet():
+        with self._writing():
             self._manager.save(step, args=self._ocp.args.StandardSave(_as_dict(state)), metrics=metrics)
 
     def wait(self) -> None:
-        """Return when all that was saved is on disk. Raises: what went wrong in the background."""
-        with _quiet():
+        """Return when all that was saved is on disk. Raises: FileError if one could not be written, as on a full disk."""
+        with self._writing():
             self._manager.wait_until_finished()
+
+    @contextlib.contextmanager
+    def _writing(self) -> Generator[None]:
+        try:
+            yield
+        except Exception as error:  # of many types: Orbax's own, TensorStore's, Python's
+            raise FileError(self._manager.directory, "", f"a checkpoint cannot be written: {error}") from error
 
     def restore(self, like: TrainState, step: int | None = None) -> TrainState:
         """The state of a step (None: the newest good one). `like`: a state of the same run, for structure, shapes and devices.
@@ -131,7 +138,7 @@ class Checkpoints:
         path, wanted = Path(self._manager.directory) / str(step), _as_dict(like)
         state, problem = None, ""
         try:
-            with reading(path, "checkpoint"), _quiet():
+            with reading(path, "checkpoint"):
                 described = self._ocp.StandardCheckpointHandler().metadata(
                     self._manager.directory / str(step) / "default"
                 )
@@ -154,8 +161,8 @@ class Checkpoints:
         return state, problem
 
     def close(self) -> None:
-        """Wait for what is being written, and release what Orbax holds."""
-        with _quiet():
+        """Wait for what is being written, and release what Orbax holds. Raises: as `wait`."""
+        with self._writing():
             self._manager.close()
 
 
@@ -271,13 +278,6 @@ def _flat(tree, prefix=""):
     return items
 
 
-@contextlib.contextmanager
-def _quiet() -> Generator[None, None, None]:
-    """Without Orbax's chatter, which goes through absl's logger."""
-    absl = logging.getLogger("absl")
-    level = absl.level
-    absl.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        absl.setLevel(level)
+def _not_of_orbax(record: logging.LogRecord) -> bool:
+    """A filter of absl's logger: Orbax tells every step there, and prints errors in full that it also raises."""
+    return "orbax" not in Path(record.pathname).parts

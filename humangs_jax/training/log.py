@@ -5,9 +5,12 @@ out/log.jsonl       one object per line; {"step", "loss", ...} while training, {
 out/tensorboard/    the numbers and the validation images, if tensorboardX is installed
 """
 
+import contextlib
 import json
+import logging
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +19,11 @@ import numpy as np
 
 from humangs_jax.data.loader import Waiting
 from humangs_jax.io.atomic import write_text
+from humangs_jax.io.reading import Refused, reading
+from humangs_jax.io.text import parse_json, read_text
 from humangs_jax.training.state import TrainState
 
+logger = logging.getLogger("humangs_jax.training")
 FLUSH_SECONDS = 10
 MANY_SKIPPED = 20
 """Number of consecutive skipped steps that is reported."""
@@ -55,9 +61,11 @@ class RunLog:
     def __exit__(self, *_):
         self.bar.close()
         if self._lines is not None:
-            self._lines.close()
+            with _naming(self._lines.name):
+                self._lines.close()
         if self._board is not None:
-            self._board.close()
+            with _naming(self._board.logdir):
+                self._board.close()
 
     def steps(self, done: int, metrics: dict[str, Any], subjects: int, waiting: Waiting, broken: int) -> None:
         """Numbers of the last step done. subjects: per step; seconds and samples a second are since the last line."""
@@ -89,16 +97,17 @@ class RunLog:
         if self._board is not None:
             self._board.add_image(name, (255 * np.clip(image, 0, 1) + 0.5).astype(np.uint8), done, dataformats="HWC")
 
-    def event(self, done: int, event: str, message: str, **numbers: float) -> None:
+    def event(self, done: int, event: str, message: str, **details: float | list[str]) -> None:
         """Something worth knowing, as a line and beside the progress bar."""
-        self._write({"step": done, "event": event} | numbers)
+        self._write({"step": done, "event": event} | details)
         if self._recording:
             self.bar.write(f"step {done}: {message}")
 
     def _write(self, record):
         if self._lines is not None:  # JSON has no NaN
             finite = lambda x: x if not isinstance(x, float) or math.isfinite(x) else None
-            self._lines.write(json.dumps({name: finite(value) for name, value in record.items()}) + "\n")
+            with _naming(self._lines.name):
+                self._lines.write(json.dumps({name: finite(value) for name, value in record.items()}) + "\n")
 
 
 class Watch:
@@ -109,18 +118,18 @@ class Watch:
         self._skipped, self._nonfinite = int(state.opt_state.skipped), int(state.opt_state.nonfinite)
         self._in_a_row = 0
 
-    def __call__(self, done: int, metrics: dict[str, Any]) -> None:
-        """The metrics of the step that was just begun; done: steps with it."""
+    def __call__(self, done: int, metrics: dict[str, Any], bad_samples: Callable[[], list[str]] = list) -> None:
+        """The metrics of the step that was just begun; done: steps with it. bad_samples: asked if it failed, see `sources`."""
         # one step may wait behind the one that runs: enough to keep a device busy, and the run reacts to a signal soon
         self.look()
         names = ("skipped", "nonfinite", "loss", "grad_norm")
-        self._pending = done, {name: metrics[name] for name in names}
+        self._pending = done, {name: metrics[name] for name in names}, bad_samples
 
     def look(self) -> None:
         """Read the metrics of the pending step, and report it if it failed."""
         if self._pending is None:
             return
-        done, metrics = self._pending
+        done, metrics, bad_samples = self._pending
         self._pending = None
         numbers = {name: float(value) for name, value in jax.device_get(metrics).items()}
         skipped, nonfinite = int(numbers["skipped"]), int(numbers["nonfinite"])
@@ -130,29 +139,49 @@ class Watch:
         if not (was_skipped or was_nonfinite):
             return
         text = f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}"
+        samples = bad_samples()
+        details = numbers | ({"samples": samples} if samples else {})
+        text = "; ".join([text, *samples])
         if was_skipped:
-            self._log.event(done, "skipped", f"skipped ({text}), {skipped} so far", **numbers)
+            self._log.event(done, "skipped", f"skipped ({text}), {skipped} so far", **details)
         else:
             self._log.event(
-                done, "nonfinite", f"gradient entries that were not finite were replaced ({text})", **numbers
+                done, "nonfinite", f"gradient entries that were not finite were replaced ({text})", **details
             )
+        if samples and jax.process_index():  # whose log is not written
+            logger.warning("step %d: %s", done, text)
         if self._in_a_row == MANY_SKIPPED:
             advice = f"{MANY_SKIPPED} steps in a row were skipped: `humangs train --diagnose` names the first stage that fails"
             self._log.event(done, "stuck", advice)
 
 
 def forget_after(path: Path, step: int) -> None:
-    """Drop the lines of later steps, and a last line that was not written to its end; the file changes whole or not."""
+    """Drop the lines of later steps, and a last line that was not written to its end; the file changes whole or not.
+
+    Raises: FileError for a file that is no log: no text, too large, or with another line that is no record.
+    """
     if not path.is_file():
         return
     kept = []
-    for line in path.read_text().splitlines():
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line)
-        except (json.JSONDecodeError, KeyError, TypeError):
-            continue
+    with reading(path, "log of a run"):
+        lines = read_text(path).splitlines()
+        for number, line in enumerate(lines, 1):
+            try:
+                if parse_json(line)["step"] <= step:
+                    kept.append(line)
+            except (ValueError, LookupError, TypeError) as error:
+                if number < len(lines):  # of the last one a kill may have left a part
+                    raise Refused(f"line {number}: expected an object with a step") from error
     write_text(path, "".join(f"{line}\n" for line in kept))
+
+
+@contextlib.contextmanager
+def _naming(path):
+    """A full disk becomes an error that names the file."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
 def _tensorboard(folder, step):

@@ -10,6 +10,7 @@ Of several processes all must see the same folder `out`; one of them writes all 
 """
 
 import contextlib
+import functools
 import logging
 import signal
 import threading
@@ -21,6 +22,7 @@ import jax
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.loader import CaptureCache, Waiting
 from humangs_jax.data.views import gaussian_body
+from humangs_jax.io.atomic import only_writer
 from humangs_jax.io.images import write_png
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import save_weights
@@ -29,7 +31,7 @@ from humangs_jax.training.checkpoint import Checkpoints, save_config
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.log import RunLog, Watch
 from humangs_jax.training.sharding import place, replicated, state_shardings, training_mesh, whole
-from humangs_jax.training.sources import MakeSource, captured_people, stage_loader
+from humangs_jax.training.sources import MakeSource, bad_samples, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import NO_NETWORKS, jitted_train_step, train_step
 from humangs_jax.training.validation import sheet, validate, validation_examples
@@ -69,10 +71,15 @@ def train(
 
     Ctrl-C and SIGTERM finish the step, save and return; a second Ctrl-C interrupts at once.
     Raises: ValueError if `out` belongs to a run of another configuration, no capture can be used, devices and batch do not
-    divide each other, or the sizes of a later stage do not fit.
+    divide each other, or the sizes of a later stage do not fit; OSError if another process trains into `out`.
     """
     out, leading = Path(out), jax.process_index() == 0
     (out / "sheets").mkdir(parents=True, exist_ok=True)
+    with only_writer(out) if leading else contextlib.nullcontext():
+        return _train(config, body, training, out, leading, validation, variables, networks, fsdp, stop_at, progress)
+
+
+def _train(config, body, training, out, leading, validation, variables, networks, fsdp, stop_at, progress):
     save_config(out, config, write=leading)
     make_source = captured_people(training, body) if isinstance(training, Sequence) else training
     unseen = CaptureCache(validation, body) if validation else None
@@ -103,8 +110,11 @@ def train(
             examples = [] if unseen is None else validation_examples(unseen, part, VALIDATED)
             batches = loader.batches(first, last, waiting=waiting)
             for step, batch in batches:
+                if step == first and mesh is None:  # for nothing: once, and the arrays are at hand
+                    for line in bad_samples(loader, step, batch):
+                        log.event(step, "sample", line, samples=[line])
                 state, metrics = train_step(state, batch, body, part, networks, mesh)
-                watch(done := step + 1, metrics)
+                watch(done := step + 1, metrics, functools.partial(bad_samples, loader, step))
                 stop = stopping(done)
                 if done % config.log_every == 0 or done == end or stop:
                     log.steps(done, jax.device_get(metrics), part.batch_size, waiting, len(loader.source.broken))

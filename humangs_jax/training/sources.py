@@ -10,13 +10,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
+import numpy as np
 from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.data.capture import DEFAULT_BODY
 from humangs_jax.data.datasets.bodies import FileBody
 from humangs_jax.data.datasets.opening import open_people
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture, PeopleCache, Source
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, Loader, Mixture, PeopleCache, Source
+from humangs_jax.network.stages import inexact_leaves
 from humangs_jax.people.bank import PeopleBank, build_bank, load_bank, save_bank
 from humangs_jax.people.manifest import find_people
 from humangs_jax.people.on_the_fly import ON_THE_FLY, OnTheFlyConfig
@@ -37,6 +40,31 @@ def stage_loader(make_source: MakeSource, config: TrainConfig, step: int, mesh: 
     sharding = None if mesh is None else batch_sharding(mesh)
     before = config.examples_before(step)
     return Loader(make_source(part), part.batch_size, part.seed, sharding, first_step=step, first_example=before)
+
+
+def check_example(example: Example, name: str) -> None:
+    """Raises: ValueError, one line that begins with the name, unless all numbers are finite, colours and masks in [0, 1]."""
+    kinds = {"images": UNIT, "masks": UNIT}
+    arrays = {
+        path: (np.asarray(leaf), kinds.get(path.split(".")[-1], FINITE)) for path, leaf in inexact_leaves(example)
+    }
+    check_values(name, arrays)
+
+
+def bad_samples(loader: Loader, step: int, batch: Example | None = None) -> list[str]:
+    """What is wrong with the samples that this process gave to a step, a line for each that `check_example` refuses.
+
+    Arguments: batch: the batch of that step, on one device. None: the samples are made again: a loader is a pure function, so
+    a run need not keep what it trains on.
+    """
+    found = []
+    for i, row in enumerate(loader.rows):
+        example = loader.example_at(step, row) if batch is None else jax.tree.map(lambda x, i=i: x[i], batch)
+        try:
+            check_example(example, f"sample {row}")
+        except ValueError as error:
+            found.append(f"{error} ({loader.describe_at(step, row)})")
+    return found
 
 
 def captured_people(folders: Sequence[str | Path], body: BodyModel, body_file: str | Path = DEFAULT_BODY) -> MakeSource:

@@ -58,6 +58,9 @@ class CountingSource:
         views = lambda n: toy_views(jnp.asarray([self.name, index, seed] + [0.0] * n, jnp.float32), "")
         return jax.tree.map(np.asarray, Example(views(input_count), views(1)))
 
+    def describe(self, seed, index, input_count):
+        return f"{index} of {self.name}"
+
 
 def content(batch):
     """(source, index) of each row."""

@@ -11,6 +11,7 @@ import pytest
 from toy_body import MODEL
 
 from humangs_jax.apps import check
+from humangs_jax.avatar.export import turned
 from humangs_jax.body import skinning
 from humangs_jax.body.landmarks import pose_landmarks
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
@@ -22,6 +23,11 @@ from humangs_jax.fitting.solve import solve
 from humangs_jax.fitting.state import Origin, camera_origin, cameras_of, clothing_thickness, segments, zero_state
 from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry import camera, quaternion, svd3, transform
+from humangs_jax.network import vertex_decoder
+from humangs_jax.network.pixel_aligned import project_vertices
+from humangs_jax.network.reader import VertexFeatures
+from humangs_jax.network.shells import Shells
+from humangs_jax.network.vertex_decoder import RawGaussians, VertexDecoder
 from humangs_jax.rendering.gaussians import Gaussians, covariances, skin_gaussians
 from humangs_jax.rendering.projection import project_gaussians
 
@@ -111,6 +117,15 @@ def skinned(gaussians, transforms):
     return covariances(skin_gaussians(skin_gaussians(gaussians, transforms), transforms))
 
 
+def decoded(geometry, logits):
+    """What the decoder places: offsets along shells, turned into the frames of the normals; and a loss of theirs."""
+    shells = Shells(jnp.ones(2), jnp.ones((5, 2, 3)), *[jnp.ones((5, 2))] * 3)
+    features = VertexFeatures(jnp.ones((5, 1)), photo_colors=jnp.ones((5, 3)), shells=shells, normals=jnp.ones((5, 3)))
+    raw = RawGaussians(geometry, jnp.ones((5, 1, 4)), None, logits)
+    config = VertexDecoder(tight=1, free=0, frame="normal", residual_color=True)
+    return vertex_decoder.activate(raw, config, features), vertex_decoder.shell_spread(logits, features)
+
+
 PROGRAMS = {
     "look_at": lambda: precisions(looking, jnp.ones(3)),
     "rays": lambda: precisions(camera.plucker_rays, CAMERA),
@@ -141,6 +156,9 @@ PROGRAMS = {
     "Levenberg and Marquardt": lambda: precisions(lambda x: solve(jnp.sin, x, 3, method="lm"), jnp.ones(4)),
     "L-BFGS": lambda: precisions(lambda x: solve(lambda y: jnp.sin(y @ y), x, 3, method="lbfgs"), jnp.ones(4)),
     "outlines": lambda: precisions(lambda v: outlines._look(v, FACES, CAMERA), jnp.ones((4, 3))),
+    "decoder": lambda: precisions(decoded, jnp.ones((5, 1, 10)), jnp.ones((5, 1, 2))),
+    "pixels of vertices": lambda: precisions(project_vertices, CAMERA, jnp.ones((4, 3))),
+    "exports": lambda: precisions(lambda g: turned(g, "z"), GAUSSIANS),
     "check": lambda: precisions(lambda v: check._body_image(v, FACES, jnp.ones((4, 3)), CAMERA), jnp.ones((4, 3))),
 }
 WHOLE = {

@@ -1,15 +1,23 @@
-"""A fuzzer over every reader: python fuzz.py FOLDER INPUTS [READER ...] prints one JSON line a reader.
+"""A fuzzer over every reader: python fuzz.py FOLDER INPUTS [READER ...] [--record FILE]
 
 Honest files are taken apart as their format has it (arrays of an archive, values of JSON, instructions of a pickle, chunks of a
 PNG, words of a text), a few parts are exchanged for hostile ones, and the file is put together again; or bytes change at random.
 What is found is shrunk by hypothesis, saved as FOLDER/found-READER, and becomes a case of `attacks_*.py`.
+
+The readers take turns, `CHUNK` inputs at a time, until each has INPUTS. The record (default: FOLDER/record.json) has the figures
+of each reader; a later call with the same record goes on from there, and tries what was found again; so does, on another
+machine, one with --page docs/security.md, from docs/results/fuzz.json.
 """
 
+import argparse
 import copy
+import gc
 import io
 import itertools
 import json
+import os
 import pickletools
+import shutil
 import struct
 import sys
 import time
@@ -21,10 +29,16 @@ import worker
 
 worker.prepare()  # before JAX and the readers are imported
 
+import jax  # noqa: E402
 import numpy as np  # noqa: E402
 import readers  # noqa: E402
-from hypothesis import HealthCheck, Phase, given, settings  # noqa: E402
+from hypothesis import HealthCheck, Phase, given, seed, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
+
+CHUNK = 500
+"""Inputs that hypothesis draws from one seed: its number among those of the reader."""
+MOST_MAPPINGS = 20_000
+"""Every compiled program maps memory, of which Linux allows 65,530 pieces: with more than this the fuzzer starts itself again."""
 
 NUMBERS = [
     0,
@@ -406,14 +420,16 @@ def checked(read, path, watch):
     return result["outcome"]
 
 
-def fuzz(name, folder, inputs, watch):
-    """Figures of one reader."""
+def fuzz(name, folder, inputs, number, watch):
+    """Figures of one chunk of a reader; with something found, only what it was."""
     place = folder / name.replace(" ", "_")
+    shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
     path = readers.SEEDS[name](place)
     file = readers.damaged_file(name, path)
     honest, counts = file.read_bytes(), {"read": 0, "refused": 0}
 
+    @seed(number)
     @settings(
         max_examples=inputs, deadline=None, database=None, phases=(Phase.generate, Phase.shrink), print_blob=False,
         suppress_health_check=list(HealthCheck), report_multiple_bugs=False,
@@ -433,29 +449,69 @@ def fuzz(name, folder, inputs, watch):
             (folder / f"found-{name.replace(' ', '_')}").write_bytes(content)
             raise
 
-    start, found = time.perf_counter(), ""
+    start = time.perf_counter()
     try:
         run()
     except AssertionError as error:
-        found = str(error)[-900:]
-    return {
-        "reader": name,
-        "inputs": sum(counts.values()),
-        **counts,
-        "seconds": round(time.perf_counter() - start, 1),
-        "found": found,
-    }
+        return {"found": str(error)[-900:]}
+    return counts | {"inputs": sum(counts.values()), "chunks": 1, "seconds": time.perf_counter() - start}
 
 
 def main():
-    folder, inputs = Path(sys.argv[1]), int(sys.argv[2])
-    names = sys.argv[3:] or [name for name, seed in readers.SEEDS.items() if seed is not None]
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("inputs", type=int)
+    parser.add_argument("readers", nargs="*")
+    parser.add_argument("--record", type=Path)
+    parser.add_argument("--page", type=Path, help="page whose table fuzz is written, with its docs/results/fuzz.json")
+    arguments = parser.parse_args()
+    folder, names = arguments.folder, arguments.readers or [name for name, make in readers.SEEDS.items() if make]
+    record_file = arguments.record or folder / "record.json"
+    published = arguments.page and arguments.page.parent / "results" / "fuzz.json"
+    record = json.loads(record_file.read_text()) if record_file.exists() else {}
+    if not record and published and published.exists():
+        record = json.loads(published.read_text())["numbers"]
+    fresh = {"inputs": 0, "read": 0, "refused": 0, "chunks": 0, "seconds": 0.0}
+    figures = {name: fresh | record.get(name, {}) | {"found": ""} for name in names}
+    shutil.rmtree(folder / "honest", ignore_errors=True)
     folder.mkdir(parents=True, exist_ok=True)
     worker.warm_up(readers, folder)
     watch = worker.Watch()
     worker.limit_memory()
-    for name in names:
-        print(json.dumps(fuzz(name, folder, inputs, watch)), flush=True)
+    while waiting := [
+        name for name in names if figures[name]["inputs"] < arguments.inputs and not figures[name]["found"]
+    ]:
+        for name in waiting:
+            own = figures[name]
+            chunk = min(CHUNK, arguments.inputs - own["inputs"])
+            for key, value in fuzz(name, folder, chunk, own["chunks"], watch).items():
+                own[key] = round(own[key] + value, 1) if key != "found" else value
+            replacement = record_file.with_suffix(".new")
+            replacement.write_text(json.dumps(record | figures, indent=1) + "\n")
+            replacement.replace(record_file)
+            if own["found"]:
+                print(f"{name}: {own['found']}", flush=True)
+            jax.clear_caches()
+            gc.collect()
+            if Path("/proc/self/maps").read_bytes().count(b"\n") > MOST_MAPPINGS:
+                os.execv(sys.executable, [sys.executable, *sys.argv])
+    if arguments.page is not None:
+        write_page(arguments.page, record | figures)
+    print(json.dumps(figures))
+
+
+def write_page(page, figures):
+    sys.path.insert(0, str(worker.ROOT))
+    from experiments.common.results import markdown_table, publish
+
+    total = lambda key: sum(each[key] for each in figures.values())
+    header = ["readers", "mutated files", "fewest of a reader", "read", "refused in one line", "anything else"]
+    fewest, found = (
+        min(each["inputs"] for each in figures.values()),
+        sum(bool(each["found"]) for each in figures.values()),
+    )
+    rows = [[len(figures), f"{total('inputs'):,}", f"{fewest:,}", f"{total('read'):,}", f"{total('refused'):,}", found]]
+    publish(page, "fuzz", markdown_table(header, rows, "r" * len(header)), figures)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,9 @@ CHANGES = (
     *("shutil.rmtree", "shutil.copyfile", "shutil.move"),
 )
 
+DESCRIPTORS = {"os.remove": 1, "os.rmdir": 1, "os.mkdir": 2, "os.rename": 2}
+"""Which of their arguments is the descriptor of a folder: `shutil.rmtree` deletes with these."""
+
 
 class Forbidden(BaseException):
     """No reader catches it."""
@@ -56,10 +59,12 @@ class Watch:
         elif event in CHANGES:
             for path in arguments[:2]:
                 if isinstance(path, str | bytes | os.PathLike):
-                    self.check(event, path)
+                    self.check(event, path, arguments[DESCRIPTORS[event]] if event in DESCRIPTORS else -1)
 
-    def check(self, event, path):
-        if not Path(os.path.abspath(os.fsdecode(path))).is_relative_to(self.folder):
+    def check(self, event, path, folder=-1):
+        """folder: descriptor of the folder that the path is relative to, -1 for the working folder."""
+        base = os.getcwd() if folder == -1 else os.readlink(f"/proc/self/fd/{folder}")
+        if not Path(os.path.abspath(os.path.join(base, os.fsdecode(path)))).is_relative_to(self.folder):
             self.stop(event, path)
 
     def stop(self, event, arguments):

@@ -1,6 +1,8 @@
 """Files and folders appear whole or not at all, and what was there before is never lost."""
 
+import errno
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -109,6 +111,60 @@ def test_an_interrupt_between_the_renames_loses_nothing(tmp_path, monkeypatch, r
     assert names(tmp_path) == ["folder"] and (folder / "a.txt").read_text() == "old"
 
 
+def test_a_full_disk_names_what_was_to_be_written(tmp_path):
+    def fill(temporary):
+        temporary = temporary if temporary.suffix else temporary / "deep" / "a.txt"
+        temporary.parent.mkdir(parents=True, exist_ok=True)
+        atomic.replace_file(temporary, lambda inner: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left")))
+
+    def say(temporary):
+        raise OSError(f"{temporary}: ffmpeg failed")
+
+    for write in (fill, say):
+        for call in (
+            lambda path, write=write: atomic.replace_file(path.with_suffix(".mp4"), write),
+            lambda path, write=write: atomic.replace_folder(path, write, mark=MARK),
+            lambda path, write=write: atomic.add_files(path, write),
+        ):
+            with pytest.raises(OSError, match=r"target(\.mp4)?.*") as error:
+                call(tmp_path / "target")
+            assert str(tmp_path / "target") in str(error.value) and ".new-" not in str(error.value)
+    assert names(tmp_path) == []
+    source = tmp_path / "source"
+    with pytest.raises(FileNotFoundError, match="source"):  # that of an input is not ours
+        atomic.replace_file(tmp_path / "file", lambda temporary: temporary.write_bytes(source.read_bytes()))
+
+
+def test_a_folder_has_one_writer_at_a_time(tmp_path):
+    code = "import sys; from humangs_jax.io import atomic\n"
+    code += "with atomic.only_writer(sys.argv[1]): print('held', flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        other.stdout.readline()
+        with (
+            pytest.raises(BlockingIOError, match=f"{tmp_path}: another process is writing here"),
+            atomic.only_writer(tmp_path),
+        ):
+            pass
+        other.kill()
+    with atomic.only_writer(tmp_path):
+        atomic.add_files(tmp_path / "folder", writes_into("whole"))
+    assert names(tmp_path) == ["folder"]
+
+
+def test_places_are_checked_before_the_work(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path, tmp_path / "file", tmp_path / "new" / "deep"):
+        atomic.check_writable(path)
+    with pytest.raises(NotADirectoryError, match=r"file/deep/a\.npz: cannot be made"):
+        atomic.check_writable(tmp_path / "file" / "deep" / "a.npz")
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    for path in (tmp_path, tmp_path / "file", tmp_path / "new" / "deep"):
+        with pytest.raises(PermissionError, match=f"{path}: cannot be written"):
+            atomic.check_writable(path)
+
+
 def test_what_killed_processes_left_is_swept(tmp_path, dead_process):
     target = tmp_path / "folder"
     folder_with(leftover(target, "new", dead_process), "half")
@@ -118,6 +174,16 @@ def test_what_killed_processes_left_is_swept(tmp_path, dead_process):
     old = folder_with(leftover(target, "new", dead_process, machine="00000001"), "of another machine, long ago")
     os.utime(old, (0, 0))
     (tmp_path / ".hidden").write_text("not ours")
+    atomic.add_files(tmp_path / "other", writes_into("new"))
+    folder_with(
+        leftover(tmp_path / "other", "new", dead_process), "of one that was killed after it had made the folder"
+    )
+    atomic._sweep.cache_clear()  # a new process sweeps
+    atomic.add_files(tmp_path / "other", writes_into("newer"))
+    assert not leftover(tmp_path / "other", "new", dead_process).exists()
+    shutil.rmtree(tmp_path / "other")
+    folder_with(leftover(target, "new", dead_process), "half")
+    atomic._sweep.cache_clear()
     atomic.replace_folder(target, writes("new"), mark=MARK)
     assert len(names(tmp_path)) == 4
     assert ".hidden" in names(tmp_path) and leftover(target, "new", os.getpid()).is_dir()

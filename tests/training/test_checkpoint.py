@@ -98,6 +98,19 @@ def without_score(step):
     (step / "metrics" / "metrics").write_text("{")
 
 
+def test_what_cannot_be_written_is_one_line_that_names_the_folder(tmp_path, monkeypatch, capfd):
+    checkpoints = Checkpoints(tmp_path / "checkpoints")
+
+    def fail(*_, **__):
+        raise RuntimeError("RESOURCE_EXHAUSTED: Error writing\nlocal file: No space left on device")
+
+    monkeypatch.setattr(checkpoints._manager, "wait_until_finished", fail)
+    with pytest.raises(FileError, match=r"checkpoints: a checkpoint cannot be written: .*No space left") as error:
+        checkpoints.wait()
+    assert "\n" not in str(error.value) and str(tmp_path) in str(error.value)
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path, same, caplog):
     first = Checkpoints(tmp_path / "whole", keep=3)
     for step in (1, 2, 3):

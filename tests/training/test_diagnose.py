@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import inspect
+import json
 
 import jax
 import jax.numpy as jnp
@@ -248,6 +249,9 @@ class Spoilt:
             example.targets.images[0, 1, 2, 0] = np.nan  # no background that the network skips
         return example
 
+    def describe(self, seed, index, input_count):
+        return self.source.describe(seed, index, input_count)
+
 
 @pytest.mark.slow
 def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, tmp_path):
@@ -259,6 +263,10 @@ def test_a_run_is_repeated_up_to_its_first_bad_step(body, captures, variables, t
 
     cache = CaptureCache(captures, body)
     train(CONFIG, body, source(3), tmp_path, variables=variables, stop_at=5, progress=False)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    events = [line for line in lines if "samples" in line]
+    assert [(event["step"], len(event["samples"])) for event in events] == [(4, 1)]
+    assert "targets.images" in events[0]["samples"][0] and str(captures[0].parent) in events[0]["samples"][0]
     diagnosis = diagnose_run(tmp_path, body, source(3), variables=variables)
     assert diagnosis.step == 3 and first_failed_step(tmp_path / "log.jsonl") == 3
     assert diagnosis.fault is not None and diagnosis.fault.leaf.name == "targets.images"

@@ -1,14 +1,20 @@
 """The log: what a killed run wrote too much goes, what went wrong is reported, TensorBoard reads the same numbers."""
 
+import dataclasses
 import json
+import re
 import struct
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from humangs_jax.data.loader import Waiting
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Waiting, subject_order
+from humangs_jax.io.reading import FileError
+from humangs_jax.training.config import tiny
 from humangs_jax.training.log import MANY_SKIPPED, RunLog, Watch, forget_after
 from humangs_jax.training.optimizer import GuardState
+from humangs_jax.training.sources import bad_samples
 from humangs_jax.training.state import TrainState
 
 
@@ -45,6 +51,19 @@ def test_lines_of_later_steps_and_half_written_ones_go(tmp_path):
     forget_after(tmp_path / "none.jsonl", 2)
 
 
+def test_what_is_no_log_is_one_line_and_stays_as_it_is(tmp_path):
+    path = tmp_path / "log.jsonl"
+    for content in (
+        b"\xff\xfe",
+        b'{"step": 1}\n[' + b"[" * 10_000 + b'\n{"step": 2}\n',
+        b'{"step": 1}\nhello\n{"step": 2}\n',
+    ):
+        path.write_bytes(content)
+        with pytest.raises(FileError, match=re.escape(str(path))) as error:
+            forget_after(path, 2)
+        assert "\n" not in str(error.value) and path.read_bytes() == content
+
+
 def test_tensorboard_reads_the_numbers_and_the_images(tmp_path):
     waiting = Waiting()
     with RunLog(tmp_path, 0, 10, progress=False) as log:
@@ -71,12 +90,53 @@ def test_numbers_that_are_not_finite_are_no_json(tmp_path):
     assert (tmp_path / "log.jsonl").read_text() == '{"step": 3, "event": "skipped", "loss": null, "grad_norm": 2.0}\n'
 
 
+def test_a_full_disk_names_the_log(tmp_path):
+    (tmp_path / "log.jsonl").symlink_to("/dev/full")
+    with (
+        pytest.raises(OSError, match=r"No space left on device: .*log\.jsonl"),
+        RunLog(tmp_path, 0, 10, progress=False) as log,
+    ):
+        log.event(3, "skipped", "skipped")
+
+
 def test_a_process_that_does_not_record_writes_nothing(tmp_path):
     with RunLog(tmp_path, 0, 10, recording=False) as log:
         log.steps(1, {"loss": jnp.ones(()), "psnr": jnp.ones(())}, 1, Waiting(), 0)
         log.event(1, "skipped", "skipped")
         log.image(1, "sheet", np.zeros((2, 2, 3)))
     assert list(tmp_path.iterdir()) == []
+
+
+@dataclasses.dataclass(frozen=True)
+class Spoilt(CaptureSource):
+    """Captures, of which example 3 is not finite and example 4 is not in [0, 1]."""
+
+    def example(self, seed, index, input_count):
+        example = super().example(seed, index, input_count)
+        if index == 3:
+            example.targets.images[0, 1, 2, 0] = np.nan
+        if index == 4:
+            example.inputs.masks[1] *= 255
+        return example
+
+
+def test_a_bad_sample_is_named(tmp_path, body, captures, capsys):
+    config = tiny()
+    cache, size = CaptureCache(captures, body), config.model.conventions.image_size
+    loader = Loader(Spoilt(cache, config.views, size, config.target_size), batch_size=2)
+    assert bad_samples(loader, 0) == bad_samples(loader, 0, loader.batch_at(0)) == []
+    (one,), (other,) = bad_samples(loader, 1), bad_samples(loader, 2, loader.batch_at(2))
+    order = [captures[i] for epoch in (0, 1) for i in subject_order(0, epoch, len(captures))]
+    assert one.endswith(f"the first at [0, 1, 2, 0]: nan ({order[3]})") and "sample 1: targets.images: " in one
+    assert "sample 0: inputs.masks: expected numbers in [0, 1]" in other and other.endswith(f"({order[4]})")
+    state = TrainState(jnp.asarray(0), {}, {}, GuardState(jnp.asarray(0), jnp.asarray(0), jnp.zeros(()), ()), None)
+    metrics = {"skipped": jnp.asarray(1), "nonfinite": jnp.asarray(1), "loss": jnp.asarray(jnp.nan)}
+    with RunLog(tmp_path, 0, 100, progress=False) as log:
+        watch = Watch(log, state)
+        watch(2, metrics | {"grad_norm": jnp.zeros(())}, lambda: bad_samples(loader, 1))
+        watch.look()
+    (event,) = read(tmp_path / "log.jsonl")
+    assert event["samples"] == [one] and one in capsys.readouterr().out
 
 
 def test_steps_that_went_wrong_are_told_by_number(tmp_path, capsys):

@@ -62,8 +62,14 @@ class Loader:
 
     def example_at(self, step: int, row: int) -> Example:
         """Row `row` of the global batch of a step."""
-        number = self.first_example + (step - self.first_step) * self.batch_size + row
-        return self.source.example(self.seed, number, self.input_count(step))
+        return self.source.example(self.seed, self._number(step, row), self.input_count(step))
+
+    def describe_at(self, step: int, row: int) -> str:
+        """Whom that row shows, in words."""
+        return self.source.describe(self.seed, self._number(step, row), self.input_count(step))
+
+    def _number(self, step, row):
+        return self.first_example + (step - self.first_step) * self.batch_size + row
 
     def batch_at(self, step: int) -> Example:
         """The batch of a step on the devices: an `Example` with a leading batch axis on every leaf.

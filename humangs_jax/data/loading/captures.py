@@ -272,6 +272,14 @@ class CaptureSource:
 
     def example(self, seed: int, index: int, input_count: int) -> Example:
         """See `Source`."""
+        return self._found(seed, index, input_count)[1]
+
+    def describe(self, seed: int, index: int, input_count: int) -> str:
+        """See `Source`: the folder."""
+        return str(self._found(seed, index, input_count)[0])
+
+    def _found(self, seed, index, input_count):
+        """The folder and the example."""
         epoch, position = divmod(index, len(self.cache))
         order = subject_order(seed, epoch, len(self.cache))
         for subject_index in np.roll(order, -position).tolist():
@@ -292,5 +300,6 @@ class CaptureSource:
                 self.cache.note(subject_index, str(error))
                 continue
             shown, asked = range(len(inputs)), range(len(inputs), len(inputs) + len(targets))
-            return Example(subject_views(seen, shown, self.input_size), subject_views(seen, asked, self.target_size))
+            example = Example(subject_views(seen, shown, self.input_size), subject_views(seen, asked, self.target_size))
+            return self.cache.name(subject_index), example
         raise ValueError(f"none of the {len(self.cache)} capture folders can be used")

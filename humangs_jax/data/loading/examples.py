@@ -89,6 +89,10 @@ class Source(Protocol):
         """
         ...
 
+    def describe(self, seed: int, index: int, input_count: int) -> str:
+        """Whom that example shows, in words: for reports, so it may take as long as `example`."""
+        ...
+
 
 def nearest_view(subject: StoredSubject, azimuth: float, allowed: np.ndarray) -> int:
     """The allowed view (bool, (v,)) whose camera stands closest to an azimuth."""

@@ -103,3 +103,8 @@ class Mixture:
         """See `Source`."""
         source, number = source_at(seed, index, self._counts)
         return self.sources[source].example(seed, number, input_count)
+
+    def describe(self, seed: int, index: int, input_count: int) -> str:
+        """See `Source`."""
+        source, number = source_at(seed, index, self._counts)
+        return self.sources[source].describe(seed, number, input_count)

@@ -1,0 +1,123 @@
+"""Kills every command that writes at random moments: python kills.py FOLDER [--moments 10] [--json FILE] [COMMAND ...]
+
+A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, some time after one, or at
+any time. Then no file under a final name may be half-written or lost, and the next run has to make what a run that nobody
+disturbed makes, and to remove what the killed one left. See `writers` for what the commands compute meanwhile.
+"""
+
+import argparse
+import dataclasses
+import json
+import random
+import shutil
+import sys
+import time
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import writers
+from writers import COMMANDS, Command, Moment
+
+LONGEST = 1.0
+"""Seconds after a change of a file at which a run is killed, at most."""
+BEFORE, AFTER = 0.45, 0.85
+"""Shares of the moments just before a change, and up to some time after one; the rest is at any time."""
+
+
+def moments(changes: list, count: int, generator: random.Random) -> list[Moment]:
+    times = [when for when, *_ in changes]
+    found = []
+    for _ in range(count):
+        at, kind = generator.randrange(len(times)), generator.random()
+        gap = (times[at + 1] if at + 1 < len(times) else times[-1] + 0.1) - times[at]
+        if kind < BEFORE:
+            found.append(Moment(at, 0.0))
+        elif kind < AFTER:
+            found.append(Moment(at, generator.uniform(1e-6, min(gap, LONGEST))))
+        else:
+            found.append(Moment(None, generator.uniform(0, times[-1])))
+    return found
+
+
+def kill(command: Command, folder: Path, inputs: Path, count: int, seed: int = 0) -> dict:
+    """Kills a command at so many moments; figures and faults."""
+    began, faults, killed, left = time.monotonic(), [], 0, 0
+    place = writers.place_of(command, folder, inputs, "whole")
+    if command.first is not None:
+        assert writers.run(command, place, inputs, 1).code == 0, command.name
+    kept = folder / "before"
+    shutil.rmtree(kept, ignore_errors=True)
+    shutil.copytree(place, kept)
+    before = writers.snapshot(place)[0]
+    undisturbed = writers.run(command, place, inputs, 2)
+    assert undisturbed.code == 0, (command.name, undisturbed.errors)
+    expected = writers.snapshot(place)[0]
+    faults += writers.unlike(command, place, expected)
+    for moment in moments(undisturbed.changes, count, random.Random(f"{command.name} {seed}")):
+        shutil.rmtree(place)
+        shutil.copytree(kept, place)
+        disturbed = writers.run(command, place, inputs, 2, moment)
+        found = [] if disturbed.code in (None, 0) else [f"exit status {disturbed.code}: {disturbed.errors[-500:]}"]
+        killed += disturbed.code is None
+        left += bool(writers.snapshot(place)[1])
+        found += writers.half_written(command, place, before, expected)
+        found += writers.next_run(command, place, inputs, expected)
+        faults += [f"{dataclasses.astuple(moment)}: {fault}" for fault in found]
+    return {
+        "changes_of_files": len(undisturbed.changes),
+        "killed": killed,
+        "came_to_their_end": count - killed,
+        "left_something": left,
+        "faults": faults,
+        "seconds": round(time.monotonic() - began),
+    }
+
+
+def kill_all(folder: Path, count: int, names: list[str], record: Path | None = None, seed: int = 0) -> dict[str, dict]:
+    """Figures by command. A record is continued: commands that are killed again replace what it has of them."""
+    writers.import_everything()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    writers.prepare(folder / "inputs")
+    figures = json.loads(record.read_text())["commands"] if record is not None and record.exists() else {}
+    for command in COMMANDS:
+        if (names and command.name not in names) or count == 0:
+            continue
+        figures[command.name] = kill(command, folder, folder / "inputs", count, seed)
+        print(command.name, figures[command.name], flush=True)
+        if record is not None:
+            totals = {key: sum(each[key] for each in figures.values()) for key in ("killed", "left_something")}
+            record.write_text(json.dumps({"commands": figures} | totals, indent=1) + "\n")
+    return figures
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("commands", nargs="*", help="default: all")
+    parser.add_argument("--moments", type=int, default=10, help="for each command")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, help="record of the figures by command; an earlier one is continued")
+    parser.add_argument("--page", type=Path, help="page whose table kills is written, with its docs/results/kills.json")
+    arguments = parser.parse_args()
+    figures = kill_all(arguments.folder, arguments.moments, arguments.commands, arguments.json, arguments.seed)
+    if arguments.page is not None:
+        write_page(arguments.page, figures)
+    sys.exit(any(each["faults"] for each in figures.values()))
+
+
+def write_page(page: Path, figures: dict[str, dict]) -> None:
+    sys.path.insert(0, str(Path(__file__).parents[2]))
+    from experiments.common.results import markdown_table, publish
+
+    total = lambda key: sum(each[key] for each in figures.values())
+    header = ["commands that write", "changes of files in one run", "killed", "left a temporary name"]
+    header += ["half-written, lost, or the next run failed"]
+    faults = sum(len(each["faults"]) for each in figures.values())
+    rows = [[len(figures), total("changes_of_files"), total("killed"), total("left_something"), faults]]
+    publish(page, "kills", markdown_table(header, rows, "r" * len(header)), figures)
+
+
+if __name__ == "__main__":
+    main()
