@@ -121,7 +121,7 @@ class Animate:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     motion: Path | None = None
-    """.npz (ours, AMASS, AIST++, THuman4.0, AvatarReX) or LHM's .json. Default: the shipped walk."""
+    """.npz or .pkl (ours, AMASS, SMPL, AIST++, THuman4.0, AvatarReX), LHM's .json, .bvh or .glb. Default: the shipped walk."""
     out: Path = Path("animation.mp4")
     """The video to write."""
     size: int = 512
@@ -140,7 +140,8 @@ class Animate:
         require_parent(self.out)
         require_suffix(self.out, (".mp4", ".gif"))
         require_at_least(1, size=self.size)
-        avatar, motion = Avatar.load(self.avatar), load_motion(self.motion)
+        avatar = Avatar.load(self.avatar)
+        motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
         frames = motion_frames(avatar, motion, self.size, azimuth=self.azimuth, turn=self.turn)
         write_video(self.out, frames, motion.fps)
         print(f"{self.out}: {len(motion.translations)} frames at {motion.fps:g} frames per second")
@@ -250,7 +251,8 @@ class View:
         from humangs_jax.data.motion import load_motion
         from humangs_jax.viewer.page import page_html, serve
 
-        motion = None if self.motion is None else load_motion(self.motion)
+        avatar = Avatar.load(self.avatar)
+        motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
         name = None if self.motion is None else self.motion.stem
-        text = page_html(Avatar.load(self.avatar), motion, self.avatar.stem, name)
+        text = page_html(avatar, motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)
