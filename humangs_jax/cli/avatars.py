@@ -11,6 +11,7 @@ from humangs_jax.cli.options import refine_limits, require_at_least, require_par
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.data.capture import Capture
+    from humangs_jax.data.motion import Motion
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +124,7 @@ class Animate:
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     motion: Path | None = None
-    """.npz (ours, AMASS, AIST++, THuman4.0, AvatarReX) or LHM's .json. Default: the shipped walk."""
+    """.npz or .pkl (ours, AMASS, SMPL, AIST++, THuman4.0, AvatarReX), LHM's .json, .bvh or .glb. Default: the shipped walk."""
     out: Path = Path("animation.mp4")
     """The video to write."""
     size: int = 512
@@ -142,7 +143,8 @@ class Animate:
         require_parent(self.out)
         require_suffix(self.out, (".mp4", ".gif"))
         require_at_least(1, size=self.size)
-        avatar, motion = Avatar.load(self.avatar), load_motion(self.motion)
+        avatar = Avatar.load(self.avatar)
+        motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
         frames = motion_frames(avatar, motion, self.size, azimuth=self.azimuth, turn=self.turn)
         write_video(self.out, frames, motion.fps)
         print(f"{self.out}: {len(motion.translations)} frames at {motion.fps:g} frames per second")
@@ -183,41 +185,45 @@ class Render:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Export an avatar: a page that shows it moving in any browser (--html), or a file for Gaussian viewers (--out): 3DGS .ply,
-    .splat, or .glb with KHR_gaussian_splatting, in the T-pose or in one frame of a motion.
+    """Export an avatar (docs/export.md): a page that shows it moving in any browser (--html), or a file for other programs.
+
+    Gaussians: 3DGS .ply, .splat, .spz, .glb with KHR_gaussian_splatting. The body as a textured mesh: .obj, and with --mesh a
+    .glb with skin and motion. In the T-pose, in one frame of a motion, or in many.
     """
 
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
     out: Path | None = None
-    """File to write: .ply, .splat or .glb. Default: avatar.ply without --html, none with it."""
+    """File to write: .ply, .splat, .spz, .glb or .obj. Default: avatar.ply without --html, none with it."""
     html: Path | None = None
     """The page to write: one .html file that needs no network (docs/viewer.md)."""
+    mesh: bool = False
+    """--out X.glb: the body as a textured mesh with its skin, and --motion as animation, in place of Gaussians."""
     motion: Path | None = None
-    """Page: the motion it plays (default: the shipped walk). --out: pose it by this motion (default: T-pose)."""
-    frame: int = 0
-    """--out: which frame of the motion."""
+    """Page: the motion it plays (default: the shipped walk). --out: pose it by this motion (default: T-pose). docs/motions.md."""
+    frame: int | None = None
+    """--out: which frame of the motion, from 0 (default: the first)."""
+    frames: str | None = None
+    """--out: many frames: a:b:step as in Python, ":" for all. X.ply becomes X_0000.ply, X_0005.ply and so on."""
     up: Literal["y", "-y", "z"] | None = None
-    """--out: the axis that points up in the file; the feet stand on 0. Default: -y, as splat viewers expect; .glb: y, as glTF
-    wants."""
+    """--out: the axis that points up in the file; the feet stand on 0. Default: -y for .ply and .splat, as their viewers expect,
+    y for the others."""
     rest: bool = False
     """.ply: add the 45 zero f_rest fields that some importers (Unity) require."""
 
     def run(self) -> None:
         out = Path("avatar.ply") if self.out is None and self.html is None else self.out
-        for option, path, suffixes in (("--out", out, (".ply", ".splat", ".glb")), ("--html", self.html, (".html",))):
+        suffixes = (".glb", ".obj") if self.mesh else (".ply", ".splat", ".spz", ".glb", ".obj")
+        for option, path, allowed in (("--out", out, suffixes), ("--html", self.html, (".html",))):
             if path is not None:
                 require_parent(path, option)
-                require_suffix(path, suffixes, option)
-        from humangs_jax.avatar.animate import animate
+                require_suffix(path, allowed, option)
+        self._check(out)
         from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.avatar.export import grounded_gaussians, turned, write_glb, write_ply, write_splat
         from humangs_jax.data.motion import load_motion
 
         avatar = Avatar.load(self.avatar)
-        motion = None if self.motion is None else load_motion(self.motion)
-        if motion is not None and not 0 <= self.frame < len(motion.translations):
-            raise ValueError(f"--frame {self.frame}: {self.motion} has {len(motion.translations)} frames, from 0")
+        motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
         if self.html is not None:
             from humangs_jax.viewer.page import write_page
 
@@ -225,15 +231,55 @@ class Export:
             size = write_page(self.html, avatar, motion, self.avatar.stem, name)
             print(f"{self.html}: {len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
         if out is not None:
-            suffix = out.suffix.lower()
-            gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(self.frame))
-            up = self.up or ("y" if suffix == ".glb" else "-y")
-            gaussians = turned(grounded_gaussians(gaussians), up)
-            if suffix == ".ply":
-                write_ply(out, gaussians, spherical_harmonics_rest=self.rest)
-            else:
-                {".splat": write_splat, ".glb": write_glb}[suffix](out, gaussians)
-            print(f"{out}: {len(gaussians.means):,} Gaussians, {up} up, feet on 0")
+            self._write(out, avatar, motion)
+
+    def _check(self, out: Path | None) -> None:
+        """What does not go together is said before anything is read. Raises: ValueError."""
+        for option, value in (("--frame", self.frame), ("--frames", self.frames)):
+            if value is not None and (self.motion is None or out is None):
+                raise ValueError(f"{option} {value}: expected --motion and --out with it")
+        if self.frame is not None and (self.frames is not None or self._animated(out)):
+            with_it = "--frames" if self.frames is not None else "--mesh, whose .glb holds the motion: use --frames"
+            raise ValueError(f"--frame {self.frame}: does not go with {with_it}")
+
+    def _animated(self, out: Path | None) -> bool:
+        return self.mesh and out is not None and out.suffix.lower() == ".glb"
+
+    def _write(self, out: Path, avatar: "Avatar", motion: "Motion | None") -> None:
+        from humangs_jax.avatar.export import export
+
+        numbers, animated = None, self._animated(out)
+        name = "motion" if self.motion is None else self.motion.stem
+        if motion is not None:
+            motion, numbers = self._frames(motion, animated)
+        mesh = self.mesh or out.suffix.lower() == ".obj"
+        files = export(
+            out, avatar, motion, None if animated else numbers, mesh=mesh, up=self.up, rest_fields=self.rest, name=name
+        )
+        what = f"{len(avatar.faces):,} triangles" if mesh else f"{len(avatar.gaussians.means):,} Gaussians"
+        poses = f", {len(motion.translations)} frames" if motion is not None and animated else ""
+        written = str(out) if len(files) == 1 else f"{files[0]} to {files[-1].name}: {len(files)} files"
+        print(f"{written}: {what}{poses}, feet on 0")
+
+    def _frames(self, motion: "Motion", animated: bool) -> "tuple[Motion, range | None]":
+        """The frames asked for, and their numbers where there are many."""
+        from humangs_jax.avatar.export import frame_range
+        from humangs_jax.core.pytree import replace
+
+        count = len(motion.translations)
+        if self.frames is None and animated:
+            return motion, None
+        if self.frames is not None:
+            numbers = frame_range(self.frames, count)
+        else:
+            frame = self.frame or 0
+            if not 0 <= frame < count:
+                raise ValueError(f"--frame {frame}: {self.motion} has {count} frames, from 0")
+            numbers = range(frame, frame + 1)
+        chosen = slice(numbers.start, numbers.stop, numbers.step)
+        fps = motion.fps / numbers.step
+        motion = replace(motion, rotations=motion.rotations[chosen], translations=motion.translations[chosen], fps=fps)
+        return motion, None if self.frames is None else numbers
 
 
 @dataclasses.dataclass(frozen=True)
@@ -254,7 +300,8 @@ class View:
         from humangs_jax.data.motion import load_motion
         from humangs_jax.viewer.page import page_html, serve
 
-        motion = None if self.motion is None else load_motion(self.motion)
+        avatar = Avatar.load(self.avatar)
+        motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
         name = None if self.motion is None else self.motion.stem
-        text = page_html(Avatar.load(self.avatar), motion, self.avatar.stem, name)
+        text = page_html(avatar, motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)

@@ -5,21 +5,16 @@ not there is left out, as trimesh does.
 """
 
 import io
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from humangs_jax.io.glb import count_of, parse_glb, view_of
 from humangs_jax.io.images import image_in
-from humangs_jax.io.reading import Refused, check_limit, check_unpacked, inside, read_bytes, reading
-from humangs_jax.io.text import parse_json
+from humangs_jax.io.reading import Refused, check_limit, inside, read_bytes, reading
 
 TYPES = ("obj", "ply", "glb", "stl", "off")
 """Suffixes of the formats; trimesh has more, of which some start programs or read XML."""
-GLB_START, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
-COLUMNS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-COMPONENT_BYTES = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
-"""https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#accessor-data-types"""
 
 
 def read_meshes(path: str | Path, textures: bool = False) -> list[Any]:
@@ -81,32 +76,11 @@ def _folder_of(path):
     return Folder(path.parent)
 
 
-# GLB ------------------------------------------------------------------------------------------------------------------
-
-
 def _check_glb(data: bytes, textures: bool) -> None:
-    """Raises: Refused, KeyError, TypeError, ... for sizes and places that do not fit the file.
-
-    https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#glb-file-format-specification
-    """
-    start, _, _, length, kind = struct.unpack_from("<IIIII", data.ljust(20, b"\0"))
-    if start != GLB_START or kind != JSON_CHUNK:
-        raise Refused("not a mesh that can be read: no GLB file")
-    check_limit("slow_text_bytes", length, "bytes of JSON in a GLB")
-    content = parse_json(data[20 : 20 + length].decode())
-    binary = b""
-    if len(data) >= 28 + length:
-        size, kind = struct.unpack_from("<II", data, 20 + length)
-        binary = data[28 + length : 28 + length + size]
-        if kind != BINARY_CHUNK or len(data) - (28 + length + size) not in range(8):
-            raise Refused("a GLB file with other chunks than JSON and one of numbers")
-    if any("uri" in buffer for buffer in content.get("buffers", [])):
-        raise Refused("numbers in another file: expected a GLB file that holds all of its own")
-    views = [_view(view, binary) for view in content.get("bufferViews", [])]
-    accessors = content.get("accessors", [])
-    counts = [_count(accessor) for accessor in accessors]
-    sizes = [COLUMNS[accessor["type"]] * COMPONENT_BYTES[accessor["componentType"]] for accessor in accessors]
-    check_unpacked(len(data), sum(count * size for count, size in zip(counts, sizes, strict=True)))
+    """Raises: Refused, KeyError, TypeError, ... for sizes and places that do not fit the file."""
+    content, binary = parse_glb(data)
+    views = [view_of(view, binary) for view in content.get("bufferViews", [])]
+    counts = [count_of(accessor) for accessor in content.get("accessors", [])]
     of_mesh = [sum(_corners(part, counts) for part in mesh["primitives"]) for mesh in content.get("meshes", [])]
     shown = [of_mesh[node["mesh"]] for node in content.get("nodes", []) if "mesh" in node]
     check_limit("corners", max(sum(of_mesh), sum(shown)), "corners of triangles")
@@ -119,23 +93,7 @@ def _check_glb(data: bytes, textures: bool) -> None:
                 raise Refused("a texture within the text: expected it as a part of the numbers")
 
 
-def _view(view, binary):
-    start, size, step = view.get("byteOffset", 0), view["byteLength"], view.get("byteStride", 1)
-    if not all(type(n) is int and n >= 0 for n in (start, size)) or start + size > len(binary):
-        raise Refused(f"{size} bytes from {start}, but there are {len(binary)}")
-    if view["buffer"] != 0 or type(step) is not int or step < 1:
-        raise Refused("a view of numbers that are not in this file, or without a step")
-    return binary[start : start + size]
-
-
 def _corners(part, counts):
     """Corners of a part of a mesh, at least 1,000: that is what any part costs."""
     indices = 3 * counts[part["indices"]] if "indices" in part else 0
     return max(1000, indices + counts[part["attributes"]["POSITION"]])
-
-
-def _count(accessor):
-    count, start = accessor["count"], accessor.get("byteOffset", 0)
-    if not all(type(n) is int and n >= 0 for n in (count, start)):
-        raise Refused(f"{count!r} numbers from {start!r}")
-    return count

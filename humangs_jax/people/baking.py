@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyPose
-from humangs_jax.core.array_types import Bool, Float, UInt8
+from humangs_jax.core.array_types import Float, UInt8
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.text import write_json
-from humangs_jax.people.atlas import Atlas, texels, unwrap
 from humangs_jax.people.kinematics import HEAD
 from humangs_jax.people.rendering import PosedSubject, light_points, paint, pose_subject, spots_at
 from humangs_jax.people.subject import SyntheticSubject
+from humangs_jax.rendering.mesh.atlas import Atlas, fill_gaps, texels, unwrap
 
 JOINTS_PER_VERTEX = 6
 """Bodies have up to 7, smoothed garments up to 12; six lose at most 0.4 % of the weight, under a millimetre in any pose."""
@@ -83,14 +83,6 @@ def strongest_joints(
     ids = np.argsort(-weights, axis=1, kind="stable")[:, :count]
     kept = np.take_along_axis(weights, ids, axis=1)
     return ids.astype(np.uint8), (kept / kept.sum(1, keepdims=True)).astype(np.float32)
-
-
-def fill_gaps(image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w c"]:
-    """The image with every unknown texel replaced by the nearest known one."""
-    from scipy.ndimage import distance_transform_edt
-
-    rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return image[rows, columns]
 
 
 SCAN, TEXTURE, PARAMETERS = "scan", "material_0.png", "scan.json"

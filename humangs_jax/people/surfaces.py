@@ -13,13 +13,9 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float, Int
+from humangs_jax.rendering.mesh.atlas import Faces, Points, edges_of, unit
 
-Points = Float[np.ndarray, "n 3"]
-Faces = Int[np.ndarray, "f 3"]
 Field = Float[np.ndarray, " n"]
-
-NORMAL_FLOOR = 1e-12
-"""Added to lengths before dividing: vertices without area get the zero normal."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,16 +65,6 @@ def scatter_add(
     """Sums of the rows of `values` (m, c) that share an index, (count, c) float32."""
     columns = [np.bincount(indices, weights=values[:, c], minlength=count) for c in range(values.shape[1])]
     return np.stack(columns, axis=1).astype(np.float32)
-
-
-def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Vectors over their lengths along the last axis."""
-    return vectors / (np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)) + NORMAL_FLOOR)
-
-
-def edges_of(faces: Faces) -> Int[np.ndarray, "e 2"]:
-    """(e, 2) directed edges of all faces, three per face."""
-    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:

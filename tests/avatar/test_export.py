@@ -1,5 +1,6 @@
 """Files for other people's viewers: one world for all of them, read back by hand, by plyfile and by npm's tools."""
 
+import gzip
 import json
 import os
 import shutil
@@ -11,11 +12,24 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export import SH_C0, grounded_gaussians, turned, write_glb, write_ply, write_splat
+from humangs_jax.avatar.export import (
+    SH_C0,
+    frame_range,
+    grounded_gaussians,
+    turned,
+    write_glb,
+    write_ply,
+    write_splat,
+    write_spz,
+)
+from humangs_jax.avatar.export.files import USUAL_UP
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.rendering.gaussians import Gaussians, covariances
 
 MATRICES = {
@@ -25,6 +39,11 @@ MATRICES = {
 }
 AXES = {"y": [0, 1, 0], "-y": [0, -1, 0], "z": [0, 0, 1]}
 PREFIX = "KHR_gaussian_splatting:"
+SPZ_LOSSES = {
+    **{"SCALE": 0.02, "ROTATION": 0.08, "OPACITY": 0.51 / 255, "COLOR_0": 2.5 / 255},
+    "SH_DEGREE_0_COEF_0": 0.51 / 255 / 0.15,
+}
+"""What the bits of `.spz` leave: scales of up to 0.6 m in steps of 6 %, which covariances have twice."""
 TOOLS = Path(os.environ.get("HUMANGS_NPM", "."))
 """Folder where `npm install @playcanvas/splat-transform` was run; the environment variable HUMANGS_NPM."""
 TRANSFORM = shutil.which(
@@ -56,6 +75,97 @@ def test_a_world_is_turned_as_a_whole_and_up_is_where_it_is_said(up, matrix):
     np.testing.assert_allclose(after.means, np.asarray(before.means) @ R.T, atol=1e-6)
     exact = R @ np.asarray(covariances(before)) @ R.T
     assert np.abs(np.asarray(covariances(after)) - exact).max() < 1e-5 * np.abs(exact).max()
+
+
+def read_ply(path):
+    """Gaussians of a 3DGS file, by plyfile and the formulas of its paper."""
+    import plyfile
+
+    vertex = plyfile.PlyData.read(str(path))["vertex"]
+    read = lambda *names: np.stack([vertex[name] for name in names], axis=-1)
+    f32 = lambda x: jnp.asarray(x, jnp.float32)
+    return Gaussians(
+        f32(read("x", "y", "z")),
+        f32(read(*(f"rot_{i}" for i in range(4)))),
+        f32(np.exp(read("scale_0", "scale_1", "scale_2"))),
+        f32(1 / (1 + np.exp(-vertex["opacity"]))),
+        f32(0.5 + SH_C0 * read("f_dc_0", "f_dc_1", "f_dc_2")),
+    )
+
+
+def read_spz(path):
+    """Gaussians of a `.spz` of version 3, by the letter of its specification."""
+    data = gzip.decompress(path.read_bytes())
+    magic, version, count, degree, bits, flags, reserved = struct.unpack("<IIIBBBB", data[:16])
+    assert (data[:4], version, degree, flags, reserved) == (b"NGSP", 3, 0, 0, 0) and magic == 0x5053474E
+    assert len(data) == 16 + 20 * count
+    sizes = np.cumsum([16, 9 * count, count, 3 * count, 3 * count])
+    parts = [np.frombuffer(data, "u1", b - a, a) for a, b in zip(sizes, [*sizes[1:], len(data)], strict=True)]
+    bytes_ = parts[0].reshape(count, 3, 3).astype(int)
+    fixed = bytes_ @ [1, 256, 65536]
+    fixed -= (fixed >= 2**23) * 2**24
+    packed = parts[4].view("<u4")
+    quats = np.zeros((count, 4))  # xyzw
+    for row, value in zip(quats, packed.tolist(), strict=True):
+        largest = value >> 30
+        for i in (3, 2, 1, 0):
+            if i != largest:
+                row[i] = (value & 511) / 511 / np.sqrt(2) * (-1 if value & 512 else 1)
+                value >>= 10
+        row[largest] = np.sqrt(max(0, 1 - (row**2).sum()))
+    f32 = lambda x: jnp.asarray(x, jnp.float32)
+    colors = (parts[2].reshape(-1, 3) / 255 - 0.5) / 0.15
+    scales = np.exp(parts[3].reshape(-1, 3) / 16 - 10)
+    return Gaussians(
+        f32(fixed / 2**bits), f32(quats[:, [3, 0, 1, 2]]), f32(scales), f32(parts[1] / 255), f32(0.5 + SH_C0 * colors)
+    )
+
+
+def off_by(a, b):
+    """Largest differences of covariances (relative to the largest), opacities and colours."""
+    exact = np.asarray(covariances(a))
+    return [
+        np.abs(np.asarray(covariances(b)) - exact).max() / np.abs(exact).max(),
+        np.abs(np.asarray(b.opacities) - np.asarray(a.opacities)).max(),
+        np.abs(np.asarray(b.colors) - np.asarray(a.colors)).max(),
+    ]
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(sorted(MATRICES)), st.floats(-8, 2), st.floats(-2, 4))
+def test_one_person_comes_back_from_every_file(tmp_path_factory, seed, up, thickness, distance):
+    """Any Gaussians: metres to micrometres thick, near and a kilometre away, opaque and faint, in any world."""
+    folder = tmp_path_factory.mktemp("files")
+    rng, before = np.random.default_rng(seed), person(seed)
+    opacities = jnp.asarray(rng.choice([0.0, 1e-3, 0.5, 1.0], 20), jnp.float32)
+    scales = before.scales * 10.0 ** (thickness / 2)
+    before = replace(before, means=before.means * 10.0 ** (distance - 1), scales=scales, opacities=opacities)
+    R, world = np.asarray(MATRICES[up], float), turned(before, up)
+    write_ply(folder / "a.ply", world)
+    write_spz(folder / "a.spz", world)
+    back = read_ply(folder / "a.ply")
+    np.testing.assert_allclose(np.asarray(back.means) @ R, before.means, rtol=1e-6)  # R^-1 = R^T
+    assert max(off_by(world, back)) < 1e-5
+    back, half_turn = read_spz(folder / "a.spz"), np.asarray([-1, 1, -1])
+    step = max(1e-6, np.abs(before.means).max() * 2.0**-22)
+    np.testing.assert_allclose((back.means * half_turn) @ R, before.means, atol=step)
+    covariance, opacity, color = off_by(world, replace(back, quats=_about_y(back.quats)))
+    assert opacity <= 0.501 / 255 and color <= 0.501 / 255 / 0.15 * SH_C0
+    smallest = np.exp(-10) <= np.asarray(scales).min()
+    assert covariance < (0.08 if smallest else 1)  # scales in steps of 1 / 16: e^(1 / 16) of the squares
+
+
+def _about_y(quats):
+    w, x, y, z = np.asarray(quats).T
+    return jnp.asarray(np.stack([-y, z, w, -x], axis=1))
+
+
+def test_frames_are_named_as_python_names_them():
+    assert list(frame_range("0:10:4", 100)) == [0, 4, 8] and len(frame_range(":", 7)) == 7
+    assert list(frame_range("-2:", 7)) == [5, 6] and list(frame_range("::3", 7)) == [0, 3, 6]
+    for bad in ("", "5", "a:b", "1:2:3:4", "0:5:0", "5:0:-1", "9:", "1.5:2"):
+        with pytest.raises(ValueError, match=r"expected|none of the 7 frames"):
+            frame_range(bad, 7)
 
 
 def test_the_lowest_gaussian_that_is_seen_stands_on_the_floor():
@@ -144,17 +254,19 @@ def small_file(folder):
     return folder / "me.npz"
 
 
-@pytest.mark.parametrize(("name", "axis"), [("a.ply", [0, -1, 0]), ("a.splat", [0, -1, 0]), ("a.glb", [0, 1, 0])])
+@pytest.mark.parametrize(
+    ("name", "axis"),
+    [("a.ply", [0, -1, 0]), ("a.splat", [0, -1, 0]), ("a.spz", [0, 1, 0]), ("a.glb", [0, 1, 0])],
+)
 def test_the_suffix_decides_the_format_and_its_world(name, axis, tmp_path, monkeypatch, capsys):
     source = small_file(tmp_path)
     monkeypatch.setattr(sys, "argv", ["humangs", "export", str(source), "--out", str(tmp_path / name)])
     cli.main()
     assert "20 Gaussians" in capsys.readouterr().out
     if name.endswith(".ply"):
-        import plyfile
-
-        vertex = plyfile.PlyData.read(str(tmp_path / name))["vertex"]
-        means = np.stack([vertex[c] for c in "xyz"], axis=1)
+        means = np.asarray(read_ply(tmp_path / name).means)
+    elif name.endswith(".spz"):
+        means = np.asarray(read_spz(tmp_path / name).means)
     elif name.endswith(".glb"):
         means = read_glb(tmp_path / name)[1]["POSITION"]
     else:
@@ -163,6 +275,50 @@ def test_the_suffix_decides_the_format_and_its_world(name, axis, tmp_path, monke
     assert heights.min() == pytest.approx(0, abs=1e-6)
     own = np.asarray(person().means)[:, 1]
     np.testing.assert_allclose(np.sort(heights), np.sort(own - own.min()), atol=1e-5)
+
+
+def exported(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["humangs", "export", *map(str, words)])
+    cli.main()
+
+
+def test_a_sequence_of_frames_stands_on_one_floor(tmp_path, monkeypatch, capsys):
+    source, rise = small_file(tmp_path), np.asarray([0, 0.5, 0.1, 2.0])
+    moves = jnp.asarray(np.stack([0 * rise, rise, 0 * rise], axis=1), jnp.float32)
+    save_motion(tmp_path / "jump.npz", Motion(jnp.zeros((4, 1, 3)), moves, 24.0))
+    exported(monkeypatch, source, "--out", tmp_path / "x.ply", "--motion", tmp_path / "jump.npz", "--frames", "0:4:3")
+    assert "x_0000.ply to x_0003.ply: 2 files: 20 Gaussians" in capsys.readouterr().out
+    assert sorted(path.name for path in tmp_path.glob("x*")) == ["x_0000.ply", "x_0003.ply"]
+    first, last = (np.asarray(read_ply(tmp_path / f"x_{i:04d}.ply").means) for i in (0, 3))
+    np.testing.assert_allclose(first - last, np.tile([0, 2.0, 0], (20, 1)), atol=1e-5)  # -y is up
+    exported(monkeypatch, source, "--out", tmp_path / "y.spz", "--motion", tmp_path / "jump.npz", "--frame", "3")
+    assert np.asarray(read_spz(tmp_path / "y.spz").means)[:, 1].min() == pytest.approx(0, abs=1e-5)
+
+
+MISUSES = {
+    "--frame 1: expected --motion and --out": ["--out", "x.ply", "--frame", "1"],
+    "--frames :: expected --motion and --out": ["--html", "x.html", "--motion", "jump.npz", "--frames", ":"],
+    "--frame 1: does not go with --frames": ["--out", "x.ply", "--motion", "jump.npz", "--frame", "1", "--frames", ":"],
+    "whose .glb holds the motion": ["--out", "x.glb", "--mesh", "--motion", "jump.npz", "--frame", "1"],
+    "expected a name ending in .glb or .obj": ["--out", "x.ply", "--mesh"],
+    "expected a name ending in .ply or .splat or .spz or .glb or .obj": ["--out", "x.sog"],
+    "none of the 4 frames": ["--out", "x.ply", "--motion", "jump.npz", "--frames", "9:"],
+    "--frame 9: jump.npz has 4 frames": ["--out", "x.ply", "--motion", "jump.npz", "--frame", "9"],
+    "rotations: expected 1 joints, got 10": ["--out", "x.ply", "--motion", "ten.npz"],
+}
+
+
+@pytest.mark.parametrize("message", MISUSES)
+def test_what_does_not_go_together_is_one_line(message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    small_file(tmp_path)
+    for name, joints in (("jump", 1), ("ten", 10)):
+        save_motion(tmp_path / f"{name}.npz", Motion(jnp.zeros((4, joints, 3)), jnp.zeros((4, 3)), 24.0))
+    with pytest.raises(SystemExit):
+        exported(monkeypatch, "me.npz", *MISUSES[message])
+    said = capsys.readouterr().err.strip()
+    assert message in said and len(said.splitlines()) == 1
+    assert not list(tmp_path.glob("x*"))
 
 
 def transformed(source, target):
@@ -176,24 +332,48 @@ needs_npm = pytest.mark.skipif(
 )
 
 
+def _covariances(xyzw, scales):
+    f32 = lambda x: jnp.asarray(x, jnp.float32)
+    return np.asarray(covariances(replace(person(), quats=f32(xyzw[:, [3, 0, 1, 2]]), scales=f32(scales))))
+
+
 @pytest.mark.slow
 @needs_npm
-def test_splat_transform_makes_our_glb_of_our_ply(tmp_path):
+@pytest.mark.parametrize("name", ["a.ply", "a.spz"])
+def test_splat_transform_makes_our_glb_of_our_files(name, tmp_path):
     """Worlds, scales, rotations, opacities and colours of both files are the same to a program that is not ours."""
     gaussians = person()
-    write_ply(tmp_path / "a.ply", turned(gaussians, "-y"))
+    write = {"a.ply": write_ply, "a.spz": write_spz}[name]
+    write(tmp_path / name, turned(gaussians, USUAL_UP[Path(name).suffix]))
     write_glb(tmp_path / "a.glb", gaussians)
-    transformed(tmp_path / "a.ply", tmp_path / "b.glb")
+    transformed(tmp_path / name, tmp_path / "b.glb")
     (ours, arrays), (theirs, others) = (read_glb(tmp_path / name) for name in ("a.glb", "b.glb"))
     extension = lambda document: document["meshes"][0]["primitives"][0]["extensions"]
     assert extension(ours) == extension(theirs) and set(arrays) == set(others)
     nearest = [int(np.argmin(np.linalg.norm(others["POSITION"] - mean, axis=1))) for mean in arrays["POSITION"]]
     assert len(set(nearest)) == len(gaussians.means)
-    for name, array in arrays.items():
-        other = others[name][nearest]
-        if name.endswith("ROTATION"):
-            other = other * np.sign((other * array).sum(1, keepdims=True))
-        np.testing.assert_allclose(other, array, atol=0.51 / 255 if name == "COLOR_0" else 2e-6, err_msg=name)
+    nearest_ones = {attribute: array[nearest] for attribute, array in others.items()}
+    for attribute, array in arrays.items():
+        other = nearest_ones[attribute]
+        if attribute.endswith("ROTATION"):  # half a turn about an axis of the Gaussian makes no other one
+            array, other = (_covariances(q, s[PREFIX + "SCALE"]) for q, s in ((array, arrays), (other, nearest_ones)))
+            array, other = array / np.abs(array).max(), other / np.abs(array).max()
+        tolerance = 0.51 / 255 if attribute == "COLOR_0" else 2e-6
+        if name == "a.spz":
+            tolerance = SPZ_LOSSES.get(attribute.removeprefix(PREFIX), tolerance)
+        np.testing.assert_allclose(other, array, atol=tolerance, err_msg=attribute)
+
+
+def test_gsply_reads_our_spz(tmp_path):
+    gsply = pytest.importorskip("gsply", reason="needs gsply (PyPI)")
+    gaussians = person()
+    write_spz(tmp_path / "a.spz", gaussians)
+    ours, theirs = read_spz(tmp_path / "a.spz"), gsply.read_spz(str(tmp_path / "a.spz"))
+    np.testing.assert_allclose(theirs.means, ours.means, atol=1e-6)
+    np.testing.assert_allclose(np.exp(theirs.scales), ours.scales, rtol=1e-5)
+    np.testing.assert_allclose(theirs.quats, ours.quats, atol=1e-6)
+    np.testing.assert_allclose(1 / (1 + np.exp(-theirs.opacities)), ours.opacities, atol=1e-5)
+    np.testing.assert_allclose(0.5 + SH_C0 * theirs.sh0, ours.colors, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -86,6 +86,24 @@ def test_aist(tmp_path, suffix, scaling):
     assert motion.fps == 60.0
 
 
+@pytest.mark.parametrize(
+    ("key", "shape"), [("poses", (24, 3)), ("pose", (72,)), ("fullpose", (55, 3)), ("poses", (52, 3))]
+)
+def test_smpl_files_of_every_kind(tmp_path, key, shape):
+    """Joints as columns or not, as npz or pickle, with the rate from the caller where the file has none."""
+    poses, transl = upright_poses(int(np.prod(shape))), random((FRAMES, 3))
+    data = {key: poses.reshape(FRAMES, *shape), "transl": transl, "betas": np.zeros(10)}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(data))
+    for path in (write(tmp_path / "a.npz", **data), tmp_path / "a.pkl"):
+        motion = load_motion(path, fps=30, up="y")
+        body = np.asarray(motion.rotations).reshape(FRAMES, -1)[:, :66]
+        np.testing.assert_allclose(body, poses[:, :66], atol=FLOAT32)
+        np.testing.assert_allclose(motion.translations, transl, atol=FLOAT32)
+        assert motion.rotations.shape == (FRAMES, 55, 3)
+        with pytest.raises(MotionError, match="mocap_framerate: missing"):
+            load_motion(path)
+
+
 def smpl_params(**changes):
     parts = dict(
         global_orient=upright_poses(3),
@@ -109,6 +127,9 @@ def test_smpl_params(tmp_path):
     np.testing.assert_allclose(rotations.reshape(FRAMES, -1), np.concatenate(expected, 1), atol=FLOAT32)
     np.testing.assert_allclose(motion.translations, parts["transl"], atol=FLOAT32)
     assert motion.fps == 30.0
+    smpl = smpl_params(body_pose=np.concatenate([parts["body_pose"], np.ones((FRAMES, 6))], axis=1))
+    smpl = load_motion(write(tmp_path / "smpl.npz", **smpl)).rotations  # 23 joints: the last two are whole hands
+    np.testing.assert_array_equal(smpl, motion.rotations)
     few = smpl_params(jaw_pose=None, left_hand_pose=None, right_hand_pose=None)
     assert (np.asarray(load_motion(write(tmp_path / "b.npz", **few)).rotations)[:, 22:] == 0).all()
 
@@ -222,7 +243,10 @@ def without(arrays, key):
 
 BAD = {
     "no motion": (dict(vertices=np.zeros(3)), ": no motion: expected one of the keys rotations"),
-    "columns": ({**AMASS, "poses": np.zeros((FRAMES, 100))}, ": poses: expected 165, 156, 72 or 66 columns"),
+    "columns": (
+        {**AMASS, "poses": np.zeros((FRAMES, 100))},
+        ": poses: expected 165 (SMPL-X), 156 (SMPL-H), 72 (SMPL), 66 (the body) numbers a frame, got shape (6, 100)",
+    ),
     "no frames": ({**AMASS, "poses": np.zeros((0, 165))}, ": poses: expected at least one frame"),
     "NaN": ({**AMASS, "poses": NAN}, ": poses: expected finite numbers, got nan at index [2, 7]"),
     "infinite": ({**AMASS, "trans": np.full((FRAMES, 3), np.inf)}, ": trans: expected finite"),
@@ -237,7 +261,14 @@ BAD = {
     "ours, no fps": (without(OURS, "fps"), ": fps: missing"),
     "aist": ({**AIST, "smpl_poses": np.zeros((FRAMES, 66))}, ": smpl_poses: expected shape (frames, 72)"),
     "aist, scaling": ({**AIST, "smpl_scaling": 0.0}, ": smpl_scaling: expected a positive"),
-    "params, body": (smpl_params(body_pose=np.zeros((FRAMES, 69))), ": body_pose: expected shape (6, 63)"),
+    "ten joints": (
+        {**AMASS, "poses": np.zeros((FRAMES, 10, 3))},
+        ": poses: expected 165 (SMPL-X), 156 (SMPL-H), 72 (SMPL), 66 (the body) numbers a frame, got shape (6, 10, 3), 10 joints",
+    ),
+    "params, body": (
+        smpl_params(body_pose=np.zeros((FRAMES, 60))),
+        ": body_pose: expected shape (6, 63), or (6, 69) of SMPL, got (6, 60)",
+    ),
     "params, orient": (without(smpl_params(), "global_orient"), ": global_orient: missing"),
     "params, hand": (smpl_params(left_hand_pose=np.zeros((2, 45))), ": left_hand_pose: expected shape (6, 45)"),
     "params, jaw": (smpl_params(jaw_pose=np.zeros((FRAMES, 4))), ": jaw_pose: expected shape (6, 3)"),

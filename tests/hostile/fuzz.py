@@ -391,10 +391,11 @@ STRUCTURES = {
     ),
     **dict.fromkeys(("pickle", "smplx pkl", "aist"), mutated_pickle),
     **dict.fromkeys(("image", "depth"), mutated_png),
-    **dict.fromkeys(("opencv yaml", "easymocap", "colmap", "obj", "off", "log"), mutated_text),
+    **dict.fromkeys(("opencv yaml", "easymocap", "colmap", "obj", "off", "log", "bvh"), mutated_text),
     **{
         "torch zip": mutated_zip,
         "glb": mutated_glb,
+        "glb motion": mutated_glb,
         "safetensors": mutated_safetensors,
         "weights": mutated_safetensors,
     },

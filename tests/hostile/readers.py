@@ -9,6 +9,7 @@ import pickle
 import struct
 from pathlib import Path
 
+import bvh_files
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,10 +31,12 @@ from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.loading.captures import read_outline
 from humangs_jax.data.motion import load_motion
+from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.data.photos import load_photos
 from humangs_jax.fitting.files import KEYS, read_fit_record
 from humangs_jax.fitting.scan_reading import read_joints, read_mesh
 from humangs_jax.io.exr import ExrView, read_exr, write_exr
+from humangs_jax.io.glb import GlbWriter
 from humangs_jax.io.images import check_image, image_size, read_grey, read_image
 from humangs_jax.io.npz import read_npz
 from humangs_jax.io.reading import reading
@@ -138,6 +141,8 @@ READERS = {
     "aist": load_motion,
     "thuman": load_motion,
     "lhm": load_motion,
+    "bvh": load_motion,
+    "glb motion": load_motion,
     "obj": lambda path: read_mesh(path, textures=True),
     "ply": lambda path: read_mesh(path, textures=True),
     "glb": lambda path: read_mesh(path, textures=True),
@@ -347,6 +352,28 @@ def lhm():
     return json.dumps({key: np.zeros(shape).tolist() for key, shape in parts.items()})
 
 
+def write_glb_motion(path):
+    """A skeleton of CMU's names whose hips turn in two frames."""
+    rest, names, writer = shipped_joints(), bvh_files.CMU, GlbWriter()
+    joints = [name for name in JOINT_NAMES if name in names]
+    above = {name: JOINT_NAMES[PARENTS[JOINT_NAMES.index(name)]] for name in joints[1:]}
+    place = lambda name: rest[JOINT_NAMES.index(name)]
+    nodes = [
+        {"name": names[n], "translation": (place(n) - (place(above[n]) if n in above else 0)).tolist()} for n in joints
+    ]
+    for name, node in zip(joints, nodes, strict=True):
+        if children := [joints.index(other) for other in joints if above.get(other) == name]:
+            node["children"] = children
+    matrices = np.tile(np.eye(4), (len(joints), 1, 1))
+    matrices[:, 3, :3] = [-place(name) for name in joints]  # column by column, as glTF has them
+    inverse = writer.array("MAT4", matrices.reshape(-1, 16))
+    times, turns = writer.array("SCALAR", np.arange(2.0)), writer.array("VEC4", np.tile([0.0, 0, 0, 1], (2, 1)))
+    channel = {"sampler": 0, "target": {"node": 0, "path": "rotation"}}
+    animation = {"channels": [channel], "samplers": [{"input": times, "output": turns}]}
+    skin = {"joints": list(range(len(joints))), "inverseBindMatrices": inverse}
+    writer.write(path, {"nodes": nodes, "skins": [skin], "animations": [animation]})
+
+
 def sphere():
     import trimesh
 
@@ -486,6 +513,8 @@ SEEDS = {
         "m.npz", lambda: {"global_orient": np.zeros((3, 3)), "body_pose": np.zeros((3, 63)), "transl": np.zeros((3, 3))}
     ),
     "lhm": text("m.json", lhm),
+    "bvh": text("m.bvh", lambda: bvh_files.write_bvh(shipped_joints(), np.zeros((2, 55, 3)), bvh_files.CMU)),
+    "glb motion": saved("m.glb", write_glb_motion),
     "obj": write_obj,
     "ply": saved("scan.ply", write_mesh),
     "glb": saved("scan.glb", lambda path: path.write_bytes(textured_glb())),

@@ -10,8 +10,9 @@ import pytest
 
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
-from humangs_jax.people import atlas, baking, cameras, rendering, subject, writer
+from humangs_jax.people import baking, cameras, rendering, subject, writer
 from humangs_jax.people.seeds import DEMO
+from humangs_jax.rendering.mesh import atlas
 from humangs_jax.rendering.mesh.texturing import render_textured_mesh, sample_texture
 
 SIZE = 512

@@ -9,6 +9,7 @@ import io
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from bvh_files import CMU, MIXAMO, rest_frames, write_bvh
 from scipy.spatial.transform import Rotation
 
 from experiments.common import chromium
@@ -263,72 +264,7 @@ def test_a_dropped_npz_is_read_as_python_reads_it(browser, avatar, tmp_path, kin
         np.testing.assert_allclose(translation, expected.translations[frame], atol=1e-4)
 
 
-MIXAMO = {
-    "pelvis": "mixamorig:Hips",
-    **{"spine1": "mixamorig:Spine", "spine2": "mixamorig:Spine1", "spine3": "mixamorig:Spine2"},
-    **{"neck": "mixamorig:Neck", "head": "mixamorig:Head"},
-    **{
-        f"{side}_{ours}": f"mixamorig:{side.title()}{theirs}"
-        for side in ("left", "right")
-        for ours, theirs in (
-            ("collar", "Shoulder"),
-            ("shoulder", "Arm"),
-            ("elbow", "ForeArm"),
-            ("wrist", "Hand"),
-            ("hip", "UpLeg"),
-            ("knee", "Leg"),
-            ("ankle", "Foot"),
-            ("foot", "ToeBase"),
-        )
-    },
-}
-CMU = {ours: theirs.split(":")[1] for ours, theirs in MIXAMO.items()}
-CMU |= {"spine1": "LowerBack", "spine2": "Spine", "spine3": "Spine1"}
-BODY = tuple(name for name in JOINT_NAMES if name in MIXAMO)
-
-
-def write_bvh(rest, poses, names, arms_down, turned):
-    """A BVH in centimetres whose rest pose differs from ours: arms lowered, the world turned, both in degrees."""
-    index = {name: JOINT_NAMES.index(name) for name in BODY}
-    parent = {name: None if name == "pelvis" else JOINT_NAMES[PARENTS[index[name]]] for name in BODY}
-    frames_of = {}
-    around = Rotation.from_euler("y", turned, degrees=True)
-    for name in BODY:  # rest frame: our rest -> the file's
-        side = 1 if name.startswith("left") else -1
-        down = arms_down if name.split("_")[-1] in ("shoulder", "elbow", "wrist") else 0
-        frames_of[name] = around * Rotation.from_euler("z", -side * down, degrees=True)
-    children = {name: [other for other in BODY if parent[other] == name] for name in BODY}
-    order: list = []
-
-    def lines(name, depth):
-        order.append(name)
-        tab = "\t" * depth
-        above, offset = parent[name], np.zeros(3)
-        if above is not None:
-            offset = frames_of[above].apply(rest[index[name]] - rest[index[above]])
-        move = "6 Xposition Yposition Zposition" if parent[name] is None else "3"
-        yield f"{tab}{'ROOT' if parent[name] is None else 'JOINT'} {names[name]}"
-        yield f"{tab}{{"
-        yield f"{tab}\tOFFSET {' '.join(f'{100 * x:.6f}' for x in offset)}"
-        yield f"{tab}\tCHANNELS {move} Zrotation Yrotation Xrotation"
-        for child in children[name]:
-            yield from lines(child, depth + 1)
-        if not children[name]:
-            yield f"{tab}\tEnd Site\n{tab}\t{{\n{tab}\t\tOFFSET 0 1 0\n{tab}\t}}"
-        yield f"{tab}}}"
-
-    text = ["HIERARCHY", *lines("pelvis", 0), "MOTION", f"Frames: {len(poses)}", "Frame Time: 0.0083333"]
-    for pose in poses:
-        world = {}
-        numbers = list(100 * np.asarray([0.1, 0.9, -0.2]))
-        for name in order:
-            own = Rotation.from_rotvec(pose[index[name]])
-            world[name] = own if parent[name] is None else world[parent[name]] * own
-            theirs = world[name] * frames_of[name].inv()
-            above = Rotation.identity() if parent[name] is None else world[parent[name]] * frames_of[parent[name]].inv()
-            numbers += list((above.inv() * theirs).as_euler("ZYX", degrees=True))
-        text.append(" ".join(f"{x:.6f}" for x in numbers))
-    return "\n".join(text).encode()
+BODY = tuple(name for name in JOINT_NAMES if name in CMU)
 
 
 def bone_directions(avatar, rotations):
@@ -345,7 +281,7 @@ def bone_directions(avatar, rotations):
 def test_a_dropped_bvh_moves_the_bones_as_the_file_does(browser, avatar, names, arms_down, turned):
     poses = random_motion(3)[0].reshape(3, 55, 3)
     poses[:, [i for i, name in enumerate(JOINT_NAMES) if name not in BODY]] = 0
-    content = write_bvh(np.asarray(avatar.rest_joints, float), poses, names, arms_down, turned)
+    content = write_bvh(np.asarray(avatar.rest_joints, float), poses, names, rest_frames(arms_down, turned)).encode()
     assert "3 frames" in drop(browser, "dance.bvh", content)
     for frame in (0, 2):
         rotations, _ = shown_pose(browser, frame)

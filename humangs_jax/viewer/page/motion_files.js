@@ -1,5 +1,5 @@
 // Motions that people drop onto the page: .npz (ours, AMASS, global_orient/body_pose files) and .bvh. Formats and their
-// conventions are those of humangs_jax/data/motion.py; a file that is refused says in one line what was expected.
+// conventions are those of humangs_jax/data/motion/; a file that is refused says in one line what was expected.
 
 const BODY_JOINTS = 22, HAND_NUMBERS = 45, FULL_JOINTS = 55;
 const PELVIS = [0, -0.35, 0];  // where SMPL-X's root is in T-pose: worlds are turned about it
@@ -138,11 +138,7 @@ function turnedUp(motion, usual) {
     const m = matrixFromQuat(root);
     for (let i = 0; i < 3; i++) mean[i] += m[3 * i + 1] / motion.quats.length;
   }
-  const axis = mean.reduce((best, v, i) => (Math.abs(v) > Math.abs(mean[best]) ? i : best), 0);
-  const up = Math.abs(mean[axis]) < CLEARLY_UP ? usual : (mean[axis] < 0 ? "-" : "") + "xyz"[axis];
-  const half = Math.SQRT1_2;
-  const turn = { y: null, "-y": [0, 1, 0, 0], z: [half, -half, 0, 0], "-z": [half, half, 0, 0], x: [half, 0, 0, half], "-x": [half, 0, 0, -half] }[up];
-  if (!turn) return motion;
+  const { axis, cosine } = nearestAxis(mean), turn = UPRIGHT[cosine < CLEARLY_UP ? usual : axis];
   const m = matrixFromQuat(turn);
   return {
     ...motion,
@@ -150,6 +146,16 @@ function turnedUp(motion, usual) {
     translations: motion.translations.map((t) => subtract(matrixApply(m, add(t, PELVIS)), PELVIS)),
   };
 }
+
+// The axis that a vector points along most, and how far it does.
+function nearestAxis(v) {
+  const i = v.reduce((best, x, k) => (Math.abs(x) > Math.abs(v[best]) ? k : best), 0);
+  return { axis: (v[i] < 0 ? "-" : "") + "xyz"[i], cosine: Math.abs(v[i]) };
+}
+
+const HALF = Math.SQRT1_2;
+// The rotation that turns the named axis to +y.
+const UPRIGHT = { y: [1, 0, 0, 0], "-y": [0, 1, 0, 0], z: [HALF, -HALF, 0, 0], "-z": [HALF, HALF, 0, 0], x: [HALF, 0, 0, HALF], "-x": [HALF, 0, 0, -HALF] };
 
 // ---- BVH ----------------------------------------------------------------------------------------------------------------
 
@@ -185,107 +191,177 @@ function parseBvh(text) {
   if (next() !== "Frame" || next() !== "Time:") throw new Error("expected Frame Time:");
   const seconds = number(), width = joints.reduce((sum, j) => sum + j.channels.length, 0), frames = [];
   if (!(seconds > 0) || count < 1) throw new Error("expected at least one frame and a positive Frame Time");
+  if (width === 0 || words.length - at !== count * width)
+    throw new Error(`expected ${count} frames of ${width} numbers, got ${words.length - at} numbers: cut short?`);
   for (let f = 0; f < count; f++) frames.push(Array.from({ length: width }, number));
   return { joints, frames, fps: 1 / seconds };
 }
 
-// Our joints by the names of others, lower case without separators: CMU (cgspeed), Mixamo, LaFAN, MotionBuilder, Biovision.
-const BVH_NAMES = {
-  pelvis: ["hips", "hip", "pelvis", "root"],
-  neck: ["neck", "neck1"], head: ["head"],
-  left_collar: ["leftshoulder", "leftcollar", "lcollar"], right_collar: ["rightshoulder", "rightcollar", "rcollar"],
-  left_shoulder: ["leftarm", "leftuparm", "leftupperarm", "lshldr"], right_shoulder: ["rightarm", "rightuparm", "rightupperarm", "rshldr"],
-  left_elbow: ["leftforearm", "leftlowarm", "leftlowerarm", "leftelbow", "lforearm"], right_elbow: ["rightforearm", "rightlowarm", "rightlowerarm", "rightelbow", "rforearm"],
-  left_wrist: ["lefthand", "leftwrist", "lhand"], right_wrist: ["righthand", "rightwrist", "rhand"],
-  left_hip: ["leftupleg", "leftthigh", "lefthip", "lthigh"], right_hip: ["rightupleg", "rightthigh", "righthip", "rthigh"],
-  left_knee: ["leftleg", "leftshin", "leftlowleg", "leftlowerleg", "leftknee", "lshin"], right_knee: ["rightleg", "rightshin", "rightlowleg", "rightlowerleg", "rightknee", "rshin"],
-  left_ankle: ["leftfoot", "leftankle", "lfoot"], right_ankle: ["rightfoot", "rightankle", "rfoot"],
-  left_foot: ["lefttoebase", "lefttoe", "ltoe"], right_foot: ["righttoebase", "righttoe", "rtoe"],
+// Our joints by the names of others, lower case, letters and digits alone: CMU (cgspeed), Mixamo, LaFAN, MotionBuilder,
+// Biovision, SMPL, Unreal. Sides are "left", "l" before and "l" behind. A joint of the file is taken once, by the first that
+// wants it: "shoulder" is the upper arm where there is no other and else the collar bone.
+const FINGERS = ["index", "middle", "pinky", "ring", "thumb"], KNUCKLES = [1, 2, 3];
+const MIDDLE_NAMES = { pelvis: ["hips", "hip", "pelvis", "root"], neck: ["neck", "neck1", "neck01"], head: ["head"] };
+const SIDED_NAMES = {
+  hip: ["upleg", "thigh", "hip"], knee: ["leg", "shin", "lowleg", "lowerleg", "calf", "knee"],
+  ankle: ["ankle", "foot"], foot: ["toebase", "toe", "ball", "foot"],
+  shoulder: ["arm", "uparm", "upperarm", "shldr", "shoulder"], collar: ["collar", "clavicle", "shoulder"],
+  elbow: ["forearm", "lowarm", "lowerarm", "elbow"], wrist: ["hand", "wrist"],
 };
-// The joint that a bone points to; others are moved as their parents are.
-const POINTS_TO = {
-  pelvis: "spine1", spine1: "spine2", spine2: "spine3", spine3: "neck", neck: "head",
-  left_collar: "left_shoulder", left_shoulder: "left_elbow", left_elbow: "left_wrist",
-  right_collar: "right_shoulder", right_shoulder: "right_elbow", right_elbow: "right_wrist",
-  left_hip: "left_knee", left_knee: "left_ankle", left_ankle: "left_foot",
-  right_hip: "right_knee", right_knee: "right_ankle", right_ankle: "right_foot",
-};
-const NEEDED = ["pelvis", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow"];
+for (const finger of FINGERS) for (const i of KNUCKLES) SIDED_NAMES[finger + i] = [`hand${finger}${i}`, `${finger}${i}`, `${finger}0${i}`];
+// Bones: a joint points to the next of its last chain that the file has; others are moved as their parents are.
+const NEXT = {};
+const chain = (...names) => names.forEach((name, i) => { NEXT[name] = names.slice(i + 1); });
+chain("pelvis", "spine1", "spine2", "spine3", "neck", "head");
+for (const side of ["left", "right"]) {
+  chain(...["collar", "shoulder", "elbow", "wrist", "middle1"].map((name) => `${side}_${name}`));
+  chain(...["hip", "knee", "ankle", "foot"].map((name) => `${side}_${name}`));
+  for (const finger of FINGERS) chain(...KNUCKLES.map((i) => `${side}_${finger}${i}`));
+}
+const NEEDED = ["pelvis", ...["hip", "knee", "ankle", "shoulder", "elbow"].flatMap((name) => [`left_${name}`, `right_${name}`])];
+const STANDING = -0.5;  // cosine between legs and spine below which a person can stand in a rest pose
+const FEW = 5;  // joints that have to share the beginning of their names for it to be no part of them
 
-// Bones point where the file's bones point. A joint's rest frames are related by the rotation that turns our rest direction
-// into the file's, carried down from the pelvis, whose is fixed by the hips' line and the up direction of the spine.
-function retargetBvh(bvh, scene) {
-  const plain = bvh.joints.map((j) => j.name.toLowerCase().replace(/[^a-z0-9]/g, ""));
-  const source = {};
-  for (const [ours, theirs] of Object.entries(BVH_NAMES)) {
-    const found = theirs.map((name) => plain.findIndex((p) => p === name || p === `mixamorig${name}`)).find((i) => i >= 0);
-    if (found !== undefined && scene.names.includes(ours)) source[ours] = found;
-  }
-  assignSpine(bvh, scene, source);
+// Index of the file's joint for each joint of ours that it has.
+function matchBvh({ joints }, scene) {
+  let plain = joints.map((j) => j.name.toLowerCase().replace(/[^a-z0-9]/g, ""));
+  const named = plain.filter(Boolean);  // the ends of limbs have no names
+  let start = 0;
+  while (named.length >= FEW && named[0][start] !== undefined && named.every((name) => name[start] === named[0][start])) start++;
+  plain = plain.map((name) => name.slice(start).replace(/^mixamorig\d*/, ""));
+  const source = {}, taken = new Set();
+  const find = (ours, theirs) => {
+    if (!scene.names.includes(ours)) return;
+    const found = theirs.map((name) => plain.indexOf(name)).find((i) => i >= 0 && !taken.has(i));
+    if (found !== undefined) taken.add(source[ours] = found);
+  };
+  for (const [ours, theirs] of Object.entries(MIDDLE_NAMES)) find(ours, theirs);
+  for (const [ours, theirs] of Object.entries(SIDED_NAMES))
+    for (const side of ["left", "right"]) find(`${side}_${ours}`, theirs.flatMap((x) => [side + x, side[0] + x, x + side[0]]));
+  assignSpine(joints, scene, source);
   const missing = NEEDED.filter((name) => source[name] === undefined);
   if (missing.length) throw new Error(`no joint for ${missing.join(", ")}: expected the names of CMU, Mixamo or LaFAN`);
+  return source;
+}
 
+// Spines have one to five joints, called differently everywhere: ours are the first, the middle and the last of the file's.
+function assignSpine(joints, scene, source) {
+  const found = [];
+  let at = joints[source.neck ?? source.head]?.parent ?? -1;
+  for (; at >= 0 && at !== source.pelvis; at = joints[at].parent) found.unshift(at);
+  const last = found.length - 1, ours = { spine3: last, spine1: last > 0 ? 0 : -1, spine2: last > 1 ? last >> 1 : -1 };
+  for (const [name, i] of Object.entries(ours))
+    if (at >= 0 && i >= 0 && scene.names.includes(name)) source[name] = found[i];
+}
+
+const transposed = (m) => [0, 3, 6, 1, 4, 7, 2, 5, 8].map((i) => m[i]);
+
+// As humangs_jax/data/motion/skeleton.py: bones point where the file's bones point. A joint's rest frames are related by the
+// rotation that turns our rest direction into the file's, carried down from the pelvis, whose is fixed by the hips' line and the
+// up direction of the spine. Where nobody can stand like the rest pose, twists are 0 on average over the frames.
+function retargetBvh(bvh, scene) {
+  const source = matchBvh(bvh, scene);
   const place = bvh.joints.map(() => [0, 0, 0]);  // rest positions: parents stand before their children
   bvh.joints.forEach((joint, i) => { place[i] = joint.parent < 0 ? [0, 0, 0] : add(place[joint.parent], joint.offset); });
-  const theirs = (a, b) => normalized(subtract(place[source[b]], place[source[a]]));
+  const between = (a, b) => subtract(place[source[b]], place[source[a]]), theirs = (a, b) => normalized(between(a, b));
   const rest = (name) => scene.rest[scene.names.indexOf(name)];
+  const top = ["spine3", "neck", "left_shoulder"].find((name) => source[name] !== undefined), spine = theirs("pelvis", top);
+  const standing = dot(normalized(add(between("left_hip", "left_ankle"), between("right_hip", "right_ankle"))), spine) < STANDING;
+  const upright = matrixFromQuat(UPRIGHT[standing ? nearestAxis(spine).axis : "y"]);
+  const posed = bvh.frames.map((numbers) => {
+    const { world, position } = poseBvh(bvh, numbers);
+    return { world: world.map((m) => matrixMultiply(upright, m)), position: position.map((p) => matrixApply(upright, p)) };
+  });
+
   const frameOf = (right, up) => {
     const x = normalized(right), z = normalized(cross(x, up)), y = cross(z, x);
     return [x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]];
   };
-  const transposed = (m) => [0, 3, 6, 1, 4, 7, 2, 5, 8].map((i) => m[i]);
-  const top = source.spine3 !== undefined ? "spine3" : source.neck !== undefined ? "neck" : "left_shoulder";
   const root = matrixMultiply(
-    frameOf(theirs("right_hip", "left_hip"), theirs("pelvis", top)),
+    frameOf(theirs("right_hip", "left_hip"), spine),
     transposed(frameOf(subtract(rest("left_hip"), rest("right_hip")), subtract(rest(top), rest("pelvis")))),
   );
-  const align = [];  // our rest frame -> the file's rest frame
+  const align = [], global = posed.map(() => []);  // our rest frame -> the file's rest frame; our joints in the world
   for (const j of scene.order) {
-    const name = scene.names[j], child = nextMapped(name, source), above = j === scene.order[0] ? root : align[scene.parents[j]];
-    align[j] = above;
-    if (name === "pelvis" || source[name] === undefined || !child) continue;
-    const from = matrixApply(above, normalized(subtract(rest(child), rest(name))));
-    align[j] = matrixMultiply(matrixFromQuat(shortestTurn(from, theirs(name, child))), above);
+    const name = scene.names[j], p = scene.parents[j], child = (NEXT[name] || []).find((other) => source[other] !== undefined);
+    align[j] = p < 0 ? root : align[p];
+    if (p >= 0 && source[name] !== undefined && child) {
+      const bone = normalized(subtract(rest(child), rest(name)));
+      align[j] = matrixMultiply(matrixFromQuat(shortestTurn(matrixApply(align[j], bone), theirs(name, child))), align[j]);
+      if (!standing) {
+        const turns = posed.map(({ world }, f) => matrixMultiply(transposed(global[f][p]), matrixMultiply(world[source[name]], align[j])));
+        align[j] = matrixMultiply(align[j], untwist(turns, bone));
+      }
+    }
+    // joints that the file does not have go with their parents
+    posed.forEach(({ world }, f) => { global[f][j] = source[name] !== undefined ? matrixMultiply(world[source[name]], align[j]) : global[f][p]; });
   }
 
   const legs = (at) => ["left_hip>left_knee", "left_knee>left_ankle"].reduce((sum, pair) => {
     const [a, b] = pair.split(">");
     return sum + Math.hypot(...subtract(at(b), at(a)));
   }, 0);
-  const scale = legs(rest) / Math.max(legs((name) => place[source[name]]), 1e-9);  // units, and the length of the steps
-  const quats = [], translations = [];
-  for (const numbers of bvh.frames) {
-    const { world, root: move } = poseBvh(bvh, numbers, source.pelvis), global = [], frame = [];
-    for (const j of scene.order) {
-      const p = scene.parents[j], name = scene.names[j];
-      // joints that the file does not have go with their parents
-      global[j] = source[name] !== undefined ? matrixMultiply(world[source[name]], align[j]) : p < 0 ? align[j] : global[p];
-      frame[j] = quatFromMatrix(p < 0 ? global[j] : matrixMultiply(transposed(global[p]), global[j]));
-    }
-    quats.push(frame);
-    translations.push(subtract(scaled(move, scale), rest("pelvis")));
-  }
+  const scale = legs(rest) / Math.max(legs((name) => posed[0].position[source[name]]), 1e-9);  // units, and the length of the steps
+  const quats = global.map((frame) => frame.map((m, j) => quatFromMatrix(scene.parents[j] < 0 ? m : matrixMultiply(transposed(frame[scene.parents[j]]), m))));
+  const moves = posed.map(({ position }) => scaled(position[source.pelvis], scale));
+  const low = standing ? soles(place, source, matrixFromQuat(UPRIGHT[nearestAxis(spine).axis]), legs(rest) / Math.max(legs((name) => place[source[name]]), 1e-9)) : null;
+  const steps = stepsOf(posed, source, scale, low), own = stepsOfBody(global, scene, source, moves);
+  const translations = moves.map((move, f) => subtract(add(move, [0, steps[f] - own[f], 0]), rest("pelvis")));
   return { quats, translations, fps: bvh.fps };
 }
 
-// Spines have one to five joints, called differently everywhere: ours are the first, the middle and the last of the file's.
-function assignSpine({ joints }, scene, source) {
-  const chain = [];
-  let at = joints[source.neck ?? source.head]?.parent ?? -1;
-  for (; at >= 0 && at !== source.pelvis; at = joints[at].parent) chain.unshift(at);
-  const last = chain.length - 1, ours = { spine3: last, spine1: last > 0 ? 0 : -1, spine2: last > 1 ? last >> 1 : -1 };
-  for (const [name, i] of Object.entries(ours))
-    if (at >= 0 && i >= 0 && scene.names.includes(name)) source[name] = chain[i];
+// The rotation about a bone that takes the mean twist about it out of rotations. The twist of (w, v) about b is 2 arg(w + i v.b).
+function untwist(turns, bone) {
+  let real = 0, imaginary = 0;
+  for (const m of turns) {
+    const [w, ...v] = quatFromMatrix(m), along = dot(v, bone);
+    real += w * w - along * along;
+    imaginary += 2 * w * along;
+  }
+  return matrixFromQuat(quatFromAxisAngle(...scaled(bone, -Math.atan2(imaginary, real))));
 }
 
-function nextMapped(name, source) {
-  let child = POINTS_TO[name];
-  while (child && source[child] === undefined) child = POINTS_TO[child];
-  return child;
+const feetOf = (source) => ["ankle", "foot"].map((kind) =>
+  ["left", "right"].map((side) => `${side}_${kind}`).filter((name) => source[name] !== undefined)).filter((kind) => kind.length);
+
+// How high the joints of the file's feet are above the lowest of them in a rest pose that stands.
+function soles(place, source, upright, scale) {
+  const names = feetOf(source).flat(), heights = names.map((name) => scale * matrixApply(upright, place[source[name]])[1]);
+  return Object.fromEntries(names.map((name, i) => [name, heights[i] - Math.min(...heights)]));
 }
 
-// Rotations of all joints in the world, and where the pelvis is.
-function poseBvh({ joints }, numbers, pelvis) {
+// How high the feet are above the floor in each frame, which is where they are lowest. low: of each joint of the feet, how high it
+// is when the foot stands; null: each kind as high as in its lowest frame.
+function stepsOf(posed, source, scale, low) {
+  const height = ({ position }, name) => scale * position[source[name]][1];
+  const least = (values) => values.reduce((a, b) => Math.min(a, b), Infinity);
+  if (!low) {
+    low = {};
+    for (const kind of feetOf(source)) {
+      const lowest = least(posed.map((frame) => Math.min(...kind.map((name) => height(frame, name)))));
+      for (const name of kind) low[name] = lowest;
+    }
+  }
+  const feet = posed.map((frame) => Math.min(...Object.keys(low).map((name) => height(frame, name) - low[name])));
+  const floor = least(feet);
+  return feet.map((y) => y - floor);
+}
+
+// The same of our body, above a floor at the height of its lowest joint in T-pose.
+function stepsOfBody(global, scene, source, moves) {
+  const feet = feetOf(source).flat().map((name) => scene.names.indexOf(name));
+  const floor = Math.min(...feet.map((j) => scene.rest[j][1]));
+  return global.map((frame, f) => {
+    const place = (j) => {
+      const p = scene.parents[j];
+      return p < 0 ? moves[f] : add(place(p), matrixApply(frame[p], subtract(scene.rest[j], scene.rest[p])));
+    };
+    return Math.min(...feet.map((j) => place(j)[1] - (scene.rest[j][1] - floor)));
+  });
+}
+
+// Rotations and places of all joints in the world.
+function poseBvh({ joints }, numbers) {
   const axes = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] }, world = [], position = [];
   let at = 0;
   joints.forEach((joint, i) => {
@@ -300,7 +376,7 @@ function poseBvh({ joints }, numbers, pelvis) {
     world[i] = p < 0 ? m : matrixMultiply(world[p], m);
     position[i] = p < 0 ? move : add(position[p], matrixApply(world[p], move));
   });
-  return { world, root: position[pelvis] };
+  return { world, position };
 }
 
 function shortestTurn(from, to) {

@@ -13,11 +13,15 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.people.surfaces import Faces, Points, edges_of, unit
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
+Points = Float[np.ndarray, "n 3"]
+Faces = Int[np.ndarray, "f 3"]
+
+NORMAL_FLOOR = 1e-12
+"""Added to lengths before dividing: vertices without area get the zero normal."""
 SIDES = np.concatenate([np.eye(3), -np.eye(3)]).astype(np.float32)
 """Directions that charts look towards at first."""
 LEAST_COSINE = 0.45
@@ -85,6 +89,24 @@ class _Flat:
     vertices: np.ndarray
     point_charts: np.ndarray
     charts: np.ndarray
+
+
+def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Vectors over their lengths along the last axis."""
+    return vectors / (np.sqrt(np.sum(vectors * vectors, axis=-1, keepdims=True)) + NORMAL_FLOOR)
+
+
+def edges_of(faces: Faces) -> Int[np.ndarray, "e 2"]:
+    """(e, 2) directed edges of all faces, three per face."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+
+
+def fill_gaps(image: Float[np.ndarray, "h w c"], known: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w c"]:
+    """The image with every unknown texel replaced by the nearest known one."""
+    from scipy.ndimage import distance_transform_edt
+
+    rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return image[rows, columns]
 
 
 def _adjacent(faces):

@@ -1,0 +1,254 @@
+"""Motions in files of arrays: the keys decide the format.
+
+=================  =====================================================================  =======================
+format             keys                                                                   frames per second
+=================  =====================================================================  =======================
+ours (.npz)        rotations (m, j, 3), translations (m, 3)                               fps
+AMASS and other    poses, fullpose or pose (m, 165 | 156 | 72 | 66), or (m, joints, 3);   mocap_framerate, fps
+SMPL (.npz, .pkl)  trans or transl (m, 3)
+AIST++ (.pkl|npz)  smpl_poses (m, 72), smpl_trans (m, 3); smpl_scaling (1,) or millimetres  60
+THuman4.0,         global_orient (m, 3), body_pose (m, 63 | 69), transl (m, 3), and if    30
+AvatarReX (.npz)   there are any jaw_pose, leye_pose, reye_pose (m, 3), *_hand_pose (m, 45)
+LHM (.json, or a   root_pose (3,), body_pose (21, 3), trans (3,), and if there are any    30
+folder of them)    jaw_pose, leye_pose, reye_pose (3,), lhand_pose, rhand_pose (15, 3)
+=================  =====================================================================  =======================
+
+SMPL-X has 55 joints (165 numbers), SMPL-H 52 (156), SMPL 24 (72), of which the last two are whole hands; 22 (66) are the body.
+What a file does not have (fingers, eyes) is 0.
+"""
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from humangs_jax.body.joints import BODY_NAMES, JOINT_NAMES
+from humangs_jax.body.smplx import HandBasis
+from humangs_jax.data.motion.motion import DEFAULT_FPS, MotionError
+from humangs_jax.io.npz import read_npz
+from humangs_jax.io.reading import open_file
+from humangs_jax.io.restricted_pickle import as_array, read_pickle
+from humangs_jax.io.text import read_json
+
+BODY_NUMBERS = 3 * len(BODY_NAMES)  # 66
+HAND_NUMBERS = 45
+COLUMNS = {
+    3 * len(JOINT_NAMES): "SMPL-X",
+    BODY_NUMBERS + 2 * HAND_NUMBERS: "SMPL-H",
+    72: "SMPL",
+    BODY_NUMBERS: "the body",
+}
+"""Numbers of a pose, by whose joints they are."""
+AIST_FPS = 60.0
+AMASS_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
+MILLIMETRES = 1000.0
+
+
+def read_arrays(path: Path, hands: HandBasis | None, flat_hand_mean: bool, fps: float | None):
+    """Rotations (m, 55, 3), translations (m, 3), frames per second, and the axis that is up where the poses do not tell.
+
+    That axis is None where y is up whatever the poses tell. Raises: MotionError.
+    """
+    file = _MotionFile(path, hands, flat_hand_mean, fps)
+    for key, read in _FORMATS.items():
+        if key in file.values:
+            return read(file)
+    keys = ", ".join(sorted(file.values)) or "none"
+    raise MotionError(path, "", f"no motion: expected one of the keys {', '.join(_FORMATS)}, got {keys}")
+
+
+# Formats ---------------------------------------------------------------------------------------------------------------
+
+
+def _ours(file):
+    if not file.flat_hand_mean:
+        raise MotionError(file.path, "rotations", "our own format holds whole rotations: expected flat_hand_mean=True")
+    rotations = file.numbers("rotations", (None, None, 3))
+    translations = file.numbers("translations", (len(rotations), 3))
+    return rotations, translations, file.rate(("fps",), None), None
+
+
+def _amass(file):
+    key = next(key for key in ("poses", "fullpose", "pose") if key in file.values)
+    poses = file.numbers(key, None)
+    count, columns = len(poses), poses[0].size
+    if poses.ndim not in (2, 3) or columns not in COLUMNS:
+        expected = ", ".join(f"{number} ({whose})" for number, whose in COLUMNS.items())
+        joints = f", {columns // 3} joints" if columns % 3 == 0 else ""
+        raise MotionError(file.path, key, f"expected {expected} numbers a frame, got shape {poses.shape}{joints}")
+    poses = poses.reshape(count, columns)
+    if columns == 3 * len(JOINT_NAMES):
+        body_and_face, *hands = np.split(poses, [columns - 2 * HAND_NUMBERS, columns - HAND_NUMBERS], axis=1)
+        hands = [file.with_mean(hand, side) for side, hand in enumerate(hands)]
+        rotations = np.concatenate([body_and_face, *hands], axis=1).reshape(count, -1, 3)
+    else:
+        # 66: body. 72: SMPL, whose last two joints are whole hands; we have fingers in their place. 156: body and fingers
+        hands = np.split(poses[:, BODY_NUMBERS:], 2, axis=1) if columns == BODY_NUMBERS + 2 * HAND_NUMBERS else None
+        hands = hands and [file.with_mean(hand, side) for side, hand in enumerate(hands)]
+        rotations = file.assemble(poses[:, :BODY_NUMBERS], hands=hands)
+    trans = "transl" if "transl" in file.values and "trans" not in file.values else "trans"
+    return rotations, file.numbers(trans, (count, 3)), file.rate(AMASS_RATES, None), "z"
+
+
+def _aist(file):
+    poses = file.numbers("smpl_poses", None)
+    poses = poses.reshape(len(poses), -1) if poses.ndim == 3 else poses
+    if poses.ndim != 2 or poses.shape[1] != 72:
+        raise MotionError(file.path, "smpl_poses", f"expected shape (frames, 72), got {poses.shape}")
+    scale = MILLIMETRES
+    if "smpl_scaling" in file.values:
+        scale = float(file.numbers("smpl_scaling", None).reshape(-1)[0])
+        if not scale > 0:
+            raise MotionError(file.path, "smpl_scaling", f"expected a positive number, got {scale}")
+    translations = file.numbers("smpl_trans", (len(poses), 3)) / scale
+    return file.assemble(poses[:, :BODY_NUMBERS]), translations, file.rate(("fps",), AIST_FPS), None
+
+
+def _smpl_params(file):
+    orient = file.numbers("global_orient", (None, 3))
+    count = len(orient)
+    body = file.numbers("body_pose", None).reshape(count if len(file.values["body_pose"]) == count else -1, -1)
+    if body.shape not in ((count, BODY_NUMBERS - 3), (count, 69)):  # 69: SMPL, whose last two joints are whole hands
+        expected = f"expected shape ({count}, {BODY_NUMBERS - 3}), or ({count}, 69) of SMPL"
+        raise MotionError(file.path, "body_pose", f"{expected}, got {np.shape(file.values['body_pose'])}")
+    body = np.concatenate([orient, body[:, : BODY_NUMBERS - 3]], axis=1)
+    face = [file.numbers(key, (count, 3), optional=True) for key in ("jaw_pose", "leye_pose", "reye_pose")]
+    hands = [file.hand(f"{side}_hand_pose", count, i) for i, side in enumerate(("left", "right"))]
+    translations = file.numbers("transl", (count, 3))
+    return file.assemble(body, face, hands), translations, file.rate(("fps", *AMASS_RATES), DEFAULT_FPS), "y"
+
+
+def _lhm(file):
+    root = file.numbers("root_pose", None)
+    count = len(root)
+    root = file.numbers("root_pose", (count, 3))
+    body = np.concatenate([root, file.numbers("body_pose", (count, 21, 3)).reshape(count, -1)], axis=1)
+    face = [file.numbers(key, (count, 3), optional=True) for key in ("jaw_pose", "leye_pose", "reye_pose")]
+    hands = [file.hand(key, count, i) for i, key in enumerate(("lhand_pose", "rhand_pose"))]
+    return file.assemble(body, face, hands), file.numbers("trans", (count, 3)), DEFAULT_FPS, "y"
+
+
+_FORMATS = {
+    "rotations": _ours,
+    "smpl_poses": _aist,
+    "poses": _amass,
+    "root_pose": _lhm,
+    "body_pose": _smpl_params,
+    "fullpose": _amass,
+    "pose": _amass,
+}
+"""Readers by a key that only their format has; the first that fits is used."""
+
+
+class _MotionFile:
+    """The values of a motion file by key, with errors that name both."""
+
+    def __init__(self, path: Path, hands: HandBasis | None, flat_hand_mean: bool, fps: float | None):
+        self.path, self.hands, self.flat_hand_mean, self.fps = path, hands, flat_hand_mean, fps
+        self.pickled: tuple[str, ...] = ()
+        suffix = self.path.suffix.lower()
+        if self.path.is_dir() or suffix == ".json":
+            self.values: Mapping[str, Any] = _read_json_frames(self.path)
+        elif suffix in (".pkl", ".pickle"):
+            self.values = read_pickle(self.path)
+        else:
+            if suffix != ".npz":
+                _check_npz(path)
+            self.values, self.pickled = read_npz(self.path)
+
+    def numbers(self, key: str, shape: tuple[int | None, ...] | None, optional: bool = False) -> Any:
+        """Finite float64 numbers; None in `shape` is any size but 0, None for it any shape with at least one frame."""
+        if key not in self.values:
+            if optional:
+                return None
+            reason = "a pickled object, which is never read" if key in self.pickled else "missing"
+            raise MotionError(self.path, key, reason)
+        try:
+            array = as_array(self.values[key])
+            if array.dtype.kind not in "fiu":
+                raise ValueError
+            array = array.astype(np.float64)
+        except (ValueError, TypeError, OverflowError):
+            raise MotionError(self.path, key, "expected numbers") from None
+        if shape is not None:
+            wanted = ", ".join("any" if size is None else str(size) for size in shape)
+            fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
+            if not fits:
+                raise MotionError(self.path, key, f"expected shape ({wanted}), got {array.shape}")
+        if array.size == 0:
+            raise MotionError(self.path, key, f"expected at least one frame, got shape {array.shape}")
+        if not np.isfinite(array).all():
+            where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
+            raise MotionError(self.path, key, f"expected finite numbers, got {array[tuple(where)]} at index {where}")
+        return array
+
+    def rate(self, keys: tuple[str, ...], default: float | None) -> float:
+        """Frames per second: those asked for, or under the first of the keys that is there."""
+        if self.fps is not None:
+            return self.fps
+        for key in keys:
+            if key in self.values:
+                rate = float(self.numbers(key, None).reshape(-1)[0])
+                if not rate > 0:
+                    raise MotionError(self.path, key, f"expected a positive number of frames per second, got {rate}")
+                return rate
+        if default is None:
+            raise MotionError(self.path, keys[0], "missing: how many frames are a second?")
+        return default
+
+    def hand(self, key: str, count: int, side: int) -> Any:
+        """(m, 45) axis-angle numbers of a hand, or None if the file has none."""
+        pose = self.numbers(key, None, optional=True)
+        if pose is None:
+            return None
+        pose = pose.reshape(len(pose), -1)
+        if len(pose) != count or pose.shape[1] > HAND_NUMBERS:
+            raise MotionError(self.path, key, f"expected shape ({count}, {HAND_NUMBERS}), got {pose.shape}")
+        if pose.shape[1] < HAND_NUMBERS:
+            if self.hands is None:
+                problem = (
+                    f"{pose.shape[1]} numbers are principal coefficients: they need the hand basis of a model (hands)"
+                )
+                raise MotionError(self.path, key, problem)
+            pose = pose @ np.asarray(self.hands.components)[side, : pose.shape[1]]
+        return self.with_mean(pose, side)
+
+    def with_mean(self, hand: Any, side: int) -> Any:
+        """A hand's pose (m, 45) from that of a file, which may be relative to the mean hand."""
+        return hand if self.flat_hand_mean or self.hands is None else hand + np.asarray(self.hands.means)[side]
+
+    def assemble(self, body, face=None, hands=None):
+        """(m, 55, 3) from (m, 66) and parts that may be None."""
+        zeros = lambda columns: np.zeros((len(body), columns))
+        face = [zeros(3) if part is None else part for part in face or [None] * 3]
+        hands = [zeros(HAND_NUMBERS) if hand is None else hand for hand in hands or [None] * 2]
+        return np.concatenate([body, *face, *hands], axis=1).reshape(len(body), -1, 3)
+
+
+def _check_npz(path):
+    """Raises: MotionError for a file of another name that is no npz archive either."""
+    with open_file(path) as file:
+        if file.read(2) != b"PK":
+            found = path.suffix or "no suffix"
+            raise MotionError(path, "", f"no motion: expected a file .npz, .pkl, .json, .bvh or .glb, got {found}")
+
+
+def _read_json_frames(path):
+    """One JSON file per frame (a folder: all of them, in the order of their numbers), stacked by key."""
+    files = [path]
+    if path.is_dir():
+        natural = lambda file: [int(x) if x.isdigit() else x for x in re.split(r"(\d+)", file.name)]
+        files = sorted(path.glob("*.json"), key=natural)
+        if not files:
+            raise MotionError(path, "", "no .json file in this folder")
+    frames = []
+    for file in files:
+        frame = read_json(file)
+        if not isinstance(frame, dict):
+            raise MotionError(file, "", f"expected a JSON object, got {type(frame).__name__}")
+        if missing := set(frames[0] if frames else ()) - set(frame):
+            raise MotionError(file, min(missing), f"missing, but {files[0].name} has it")
+        frames.append(frame)
+    return {key: [frame[key] for frame in frames] for key in frames[0]}

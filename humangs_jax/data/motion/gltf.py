@@ -1,0 +1,181 @@
+"""Skeleton animations in GLB files: the first animation, on the joints of its skin.
+
+https://registry.khronos.org/glTF/specs/2.0/glTF-2.0.html#animations. The rest pose is the one in which the skin was bound to the
+mesh (inverse bind matrices), without a skin that of the nodes. Splines are taken at their keys and interpolated linearly.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from humangs_jax.data.motion.motion import DEFAULT_FPS
+from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
+from humangs_jax.io.glb import parse_glb, read_accessor
+from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_bytes
+
+PATHS = {"translation": 3, "rotation": 4, "scale": 3}
+
+
+def read_animation(path: Path) -> Clip:
+    """The skeleton of a GLB file in motion. Raises: OSError; Refused and what damaged numbers raise."""
+    data = read_bytes(path, "mesh_bytes")
+    content, binary = parse_glb(data)
+    nodes, animations = content.get("nodes", []), content.get("animations", [])
+    if not animations:
+        raise Refused("a GLB file without an animation: expected a skeleton in motion")
+    parents = _parents(nodes)
+    joints, binding = _joints(content, binary, nodes)
+    order = _with_ancestors(joints, parents)
+    check_limit("joints", len(order), "joints")
+    tracks = _tracks(content, binary, animations[0], set(order))
+    times, fps = _times(tracks)
+    check_unpacked(len(data), 3 * bytes_of_clip(len(times), len(order)))
+    posed = _world(nodes, parents, order, tracks, times)
+    rest = _world(nodes, parents, order, {}, np.zeros(1))
+    index = {joint: i for i, joint in enumerate(joints)}
+    bind = np.stack([binding.get(joint, rest[joint][0]) for joint in joints])
+    matrices = np.stack([posed[joint] for joint in joints], axis=1)
+    turns = _rotations(matrices) @ np.swapaxes(_rotations(bind), -1, -2)
+    names = tuple(str(nodes[joint].get("name", "")) for joint in joints)
+    above = tuple(index.get(_next_joint(parents, joint, index), -1) for joint in joints)
+    return Clip(names, above, bind[:, :3, 3], turns, matrices[..., :3, 3], fps, up="y")
+
+
+def _parents(nodes):
+    """Parent of each node, -1 for roots. Raises: Refused for a node with two parents."""
+    parents = [-1] * len(nodes)
+    for i, node in enumerate(nodes):
+        for child in node.get("children", []):
+            if type(child) is not int or not 0 <= child < len(nodes) or parents[child] != -1:
+                raise Refused(f"nodes: {child!r} is no node, or has two parents")
+            parents[child] = i
+    return parents
+
+
+def _joints(content, binary, nodes):
+    """Nodes that are joints, and the matrices (4, 4) of their places when they were bound, as far as the file tells."""
+    skins = [skin for skin in content.get("skins", []) if skin.get("joints")]
+    if not skins:
+        return list(range(len(nodes))), {}
+    skin = max(skins, key=lambda each: len(each["joints"]))
+    joints = skin["joints"]
+    if any(type(joint) is not int or not 0 <= joint < len(nodes) for joint in joints):
+        raise Refused("skins: a joint that is no node")
+    joints = list(dict.fromkeys(joints))
+    if "inverseBindMatrices" not in skin or len(joints) != len(skin["joints"]):
+        return joints, {}
+    inverse = read_accessor(content, binary, skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
+    _check(inverse, "inverseBindMatrices")
+    return joints, dict(zip(joints, np.linalg.inv(inverse), strict=True))
+
+
+def _with_ancestors(joints, parents):
+    """Joints and the nodes above them, parents first. Raises: Refused for nodes that are above themselves."""
+    order: list[int] = []
+    placed: set[int] = set()
+    for joint in joints:
+        path: list[int] = []
+        while joint != -1 and joint not in placed:
+            if len(path) > len(parents):
+                raise Refused("nodes: one lies below itself")
+            path.append(joint)
+            joint = parents[joint]
+        order += reversed(path)
+        placed.update(path)
+    return order
+
+
+def _next_joint(parents, joint, joints):
+    joint = parents[joint]
+    while joint != -1 and joint not in joints:
+        joint = parents[joint]
+    return joint
+
+
+def _tracks(content, binary, animation, wanted):
+    """(times, values) by node and path, of the nodes that are wanted."""
+    tracks: dict[tuple[int, str], Any] = {}
+    for channel in animation["channels"]:
+        node, path = channel["target"].get("node"), channel["target"]["path"]
+        if node not in wanted or path not in PATHS:
+            continue
+        sampler = animation["samplers"][channel["sampler"]]
+        times = read_accessor(content, binary, sampler["input"])[:, 0]
+        values = read_accessor(content, binary, sampler["output"])
+        if sampler.get("interpolation") == "CUBICSPLINE":
+            values = values.reshape(-1, 3, values.shape[1])[:, 1]  # between the tangents
+        _check(values, path)
+        if not len(times) or values.shape != (len(times), PATHS[path]) or not (np.diff(times) > 0).all():
+            raise Refused(f"animation: expected one {path} for each of increasing times")
+        _check(times, "times")
+        tracks[node, path] = times, values, sampler.get("interpolation") == "STEP"
+    if not any(path == "rotation" for _, path in tracks):
+        raise Refused("an animation that turns no joint: expected a skeleton in motion")
+    return tracks
+
+
+def _times(tracks):
+    """Times of the frames in seconds, as close as those of the densest track, and their rate."""
+    first, last = (pick(times[end] for times, _, _ in tracks.values()) for pick, end in ((min, 0), (max, -1)))
+    dense = max((times for times, _, _ in tracks.values()), key=len)
+    if len(dense) < 2 or not last > first:
+        return np.asarray([first]), DEFAULT_FPS
+    fps = (len(dense) - 1) / float(dense[-1] - dense[0])
+    count = round((last - first) * fps) + 1
+    if count > 4 * len(dense):
+        raise Refused("animation: tracks of very different lengths")
+    return first + np.arange(count) / fps, fps
+
+
+def _world(nodes, parents, order, tracks, times):
+    """Matrices (m, 4, 4) of the nodes at some times."""
+    world: dict[int, np.ndarray] = {}
+    for i in order:
+        local = _local(nodes[i], {path: tracks[i, path] for path in PATHS if (i, path) in tracks}, times)
+        world[i] = local if parents[i] == -1 else world[parents[i]] @ local
+    return world
+
+
+def _local(node, tracks, times):
+    local = np.tile(np.eye(4), (len(times), 1, 1))
+    if "matrix" in node:
+        local[:] = np.asarray(node["matrix"], np.float64).reshape(4, 4).T
+        _check(local, "matrix")
+        return local
+    usual = {"translation": [0, 0, 0], "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]}
+    parts = {}
+    for path, still in usual.items():
+        value = np.asarray(node.get(path, still), np.float64).reshape(1, PATHS[path])
+        _check(value, path)
+        parts[path] = _sampled(tracks[path], times, path) if path in tracks else np.tile(value, (len(times), 1))
+    local[:, :3, :3] = Rotation.from_quat(parts["rotation"]).as_matrix() * parts["scale"][:, None, :]
+    local[:, :3, 3] = parts["translation"]
+    return local
+
+
+def _sampled(track, times, path):
+    keys, values, stepped = track
+    if stepped or len(keys) == 1:
+        times = times + 0.01 * (times[1] - times[0] if len(times) > 1 else 1.0)  # keys are rounded to float32
+        return values[np.clip(np.searchsorted(keys, times, side="right") - 1, 0, len(keys) - 1)]
+    times = np.clip(times, keys[0], keys[-1])
+    if path == "rotation":
+        return Slerp(keys, Rotation.from_quat(values))(times).as_quat()
+    return np.stack([np.interp(times, keys, column) for column in values.T], axis=1)
+
+
+def _rotations(matrices):
+    """The rotations in matrices of rotation and scale. Raises: Refused where there is none."""
+    linear = matrices[..., :3, :3]
+    lengths = np.linalg.norm(linear, axis=-2, keepdims=True)
+    if not (lengths > 0).all() or not (np.linalg.det(linear) > 0).all():
+        raise Refused("a joint that is mirrored or without size: expected rotations, positions and scales")
+    flat = (linear / lengths).reshape(-1, 3, 3)
+    return Rotation.from_matrix(flat).as_matrix().reshape(linear.shape)
+
+
+def _check(values, what):
+    if not np.isfinite(values).all():
+        raise Refused(f"{what}: expected finite numbers")

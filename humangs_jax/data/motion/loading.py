@@ -1,0 +1,85 @@
+"""The one door to motions: `load_motion` reads every format of `arrays`, `bvh` and `gltf`."""
+
+from importlib import resources
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.smplx import HandBasis
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.data.motion import arrays, skeleton, world
+from humangs_jax.data.motion.bvh import read_bvh
+from humangs_jax.data.motion.gltf import read_animation
+from humangs_jax.data.motion.motion import Motion, MotionError
+from humangs_jax.io.reading import reading
+
+WALK = "walk.npz"
+LARGEST_DISTANCE = 1e4
+"""Metres from the origin: farther, float32 loses millimetres, and the numbers are no metres."""
+_SKELETONS = {".bvh": read_bvh, ".glb": read_animation}
+
+
+def load_motion(
+    path: str | Path | None = None,
+    *,
+    up: str = "auto",
+    fps: float | int | None = None,
+    hands: HandBasis | None = None,
+    flat_hand_mean: bool = True,
+    rest_joints: Float[Array, "j 3"] | Float[np.ndarray, "j 3"] | None = None,
+) -> Motion:
+    """Read a motion; suffix and keys decide the format (docs/motions.md).
+
+    Arguments:
+        path: None for the walk that comes with the package; else a file (.npz, .pkl, .json, .bvh, .glb), or a folder of LHM's
+            JSON files.
+        up: axis of the file's world that points up ("y", "-y", "z", ...); the motion is turned so that y does. "auto"
+            asks the poses: the axis along which the pelvis stands upright on average, and if none is clear the format's
+            own (AMASS z, others y). Our own format and AIST++ are y-up and never turned by "auto". Skeletons (.bvh, .glb)
+            have a rest pose: "auto" takes its up if a person stands in it, else y.
+        fps: frames per second in place of those in the file.
+        hands: hand basis of an SMPL-X model, needed for hands of fewer than 45 numbers (principal coefficients) and for
+            `flat_hand_mean` False, which adds the mean hand (only to hands that a file has). Our own format holds
+            whole rotations: there is nothing to add.
+        rest_joints: joints in the T-pose of the body that will move (`avatar.rest_joints`), metres: skeletons of other programs
+            are brought to it, and a motion of another number of joints is refused. None: the shipped body.
+
+    Raises: MotionError, one line naming file and key.
+    """
+    if up not in ("auto", *world.UPRIGHT):
+        raise ValueError(f"up: expected auto, {', '.join(world.UPRIGHT)}, got {up!r}")
+    if hands is None and not flat_hand_mean:
+        raise ValueError("flat_hand_mean=False needs the mean hand: pass hands")
+    if path is None:
+        with resources.as_file(resources.files("humangs_jax") / "assets" / WALK) as file:
+            return load_motion(file, up=up, fps=fps, rest_joints=rest_joints)
+    if fps is not None and not (np.isfinite(fps) and fps > 0):
+        raise MotionError(path, "fps", f"expected a positive number of frames per second, got {fps}")
+    with reading(path, "motion", MotionError):
+        return _load(Path(path), up, None if fps is None else float(fps), hands, flat_hand_mean, rest_joints)
+
+
+def _load(path, up, fps, hands, flat_hand_mean, rest_joints):
+    if not path.exists():
+        raise MotionError(path, "", "no such file")
+    read = _SKELETONS.get(path.suffix.lower())
+    if read is None or path.is_dir():
+        rotations, translations, file_fps, usual_up = arrays.read_arrays(path, hands, flat_hand_mean, fps)
+        if up == "auto":
+            up = "y" if usual_up is None else world.up_axis(rotations[:, 0], usual_up)
+        rotations, translations = world.turned_upright(rotations, translations, up)
+    else:
+        clip = read(path)
+        file_fps = clip.fps
+        joints = skeleton.shipped_joints() if rest_joints is None else np.asarray(rest_joints, np.float64)
+        with np.errstate(all="ignore"):  # of numbers without sense, which are refused below
+            rotations, translations = skeleton.retargeted(clip, joints, up)
+    if rest_joints is not None and rotations.shape[1] != len(rest_joints):
+        raise MotionError(path, "rotations", f"expected {len(rest_joints)} joints, got {rotations.shape[1]}")
+    if not np.isfinite(rotations).all():
+        raise MotionError(path, "", "expected a skeleton of finite size")
+    if not (farthest := np.abs(translations).max()) <= LARGEST_DISTANCE:
+        raise MotionError(path, "", f"expected metres, at most {LARGEST_DISTANCE:g} from the origin, got {farthest:g}")
+    rate = file_fps if fps is None else fps
+    return Motion(jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), rate)

@@ -1,0 +1,135 @@
+"""BVH files in the conventions of their sources, written from poses of our own skeleton."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.body.joints import FINGERS, JOINT_NAMES, PARENTS
+
+INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
+_LIMBS = {
+    **{"collar": "Shoulder", "shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand"},
+    **{"hip": "UpLeg", "knee": "Leg", "ankle": "Foot", "foot": "ToeBase"},
+}
+CMU = {
+    **{"pelvis": "Hips", "spine1": "LowerBack", "spine2": "Spine", "spine3": "Spine1", "neck": "Neck", "head": "Head"},
+    **{f"{s}_{ours}": s.title() + theirs for s in ("left", "right") for ours, theirs in _LIMBS.items()},
+}
+_SPINE = {"spine1": "Spine", "spine2": "Spine1", "spine3": "Spine2"}
+LAFAN = CMU | _SPINE | {f"{s}_foot": f"{s.title()}Toe" for s in ("left", "right")}
+MIXAMO = {ours: f"mixamorig:{theirs}" for ours, theirs in (CMU | _SPINE).items()}
+MIXAMO |= {
+    f"{s}_{finger}{i}": f"mixamorig:{s.title()}Hand{finger.title()}{i}"
+    for s in ("left", "right")
+    for finger in FINGERS
+    for i in (1, 2, 3)
+}
+BONES = [
+    *(("pelvis", "spine1"), ("spine1", "spine2"), ("spine2", "spine3"), ("spine3", "neck"), ("neck", "head")),
+    *(
+        (f"{s}_{a}", f"{s}_{b}")
+        for s in ("left", "right")
+        for a, b in (
+            *(("collar", "shoulder"), ("shoulder", "elbow"), ("elbow", "wrist")),
+            *(("hip", "knee"), ("knee", "ankle"), ("ankle", "foot")),
+        )
+    ),
+]
+
+
+def rest_frames(arms_down=0.0, turned=0.0):
+    """Our rest frame -> the file's, by joint: arms lowered, the world turned about y, both in degrees."""
+    around, frames = Rotation.from_euler("y", turned, degrees=True), {}
+    for name in JOINT_NAMES:
+        arm = any(part in name for part in ("shoulder", "elbow", "wrist", *FINGERS))
+        side = 1 if name.startswith("left") else -1
+        frames[name] = around * Rotation.from_euler("z", -side * arms_down * arm, degrees=True)
+    return frames
+
+
+def frames_along_bones(rest, seed=0):
+    """LaFAN's: every bone lies along +x of its joint, twisted as it likes; joints without a bone are as their parents."""
+    rng, frames = np.random.default_rng(seed), {}
+    children = dict(BONES)
+    for name in JOINT_NAMES:
+        child, parent = children.get(name), PARENTS[INDEX[name]]
+        if name == "pelvis":  # the spine along x, the hips along z
+            up = rest[INDEX["spine3"]] - rest[0]
+            left = rest[INDEX["left_hip"]] - rest[INDEX["right_hip"]]
+            frames[name] = Rotation.align_vectors([[1, 0, 0], [0, 0, 1]], [up, left], weights=[1e6, 1])[0]
+        elif child is None:
+            frames[name] = frames[JOINT_NAMES[parent]]
+        else:
+            bone = rest[INDEX[child]] - rest[INDEX[name]]
+            onto = Rotation.align_vectors([[1, 0, 0]], [bone])[0]
+            frames[name] = Rotation.from_euler("x", rng.uniform(-180, 180), degrees=True) * onto
+    return frames
+
+
+def without_twist(rest, poses):
+    """Poses (m, 55, 3) whose rotations turn no bone about itself."""
+    poses = poses.copy()
+    for a, b in BONES[1:]:
+        bone = rest[INDEX[b]] - rest[INDEX[a]]
+        bone /= np.linalg.norm(bone)
+        poses[:, INDEX[a]] -= (poses[:, INDEX[a]] @ bone)[:, None] * bone
+    return poses
+
+
+def places_of(rest, poses, moves):
+    """Joints (m, 55, 3) in space: `moves` (m, 3) is where the pelvis is."""
+    world, places = {}, {}
+    for j, parent in enumerate(PARENTS):
+        own = Rotation.from_rotvec(poses[:, j])
+        world[j] = own if parent < 0 else world[parent] * own
+        places[j] = moves if parent < 0 else places[parent] + world[parent].apply(rest[j] - rest[parent])
+    return np.stack([places[j] for j in range(len(PARENTS))], axis=1)
+
+
+def bone_directions(places):
+    bones = np.stack([places[:, INDEX[b]] - places[:, INDEX[a]] for a, b in BONES], axis=1)
+    return bones / np.linalg.norm(bones, axis=-1, keepdims=True)
+
+
+def write_bvh(rest, poses, names, frames_of=None, moves=None, order="ZYX", unit=100.0, up=None):
+    """The text of a BVH file of a body with the joints `rest` (55, 3) in T-pose, in centimetres.
+
+    poses: (m, 55, 3). names: ours -> the file's; other joints are left out. frames_of: see above. moves: (m, 3), where the
+    pelvis is. up: a rotation of the whole world.
+    """
+    frames_of = frames_of or rest_frames()
+    moves = np.tile([0.1, 0.9, -0.2], (len(poses), 1)) if moves is None else moves
+    up = up or Rotation.identity()
+    body = [name for name in JOINT_NAMES if name in names]
+    above = {name: JOINT_NAMES[PARENTS[INDEX[name]]] for name in body[1:]}
+    children = {name: [other for other in body[1:] if above[other] == name] for name in body}
+    written: list = []
+
+    def lines(name, depth):
+        written.append(name)
+        tab = "\t" * depth
+        offset = np.zeros(3)
+        if name in above:
+            offset = (up * frames_of[above[name]]).apply(rest[INDEX[name]] - rest[INDEX[above[name]]])
+        move = "3" if name in above else "6 Xposition Yposition Zposition"
+        yield f"{tab}{'JOINT' if name in above else 'ROOT'} {names[name]}"
+        yield f"{tab}{{"
+        yield f"{tab}\tOFFSET {' '.join(f'{unit * x:.8f}' for x in offset)}"
+        yield f"{tab}\tCHANNELS {move} {' '.join(f'{axis}rotation' for axis in order)}"
+        for child in children[name]:
+            yield from lines(child, depth + 1)
+        if not children[name]:
+            yield f"{tab}\tEnd Site\n{tab}\t{{\n{tab}\t\tOFFSET 0 1 0\n{tab}\t}}"
+        yield f"{tab}}}"
+
+    text = ["HIERARCHY", *lines("pelvis", 0), "MOTION", f"Frames: {len(poses)}", "Frame Time: 0.0083333"]
+    for pose, move in zip(poses, moves, strict=True):
+        world, numbers = {}, list(unit * up.apply(move))
+        for name in written:
+            own = Rotation.from_rotvec(pose[INDEX[name]])
+            world[name] = own if name not in above else world[above[name]] * own
+            theirs = up * world[name] * (up * frames_of[name]).inv()
+            if name in above:
+                theirs = (up * world[above[name]] * (up * frames_of[above[name]]).inv()).inv() * theirs
+            numbers += list(theirs.as_euler(order, degrees=True))
+        text.append(" ".join(f"{x:.8f}" for x in numbers))
+    return "\n".join(text) + "\n"

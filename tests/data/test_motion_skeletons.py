@@ -1,0 +1,322 @@
+"""Skeletons of other programs: bones, feet and names, in files as CMU, Mixamo and LaFAN write them; and the page's reader."""
+
+import functools
+import json
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bvh_files import (
+    CMU,
+    INDEX,
+    LAFAN,
+    MIXAMO,
+    bone_directions,
+    frames_along_bones,
+    places_of,
+    rest_frames,
+    without_twist,
+    write_bvh,
+)
+from scipy.spatial.transform import Rotation
+
+import humangs_jax
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.data.motion import MotionError, load_motion
+from humangs_jax.data.motion.skeleton import shipped_joints
+from humangs_jax.io.glb import GlbWriter
+
+EXACT = 1e-5
+"""Radians and metres: float32, and BVH's eight decimals."""
+PAGE = Path(humangs_jax.__file__).parent / "viewer" / "page"
+NODE = shutil.which("node")
+
+
+@functools.cache
+def person():
+    return shipped_joints()
+
+
+def other_person():
+    """Longer shins, shorter thighs, wider hips, other arms."""
+    rest, stretch = person(), {"knee": 0.85, "ankle": 1.2, "hip": 1.3, "elbow": 1.1, "wrist": 0.9, "spine2": 1.2}
+    out = rest.copy()
+    for j, parent in enumerate(PARENTS[1:], 1):
+        out[j] = out[parent] + stretch.get(JOINT_NAMES[j].split("_")[-1], 1.0) * (rest[j] - rest[parent])
+    return out
+
+
+def dance(frames=5, seed=0, names=MIXAMO, scale=0.5):
+    poses = np.random.default_rng(seed).normal(size=(frames, 55, 3)) * scale
+    poses[:, [i for i, name in enumerate(JOINT_NAMES) if name not in names]] = 0
+    return poses
+
+
+def loaded(tmp_path, text, **options):
+    path = tmp_path / "dance.bvh"
+    path.write_text(text)
+    motion = load_motion(path, **options)
+    return np.asarray(motion.rotations, float), np.asarray(motion.translations, float), motion
+
+
+def matrices(rotations):
+    return Rotation.from_rotvec(np.reshape(rotations, (-1, 3))).as_matrix()
+
+
+SCHEMES = {
+    "CMU": (CMU, {}, {"order": "ZYX"}),
+    "CMU, A-pose": (CMU, {"arms_down": 48}, {"unit": 1 / 0.45 / 0.0254}),
+    "Mixamo": (MIXAMO, {}, {"order": "XYZ"}),
+    "Mixamo, turned": (MIXAMO, {"arms_down": 40, "turned": 90}, {}),
+    "z up": (CMU, {}, {"up": Rotation.from_euler("x", 90, degrees=True)}),
+}
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_bones_point_where_the_files_bones_point(tmp_path, scheme):
+    names, frame, options = SCHEMES[scheme]
+    rest, poses = person(), dance(names=names)
+    moves = np.random.default_rng(1).normal(size=(5, 3))
+    text = write_bvh(rest, poses, names, rest_frames(**frame), moves, **options)
+    rotations, translations, motion = loaded(tmp_path, text, rest_joints=rest)
+    assert rotations.shape == (5, 55, 3) and motion.fps == pytest.approx(120, rel=1e-4)
+    theirs, ours = places_of(rest, poses, moves), places_of(rest, rotations, translations + rest[0])
+    np.testing.assert_allclose(bone_directions(ours), bone_directions(theirs), atol=EXACT)
+    if not frame:  # the same rest pose: the same rotations
+        np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+    # the same body: the pelvis goes where it went, up to the height of the floor
+    np.testing.assert_allclose(np.ptp(translations + rest[0] - moves, axis=0), 0, atol=EXACT)
+    np.testing.assert_allclose((translations + rest[0] - moves)[:, [0, 2]], 0, atol=EXACT)
+
+
+def test_a_rest_pose_in_which_nobody_stands_gets_its_twists_from_the_motion(tmp_path):
+    rest = person().copy()
+    for name in ("spine1", "spine2", "spine3"):  # a straight spine: as the file's is
+        rest[INDEX[name], [0, 2]] = rest[0, [0, 2]]
+    poses = without_twist(rest, dance(names=LAFAN, scale=0.4))
+    text = write_bvh(rest, poses, LAFAN, frames_along_bones(rest))
+    offset = text.split("JOINT LeftLeg")[1].split("OFFSET ")[1].splitlines()[0].split()
+    assert float(offset[0]) > 30 and abs(float(offset[1])) < 1e-6  # as LaFAN's are: along x
+    rotations, _, _ = loaded(tmp_path, text, rest_joints=rest)
+    np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=1e-4)
+
+
+@pytest.mark.parametrize("names", [CMU, LAFAN])
+def test_feet_stay_on_the_ground_on_another_body(tmp_path, names):
+    """Squats of one person, with a jump in the middle, on a body of other proportions."""
+    source, target, frames = other_person(), person(), 9
+    bend = np.radians(np.linspace(0, 80, frames))
+    poses, moves = np.zeros((frames, 55, 3)), np.zeros((frames, 3))
+    for side in ("left", "right"):
+        for joint, share in (("hip", -1), ("knee", 2), ("ankle", -1)):
+            poses[:, INDEX[f"{side}_{joint}"], 0] = share * bend
+    poses[4] = 0  # in the air, legs stretched
+    ankle = INDEX["left_ankle"]
+    moves[:, 1] = 0.1 - places_of(source, poses, moves)[:, ankle, 1]
+    moves[4, 1] += 0.25
+    frame = frames_along_bones(source) if names is LAFAN else None
+    rotations, translations, _ = loaded(tmp_path, write_bvh(source, poses, names, frame, moves), rest_joints=target)
+    ours = places_of(target, rotations, translations + target[0])
+    legs = lambda rest: sum(
+        np.linalg.norm(rest[INDEX[f"left_{b}"]] - rest[INDEX[f"left_{a}"]])
+        for a, b in (("hip", "knee"), ("knee", "ankle"))
+    )
+    expected = np.where(np.arange(frames) == 4, 0.25 * legs(target) / legs(source), 0)
+    feet = ours[:, [ankle, INDEX["right_ankle"]], 1]
+    np.testing.assert_allclose(feet - feet[0], np.stack([expected] * 2, 1), atol=1e-4)
+    assert np.ptp(ours[:, 0, 1]) > 0.3  # they were squats
+
+
+def test_names_of_other_schemes(tmp_path):
+    """A prefix that all joints share, sides behind the name, and SMPL's own, whose foot is the toe and whose shoulder the arm."""
+    rest, poses = person(), dance(3, names=CMU)
+    unreal = {"shoulder": "upperarm", "elbow": "lowerarm", "wrist": "hand", "collar": "clavicle"}
+    unreal |= {"hip": "thigh", "knee": "calf", "ankle": "foot", "foot": "ball"}
+    schemes = [
+        {ours: f"Model_{theirs}" for ours, theirs in CMU.items()},
+        {ours: ours for ours in CMU},
+        {ours: ours.replace("left_", "L_").replace("right_", "R_") for ours in CMU},
+        {o: f"{unreal[o.split('_')[1]]}_{o[0]}" if "_" in o else {"neck": "neck_01"}.get(o, o) for o in CMU},
+    ]
+    for names in schemes:
+        rotations, _, _ = loaded(tmp_path, write_bvh(rest, poses, names), rest_joints=rest)
+        np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+
+
+def test_few_spine_joints(tmp_path):
+    rest, poses = person(), np.zeros((2, 55, 3))
+    names = {ours: theirs for ours, theirs in CMU.items()}
+    poses[:, INDEX["left_knee"], 0] = 0.5
+    text = write_bvh(rest, poses, names).replace("LowerBack", "Tail").replace("Spine1", "Chest")
+    rotations, _, _ = loaded(tmp_path, text, rest_joints=rest)
+    np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+
+
+HEAD = (
+    "HIERARCHY\nROOT Hips\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\nEnd Site\n{\nOFFSET 0 0 0\n}\n}\n"
+)
+BAD = {
+    "words": ("hello", "not a BVH file: expected HIERARCHY first"),
+    "cut": ("HIERARCHY ROOT Hips { OFFSET 0 0", "cut short"),
+    "open": ("HIERARCHY ROOT Hips { OFFSET 0 0 0 ", "a brace of the joints is open"),
+    "no motion": (HEAD, "expected MOTION, Frames: and Frame Time:"),
+    "strange": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 0 0\n", "expected the names of CMU, Mixamo or LaFAN"),
+    "few": (HEAD + "MOTION\nFrames: 2\nFrame Time: 0.1\n0 0 0\n", "expected 2 frames of 3 numbers, got 3 numbers"),
+    "nan": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 nan 0\n", "expected finite numbers, got nan"),
+    "letters": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 x 0\n", "frames: expected numbers"),
+    "time": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0\n0 0 0\n", "a positive Frame Time, got 1 and 0"),
+    "channels": (HEAD.replace("Zrot", "Wrot"), "expected up to 6 channels"),
+    "word": (HEAD.replace("CHANNELS", "CHANELS"), "unknown word CHANELS"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_files_are_one_line(tmp_path, case):
+    text, expected = BAD[case]
+    with pytest.raises(MotionError) as caught:
+        loaded(tmp_path, text)
+    message = str(caught.value)
+    assert str(tmp_path / "dance.bvh") in message and expected in message and "\n" not in message
+
+
+def test_a_body_of_other_joints_is_refused_by_name(tmp_path):
+    with pytest.raises(MotionError, match="bodies of 55 joints, this one has 3"):
+        loaded(tmp_path, write_bvh(person(), dance(2), CMU), rest_joints=np.zeros((3, 3)))
+    np.savez(tmp_path / "ten.npz", rotations=np.zeros((4, 10, 3)), translations=np.zeros((4, 3)), fps=30)
+    with pytest.raises(MotionError, match=r"ten\.npz: rotations: expected 55 joints, got 10"):
+        load_motion(tmp_path / "ten.npz", rest_joints=person())
+    np.savez(tmp_path / "far.npz", rotations=np.zeros((4, 55, 3)), translations=np.full((4, 3), 1e6), fps=30)
+    with pytest.raises(MotionError, match="expected metres, at most 10000 from the origin, got 1e\\+06"):
+        load_motion(tmp_path / "far.npz")
+    (tmp_path / "walk.fbx").write_text("Kaydara")
+    with pytest.raises(MotionError, match=r"expected a file .npz, .pkl, .json, .bvh or .glb, got .fbx"):
+        load_motion(tmp_path / "walk.fbx")
+
+
+# The page ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(NODE is None, reason="needs node (nodejs.org)")
+@pytest.mark.parametrize("scheme", ["CMU, A-pose", "Mixamo, turned", "z up", "LaFAN"])
+def test_the_page_reads_a_file_as_python_does(tmp_path, scheme):
+    source, target = other_person(), person()
+    moves = np.random.default_rng(2).normal(size=(4, 3))
+    if scheme == "LaFAN":
+        text = write_bvh(source, dance(4, names=LAFAN), LAFAN, frames_along_bones(source), moves)
+    else:
+        names, frame, options = SCHEMES[scheme]
+        text = write_bvh(source, dance(4, names=names), names, rest_frames(**frame), moves, **options)
+    rotations, translations, motion = loaded(tmp_path, text, rest_joints=target)
+    scripts = "\n".join((PAGE / f"{name}.js").read_text() for name in ("kinematics", "motion_files"))
+    body = json.dumps({"rest": target.tolist(), "parents": PARENTS, "names": JOINT_NAMES})
+    program = f"""{scripts}
+    const scene = {body};
+    scene.order = jointOrder(scene.parents);
+    const text = require("fs").readFileSync({json.dumps(str(tmp_path / "dance.bvh"))}, "utf8");
+    process.stdout.write(JSON.stringify(retargetBvh(parseBvh(text), scene)));"""
+    done = subprocess.run([str(NODE), "-e", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    page = json.loads(done.stdout)
+    theirs = Rotation.from_quat(np.reshape(page["quats"], (-1, 4))[:, [1, 2, 3, 0]]).as_matrix()
+    np.testing.assert_allclose(theirs, matrices(rotations), atol=EXACT)
+    np.testing.assert_allclose(page["translations"], translations, atol=EXACT)
+    assert page["fps"] == pytest.approx(motion.fps)
+
+
+# GLB --------------------------------------------------------------------------------------------------------------------
+
+
+def write_glb(path, rest, poses, moves, names, bind=None, fps=24.0, above=None, interpolation="LINEAR"):
+    """A skinned skeleton in motion; `above`: the node that it hangs on, as programs of centimetres and z up write it."""
+    writer, joints = GlbWriter(), [name for name in JOINT_NAMES if name in names]
+    place = {name: i for i, name in enumerate(joints)}
+    nodes, channels, samplers = [], [], []
+    times = writer.array("SCALAR", np.arange(len(poses)) / fps, bounds=True)
+
+    def animate(node, path_, values):
+        if interpolation == "CUBICSPLINE":
+            values = np.stack([np.zeros_like(values), values, np.zeros_like(values)], axis=1).reshape(
+                -1, values.shape[1]
+            )
+        kind = {3: "VEC3", 4: "VEC4"}[values.shape[1]]
+        samplers.append({"input": times, "output": writer.array(kind, values), "interpolation": interpolation})
+        channels.append({"sampler": len(samplers) - 1, "target": {"node": node, "path": path_}})
+
+    inverse = []
+    outer = np.eye(4) if above is None else np.reshape(above["matrix"], (4, 4)).T
+    for name in joints:
+        j, p = INDEX[name], PARENTS[INDEX[name]]
+        nodes.append({"name": names[name], "translation": (rest[j] - (rest[p] if p >= 0 else 0)).tolist()})
+        children = [place[other] for other in joints if PARENTS[INDEX[other]] == j]
+        if children:
+            nodes[-1]["children"] = children
+        matrix = np.eye(4)
+        matrix[:3, 3] = rest[j]
+        inverse.append(np.linalg.inv(outer @ matrix).T.reshape(-1))
+        animate(place[name], "rotation", Rotation.from_rotvec(poses[:, j]).as_quat())
+    animate(0, "translation", moves)
+    roots = [0]
+    if above is not None:
+        nodes.append(above | {"children": [0]})
+        roots = [len(nodes) - 1]
+    skin = {"joints": list(range(len(joints))), "inverseBindMatrices": writer.array("MAT4", np.stack(inverse))}
+    document = {"scene": 0, "scenes": [{"nodes": roots}], "nodes": nodes, "skins": [skin]}
+    writer.write(path, document | {"animations": [{"channels": channels, "samplers": samplers}]})
+
+
+@pytest.mark.parametrize("interpolation", ["LINEAR", "CUBICSPLINE", "STEP"])
+def test_the_skeleton_of_a_glb(tmp_path, interpolation):
+    rest, poses = person(), dance(4)
+    moves = np.random.default_rng(1).normal(size=(4, 3))
+    write_glb(tmp_path / "a.glb", rest, poses, moves, MIXAMO, interpolation=interpolation)
+    motion = load_motion(tmp_path / "a.glb", rest_joints=rest)
+    assert motion.fps == pytest.approx(24, rel=1e-5)
+    np.testing.assert_allclose(matrices(motion.rotations), matrices(poses), atol=EXACT)
+    np.testing.assert_allclose((motion.translations + rest[0] - moves)[:, [0, 2]], 0, atol=EXACT)
+
+
+def test_a_glb_in_centimetres_below_a_turned_node(tmp_path):
+    """As Blender writes z-up rigs: an armature of scale 0.01, turned by a quarter."""
+    rest, poses = person(), dance(3)
+    matrix = np.eye(4)
+    matrix[:3, :3] = 0.01 * Rotation.from_euler("x", -90, degrees=True).as_matrix()
+    inner = Rotation.from_euler("x", 90, degrees=True)  # bones lie in z-up centimetres
+    turned = 100 * inner.apply(rest)
+    local = np.stack([inner.apply(p) for p in poses])
+    moves = np.random.default_rng(1).normal(size=(3, 3))
+    above = {"name": "Armature", "matrix": matrix.T.reshape(-1).tolist()}
+    write_glb(tmp_path / "a.glb", turned, local, 100 * inner.apply(moves), MIXAMO, above=above)
+    motion = load_motion(tmp_path / "a.glb", rest_joints=rest)
+    np.testing.assert_allclose(matrices(motion.rotations), matrices(poses), atol=EXACT)
+    np.testing.assert_allclose((motion.translations + rest[0] - moves)[:, [0, 2]], 0, atol=EXACT)
+
+
+def test_glb_files_that_are_no_motion(tmp_path):
+    def message(document, writer=None):
+        (writer or GlbWriter()).write(tmp_path / "a.glb", document)
+        with pytest.raises(MotionError) as caught:
+            load_motion(tmp_path / "a.glb")
+        assert str(tmp_path / "a.glb") in str(caught.value) and "\n" not in str(caught.value)
+        return str(caught.value)
+
+    nodes = {"nodes": [{"children": [1]}, {"children": [0]}]}
+    writer = GlbWriter()
+    times, turns = writer.array("SCALAR", np.arange(2.0)), writer.array("VEC4", np.ones((2, 4)))
+    track = lambda **sampler: {
+        "animations": [
+            {
+                "channels": [{"sampler": 0, "target": {"node": 0, "path": "rotation"}}],
+                "samplers": [{"input": times, "output": turns} | sampler],
+            }
+        ]
+    }
+    assert "without an animation" in message({})
+    assert "below itself" in message(nodes | track(), writer)
+    assert "one rotation for each of increasing times" in message({"nodes": [{}]} | track(output=times), writer)
+    assert "expected the names of CMU" in message({"nodes": [{"name": "a"}]} | track(), writer)
+    assert "turns no joint" in message({"nodes": [{}], "animations": [{"channels": [], "samplers": []}]})
+    (tmp_path / "a.glb").write_text("hello")
+    with pytest.raises(MotionError, match="no GLB file"):
+        load_motion(tmp_path / "a.glb")
