@@ -18,7 +18,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.geometry import transform
-from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at
+from humangs_jax.geometry.camera import Camera, intrinsics_from_fov
 from humangs_jax.rendering.constants import ALPHA_MIN
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig, drawn_as
@@ -128,23 +128,28 @@ def shot_cameras(
     and the image holds everything that happens.
 
     Without `shot.distance` it is the smallest for which every point lies in the middle 1 / MARGIN of the image.
+
+    Raises: ValueError for a shot that is out of range.
     """
+    shot.check()
     low, high = points.min(axis=1), points.max(axis=1)
     if smoothing is None:
         targets = np.broadcast_to(0.5 * (low.min(axis=0) + high.max(axis=0)), (len(points), 3))
     else:
         targets = smoothed_path(0.5 * (low + high), smoothing)
     turns, lift = np.radians(shot.azimuth + np.asarray(azimuths)), np.radians(shot.elevation)
-    towards = np.cos(lift) * np.stack([np.sin(turns), 0 * turns, np.cos(turns)], axis=-1)
-    towards[:, 1] = np.sin(lift)
-    targets = np.broadcast_to(targets, towards.shape)
-    distance = _fitting_distance(shot, points, targets, towards) if shot.distance is None else shot.distance
+    right = np.stack([np.cos(turns), 0 * turns, -np.sin(turns)], axis=-1)
+    back = np.cos(lift) * np.stack([np.sin(turns), 0 * turns, np.cos(turns)], axis=-1)
+    back[:, 1] = np.sin(lift)
+    axes = np.stack([right, np.cross(right, back), -back], axis=1)  # of the cameras in the world: right, down, forward
+    targets = np.broadcast_to(targets, back.shape)
+    distance = _fitting_distance(shot, points, targets, axes) if shot.distance is None else shot.distance
     width, height = shot.resolution
-    K = intrinsics_from_fov(np.radians(shot.fov), width, height)
-    up = jnp.asarray([0.0, 1.0, 0.0])
-    aim = jax.vmap(lambda eye, target: look_at(eye, target, up, K, width, height))
-    eyes = targets + distance * towards
-    return aim(jnp.asarray(eyes, jnp.float32), jnp.asarray(targets, jnp.float32))
+    views = np.zeros((len(turns), 4, 4), np.float32)
+    views[:, :3, :3], views[:, 3, 3] = axes, 1
+    views[:, :3, 3] = -np.einsum("vij,vj->vi", axes, targets + distance * back)
+    K = jnp.broadcast_to(intrinsics_from_fov(np.radians(shot.fov), width, height), (len(turns), 3, 3))
+    return replace(Camera(K[0], jnp.eye(4), width, height), K=K, cam_from_world=jnp.asarray(views))
 
 
 def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.ndarray, "m 3"]:
@@ -157,17 +162,13 @@ def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.nda
     return np.stack([np.convolve(column, kernel / kernel.sum(), mode="valid") for column in longer.T], axis=-1)
 
 
-def _fitting_distance(shot, points, targets, towards) -> float:
-    """|x| / (distance - z) <= tangent / MARGIN for all points, with x across the image and z towards the camera."""
-    right = np.stack([towards[:, 2], 0 * towards[:, 2], -towards[:, 0]], axis=-1)
-    right /= np.linalg.norm(right, axis=-1, keepdims=True)
-    axes = right, np.cross(towards, right)
+def _fitting_distance(shot, points, targets, axes) -> float:
+    """The least d with MARGIN |x| <= tangent (d + z) for all points: x across or down the image, z behind the target."""
     needed = 0.0
     for i, target in enumerate(targets):
-        from_target = points[i % len(points)] - target
-        nearer = from_target @ towards[i]
-        for axis, tangent in zip(axes, shot.tangents, strict=True):
-            needed = max(needed, float((np.abs(from_target @ axis[i]) * MARGIN / tangent + nearer).max()))
+        x, y, z = axes[i] @ (points[i % len(points)] - target).T
+        for across, tangent in zip((x, y), shot.tangents, strict=True):
+            needed = max(needed, float((np.abs(across) * MARGIN / tangent - z).max()))
     return needed
 
 
@@ -225,7 +226,7 @@ def motion_views(
     """
     motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
     count = len(motion.translations)
-    poses = BodyPose(motion.rotations, motion.translations)
+    poses = jax.vmap(BodyPose)(motion.rotations, motion.translations)
     azimuths = turn * np.arange(count) / count
     return poses, shot_cameras(
         shot, tracked_points(avatar, poses), azimuths, FOLLOWING * motion.fps if follow else None

@@ -15,7 +15,6 @@ import dataclasses
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -37,8 +36,7 @@ from humangs_jax.rendering.drawing import Rendering
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SplatConfig
 
-Layer = Literal["rgba", "z", "position", "normal", "part"]
-LAYERS: tuple[Layer, ...] = get_args(Layer)
+LAYERS = ("rgba", "z", "position", "normal", "part")
 EXR_NAME = "views.exr"
 COVERED = 0.5
 """Pixels of less alpha have no part."""
@@ -51,10 +49,11 @@ class ExrLayers:
     in 32, since half floats are 2 mm apart at 4 m.
     """
 
-    layers: tuple[Layer, ...] = ("rgba", "z")
+    layers: tuple[str, ...] = ("rgba", "z")
     half: bool = False
 
-    def __post_init__(self):
+    def check(self) -> None:
+        """Raises: ValueError naming a layer that does not exist."""
         if unknown := [layer for layer in self.layers if layer not in LAYERS]:
             raise ValueError(f"channels {unknown[0]!r}: expected some of {', '.join(LAYERS)}")
 
@@ -82,6 +81,8 @@ def write_views(
     from tqdm import tqdm
 
     out, count = Path(out), len(poses)
+    if exr is not None:
+        exr.check()
     if exr is not None and (size := exr.bytes_of(count, cameras.width, cameras.height)) > limits().array_bytes:
         most = limits().array_bytes
         raise ValueError(
@@ -109,7 +110,7 @@ def exr_view(
     pose: BodyPose,
     camera: Camera,
     rendering: Rendering,
-    layers: Iterable[Layer],
+    layers: Iterable[str],
     how: SplatConfig,
 ) -> ExrView:
     """A view with its layers. rendering: of this avatar, pose and camera onto black."""

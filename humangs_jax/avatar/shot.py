@@ -36,8 +36,8 @@ class Shot:
     """How Gaussians are drawn: near_exact and fast trade accuracy for time (docs/performance.md), inria is the published
     rasterizer. Default: as the avatar's weights were trained."""
 
-    def __post_init__(self):
-        """Raises ValueError naming what is out of range."""
+    def check(self) -> None:
+        """Raises: ValueError naming what is out of range."""  # not on construction: the command line would make a box of it
         for name in ("size", "width", "height"):
             value = getattr(self, name)
             if value is not None and not 1 <= value <= LARGEST_SIDE:
@@ -47,8 +47,6 @@ class Shot:
             value = getattr(self, name)
             if value is not None and not low <= value <= high:
                 raise ValueError(f"{name} {value}: expected a number from {low} to {high}")
-        if self.splat not in ("as_trained", "exact", "near_exact", "fast", "inria"):
-            raise ValueError(f"splat {self.splat!r}: expected as_trained, exact, near_exact, fast or inria")
         self.color()
 
     @property

@@ -113,6 +113,7 @@ def _write_mp4(path, frames, fps, shape):
 
 def _write_webm(path, frames, fps, shape):
     quality = ["-c:v", "libvpx-vp9", "-crf", str(VP9_QUALITY), "-b:v", "0", "-deadline", "good", "-cpu-used", "4"]
+    quality += ["-fflags", "+bitexact"]  # no random number in the file
     if shape[-1] == 4:  # a second stream beside the colours; alternate reference frames would separate the two
         quality += ["-pix_fmt", "yuva420p", "-auto-alt-ref", "0"]
     else:
@@ -142,6 +143,12 @@ def _write_by_ffmpeg(path, frames, fps, shape, quality):
         except BrokenPipeError:  # ffmpeg has given up: it says why
             with contextlib.suppress(BrokenPipeError):
                 ffmpeg.stdin.close()
+        except BaseException:  # of the frames, or Ctrl-C: the file is not wanted any more
+            ffmpeg.kill()
+            with contextlib.suppress(BrokenPipeError):
+                ffmpeg.stdin.close()
+            ffmpeg.wait()
+            raise
         problem = ffmpeg.stderr.read().decode(errors="replace")
     if ffmpeg.returncode:
         raise OSError(f"{path}: ffmpeg failed: {' '.join(problem.split())}")

@@ -49,6 +49,7 @@ class Animate:
         from humangs_jax.avatar.video import check_video, write_video
         from humangs_jax.data.motion import load_motion
 
+        self.shot.check()
         require_parent(self.out)
         check_video(self.out, 0, *self.shot.resolution, transparent=self.shot.color() is None)
         if self.fps is not None and not 0 < self.fps <= 1000:
@@ -96,16 +97,20 @@ class Render:
         from humangs_jax.avatar.video import check_video, write_video
         from humangs_jax.data.capture import load_capture
 
+        self.shot.check()
         video = self.out.suffix != ""
-        views = self.views or (max(2, round(TURN_SECONDS * self.fps)) if video else 8)
-        require_parent(self.out)
-        require_at_least(1, views=views if self.views is None else self.views)
         if not 0 < self.fps <= 1000:
             raise ValueError(f"--fps {self.fps}: expected more than 0 and at most 1000")
+        views = self.views
+        if views is None:
+            views = max(2, round(TURN_SECONDS * self.fps)) if video else 8
+        require_parent(self.out)
+        require_at_least(1, views=views)
         check_video(self.out, views, *self.shot.resolution, transparent=video and self.shot.color() is None)
         if self.capture is not None:
             self._require_defaults()
-        layers = ExrLayers(tuple(self.channels.split(",")), half=self.exr_type == "half")  # ty: ignore[invalid-argument-type]
+        layers = ExrLayers(tuple(self.channels.split(",")), half=self.exr_type == "half")
+        layers.check()
         if video and self.exr:
             raise ValueError(f"--exr: {self.out} is a video: expected a folder")
         avatar = Avatar.load(self.avatar)

@@ -12,6 +12,7 @@ draws. viser (https://viser.studio) has its own splatting in the browser, with 8
 
 import contextlib
 import importlib
+import io
 import socket
 import threading
 import time
@@ -26,10 +27,10 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import a_pose_of, rest_pose_of
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.body.model import BodyPose, RestBody
+from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.capture import Capture, load_capture
-from humangs_jax.data.motion import Motion, grounded, load_motion
+from humangs_jax.data.motion import Motion, load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.network.weights import load_weights
 from humangs_jax.rendering.gaussians import covariances
@@ -54,7 +55,8 @@ class LiveView:
     def __init__(self, motion: Motion | None = None, port: int = 0):
         viser = _viser()
         self.motion, self.avatar, self.lock = load_motion() if motion is None else motion, None, threading.Lock()
-        self.server = viser.ViserServer(host="127.0.0.1", port=_free_port(port), label="humangs", verbose=False)
+        with contextlib.redirect_stdout(io.StringIO()):  # it says where it is; so do we
+            self.server = viser.ViserServer(host="127.0.0.1", port=_free_port(port), label="humangs", verbose=False)
         self.url = f"http://127.0.0.1:{self.server.get_port()}/"
         self.server.scene.set_up_direction("+y")
         self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_layout="collapsible")
@@ -74,7 +76,8 @@ class LiveView:
 
     def close(self) -> None:
         """Stop the server."""
-        self.server.stop()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
 
     def show(self, avatar: Avatar, status: str | None = None) -> None:
         """Show an avatar in place of the last one, and a line above the controls. May be called from any thread."""
@@ -120,9 +123,10 @@ class LiveView:
     def _chosen_pose(self, avatar) -> BodyPose:
         if self.pose.value == "A-pose":
             return a_pose_of(avatar)
-        if self.pose.value == "motion" and self.motion.rotations.shape[1] == len(avatar.parents):
-            motion = grounded(self.motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
-            return motion.pose(min(int(self.frame.value), len(motion.translations) - 1))
+        motion, frame = self.motion, min(int(self.frame.value), len(self.motion.translations) - 1)
+        if self.pose.value == "motion" and motion.rotations.shape[1] == len(avatar.parents):
+            # from where the T-pose stands, at which the camera looks
+            return BodyPose(motion.rotations[frame], motion.translations[frame] - motion.translations[0])
         return rest_pose_of(avatar)
 
 
