@@ -11,6 +11,7 @@ avatar: the shipped person, feed-forward.
 """
 
 import argparse
+import math
 import sys
 import tempfile
 from pathlib import Path
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 AZIMUTHS = (0.0, 1.1, 2.9)
 ELEVATIONS = (0.1, 0.5, -0.2)
 WALK_FRAME = 17
+VERTICAL_FOV = math.pi / 6
 FINE_EDGE = 0.017
 """Metres; the longest edge of a body that carries some 60,000 Gaussians."""
 MOTION_WINDOW = (480, 600)
@@ -104,7 +106,6 @@ def test_views(avatar: "Avatar", size: int) -> "tuple[list[Camera], dict[str, Bo
     import jax.numpy as jnp
     import numpy as np
 
-    from humangs_jax.avatar.frames import VERTICAL_FOV
     from humangs_jax.body.model import BodyPose
     from humangs_jax.data.capture import load_capture
     from humangs_jax.data.motion import load_motion

@@ -16,9 +16,11 @@ import numpy as np
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import write_ply
-from humangs_jax.avatar.frames import capture_renderings, motion_frames, write_renderings_exr
+from humangs_jax.avatar.frames import capture_renderings, motion_frames
+from humangs_jax.avatar.layers import write_renderings_exr
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.sheets import contact_sheet, side_by_side
+from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import write_video
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
@@ -94,9 +96,8 @@ def _write_products(
         _say("refining on the four photos")
         avatar, refined = _refine(avatar, inputs, truth, ours, refine, out / "refined.png")
     _say("animating")
-    frames = _timed(
-        timings, "animation_frames", lambda: np.stack(list(motion_frames(avatar, motion, frame_size, 25.0, 40.0)))
-    )
+    shot = Shot(size=frame_size, azimuth=25.0)
+    frames = _timed(timings, "animation_frames", lambda: np.stack(list(motion_frames(avatar, motion, shot, turn=40.0))))
 
     start = time.perf_counter()
     contact_sheet(inputs.images, out / "inputs.png", labels=[f"photo {i}" for i in range(inputs.view_count)])

@@ -1,8 +1,8 @@
 """Images of an avatar: along a motion, from a circle of cameras, or as a capture's cameras saw the person."""
 
-import os
-from collections.abc import Iterator
-from pathlib import Path
+import dataclasses
+import functools
+from collections.abc import Iterable, Iterator
 
 import jax
 import jax.numpy as jnp
@@ -10,37 +10,48 @@ import numpy as np
 
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody
+from humangs_jax.body.skinning import blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
-from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
+from humangs_jax.geometry import transform
+from humangs_jax.geometry.camera import Camera, intrinsics_from_fov
+from humangs_jax.rendering.constants import ALPHA_MIN
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig, drawn_as
 from humangs_jax.rendering.splatting import BufferOverflowError, Rendering, plan_buffers, render
 
-VERTICAL_FOV = np.pi / 6
-"""Narrow enough that a person keeps natural proportions."""
 MARGIN = 1.08
-"""Room around a person in the frame."""
-ARM_REACH = 0.3
-"""Share of the height that swinging arms and striding legs reach from the root, sideways."""
-ELEVATION = 0.1
-"""Radians above the horizon."""
+"""Room around a person in the frame: the extent is measured at the centres of Gaussians."""
+FOLLOWING = 0.5
+"""Seconds: standard deviation of the Gaussian that smooths the path of the camera. Steps and swinging arms, of about a second,
+do not reach it; a walk does."""
+TRACKED, TRACKED_OPACITY = 1024, 0.5
+"""A person's extent is that of so many Gaussians, evenly spread, of at least this opacity."""
+A_POSE = 48.0
+"""Degrees that the arms hang down in the A-pose, as in the page."""
 
 posed = jax.jit(skin)
 
 
 def draw(
-    avatar: Avatar, poses: Iterator[BodyPose], cameras: Iterator[Camera], background: Float[Array, "3"] | None = None
+    avatar: Avatar,
+    poses: Iterable[BodyPose],
+    cameras: Iterable[Camera],
+    background: Float[Array, "3"] | None = None,
+    how: SplatConfig | None = None,
 ) -> Iterator[Rendering]:
-    """One rendering per pose and camera."""
-    return draw_gaussians((posed(avatar, pose) for pose in poses), cameras, background, SPLAT_PRESETS[avatar.rendering])
+    """One rendering per pose and camera. how: None for what the avatar's weights were trained with."""
+    how = SPLAT_PRESETS[avatar.rendering] if how is None else how
+    return draw_gaussians((posed(avatar, pose) for pose in poses), cameras, background, how)
 
 
 def draw_gaussians(
-    gaussians: Iterator[Gaussians],
-    cameras: Iterator[Camera],
+    gaussians: Iterable[Gaussians],
+    cameras: Iterable[Camera],
     background: Float[Array, "3"] | None = None,
     how: SplatConfig = SPLAT_PRESETS["exact"],
 ) -> Iterator[Rendering]:
@@ -60,112 +71,243 @@ def draw_gaussians(
         yield rendering
 
 
-def motion_frames(
-    avatar: Avatar, motion: Motion, size: int, azimuth: float = 0.0, turn: float = 0.0, progress: bool = True
-) -> Iterator[Float[np.ndarray, "size size 3"]]:
-    """Frames of a moving avatar, each (size, size, 3) in [0, 1], drawn when asked for. azimuth and turn in degrees."""
-    from tqdm import tqdm
+def splatting_of(shot: Shot, avatar: Avatar) -> SplatConfig:
+    """The preset of a shot; near_exact and fast keep the conventions that the avatar's weights were trained with."""
+    if shot.splat == "as_trained":
+        return SPLAT_PRESETS[avatar.rendering]
+    config = SPLAT_PRESETS[shot.splat]
+    return config if shot.splat in ("exact", "inria") else drawn_as(config, avatar.rendering)
 
-    rest = RestBody(avatar.rest_vertices, avatar.rest_joints)
-    motion = grounded(motion, rest, avatar.parents)
+
+def image_of(
+    rendering: Rendering, color: tuple[float, float, float] | None
+) -> Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w 4"]:
+    """A rendering onto black as an image in [0, 1]: over a colour, or with straight alpha for None, as PNG and WebM have it."""
+    rgb, alpha = np.asarray(rendering.rgb), np.asarray(rendering.alpha)[..., None]
+    if color is not None:
+        return np.clip(rgb + (1 - alpha) * np.asarray(color, rgb.dtype), 0, 1)
+    straight = np.divide(rgb, alpha, out=np.zeros_like(rgb), where=alpha > 0)
+    return np.clip(np.concatenate([straight, alpha], axis=-1), 0, 1)
+
+
+def rest_pose_of(avatar: Avatar) -> BodyPose:
+    """The T-pose, at the place where the avatar's body is modelled."""
+    return BodyPose(jnp.zeros((len(avatar.parents), 3)), jnp.zeros(3))
+
+
+def a_pose_of(avatar: Avatar) -> BodyPose:
+    """Arms down by 48 degrees. Raises: ValueError for a body without the joints left_shoulder and right_shoulder."""
+    names, angle = avatar.joint_names, np.radians(A_POSE)
+    if missing := {"left_shoulder", "right_shoulder"} - set(names):
+        raise ValueError(f"A-pose: the avatar's body has no joint {' and '.join(sorted(missing))}")
+    rotations = np.zeros((len(names), 3), np.float32)
+    rotations[names.index("left_shoulder"), 2] = -angle  # the left side is at +x, y is up
+    rotations[names.index("right_shoulder"), 2] = angle
+    return BodyPose(jnp.asarray(rotations), jnp.zeros(3))
+
+
+# Cameras -----------------------------------------------------------------------------------------------------------------
+
+
+def tracked_points(avatar: Avatar, poses: BodyPose) -> Float[np.ndarray, "m p 3"]:
+    """Where opaque Gaussians of the avatar are in each pose of a batch, metres: what a frame has to show."""
+    opacities = np.asarray(avatar.gaussians.opacities)
+    opaque = np.flatnonzero(opacities >= min(TRACKED_OPACITY, opacities.max()))
+    chosen = opaque[np.linspace(0, len(opaque) - 1, min(TRACKED, len(opaque))).astype(int)]
+    means, weights = avatar.gaussians.means[chosen], avatar.skinning_weights[chosen]
+    return np.asarray(_paths(means, weights, avatar.rest_joints, avatar.parents, poses))
+
+
+def shot_cameras(
+    shot: Shot, points: Float[np.ndarray, "m p 3"], azimuths: Float[np.ndarray, " v"], smoothing: float | None
+) -> Camera:
+    """A batch of cameras, one per azimuth, that show all points of their frame, all from the same distance.
+
+    Arguments: points: of each frame; of one frame: the same for all cameras. azimuths: degrees, added to that of the shot.
+    smoothing: frames, the standard deviation with which the camera follows the middle of the person; None: it stands still,
+    and the image holds everything that happens.
+
+    Without `shot.distance` it is the smallest for which every point lies in the middle 1 / MARGIN of the image.
+
+    Raises: ValueError for a shot that is out of range.
+    """
+    shot.check()
+    low, high = points.min(axis=1), points.max(axis=1)
+    if smoothing is None:
+        targets = np.broadcast_to(0.5 * (low.min(axis=0) + high.max(axis=0)), (len(points), 3))
+    else:
+        targets = smoothed_path(0.5 * (low + high), smoothing)
+    turns, lift = np.radians(shot.azimuth + np.asarray(azimuths)), np.radians(shot.elevation)
+    right = np.stack([np.cos(turns), 0 * turns, -np.sin(turns)], axis=-1)
+    back = np.cos(lift) * np.stack([np.sin(turns), 0 * turns, np.cos(turns)], axis=-1)
+    back[:, 1] = np.sin(lift)
+    axes = np.stack([right, np.cross(right, back), -back], axis=1)  # of the cameras in the world: right, down, forward
+    targets = np.broadcast_to(targets, back.shape)
+    distance = _fitting_distance(shot, points, targets, axes) if shot.distance is None else shot.distance
+    width, height = shot.resolution
+    views = np.zeros((len(turns), 4, 4), np.float32)
+    views[:, :3, :3], views[:, 3, 3] = axes, 1
+    views[:, :3, 3] = -np.einsum("vij,vj->vi", axes, targets + distance * back)
+    K = jnp.broadcast_to(intrinsics_from_fov(np.radians(shot.fov), width, height), (len(turns), 3, 3))
+    return replace(Camera(K[0], jnp.eye(4), width, height), K=K, cam_from_world=jnp.asarray(views))
+
+
+def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.ndarray, "m 3"]:
+    """A path smoothed by a Gaussian of this standard deviation; at its ends it is taken to go on as it came (point mirrored)."""
+    reach = int(np.ceil(3 * frames))
+    if reach == 0 or len(path) == 1:
+        return path
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / frames) ** 2)
+    longer = np.pad(path, ((reach, reach), (0, 0)), mode="reflect", reflect_type="odd")
+    return np.stack([np.convolve(column, kernel / kernel.sum(), mode="valid") for column in longer.T], axis=-1)
+
+
+def _fitting_distance(shot, points, targets, axes) -> float:
+    """The least d with MARGIN |x| <= tangent (d + z) for all points: x across or down the image, z behind the target."""
+    needed = 0.0
+    for i, target in enumerate(targets):
+        x, y, z = axes[i] @ (points[i % len(points)] - target).T
+        for across, tangent in zip((x, y), shot.tangents, strict=True):
+            needed = max(needed, float((np.abs(across) * MARGIN / tangent - z).max()))
+    return needed
+
+
+@functools.partial(jax.jit, static_argnames="parents")
+def _paths(means, weights, rest_joints, parents, poses):
+    """(m, p, 3) places of Gaussians in each pose, one pose at a time."""
+
+    def one(pose):
+        transforms = joint_transforms(rest_joints, parents, pose.rotations, pose.translation)
+        return transform.apply(blend_transforms(weights, transforms), means)
+
+    return jax.lax.map(one, poses)
+
+
+# Sequences ---------------------------------------------------------------------------------------------------------------
+
+
+def excerpt(
+    motion: Motion, start: float = 0.0, stop: float | None = None, fps: float | None = None, loop: int = 1
+) -> Motion:
+    """A motion from `start` to `stop` (seconds), at another frame rate, `loop` times.
+
+    Every repetition starts where the one before has ended, at the same height. Raises: ValueError naming what is out of range.
+    """
     count = len(motion.translations)
-    azimuths = np.radians(azimuth + turn * np.arange(count) / max(count, 1))
-    # the target stands still: the frame holds everywhere that the root goes
-    path = np.asarray(motion.translations + avatar.rest_joints[0])[:, [0, 2]]
-    height = float(np.ptp(np.asarray(avatar.rest_vertices)[:, 1]))
-    middle = 0.5 * (path.min(0) + path.max(0))
-    half_width = 0.5 * float(np.linalg.norm(np.ptp(path, axis=0))) + ARM_REACH * height
-    half = MARGIN * max(0.5 * height, half_width)
-    cameras = orbit(
-        jnp.asarray([middle[0], 0.5 * height, middle[1]], jnp.float32),
-        half / np.tan(0.5 * VERTICAL_FOV) + half_width,
-        jnp.asarray(azimuths, jnp.float32),
-        ELEVATION,
-        intrinsics_from_fov(VERTICAL_FOV, size, size),
-        size,
-        size,
+    length = count / motion.fps
+    stop = length if stop is None else stop
+    if not 0 <= start < stop <= length + 0.5 / motion.fps:
+        raise ValueError(
+            f"start {start:g}, stop {stop:g}: expected 0 <= start < stop <= {length:g}, the motion's seconds"
+        )
+    if loop < 1:
+        raise ValueError(f"loop {loop}: expected at least 1")
+    first = min(int(start * motion.fps), count - 1)
+    last = max(first + 1, min(round(stop * motion.fps), count))
+    part = replace(motion, rotations=motion.rotations[first:last], translations=motion.translations[first:last])
+    part = part if fps is None else part.at_rate(fps)
+    if loop == 1:
+        return part
+    path = np.asarray(part.translations)
+    period = len(path) / max(len(path) - 1, 1)  # the last frame is a step before the end
+    travelled = period * (path[-1] - path[0]) * [1, 0, 1]
+    moved = np.concatenate([path + i * travelled for i in range(loop)])
+    turned = jnp.tile(part.rotations, (loop, 1, 1))
+    return replace(part, rotations=turned, translations=jnp.asarray(moved, jnp.float32))
+
+
+def motion_views(
+    avatar: Avatar, motion: Motion, shot: Shot, turn: float = 0.0, follow: bool = True
+) -> tuple[BodyPose, Camera]:
+    """A pose and a camera for each frame of a motion, which is put on the floor.
+
+    Arguments: turn: degrees that the camera travels around the person. follow: the camera goes along with the person; else it
+    stands still and is so far away that the person stays in the image.
+    """
+    motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
+    count = len(motion.translations)
+    poses = jax.vmap(BodyPose)(motion.rotations, motion.translations)
+    azimuths = turn * np.arange(count) / count
+    return poses, shot_cameras(
+        shot, tracked_points(avatar, poses), azimuths, FOLLOWING * motion.fps if follow else None
     )
-    renderings = draw(avatar, (motion.pose(i) for i in range(count)), (cameras[i] for i in range(count)))
-    bar = tqdm(renderings, total=count, desc="animate", unit="frame", disable=not progress)
-    return (np.clip(np.asarray(rendering.rgb), 0, 1) for rendering in bar)
 
 
-def turntable_renderings(avatar: Avatar, views: int, size: int) -> tuple[Camera, list[Rendering]]:
-    """The T-pose from `views` cameras on a circle, starting in front."""
-    if views < 1 or size < 1:
-        raise ValueError(f"--views and --size must be at least 1, got {views} and {size}")
-    vertices = np.asarray(avatar.rest_vertices)
-    center = 0.5 * (vertices.min(0) + vertices.max(0))
-    radius = np.linalg.norm(vertices - center, axis=-1).max()
-    cameras = orbit(
-        jnp.asarray(center),
-        MARGIN * radius / np.sin(0.5 * VERTICAL_FOV),
-        jnp.linspace(0, 2 * np.pi, views, endpoint=False),
-        ELEVATION,
-        intrinsics_from_fov(VERTICAL_FOV, size, size),
-        size,
-        size,
-    )
-    pose = BodyPose(jnp.zeros((len(avatar.parents), 3)), jnp.zeros(3))
-    return cameras, list(draw(avatar, iter([pose] * views), (cameras[i] for i in range(views))))
+def turntable_views(avatar: Avatar, pose: BodyPose, views: int, shot: Shot) -> tuple[BodyPose, Camera]:
+    """One pose, and cameras on a circle that starts at the azimuth of the shot. Raises: ValueError for no view."""
+    if views < 1:
+        raise ValueError(f"views {views}: expected at least 1")
+    points = tracked_points(avatar, jax.tree.map(lambda x: x[None], pose))
+    cameras = shot_cameras(shot, points, np.linspace(0, 360, views, endpoint=False), None)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (views, *x.shape)), pose), cameras
 
 
-def capture_renderings(
-    avatar: Avatar, capture: Capture, background: Float[Array, "3"] | None = None
-) -> tuple[Camera, list[Rendering]]:
-    """The avatar in the poses and from the cameras of a capture.
+def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
+    """The pose and the camera of each view of a capture.
 
     Raises: ValueError if the capture's body has another number of joints than the avatar.
     """
     joints = capture.poses.rotations.shape[1]
     if joints != len(avatar.parents):
         raise ValueError(f"the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}")
-    poses = (capture.pose(int(frame)) for frame in capture.frames)
-    cameras = (capture.cameras[i] for i in range(capture.view_count))
-    return capture.cameras, list(draw(avatar, poses, cameras, background))
+    return jax.tree.map(lambda x: x[np.asarray(capture.frames)], capture.poses), capture.cameras
 
 
-def write_renderings(out: str | os.PathLike, cameras: Camera, renderings: list[Rendering], exr: bool = False) -> int:
-    """Write renderings onto white as view_000.png ... into a folder, and views.exr if asked; all of them or none.
+def capture_renderings(
+    avatar: Avatar, capture: Capture, background: Float[Array, "3"] | None = None
+) -> tuple[Camera, list[Rendering]]:
+    """The avatar in the poses and from the cameras of a capture. Raises: as `capture_views`."""
+    poses, cameras = capture_views(avatar, capture)
+    return cameras, list(draw(avatar, poses, cameras, background))
 
-    Returns the number of views.
+
+def images(
+    avatar: Avatar, poses: BodyPose, cameras: Camera, shot: Shot, progress: str | None = None
+) -> Iterator[Float[np.ndarray, "h w c"]]:
+    """One image per pose and camera, drawn when asked for, (h, w, 3) or with alpha (h, w, 4), see `image_of`.
+
+    progress: what a progress bar says; None: no bar.
     """
-    from humangs_jax.io.atomic import add_files
-    from humangs_jax.io.images import write_png
+    from tqdm import tqdm
 
-    def write(folder: Path):
-        for i, rendering in enumerate(renderings):
-            write_png(folder / f"view_{i:03d}.png", np.asarray(rendering.rgb))
-        if exr:
-            write_renderings_exr(folder / "views.exr", cameras, renderings, background=1.0)
-
-    add_files(out, write)
-    return len(renderings)
+    drawn = draw(avatar, poses, cameras, jnp.zeros(3), splatting_of(shot, avatar))
+    bar = tqdm(drawn, total=len(poses), desc=progress, unit="frame", disable=progress is None)
+    return (image_of(rendering, shot.color()) for rendering in bar)
 
 
-def write_renderings_exr(
-    path: str | os.PathLike, cameras: Camera, renderings: list[Rendering], background: float = 0.0
-) -> None:
-    """Float32 RGBA, premultiplied as compositing programs expect it, Z in metres and the camera's matrices, one part per view.
+def motion_frames(
+    avatar: Avatar,
+    motion: Motion,
+    shot: Shot | None = None,
+    *,
+    turn: float = 0.0,
+    follow: bool = True,
+    progress: bool = True,
+) -> Iterator[Float[np.ndarray, "h w c"]]:
+    """Frames of a moving avatar, drawn when asked for; see `motion_views` and `images`."""
+    shot = Shot() if shot is None else shot
+    poses, cameras = motion_views(avatar, motion, shot, turn, follow)
+    return images(avatar, poses, cameras, shot, "animate" if progress else None)
 
-    Arguments: background: the grey that they were rendered onto, which is taken away: colours are 0 where alpha is.
+
+def without_unseen(
+    avatar: Avatar,
+    poses: BodyPose,
+    cameras: Camera,
+    how: SplatConfig,
+    threshold: float = ALPHA_MIN,
+    progress: str | None = None,
+) -> Avatar:
+    """The avatar without the Gaussians that weigh less than `threshold` on every pixel of every one of these images.
+
+    Draws all of them once to find out: worth it for what is drawn several times. docs/video.md has the error and the time.
     """
-    from humangs_jax.io.exr import ExrView, write_exr
+    from tqdm import tqdm
 
-    def premultiplied(rendering):
-        alpha = np.asarray(rendering.alpha)[..., None]
-        return np.concatenate([np.asarray(rendering.rgb) - np.float32(background) * (1 - alpha), alpha], axis=-1)
-
-    write_exr(
-        Path(path),
-        [
-            ExrView(
-                name=f"view_{i:03d}",
-                rgba=premultiplied(r),
-                depth=np.asarray(r.depth),
-                K=np.asarray(cameras.K[i]),
-                cam_from_world=np.asarray(cameras.cam_from_world[i]),
-            )
-            for i, r in enumerate(renderings)
-        ],
-    )
+    most = np.zeros(len(avatar.gaussians.means), np.float32)
+    drawn = draw(avatar, poses, cameras, how=dataclasses.replace(how, visibility=True))
+    for rendering in tqdm(drawn, total=len(poses), desc=progress, unit="frame", disable=progress is None):
+        most = np.maximum(most, rendering.visibility)
+    kept = np.flatnonzero(most >= threshold)
+    gaussians = jax.tree.map(lambda x: x[kept], avatar.gaussians)
+    return replace(avatar, gaussians=gaussians, skinning_weights=avatar.skinning_weights[kept])

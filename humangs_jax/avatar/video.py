@@ -1,4 +1,6 @@
-"""Frames -> a video file: .mp4 (H.264, plays everywhere) or .gif (256 colours for all frames, endless loop)."""
+"""Frames -> a video: .mp4 (H.264, plays everywhere), .webm (VP9, may be transparent), .gif (256 colours for all frames, endless
+loop), or a folder of PNG files (may be transparent).
+"""
 
 import contextlib
 import itertools
@@ -10,41 +12,85 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.io.atomic import replace_file
-from humangs_jax.io.images import to_uint8
+from humangs_jax.io.atomic import add_files, replace_file
+from humangs_jax.io.images import to_uint8, write_png
 
 CONSTANT_RATE_FACTOR = 17
 """x264's quality; 18 counts as visually lossless."""
+VP9_QUALITY = 18
+"""libvpx's constant quality, 0 to 63: its 18 is about as good as x264's."""
+LARGEST_GIF = 1 << 30
+"""Bytes of all frames of a GIF in 24 bits, which are kept in memory: one palette is chosen for all."""
+SUFFIXES = (".mp4", ".webm", ".gif")
 LARGEST_GIF_FPS = 50
 """Viewers slow down frames that are shorter than 2/100 s."""
 PALETTE_FRAMES = 16
 """The palette of a GIF is chosen from this number of frames, evenly spaced."""
 
 
-def write_video(
-    path: str | Path, frames: Float[np.ndarray, "m h w 3"] | Iterable[Float[np.ndarray, "h w 3"]], fps: float | int
+def check_video(
+    path: str | Path, frames: int, width: int, height: int, transparent: bool = False, option: str = "--out"
 ) -> None:
-    """Write frames in [0, 1] as .mp4 or .gif; the file appears whole or not at all.
+    """Whether such a video can be written; to be asked before its frames are drawn.
 
-    Frames are asked for one by one: an .mp4 keeps none in memory, a .gif one byte a channel. H.264 wants even sides: odd
-    ones get one more row or column, a copy of the last. A GIF of more than 50 frames a second leaves out frames to keep
-    its speed.
+    Raises: ValueError naming the option for a suffix that is no video (none is a folder of PNG files), transparency that the
+    format does not have, or a GIF that would not fit into memory; OSError if there is something else of that name.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (*SUFFIXES, ""):
+        raise ValueError(f"{option} {path}: expected a name ending in {', '.join(SUFFIXES)}, or a folder for PNG files")
+    if transparent and suffix in (".mp4", ".gif"):
+        raise ValueError(
+            f"{option} {path}: {suffix} has no transparency: expected .webm, a folder for PNG files, or a colour"
+        )
+    if suffix == ".gif" and frames * width * height * 3 > LARGEST_GIF:
+        raise ValueError(
+            f"{option} {path}: {frames} frames of {width} x {height} are too many for a .gif: use .mp4 or .webm"
+        )
+    if suffix and path.is_dir():
+        raise IsADirectoryError(f"{option} {path}: is a folder: expected a file name")
+    if not suffix and path.is_file():
+        raise NotADirectoryError(f"{option} {path}: is a file: expected a folder name")
 
-    Raises: ValueError if there is no frame, they differ in size, a number is not finite, `fps` is not positive or the suffix
-    another one; OSError if the file cannot be written; what `frames` raises.
+
+def write_video(
+    path: str | Path, frames: Float[np.ndarray, "m h w c"] | Iterable[Float[np.ndarray, "h w c"]], fps: float | int
+) -> int:
+    """Write frames in [0, 1], (h, w, 3) or with straight alpha (h, w, 4); returns their number.
+
+    The suffix decides: .mp4, .webm, .gif; none: a folder of frame_00000.png and so on, which replace those that are there.
+    All appears at the end or nothing does. Frames are asked for one by one: a .gif keeps one byte a channel of all in memory,
+    the others none. Video codecs want even sides: odd ones get one more row or column, a copy of the last. A GIF of more than
+    50 frames a second leaves out frames to keep its speed. Only .webm and PNG files have alpha.
+
+    Raises: ValueError if there is no frame, they differ in size, a number is not finite, `fps` is not positive, the suffix is
+    another one or has no alpha; OSError if the file cannot be written; what `frames` raises.
     """
     path = Path(path)
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"{path}: expected a positive number of frames per second, got {fps}")
-    writers = {".mp4": _write_mp4, ".gif": _write_gif}
-    if path.suffix.lower() not in writers:
-        raise ValueError(f"{path}: expected a name ending in .mp4 or .gif")
+    check_video(path, 0, 0, 0, option="video")
     checked = _checked(path, frames)
     first = next(checked, None)
     if first is None:
         raise ValueError(f"{path}: expected at least one frame, got none")
-    frames = itertools.chain([first], checked)
-    replace_file(path, lambda temporary: writers[path.suffix.lower()](temporary, frames, float(fps), first.shape))
+    height, width, channels = first.shape
+    check_video(path, 0, width, height, channels == 4, option="video")
+    count = itertools.count()  # of the frames that have been taken
+    frames = (frame for frame, _ in zip(itertools.chain([first], checked), count, strict=False))
+    writers = {".mp4": _write_mp4, ".webm": _write_webm, ".gif": _write_gif}
+    if path.suffix:
+        replace_file(path, lambda temporary: writers[path.suffix.lower()](temporary, frames, float(fps), first.shape))
+    else:
+        old = [file.name for file in path.glob("frame_*.png")]
+        add_files(path, lambda folder: _write_pngs(folder, frames), without=old)
+    return next(count)
+
+
+def _write_pngs(folder, frames):
+    for i, frame in enumerate(frames):
+        write_png(folder / f"frame_{i:05d}.png", frame)
 
 
 def _checked(path, frames):
@@ -61,15 +107,30 @@ def _checked(path, frames):
 
 
 def _write_mp4(path, frames, fps, shape):
+    quality = ["-c:v", "libx264", "-crf", str(CONSTANT_RATE_FACTOR), "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    _write_by_ffmpeg(path, frames, fps, shape, quality)
+
+
+def _write_webm(path, frames, fps, shape):
+    quality = ["-c:v", "libvpx-vp9", "-crf", str(VP9_QUALITY), "-b:v", "0", "-deadline", "good", "-cpu-used", "4"]
+    quality += ["-fflags", "+bitexact"]  # no random number in the file
+    if shape[-1] == 4:  # a second stream beside the colours; alternate reference frames would separate the two
+        quality += ["-pix_fmt", "yuva420p", "-auto-alt-ref", "0"]
+    else:
+        quality += ["-pix_fmt", "yuv420p"]
+    _write_by_ffmpeg(path, frames, fps, shape, quality)
+
+
+def _write_by_ffmpeg(path, frames, fps, shape, quality):
     """Through ffmpeg itself: imageio's writer does not tell when ffmpeg fails."""
     import imageio_ffmpeg
 
-    height, width = shape[:2]
+    height, width, channels = shape
     odd = ((0, height % 2), (0, width % 2), (0, 0))
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error"]
-    command += ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width + width % 2}x{height + height % 2}"]
-    command += ["-r", str(Fraction(fps).limit_denominator(100_000)), "-i", "-", "-an"]
-    command += ["-c:v", "libx264", "-crf", str(CONSTANT_RATE_FACTOR), "-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    command += ["-f", "rawvideo", "-pix_fmt", "rgba" if channels == 4 else "rgb24"]
+    command += ["-s", f"{width + width % 2}x{height + height % 2}"]
+    command += ["-r", str(Fraction(fps).limit_denominator(100_000)), "-i", "-", "-an", *quality]
     # said and done in BT.709: players guess the matrix of an untagged file by its size
     command += ["-vf", "scale=out_color_matrix=bt709:out_range=tv"]
     command += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", str(path)]
@@ -82,6 +143,12 @@ def _write_mp4(path, frames, fps, shape):
         except BrokenPipeError:  # ffmpeg has given up: it says why
             with contextlib.suppress(BrokenPipeError):
                 ffmpeg.stdin.close()
+        except BaseException:  # of the frames, or Ctrl-C: the file is not wanted any more
+            ffmpeg.kill()
+            with contextlib.suppress(BrokenPipeError):
+                ffmpeg.stdin.close()
+            ffmpeg.wait()
+            raise
         problem = ffmpeg.stderr.read().decode(errors="replace")
     if ffmpeg.returncode:
         problem = " ".join(problem.split()) or f"it ended with {ffmpeg.returncode}"

@@ -12,7 +12,8 @@ from typing import Protocol
 
 import tyro
 
-from humangs_jax.cli.avatars import Animate, Demo, Export, Reconstruct, Refine, Render, View
+from humangs_jax.cli.animate import Animate, Render, View
+from humangs_jax.cli.avatars import Demo, Export, Reconstruct, Refine
 from humangs_jax.cli.captures import ImportCameras, Synth
 from humangs_jax.cli.evaluate import Evaluate
 from humangs_jax.cli.fit import Check, Fit

@@ -1,4 +1,4 @@
-"""`humangs demo`, `reconstruct`, `refine`, `animate`, `render`, `export`: from photos to an avatar, and what to do with one."""
+"""`humangs demo`, `reconstruct`, `refine`, `export`: from photos to an avatar, and to files of it."""
 
 import dataclasses
 from pathlib import Path
@@ -9,6 +9,8 @@ from tyro.conf import Positional
 from humangs_jax.cli.options import refine_limits, require_at_least, require_parent, require_suffix
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.data.capture import Capture
     from humangs_jax.data.motion import Motion
@@ -93,6 +95,8 @@ class Refine:
     """Also refine the pose of each photo: for poses from `humangs fit`, which are millimetres off."""
     growth: float = 1.0
     """The number of Gaussians may grow by this factor: those with the largest errors are split."""
+    live: bool = False
+    """Write the avatar so far to --out now and then, which `humangs view --live OUT` shows."""
 
     def run(self) -> None:
         limits = refine_limits(self.limit)
@@ -102,85 +106,22 @@ class Refine:
         require_parent(self.out)
         avatar, photos = Avatar.load(self.avatar), load_capture(self.capture)
         settings = {"image_size": self.image_size, "poses": self.refine_poses, "growth": self.growth}
-        refined = _refined(avatar, photos, **settings, **limits)
+        watch = (lambda so_far: so_far.save(self.out)) if self.live else None
+        refined = _refined(avatar, photos, watch, **settings, **limits)
         refined.save(self.out)
         print(f"{self.out}: {len(refined.gaussians.means):,} Gaussians refined on {photos.view_count} photos")
 
 
-def _refined(avatar: "Avatar", photos: "Capture", **settings: Any) -> "Avatar":
+def _refined(
+    avatar: "Avatar", photos: "Capture", watch: "Callable[[Avatar], None] | None" = None, **settings: Any
+) -> "Avatar":
     """Refine with a progress bar, and print what it took."""
     from humangs_jax.refinement.config import RefineConfig
     from humangs_jax.refinement.refine import refine_with_report
 
-    refinement = refine_with_report(avatar, photos, RefineConfig(**settings), progress=True)
+    refinement = refine_with_report(avatar, photos, RefineConfig(**settings), progress=True, watch=watch)
     print(refinement.summary())
     return refinement.avatar
-
-
-@dataclasses.dataclass(frozen=True)
-class Animate:
-    """Animate an avatar with a motion of SMPL-X poses and write a video (.mp4 or .gif)."""
-
-    avatar: Positional[Path]
-    """File written by `humangs reconstruct`."""
-    motion: Path | None = None
-    """.npz or .pkl (ours, AMASS, SMPL, AIST++, THuman4.0, AvatarReX), LHM's .json, .bvh or .glb. Default: the shipped walk."""
-    out: Path = Path("animation.mp4")
-    """The video to write."""
-    size: int = 512
-    """Side of the frames in pixels."""
-    azimuth: float = 20.0
-    """Degrees; 0 looks at the avatar's front."""
-    turn: float = 0.0
-    """Degrees that the camera travels around the avatar during the motion."""
-
-    def run(self) -> None:
-        from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.avatar.frames import motion_frames
-        from humangs_jax.avatar.video import write_video
-        from humangs_jax.data.motion import load_motion
-
-        require_parent(self.out)
-        require_suffix(self.out, (".mp4", ".gif"))
-        require_at_least(1, size=self.size)
-        avatar = Avatar.load(self.avatar)
-        motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
-        frames = motion_frames(avatar, motion, self.size, azimuth=self.azimuth, turn=self.turn)
-        write_video(self.out, frames, motion.fps)
-        print(f"{self.out}: {len(motion.translations)} frames at {motion.fps:g} frames per second")
-
-
-@dataclasses.dataclass(frozen=True)
-class Render:
-    """Render an avatar in its T-pose from a circle of cameras, or in the poses and from the cameras of a capture."""
-
-    avatar: Positional[Path]
-    """File written by `humangs reconstruct`."""
-    out: Path = Path("views")
-    """Folder for view_000.png and so on."""
-    views: int = 8
-    """Number of cameras on the circle."""
-    size: int = 512
-    """Side of the images in pixels (circle only)."""
-    capture: Path | None = None
-    """Take cameras and poses from this capture folder instead."""
-    exr: bool = False
-    """Also write views.exr: float32 RGBA (premultiplied), depth Z and camera matrices, one part per view."""
-
-    def run(self) -> None:
-        from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.avatar.frames import capture_renderings, turntable_renderings, write_renderings
-        from humangs_jax.data.capture import load_capture
-        from humangs_jax.io.atomic import check_writable
-
-        check_writable(self.out)
-        avatar = Avatar.load(self.avatar)
-        if self.capture is not None:
-            cameras, renderings = capture_renderings(avatar, load_capture(self.capture))
-        else:
-            cameras, renderings = turntable_renderings(avatar, self.views, self.size)
-        written = write_renderings(self.out, cameras, renderings, exr=self.exr)
-        print(f"{self.out}: {written} views")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -280,28 +221,3 @@ class Export:
         fps = motion.fps / numbers.step
         motion = replace(motion, rotations=motion.rotations[chosen], translations=motion.translations[chosen], fps=fps)
         return motion, None if self.frames is None else numbers
-
-
-@dataclasses.dataclass(frozen=True)
-class View:
-    """Show an avatar moving in the browser: serves the page of `humangs export --html` on this machine until Ctrl-C."""
-
-    avatar: Positional[Path]
-    """File written by `humangs reconstruct`."""
-    motion: Path | None = None
-    """The motion it plays. Default: the shipped walk."""
-    port: int = 0
-    """Port on 127.0.0.1; 0 for any free one."""
-    browser: bool = True
-    """Open the browser; --no-browser only prints the address."""
-
-    def run(self) -> None:
-        from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.data.motion import load_motion
-        from humangs_jax.viewer.page import page_html, serve
-
-        avatar = Avatar.load(self.avatar)
-        motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
-        name = None if self.motion is None else self.motion.stem
-        text = page_html(avatar, motion, self.avatar.stem, name)
-        serve(text, self.port, self.browser)

@@ -1,9 +1,10 @@
-"""Rendered views as OpenEXR files: float32, lossless ZIP, cameras in the header; several views are parts of one file.
+"""Rendered views as OpenEXR files: lossless ZIP, cameras in the header; several views are parts of one file.
 
 Channels R, G, B, A and Z (depth along the optical axis, metres, 0 for background), and further channels
-under their own names (`position.X`). Header of each part: `K` (3x3, pixels) and `cam_from_world` (4x4, OpenCV, metres),
-float32, exact. Colours are linear and stored as given; compositing programs expect them premultiplied, that is rendered
-onto black.
+under their own names (`position.X`), in 32 bits or in half precision. Header of each part: `K` (3x3, pixels) and
+`cam_from_world` (4x4, OpenCV, metres), float32, exact. Colours are stored as given. Compositing programs expect them
+premultiplied, that is rendered onto black. Ours are the values of the photos, as in PNG files: encoded for a display by the curve
+of sRGB, not linear in light.
 """
 
 import dataclasses
@@ -19,6 +20,9 @@ from humangs_jax.io.reading import Refused, check_limit, open_file, reading
 
 RGBA = ("R", "G", "B", "A")
 DEPTH = "Z"
+WIDE = (DEPTH, "position.")
+"""How the names of channels start that stay in 32 bits when others are halved: metres, of which half precision has steps of 2 mm
+at 4 m."""
 STANDARD_ATTRIBUTES = {"name", "type", "compression", "owner", "view", "comments"}
 """Header strings with a meaning of their own in OpenEXR: neither written nor returned as ours."""
 
@@ -27,7 +31,7 @@ STANDARD_ATTRIBUTES = {"name", "type", "compression", "owner", "view", "comments
 class ExrView:
     """One rendered view.
 
-    rgba: (h, w, 4) linear colours and coverage. depth: (h, w) metres, or None.
+    rgba: (h, w, 4) colours and coverage. depth: (h, w) metres, or None.
     K, cam_from_world: (3, 3) pixels and (4, 4) metres of its camera, both or neither.
     name: of the part; unique in a file. channels: further (h, w) images by name. attributes: strings for the header.
     """
@@ -48,10 +52,11 @@ class ExrView:
         return Camera.from_opencv(self.K, self.cam_from_world, self.rgba.shape[1], self.rgba.shape[0])
 
 
-def write_exr(path: str | Path, views: ExrView | Sequence[ExrView]) -> None:
+def write_exr(path: str | Path, views: ExrView | Sequence[ExrView], half: bool = False) -> None:
     """Write one view, or several as parts of one file (all of one size); the file appears whole or not at all.
 
-    Everything is stored as float32. Unnamed views are called view000, view001, ...
+    Unnamed views are called view000, view001, ... half: store all in 16 bits but Z and `position.*`, which stay in 32 like
+    everything without it; numbers beyond 65504 become infinite.
 
     Raises: ValueError naming the view and what does not fit; OSError if the file cannot be written.
     """
@@ -65,7 +70,7 @@ def write_exr(path: str | Path, views: ExrView | Sequence[ExrView]) -> None:
         raise ValueError(f"views: expected different names, got {names}")
     if len({view.rgba.shape for view in views}) > 1:  # parts of a file share one display window
         raise ValueError(f"views: expected one image size, got {sorted({view.rgba.shape[:2] for view in views})}")
-    parts = [_to_part(view, name) for view, name in zip(views, names, strict=True)]
+    parts = [_to_part(view, name, half) for view, name in zip(views, names, strict=True)]
 
     def write(temporary: Path):
         with OpenEXR.File(parts) as file:
@@ -99,7 +104,7 @@ def read_exr(path: str | Path) -> list[ExrView]:
             return [_from_part(part, path) for part in file.parts]
 
 
-def _to_part(view, name):
+def _to_part(view, name, half):
     import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
 
     height, width = view.rgba.shape[:2]
@@ -111,7 +116,9 @@ def _to_part(view, name):
             raise ValueError(f"view {name!r}: channels: {channel} is there already")
         channels[channel] = image
     # OpenEXR writes strided arrays wrongly in silence and refuses every type but its own
-    channels = {channel: np.ascontiguousarray(image, np.float32) for channel, image in channels.items()}
+    kinds = {name: np.float16 if half and not name.startswith(WIDE) else np.float32 for name in channels}
+    with np.errstate(over="ignore"):
+        channels = {name: np.ascontiguousarray(image, kinds[name]) for name, image in channels.items()}
     for channel, image in channels.items():
         if image.shape != (height, width):
             raise ValueError(f"view {name!r}: channel {channel}: expected shape {(height, width)}, got {image.shape}")

@@ -89,12 +89,14 @@ def refine_with_report(
     *,
     mesh: Mesh | None = None,
     progress: bool = False,
+    watch: Callable[[Avatar], None] | None = None,
 ) -> Refinement:
     """`refine`, with the number of steps, the seconds and the gain.
 
     Arguments:
         avatar: of the person in the photos, on the body of the capture. capture: photos with masks, in any poses. mesh: of one
-            axis, whose devices share the `views_per_step` photos of a step. progress: show a bar.
+            axis, whose devices share the `views_per_step` photos of a step. progress: show a bar. watch: gets the avatar so
+            far at each of the `checks`; its time counts.
 
     Ctrl-C ends the run; the best state until then is returned.
 
@@ -105,7 +107,7 @@ def refine_with_report(
     _check(avatar, capture, config, mesh)
     views = crop_to_person(capture, config.image_size)
     run = _Run(avatar, views, config, mesh, splat=_planned(avatar, views))
-    return run.go(progress)
+    return run.go(progress, watch)
 
 
 def refine_views(
@@ -182,7 +184,7 @@ class _Run:
         useful = np.flatnonzero(np.asarray(~held).any(axis=(1, 2)))
         self.order = _order(useful, config.views_per_step, np.random.default_rng(config.seed))
 
-    def go(self, progress: bool) -> Refinement:
+    def go(self, progress: bool, watch: Callable[[Avatar], None] | None) -> Refinement:
         from tqdm import tqdm
 
         config, began = self.config, time.perf_counter()
@@ -211,6 +213,8 @@ class _Run:
                     psnr = self.loss(state, self.held)[1]
                     if psnr > highest or not self.any_held:
                         best, highest = (state, self.avatar), psnr
+                    if watch is not None:
+                        watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
                 bar.update(int(100 * passed) - bar.n)
         except KeyboardInterrupt:
             interrupted = True

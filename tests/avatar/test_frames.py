@@ -1,18 +1,24 @@
-"""Frames of an animation: one plan of buffers, made anew only for a frame that needs more room."""
+"""Frames of an animation: where the cameras stand, which frames there are, what is behind the person, how buffers are planned."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from avatar.avatar_cases import CENTRES, RADIUS, two_balls
 
 from humangs_jax.avatar import frames
-from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.io.exr import read_exr
-from humangs_jax.io.images import read_image
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.body.model import BodyPose
+from humangs_jax.data.motion import Motion
+from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import Rendering, render
 
 ROUNDING = 1e-6
 """float32; other buffers are other programs."""
+PIXEL_ROUNDING = 2e-2
+"""Pixels: float32 of positions some metres away."""
 
 
 def blobs(count=80):
@@ -37,19 +43,213 @@ def test_a_frame_that_needs_more_room_gets_it(monkeypatch):
         assert rendering.overflow == 0 and rendering.alpha.max() > 0.5
 
 
-def test_exr_colours_are_premultiplied(tmp_path):
-    """A compositing program shows what was rendered when it adds (1 - alpha) times the background."""
-    alpha = np.asarray([[0.0, 0.5, 1.0]], np.float32)
-    onto_white = 0.25 * alpha[..., None] + (1 - alpha[..., None]) * np.ones(3, np.float32)
-    rendering = Rendering(jnp.asarray(onto_white), jnp.asarray(alpha), jnp.zeros((1, 3)), jnp.zeros((), jnp.int32))
-    cameras = stack_cameras([Camera(jnp.eye(3), jnp.eye(4), 3, 1)])
-    frames.write_renderings(tmp_path, cameras, [rendering], exr=True)
-    (view,) = read_exr(tmp_path / "views.exr")
-    np.testing.assert_allclose(view.rgba[..., :3], 0.25 * alpha[..., None] * np.ones(3), atol=ROUNDING)
-    np.testing.assert_array_equal(view.rgba[..., 3], alpha)
-    np.testing.assert_allclose(read_image(tmp_path / "view_000.png")[0], onto_white, atol=0.5 / 255 + ROUNDING)
-
-
 def test_each_frame_needs_a_camera():
     with pytest.raises(ValueError, match="zip"):
         list(frames.draw_gaussians(iter([blobs()]), iter([])))
+
+
+# Cameras -----------------------------------------------------------------------------------------------------------------
+
+
+def pixels(cameras, points):
+    """(v, p, 2) where each camera sees the points of its frame."""
+    K, world = np.asarray(cameras.K, float), np.asarray(cameras.cam_from_world, float)
+    seen = np.einsum("vij,vpj->vpi", world[:, :3, :3], points) + world[:, None, :3, 3]
+    assert (seen[..., 2] > 0).all()
+    projected = np.einsum("vij,vpj->vpi", K, seen)
+    return projected[..., :2] / projected[..., 2:]
+
+
+def walker(metres=3.0, frames_per_second=30, seconds=3.0):
+    """A box 1.7 m high that walks along x, bobbing and swaying at the pace of steps."""
+    count = int(seconds * frames_per_second)
+    time = np.arange(count) / frames_per_second
+    path = np.stack(
+        [metres * time / seconds, 0.03 * np.sin(4 * np.pi * time), 0.05 * np.sin(2 * np.pi * time)], axis=-1
+    )
+    box = np.stack(np.meshgrid([-0.3, 0.3], [0, 1.7], [-0.2, 0.2]), axis=-1).reshape(-1, 3)
+    return path[:, None] + box
+
+
+SHOTS = {
+    "square": Shot(),
+    "portrait from above": Shot(width=90, height=160, azimuth=40.0, elevation=50.0),
+    "landscape, wide angle, from behind": Shot(width=640, height=200, azimuth=200.0, fov=90.0, elevation=-20.0),
+}
+
+
+@pytest.mark.parametrize("name", SHOTS)
+@pytest.mark.parametrize("smoothing", [15.0, None])
+def test_the_camera_is_as_near_as_everything_fits(name, smoothing):
+    shot, points = SHOTS[name], walker()
+    cameras = frames.shot_cameras(shot, points, np.linspace(0, 50, len(points)), smoothing)
+    size = np.asarray(shot.resolution)
+    assert (cameras.width, cameras.height) == shot.resolution and len(cameras) == len(points)
+    from_middle = np.abs(pixels(cameras, points) - size / 2) / (size / 2)
+    np.testing.assert_allclose(from_middle.max(), 1 / frames.MARGIN, atol=PIXEL_ROUNDING / size.min() * 2)
+
+
+def test_the_camera_goes_along_and_does_not_bob():
+    points, shot = walker(), Shot(size=100)
+    cameras = frames.shot_cameras(shot, points, np.zeros(len(points)), 0.5 * 30)
+    seen = pixels(cameras, points)
+    heights = np.ptp(seen[..., 1], axis=1)
+    assert heights.min() > 85  # standing still, it leaves the person less than half of the image:
+    still = frames.shot_cameras(shot, points, np.zeros(len(points)), None)
+    assert np.ptp(pixels(still, points)[..., 1], axis=1).max() < 50
+    middle = 0.5 * (seen.min(axis=1) + seen.max(axis=1))
+    assert np.abs(middle[:, 0] - 50).max() < 3  # in the middle of the image, at the ends of the walk, too
+    eyes = np.asarray(cameras.center)
+    np.testing.assert_allclose(np.diff(eyes[:, 0]), 3.0 / 90, rtol=1e-2)
+    assert (
+        np.ptp(eyes[:, 1]) < 0.25 * 0.06
+    )  # the head moves by 0.06; at the ends the path is mirrored at a point of that
+
+
+def test_distance_and_angles_are_those_that_are_asked_for():
+    points = walker()[:1]
+    shot = Shot(distance=2.5, azimuth=90.0, elevation=30.0, fov=40.0, width=80, height=60)
+    camera = frames.shot_cameras(shot, points, np.zeros(1), None)[0]
+    middle = 0.5 * (points[0].min(0) + points[0].max(0))
+    towards = np.asarray([np.cos(np.radians(30)), 0.5, 0])  # azimuth 90 is +x, the left side
+    np.testing.assert_allclose(camera.center, middle + 2.5 * towards, atol=1e-5)
+    np.testing.assert_allclose(camera.K[1, 1], 30 / np.tan(np.radians(20)), rtol=1e-5)
+    np.testing.assert_allclose(camera.K[0, 0], camera.K[1, 1], rtol=1e-6)
+
+
+def test_smoothing_keeps_straight_paths_and_short_ones():
+    line = np.arange(20)[:, None] * [1.0, 0.5, -2.0]
+    np.testing.assert_allclose(frames.smoothed_path(line, 7.0), line, atol=1e-9)
+    np.testing.assert_allclose(frames.smoothed_path(line[:2], 30.0), line[:2], atol=1e-9)
+    assert frames.smoothed_path(line[:1], 5.0).shape == (1, 3)
+    wave = np.sin(np.arange(200))[:, None] * [1.0, 1.0, 1.0]
+    assert np.abs(frames.smoothed_path(wave, 6.0)[30:-30]).max() < 1e-3
+
+
+def test_a_turntable_shows_the_person_from_all_sides():
+    avatar = two_balls(2)
+    poses, cameras = frames.turntable_views(avatar, frames.rest_pose_of(avatar), 4, Shot(elevation=0.0))
+    assert len(poses) == len(cameras) == 4
+    middle = CENTRES.mean(axis=0)
+    directions = np.asarray(cameras.center) - middle
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    np.testing.assert_allclose(directions, [[0, 0, 1], [1, 0, 0], [0, 0, -1], [-1, 0, 0]], atol=0.02)
+    with pytest.raises(ValueError, match="views 0: expected at least 1"):
+        frames.turntable_views(avatar, frames.rest_pose_of(avatar), 0, Shot())
+
+
+def test_what_is_tracked_moves_with_the_joints():
+    avatar = two_balls(2)
+    rotations = np.zeros((2, 3, 3), np.float32)
+    rotations[1, 0] = [0, 0, np.pi / 2]  # about the lower ball's centre: the upper one goes to -x
+    poses = jax.vmap(BodyPose)(jnp.asarray(rotations), jnp.asarray([[0, 0, 0], [0, 0, 2.0]], jnp.float32))
+    points = frames.tracked_points(avatar, poses)
+    still, turned = (0.5 * (frame.min(axis=0) + frame.max(axis=0)) for frame in points)
+    np.testing.assert_allclose(still, CENTRES.mean(axis=0), atol=0.02)
+    np.testing.assert_allclose(turned, [-0.4, 0.5, 2.0], atol=0.02)
+    assert np.ptp(points[1, :, 0]) == pytest.approx(0.8 + 2 * RADIUS, abs=0.02)
+
+
+def test_the_a_pose_lowers_the_arms():
+    avatar = two_balls(1)
+    rotations = np.asarray(frames.a_pose_of(avatar).rotations)
+    np.testing.assert_allclose(rotations[1:, 2], np.radians([-48, 48]), rtol=1e-6)
+    assert not rotations[0].any() and not rotations[:, :2].any()
+    from humangs_jax.core.pytree import replace
+
+    with pytest.raises(ValueError, match="no joint left_shoulder"):
+        frames.a_pose_of(replace(avatar, joint_names=("pelvis", "a", "right_shoulder")))
+
+
+# Frames and colours ------------------------------------------------------------------------------------------------------
+
+
+def walk(count=24, fps=24.0):
+    path = np.stack([np.zeros(count), 1 + 0.1 * np.sin(np.arange(count)), 0.05 * np.arange(count)], axis=-1)
+    turns = np.random.default_rng(0).normal(size=(count, 3, 3))
+    return Motion(jnp.asarray(turns, jnp.float32), jnp.asarray(path, jnp.float32), fps)
+
+
+def test_an_excerpt_is_a_part_of_the_motion():
+    motion = walk()
+    part = frames.excerpt(motion, 0.25, 0.75)
+    np.testing.assert_array_equal(part.translations, motion.translations[6:18])
+    np.testing.assert_array_equal(part.rotations, motion.rotations[6:18])
+    assert frames.excerpt(motion).translations.shape == (24, 3)
+    faster = frames.excerpt(motion, 0.0, 0.5, fps=48.0)
+    assert faster.fps == 48 and len(faster.translations) == 24
+    assert len(frames.excerpt(motion, 0.99).translations) == 1
+
+
+def test_a_loop_goes_on_where_it_was():
+    motion = walk()
+    twice = frames.excerpt(motion, loop=3)
+    path = np.asarray(twice.translations)
+    np.testing.assert_allclose(np.diff(path[:, 2]), 0.05, atol=1e-5)  # no step back, no step of another length
+    np.testing.assert_allclose(path[24:48, 1], path[:24, 1], atol=1e-6)
+    np.testing.assert_array_equal(twice.rotations[24:48], motion.rotations)
+
+
+@pytest.mark.parametrize("times", [(-0.1, None), (0.5, 0.5), (0.5, 0.2), (0.0, 1.2), (1.0, None), (float("nan"), None)])
+def test_times_outside_of_the_motion_are_named(times):
+    with pytest.raises(ValueError, match=r"start .*stop .*expected 0 <= start < stop <= 1,"):
+        frames.excerpt(walk(), *times)
+    with pytest.raises(ValueError, match="loop 0"):
+        frames.excerpt(walk(), loop=0)
+
+
+def test_what_is_behind_the_person():
+    """A colour shows through; without one the image has straight alpha, which gives the same over that colour."""
+    rng = np.random.default_rng(0)
+    alpha = np.concatenate([[0.0, 1.0], rng.random(10)]).reshape(3, 4).astype(np.float32)
+    own = rng.random((3, 4, 3)).astype(np.float32)
+    rendering = Rendering(jnp.asarray(own * alpha[..., None]), jnp.asarray(alpha), jnp.zeros((3, 4)), jnp.int32(0))
+    color = (0.1, 0.5, 0.9)
+    opaque, clear = frames.image_of(rendering, color), frames.image_of(rendering, None)
+    np.testing.assert_allclose(opaque, own * alpha[..., None] + (1 - alpha[..., None]) * color, atol=ROUNDING)
+    assert clear.shape == (3, 4, 4) and np.isfinite(clear).all() and not clear[0, 0].any()
+    over = clear[..., :3] * clear[..., 3:] + (1 - clear[..., 3:]) * np.asarray(color)
+    np.testing.assert_allclose(over, opaque, atol=ROUNDING)
+
+
+def test_presets_keep_the_conventions_of_the_weights():
+    from humangs_jax.core.pytree import replace
+
+    ours = two_balls(1)
+    theirs = replace(ours, rendering="inria")
+    assert frames.splatting_of(Shot(), ours) == SPLAT_PRESETS["exact"]
+    assert frames.splatting_of(Shot(), theirs) == SPLAT_PRESETS["inria"]
+    assert frames.splatting_of(Shot(splat="fast"), ours) == SPLAT_PRESETS["fast"]
+    assert frames.splatting_of(Shot(splat="exact"), theirs) == SPLAT_PRESETS["exact"]
+    fast = frames.splatting_of(Shot(splat="fast"), theirs)
+    assert fast.square and fast.transmittance_stop == SPLAT_PRESETS["fast"].transmittance_stop
+
+
+BAD_SHOTS = {
+    "size 0": dict(size=0),
+    "size -5": dict(size=-5),
+    "width 100000": dict(width=100000),
+    "azimuth nan": dict(azimuth=float("nan")),
+    "elevation 90": dict(elevation=90.0),
+    "fov 180": dict(fov=180.0),
+    "distance -1": dict(distance=-1.0),
+    "distance inf": dict(distance=float("inf")),
+    "background 'greenish'": dict(background="greenish"),
+    "background '#11223344'": dict(background="#11223344"),
+}
+
+
+@pytest.mark.parametrize("message", BAD_SHOTS)
+def test_a_shot_that_cannot_be_taken_is_named(message):
+    with pytest.raises(ValueError) as error:
+        Shot(**BAD_SHOTS[message]).check()
+    assert str(error.value).startswith(message) and "expected" in str(error.value)
+
+
+def test_colours_have_names_and_numbers():
+    assert (
+        Shot().color() == (1, 1, 1) == Shot(background="#ffffff").color() == Shot(background="rgb(255,255,255)").color()
+    )
+    assert Shot(background=" Transparent ").color() is None
+    assert Shot(background="#336699").color() == (0.2, 0.4, 0.6)
+    assert Shot(width=20).resolution == (20, 512) and Shot(size=9, height=5).resolution == (9, 5)

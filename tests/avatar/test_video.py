@@ -1,10 +1,13 @@
+import shutil
 import subprocess
 import weakref
 
 import numpy as np
 import pytest
 
-from humangs_jax.avatar.video import write_video
+from humangs_jax.avatar import video
+from humangs_jax.avatar.video import check_video, write_video
+from humangs_jax.io.images import read_image
 
 H264_ERROR = 0.02
 """Mean absolute difference after compression of a smooth image; a wrong colour matrix gives 0.03 and more."""
@@ -36,10 +39,10 @@ def read_back(path, height=48, width=64):
     return np.frombuffer(data, np.uint8).reshape(-1, height, width, 3) / 255.0
 
 
-@pytest.mark.parametrize("name", ["a.mp4", "a.MP4", "a.gif"])
+@pytest.mark.parametrize("name", ["a.mp4", "a.MP4", "a.gif", "a.webm"])
 def test_frames_come_back(tmp_path, name):
     frames = moving_square(12)
-    write_video(tmp_path / name, frames, 24.0)
+    assert write_video(tmp_path / name, frames, 24.0) == 12
     back = read_back(tmp_path / name)
     assert back.shape == frames.shape
     assert np.abs(back - frames).mean() < (PALETTE_ERROR if name.endswith("gif") else H264_ERROR)
@@ -48,7 +51,60 @@ def test_frames_come_back(tmp_path, name):
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
-@pytest.mark.parametrize("name", ["a.mp4", "a.gif"])
+def test_webm_and_png_files_are_transparent(tmp_path):
+    """Straight alpha: colours where it is, and none beside it, whatever lies there."""
+    colours = moving_square(6)
+    alpha = np.zeros((*colours.shape[:3], 1))
+    alpha[:, 10:40, 10:50] = 0.5
+    alpha[:, 20:30, 20:40] = 1
+    frames = np.concatenate([colours, alpha], axis=-1)
+    write_video(tmp_path / "a.webm", frames, 24)
+    decode = ("-c:v", "libvpx-vp9", "-i", tmp_path / "a.webm", "-f", "rawvideo", "-pix_fmt", "rgba", "-")
+    back = np.frombuffer(ffmpeg("-v", "error", *decode).stdout, np.uint8).reshape(6, 48, 64, 4) / 255.0
+    assert np.abs(back[..., 3] - alpha[..., 0]).mean() < H264_ERROR
+    seen = alpha[..., 0] == 1
+    assert np.abs(back - frames)[seen].mean() < H264_ERROR
+    assert write_video(tmp_path / "frames", frames, 24) == 6
+    for i, frame in enumerate(frames):
+        image, its_alpha = read_image(tmp_path / "frames" / f"frame_{i:05d}.png")
+        np.testing.assert_allclose(np.concatenate([image, its_alpha[..., None]], -1), frame, atol=0.5 / 255 + 1e-6)
+
+
+def test_png_files_of_an_earlier_video_are_replaced_and_others_stay(tmp_path):
+    write_video(tmp_path / "frames", moving_square(5), 24)
+    (tmp_path / "frames" / "notes.txt").write_text("mine")
+    write_video(tmp_path / "frames", moving_square(2), 24)
+    assert sorted(p.name for p in (tmp_path / "frames").iterdir()) == [
+        "frame_00000.png",
+        "frame_00001.png",
+        "notes.txt",
+    ]
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "frames"])
+def test_an_interruption_leaves_nothing(tmp_path, name):
+    def drawn():
+        yield from moving_square(5)
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / name, drawn(), 24)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_written_is_refused_before_it_is_drawn(tmp_path, monkeypatch):
+    (tmp_path / "a.mp4").mkdir()
+    (tmp_path / "frames").write_text("mine")
+    with pytest.raises(IsADirectoryError, match=r"--out .*a.mp4: is a folder: expected a file name"):
+        check_video(tmp_path / "a.mp4", 10, 64, 64)
+    with pytest.raises(NotADirectoryError, match=r"frames: is a file: expected a folder name"):
+        check_video(tmp_path / "frames", 10, 64, 64)
+    with pytest.raises(ValueError, match=r"1000 frames of 1024 x 1024 are too many for a .gif: use .mp4 or .webm"):
+        check_video(tmp_path / "a.gif", 1000, 1024, 1024)
+    check_video(tmp_path / "b.webm", 10**9, 8192, 8192, transparent=True)
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "a.webm", "a.gif", "frames"])
 def test_frames_are_taken_one_by_one(tmp_path, name):
     """The same file as of an array, and an error in the middle leaves nothing."""
     frames, alive = moving_square(12), []
@@ -61,10 +117,11 @@ def test_frames_are_taken_one_by_one(tmp_path, name):
             assert sum(each() is not None for each in alive) <= 2
 
     write_video(tmp_path / name, drawn(), 24.0)
-    data = (tmp_path / name).read_bytes()
+    files = sorted(path for path in tmp_path.rglob("*") if path.is_file())
+    data = [path.read_bytes() for path in files]
     write_video(tmp_path / name, frames, 24.0)
-    assert (tmp_path / name).read_bytes() == data
-    (tmp_path / name).unlink()
+    assert [path.read_bytes() for path in files] == data
+    shutil.rmtree(tmp_path / name) if name == "frames" else (tmp_path / name).unlink()
     with pytest.raises(ValueError, match="frame 12 has shape"):
         write_video(tmp_path / name, (f for f in (*frames, frames[0, 1:])), 24.0)
     assert list(tmp_path.iterdir()) == []
@@ -114,7 +171,10 @@ NAN[1, 2, 2, 0] = np.nan
         ("a.mp4", NAN, 24, "frame 1"),
         ("a.mp4", np.zeros((2, 4, 4, 3)), 0, "frames per second"),
         ("a.mp4", np.zeros((2, 4, 4, 3)), float("inf"), "frames per second"),
-        ("a.avi", np.zeros((2, 4, 4, 3)), 24, r"\.mp4 or \.gif"),
+        ("a.avi", np.zeros((2, 4, 4, 3)), 24, r"expected a name ending in \.mp4, \.webm, \.gif, or a folder"),
+        ("a.mp4", np.zeros((2, 4, 4, 4)), 24, r"\.mp4 has no transparency: expected \.webm"),
+        ("a.gif", np.zeros((2, 4, 4, 4)), 24, r"\.gif has no transparency"),
+        ("frames", np.zeros((0, 4, 4, 3)), 24, "at least one frame"),
     ],
 )
 def test_errors_write_nothing(tmp_path, name, frames, fps, message):
@@ -124,10 +184,8 @@ def test_errors_write_nothing(tmp_path, name, frames, fps, message):
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
-    import humangs_jax.avatar.video as module
-
     (tmp_path / "a.mp4").write_text("old")
-    monkeypatch.setattr(module, "to_uint8", lambda frame: (_ for _ in ()).throw(MemoryError("full")))
+    monkeypatch.setattr(video, "to_uint8", lambda frame: (_ for _ in ()).throw(MemoryError("full")))
     with pytest.raises(MemoryError):
         write_video(tmp_path / "a.mp4", moving_square(2), 24)
     assert (tmp_path / "a.mp4").read_text() == "old" and len(list(tmp_path.iterdir())) == 1
@@ -136,9 +194,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 
 
 def test_ffmpeg_failing_is_an_error(tmp_path, monkeypatch):
-    import humangs_jax.avatar.video as module
-
-    monkeypatch.setattr(module, "CONSTANT_RATE_FACTOR", "no number")
+    monkeypatch.setattr(video, "CONSTANT_RATE_FACTOR", "no number")
     with pytest.raises(OSError, match=r"ffmpeg failed: .*no number"):
         write_video(tmp_path / "a.mp4", moving_square(200), 24)
     assert list(tmp_path.iterdir()) == []

@@ -83,6 +83,25 @@ def test_other_types_become_float32(tmp_path):
     np.testing.assert_array_equal(back.depth, view.depth.astype(np.float32))
 
 
+def test_half_precision_keeps_metres(tmp_path):
+    """Colours, normals and parts in 16 bits; depth and positions to the last bit."""
+    channels = dict(make_view(0).channels) | {
+        "normal.X": make_view(0).rgba[..., 0],
+        "part": np.full((HEIGHT, WIDTH), 55.0),
+    }
+    view = make_view(0, channels=channels)
+    write_exr(tmp_path / "half.exr", view, half=True)
+    write_exr(tmp_path / "float.exr", view)
+    (back,) = read_exr(tmp_path / "half.exr")
+    np.testing.assert_array_equal(back.depth, view.depth)
+    np.testing.assert_array_equal(back.channels["position.X"], channels["position.X"])
+    np.testing.assert_array_equal(back.rgba, view.rgba.astype(np.float16).astype(np.float32))
+    np.testing.assert_array_equal(back.channels["normal.X"], channels["normal.X"].astype(np.float16).astype(np.float32))
+    np.testing.assert_array_equal(back.channels["part"], 55)
+    assert (back.rgba != view.rgba).any()
+    assert (tmp_path / "half.exr").stat().st_size < (tmp_path / "float.exr").stat().st_size
+
+
 def test_files_of_others(tmp_path):
     """Half floats without alpha, and grey ones."""
     import OpenEXR

@@ -1,0 +1,206 @@
+"""Views of an avatar as files: PNG images, and an OpenEXR file of layers for compositing programs.
+
+Layers of a view, besides the colours:
+
+Z: depth along the camera's axis, metres. position: the point of the world on the ray of the pixel at that depth, metres.
+normal: of the body's surface, in the world; unit vectors. Each Gaussian has the normal of the vertex that is nearest to it in the
+    T-pose, turned by its own skinning transform; a pixel has the mean by the weights of its colour, normalised.
+part: the joint that most of the pixel's colour follows, 1 for the first of the header's `parts`, 0 where alpha is below 1/2. A
+    Gaussian follows the joint of its largest skinning weight.
+
+None of these is multiplied by alpha; they are 0 where alpha is.
+"""
+
+import dataclasses
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import draw, draw_gaussians, image_of, posed, splatting_of
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.body.model import BodyPose
+from humangs_jax.body.skinning import blend_transforms, joint_transforms
+from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.pytree import replace
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.atomic import add_files
+from humangs_jax.io.exr import ExrView, write_exr
+from humangs_jax.io.images import write_png
+from humangs_jax.io.reading import limits
+from humangs_jax.rendering.drawing import Rendering
+from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.splat_config import SplatConfig
+
+LAYERS = ("rgba", "z", "position", "normal", "part")
+EXR_NAME = "views.exr"
+COVERED = 0.5
+"""Pixels of less alpha have no part."""
+_BLACK = (0.0, 0.0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class ExrLayers:
+    """What an EXR file of views has. Colours always are there. half: colours, normals and parts in 16 bits; Z and positions stay
+    in 32, since half floats are 2 mm apart at 4 m.
+    """
+
+    layers: tuple[str, ...] = ("rgba", "z")
+    half: bool = False
+
+    def check(self) -> None:
+        """Raises: ValueError naming a layer that does not exist."""
+        if unknown := [layer for layer in self.layers if layer not in LAYERS]:
+            raise ValueError(f"channels {unknown[0]!r}: expected some of {', '.join(LAYERS)}")
+
+    def bytes_of(self, views: int, width: int, height: int) -> int:
+        """Size of all layers in memory, in 32 bits."""
+        channels = {"rgba": 4, "z": 1, "position": 3, "normal": 3, "part": 1}
+        return 4 * views * width * height * sum(channels[name] for name in {"rgba", *self.layers})
+
+
+def write_views(
+    out: str | os.PathLike,
+    avatar: Avatar,
+    poses: BodyPose,
+    cameras: Camera,
+    shot: Shot,
+    exr: ExrLayers | None = None,
+    progress: bool = True,
+) -> int:
+    """Draw an avatar in each pose (batch v) from each camera into a folder: view_000.png ..., and views.exr if asked.
+
+    The files appear together when all are drawn; other views of an earlier call are removed. Returns the number of views.
+
+    Raises: ValueError if the layers of all views are more than an EXR file may hold (see docs/security.md); OSError.
+    """
+    from tqdm import tqdm
+
+    out, count = Path(out), len(poses)
+    if exr is not None:
+        exr.check()
+    if exr is not None and (size := exr.bytes_of(count, cameras.width, cameras.height)) > limits().array_bytes:
+        most = limits().array_bytes
+        raise ValueError(
+            f"{out / EXR_NAME}: {count} views are {size:.3g} bytes, more than {most:.3g}: expected fewer or smaller ones"
+        )
+    how = splatting_of(shot, avatar)
+
+    def write(folder: Path):
+        drawn = draw(avatar, poses, cameras, jnp.zeros(3), how)
+        views = []
+        for i, rendering in enumerate(tqdm(drawn, total=count, desc="render", unit="view", disable=not progress)):
+            write_png(folder / f"view_{i:03d}.png", image_of(rendering, shot.color()))
+            if exr is not None:
+                views.append(exr_view(f"view_{i:03d}", avatar, poses[i], cameras[i], rendering, exr.layers, how))
+        if exr is not None:
+            write_exr(folder / EXR_NAME, views, half=exr.half)
+
+    add_files(out, write, without=[file.name for file in (*out.glob("view_*.png"), *out.glob(EXR_NAME))])
+    return count
+
+
+def exr_view(
+    name: str,
+    avatar: Avatar,
+    pose: BodyPose,
+    camera: Camera,
+    rendering: Rendering,
+    layers: Iterable[str],
+    how: SplatConfig,
+) -> ExrView:
+    """A view with its layers. rendering: of this avatar, pose and camera onto black."""
+    layers, alpha, depth = set(layers), np.asarray(rendering.alpha), np.asarray(rendering.depth)
+    channels, attributes = {}, {}
+    if "position" in layers:
+        positions = np.where(alpha[..., None] > 0, unprojected(camera, depth), 0)
+        channels |= {f"position.{axis}": positions[..., i] for i, axis in enumerate("XYZ")}
+    if layers & {"normal", "part"}:
+        gaussians = posed(avatar, pose)
+    if "normal" in layers:
+        sums = splatted(gaussians, camera, how, gaussian_normals(avatar, pose))
+        length = np.linalg.norm(sums, axis=-1, keepdims=True)
+        normals = np.divide(sums, length, out=np.zeros_like(sums), where=(length > 0) & (alpha[..., None] > 0))
+        channels |= {f"normal.{axis}": normals[..., i] for i, axis in enumerate("XYZ")}
+    if "part" in layers:
+        parts, present = gaussian_parts(avatar), None
+        present = np.unique(parts)
+        weights = splatted(gaussians, camera, how, jnp.asarray(parts[:, None] == present, jnp.float32))
+        channels["part"] = np.where(alpha >= COVERED, 1 + present[weights.argmax(axis=-1)], 0).astype(np.float32)
+        attributes["parts"] = ",".join(avatar.joint_names)
+    rgba = np.concatenate([np.asarray(rendering.rgb), alpha[..., None]], axis=-1)
+    matrices = {"K": np.asarray(camera.K), "cam_from_world": np.asarray(camera.cam_from_world)}
+    depth = depth if "z" in layers else None
+    return ExrView(rgba=rgba, depth=depth, name=name, channels=channels, attributes=attributes, **matrices)
+
+
+def write_renderings_exr(path: str | os.PathLike, cameras: Camera, renderings: Iterable[Rendering]) -> None:
+    """Renderings onto black as an EXR file of premultiplied RGBA in 32 bits, Z in metres and the camera, one part per view."""
+    views = [
+        ExrView(
+            name=f"view_{i:03d}",
+            rgba=np.concatenate([np.asarray(r.rgb), np.asarray(r.alpha)[..., None]], axis=-1),
+            depth=np.asarray(r.depth),
+            K=np.asarray(cameras.K[i]),
+            cam_from_world=np.asarray(cameras.cam_from_world[i]),
+        )
+        for i, r in enumerate(renderings)
+    ]
+    write_exr(Path(path), views)
+
+
+def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
+    """The points of the world on the rays of the pixels (centres at +0.5), at these depths along the camera's axis, metres."""
+    K, world_from_cam = np.asarray(camera.K, np.float64), np.linalg.inv(np.asarray(camera.cam_from_world, np.float64))
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
+    points = (depth[..., None] * rays) @ world_from_cam[:3, :3].T + world_from_cam[:3, 3]
+    return points.astype(np.float32)
+
+
+def splatted(
+    gaussians: Gaussians, camera: Camera, how: SplatConfig, values: Float[Array, "g c"]
+) -> Float[np.ndarray, "h w c"]:
+    """Any numbers of Gaussians summed by the weights of their colours: splatting draws three channels at a time."""
+    count = values.shape[1]
+    triples = jnp.pad(values, ((0, 0), (0, -count % 3))).reshape(len(values), -1, 3)
+    each = (replace(gaussians, colors=triples[:, i]) for i in range(triples.shape[1]))
+    drawn = draw_gaussians(each, [camera] * triples.shape[1], jnp.zeros(3), how)
+    return np.concatenate([np.asarray(rendering.rgb) for rendering in drawn], axis=-1)[..., :count]
+
+
+def gaussian_parts(avatar: Avatar) -> Int[np.ndarray, " g"]:
+    """The joint that each Gaussian follows most."""
+    return np.asarray(avatar.skinning_weights).argmax(axis=-1)
+
+
+def gaussian_normals(avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
+    """Unit normals of the posed body's surface: of the nearest vertex, turned by the Gaussian's own transform."""
+    return _turned_normals(jnp.asarray(_rest_normals(avatar)), avatar, pose)
+
+
+@jax.jit
+def _turned_normals(normals, avatar, pose):
+    transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
+    linear = blend_transforms(avatar.skinning_weights, transforms)[:, :3, :3]
+    # the inverse transpose, up to a positive factor: rows of cofactors
+    rows = [jnp.cross(linear[:, (i + 1) % 3], linear[:, (i + 2) % 3]) for i in range(3)]
+    turned = jnp.einsum("gij,gj->gi", jnp.stack(rows, axis=1), normals)
+    return turned / jnp.maximum(jnp.linalg.norm(turned, axis=-1, keepdims=True), 1e-12)
+
+
+def _rest_normals(avatar) -> np.ndarray:
+    """(g, 3) normals in the T-pose; a vertex's is the mean of its faces', by their areas."""
+    from scipy.spatial import KDTree
+
+    vertices, faces = np.asarray(avatar.rest_vertices, np.float64), np.asarray(avatar.faces)
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    normals = np.zeros_like(vertices)
+    for i in range(3):
+        np.add.at(normals, faces[:, i], np.cross(b - a, c - a))
+    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    return normals[KDTree(vertices).query(np.asarray(avatar.gaussians.means))[1]].astype(np.float32)

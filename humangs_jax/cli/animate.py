@@ -1,0 +1,187 @@
+"""`humangs animate`, `render`, `view`: videos and images of an avatar, and the avatar in the browser."""
+
+import dataclasses
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import OmitArgPrefixes, Positional
+
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.cli.options import require_at_least, require_parent
+
+TURN_SECONDS = 4.0
+"""A turntable as a video turns once in this time."""
+FROM_THE_SIDE = Shot(azimuth=20.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class Animate:
+    """Animate an avatar with a motion of SMPL-X poses and write a video: .mp4, .webm (may be transparent), .gif, or a folder of
+    PNG files. The camera goes along with the person.
+    """
+
+    avatar: Positional[Path]
+    """File written by `humangs reconstruct`."""
+    shot: OmitArgPrefixes[Shot] = FROM_THE_SIDE
+    motion: Path | None = None
+    """.npz (ours, AMASS, AIST++, THuman4.0, AvatarReX) or LHM's .json. Default: the shipped walk."""
+    out: Path = Path("animation.mp4")
+    """The video to write; a name without suffix is a folder for frame_00000.png and so on."""
+    turn: float = 0.0
+    """Degrees that the camera travels around the avatar during the motion."""
+    follow: bool = True
+    """The camera goes along with the person; --no-follow: it stands still, and sees everywhere that the person goes."""
+    fps: float | None = None
+    """Frames per second of the video: the motion keeps its speed. Default: those of the motion."""
+    start: float = 0.0
+    """Where to begin, in seconds of the motion."""
+    stop: float | None = None
+    """Where to end, in seconds of the motion."""
+    loop: int = 1
+    """Play the motion so many times; each time goes on from the place where the last one has ended."""
+    prune: bool = False
+    """Leave out Gaussians that weigh less than 1/255 on every pixel of every frame. To find them all frames are drawn once more:
+    docs/video.md has what it saves."""
+
+    def run(self) -> None:
+        from humangs_jax.avatar.avatar import Avatar
+        from humangs_jax.avatar.frames import excerpt, images, motion_views, splatting_of, without_unseen
+        from humangs_jax.avatar.video import check_video, write_video
+        from humangs_jax.data.motion import load_motion
+
+        self.shot.check()
+        require_parent(self.out)
+        check_video(self.out, 0, *self.shot.resolution, transparent=self.shot.color() is None)
+        if self.fps is not None and not 0 < self.fps <= 1000:
+            raise ValueError(f"--fps {self.fps}: expected more than 0 and at most 1000")
+        avatar = Avatar.load(self.avatar)
+        motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
+        motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
+        check_video(self.out, len(motion.translations), *self.shot.resolution)
+        poses, cameras = motion_views(avatar, motion, self.shot, self.turn, self.follow)
+        if self.prune:
+            every = len(avatar.gaussians.means)
+            avatar = without_unseen(avatar, poses, cameras, splatting_of(self.shot, avatar), progress="look")
+            print(f"{every - len(avatar.gaussians.means):,} of {every:,} Gaussians are in no frame")
+        written = write_video(self.out, images(avatar, poses, cameras, self.shot, "animate"), motion.fps)
+        print(f"{self.out}: {written} frames of {_size(self.shot)} at {motion.fps:g} frames per second")
+
+
+@dataclasses.dataclass(frozen=True)
+class Render:
+    """Render an avatar from a circle of cameras, as images or as a video, or in the poses and from the cameras of a capture."""
+
+    avatar: Positional[Path]
+    """File written by `humangs reconstruct`."""
+    shot: OmitArgPrefixes[Shot]
+    out: Path = Path("views")
+    """Folder for view_000.png and so on, or a video of a turn: .mp4, .webm or .gif."""
+    pose: Literal["t", "a"] = "t"
+    """T-pose, or A-pose with the arms down (circle only)."""
+    views: int | None = None
+    """Number of cameras on the circle. Default: 8; for a video as many as one turn in 4 seconds takes."""
+    fps: float = 24.0
+    """Frames per second of a video."""
+    capture: Path | None = None
+    """Take cameras and poses from this capture folder instead of a circle."""
+    exr: bool = False
+    """Also write views.exr, one part per view: premultiplied colours, further channels, and the camera (docs/video.md)."""
+    channels: str = "rgba,z"
+    """Of views.exr: rgba (always there), z, position, normal, part, separated by commas."""
+    exr_type: Literal["float", "half"] = "float"
+    """Numbers of views.exr. half: Z and positions still have 32 bits."""
+
+    def run(self) -> None:
+        from humangs_jax.avatar.avatar import Avatar
+        from humangs_jax.avatar.frames import a_pose_of, capture_views, images, rest_pose_of, turntable_views
+        from humangs_jax.avatar.layers import ExrLayers, write_views
+        from humangs_jax.avatar.video import check_video, write_video
+        from humangs_jax.data.capture import load_capture
+
+        self.shot.check()
+        video = self.out.suffix != ""
+        if not 0 < self.fps <= 1000:
+            raise ValueError(f"--fps {self.fps}: expected more than 0 and at most 1000")
+        views = self.views
+        if views is None:
+            views = max(2, round(TURN_SECONDS * self.fps)) if video else 8
+        require_parent(self.out)
+        require_at_least(1, views=views)
+        check_video(self.out, views, *self.shot.resolution, transparent=video and self.shot.color() is None)
+        if self.capture is not None:
+            self._require_defaults()
+        layers = ExrLayers(tuple(self.channels.split(",")), half=self.exr_type == "half")
+        layers.check()
+        if video and self.exr:
+            raise ValueError(f"--exr: {self.out} is a video: expected a folder")
+        avatar = Avatar.load(self.avatar)
+        if self.capture is not None:
+            poses, cameras = capture_views(avatar, load_capture(self.capture))
+        else:
+            pose = rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
+            poses, cameras = turntable_views(avatar, pose, views, self.shot)
+        if video:
+            written = write_video(self.out, images(avatar, poses, cameras, self.shot, "render"), self.fps)
+            print(f"{self.out}: {written} frames of {_size(self.shot)} at {self.fps:g} frames per second")
+        else:
+            written = write_views(self.out, avatar, poses, cameras, self.shot, layers if self.exr else None)
+            print(f"{self.out}: {written} views of {cameras.width} x {cameras.height}{' and views.exr' * self.exr}")
+
+    def _require_defaults(self):
+        """With --capture nothing is said about the cameras. Raises: ValueError naming the first option that does."""
+        free, usual = ("background", "splat"), Shot()
+        said = [name for name, value in vars(self.shot).items() if name not in free and value != getattr(usual, name)]
+        said += ["views"] * (self.views is not None) + ["pose"] * (self.pose != "t")
+        if said:
+            raise ValueError(f"--{said[0]}: not with --capture, which has cameras and poses of its own")
+        if self.out.suffix:
+            raise ValueError(f"--out {self.out}: expected a folder: the views of a capture are no video")
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """Show an avatar moving in the browser: serves the page of `humangs export --html` on this machine until Ctrl-C. With --live,
+    show what a training run or a refinement makes while it runs.
+    """
+
+    avatar: Positional[Path]
+    """File written by `humangs reconstruct`. --live: an avatar file that is shown anew whenever it is replaced (`humangs refine
+    --live` does so), or the folder of a training run, whose newest weights reconstruct someone."""
+    motion: Path | None = None
+    """The motion it plays. Default: the shipped walk."""
+    port: int = 0
+    """Port on 127.0.0.1; 0 for any free one."""
+    browser: bool = True
+    """Open the browser; --no-browser only prints the address."""
+    live: bool = False
+    """Follow a training run or an avatar file that is being refined. Needs viser: pip install 'humangs_jax[viewer]'."""
+    capture: Path | None = None
+    """--live of a training run: the capture of the person that it reconstructs. Default: the shipped one."""
+
+    def run(self) -> None:
+        from humangs_jax.data.motion import load_motion
+
+        if self.live:
+            from humangs_jax.viewer.live import follow
+
+            motion = None if self.motion is None else load_motion(self.motion)
+            try:
+                follow(self.avatar, self.capture, motion, self.port, self.browser)
+            except ModuleNotFoundError as error:
+                raise ValueError(f"--live: {error}") from error
+            return
+        from humangs_jax.avatar.avatar import Avatar
+        from humangs_jax.viewer.page import page_html, serve
+
+        if self.capture is not None:
+            raise ValueError("--capture: only with --live")
+        avatar = Avatar.load(self.avatar)
+        motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
+        name = None if self.motion is None else self.motion.stem
+        text = page_html(avatar, motion, self.avatar.stem, name)
+        serve(text, self.port, self.browser)
+
+
+def _size(shot):
+    width, height = shot.resolution
+    return f"{width} x {height}"

@@ -1,0 +1,151 @@
+"""`humangs animate`, `render`, `view`: bad options are one line and leave nothing; what is written is what was asked for."""
+
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from avatar.avatar_cases import two_balls
+
+from humangs_jax import cli
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.cli.animate import Animate, Render
+from humangs_jax.data.motion import Motion, save_motion
+from humangs_jax.io.exr import read_exr
+from humangs_jax.io.images import read_image
+
+
+def run(monkeypatch, capsys, *arguments):
+    """(exit code, stdout, stderr) of the command line, in this process."""
+    monkeypatch.setattr(sys, "argv", ["humangs", *map(str, arguments)])
+    try:
+        cli.main()
+        code = 0
+    except SystemExit as exit_:
+        code = exit_.code
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """A folder with an avatar and a motion of a second, in which commands run."""
+    import jax.numpy as jnp
+
+    monkeypatch.chdir(tmp_path)
+    avatar = two_balls(2)
+    avatar.save(tmp_path / "avatar.npz")
+    path = np.stack([np.zeros(12), np.zeros(12), np.linspace(0, 1, 12)], axis=-1)
+    save_motion(tmp_path / "motion.npz", Motion(jnp.zeros((12, 3, 3)), jnp.asarray(path, jnp.float32), 12.0))
+    (tmp_path / "a.webm").mkdir()
+    (tmp_path / "file").write_text("mine")
+    return tmp_path
+
+
+BAD = {
+    "azimuth nan: expected": ("animate", "--azimuth", "nan"),
+    "size -5: expected 1 to 8192 pixels": ("animate", "--size", "-5"),
+    "height 100000: expected": ("render", "--height", "100000"),
+    "background 'blu': expected a colour": ("animate", "--background", "blu"),
+    "--out b.mp4: .mp4 has no transparency": ("animate", "--background", "transparent", "--out", "b.mp4"),
+    "--out c.gif: .gif has no transparency": ("render", "--background", "transparent", "--out", "c.gif"),
+    "--out b.avi: expected a name ending in": ("animate", "--out", "b.avi"),
+    "--out a.webm: is a folder": ("animate", "--out", "a.webm"),
+    "--out file: is a file": ("render", "--out", "file"),
+    "the folder none does not exist": ("animate", "--out", "none/b.mp4"),
+    "--fps 0.0: expected": ("animate", "--fps", "0"),
+    "--fps nan: expected": ("render", "--fps", "nan"),
+    "--views -1: expected at least 1": ("render", "--views", "-1"),
+    "start 3, stop 1: expected": ("animate", "--motion", "motion.npz", "--start", "3"),
+    "loop 0: expected": ("animate", "--motion", "motion.npz", "--loop", "0"),
+    "channels 'depth': expected some of": ("render", "--exr", "--channels", "rgba,depth"),
+    "--exr: b.mp4 is a video": ("render", "--exr", "--out", "b.mp4"),
+    "--azimuth: not with --capture": ("render", "--capture", "demo_capture", "--azimuth", "3"),
+    "--views: not with --capture": ("render", "--capture", "demo_capture", "--views", "3"),
+    "--pose: not with --capture": ("render", "--capture", "demo_capture", "--pose", "a"),
+    "--out b.mp4: expected a folder": ("render", "--capture", "demo_capture", "--out", "b.mp4"),
+    "the capture's poses have 55 joints, the avatar has 3": ("render", "--capture", "demo_capture"),
+    "none.npz": ("animate", "--motion", "none.npz"),
+    "--capture: only with --live": ("view", "--capture", "demo_capture"),
+}
+
+
+@pytest.mark.parametrize("message", BAD)
+def test_bad_options_are_one_line_and_nothing_is_written(message, folder, monkeypatch, capsys):
+    before = sorted(folder.rglob("*"))
+    command, *options = BAD[message]
+    code, _, error = run(monkeypatch, capsys, command, "avatar.npz", *options)
+    assert code == 2 and message in error and error.count("\n") == 1, error
+    assert sorted(folder.rglob("*")) == before
+
+
+def test_both_commands_have_the_options_of_a_shot(monkeypatch, capsys):
+    for command in (Animate, Render):
+        assert any(field.name == "shot" for field in dataclasses.fields(command))
+    texts = [run(monkeypatch, capsys, command, "--help")[1] for command in ("animate", "render")]
+    assert all(f"--{field.name}" in text for text in texts for field in dataclasses.fields(Shot))
+
+
+@pytest.mark.slow
+def test_what_is_written_is_what_was_asked_for(folder, monkeypatch, capsys):
+    small = ("--width", "40", "--height", "64", "--splat", "fast")
+    code, printed, error = run(
+        monkeypatch, capsys, "animate", "avatar.npz", "--motion", "motion.npz", "--out", "frames", *small,
+        "--background", "transparent", "--start", "0.5", "--fps", "6", "--loop", "2", "--prune",
+    )  # fmt: skip
+    assert code == 0 and "frames: 6 frames of 40 x 64 at 6 frames per second" in printed, error
+    image, alpha = read_image("frames/frame_00005.png")
+    assert image.shape == (64, 40, 3) and alpha.max() > 0.9 and alpha.min() == 0 and len(os.listdir("frames")) == 6
+    rows = np.flatnonzero(alpha.max(axis=1) > 0.5)
+    assert rows[-1] - rows[0] > 0.8 * 64  # followed and framed, whatever it walked
+
+    code, printed, error = run(
+        monkeypatch, capsys, "render", "avatar.npz", "--out", "turn.webm", "--views", "5", *small, "--pose", "a"
+    )
+    assert code == 0 and "turn.webm: 5 frames of 40 x 64 at 24" in printed, error
+    assert (folder / "turn.webm").stat().st_size > 500
+
+    more = ("--exr", "--channels", "rgba,z,position", "--exr-type", "half", "--views", "2", "--background", "#000")
+    code, printed, error = run(monkeypatch, capsys, "render", "avatar.npz", "--out", "views", *small, *more)
+    assert code == 0 and "views: 2 views of 40 x 64 and views.exr" in printed, error
+    views = read_exr("views/views.exr")
+    assert len(views) == 2 and set(views[0].channels) == {"position.X", "position.Y", "position.Z"}
+    np.testing.assert_allclose(read_image("views/view_001.png")[0], views[1].rgba[..., :3], atol=3e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="sends SIGINT")
+@pytest.mark.parametrize("out", ["b.mp4", "b.webm", "frames"])
+def test_ctrl_c_in_the_middle_leaves_nothing(out, folder):
+    """Frames are written while they are drawn: the signal comes when a temporary file is there."""
+    before = sorted(folder.iterdir())
+    command = [
+        sys.executable,
+        "-m",
+        "humangs_jax.cli",
+        "animate",
+        "avatar.npz",
+        "--motion",
+        "motion.npz",
+        "--loop",
+        "500",
+    ]
+    process = subprocess.Popen(
+        [*command, "--size", "64", "--out", out], stderr=subprocess.PIPE, stdout=subprocess.PIPE, cwd=folder
+    )
+    try:
+        until = time.monotonic() + 300
+        while sorted(folder.iterdir()) == before and process.poll() is None and time.monotonic() < until:
+            time.sleep(0.05)
+        time.sleep(0.5)
+        assert process.poll() is None, process.communicate()
+        process.send_signal(signal.SIGINT)
+        _, error = process.communicate(timeout=120)
+    finally:
+        process.kill()
+    assert process.returncode == 130 and b"interrupted" in error
+    assert sorted(folder.iterdir()) == before
