@@ -19,6 +19,7 @@ from pathlib import Path
 import jax
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.progress import stage
 from humangs_jax.data.loader import CaptureCache, Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.images import write_png
@@ -103,7 +104,8 @@ def train(
             examples = [] if unseen is None else validation_examples(unseen, part, VALIDATED)
             batches = loader.batches(first, last, waiting=waiting)
             for step, batch in batches:
-                state, metrics = train_step(state, batch, body, part, networks, mesh)
+                with stage("compiling the step") if step == first else contextlib.nullcontext():
+                    state, metrics = train_step(state, batch, body, part, networks, mesh)
                 watch(done := step + 1, metrics)
                 stop = stopping(done)
                 if done % config.log_every == 0 or done == end or stop:
