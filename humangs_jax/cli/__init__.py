@@ -11,7 +11,7 @@ import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from humangs_jax import __version__
 from humangs_jax.cli.options import UsageError
@@ -20,6 +20,7 @@ BAD_DATA, BAD_USAGE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
 """The last two: 128 and the number of the signal, as in shells."""
 
 
+@runtime_checkable
 class Command(Protocol):
     """A subcommand with its options."""
 
@@ -75,15 +76,16 @@ def execute(arguments: Sequence[str]) -> int:
     try:
         if "--version" in given:
             print(f"humangs_jax {__version__}")
-            return 0
-        command = _parsed(arguments)
-        screen.begin("--quiet" in given, verbose)
-        command.run()
-        screen.finish()
+        else:
+            command = _parsed(arguments)
+            screen.begin("--quiet" in given, verbose)
+            command.run()
+            screen.finish()
         sys.stdout.flush()
         return 0
-    except BrokenPipeError as error:
-        return BROKEN_PIPE if _nobody_reads() else _failed(error, verbose)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
+        return BROKEN_PIPE
     except (ValueError, OSError) as error:
         return _failed(error, verbose)
     except KeyboardInterrupt:
@@ -129,13 +131,3 @@ def _failed(error: Exception, verbose: bool) -> int:
 def _interrupted() -> int:
     print("humangs: interrupted", file=sys.stderr, flush=True)
     return INTERRUPTED
-
-
-def _nobody_reads() -> bool:
-    """Whether stdout is a pipe that nobody reads any more; what is left to print is dropped then."""
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return True
-    return False

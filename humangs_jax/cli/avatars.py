@@ -1,6 +1,7 @@
 """`humangs demo`, `reconstruct`, `refine`, `animate`, `render`, `export`: from photos to an avatar, and what to do with one."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -186,14 +187,15 @@ class Animate:
     """Degrees that the camera travels around the avatar during the motion."""
 
     def run(self) -> None:
+        require_parent(self.out)
+        require_suffix(self.out, (".mp4", ".gif"))
+        require_between(16, LARGEST_IMAGE, size=self.size)
+        require_between(-math.inf, math.inf, azimuth=self.azimuth, turn=self.turn)
         from humangs_jax.avatar.avatar import Avatar
         from humangs_jax.avatar.frames import motion_frames
         from humangs_jax.avatar.video import write_video
         from humangs_jax.data.motion import load_motion
 
-        require_parent(self.out)
-        require_suffix(self.out, (".mp4", ".gif"))
-        require_at_least(1, size=self.size)
         avatar, motion = Avatar.load(self.avatar), load_motion(self.motion)
         frames = motion_frames(avatar, motion, self.size, azimuth=self.azimuth, turn=self.turn)
         write_video(self.out, frames, motion.fps)
@@ -218,6 +220,8 @@ class Render:
     """Also write views.exr: float32 RGBA (premultiplied), depth Z and camera matrices, one part per view."""
 
     def run(self) -> None:
+        require_folder(self.out)
+        require_between(16, LARGEST_IMAGE, size=self.size)
         from humangs_jax.avatar.avatar import Avatar
         from humangs_jax.avatar.frames import capture_renderings, turntable_renderings, write_renderings
         from humangs_jax.data.capture import load_capture

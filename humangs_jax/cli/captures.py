@@ -101,7 +101,7 @@ class Synth:
 
     def run(self) -> None:
         extras = self.extras
-        counts = {name: getattr(self, name) for name in ("subjects", "size", "views", "poses", "frames")}
+        counts = {name: getattr(self, name) for name in ("subjects", "views", "poses", "frames")}
         require_at_least(1, workers=self.workers, **counts)
         require_at_least(0, first=self.first, close_views=self.close_views, held_out=extras.held_out)
         if self.size not in SIZES:

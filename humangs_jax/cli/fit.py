@@ -138,7 +138,7 @@ class Fit:
         if self.out is not None and not in_place:
             mark, views = ("scan_fit.json", scan.views) if way == "--scan" else ("capture.json", None)
             require_replaceable(self.out, self.overwrite, mark, (*inputs, views))
-        elif self.capture is not None and self.capture.exists():
+        elif self.capture is not None and self.capture.is_dir():
             require_folder(self.capture, "CAPTURE")
             if (body := self.capture / "body.npz").exists() and not self.overwrite:
                 raise UsageError(f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere")

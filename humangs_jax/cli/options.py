@@ -95,12 +95,12 @@ def require_suffix(path: Path, suffixes: tuple[str, ...], option: str = "--out")
         raise UsageError(f"{option} {path}: expected a name ending in {' or '.join(suffixes)}")
 
 
-def require_at_least(least: int, **values: float | int | None) -> None:
+def require_at_least(least: float | int, **values: float | int | None) -> None:
     """Numbers by the name of their option are not too small; None is no number. Raises: UsageError."""
     require_between(least, math.inf, **values)
 
 
-def require_between(least: float, most: float, **values: float | int | None) -> None:
+def require_between(least: float | int, most: float | int, **values: float | int | None) -> None:
     """Finite numbers by the name of their option are in [least, most]; None is no number. Raises: UsageError."""
     for name, value in values.items():
         if value is not None and not (least <= value <= most and math.isfinite(value)):
