@@ -35,22 +35,23 @@ def main() -> None:
     arguments.out.mkdir(parents=True)
     write_subject(arguments.out / "truth", SEED, body=load_body(), image_size=SIZE, input_views=VIEWS)
     truth, photos, me = load_capture(arguments.out / "truth"), arguments.out / "photos", arguments.out / "me"
-    points = write_material(photos, truth, NOISE)
+    points = landmarks_in(truth)
+    points = points + np.random.default_rng(0).normal(0, NOISE, points.shape)
+    write_material(photos, truth, points)
     code = cli.execute(["start", str(photos), "--out", str(me), "--refine", "15s", "--no-browser"])
     if code or not arguments.docs:
         sys.exit(code)
     draw_figures(arguments.out, points)
 
 
-def write_material(folder: Path, capture, noise: float = 0.0, keypoints: bool = True) -> np.ndarray:
-    """Photos, masks, calibration and keypoints of a capture as other programs write them; returns the keypoints (v, k, 2)."""
+def write_material(folder: Path, capture, points: np.ndarray) -> None:
+    """Photos, masks, calibration and keypoints (v, 133, 2) of a capture as other programs write them."""
     from humangs_jax.io.images import write_png
     from humangs_jax.io.text import write_json
 
-    for name in ("images", "masks", *(["keypoints"] if keypoints else [])):
+    for name in ("images", "masks", "keypoints"):
         (folder / name).mkdir(parents=True)
-    points, calibration = landmarks_in(capture), {}
-    points = points + np.random.default_rng(0).normal(0, noise, points.shape)
+    calibration = {}
     for i, name in enumerate(f"cam{i}" for i in range(capture.view_count)):
         write_png(folder / "images" / f"{name}.png", in_a_room(capture.images[i], capture.masks[i]))
         write_png(folder / "masks" / f"{name}.png", capture.masks[i])
@@ -67,21 +68,21 @@ def write_material(folder: Path, capture, noise: float = 0.0, keypoints: bool = 
         known = np.isfinite(points[i]).all(-1)
         person = {"keypoints": np.where(known[:, None], points[i] - 0.5, 0).tolist()}
         person["keypoint_scores"] = np.where(known, 0.9, 0.0).tolist()
-        if keypoints:
-            write_json(folder / "keypoints" / f"{name}.json", [person])
+        write_json(folder / "keypoints" / f"{name}.json", [person])
     write_json(folder / "calibration.json", calibration)
-    return points
 
 
 def landmarks_in(capture) -> np.ndarray:
     """Where COCO-WholeBody's points are in each photo, (v, 133, 2) pixels; NaN for those that the body does not have."""
+    import jax.numpy as jnp
+
     from humangs_jax.body.landmarks import landmark_model, pose_landmarks
     from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
 
-    model = landmark_model(capture.body, COCO_WHOLEBODY_133.names)
+    model, betas = landmark_model(capture.body, COCO_WHOLEBODY_133.names), jnp.asarray(capture.betas)
     points = []
     for i, frame in enumerate(capture.frames):
-        landmarks = np.asarray(pose_landmarks(model, capture.betas, capture.pose(int(frame)))[0])
+        landmarks = np.asarray(pose_landmarks(model, betas, capture.pose(int(frame)))[0])
         matrix, K = np.asarray(capture.cameras.cam_from_world[i]), np.asarray(capture.cameras.K[i])
         seen = (landmarks @ matrix[:3, :3].T + matrix[:3, 3]) @ K.T
         points.append(np.where(np.asarray(model.known)[:, None] > 0, seen[:, :2] / seen[:, 2:], np.nan))

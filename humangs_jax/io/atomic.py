@@ -11,6 +11,8 @@ import os
 import platform
 import re
 import shutil
+import signal
+import threading
 import time
 import uuid
 import zlib
@@ -177,15 +179,32 @@ def add_files(
     temporary.mkdir()
     try:
         write(temporary)
-        folder.mkdir(exist_ok=True)
-        for file in without:
-            (folder / file).unlink(missing_ok=True)
-        for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
-            target = folder / file.relative_to(temporary)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            file.replace(target)
+        with _undisturbed():
+            folder.mkdir(exist_ok=True)
+            for file in without:
+                (folder / file).unlink(missing_ok=True)
+            for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
+                target = folder / file.relative_to(temporary)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                file.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _undisturbed():
+    """Ctrl-C waits until the block is over."""
+    if threading.current_thread() is not threading.main_thread():  # only that one gets it
+        yield
+        return
+    waiting = []
+    previous = signal.signal(signal.SIGINT, lambda *arguments: waiting.append(arguments))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+        if waiting and callable(previous):
+            previous(*waiting[0])
 
 
 def _tag():
