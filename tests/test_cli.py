@@ -2,6 +2,7 @@ import dataclasses
 import json
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -15,6 +16,7 @@ from humangs_jax import __version__, cli
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.cli import fit, screen
+from humangs_jax.cli.interrupts import PATIENCE
 from humangs_jax.cli.options import UsageError
 from humangs_jax.core import progress
 from humangs_jax.core.progress import stage
@@ -350,6 +352,28 @@ def test_a_reader_that_has_gone_ends_a_command_quietly(tmp_path):
     error = program.stderr.read()
     program.stderr.close()
     assert program.wait() == cli.BROKEN_PIPE and error == b""
+
+
+def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
+    """As in a compilation: a long call into C, which gives Python no turn."""
+    code = (
+        "import hashlib, signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from humangs_jax import cli\n"
+        "class Long:\n"
+        "    def run(self):\n"
+        "        print('begun', flush=True)\n"
+        "        hashlib.pbkdf2_hmac('sha256', b'', b'', 200_000_000)\n"
+        "cli._parsed = lambda arguments: Long()\n"
+        "cli.main()"
+    )
+    program = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert program.stdout.readline() == b"begun\n"
+    time.sleep(0.5)  # now it is in there
+    began = time.monotonic()
+    program.send_signal(signal.SIGINT)
+    _, error = program.communicate(timeout=60)
+    assert program.returncode == cli.INTERRUPTED and error.endswith(b"humangs: interrupted\n")
+    assert PATIENCE <= time.monotonic() - began < 30
 
 
 def test_the_logs_of_libraries_stay_off_the_screen():

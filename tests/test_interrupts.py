@@ -97,6 +97,7 @@ def contents(folder):
 def interrupted_after(seconds):
     """SIGINT so much later, unless the block has ended."""
     previous = signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start what runs in the background without it
     signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-4))
     try:
         yield
@@ -160,6 +161,9 @@ def load_capture_or_photos(folder):
     return load_capture(folder) if (folder / "body.npz").exists() else load_photos(folder)
 
 
+START = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from humangs_jax.cli import main; main()"
+)
 REAL = {**WORKS, "view": ("view", "me.npz", "--no-browser")}
 
 
@@ -170,7 +174,7 @@ def test_a_process_that_is_interrupted_exits_with_130(command, share, place, tmp
     seconds = {"import": 4, "export": 6, "view": 4}.get(command, 15)
     out = () if command == "view" else ("--out", str(tmp_path / OUT.get(command, "new")))
     program = subprocess.Popen(
-        [sys.executable, "-m", "humangs_jax.cli", *REAL[command], *out],
+        [sys.executable, "-c", START, *REAL[command], *out],
         cwd=place,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

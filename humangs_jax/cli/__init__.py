@@ -14,10 +14,11 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from humangs_jax import __version__
+from humangs_jax.cli.interrupts import INTERRUPTED, end_within_seconds
 from humangs_jax.cli.options import UsageError
 
-BAD_DATA, BAD_USAGE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
-"""The last two: 128 and the number of the signal, as in shells."""
+BAD_DATA, BAD_USAGE, BROKEN_PIPE = 1, 2, 141
+"""The last one: 128 and the number of the signal, as in shells."""
 
 
 @runtime_checkable
@@ -55,6 +56,7 @@ DESCRIPTION = (
 def main() -> None:
     """Entry point of the console script."""
     try:
+        end_within_seconds()
         _prepare("--verbose" in sys.argv)
         code = execute(sys.argv[1:])
     except KeyboardInterrupt:  # before the command has begun, or the second one
