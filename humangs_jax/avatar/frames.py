@@ -12,6 +12,7 @@ from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
@@ -64,8 +65,6 @@ def motion_frames(
     avatar: Avatar, motion: Motion, size: int, azimuth: float = 0.0, turn: float = 0.0, progress: bool = True
 ) -> Iterator[Float[np.ndarray, "size size 3"]]:
     """Frames of a moving avatar, each (size, size, 3) in [0, 1], drawn when asked for. azimuth and turn in degrees."""
-    from tqdm import tqdm
-
     rest = RestBody(avatar.rest_vertices, avatar.rest_joints)
     motion = grounded(motion, rest, avatar.parents)
     count = len(motion.translations)
@@ -86,8 +85,8 @@ def motion_frames(
         size,
     )
     renderings = draw(avatar, (motion.pose(i) for i in range(count)), (cameras[i] for i in range(count)))
-    bar = tqdm(renderings, total=count, desc="animate", unit="frame", disable=not progress)
-    return (np.clip(np.asarray(rendering.rgb), 0, 1) for rendering in bar)
+    shown = bar(renderings, total=count, desc="animate", unit="frame", shown=progress)
+    return (np.clip(np.asarray(rendering.rgb), 0, 1) for rendering in shown)
 
 
 def turntable_renderings(avatar: Avatar, views: int, size: int) -> tuple[Camera, list[Rendering]]:

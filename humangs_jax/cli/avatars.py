@@ -198,8 +198,9 @@ class Animate:
 
         avatar, motion = Avatar.load(self.avatar), load_motion(self.motion)
         frames = motion_frames(avatar, motion, self.size, azimuth=self.azimuth, turn=self.turn)
-        write_video(self.out, frames, motion.fps)
-        print(f"{self.out}: {len(motion.translations)} frames at {motion.fps:g} frames per second")
+        with stage("drawing"):
+            write_video(self.out, frames, motion.fps)
+        wrote(self.out, f"{len(motion.translations)} frames at {motion.fps:g} frames per second")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -227,12 +228,14 @@ class Render:
         from humangs_jax.data.capture import load_capture
 
         avatar = Avatar.load(self.avatar)
-        if self.capture is not None:
-            cameras, renderings = capture_renderings(avatar, load_capture(self.capture))
-        else:
-            cameras, renderings = turntable_renderings(avatar, self.views, self.size)
-        written = write_renderings(self.out, cameras, renderings, exr=self.exr)
-        print(f"{self.out}: {written} views")
+        with stage("rendering"):
+            if self.capture is not None:
+                cameras, renderings = capture_renderings(avatar, load_capture(self.capture))
+            else:
+                cameras, renderings = turntable_renderings(avatar, self.views, self.size)
+        with stage("writing"):
+            written = write_renderings(self.out, cameras, renderings, exr=self.exr)
+        wrote(self.out, f"{written} views")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -277,7 +280,7 @@ class Export:
 
             name = None if self.motion is None else self.motion.stem
             size = write_page(self.html, avatar, motion, self.avatar.stem, name)
-            print(f"{self.html}: {len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
+            wrote(self.html, f"{len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
         if out is not None:
             suffix = out.suffix.lower()
             gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(self.frame))
@@ -287,7 +290,7 @@ class Export:
                 write_ply(out, gaussians, spherical_harmonics_rest=self.rest)
             else:
                 {".splat": write_splat, ".glb": write_glb}[suffix](out, gaussians)
-            print(f"{out}: {len(gaussians.means):,} Gaussians, {up} up, feet on 0")
+            wrote(out, f"{len(gaussians.means):,} Gaussians, {up} up, feet on 0")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -310,5 +313,6 @@ class View:
 
         motion = None if self.motion is None else load_motion(self.motion)
         name = None if self.motion is None else self.motion.stem
-        text = page_html(Avatar.load(self.avatar), motion, self.avatar.stem, name)
+        with stage("making the page"):
+            text = page_html(Avatar.load(self.avatar), motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)
