@@ -2,19 +2,30 @@ import dataclasses
 import json
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax import cli
-from humangs_jax.cli import fit
+from humangs_jax import __version__, cli
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
+from humangs_jax.cli import fit, screen
+from humangs_jax.cli.interrupts import PATIENCE
+from humangs_jax.cli.options import UsageError
+from humangs_jax.core import progress
+from humangs_jax.core.progress import stage
+from humangs_jax.data import motion
 from humangs_jax.data.capture import load_capture, save_capture
-from humangs_jax.io.images import read_image
+from humangs_jax.io.images import read_image, write_png
+from humangs_jax.rendering.gaussians import Gaussians
 
-COMMANDS = ("import", "fit", "check", "demo", "reconstruct", "animate", "render", "export", "synth", "train", "convert")
+COMMANDS = tuple(cli.COMMANDS)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +66,7 @@ def test_help_names_every_command_and_imports_nothing_heavy():
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command, monkeypatch, capsys):
     code, out, _ = run(monkeypatch, capsys, command, "--help")
-    assert code == 0 and "--out" in out and "docstring" not in out
+    assert code == 0 and ("--out" in out or command == "view") and "docstring" not in out
 
 
 def spoil_json(change):
@@ -99,27 +110,29 @@ def test_a_bad_capture_is_one_line_and_nothing_is_written(case, command, folder,
     shutil.copytree(folder, bad)
     spoil(bad)
     out.mkdir()
-    code, printed, error = run(monkeypatch, capsys, command, bad, "--out", out / "result.npz")
-    assert code == 2 and printed == ""
+    result = out / {"check": "result.png"}.get(command, "result.npz")
+    code, printed, error = run(monkeypatch, capsys, command, bad, "--out", result)
+    assert code == cli.BAD_DATA and printed == ""
     assert error.count("\n") == 1 and error.startswith("humangs: error: ")
     assert field in error and "bad" in error  # names the field and the file
     assert list(out.iterdir()) == []
 
 
 def test_wrong_options_are_one_line_too(folder, tmp_path, monkeypatch, capsys):
-    for arguments in (
-        ("reconstruct", tmp_path / "nowhere"),
-        ("reconstruct", folder, "--out", tmp_path / "no" / "such" / "folder.npz"),
-        ("animate", tmp_path / "no_avatar.npz", "--out", tmp_path / "a.mp4"),
-        ("animate", tmp_path / "no_avatar.npz", "--out", tmp_path / "a.txt"),
-        ("export", folder / "body.npz", "--out", tmp_path / "a.ply"),
-        ("reconstruct", folder, "--weights", folder / "body.npz", "--out", tmp_path / "a.npz"),
-        ("reconstruct", folder, "--refine", "soon", "--out", tmp_path / "a.npz"),
-        ("refine", tmp_path / "no_avatar.npz", folder, "--limit", "0s"),
-        ("synth", "--subjects", "0", "--out", tmp_path / "people"),
+    usage, data = cli.BAD_USAGE, cli.BAD_DATA
+    for expected, *arguments in (
+        (data, "reconstruct", tmp_path / "nowhere", "--out", tmp_path / "a.npz"),
+        (usage, "reconstruct", folder, "--out", tmp_path / "no" / "such" / "folder.npz"),
+        (data, "animate", tmp_path / "no_avatar.npz", "--out", tmp_path / "a.mp4"),
+        (usage, "animate", tmp_path / "no_avatar.npz", "--out", tmp_path / "a.txt"),
+        (data, "export", folder / "body.npz", "--out", tmp_path / "a.ply"),
+        (data, "reconstruct", folder, "--weights", folder / "body.npz", "--no-check", "--out", tmp_path / "a.npz"),
+        (usage, "reconstruct", folder, "--refine", "soon", "--out", tmp_path / "a.npz"),
+        (usage, "refine", tmp_path / "no_avatar.npz", folder, "--limit", "0s"),
+        (usage, "synth", "--subjects", "0", "--out", tmp_path / "people"),
     ):
         code, _, error = run(monkeypatch, capsys, *arguments)
-        assert code == 2 and error.count("\n") == 1, (arguments, error)
+        assert code == expected and error.count("\n") == 1, (arguments, error)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -172,7 +185,8 @@ def test_fit_says_what_is_missing(folder, tmp_path, monkeypatch, capsys, argumen
     monkeypatch.chdir(tmp_path)
     arguments = [folder if argument == "FOLDER" else argument for argument in arguments]
     code, _, err = run(monkeypatch, capsys, "fit", *arguments)
-    assert code == 2 and message in err and err.count("\n") == 1
+    of_data = message in ("k.json", "scan.obj")
+    assert code == (cli.BAD_DATA if of_data else cli.BAD_USAGE) and message in err and err.count("\n") == 1, err
     assert not any(tmp_path.iterdir())
 
 
@@ -195,7 +209,11 @@ def test_fit_deletes_no_folder_with_something_of_its_own_or_of_the_user(folder, 
         assert code == 2 and message in error and error.count("\n") == 1, (arguments, error)
     assert sorted(tmp_path.rglob("*")) == before
     code, printed, _ = run(monkeypatch, capsys, "fit", "--scan", "none.obj", "--out", "docs", "--overwrite")
-    assert code == 2 and "this is deleted: me.obj, scan_fit.json" in printed and sorted(tmp_path.rglob("*")) == before
+    assert (
+        code == cli.BAD_DATA
+        and "this is deleted: me.obj, scan_fit.json" in printed
+        and sorted(tmp_path.rglob("*")) == before
+    )
 
 
 def test_the_options_of_each_way_to_fit_exist():
@@ -216,7 +234,8 @@ def test_training_goes_on_from_weights_as_they_were_trained(tmp_path, monkeypatc
     monkeypatch.setattr(sources, "training_people", lambda *arguments: None)
     monkeypatch.setattr(loop, "train", lambda settings, *arguments, **options: started.append(settings))
     for config in ("tiny", "published"):
-        code, _, error = run(monkeypatch, capsys, "train", "--config", config, "--init-weights", "w", "--out", tmp_path)
+        arguments = ("--config", config, "--init-weights", "w", "--out", tmp_path)
+        code, _, error = run(monkeypatch, capsys, "train", "--on-the-fly", "1", *arguments)
         assert code == 0, error
     assert all(settings.splat.square and settings.splat.radius_sigma == 3 for settings in started)
     assert [settings.model.conventions.rendering for settings in started] == ["inria", "inria"]
@@ -234,5 +253,328 @@ def test_import_of_what_is_no_calibration_is_one_line(folder, tmp_path, monkeypa
         "--out",
         tmp_path / "new",
     )
-    assert code == 2 and "none" in err and err.count("\n") == 1
+    assert code == cli.BAD_DATA and "none" in err and err.count("\n") == 1
     assert not (tmp_path / "new").exists()
+
+
+# What a command shows -------------------------------------------------------------------------------------------------
+
+
+def test_version_and_unknown_commands(monkeypatch, capsys):
+    assert run(monkeypatch, capsys, "--version") == (0, f"humangs_jax {__version__}\n", "")
+    assert run(monkeypatch, capsys, "check", "--version")[0] == 0
+    assert run(monkeypatch, capsys, "chekc")[0] == cli.BAD_USAGE
+
+
+@dataclasses.dataclass(frozen=True)
+class Sample:
+    """A command of two stages."""
+
+    fails: str = ""
+
+    def run(self) -> None:
+        with stage("counting"), stage("inside"):
+            screen.warn("odd")
+        with stage("writing"):
+            if self.fails:
+                raise {"usage": UsageError, "data": ValueError, "option": OSError, "keys": KeyboardInterrupt}[
+                    self.fails
+                ]("--port 9: taken" if self.fails == "option" else "no good")
+        screen.tell("the report")
+        screen.wrote(Path("my file.npz"), "3 numbers")
+        screen.suggest("humangs view", Path("my file.npz"))
+
+
+@pytest.fixture
+def sample(monkeypatch):
+    monkeypatch.setattr(cli, "_command", lambda name: Sample)
+    monkeypatch.setitem(cli.COMMANDS, "sample", "")
+
+
+def test_a_command_ends_with_what_it_wrote_how_long_it_took_and_what_is_next(sample, capsys):
+    assert cli.execute(["sample"]) == 0
+    out, err = capsys.readouterr()
+    report, written, took, following = out.splitlines()
+    assert (report, written, err) == ("the report", "my file.npz: 3 numbers", "humangs: warning: odd\n")
+    assert re.fullmatch(r"took \d+\.\d s: counting \d+\.\d, writing \d+\.\d", took)
+    assert following == "next: humangs view 'my file.npz'"
+
+
+def test_quiet_and_verbose(sample, capsys):
+    assert cli.execute(["--quiet", "sample"]) == 0
+    assert capsys.readouterr() == ("the report\n", "humangs: warning: odd\n")
+    assert cli.execute(["sample", "--verbose"]) == 0
+    assert re.search(r"counting: \d+\.\d s\nwriting: ", capsys.readouterr().err)
+    assert cli.execute(["sample", "--verbose", "--fails", "data"]) == cli.BAD_DATA
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("fails", "code"), [("usage", 2), ("data", 1), ("option", 2), ("keys", 130)])
+def test_exit_codes(sample, capsys, fails, code):
+    assert cli.execute(["sample", "--fails", fails]) == code
+    out, err = capsys.readouterr()
+    last = err.splitlines()[-1]
+    assert out == "" and last.startswith("humangs: interrupted" if fails == "keys" else "humangs: error: ")
+
+
+def test_a_stage_on_a_terminal_counts_its_seconds(sample, monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(progress, "TICK", 0.01)
+    shown = progress.begin()
+    try:
+        with stage("compiling"):
+            time.sleep(0.1)
+            with stage("the step"):
+                time.sleep(0.1)
+            assert list(progress.bar(range(3), desc="steps")) == [0, 1, 2]  # takes the line
+    finally:
+        progress.end()
+    err = capsys.readouterr().err
+    assert "compiling ... 0 s" in err and "compiling: the step ... 0 s" in err and "steps: 100%" in err
+    assert re.search(r"compiling: 0\.\d s\n$", err) and list(shown.seconds) == ["compiling"]
+
+
+def test_bars_are_hidden_by_quiet(capsys):
+    progress.begin(quiet=True)
+    try:
+        assert list(progress.bar(range(3))) == [0, 1, 2] and not progress.watched()
+    finally:
+        progress.end()
+    assert capsys.readouterr().err == ""
+
+
+def test_a_reader_that_has_gone_ends_a_command_quietly(tmp_path):
+    """As `humangs check X | head -0`: through a real pipe, whose other end is closed at once."""
+    program = subprocess.Popen(
+        [sys.executable, "-m", "humangs_jax.cli", "--version"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    program.stdout.close()
+    error = program.stderr.read()
+    program.stderr.close()
+    assert program.wait() == cli.BROKEN_PIPE and error == b""
+
+
+def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
+    """As in a compilation: a long call into C, which gives Python no turn."""
+    code = (
+        "import hashlib, signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from humangs_jax import cli\n"
+        "class Long:\n"
+        "    def run(self):\n"
+        "        print('begun', flush=True)\n"
+        "        hashlib.pbkdf2_hmac('sha256', b'', b'', 200_000_000)\n"
+        "cli._parsed = lambda arguments: Long()\n"
+        "cli.main()"
+    )
+    program = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert program.stdout.readline() == b"begun\n"
+    time.sleep(0.5)  # now it is in there
+    began = time.monotonic()
+    program.send_signal(signal.SIGINT)
+    _, error = program.communicate(timeout=60)
+    assert program.returncode == cli.INTERRUPTED and error.endswith(b"humangs: interrupted\n")
+    assert PATIENCE <= time.monotonic() - began < 30
+
+
+def test_the_logs_of_libraries_stay_off_the_screen():
+    """Orbax's warnings go through absl's logger; ours are shown."""
+    code = (
+        "from humangs_jax.cli.screen import silence; import logging, warnings; silence(False)\n"
+        "logging.getLogger('absl').warning('noise'); warnings.warn('noise')\n"
+        "logging.getLogger('humangs_jax.training').warning('ours')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "humangs: ours\n"
+
+
+# Places that cannot be written to -------------------------------------------------------------------------------------
+
+
+PLACES = {
+    "a folder": ("folder.npz", "is a folder: expected the name of a file"),
+    "in a file": ("file.npz/a.npz", "is no folder"),
+    "nowhere": ("nowhere/a.npz", "does not exist"),
+    "another suffix": ("a.zip", "expected a name ending in .npz"),
+    "of another kind": ("body.npz", "exists and is no avatar"),
+    "not writable": ("/proc/a.npz", "cannot write to /proc"),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_files_that_cannot_be_written_are_refused_before_the_work(place, tmp_path, monkeypatch, capsys):
+    name, problem = PLACES[place]
+    if name.startswith("/proc") and not sys.platform.startswith("linux"):
+        pytest.skip("needs Linux's /proc")
+    monkeypatch.chdir(tmp_path)
+    Path("folder.npz").mkdir()
+    Path("file.npz").write_text("mine")
+    np.savez("body.npz", body="makehuman")
+    code, out, err = run(monkeypatch, capsys, "reconstruct", "no_capture", "--out", name)
+    assert code == cli.BAD_USAGE and out == "" and err.startswith(f"humangs: error: --out {name}: ") and problem in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["body.npz", "file.npz", "folder.npz"]
+
+
+FILE = "file"
+"""A file where a folder is wanted."""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (("demo", "--out", FILE), "--out"),
+        (("synth", "--out", FILE), "--out"),
+        (("train", "--on-the-fly", "1", "--out", FILE), "--out"),
+        (("import", "cameras", "c", "--images", "i", "--out", FILE), "--out"),
+        (("fit", "capture", "--keypoints", "k", "--out", FILE), "--out"),
+        (("fit", "--scan", "s.obj", "--out", FILE), "--out"),
+        (("fit", "--scan", "s.obj", "--views", FILE), "--views"),
+        (("start", "photos", "--out", FILE), "--out"),
+        (("render", "me.npz", "--out", FILE), "--out"),
+    ],
+)
+def test_folders_that_cannot_be_written_are_refused_before_the_work(arguments, option, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path(FILE).write_text("mine")
+    code, out, err = run(monkeypatch, capsys, *arguments)
+    assert code == cli.BAD_USAGE and out == "" and err.startswith(f"humangs: error: {option} {FILE}: is a file"), err
+    assert Path(FILE).read_text() == "mine"
+
+
+def test_places_are_checked_before_anything_heavy_is_imported(tmp_path):
+    code = (
+        "import sys; from humangs_jax import cli\n"
+        "for words in (['reconstruct', 'x', '--out', 'no/a.npz'], ['refine', 'x', 'y', '--out', 'no/a.npz'],"
+        " ['check', 'x', '--out', 'a.npz'], ['convert', 'x', '--out', 'a.npz'], ['demo', '--size', '0'],"
+        " ['synth', '--workers', '0'],"
+        " ['fit', 'x', '--keypoints', 'k', '--out', '.'], ['import', 'cameras', 'c', '--images', 'i', '--out', '.'],"
+        " ['start', 'p', '--out', '.'], ['train', '--on-the-fly', '-1'], ['animate', 'x', '--out', 'no/a.mp4'],"
+        " ['render', 'x', '--size', '0'], ['export', 'x', '--out', 'no/a.ply']):\n"
+        "    assert cli.execute(words) == cli.BAD_USAGE, words\n"
+        "assert 'jax' not in sys.modules and 'numpy' not in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stderr.splitlines()) == 13 and list(tmp_path.iterdir()) == []
+
+
+def test_what_a_command_reads_is_not_replaced(tiny_avatar, folder, monkeypatch, capsys):
+    before = tiny_avatar.read_bytes()
+    code, _, err = run(monkeypatch, capsys, "refine", tiny_avatar, folder, "--out", tiny_avatar)
+    assert code == cli.BAD_USAGE and "is read by this command" in err and tiny_avatar.read_bytes() == before
+
+
+# Bad input ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def tiny_avatar(tmp_path_factory):
+    """An avatar of SMPL-X's joints and three Gaussians."""
+    joints = np.cumsum(np.full((55, 3), 0.01), axis=0)
+    gaussians = Gaussians(
+        jnp.asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [0.2, 1.7, 0.0]]),
+        jnp.asarray([[1.0, 0, 0, 0]] * 3),
+        jnp.full((3, 3), 0.1),
+        jnp.full(3, 0.9),
+        jnp.full((3, 3), 0.5),
+    )
+    path = tmp_path_factory.mktemp("avatars") / "me.npz"
+    Avatar(
+        gaussians,
+        jnp.zeros((3, 55)).at[:, 0].set(1.0),
+        gaussians.means,
+        jnp.asarray(joints, jnp.float32),
+        jnp.asarray([[0, 1, 2]]),
+        parents=PARENTS,
+        joint_names=JOINT_NAMES,
+    ).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def things(tmp_path_factory, tiny_avatar):
+    """A folder of files that are not what they are taken for."""
+    path = tmp_path_factory.mktemp("things")
+    data = tiny_avatar.read_bytes()
+    shutil.copyfile(tiny_avatar, path / "me.npz")
+    (path / "truncated.npz").write_bytes(data[: len(data) // 2])
+    middle = data.index(b"quats.npy") + 100
+    (path / "altered.npz").write_bytes(data[:middle] + bytes([data[middle] ^ 16]) + data[middle + 1 :])
+    arrays = dict(np.load(tiny_avatar))
+    header = json.loads(str(arrays["header"]))
+    write = lambda name, **changes: np.savez(path / name, **{**arrays, **changes})
+    write("other_numbers.npz", colors=np.full((3, 3), 0.25, np.float32))
+    del header["checksum"]
+    write("nan.npz", header=json.dumps(header), means=np.full((3, 3), np.nan, np.float32))
+    np.savez(path / "no_keys.npz", header=arrays["header"])
+    write_png(path / "photo.png", np.ones((8, 8, 3)))
+    (path / "cloud.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n")
+    np.savez(path / "ten.npz", poses=np.zeros((2, 30)), trans=np.zeros((2, 3)), mocap_framerate=30)
+    np.savez(path / "far.npz", poses=np.zeros((2, 165)), trans=np.full((2, 3), 1e6), mocap_framerate=30)
+    np.savez(path / "pickled.npz", poses=np.array([{"a": 1}], dtype=object), trans=np.zeros((1, 3)))
+    return path
+
+
+HUGE = "100000"
+BAD_INPUT = [
+    (("export", "truncated.npz"), "truncated.npz: not an avatar file"),
+    (("export", "altered.npz"), "altered.npz: not an avatar file"),
+    (("export", "other_numbers.npz"), "other_numbers.npz"),
+    (("export", "nan.npz"), "nan.npz: means: expected"),
+    (("export", "no_keys.npz"), "no_keys.npz: missing keys"),
+    (("export", "photo.png"), "photo.png: not an avatar file"),
+    (("animate", "cloud.ply"), "cloud.ply: not an avatar file"),
+    (("reconstruct", "photo.png"), "photo.png"),
+    (("reconstruct", "cloud.ply"), "cloud.ply"),
+    (("reconstruct", "me.npz"), "me.npz"),
+    (("check", "photo.png"), "photo.png"),
+    (("fit", "photo.png", "--keypoints", "k.json"), "photo.png"),
+    (("start", "cloud.ply", "--out", "new"), "cloud.ply: is a file: expected a folder of photos"),
+    (("animate", "me.npz", "--motion", "ten.npz"), "ten.npz: poses: expected"),
+    (("animate", "me.npz", "--motion", "pickled.npz"), "pickled.npz: no motion: expected one of the keys"),
+    pytest.param(
+        *(("animate", "me.npz", "--motion", "far.npz"), "far.npz"),
+        marks=pytest.mark.skipif(
+            not hasattr(motion, "__path__"),
+            reason="comes with the readers of skeletons, which make data/motion a package",
+        ),
+    ),
+    (("convert", "nobody.pt"), "nobody.pt: no such file"),
+    (("convert", "photo.png"), "photo.png"),
+    *((("animate", "me.npz", "--size", size), f"--size {size}: expected") for size in ("-5", "0", HUGE)),
+    *((("render", "me.npz", "--size", size), f"--size {size}: expected") for size in ("-5", "0", HUGE)),
+    *((("demo", "--size", size), f"--size {size}: expected 16 to 8192") for size in ("-5", "0", HUGE)),
+    *((("synth", "--size", size), f"--size {size}: expected 128, 256 or 512") for size in ("-5", "0", "100", HUGE)),
+    (("refine", "me.npz", "me", "--image-size", "0"), "--image-size 0: expected 16 to 8192"),
+    (("refine", "me.npz", "me", "--growth", "nan"), "--growth nan: expected 1 to 100"),
+    (("animate", "me.npz", "--azimuth", "nan"), "--azimuth nan: expected a finite number"),
+    (("demo", "--refine", "inf"), "--refine inf: expected at least 0"),
+    (("synth", "--workers", "0"), "--workers 0: expected at least 1"),
+    (("train", "--on-the-fly", "-1"), "--on-the-fly -1: expected at least 0"),
+    (("train", "--on-the-fly", "1", "--steps", "0"), "--steps 0: expected at least 1"),
+    (("train",), "nobody to train on"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "message"), BAD_INPUT)
+def test_bad_input_is_one_line_with_file_and_key(arguments, message, things, tmp_path, monkeypatch, capsys):
+    """Bad usage ends with 2, bad data with 1; nothing is written."""
+    shutil.copytree(things, tmp_path, dirs_exist_ok=True)
+    monkeypatch.chdir(tmp_path)
+    before = sorted(tmp_path.rglob("*"))
+    code, out, err = run(monkeypatch, capsys, *arguments)
+    usage = message.startswith(("--", "nobody to"))
+    assert err.count("\n") == 1 and err.startswith("humangs: error: ") and message in err and out == "", (out, err)
+    assert code == (cli.BAD_USAGE if usage else cli.BAD_DATA)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_capture_that_looks_wrong_is_warned_about(folder, tmp_path, monkeypatch, capsys):
+    """The quick part of `check`; without weights that can be read the command ends before the work."""
+    turned = tmp_path / "turned"
+    shutil.copytree(folder, turned)
+    spoil_body(lambda arrays: arrays.update(rotations=np.degrees(arrays["rotations"])))(turned)
+    arguments = ("reconstruct", turned, "--weights", tmp_path / "none", "--out", tmp_path / "a.npz")
+    code, _, err = run(monkeypatch, capsys, *arguments)
+    assert code == cli.BAD_DATA and "warning: the poses seem to be in degrees" in err and "humangs check" in err
+    _, _, err = run(monkeypatch, capsys, *arguments, "--no-check")
+    assert "warning" not in err

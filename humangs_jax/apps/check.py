@@ -14,6 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.ndimage import binary_dilation
 
+from humangs_jax.apps.quick_check import (
+    LEAST_INSIDE,
+    LEAST_IOU,
+    MISTAKES,
+    SURELY_INSIDE,
+    SURELY_IOU,
+    whole_capture_mistakes,
+)
 from humangs_jax.avatar.sheets import contact_sheet
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
 from humangs_jax.core.array_types import Array, Bool, Float
@@ -26,48 +34,18 @@ from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, raster
 
 LONGEST_SIDE = 512
 """Larger photos are shrunk to this for the check, pixels."""
-LEAST_IOU = 0.5
-"""Clothes and hair cover about a fifth of a silhouette that the body does not; half means another pose or camera."""
-SURELY_IOU = 0.6
 MOST_OUTSIDE = 0.05
 """Share of the body's pixels: those outside of the mask take the background's colour."""
 WIDER = (
     "{:.0%} of the body is outside the mask: it is wider than the person, or the pose is off; "
     "`humangs fit CAPTURE --refine --fixed-cameras` fits shape and pose to the masks"
 )
-LEAST_INSIDE, SURELY_INSIDE = 0.5, 0.9
-"""Share of the vertices in the frame: below the first it is a warning, the second is asked of an explanation."""
 LEAST_HEIGHT = 0.05
 """Share of the image's height: a body smaller than this has its lengths in another unit."""
 LEFT, RIGHT, MIDDLE = (0.15, 0.45, 1.0), (1.0, 0.35, 0.15), (0.85, 0.85, 0.85)
 OUTLINE = (0.1, 0.85, 0.2)
 AMBIENT = 0.35
 OPACITY = 0.55
-
-_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-_FROM_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
-"""Points of a y-up world -> points of a z-up world."""
-
-
-def _moved(offset):
-    return np.block([[np.eye(3), np.reshape(offset, (3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]])
-
-
-MISTAKES = {
-    "cam_from_world is the inverse (world_from_cam, camera to world)": lambda m, t: np.linalg.inv(m),
-    "the camera looks along -z with y up (OpenGL, Blender, NeRF): negate rows 2 and 3 of cam_from_world": (
-        lambda m, t: _FLIP @ m
-    ),
-    "the matrix is camera to world in OpenGL's convention (NeRF, Blender): invert it, then negate rows 2 and 3": (
-        lambda m, t: _FLIP @ np.linalg.inv(m)
-    ),
-    "the camera's translation is in millimetres": lambda m, t: np.block([[m[:3, :3], m[:3, 3:] / 1000], [m[3:]]]),
-    "the body's translation is in millimetres": lambda m, t: m @ _moved(t / 1000 - t),
-    "the cameras stand in a world with z up: multiply cam_from_world by (x, y, z) -> (x, -z, y) from the right": (
-        lambda m, t: m @ _FROM_Y_UP
-    ),
-}
-"""Usual mistakes, and the correct cam_from_world from the given one and the body's translation."""
 
 
 @pytree_dataclass
@@ -100,14 +78,15 @@ class ViewCheck:
 
 @dataclasses.dataclass(frozen=True)
 class CheckReport:
-    """One row per view; `str(report)` is the table that the command line prints."""
+    """One row per view; `str(report)` is the table that the command line prints. warnings: about the capture as a whole."""
 
     views: tuple[ViewCheck, ...]
+    warnings: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
-        """Whether no view has a warning."""
-        return not any(view.warnings for view in self.views)
+        """Whether there is no warning."""
+        return not (self.warnings or any(view.warnings for view in self.views))
 
     def __str__(self) -> str:
         """A table, then the warnings."""
@@ -118,6 +97,7 @@ class CheckReport:
             outside = "" if view.outside is None else f"{view.outside:.1%}"
             mark = "  !" if view.warnings else ""
             lines.append(f"{view.name:<{width}}  {iou:>14}  {outside:>17}  {view.inside:>12.0%}{mark}")
+        lines += [f"warning: {warning}" for warning in self.warnings]
         lines += [f"warning: {view.name}: {warning}" for view in self.views for warning in view.warnings]
         if self.ok:
             lines.append(
@@ -152,7 +132,8 @@ def check_capture(capture: Capture, out: str | Path) -> CheckReport:
         overlays.append(overlay(capture.images[i], drawn))
         views.append(view)
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])
-    return CheckReport(tuple(views))
+    off = any(view.warnings for view in views)
+    return CheckReport(tuple(views), whole_capture_mistakes(capture) if off else ())
 
 
 def draw_body(

@@ -22,6 +22,7 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.sheets import contact_sheet, side_by_side
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.avatar.video import write_video
+from humangs_jax.core.progress import stage
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
@@ -60,55 +61,51 @@ def run_demo(
         write_json(folder / "report.json", report, indent=2)
 
     add_files(out, write)
-    print(
-        f"{out}: PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.3f}, foreground PSNR "
-        f"{report['psnr_foreground']:.2f} dB on {report['views']['held_out']} views that the network has not seen "
-        f"(painted body mesh: {report['baseline_psnr']:.2f} dB){_gain(report)}; {report['total_seconds']:.0f} s in all"
-    )
     return report
 
 
-def _gain(report):
+def summary(report: dict[str, Any]) -> str:
+    """What `run_demo` found, in one line."""
+    quality = (
+        f"PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.3f}, foreground PSNR {report['psnr_foreground']:.2f} dB on "
+        f"{report['views']['held_out']} views that the network has not seen (painted body mesh: {report['baseline_psnr']:.2f} dB)"
+    )
     refined = report.get("refined")
     if refined is None:
-        return ""
-    return f"; refined for {refined['seconds']:.0f} s: {refined['psnr']:.2f}, foreground {refined['psnr_foreground']:.2f} dB"
+        return quality
+    gain = f"{refined['psnr']:.2f}, foreground {refined['psnr_foreground']:.2f} dB"
+    return f"{quality}; refined for {refined['seconds']:.0f} s: {gain}"
 
 
 def _write_products(
     out: Path, weights: str | os.PathLike | None, frame_size: int, refine: RefineConfig | None
 ) -> dict[str, Any]:
     timings: dict[str, dict[str, float]] = {}
-    inputs = _timed(timings, "load_capture", lambda: load_capture(DEMO_CAPTURE))
-    truth = load_capture(f"{DEMO_CAPTURE}/held_out")
-    variables, config = _timed(timings, "load_weights", lambda: load_weights(weights))
-    motion = load_motion()
-
-    _say("reconstructing from four photos")
-    avatar = _timed(timings, "reconstruct", lambda: reconstruct(variables, config, inputs), twice=True)
-    _timed(timings, "animate", lambda: animate(avatar, motion.pose(0)), twice=True)
-    _say("rendering views that the network has not seen")
-    draw = lambda background: capture_renderings(avatar, truth, background)
-    cameras, renderings = _timed(timings, "render_held_out", lambda: draw(jnp.ones(3)), twice=True)
-    ours = np.stack([np.asarray(r.rgb) for r in renderings])
-    scores, refined = score(ours, truth), {}
+    with stage("loading"):
+        inputs = _timed(timings, "load_capture", lambda: load_capture(DEMO_CAPTURE))
+        truth = load_capture(f"{DEMO_CAPTURE}/held_out")
+        variables, config = _timed(timings, "load_weights", lambda: load_weights(weights))
+        motion = load_motion()
+    with stage("reconstructing"):
+        avatar = _timed(timings, "reconstruct", lambda: reconstruct(variables, config, inputs), twice=True)
+        _timed(timings, "animate", lambda: animate(avatar, motion.pose(0)), twice=True)
+    with stage("rendering"):
+        draw = lambda background: capture_renderings(avatar, truth, background)
+        cameras, renderings = _timed(timings, "render_held_out", lambda: draw(jnp.ones(3)), twice=True)
+        ours = np.stack([np.asarray(r.rgb) for r in renderings])
+        scores, refined = score(ours, truth), {}
     if refine is not None:
-        _say("refining on the four photos")
-        avatar, refined = _refine(avatar, inputs, truth, ours, refine, out / "refined.png")
-    _say("animating")
-    shot = Shot(size=frame_size, azimuth=25.0)
-    frames = _timed(timings, "animation_frames", lambda: np.stack(list(motion_frames(avatar, motion, shot, turn=40.0))))
-
-    start = time.perf_counter()
-    contact_sheet(inputs.images, out / "inputs.png", labels=[f"photo {i}" for i in range(inputs.view_count)])
-    side_by_side(truth.images, ours, out / "novel_views.png")
-    write_renderings_exr(out / "novel_views.exr", cameras, draw(jnp.zeros(3))[1])
-    write_video(out / "animation.mp4", frames, motion.fps)
-    write_video(out / "animation.gif", frames, motion.fps)
-    avatar.save(out / "avatar.npz")
-    write_ply(out / "avatar.ply", avatar.gaussians)
-    write_page(out / "avatar.html", avatar, motion)
-    timings["write_files"] = {"seconds": round(time.perf_counter() - start, 3)}
+        with stage("refining"):
+            avatar, refined = _refine(avatar, inputs, truth, ours, refine, out / "refined.png")
+    with stage("animating"):
+        shot = Shot(size=frame_size, azimuth=25.0)
+        draw_motion = lambda: np.stack(list(motion_frames(avatar, motion, shot, turn=40.0)))
+        frames = _timed(timings, "animation_frames", draw_motion)
+    with stage("writing"):
+        start = time.perf_counter()
+        _write_files(out, avatar, inputs, truth, ours, frames, motion)
+        write_renderings_exr(out / "novel_views.exr", cameras, draw(jnp.zeros(3))[1])
+        timings["write_files"] = {"seconds": round(time.perf_counter() - start, 3)}
 
     baseline = score(draw_painted_body(painted_body(inputs), truth), truth)
     return {
@@ -126,9 +123,21 @@ def _write_products(
     }
 
 
+def _write_files(out, avatar, inputs, truth, ours, frames, motion):
+    contact_sheet(inputs.images, out / "inputs.png", labels=[f"photo {i}" for i in range(inputs.view_count)])
+    side_by_side(truth.images, ours, out / "novel_views.png")
+    write_video(out / "animation.mp4", frames, motion.fps)
+    write_video(out / "animation.gif", frames, motion.fps)
+    avatar.save(out / "avatar.npz")
+    write_ply(out / "avatar.ply", avatar.gaussians)
+    write_page(out / "avatar.html", avatar, motion)
+
+
 def _refine(avatar, inputs, truth, feed_forward, config, sheet: Path) -> tuple[Avatar, dict[str, Any]]:
     """The refined avatar, and what the report says of it; draws both beside the truth."""
     run = refine_with_report(avatar, inputs, config, progress=True)
+    if run.interrupted:
+        raise KeyboardInterrupt
     drawn = np.stack([np.asarray(r.rgb) for r in capture_renderings(run.avatar, truth)[1]])
     rows = np.stack([truth.images, feed_forward, np.clip(drawn, 0, 1)], axis=1).reshape(-1, *drawn.shape[1:])
     contact_sheet(np.clip(rows, 0, 1), sheet, headers=("truth", "feed-forward", "refined") * 2, columns=6)
@@ -137,19 +146,15 @@ def _refine(avatar, inputs, truth, feed_forward, config, sheet: Path) -> tuple[A
     return run.avatar, {"refined": numbers | about}
 
 
-def _timed(timings: dict, stage: str, run: Callable[[], Any], twice: bool = False) -> Any:
+def _timed(timings: dict, name: str, run: Callable[[], Any], twice: bool = False) -> Any:
     """Run a stage and record its seconds; `twice`: separately for compiling (first run less second) and running (second)."""
     start = time.perf_counter()
     result = jax.block_until_ready(run())
     first = time.perf_counter() - start
-    timings[stage] = {"seconds": round(first, 3)}
+    timings[name] = {"seconds": round(first, 3)}
     if twice:
         start = time.perf_counter()
         jax.block_until_ready(run())
         second = time.perf_counter() - start
-        timings[stage] = {"compile": round(max(first - second, 0.0), 3), "run": round(second, 3)}
+        timings[name] = {"compile": round(max(first - second, 0.0), 3), "run": round(second, 3)}
     return result
-
-
-def _say(what: str) -> None:
-    print(f"humangs demo: {what} ...", flush=True)

@@ -14,6 +14,7 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
@@ -268,11 +269,9 @@ def images(
 
     progress: what a progress bar says; None: no bar.
     """
-    from tqdm import tqdm
-
     drawn = draw(avatar, poses, cameras, jnp.zeros(3), splatting_of(shot, avatar))
-    bar = tqdm(drawn, total=len(poses), desc=progress, unit="frame", disable=progress is None)
-    return (image_of(rendering, shot.color()) for rendering in bar)
+    shown = bar(drawn, total=len(poses), desc=progress, unit="frame", shown=progress is not None)
+    return (image_of(rendering, shot.color()) for rendering in shown)
 
 
 def motion_frames(
@@ -302,11 +301,9 @@ def without_unseen(
 
     Draws all of them once to find out: worth it for what is drawn several times. docs/video.md has the error and the time.
     """
-    from tqdm import tqdm
-
     most = np.zeros(len(avatar.gaussians.means), np.float32)
     drawn = draw(avatar, poses, cameras, how=dataclasses.replace(how, visibility=True))
-    for rendering in tqdm(drawn, total=len(poses), desc=progress, unit="frame", disable=progress is None):
+    for rendering in bar(drawn, total=len(poses), desc=progress, unit="frame", shown=progress is not None):
         most = np.maximum(most, rendering.visibility)
     kept = np.flatnonzero(most >= threshold)
     gaussians = jax.tree.map(lambda x: x[kept], avatar.gaussians)

@@ -155,6 +155,14 @@ def _write_by_ffmpeg(path, frames, fps, shape, quality):
         raise OSError(f"{path}: ffmpeg failed: {problem}")
 
 
+def _commonest(pixels):
+    """The most frequent colour (3,) of (h, w, 3) pixels: the background, where it is of one colour."""
+    packed = pixels.reshape(-1, 3).astype(np.int32) @ (1 << 16, 1 << 8, 1)
+    values, counts = np.unique(packed, return_counts=True)
+    common = int(values[counts.argmax()])
+    return common >> 16, common >> 8 & 255, common & 255
+
+
 def _write_gif(path, frames, fps, _):
     from PIL import Image
 
@@ -162,7 +170,13 @@ def _write_gif(path, frames, fps, _):
     kept, fps = [to_uint8(frame) for i, frame in enumerate(frames) if i % step == 0], fps / step
     chosen = np.unique(np.linspace(0, len(kept) - 1, PALETTE_FRAMES).round().astype(int))
     # one palette for all frames: with one each, still surfaces flicker
-    palette = Image.fromarray(np.concatenate([kept[i] for i in chosen])).quantize(256, Image.Quantize.MEDIANCUT)
+    sampled = np.concatenate([kept[i] for i in chosen])
+    palette = Image.fromarray(sampled).quantize(255, Image.Quantize.MEDIANCUT)
+    colors = np.zeros((256, 3), np.uint8)
+    known = np.asarray(palette.getpalette(), np.uint8).reshape(-1, 3)[:255]
+    colors[: len(known)] = known
+    colors[255] = _commonest(sampled)  # else the background would become the mean of colours like it
+    palette.putpalette(colors.tobytes())
     images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in kept]
     # durations are whole hundredths of a second; rounding the times, not the durations, keeps the speed
     times = np.rint(np.arange(len(images) + 1) * 100 / fps).astype(int)

@@ -1,28 +1,27 @@
 """The `humangs` command. Each subcommand is a frozen dataclass whose fields are its options; `run` does the work.
 
-Modules here import nothing heavy, so that `--help` is fast: what a command needs is imported when it runs. Wrong input (a
-capture, a file, an option) ends in one line on stderr and exit code 2, with nothing written.
+Modules here import nothing heavy, so that `--help` is fast: what a command needs is imported when it runs, after its options
+and the places that it will write to were checked. --quiet, --verbose and --version are for all commands.
+
+Exit codes: 0; 1 for bad data (a capture, a file that cannot be read); 2 for bad usage (an option, a place that cannot be written
+to); 130 after Ctrl-C; 141 where the reader of a pipe has gone. Errors are one line on stderr, with nothing half-written.
 """
 
+import importlib
 import os
 import sys
-import warnings
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol, runtime_checkable
 
-import tyro
+from humangs_jax import __version__
+from humangs_jax.cli.interrupts import INTERRUPTED, end_within_seconds
+from humangs_jax.cli.options import UsageError
 
-from humangs_jax.cli.animate import Animate, Render, View
-from humangs_jax.cli.avatars import Demo, Export, Reconstruct, Refine
-from humangs_jax.cli.captures import ImportCameras, Synth
-from humangs_jax.cli.evaluate import Evaluate
-from humangs_jax.cli.fit import Check, Fit
-from humangs_jax.cli.preprocess import Preprocess
-from humangs_jax.cli.training import Convert, Train
-from humangs_jax.core.allocator import keep_freed_memory
-from humangs_jax.core.compile_cache import enable_compile_cache
+BAD_DATA, BAD_USAGE, BROKEN_PIPE = 1, 2, 141
+"""The last one: 128 and the number of the signal, as in shells."""
 
 
+@runtime_checkable
 class Command(Protocol):
     """A subcommand with its options."""
 
@@ -31,37 +30,108 @@ class Command(Protocol):
         ...
 
 
-COMMANDS: dict[str, Callable[..., Command]] = {
-    "import": ImportCameras,
-    "fit": Fit,
-    "check": Check,
-    "demo": Demo,
-    "reconstruct": Reconstruct,
-    "refine": Refine,
-    "animate": Animate,
-    "render": Render,
-    "export": Export,
-    "evaluate": Evaluate,
-    "view": View,
-    "synth": Synth,
-    "preprocess": Preprocess,
-    "train": Train,
-    "convert": Convert,
+COMMANDS = {
+    "start": "start.Start",
+    "import": "captures.ImportCameras",
+    "fit": "fit.Fit",
+    "check": "fit.Check",
+    "demo": "avatars.Demo",
+    "reconstruct": "avatars.Reconstruct",
+    "refine": "avatars.Refine",
+    "animate": "animate.Animate",
+    "render": "animate.Render",
+    "export": "avatars.Export",
+    "evaluate": "evaluate.Evaluate",
+    "view": "animate.View",
+    "synth": "captures.Synth",
+    "preprocess": "preprocess.Preprocess",
+    "train": "training.Train",
+    "convert": "training.Convert",
 }
-DESCRIPTION = "Animatable 3D Gaussian humans from a few photos with body poses."
+"""Module and class of each command, imported when it is asked for."""
+DESCRIPTION = (
+    "Animatable 3D Gaussian humans from a few photos with body poses. For every command: --quiet shows results and errors "
+    "only, --verbose also what libraries log, --version the version."
+)
 
 
 def main() -> None:
     """Entry point of the console script."""
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")  # XLA's notes would appear between our lines
-    warnings.filterwarnings("ignore", module="PIL")  # what is wrong with a photo is said in one line of ours
+    try:
+        end_within_seconds()
+        _prepare("--verbose" in sys.argv)
+        code = execute(sys.argv[1:])
+    except KeyboardInterrupt:  # before the command has begun, or the second one
+        code = _interrupted()
+    if code == INTERRUPTED:
+        # XLA's threads may still be computing: they crash when the interpreter takes their arrays away
+        os._exit(code)
+    if code:
+        sys.exit(code)
+
+
+def execute(arguments: Sequence[str]) -> int:
+    """Run a command line in this process. Returns the exit code. Raises: SystemExit for --help and what tyro refuses."""
+    from humangs_jax.cli import screen
+
+    everywhere = {"--quiet", "--verbose", "--version"}
+    given, arguments = everywhere & set(arguments), [word for word in arguments if word not in everywhere]
+    verbose = "--verbose" in given
+    try:
+        if "--version" in given:
+            print(f"humangs_jax {__version__}")
+        else:
+            command = _parsed(arguments)
+            screen.begin("--quiet" in given, verbose)
+            command.run()
+            screen.finish()
+        sys.stdout.flush()
+        return 0
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
+        return BROKEN_PIPE
+    except (ValueError, OSError) as error:
+        return _failed(error, verbose)
+    except KeyboardInterrupt:
+        return _interrupted()
+
+
+def _prepare(verbose: bool) -> None:
+    """Settings of the process."""
+    from humangs_jax.cli.screen import silence
+    from humangs_jax.core.allocator import keep_freed_memory
+    from humangs_jax.core.compile_cache import enable_compile_cache
+
+    silence(verbose)
     keep_freed_memory()
     enable_compile_cache()
-    try:
-        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="humangs", description=DESCRIPTION).run()
-    except (ValueError, OSError) as error:
-        print(f"humangs: error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("humangs: interrupted", file=sys.stderr)
-        sys.exit(130)
+
+
+def _parsed(arguments: list[str]) -> Command:
+    """The command with its options. Only its own module is imported, and only its options are looked at: that is faster."""
+    import tyro
+
+    if arguments and arguments[0] in COMMANDS:
+        return tyro.cli(_command(arguments[0]), prog=f"humangs {arguments[0]}", args=arguments[1:])
+    every = {name: _command(name) for name in COMMANDS}
+    return tyro.extras.subcommand_cli_from_dict(every, prog="humangs", description=DESCRIPTION, args=arguments)
+
+
+def _command(name: str) -> Callable[..., Any]:
+    module, _, kind = COMMANDS[name].partition(".")
+    return getattr(importlib.import_module(f"humangs_jax.cli.{module}"), kind)
+
+
+def _failed(error: Exception, verbose: bool) -> int:
+    """One line. What begins with an option is bad usage, wherever it was raised."""
+    if verbose:
+        import traceback
+
+        traceback.print_exc()
+    print(f"humangs: error: {error}", file=sys.stderr)
+    return BAD_USAGE if isinstance(error, UsageError) or str(error).startswith("--") else BAD_DATA
+
+
+def _interrupted() -> int:
+    print("humangs: interrupted", file=sys.stderr, flush=True)
+    return INTERRUPTED

@@ -1,16 +1,25 @@
 """`humangs demo`, `reconstruct`, `refine`, `export`: from photos to an avatar, and to files of it."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
-from humangs_jax.cli.options import refine_limits, require_at_least, require_parent, require_suffix
+from humangs_jax.cli.options import (
+    LARGEST_IMAGE,
+    refine_limits,
+    require_at_least,
+    require_avatar,
+    require_between,
+    require_folder,
+    require_parent,
+    require_suffix,
+)
+from humangs_jax.cli.screen import stage, suggest, warn, wrote
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.data.capture import Capture
     from humangs_jax.data.motion import Motion
@@ -31,13 +40,16 @@ class Demo:
 
     def run(self) -> None:
         require_at_least(0, refine=self.refine)
-        from humangs_jax.apps.demo import run_demo
-        from humangs_jax.io.atomic import check_writable
-        from humangs_jax.refinement.config import RefineConfig
+        require_between(16, LARGEST_IMAGE, size=self.size)
+        require_folder(self.out)
+        with stage("starting"):
+            from humangs_jax.apps.demo import run_demo, summary
+            from humangs_jax.refinement.config import RefineConfig
 
-        check_writable(self.out)
         refine = RefineConfig(seconds=self.refine) if self.refine else None
-        run_demo(self.out, weights=self.weights, frame_size=self.size, refine=refine)
+        report = run_demo(self.out, weights=self.weights, frame_size=self.size, refine=refine)
+        wrote(self.out, summary(report))
+        suggest("humangs view", self.out / "avatar.npz")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,9 +57,9 @@ class Reconstruct:
     """Reconstruct an avatar from a capture folder (photos, cameras, body poses: docs/capture_format.md)."""
 
     capture: Positional[Path]
-    """Folder with capture.json."""
+    """Folder with capture.json. "demo_capture", if there is no such folder: the one that comes with the package."""
     out: Path = Path("avatar.npz")
-    """The avatar file to write."""
+    """The avatar file to write; an avatar that is there is replaced."""
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
     tokens: Literal["as_trained", "all", "foreground"] = "as_trained"
@@ -57,36 +69,44 @@ class Reconstruct:
     """Number type of the encoder's matrix products ("as_trained": float32). The short ones are faster on GPU and TPU."""
     refine: str | None = None
     """Fit the avatar to the photos afterwards for so long: seconds ("15s") or steps ("100steps"); see `humangs refine`."""
+    check: bool = True
+    """Look first whether photos, cameras and poses belong together, the quick part of `humangs check`; --no-check skips it."""
 
     def run(self) -> None:
-        limits = None if self.refine is None else refine_limits(self.refine)
-        from humangs_jax.avatar.reconstruct import reconstruct
-        from humangs_jax.data.capture import load_capture
-        from humangs_jax.network.weights import load_weights
+        limits = None if self.refine is None else refine_limits(self.refine, "--refine")
+        require_avatar(self.out)
+        with stage("starting"):
+            from humangs_jax.avatar.reconstruct import reconstruct
+            from humangs_jax.network.weights import load_weights
 
-        photos = load_capture(self.capture)
-        require_parent(self.out)
-        variables, config = load_weights(self.weights)
+        photos = _read_capture(self.capture, self.check)
+        with stage("loading the network"):
+            variables, config = load_weights(self.weights)
         tokens = None if self.tokens == "as_trained" else self.tokens
         dtype = "float32" if self.dtype == "as_trained" else self.dtype
         config = config.with_execution(tokens=tokens, dtype=dtype)
-        avatar = reconstruct(variables, config, photos)
-        if limits is not None:
-            avatar = _refined(avatar, photos, **limits)
-        avatar.save(self.out)
-        print(f"{self.out}: {len(avatar.gaussians.means):,} Gaussians from {len(photos.images)} photos")
+        with stage("reconstructing"):
+            avatar = reconstruct(variables, config, photos)
+            avatar.gaussians.means.block_until_ready()
+        if limits is None:
+            _save(avatar, self.out, f"from {photos.view_count} photos")
+        else:
+            _refine_and_save(avatar, photos, self.out, **limits)
 
 
 @dataclasses.dataclass(frozen=True)
 class Refine:
-    """Fit an avatar to the photos of a capture: sharper where photos show it, unchanged where none does."""
+    """Fit an avatar to the photos of a capture: sharper where photos show it, unchanged where none does.
+
+    Ctrl-C ends it early; the best avatar until then is written.
+    """
 
     avatar: Positional[Path]
     """File written by `humangs reconstruct` from these photos."""
     capture: Positional[Path]
     """Folder with capture.json: may have more or larger photos than the network saw."""
     out: Path = Path("refined.npz")
-    """The avatar file to write."""
+    """The avatar file to write; an avatar that is there is replaced."""
     limit: str = "15s"
     """How long: seconds ("15s") or steps ("100steps"), after a compilation of some seconds."""
     image_size: int | None = None
@@ -97,31 +117,63 @@ class Refine:
     """The number of Gaussians may grow by this factor: those with the largest errors are split."""
     live: bool = False
     """Write the avatar so far to --out now and then, which `humangs view --live OUT` shows."""
+    check: bool = True
+    """Look first whether photos, cameras and poses belong together, the quick part of `humangs check`; --no-check skips it."""
 
     def run(self) -> None:
-        limits = refine_limits(self.limit)
-        from humangs_jax.avatar.avatar import Avatar
+        limits = refine_limits(self.limit, "--limit")
+        require_between(16, LARGEST_IMAGE, image_size=self.image_size)
+        require_between(1, 100, growth=self.growth)
+        require_avatar(self.out, inputs=(self.avatar,))
+        with stage("starting"):
+            from humangs_jax.avatar.avatar import Avatar
+
+            avatar = Avatar.load(self.avatar)
+        photos = _read_capture(self.capture, self.check)
+        settings = {"image_size": self.image_size, "poses": self.refine_poses, "growth": self.growth}
+        _refine_and_save(avatar, photos, self.out, self.live, **settings, **limits)
+
+
+def _read_capture(path: Path, check: bool) -> "Capture":
+    """A capture, after warnings about what looks wrong in it."""
+    with stage("reading the capture"):
         from humangs_jax.data.capture import load_capture
 
-        require_parent(self.out)
-        avatar, photos = Avatar.load(self.avatar), load_capture(self.capture)
-        settings = {"image_size": self.image_size, "poses": self.refine_poses, "growth": self.growth}
-        watch = (lambda so_far: so_far.save(self.out)) if self.live else None
-        refined = _refined(avatar, photos, watch, **settings, **limits)
-        refined.save(self.out)
-        print(f"{self.out}: {len(refined.gaussians.means):,} Gaussians refined on {photos.view_count} photos")
+        photos = load_capture(path)
+    if check:
+        with stage("checking it"):
+            from humangs_jax.apps.quick_check import likely_mistakes
+
+            mistakes = likely_mistakes(photos)
+        for mistake in mistakes:
+            warn(mistake)
+        if mistakes:
+            warn(f"go on at your own risk: `humangs check {path}` draws the body over each photo")
+    return photos
 
 
-def _refined(
-    avatar: "Avatar", photos: "Capture", watch: "Callable[[Avatar], None] | None" = None, **settings: Any
-) -> "Avatar":
-    """Refine with a progress bar, and print what it took."""
-    from humangs_jax.refinement.config import RefineConfig
-    from humangs_jax.refinement.refine import refine_with_report
+def _refine_and_save(avatar: "Avatar", photos: "Capture", out: Path, live: bool = False, **settings: Any) -> None:
+    """Refine with a progress bar, write the result (now and then, if live), say what it took.
 
-    refinement = refine_with_report(avatar, photos, RefineConfig(**settings), progress=True, watch=watch)
-    print(refinement.summary())
-    return refinement.avatar
+    Raises: KeyboardInterrupt, after that, if one ended it.
+    """
+    with stage("refining"):
+        from humangs_jax.refinement.config import RefineConfig
+        from humangs_jax.refinement.refine import refine_with_report
+
+        watch = (lambda so_far: so_far.save(out)) if live else None
+        refinement = refine_with_report(avatar, photos, RefineConfig(**settings), progress=True, watch=watch)
+    _save(refinement.avatar, out, f"from {photos.view_count} photos, {refinement.summary()}")
+    if refinement.interrupted:
+        raise KeyboardInterrupt
+
+
+def _save(avatar: "Avatar", out: Path, how: str) -> None:
+    """Write an avatar and say so."""
+    with stage("writing"):
+        avatar.save(out)
+    wrote(out, f"{len(avatar.gaussians.means):,} Gaussians {how}")
+    suggest("humangs view", out)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -170,7 +222,7 @@ class Export:
 
             name = None if self.motion is None else self.motion.stem
             size = write_page(self.html, avatar, motion, self.avatar.stem, name)
-            print(f"{self.html}: {len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
+            wrote(self.html, f"{len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
         if out is not None:
             self._write(out, avatar, motion)
 
@@ -200,7 +252,7 @@ class Export:
         what = f"{len(avatar.faces):,} triangles" if mesh else f"{len(avatar.gaussians.means):,} Gaussians"
         poses = f", {len(motion.translations)} frames" if motion is not None and animated else ""
         written = str(out) if len(files) == 1 else f"{files[0]} to {files[-1].name}: {len(files)} files"
-        print(f"{written}: {what}{poses}, feet on 0")
+        wrote(written, f"{what}{poses}, feet on 0")
 
     def _frames(self, motion: "Motion", animated: bool) -> "tuple[Motion, range | None]":
         """The frames asked for, and their numbers where there are many."""

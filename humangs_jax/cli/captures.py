@@ -7,7 +7,11 @@ from typing import Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from humangs_jax.cli.options import require_at_least, tell_deleted
+from humangs_jax.cli.options import UsageError, require_at_least, require_folder, require_replaceable, tell_deleted
+from humangs_jax.cli.screen import stage, suggest, tell, wrote
+
+SIZES = (128, 256, 512)
+"""Sides of photos that `humangs synth` writes: those that training reads."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,12 +41,18 @@ class ImportCameras:
     """Replace the capture folder."""
 
     def run(self) -> None:
-        from humangs_jax.data.calibration.importing import import_cameras
+        inputs = (self.source, self.images, self.masks)
+        require_replaceable(self.out, self.overwrite, "capture.json", inputs)
+        with stage("starting"):
+            from humangs_jax.data.calibration.importing import import_cameras
 
         options = {name: value for name, value in vars(self).items() if name != "what"}
         if self.overwrite and (self.out / "capture.json").is_file():
             tell_deleted(self.out)
-        print(import_cameras(**options))
+        with stage("importing"):
+            report = import_cameras(**options)
+        tell(report)
+        suggest("humangs fit", self.out, "--keypoints FILE")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,14 +100,18 @@ class Synth:
     """Processes. Default: as many as cores."""
 
     def run(self) -> None:
-        from humangs_jax.people.writer import Layout, write_set
-
         extras = self.extras
-        counts = {name: getattr(self, name) for name in ("subjects", "size", "views", "poses", "frames")}
-        require_at_least(1, **counts)
+        counts = {name: getattr(self, name) for name in ("subjects", "views", "poses", "frames")}
+        require_at_least(1, workers=self.workers, **counts)
         require_at_least(0, first=self.first, close_views=self.close_views, held_out=extras.held_out)
+        if self.size not in SIZES:
+            raise UsageError(f"--size {self.size}: expected {', '.join(map(str, SIZES[:-1]))} or {SIZES[-1]}")
         if self.sequences and self.poses > self.frames:
-            raise ValueError(f"--poses {self.poses}: expected at most --frames {self.frames}, the length of the motion")
+            raise UsageError(f"--poses {self.poses}: expected at most --frames {self.frames}, the length of the motion")
+        require_folder(self.out)
+        with stage("starting"):
+            from humangs_jax.people.writer import Layout, write_set
+
         layout = Layout(
             self.size,
             self.poses,
@@ -112,8 +126,10 @@ class Synth:
         if self.for_training:
             layout = Layout(256, poses=2, views=12)
         workers = _cores() if self.workers is None else self.workers
-        folders = write_set(self.out, self.subjects, layout, self.split, self.first, workers=workers)
-        print(f"{self.out}: {len(folders)} people")
+        with stage("making people"):
+            folders = write_set(self.out, self.subjects, layout, self.split, self.first, workers=workers)
+        wrote(self.out, f"{len(folders)} people")
+        suggest("humangs train", self.out, "--out runs/train")
 
 
 def _cores():

@@ -10,10 +10,16 @@ from typing import Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from humangs_jax.cli.options import require_at_least, require_parent, tell_deleted
-
-LISTED = 5
-"""Names of views in a warning, at most."""
+from humangs_jax.cli.options import (
+    UsageError,
+    require_at_least,
+    require_folder,
+    require_parent,
+    require_replaceable,
+    require_suffix,
+    tell_deleted,
+)
+from humangs_jax.cli.screen import stage, suggest, tell, wrote
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,12 +104,15 @@ class Fit:
     def run(self) -> None:
         """Fit in the way that was asked for."""
         if (self.capture is None) == (self.scan.scan is None):
-            raise ValueError("give either a CAPTURE folder or --scan MESH")
+            raise UsageError("give either a CAPTURE folder or --scan MESH")
         way: Way = "--scan" if self.scan.scan else "--refine" if self.refinement.refine else "--keypoints"
         for option in self._given():
             if option not in WAYS[way] and f"--{option}" != way:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
-                raise ValueError(f"--{option} is for {owners or 'captures'}, not for {way}")
+                raise UsageError(f"--{option} is for {owners or 'captures'}, not for {way}")
+        if way == "--keypoints" and self.detections.keypoints is None:
+            raise UsageError("--keypoints FILE is missing (or --refine, to improve the body that a capture has)")
+        self._check_places(way)
         if way == "--scan":
             self._fit_scan()
         elif way == "--refine":
@@ -119,97 +128,118 @@ class Fit:
                 if chosen and field.name not in ("capture", "out", "overwrite"):
                     yield field.name
 
-    def _fit_keypoints(self):
-        from humangs_jax.body.library import load_body
-        from humangs_jax.data.capture import DEFAULT_BODY
-        from humangs_jax.data.photos import load_photos
-        from humangs_jax.fitting.files import check_place, write_fitted
-        from humangs_jax.fitting.fit_capture import fit_photos
-        from humangs_jax.fitting.landmark_fit import FitConfig
+    def _check_places(self, way):
+        """Whether the result can be written; the whole of it is checked again where the capture is known."""
+        scan, keypoints = self.scan, self.detections.keypoints
+        inputs = (self.capture, scan.scan, scan.joints, keypoints, self.body)
+        in_place = self.capture is not None and (self.out is None or self.out.resolve() == self.capture.resolve())
+        if scan.views is not None:
+            require_folder(scan.views, "--views")
+        if self.out is not None and not in_place:
+            mark, views = ("scan_fit.json", scan.views) if way == "--scan" else ("capture.json", None)
+            require_replaceable(self.out, self.overwrite, mark, (*inputs, views))
+        elif self.capture is not None and self.capture.is_dir():
+            require_folder(self.capture, "CAPTURE")
+            if (body := self.capture / "body.npz").exists() and not self.overwrite:
+                raise UsageError(f"{body} exists: --overwrite replaces it, --out FOLDER writes the fit elsewhere")
 
+    def _fit_keypoints(self):
         assert self.capture is not None  # `run` has checked it
-        if self.detections.keypoints is None:
-            raise ValueError("--keypoints FILE is missing (or --refine, to improve the body that a capture has)")
         require_at_least(0, smoothness=self.smoothness)
+        with stage("starting"):
+            from humangs_jax.body.library import load_body
+            from humangs_jax.data.capture import DEFAULT_BODY
+            from humangs_jax.data.photos import load_photos
+            from humangs_jax.fitting.files import check_place, write_fitted
+            from humangs_jax.fitting.fit_capture import fit_photos
+            from humangs_jax.fitting.landmark_fit import FitConfig
+
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints, self.body))
         tell_deleted(target, unless=target if self.out is None else self.capture)
-        photos = load_photos(self.capture)
-        keypoints = self.detections.read(photos)
+        with stage("reading photos and keypoints"):
+            photos = load_photos(self.capture)
+            keypoints = self.detections.read(photos)
+            body = load_body(self.body)
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
         config = dataclasses.replace(FitConfig(), smoothness=self.smoothness)
-        fitted = fit_photos(photos, keypoints, load_body(self.body), body_file=body_file, config=config)
-        warnings = (*fitted.report.warnings, *_reading_warnings(keypoints))
-        report = dataclasses.replace(fitted.report, warnings=warnings)
-        write_fitted(self.capture, target, fitted.capture, report, fitted.record)
-        print(report)
-        print(f"{target}: body.npz, fit.npz and fit.json; `humangs check {target}` shows them")
+        with stage("fitting"):
+            fitted = fit_photos(photos, keypoints, body, body_file=body_file, config=config)
+        with stage("examining the fit"):
+            report = fitted.report
+        report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
+        with stage("writing"):
+            write_fitted(self.capture, target, fitted.capture, report, fitted.record)
+        tell(report)
+        wrote(target, "body.npz, fit.npz and fit.json")
+        suggest("humangs check", target)
 
     def _refine(self):
-        from humangs_jax.data.capture import load_capture
-        from humangs_jax.fitting.files import check_place, write_fitted
-        from humangs_jax.fitting.refine import refine_capture
-        from humangs_jax.fitting.refine_rounds import CaptureRefineConfig
-
         assert self.capture is not None  # `run` has checked it
+        with stage("starting"):
+            from humangs_jax.data.capture import load_capture
+            from humangs_jax.fitting.files import check_place, write_fitted
+            from humangs_jax.fitting.refine import refine_capture
+            from humangs_jax.fitting.refine_rounds import CaptureRefineConfig
+
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
         tell_deleted(target, unless=target if self.out is None else self.capture)
-        start = load_capture(self.capture)
-        keypoints = self.detections.read(start)
+        with stage("reading photos and keypoints"):
+            start = load_capture(self.capture)
+            keypoints = self.detections.read(start)
         config = CaptureRefineConfig(fixed_cameras=self.refinement.fixed_cameras)
-        refinement = refine_capture(start, keypoints=keypoints, photometric=self.refinement.photometric, config=config)
-        print(refinement.report)
+        with stage("refining cameras and body"):
+            photometric = self.refinement.photometric
+            refinement = refine_capture(start, keypoints=keypoints, photometric=photometric, config=config)
+        tell(refinement.report)
         if not refinement.report.kept:
-            print("nothing was written: refinement did not improve the capture")
+            tell("nothing was written: refinement did not improve the capture")
             return
-        write_fitted(self.capture, target, refinement.capture, refinement.report)
-        print(f"{target}: refined cameras and body; `humangs check {target}` shows them")
+        with stage("writing"):
+            write_fitted(self.capture, target, refinement.capture, refinement.report)
+        wrote(target, "refined cameras and body")
+        suggest("humangs check", target)
 
     def _fit_scan(self):
         scan, keypoints = self.scan, self.detections.keypoints
         if scan.joints is not None and scan.views is not None:
-            raise ValueError("--joints and --views: give one of them, both say where the joints are")
+            raise UsageError("--joints and --views: give one of them, both say where the joints are")
         if keypoints is not None and scan.views is None:
-            raise ValueError("--keypoints of a scan needs --views FOLDER, the images that they are of")
-        from humangs_jax.body.library import load_body
-        from humangs_jax.data.capture import DEFAULT_BODY
-        from humangs_jax.data.photos import load_photos
-        from humangs_jax.fitting.files import check_scan_folder, save_scan_fit
-        from humangs_jax.fitting.scan_fit import fit_scan
-        from humangs_jax.fitting.scan_reading import read_joints
-        from humangs_jax.fitting.scan_views import joints_from_views, render_scan_views
+            raise UsageError("--keypoints of a scan needs --views FOLDER, the images that they are of")
+        only_views = scan.views is not None and keypoints is None
+        if self.out is None and not only_views:
+            raise UsageError("--out FOLDER is missing: where the body of the scan goes")
+        with stage("starting"):
+            from humangs_jax.body.library import load_body
+            from humangs_jax.data.capture import DEFAULT_BODY
+            from humangs_jax.data.photos import load_photos
+            from humangs_jax.fitting.files import check_scan_folder, save_scan_fit
+            from humangs_jax.fitting.scan_fit import fit_scan
+            from humangs_jax.fitting.scan_reading import read_joints
+            from humangs_jax.fitting.scan_views import joints_from_views, render_scan_views
 
         assert scan.scan is not None  # `run` has checked it
-        if scan.views is not None and keypoints is None:
-            render_scan_views(scan.scan, scan.views)
-            found = f"find keypoints in {scan.views / 'images'}, then add --keypoints FILE --out FOLDER"
-            print(f"{scan.views}: images of the scan; {found}")
+        if only_views:
+            assert scan.views is not None
+            with stage("rendering the scan"):
+                render_scan_views(scan.scan, scan.views)
+            wrote(scan.views, f"images of the scan; find keypoints in {scan.views / 'images'}, then")
+            suggest("humangs fit --scan", scan.scan, "--views", scan.views, "--keypoints FILE --out FOLDER")
             return
-        if self.out is None:
-            raise ValueError("--out FOLDER is missing: where the body of the scan goes")
+        assert self.out is not None
         check_scan_folder(self.out, self.overwrite, (scan.scan, scan.joints, scan.views, keypoints, self.body))
         tell_deleted(self.out)
-        joints = None if scan.joints is None else read_joints(scan.joints)
-        if scan.views is not None:
-            joints = joints_from_views(scan.views, self.detections.read(load_photos(scan.views)))
-        body = load_body(self.body)
-        fitted = fit_scan(scan.scan, body=body, joints=joints, clothed=not scan.bare, height=scan.height)
+        with stage("reading joints and body"):
+            joints = None if scan.joints is None else read_joints(scan.joints)
+            if scan.views is not None:
+                joints = joints_from_views(scan.views, self.detections.read(load_photos(scan.views)))
+            body = load_body(self.body)
+        with stage("fitting"):
+            fitted = fit_scan(scan.scan, body=body, joints=joints, clothed=not scan.bare, height=scan.height)
         body_file = DEFAULT_BODY if self.body is None else os.path.relpath(self.body.resolve(), self.out.resolve())
-        save_scan_fit(self.out, fitted, body_file, overwrite=self.overwrite)
-        print(fitted.report)
-        print(f"{self.out}: body.npz, scan_fit.json and body_in_scan.ply")
-
-
-def _reading_warnings(keypoints):
-    """Problems of a keypoint file that could be read."""
-    if keypoints.missing:
-        names = ", ".join(keypoints.missing[:LISTED]) + (" ..." if len(keypoints.missing) > LISTED else "")
-        yield f"no keypoints of {len(keypoints.missing)} views: {names}"
-    if keypoints.shifted:
-        yield f"frames and photos are counted from different numbers and were matched in order: {keypoints.shifted}"
-    if keypoints.not_finite:
-        yield f"{keypoints.not_finite} keypoints are not finite numbers and are ignored"
-    if keypoints.far_outside:
-        yield f"{keypoints.far_outside} keypoints lie far outside of their photo and are ignored: of photos of another size?"
+        with stage("writing"):
+            save_scan_fit(self.out, fitted, body_file, overwrite=self.overwrite)
+        tell(fitted.report)
+        wrote(self.out, "body.npz, scan_fit.json and body_in_scan.ply")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,26 +253,39 @@ class Check:
     """Folder with capture.json."""
     detections: OmitArgPrefixes[Detections]
     out: Path = Path("check.png")
-    """The contact sheet to write; that of the keypoints is NAME_fit.png beside it."""
+    """The contact sheet to write, .png; that of the keypoints is NAME_fit.png beside it."""
 
     def run(self) -> None:
-        from humangs_jax.apps.check import check_capture
-        from humangs_jax.data.capture import load_capture
-        from humangs_jax.data.photos import capture_folder
-        from humangs_jax.fitting.files import FIT_FILE, read_fit_record
+        sheet = self.out.with_name(f"{self.out.stem}_fit{self.out.suffix}")
+        for path in (self.out, sheet):
+            require_suffix(path, (".png",))
+            require_parent(path)
+        with stage("starting"):
+            from humangs_jax.apps.check import check_capture
+            from humangs_jax.data.capture import load_capture
+            from humangs_jax.data.photos import capture_folder
+            from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
-        capture = load_capture(self.capture)
-        require_parent(self.out)
-        keypoints, record = self.detections.read(capture), None
-        record_file = capture_folder(self.capture) / FIT_FILE
-        if keypoints is None and record_file.exists():
-            record = read_fit_record(record_file)
-        print(check_capture(capture, self.out))
+        with stage("reading the capture"):
+            capture = load_capture(self.capture)
+            keypoints, record = self.detections.read(capture), None
+            record_file = capture_folder(self.capture) / FIT_FILE
+            if keypoints is None and record_file.exists():
+                record = read_fit_record(record_file)
+        with stage("drawing the body"):
+            report = check_capture(capture, self.out)
+        tell(report)
+        wrote(self.out, "the body over the photos")
+        ok = report.ok
         if record is not None or keypoints is not None:
-            from humangs_jax.apps.fit_sheet import fit_sheet
-            from humangs_jax.fitting.examination import examine_record
+            with stage("examining the fit"):
+                from humangs_jax.apps.fit_sheet import fit_sheet
+                from humangs_jax.fitting.examination import examine_record
 
-            examination, keypoints = examine_record(capture, record, keypoints)
-            sheet = self.out.with_name(f"{self.out.stem}_fit{self.out.suffix}")
-            fit_sheet(capture, keypoints, examination, sheet)
-            print(f"\n{examination.report}\n{sheet}: the keypoints over the photos")
+                examination, keypoints = examine_record(capture, record, keypoints)
+                fit_sheet(capture, keypoints, examination, sheet)
+            tell(f"\n{examination.report}")
+            wrote(sheet, "the keypoints over the photos")
+            ok = ok and examination.report.ok
+        if ok:
+            suggest("humangs reconstruct", self.capture, "--out avatar.npz")

@@ -1,19 +1,84 @@
-"""Options that several commands share: checks, which raise an error of one line that names the option, and parsing."""
+"""Options that several commands share: checks, which raise an error of one line that names the option, and parsing.
 
+Where results go is checked before the work begins, and before anything heavy is imported. One rule for all commands: a single
+file that exists is replaced, whole, once the work is done; an .npz by its own kind only, and none that the command reads. The
+folder of a capture or of a fit to a scan is replaced with --overwrite only; `demo`, `render`, `synth`, `train` add to theirs.
+"""
+
+import math
 import re
+import tempfile
+import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+LARGEST_IMAGE = 8192
+"""Pixels along a side of what is drawn: an image of this size takes a gigabyte while it is drawn."""
 
-def require_parent(path: Path, option: str = "--out") -> None:
-    """A file can be written: its folder exists and is no read-only one, it is no folder itself. Raises: OSError."""
-    from humangs_jax.io.atomic import check_writable
 
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{option} {path}: the folder {path.parent} does not exist")
+class UsageError(ValueError):
+    """A command line that cannot be meant; the exit code is 2. The message names the option."""
+
+
+def require_parent(path: Path, option: str = "--out", inputs: Iterable[Path | None] = ()) -> None:
+    """A file can be written to that path. inputs: files that the command reads (None is left out). Raises: UsageError."""
     if path.is_dir():
-        raise IsADirectoryError(f"{option} {path}: is a folder: expected the name of a file")
-    check_writable(path)
+        raise UsageError(f"{option} {path}: is a folder: expected the name of a file")
+    if not path.parent.is_dir():
+        wrong = "is no folder" if path.parent.exists() else "does not exist"
+        raise UsageError(f"{option} {path}: the folder {path.parent} {wrong}")
+    if path.exists() and not path.is_file():
+        raise UsageError(f"{option} {path}: is no regular file: expected the name of a file")
+    for each in inputs:
+        if each is not None and path.exists() and each.exists() and path.samefile(each):
+            raise UsageError(f"{option} {path}: is read by this command: expected another name")
+    _require_writable(path.parent, f"{option} {path}")
+
+
+def require_avatar(path: Path, option: str = "--out", inputs: Iterable[Path | None] = ()) -> None:
+    """An avatar can be written to that path: a .npz, which replaces an avatar only. Raises: UsageError."""
+    require_suffix(path, (".npz",), option)
+    require_parent(path, option, inputs)
+    if path.exists():
+        try:
+            with zipfile.ZipFile(path) as archive:
+                mine = {"header.npy", "skinning_weights.npy"} <= set(archive.namelist())
+        except (zipfile.BadZipFile, OSError):
+            mine = False
+        if not mine:
+            raise UsageError(f"{option} {path}: exists and is no avatar: expected another name")
+
+
+def require_folder(path: Path, option: str = "--out") -> None:
+    """Files can be written into that folder, which is made if it does not exist. Raises: UsageError."""
+    if path.exists() and not path.is_dir():
+        raise UsageError(f"{option} {path}: is a file: expected the name of a folder")
+    above = next((parent for parent in (path, *path.absolute().parents) if parent.exists()), Path("/"))
+    if not above.is_dir():
+        raise UsageError(f"{option} {path}: {above} is no folder")
+    _require_writable(above, f"{option} {path}")
+
+
+def require_replaceable(
+    folder: Path, overwrite: bool, mark: str, inputs: Iterable[Path | None] = (), option: str = "--out"
+) -> None:
+    """A folder of the kind that holds the file `mark` can be made there, or replaced with --overwrite. Raises: UsageError."""
+    from humangs_jax.io.atomic import check_replaceable
+
+    require_folder(folder, option)
+    try:
+        check_replaceable(folder, overwrite, mark, inputs)
+    except ValueError as error:
+        raise UsageError(f"{option} {error}") from error
+
+
+def _require_writable(folder, named):
+    """Tried, because permissions do not tell of full, read-only and network disks."""
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise UsageError(f"{named}: cannot write to {folder}: {error.strerror or error}") from error
 
 
 def tell_deleted(folder: Path, unless: Path | None = None) -> None:
@@ -25,23 +90,30 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
 
 
 def require_suffix(path: Path, suffixes: tuple[str, ...], option: str = "--out") -> None:
-    """The name of a file ends as its format requires. Raises: ValueError."""
+    """The name of a file ends as its format requires. Raises: UsageError."""
     if path.suffix.lower() not in suffixes:
-        raise ValueError(f"{option} {path}: expected a name ending in {' or '.join(suffixes)}")
+        raise UsageError(f"{option} {path}: expected a name ending in {' or '.join(suffixes)}")
 
 
-def require_at_least(least: int, **values: float | int) -> None:
-    """Numbers by the name of their option are not too small. Raises: ValueError."""
+def require_at_least(least: float | int, **values: float | int | None) -> None:
+    """Numbers by the name of their option are not too small; None is no number. Raises: UsageError."""
+    require_between(least, math.inf, **values)
+
+
+def require_between(least: float | int, most: float | int, **values: float | int | None) -> None:
+    """Finite numbers by the name of their option are in [least, most]; None is no number. Raises: UsageError."""
     for name, value in values.items():
-        if not value >= least:
-            raise ValueError(f"--{name.replace('_', '-')} {value}: expected at least {least}")
+        if value is not None and not (least <= value <= most and math.isfinite(value)):
+            bounds = f"at least {least:g}" if most == math.inf else f"{least:g} to {most:g}"
+            bounds = "a finite number" if least == -math.inf else bounds
+            raise UsageError(f"--{name.replace('_', '-')} {value}: expected {bounds}")
 
 
-def refine_limits(text: str) -> dict[str, Any]:
-    """Fields of `RefineConfig` for "15s", "15" (seconds) or "100steps". Raises: ValueError."""
+def refine_limits(text: str, option: str) -> dict[str, Any]:
+    """Fields of `RefineConfig` for "15s", "15" (seconds) or "100steps". Raises: UsageError."""
     match = re.fullmatch(r"(?P<number>\d+(\.\d*)?)(?P<unit>s|steps)?", text.strip())
     number = float(match["number"]) if match else 0.0
     in_steps = match is not None and match["unit"] == "steps"
     if not number > 0 or (in_steps and number != int(number)):
-        raise ValueError(f'{text!r}: expected how long to refine, as in "15s" or "100steps"')
+        raise UsageError(f'{option} {text!r}: expected how long to refine, as in "15s" or "100steps"')
     return {"steps": int(number), "seconds": None} if in_steps else {"steps": None, "seconds": number}

@@ -6,7 +6,8 @@ from typing import Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from humangs_jax.cli.options import require_at_least, require_parent, require_suffix
+from humangs_jax.cli.options import UsageError, require_at_least, require_folder, require_parent, require_suffix
+from humangs_jax.cli.screen import stage, suggest, tell, wrote
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +64,8 @@ class Train:
     validation: Path | None = None
     """Folder of capture folders of other people, evaluated now and then."""
     steps: int | None = None
-    """Length of the run. Default: that of the configuration."""
+    """Length of the run. Default: that of the configuration. More than a finished run has: it goes on, with the learning rate of
+    the longer run."""
     init_weights: Path | None = None
     """Start from these weights, and their network, instead of random ones."""
     fsdp: int | None = None
@@ -74,40 +76,54 @@ class Train:
 
     def run(self) -> None:
         require_at_least(0, on_the_fly=self.on_the_fly)
-        self.processes.join()  # before anything asks for devices
-        from humangs_jax.body.library import load_body
-        from humangs_jax.data.capture import DEFAULT_BODY
-        from humangs_jax.network.weights import load_weights
-        from humangs_jax.objectives.loss_networks import load_loss_networks
-        from humangs_jax.people.manifest import find_people
-        from humangs_jax.rendering.splat_config import drawn_as
-        from humangs_jax.training.config import fitting_losses, read_config
-        from humangs_jax.training.diagnose import diagnose_run
-        from humangs_jax.training.loop import train
-        from humangs_jax.training.sources import training_people
+        require_at_least(1, steps=self.steps, fsdp=self.fsdp)
+        require_folder(self.out)
+        if self.data is None and not self.on_the_fly:
+            raise UsageError("nobody to train on: name a folder of captures, or give --on-the-fly a number of people")
+        with stage("starting"):
+            self.processes.join()  # before anything asks for devices
+            from humangs_jax.body.library import load_body
+            from humangs_jax.data.capture import DEFAULT_BODY
+            from humangs_jax.network.weights import load_weights
+            from humangs_jax.objectives.loss_networks import load_loss_networks
+            from humangs_jax.people.manifest import find_people
+            from humangs_jax.rendering.splat_config import drawn_as
+            from humangs_jax.training.config import fitting_losses, read_config
+            from humangs_jax.training.diagnose import diagnose_run
+            from humangs_jax.training.loop import train
+            from humangs_jax.training.sources import training_people
 
-        files = self.networks
-        networks = load_loss_networks(files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net)
-        settings = fitting_losses(read_config(self.config), networks)
-        if self.steps is not None:
-            settings = dataclasses.replace(settings, steps=self.steps)
-        variables = None
-        if self.init_weights is not None:
-            variables, model = load_weights(self.init_weights)
-            model = dataclasses.replace(model, execution=settings.model.execution)
-            settings = dataclasses.replace(
-                settings, model=model, splat=drawn_as(settings.splat, model.conventions.rendering)
-            )
-        body = load_body(self.body)
-        body_file = DEFAULT_BODY if self.body is None else self.body
-        people = training_people(self.data, self.on_the_fly, self.out, body, body_file)
+            files = self.networks
+            networks = load_loss_networks(files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net)
+            settings = fitting_losses(read_config(self.config), networks)
+            if self.steps is not None:
+                settings = dataclasses.replace(settings, steps=self.steps)
+            variables = None
+            if self.init_weights is not None:
+                variables, model = load_weights(self.init_weights)
+                model = dataclasses.replace(model, execution=settings.model.execution)
+                drawn = drawn_as(settings.splat, model.conventions.rendering)
+                settings = dataclasses.replace(settings, model=model, splat=drawn)
+            body = load_body(self.body)
+        with stage("finding people"):
+            body_file = DEFAULT_BODY if self.body is None else self.body
+            people = training_people(self.data, self.on_the_fly, self.out, body, body_file)
+            others = find_people(self.validation, None) if self.validation is not None else ()
         if self.diagnose:
-            print(diagnose_run(self.out, body, people, networks=networks, variables=variables))
+            with stage("diagnosing"):
+                diagnosis = diagnose_run(self.out, body, people, networks=networks, variables=variables)
+            tell(diagnosis)
             return
-        others = find_people(self.validation, None) if self.validation is not None else ()
-        train(
-            settings, body, people, self.out, validation=others, variables=variables, networks=networks, fsdp=self.fsdp
-        )
+        fsdp = self.fsdp
+        with stage("training"):
+            state = train(
+                settings, body, people, self.out, validation=others, variables=variables, networks=networks, fsdp=fsdp
+            )
+        done = None if state is None else int(state.step)
+        wrote(self.out, f"{done} of {settings.steps} steps; weights.safetensors, log.jsonl")
+        if done is not None and done < settings.steps:  # Ctrl-C: all is saved, the same command goes on
+            raise KeyboardInterrupt
+        suggest("humangs reconstruct CAPTURE --weights", self.out / "weights.safetensors")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -131,29 +147,36 @@ class Convert:
     """Type of the stored numbers; float16 halves the file."""
 
     def run(self) -> None:
-        from safetensors.numpy import save
-
-        from humangs_jax.io.atomic import write_bytes
-        from humangs_jax.network.conversion import LOSS_PREFIX, describe, load_checkpoint
-        from humangs_jax.network.weights import save_weights
-        from humangs_jax.objectives.loss_networks import collect_loss_networks
-
         out, losses, checkpoint = self.out, self.losses, self.checkpoint
         for option, path in (("--out", out), ("--losses", losses)):
             if path is None:
                 continue
-            require_parent(path, option)
             require_suffix(path, (".safetensors",), option)
             if path.exists() and checkpoint.exists() and path.samefile(checkpoint):
-                raise ValueError(f"{option} {path} is the checkpoint itself")
+                raise UsageError(f"{option} {path} is the checkpoint itself")
+            require_parent(path, option)
         if losses is not None and losses.resolve() == out.resolve():
-            raise ValueError(f"--losses {losses}: the same file as --out")
-        networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)
-        converted = load_checkpoint(checkpoint, self.head_width)
-        save_weights(out, converted.variables, converted.config.with_conventions(pool=self.pool), self.dtype)
-        print(f"{out}: {describe(converted)}")
+            raise UsageError(f"--losses {losses}: the same file as --out")
+        if not checkpoint.exists():
+            raise FileNotFoundError(f"{checkpoint}: no such file")
+        with stage("starting"):
+            from safetensors.numpy import save
+
+            from humangs_jax.io.atomic import write_bytes
+            from humangs_jax.network.conversion import LOSS_PREFIX, describe, load_checkpoint
+            from humangs_jax.network.weights import save_weights
+            from humangs_jax.objectives.loss_networks import collect_loss_networks
+
+        with stage("reading"):
+            networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)
+            converted = load_checkpoint(checkpoint, self.head_width)
+        with stage("writing"):
+            save_weights(out, converted.variables, converted.config.with_conventions(pool=self.pool), self.dtype)
+            if losses is not None:
+                write_bytes(losses, save(networks))
+        wrote(out, describe(converted))
         if losses is None:
-            print(f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*); --losses keeps them")
+            tell(f"skipped {converted.skipped} tensors of the loss networks ({LOSS_PREFIX}*); --losses keeps them")
         else:
-            write_bytes(losses, save(networks))
-            print(f"{losses}: {' and '.join(names)}")
+            wrote(losses, " and ".join(names))
+        suggest("humangs reconstruct CAPTURE --weights", out)

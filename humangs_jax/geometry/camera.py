@@ -34,16 +34,22 @@ class Camera(Batchable):
 
     @classmethod
     def from_opencv(cls, K: object, cam_from_world: object, width: int, height: int) -> "Camera":
-        """A camera from array-likes (3, 3) and (4, 4), checked.
+        """A camera from array-likes (3, 3) and (4, 4), checked. Under `jit`, `vmap` and `grad` only shapes are.
 
         Raises: ValueError if a shape is wrong, a number not finite, a focal length not positive, the rotation not
         orthonormal and right-handed (to 1e-3), or the image empty.
         """
-        K, cam_from_world = np.asarray(K, np.float32), np.asarray(cam_from_world, np.float32)
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((K, cam_from_world)))
+        array = jnp.asarray if traced else np.asarray
+        K, cam_from_world = array(K, jnp.float32), array(cam_from_world, jnp.float32)
         if K.shape != (3, 3):
             raise ValueError(f"K: expected shape (3, 3), got {K.shape}")
         if cam_from_world.shape != (4, 4):
             raise ValueError(f"cam_from_world: expected shape (4, 4), got {cam_from_world.shape}")
+        if width < 1 or height < 1:
+            raise ValueError(f"width and height must be at least 1, got {width} x {height}")
+        if traced:
+            return cls(jnp.asarray(K), jnp.asarray(cam_from_world), int(width), int(height))
         if not (np.isfinite(K).all() and np.isfinite(cam_from_world).all()):
             raise ValueError("K and cam_from_world must be finite numbers")
         if not (K[0, 0] > 0 and K[1, 1] > 0):
@@ -57,8 +63,6 @@ class Camera(Batchable):
             )
         if not np.allclose(cam_from_world[3], [0, 0, 0, 1]):
             raise ValueError(f"cam_from_world: the last row must be 0 0 0 1, got {cam_from_world[3].tolist()}")
-        if width < 1 or height < 1:
-            raise ValueError(f"width and height must be at least 1, got {width} x {height}")
         return cls(jnp.asarray(K), jnp.asarray(cam_from_world), int(width), int(height))
 
     @property

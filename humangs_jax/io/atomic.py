@@ -11,6 +11,8 @@ import os
 import platform
 import re
 import shutil
+import signal
+import threading
 import time
 import uuid
 import zlib
@@ -180,14 +182,15 @@ def add_files(
         with _naming(folder, temporary):
             temporary.mkdir()
             write(temporary)
-            folder.mkdir(exist_ok=True)
-            with _locked(folder, wait=True):
-                for file in without:
-                    (folder / file).unlink(missing_ok=True)
-                for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
-                    target = folder / file.relative_to(temporary)
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    file.replace(target)
+            with _undisturbed():
+                folder.mkdir(exist_ok=True)
+                with _locked(folder, wait=True):
+                    for file in without:
+                        (folder / file).unlink(missing_ok=True)
+                    for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
+                        target = folder / file.relative_to(temporary)
+                        target.parent.mkdir(parents=True, exist_ok=True)
+                        file.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
@@ -253,6 +256,22 @@ def check_writable(path: str | os.PathLike) -> None:
         raise NotADirectoryError(f"{path}: cannot be made: {above} is no folder")
     if not os.access(above if above.is_dir() else above.parent, os.W_OK | os.X_OK):
         raise PermissionError(f"{path}: cannot be written: {above} is read-only or belongs to somebody else")
+
+
+@contextlib.contextmanager
+def _undisturbed():
+    """Ctrl-C waits until the block is over."""
+    if threading.current_thread() is not threading.main_thread():  # only that one gets it
+        yield
+        return
+    waiting = []
+    previous = signal.signal(signal.SIGINT, lambda *arguments: waiting.append(arguments))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+        if waiting and callable(previous):
+            previous(*waiting[0])
 
 
 def _tag():

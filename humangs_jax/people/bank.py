@@ -16,6 +16,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
+from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.core.workers import end_with_parent
 from humangs_jax.io.arrays import check_array, check_indices, check_joints
@@ -105,16 +106,14 @@ def build_bank(
     if not seeds:
         raise ValueError("no seeds")
     _check_range(seeds, split)
-    from tqdm import tqdm
-
     make = functools.partial(_person, texture_size=texture_size, pose_count=pose_count)
-    bar = functools.partial(tqdm, total=len(seeds), desc="bank", disable=not progress)
+    shown = functools.partial(bar, total=len(seeds), desc="bank", shown=progress)
     if processes == 1:
-        people = list(bar(make(seed, body) for seed in seeds))
+        people = list(shown(make(seed, body) for seed in seeds))
     else:
         context = multiprocessing.get_context("spawn")  # a forked process may hang in jax's threads
         with concurrent.futures.ProcessPoolExecutor(processes, context, end_with_parent) as pool:
-            people = list(bar(pool.map(make, seeds)))
+            people = list(shown(pool.map(make, seeds)))
     return _stacked(people, body, split)
 
 

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.workers import end_with_parent
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.motion import Motion, save_motion
@@ -195,8 +196,6 @@ def write_set(
     Returns the folders. Raises: ValueError if the people reach beyond the split, `out` was written with other settings or by
     another version of the generator, or (at the end, the others being written) some could not be made.
     """
-    from tqdm import tqdm
-
     out, seeds, settings = Path(out), seeds_of(split, first, subjects), dataclasses.asdict(layout)
     begin_set(out, split, settings)
     folders = {seed: out / f"{seed:07d}" for seed in seeds}
@@ -204,7 +203,7 @@ def write_set(
     failed: dict[int, Exception] = {}
     written = time.monotonic()
     try:
-        with tqdm(total=subjects, initial=subjects - len(missing), desc="people", disable=not progress) as bar:
+        with progress_bar(total=subjects, initial=subjects - len(missing), desc="people", shown=progress) as bar:
             for seed, error in _make(missing, folders, layout, body, workers):
                 if error is not None:
                     failed[seed] = error

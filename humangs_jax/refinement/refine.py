@@ -21,6 +21,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
+from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews
@@ -185,8 +186,6 @@ class _Run:
         self.order = _order(useful, config.views_per_step, np.random.default_rng(config.seed))
 
     def go(self, progress: bool, watch: Callable[[Avatar], None] | None) -> Refinement:
-        from tqdm import tqdm
-
         config, began = self.config, time.perf_counter()
         state = _compiled(start)(self.avatar, self.all, self.compiled_for, self.splat)
         before = self.loss(state, self.all)
@@ -196,7 +195,7 @@ class _Run:
             self.denser(state)
         compile_seconds = time.perf_counter() - began
         began, done, interrupted = time.perf_counter(), 0, False
-        bar = tqdm(total=100, desc="refine", unit="%", disable=not progress, bar_format="{l_bar}{bar}| {elapsed}")
+        bar = progress_bar(total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}")
         try:
             passed, checked, splits = 0.0, 0, list(SPLITS) if config.growth > 1 else []
             while passed < 1:

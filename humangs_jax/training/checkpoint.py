@@ -236,12 +236,16 @@ def _set_aside(steps: list[Path]) -> None:
 def save_config(out: str | Path, config: TrainConfig, write: bool = True) -> None:
     """Write out/config.json, or check the one that is there. write: only check otherwise.
 
+    A finished run may get more steps: it goes on, and its learning rate is then that of the longer run.
+
     Raises: ValueError, naming a field, if the folder belongs to a run of another configuration.
     """
     path = Path(out) / "config.json"
     if path.is_file():
         earlier, now = (_flat(json.loads(config_to_json(run))) for run in (load_config(out), config))
-        for name in sorted((earlier.keys() | now.keys()) - set(ADJUSTABLE)):
+        finished = (Path(out) / "checkpoints" / str(earlier["steps"])).is_dir()
+        longer = {"steps"} if finished and now["steps"] > earlier["steps"] else set()
+        for name in sorted((earlier.keys() | now.keys()) - set(ADJUSTABLE) - longer):
             if earlier.get(name) != now.get(name):
                 raise ValueError(
                     f"{path}: this run was started with {name} = {earlier.get(name)}, not {now.get(name)}: use another --out"

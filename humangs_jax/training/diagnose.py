@@ -17,6 +17,7 @@ import jax
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Key, PyTree, Scalar
+from humangs_jax.core.progress import bar, watched
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import gaussian_body
@@ -114,7 +115,7 @@ def diagnose_step(
     stored = [StageReport(name, leaves(tree)) for name, tree in parts.items() if jax.tree.leaves(tree)]
     keys = subject_keys(config.seed, state.step, len(batch.inputs.betas))
     found = []
-    for subject, key in enumerate(keys):
+    for subject, key in enumerate(bar(keys, desc="diagnose", unit="subject", shown=watched())):
         example = jax.tree.map(lambda x, i=subject: x[i], batch)
         loss, stages = observe_subject(state.params, state.batch_stats, body, example, key, config, networks)
         diagnosis = Diagnosis(
@@ -156,12 +157,16 @@ def diagnose_run(
         state = checkpoints.restore(state, before[-1])
     checkpoints.close()
     step = int(state.step)
-    for first, last in config.spans(step, step + 1 if failed is None else failed + 1):
+    steps = 1 if failed is None else failed + 1 - step
+    repeated = bar(total=steps - 1, desc="repeat", unit="step", shown=watched() and steps > 1)
+    for first, last in config.spans(step, step + steps):
         part, loader = config.at(first), stage_loader(make_source, config, first)
         for step, batch in loader.batches(first, last):
             if step + 1 < (last if failed is None else failed + 1):
                 state, _ = train_step(state, batch, body, part, networks)
+                repeated.update(1)
             else:
+                repeated.close()
                 return diagnose_step(state, batch, body, config, networks)
     raise AssertionError("the last of the steps is diagnosed")
 

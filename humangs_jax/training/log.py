@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from humangs_jax.core.progress import bar
 from humangs_jax.data.loader import Waiting
 from humangs_jax.io.atomic import write_text
 from humangs_jax.io.reading import Refused, reading
@@ -36,16 +37,8 @@ class RunLog:
     """
 
     def __init__(self, out: str | Path, step: int, total: int, recording: bool = True, progress: bool = True):
-        from tqdm import tqdm
-
-        self.bar = tqdm(
-            total=total,
-            initial=step,
-            disable=not (recording and progress),
-            unit="step",
-            dynamic_ncols=True,
-            smoothing=0.05,
-        )
+        shown = recording and progress
+        self.bar = bar(shown=shown, total=total, initial=step, unit="step", dynamic_ncols=True, smoothing=0.05)
         self._recording = recording
         self._lines = self._board = None
         self._previous = (step, time.perf_counter(), 0.0)

@@ -20,6 +20,7 @@ from pathlib import Path
 import jax
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.progress import stage
 from humangs_jax.data.loader import CaptureCache, Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import only_writer
@@ -113,7 +114,8 @@ def _train(config, body, training, out, leading, validation, variables, networks
                 if step == first and mesh is None:  # for nothing: once, and the arrays are at hand
                     for line in bad_samples(loader, step, batch):
                         log.event(step, "sample", line, samples=[line])
-                state, metrics = train_step(state, batch, body, part, networks, mesh)
+                with stage("compiling the step") if step == first else contextlib.nullcontext():
+                    state, metrics = train_step(state, batch, body, part, networks, mesh)
                 watch(done := step + 1, metrics, functools.partial(bad_samples, loader, step))
                 stop = stopping(done)
                 if done % config.log_every == 0 or done == end or stop:

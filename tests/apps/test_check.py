@@ -164,6 +164,22 @@ def test_mistakes_in_images_and_poses_are_named(tmp_path):
         assert sum(mistake in warning for warnings in named for warning in warnings) >= 2, (mistake, named)
 
 
+def test_mistakes_that_no_single_view_shows_are_named(tmp_path):
+    right, order = capture(), jnp.asarray([1, 0, 2])
+    seen = right.cameras
+    exchanged = replace(seen, K=seen.K[order], cam_from_world=seen.cam_from_world[order])
+    for changed, named in (
+        (
+            dataclasses.replace(right, cameras=exchanged),
+            "cameras are exchanged: the body would fit 000 by the camera of 001",
+        ),
+        (capture(rotations=np.full((1, 3, 3), 30.0)), "the poses seem to be in degrees: rotations up to 52"),
+    ):
+        report = check_capture(changed, tmp_path / "check.png")
+        assert not report.ok and named in report.warnings[0] and f"warning: {report.warnings[0]}" in str(report)
+        assert "no warnings" not in str(report)
+
+
 def test_warnings_tell_what_is_wrong(tmp_path):
     def warnings(**arrays):
         return " | ".join(check_capture(capture(**arrays), tmp_path / "check.png").views[0].warnings)

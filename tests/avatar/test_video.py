@@ -158,6 +158,21 @@ def test_gif_background_does_not_flicker(tmp_path):
     assert (still == still[:1]).all()
 
 
+@pytest.mark.parametrize("background", [1.0, 0.0, 0.37])
+def test_gif_background_is_exact(tmp_path, background):
+    """Median cut takes the mean of its boxes: white became 252 beside a person of many colours."""
+    from PIL import Image
+
+    frames = np.full((4, 48, 64, 3), background)
+    frames[:, 8:40, 16:48] = np.random.default_rng(0).uniform(0.3, 1.0, (4, 32, 32, 3))
+    write_video(tmp_path / "a.gif", frames, 24)
+    with Image.open(tmp_path / "a.gif") as image:
+        for i in range(4):
+            image.seek(i)
+            pixels = np.asarray(image.convert("RGB"))
+            assert (pixels[:8] == round(255 * background)).all() and (pixels[40:] == round(255 * background)).all()
+
+
 NAN = np.zeros((3, 4, 4, 3))
 NAN[1, 2, 2, 0] = np.nan
 

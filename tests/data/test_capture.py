@@ -118,6 +118,9 @@ def test_select_and_pose():
     assert some.view_count == 2 and some.frame_count == capture.frame_count == FRAMES
     np.testing.assert_array_equal(capture.pose(1).rotations, capture.poses.rotations[1])
     assert capture.pose(1).translation.shape == (3,)
+    for frame in (FRAMES, FRAMES + 3):  # JAX would take the last one
+        with pytest.raises(IndexError, match=f"index {frame} is out of range for a batch of {FRAMES}"):
+            capture.pose(frame)
 
 
 def test_alpha_is_the_mask_and_goes_onto_white(folder):

@@ -89,6 +89,29 @@ def test_several_people_are_refused(tmp_path):
         read(tmp_path / "k.json", people)
 
 
+@pytest.mark.parametrize(("count", "set_size"), [(16, 133), (5, 133), (17, 133), (16, 17)])
+def test_people_whose_hands_and_faces_were_not_found_are_people(tmp_path, count, set_size):
+    """16 points of the body are 12 % of COCO-WholeBody's: the more confident of two such people was taken in silence."""
+    people = [entry(count=set_size, confidence=confidence) for confidence in (0.7, 0.9)]
+    for person in people:
+        person["keypoints"][3 * count + 2 :: 3] = [0.0] * (set_size - count)
+    with pytest.raises(CaptureError, match=r"k\.json: view front: 2 people: expected one"):
+        read(tmp_path / "k.json", people)
+    assert read(tmp_path / "k.json", people, person=0).confidences[0, 0] == np.float32(0.7)
+
+
+def test_openpose_people_without_hands_are_people(tmp_path):
+    body = np.stack([100.0 + np.arange(25), np.full(25, 50.0), np.full(25, 0.8)], axis=1)
+    person = {
+        "pose_keypoints_2d": body.reshape(-1).tolist(),
+        "hand_left_keypoints_2d": [],
+        "hand_right_keypoints_2d": [],
+    }
+    with pytest.raises(CaptureError, match=r"view front: 2 people: expected one"):
+        read(tmp_path / "front_keypoints.json", {"people": [person, person]})
+    assert read(tmp_path / "front_keypoints.json", {"people": [person]}).missing == ("back",)
+
+
 def test_people_of_other_images_do_not_matter(tmp_path):
     assert read(tmp_path / "k.json", [entry(), entry("x"), entry("x", shift=9)]).missing == ("back",)
 

@@ -61,6 +61,20 @@ def test_gradients_reach_the_pose_and_the_intrinsics():
     assert np.abs(gradient.K).max() > 0 and np.abs(gradient.cam_from_world).max() > 0
 
 
+def test_from_opencv_is_traced_and_differentiated():
+    def depth(K, matrix):
+        return cameras.project(Camera.from_opencv(K, matrix, 32, 24), jnp.asarray([0.2, 1.0, 2.0]))[0].sum()
+
+    K32, matrix = jnp.asarray(K, jnp.float32), jnp.eye(4)
+    value, (by_K, by_matrix) = jax.jit(jax.value_and_grad(depth, argnums=(0, 1)))(K32, matrix)
+    np.testing.assert_allclose(value, depth(K32, matrix), rtol=1e-6)
+    np.testing.assert_allclose(by_K[0, 0], 0.2 / 2, rtol=1e-6)
+    assert np.abs(by_matrix[:3, 3]).max() > 1
+    assert jax.vmap(lambda K: Camera.from_opencv(K, matrix, 32, 24))(jnp.stack([K32] * 3)).K.shape == (3, 3, 3)
+    with pytest.raises(ValueError, match=r"K: expected shape \(3, 3\)"):
+        jax.jit(lambda K: Camera.from_opencv(K, matrix, 32, 24).K)(jnp.eye(4))
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -10,7 +10,7 @@ import pytest
 from training_cases import without_upsampler
 
 from humangs_jax.io.reading import FileError
-from humangs_jax.training.checkpoint import Checkpoints, _checksum, save_config
+from humangs_jax.training.checkpoint import Checkpoints, _checksum, load_config, save_config
 from humangs_jax.training.config import tiny
 from humangs_jax.training.optimizer import OptimizerConfig, make_optimizer
 from humangs_jax.training.state import TrainState
@@ -178,6 +178,15 @@ def test_a_folder_belongs_to_one_configuration(tmp_path):
     save_config(tmp_path, dataclasses.replace(tiny(), log_every=7))
     with pytest.raises(ValueError, match=r"started with steps = 60, not 5"):
         save_config(tmp_path, dataclasses.replace(tiny(), steps=5))
+    with pytest.raises(
+        ValueError, match="steps = 60, not 90"
+    ):  # not finished: its learning rate would change on the way
+        save_config(tmp_path, dataclasses.replace(tiny(), steps=90))
+    (tmp_path / "checkpoints" / "60").mkdir(parents=True)
+    with pytest.raises(ValueError, match="steps = 60, not 5"):
+        save_config(tmp_path, dataclasses.replace(tiny(), steps=5))
+    save_config(tmp_path, dataclasses.replace(tiny(), steps=90))
+    assert load_config(tmp_path).steps == 90
     other = dataclasses.replace(tiny(), loss=dataclasses.replace(tiny().loss, structural=9.0))
     with pytest.raises(ValueError, match=r"loss\.structural = "):
         save_config(tmp_path, other)

@@ -49,6 +49,14 @@ def test_a_finished_run_stays_as_it_is(body, captures, variables, whole, same):
     assert len(lines(whole[1])) == before
 
 
+@pytest.mark.slow
+def test_a_finished_run_goes_on_when_it_gets_more_steps(body, captures, variables, tmp_path):
+    options = {"variables": variables, "progress": False}
+    assert int(train(dataclasses.replace(CONFIG, steps=2), body, captures[:2], tmp_path, **options).step) == 2
+    assert int(train(dataclasses.replace(CONFIG, steps=3), body, captures[:2], tmp_path, **options).step) == 3
+    assert [line["step"] for line in lines(tmp_path) if "loss" in line] == [1, 2, 3]
+
+
 def test_what_a_run_leaves_behind(whole):
     state, out = whole
     validations = [line for line in lines(out) if "val_psnr" in line]

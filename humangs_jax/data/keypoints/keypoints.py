@@ -14,6 +14,9 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.keypoints.sets import KeypointSet
 from humangs_jax.io.npz import write_npz
 
+LISTED = 5
+"""Names of views in a warning, at most."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Keypoints:
@@ -35,6 +38,25 @@ class Keypoints:
     not_finite: int = 0
     far_outside: int = 0
     shifted: str = ""
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Problems of a keypoint file that could be read, a line each."""
+        found = []
+        if self.missing:
+            names = ", ".join(self.missing[:LISTED]) + (" ..." if len(self.missing) > LISTED else "")
+            found.append(f"no keypoints of {len(self.missing)} views: {names}")
+        if self.shifted:
+            found.append(
+                f"frames and photos are counted from different numbers and were matched in order: {self.shifted}"
+            )
+        if self.not_finite:
+            found.append(f"{self.not_finite} keypoints are not finite numbers and are ignored")
+        if self.far_outside:
+            found.append(
+                f"{self.far_outside} keypoints lie far outside of their photo and are ignored: of photos of another size?"
+            )
+        return tuple(found)
 
 
 def save_keypoints(path: str | Path, keypoints: Keypoints, names: Sequence[str]) -> None:

@@ -12,7 +12,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.formats import DetectedImage, Detections, read_detections
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.keypoints.sets import KeypointSet
+from humangs_jax.data.keypoints.sets import COCO_17, KeypointSet
 from humangs_jax.io.reading import reading
 
 NORMALIZED = 2.0
@@ -21,7 +21,10 @@ LARGEST_CONFIDENCE = 2.0
 """Heat maps overshoot 1 a little (1.02 is common) and undershoot 0; what is beyond 2 or -1 is on another scale."""
 SMALLEST_CONFIDENCE = -1.0
 CLEAR_CONFIDENCE, CLEAR_SHARE = 0.3, 0.25
-"""A detection of more than this mean confidence and share of the points is a person, others are a detector's ghosts."""
+"""A detection of more than this mean confidence and share of the points of `TRUNK_AND_LIMBS` is a person, others are a detector's
+ghosts. Hands, face and feet do not count: detectors leave them out where they are small, or were not asked for them.
+"""
+TRUNK_AND_LIMBS = frozenset(COCO_17.names)
 FAR_OUTSIDE = 0.5
 """Detectors extrapolate a little beyond the image. Points further out than this share of its size mean nothing."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
@@ -66,7 +69,7 @@ def _read(path, names, width, height, person):
         raise CaptureError(path, "", "nobody in any of its images: expected one person")
     images = _images_of_views(path, detections, names, width, height)
     people = [
-        None if image is None else _chosen_person(image, name, person, detections.offset, width, height)
+        None if image is None else _chosen_person(image, name, person, detections, width, height)
         for image, name in zip(images, names, strict=True)
     ]
     if person is not None and not any(people):
@@ -148,17 +151,19 @@ def _check_pixels(path: Path, keypoints: Keypoints) -> None:
 
 
 def _chosen_person(
-    image: DetectedImage, view: str, person: int | None, offset: float, width: int, height: int
+    image: DetectedImage, view: str, person: int | None, detections: Detections, width: int, height: int
 ) -> Person | None:
     """The one person of a view, or the one asked for by number; None if there is none.
 
     Raises: CaptureError if there are several and no number was given, or if confidences are not in [0, 1].
     """
     field = f"view {view}"
-    people = [_usable(each, offset, width, height, image, field) for each in image.people]
+    people = [_usable(each, detections.offset, width, height, image, field) for each in image.people]
     if person is not None:
         return people[person] if person < len(people) else None
-    clear = sum(_is_clear(each.confidences) for each in people)
+    assert detections.set is not None  # `_read` has checked it
+    body = np.asarray([name in TRUNK_AND_LIMBS for name in detections.set.names])
+    clear = sum(_is_clear(each.confidences[body]) for each in people)
     if clear > 1:
         raise CaptureError(
             image.file,

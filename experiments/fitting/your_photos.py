@@ -1,0 +1,143 @@
+"""The figures of docs/your_photos.md: a folder as a photographer has it, made of a synthetic person, and what comes of it.
+
+    python experiments/fitting/your_photos.py --out OUT --docs
+
+OUT/photos is the folder: images in a room, calibration.json of OpenCV, masks, keypoints as MMPose writes them (with 2 pixels of
+noise). `humangs start` makes OUT/me of it. About two minutes, most of them compilation.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+import numpy as np
+
+IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
+SEED, VIEWS, SIZE, NOISE = 4_000_002, 4, 512, 2.0
+OPENCV_FROM_Y_UP = np.diag([1.0, -1.0, -1.0, 1.0])
+WIDTH = 1200
+"""Pixels of a figure."""
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, required=True, help="a new folder")
+    parser.add_argument("--docs", action="store_true", help="write the figures into docs/images")
+    arguments = parser.parse_args()
+    from humangs_jax import cli
+    from humangs_jax.body.library import load_body
+    from humangs_jax.data.capture import load_capture
+    from humangs_jax.people.writer import write_subject
+
+    arguments.out.mkdir(parents=True)
+    write_subject(arguments.out / "truth", SEED, body=load_body(), image_size=SIZE, input_views=VIEWS)
+    truth, photos, me = load_capture(arguments.out / "truth"), arguments.out / "photos", arguments.out / "me"
+    points = landmarks_in(truth)
+    points = points + np.random.default_rng(0).normal(0, NOISE, points.shape)
+    write_material(photos, truth, points)
+    code = cli.execute(["start", str(photos), "--out", str(me), "--refine", "15s", "--no-browser"])
+    if code or not arguments.docs:
+        sys.exit(code)
+    draw_figures(arguments.out, points)
+
+
+def write_material(folder: Path, capture, points: np.ndarray) -> None:
+    """Photos, masks, calibration and keypoints (v, 133, 2) of a capture as other programs write them."""
+    from humangs_jax.io.images import write_png
+    from humangs_jax.io.text import write_json
+
+    for name in ("images", "masks", "keypoints"):
+        (folder / name).mkdir(parents=True)
+    calibration = {}
+    for i, name in enumerate(f"cam{i}" for i in range(capture.view_count)):
+        write_png(folder / "images" / f"{name}.png", in_a_room(capture.images[i], capture.masks[i]))
+        write_png(folder / "masks" / f"{name}.png", capture.masks[i])
+        K, matrix = np.array(capture.cameras.K[i], float), np.array(capture.cameras.cam_from_world[i], float)
+        K[:2, 2] -= 0.5  # OpenCV counts pixels, also in keypoints
+        matrix = matrix @ OPENCV_FROM_Y_UP
+        size = [capture.cameras.width, capture.cameras.height]
+        calibration[name] = {
+            "K": K.tolist(),
+            "R": matrix[:3, :3].tolist(),
+            "T": matrix[:3, 3].tolist(),
+            "imgSize": size,
+        }
+        known = np.isfinite(points[i]).all(-1)
+        person = {"keypoints": np.where(known[:, None], points[i] - 0.5, 0).tolist()}
+        person["keypoint_scores"] = np.where(known, 0.9, 0.0).tolist()
+        write_json(folder / "keypoints" / f"{name}.json", [person])
+    write_json(folder / "calibration.json", calibration)
+
+
+def landmarks_in(capture) -> np.ndarray:
+    """Where COCO-WholeBody's points are in each photo, (v, 133, 2) pixels; NaN for those that the body does not have."""
+    import jax.numpy as jnp
+
+    from humangs_jax.body.landmarks import landmark_model, pose_landmarks
+    from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
+
+    model, betas = landmark_model(capture.body, COCO_WHOLEBODY_133.names), jnp.asarray(capture.betas)
+    points = []
+    for i, frame in enumerate(capture.frames):
+        landmarks = np.asarray(pose_landmarks(model, betas, capture.pose(int(frame)))[0])
+        matrix, K = np.asarray(capture.cameras.cam_from_world[i]), np.asarray(capture.cameras.K[i])
+        seen = (landmarks @ matrix[:3, :3].T + matrix[:3, 3]) @ K.T
+        points.append(np.where(np.asarray(model.known)[:, None] > 0, seen[:, :2] / seen[:, 2:], np.nan))
+    return np.stack(points)
+
+
+def in_a_room(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """A person on white, in front of a wall and on a floor."""
+    height, width = mask.shape
+    y = np.linspace(0, 1, height)[:, None, None]
+    wall, floor = np.array([0.62, 0.66, 0.70]), np.array([0.45, 0.38, 0.32])
+    room = np.where(y < 0.78, wall * (1.05 - 0.25 * y), floor * (0.7 + 0.4 * y)) * np.ones((1, width, 1))
+    return image - (1 - mask[..., None]) * (1 - room)  # the edge's share of white becomes the room's
+
+
+def draw_figures(out: Path, points: np.ndarray) -> None:
+    """docs/images/your_photos_*.jpg."""
+    from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.avatar.frames import turntable_renderings
+    from humangs_jax.avatar.sheets import tile
+    from humangs_jax.io.images import read_image
+
+    read = lambda folder, i: read_image(out / "photos" / folder / f"cam{i}.png")[0]
+    photos, masks = (np.stack([read(folder, i) for i in range(VIEWS)]) for folder in ("images", "masks"))
+    marked = np.stack([with_points(photo, own) for photo, own in zip(photos, points, strict=True)])
+    rows = np.concatenate([photos, masks, marked])
+    labels = [f"{folder}/cam{i}" for folder in ("images", "masks", "keypoints") for i in range(VIEWS)]
+    save(tile(rows, labels=labels, columns=VIEWS), IMAGES / "your_photos_material.jpg")
+    save(read_image(out / "me" / "check.png")[0], IMAGES / "your_photos_check.jpg")
+    drawn = turntable_renderings(Avatar.load(out / "me" / "avatar.npz"), VIEWS, SIZE)[1]
+    save(
+        tile(np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in drawn]), columns=VIEWS),
+        IMAGES / "your_photos_avatar.jpg",
+    )
+
+
+def with_points(photo: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """A photo with a dot for each keypoint."""
+    from PIL import Image, ImageDraw
+
+    image = Image.fromarray((255 * photo).round().astype(np.uint8))
+    pen = ImageDraw.Draw(image)
+    for x, y in points[np.isfinite(points).all(-1)]:
+        pen.ellipse([x - 3, y - 3, x + 3, y + 3], fill=(230, 30, 120), outline=(255, 255, 255))
+    return np.asarray(image) / 255
+
+
+def save(image: np.ndarray, path: Path) -> None:
+    """A JPEG of at most `WIDTH` pixels."""
+    from PIL import Image
+
+    picture = Image.fromarray((255 * np.clip(image[..., :3], 0, 1)).round().astype(np.uint8))
+    picture.thumbnail((WIDTH, WIDTH), Image.Resampling.LANCZOS)
+    picture.save(path, quality=88)
+
+
+if __name__ == "__main__":
+    main()

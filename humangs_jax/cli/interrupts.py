@@ -1,0 +1,42 @@
+"""Ctrl-C while a program compiles or runs: Python hears of it only when that returns, which can be minutes later."""
+
+import os
+import signal
+import sys
+import threading
+import time
+
+INTERRUPTED = 130
+"""The exit code: 128 and the number of the signal, as in shells."""
+PATIENCE = 2.0
+"""Seconds that Python gets to hear of it and to tidy up; files are written by calls that are shorter."""
+
+
+def end_within_seconds() -> None:
+    """From now on Ctrl-C ends this process by a KeyboardInterrupt or, if that is not heard in time, at once.
+
+    For the console script. Where a command handles the signal itself, as training does to save its state, nothing is forced.
+    """
+    if sys.platform == "win32" or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        return  # there, wake-up descriptors are sockets; or somebody else handles it
+    heard = threading.Event()
+
+    def interrupt(number, frame):
+        heard.set()
+        signal.default_int_handler(number, frame)
+
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    signal.signal(signal.SIGINT, interrupt)
+    signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+
+    def watch():
+        while number := os.read(reader, 1):
+            if number[0] != signal.SIGINT or signal.getsignal(signal.SIGINT) is not interrupt:
+                continue
+            time.sleep(PATIENCE)
+            if not heard.is_set():
+                os.write(2, b"\nhumangs: interrupted\n")
+                os._exit(INTERRUPTED)
+
+    threading.Thread(target=watch, daemon=True).start()

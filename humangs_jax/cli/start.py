@@ -1,0 +1,152 @@
+"""`humangs start`: from a folder of photos to an avatar in the browser."""
+
+import dataclasses
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from tyro.conf import Positional
+
+from humangs_jax.cli.options import UsageError, refine_limits, require_at_least, require_replaceable, tell_deleted
+from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+
+if TYPE_CHECKING:
+    from humangs_jax.apps.start import Material
+    from humangs_jax.data.capture import Capture
+
+
+@dataclasses.dataclass(frozen=True)
+class Start:
+    """From a folder of photos to an avatar: looks what is there, names the tools that make what is missing, and does the rest.
+
+    With cameras, masks and keypoints beside the photos it imports, fits, checks and reconstructs, and opens the page. Run it
+    again when something was added. docs/your_photos.md shows the way.
+    """
+
+    photos: Positional[Path]
+    """Folder of the photos, or with a folder `images` in it; cameras, masks and keypoints are looked for in there."""
+    out: Path
+    """The capture folder to write, with avatar.npz, avatar.html and check.png in it."""
+    cameras: Path | None = None
+    """Calibration, if it is elsewhere; formats: docs/cameras.md."""
+    masks: Path | None = None
+    """Folder of the masks, if it is elsewhere."""
+    keypoints: Path | None = None
+    """Keypoint file or folder, if it is elsewhere; formats: docs/fitting.md."""
+    person: int | None = None
+    """Which person of the keypoint file, from 0, if a view has several."""
+    scale: float | None = None
+    """Metres per unit of the calibration. Default: 1."""
+    up: str | None = None
+    """Axis of the calibration's world that points up, like --up=+z or --up=-y. Default: the format's."""
+    without_masks: bool = False
+    """Do without masks: the photos have nothing but white behind the person."""
+    refine: str | None = None
+    """Fit the avatar to the photos for so long: seconds ("15s") or steps ("100steps"); see `humangs refine`. Needs masks."""
+    browser: bool = True
+    """Open the page at the end."""
+    overwrite: bool = False
+    """Replace a capture that has a body already."""
+
+    def run(self) -> None:
+        limits = None if self.refine is None else refine_limits(self.refine, "--refine")
+        require_at_least(0, person=self.person)
+        if limits is not None and self.without_masks:
+            raise UsageError("--refine needs masks: leave out --without-masks")
+        begun = not (self.out / "body.npz").exists()  # by an earlier run that missed something: nothing is lost
+        inputs = (self.photos, self.cameras, self.masks, self.keypoints)
+        require_replaceable(self.out, self.overwrite or begun, "capture.json", inputs)
+        with stage("starting"):
+            from humangs_jax.apps.start import look, missing
+
+        material = look(self.photos, cameras=self.cameras, masks=self.masks, keypoints=self.keypoints)
+        tell(material)
+        if self.overwrite:
+            tell_deleted(self.out)
+        undistorted = self._import(material) if material.cameras is not None else None
+        needed = [each for each in missing(material, undistorted) if not (self.without_masks and each.name == "masks")]
+        if needed:
+            tell("\nto be made:\n" + "\n".join(map(str, needed)))
+            suggest("humangs start", self.photos, "--out", self.out)
+            names = " and ".join(each.name for each in needed)
+            raise ValueError(f"{self.photos}: {names} missing: make them as above and run the same command again")
+        fitted = self._fit(material)
+        self._check(fitted)
+        self._reconstruct(fitted, limits)
+
+    def _import(self, material: "Material") -> Path | None:
+        """Photos and cameras as a capture folder; the folder of its photos if lens distortion was removed from them."""
+        with stage("importing photos and cameras"):
+            from humangs_jax.data.calibration.importing import import_cameras
+
+            assert material.cameras is not None
+            report = import_cameras(
+                material.cameras,
+                material.images,
+                self.out,
+                masks=material.masks,
+                scale=self.scale,
+                up=self.up,
+                overwrite=True,
+            )
+        tell(report)
+        if report.undistorted and material.keypoints is not None:
+            warn(f"lens distortion was removed: {material.keypoints} should be of the photos in {self.out / 'images'}")
+        return self.out / "images" if report.undistorted else None
+
+    def _fit(self, material: "Material") -> "Capture":
+        """The body, written into the capture folder."""
+        with stage("fitting the body"):
+            from humangs_jax.body.library import load_body
+            from humangs_jax.data.capture import load_capture
+            from humangs_jax.data.keypoints.reading import read_keypoints
+            from humangs_jax.data.photos import load_photos
+            from humangs_jax.fitting.files import write_fitted
+            from humangs_jax.fitting.fit_capture import fit_photos
+
+            assert material.keypoints is not None
+            photos = load_photos(self.out)
+            height, width = photos.images.shape[1:3]
+            keypoints = read_keypoints(material.keypoints, photos.names, width, height, person=self.person)
+            fitted = fit_photos(photos, keypoints, load_body())
+        with stage("examining the fit"):
+            report = fitted.report
+            report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
+            write_fitted(self.out, self.out, fitted.capture, report, fitted.record)
+        tell(f"\n{report}")
+        return load_capture(self.out)
+
+    def _check(self, capture: "Capture") -> None:
+        """The sheet of the body over the photos, and what it says."""
+        with stage("checking"):
+            from humangs_jax.apps.check import check_capture
+
+            report = check_capture(capture, self.out / "check.png")
+        tell(f"\n{report}")
+        wrote(self.out / "check.png", "the body over the photos: look at it")
+
+    def _reconstruct(self, capture: "Capture", limits: dict[str, Any] | None) -> None:
+        """Avatar and page."""
+        with stage("reconstructing"):
+            from humangs_jax.avatar.reconstruct import reconstruct
+            from humangs_jax.network.weights import load_weights
+            from humangs_jax.viewer.page import write_page
+
+            avatar = reconstruct(*load_weights(), capture)
+        if limits is not None:
+            with stage("refining"):
+                from humangs_jax.refinement.config import RefineConfig
+                from humangs_jax.refinement.refine import refine_with_report
+
+                refinement = refine_with_report(avatar, capture, RefineConfig(**limits), progress=True)
+                avatar = refinement.avatar
+            tell(refinement.summary())
+        with stage("writing the page"):
+            avatar.save(self.out / "avatar.npz")
+            page = self.out / "avatar.html"
+            write_page(page, avatar, title=self.photos.resolve().name)
+        wrote(self.out / "avatar.npz", f"{len(avatar.gaussians.means):,} Gaussians from {capture.view_count} photos")
+        wrote(page, "the avatar in a browser")
+        if self.browser:
+            webbrowser.open(page.resolve().as_uri())
+        suggest("humangs animate", self.out / "avatar.npz", "--motion FILE --out video.mp4")

@@ -1,0 +1,111 @@
+"""Stages of long work, and bars, for programs that show them.
+
+    with stage("reading the capture"):
+        ...
+    for view in bar(views, desc="render"):
+        ...
+
+The library opens stages where work takes long. Unless a program asked for it by `begin`, a stage shows and costs nothing. The
+seconds of the outermost stages are kept for whoever began; stages inside of them only change the line that is shown.
+"""
+
+import contextlib
+import dataclasses
+import sys
+import threading
+import time
+from collections.abc import Generator, Iterable
+from typing import Any
+
+TICK = 0.2
+"""Seconds between two updates of the line."""
+_CLEAR = "\r\033[K"
+
+
+@dataclasses.dataclass
+class Progress:
+    """What is shown, and what was measured.
+
+    ticking: a line on stderr counts the seconds of a stage while it runs. lines: each stage leaves a line there. bars: whether
+    bars are shown at all. seconds: of the finished outermost stages, by name. names: of the stages that run, paused: a bar has
+    the line.
+    """
+
+    ticking: bool = False
+    lines: bool = False
+    bars: bool = True
+    seconds: dict[str, float] = dataclasses.field(default_factory=dict)
+    names: list[str] = dataclasses.field(default_factory=list)
+    paused: bool = False
+
+
+_current = Progress()
+
+
+def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
+    """Show stages from now on; a terminal on stderr gets a line that counts seconds.
+
+    Arguments: quiet: show neither stages nor bars. lines: leave a line for each stage, wherever stderr goes.
+    """
+    global _current
+    _current = Progress(ticking=sys.stderr.isatty() and not quiet, lines=lines and not quiet, bars=not quiet)
+    return _current
+
+
+def end() -> None:
+    """Show nothing any more, as before `begin`."""
+    global _current
+    _current = Progress()
+
+
+@contextlib.contextmanager
+def stage(name: str) -> Generator[None]:
+    """A part of long work."""
+    current, paused = _current, _current.paused
+    current.names.append(name)
+    current.paused = False
+    started, stop = time.perf_counter(), threading.Event()
+    outermost = len(current.names) == 1
+    ticker = threading.Thread(target=_tick, args=(current, stop, started), daemon=True)
+    if outermost and current.ticking:
+        ticker.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        if ticker.is_alive():
+            ticker.join()
+        current.names.pop()
+        current.paused = paused
+        seconds = time.perf_counter() - started
+        if outermost:
+            current.seconds[name] = current.seconds.get(name, 0.0) + seconds
+            if current.ticking or current.lines:
+                clear = _CLEAR if current.ticking else ""
+                print(f"{clear}{name}: {seconds:.1f} s", file=sys.stderr, flush=True)
+
+
+def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, **how: Any) -> Any:
+    """A bar of tqdm, whose options `how` are. It takes the place of the line of the stage around it.
+
+    Arguments: shown: whether the caller of the library asked for bars; a program may still hide all of them.
+    """
+    from tqdm import tqdm
+
+    if shown and _current.bars and _current.ticking and _current.names:
+        _current.paused = True
+        sys.stderr.write(_CLEAR)
+    return tqdm(iterable, disable=not (shown and _current.bars), **how)
+
+
+def watched() -> bool:
+    """Whether a program shows stages on a terminal: then long loops without a bar of their own show one."""
+    return _current.ticking
+
+
+def _tick(current, stop, started):
+    while not stop.wait(TICK):
+        if not current.paused and current.names:
+            name = ": ".join(dict.fromkeys((current.names[0], current.names[-1])))
+            sys.stderr.write(f"{_CLEAR}{name} ... {time.perf_counter() - started:.0f} s")
+            sys.stderr.flush()

@@ -1,0 +1,164 @@
+"""`humangs start`: what a folder has, what is said to be missing, and the way to the page."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments.fitting.your_photos import landmarks_in, write_material
+from humangs_jax import cli
+from humangs_jax.apps.start import look, missing
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.photos import load_photos
+from humangs_jax.io.images import write_png
+
+NEEDED = ("cameras", "masks", "keypoints")
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory):
+    """Photos, calibration, masks and keypoints of the demo's person, as other programs write them."""
+    folder = tmp_path_factory.mktemp("mine") / "photos"
+    write_material(folder, load_capture("demo_capture"), np.full((4, 133, 2), 100.0))
+    return folder
+
+
+@pytest.fixture
+def mine(photos, tmp_path, monkeypatch):
+    """A copy that a test may change, in the working folder."""
+    shutil.copytree(photos, tmp_path / "photos")
+    monkeypatch.chdir(tmp_path)
+    return Path("photos")
+
+
+def test_everything_is_found(mine):
+    found = look(mine)
+    assert (found.images, found.photos, found.size) == (mine / "images", 4, (256, 256))
+    assert (found.cameras, found.masks, found.keypoints) == (mine, mine / "masks", mine / "keypoints")
+    assert missing(found) == () and str(found).count("\n") == 3
+
+
+def test_other_layouts_are_found(mine):
+    """Photos beside the rest, a folder for each camera, COLMAP's workspace, OpenPose's file of a name of its own."""
+    for path in (mine / "images").iterdir():
+        (mine / path.stem).mkdir()
+        path.rename(mine / path.stem / "000000.png")
+    (mine / "images").rmdir()
+    (mine / "colmap" / "sparse" / "0").mkdir(parents=True)
+    (mine / "calibration.json").unlink()
+    (mine / "colmap" / "sparse" / "0" / "images.txt").write_text("")
+    (mine / "keypoints").rename(mine / "my_keypoints")
+    (mine / "masks").rename(mine / "matte")
+    found = look(mine)
+    assert (found.images, found.photos, found.masks) == (mine, 4, mine / "matte")
+    assert (found.cameras, found.keypoints) == (mine / "colmap", mine / "my_keypoints")
+
+
+def test_alpha_is_a_mask(mine):
+    shutil.rmtree(mine / "masks")
+    for path in (mine / "images").iterdir():
+        write_png(path, np.concatenate([np.ones((256, 256, 3)), np.zeros((256, 256, 1))], axis=-1))
+    found = look(mine)
+    assert found.alpha and missing(found) == () and "in the photos' alpha channel" in str(found)
+
+
+@pytest.mark.parametrize("name", NEEDED)
+def test_what_is_missing_comes_with_its_tools(name, mine, capsys):
+    shutil.rmtree(mine / name, ignore_errors=True)
+    if name == "cameras":
+        (mine / "calibration.json").unlink()
+    code = cli.execute(["start", str(mine), "--out", "me"])
+    out, err = capsys.readouterr()
+    assert code == cli.BAD_DATA and err == (
+        f"humangs: error: photos: {name} missing: make them as above and run the same command again\n"
+    )
+    tools = {
+        "cameras": (
+            "colmap automatic_reconstructor --workspace_path photos/colmap --image_path photos/images",
+            "EasyMocap",
+        ),
+        "masks": ("rembg p -m u2net_human_seg -om photos/images photos/masks", "SAM 2"),
+        "keypoints": (
+            "inferencer_demo.py photos/images --pose2d wholebody --pred-out-dir photos/keypoints",
+            "openpose.bin",
+        ),
+    }
+    for other, lines in tools.items():
+        assert all((line in out) == (other == name) for line in lines), out
+    if name == "cameras":
+        assert not Path("me").exists()
+    else:  # what is there was imported
+        assert load_photos("me").images.shape == (4, 256, 256, 3) and not Path("me/body.npz").exists()
+
+
+def test_all_that_is_missing_is_told_at_once(mine, capsys):
+    for name in ("masks", "keypoints"):
+        shutil.rmtree(mine / name)
+    (mine / "calibration.json").unlink()
+    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
+    out, err = capsys.readouterr()
+    assert "cameras and masks and keypoints missing" in err and [
+        line for line in out.splitlines() if line.endswith("missing")
+    ]
+    assert list(Path().iterdir()) == [mine]
+
+
+def test_keypoints_have_to_be_of_photos_without_lens_distortion(mine, capsys):
+    shutil.rmtree(mine / "keypoints")
+    calibration = json.loads((mine / "calibration.json").read_text())
+    for camera in calibration.values():
+        camera["dist"] = [0.1, 0, 0, 0, 0]
+    (mine / "calibration.json").write_text(json.dumps(calibration))
+    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
+    assert "inferencer_demo.py me/images --pose2d" in capsys.readouterr().out
+
+
+def test_folders_without_photos_and_captures_are_refused(mine, tmp_path):
+    Path("empty").mkdir()
+    for folder, problem in (
+        (Path("empty"), "empty: no photo: expected"),
+        (Path("nowhere"), "nowhere: no such folder"),
+        (mine / "calibration.json", "is a file: expected a folder of photos"),
+    ):
+        with pytest.raises(CaptureError, match=problem):
+            look(folder)
+    (mine / "capture.json").write_text("{}")
+    with pytest.raises(CaptureError, match="is a capture already"):
+        look(mine)
+    (mine / "capture.json").unlink()
+    with pytest.raises(CaptureError, match=r"none\.json: no such file or folder"):
+        look(mine, keypoints=Path("none.json"))
+
+
+def test_a_body_that_is_there_is_not_replaced(mine, capsys):
+    Path("me").mkdir()
+    for name in ("capture.json", "body.npz"):
+        Path("me", name).write_text("mine")
+    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_USAGE
+    assert "--out me: the folder is not empty" in capsys.readouterr().err
+    assert Path("me/body.npz").read_text() == "mine"
+
+
+@pytest.mark.slow
+def test_from_photos_to_the_page(mine, capsys, monkeypatch):
+    import webbrowser
+
+    shutil.rmtree(mine)
+    write_material(mine, truth := load_capture("demo_capture"), landmarks_in(truth))
+    opened = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    assert cli.execute(["start", str(mine), "--out", "me"]) == 0, capsys.readouterr().err
+    out, _ = capsys.readouterr()
+    assert "keypoints, median error" in out and "silhouette IoU" in out and "next: humangs animate me/avatar.npz" in out
+    assert opened == [(Path("me").resolve() / "avatar.html").as_uri()]
+    assert len(Avatar.load("me/avatar.npz").gaussians.means) > 10_000
+    fitted = load_capture("me")
+    # the world of the calibration, OpenCV's, was turned back to y up
+    np.testing.assert_allclose(fitted.cameras.cam_from_world, truth.cameras.cam_from_world, atol=1e-4)
+    error = np.linalg.norm(np.asarray(fitted.pose(0).translation) - np.asarray(truth.pose(0).translation))
+    assert error < 0.05
+    assert {path.name for path in Path("me").iterdir()} >= {"check.png", "avatar.html", "fit.json", "body.npz"}
