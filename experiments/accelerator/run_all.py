@@ -269,13 +269,14 @@ def frames(arguments: argparse.Namespace) -> Iterator[Measurement]:
     def animation():
         from humangs_jax.avatar.frames import motion_frames
         from humangs_jax.avatar.reconstruct import reconstruct
+        from humangs_jax.avatar.shot import Shot
         from humangs_jax.data.capture import load_capture
         from humangs_jax.data.motion import load_motion
         from humangs_jax.network.weights import load_weights
 
         avatar, motion = reconstruct(*load_weights(), load_capture("demo_capture")), load_motion(None)
         count = len(motion.translations)
-        draw = {"all": lambda: sum(1 for _ in motion_frames(avatar, motion, size, progress=False))}
+        draw = {"all": lambda: sum(1 for _ in motion_frames(avatar, motion, Shot(size=size), progress=False))}
         return {"frames a second": 1e3 * count / float(medians(draw, 1 if arguments.tiny else 3)["all"][0])}
 
     def on_the_fly(batch):

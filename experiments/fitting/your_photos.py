@@ -101,8 +101,9 @@ def in_a_room(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
 def draw_figures(out: Path, points: np.ndarray) -> None:
     """docs/images/your_photos_*.jpg."""
     from humangs_jax.avatar.avatar import Avatar
-    from humangs_jax.avatar.frames import turntable_renderings
+    from humangs_jax.avatar.frames import images, rest_pose_of, turntable_views
     from humangs_jax.avatar.sheets import tile
+    from humangs_jax.avatar.shot import Shot
     from humangs_jax.io.images import read_image
 
     read = lambda folder, i: read_image(out / "photos" / folder / f"cam{i}.png")[0]
@@ -112,11 +113,9 @@ def draw_figures(out: Path, points: np.ndarray) -> None:
     labels = [f"{folder}/cam{i}" for folder in ("images", "masks", "keypoints") for i in range(VIEWS)]
     save(tile(rows, labels=labels, columns=VIEWS), IMAGES / "your_photos_material.jpg")
     save(read_image(out / "me" / "check.png")[0], IMAGES / "your_photos_check.jpg")
-    drawn = turntable_renderings(Avatar.load(out / "me" / "avatar.npz"), VIEWS, SIZE)[1]
-    save(
-        tile(np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in drawn]), columns=VIEWS),
-        IMAGES / "your_photos_avatar.jpg",
-    )
+    avatar, shot = Avatar.load(out / "me" / "avatar.npz"), Shot(size=SIZE)
+    turn = turntable_views(avatar, rest_pose_of(avatar), VIEWS, shot)
+    save(tile(np.stack(list(images(avatar, *turn, shot))), columns=VIEWS), IMAGES / "your_photos_avatar.jpg")
 
 
 def with_points(photo: np.ndarray, points: np.ndarray) -> np.ndarray:

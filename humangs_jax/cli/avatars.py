@@ -1,7 +1,6 @@
 """`humangs demo`, `reconstruct`, `refine`, `export`: from photos to an avatar, and to files of it."""
 
 import dataclasses
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
