@@ -77,11 +77,13 @@ def measure(arguments: argparse.Namespace) -> dict[str, float]:
 
 def shares(rgb, alpha, image, mask) -> dict[str, float]:
     """Squared error of one image by place, and its PSNR, also under the true coverage. (h, w, 3) and (h, w)."""
+    import jax.numpy as jnp
     import numpy as np
     from scipy import ndimage
 
-    from humangs_jax.objectives.metrics import psnr
+    from humangs_jax.objectives import metrics
 
+    psnr = lambda drawn: float(metrics.psnr(jnp.asarray(drawn), jnp.asarray(image)))
     error = ((np.clip(rgb, 0, 1) - image) ** 2).mean(-1)
     inner = ndimage.binary_erosion(mask > 0.5, iterations=BAND)
     outer = ~ndimage.binary_dilation(mask > 0.5, iterations=BAND)
@@ -89,8 +91,8 @@ def shares(rgb, alpha, image, mask) -> dict[str, float]:
     color = np.where(alpha[..., None] > LEAST_COVERAGE, color, image)
     covered = color * mask[..., None] + 1 - mask[..., None]
     return {
-        "psnr": float(psnr(rgb, image)),
-        "psnr under the true coverage": float(psnr(covered, image)),
+        "psnr": psnr(rgb),
+        "psnr under the true coverage": psnr(covered),
         "squared error": float(error.mean()),
         "share at the outline": float((error * ~(inner | outer)).mean()),
         "share in holes": float((error * (1 - alpha) * inner).mean()),

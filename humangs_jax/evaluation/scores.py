@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
+from humangs_jax.core.checks import FINITE, check_values
 from humangs_jax.data.capture import Capture
 from humangs_jax.evaluation.protocol import PROTOCOLS, EvaluationProtocol, WholeFrame
 from humangs_jax.evaluation.tables import Row, mean_scores
@@ -187,10 +188,11 @@ def score_views(
 ) -> Iterator[Row]:
     """The scores of each view of a capture; see `score_image`. predicted: on the protocol's background.
 
-    Raises: ValueError if the sizes differ, or if the protocol needs masks that the capture lacks.
+    Raises: ValueError if the sizes differ, if a value is not finite, or if the protocol needs masks that the capture lacks.
     """
     if predicted.shape != truth.images.shape:
         raise ValueError(f"predicted images have shape {predicted.shape}, the true ones {truth.images.shape}")
+    check_values("evaluate", {"predicted images": (predicted, FINITE), "alpha": (alpha, FINITE)})
     if truth.masks is None and protocol.needs_masks:
         raise ValueError("the protocol needs a mask for every view, and the capture has none")
     for i in range(truth.view_count):
