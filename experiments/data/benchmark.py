@@ -3,9 +3,9 @@
     python experiments/data/benchmark.py --json sources.json [--page docs/datasets.md] [--samples 20] [--flat 1000]
 
 Synthetic people are written in each layout with photos of the real sizes, read through the loader (4 input and 3 target views at
-256 pixels a sample, nothing kept in memory), and preprocessed. Memory: the resident set of this process over --flat samples of two
-views of the scene list, and over --flat-photos samples of each source of large photos, after the first fifth. CPU seconds count the
-work of all threads and depend little on other programs. About 5 minutes on 2 CPU cores.
+256 pixels a sample, nothing kept in memory), and preprocessed. Memory: the resident set of this process over --flat samples of
+two views of the scene list, and over --flat-photos samples of each source of large photos, after the first fifth. CPU seconds
+count the work of all threads and depend little on other programs. About 5 minutes on 2 CPU cores.
 """
 
 import argparse
@@ -146,7 +146,7 @@ def table(result: dict[str, Any]) -> str:
     made = [[kinds[kind], significant(1e3 * n["cpu_s_per_view"])] for kind, n in result["preprocessing"].items()]
     parts = [
         f"A sample is {INPUTS} input and {TARGETS} target views at {SIZE} px, decoded from disk every time; a training step of "
-        f"the preset `small` takes {step:.2g} s and one sample. Memory: growth of the resident set over some samples of two views.",
+        f"the preset `small` takes {step:.2g} s and one sample. Memory: growth of the resident set over samples of two views.",
         markdown_table(header, rows),
         markdown_table(["preprocessing to 512 px", "CPU ms"], made),
     ]
