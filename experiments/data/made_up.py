@@ -19,10 +19,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from humangs_jax.people.seeds import DEMO
-
-TIGHT = (DEMO[271], DEMO[584])
-"""People in tight clothes: T-shirts and leggings."""
+SEEDS = (3_000_271, 3_000_584)
+"""People who are written, of the split "demo"."""
+TIGHT = ("tank", "leggings", "socks")
+"""What all of them wear, with short hair: close to the skin, so that the body's outline tells whether it stands in its place."""
 HANDS = slice(25, 40), slice(40, 55)
 COLUMNS = 10
 """Shape directions, and as many of expression, of an old SMPL-X file."""
@@ -69,10 +69,35 @@ def make_people(seeds: Sequence[int], vertices: int | None = None) -> tuple[list
     """Synthetic people, the body that they are made of, and the one of the model file: decimated to `vertices`."""
     from humangs_jax.body.decimation import decimate
     from humangs_jax.body.library import load_body
-    from humangs_jax.people.subject import make_subject
 
     body = load_body()
-    return [make_subject(seed, body) for seed in seeds], body, body if vertices is None else decimate(body, vertices)
+    return (
+        [in_tight_clothes(seed, body) for seed in seeds],
+        body,
+        body if vertices is None else decimate(body, vertices),
+    )
+
+
+def in_tight_clothes(seed: int, body: Any) -> Any:
+    """The person of a seed in `TIGHT` clothes of other people of the documentation, with hair that is buzzed."""
+    import dataclasses
+
+    from humangs_jax.people.seeds import DEMO
+    from humangs_jax.people.subject import describe, make_subject
+
+    person, wanted, garments, haircut = describe(seed, body), set(TIGHT), {}, None
+    for other in DEMO:
+        seen = describe(other, body)
+        for garment in seen.garments:
+            if garment.kind in wanted:
+                garments[garment.kind] = garment
+                wanted.discard(garment.kind)
+        haircut = seen.haircut if haircut is None and seen.haircut.cut == "buzz" else haircut
+        if not wanted and haircut is not None:
+            break
+    assert haircut is not None and not wanted  # there are a thousand people
+    worn = tuple(garments[kind] for kind in TIGHT)
+    return make_subject(seed, body, dataclasses.replace(person, garments=worn, haircut=haircut))
 
 
 def fitted_vertices(body_file: Path, parameters: Any) -> np.ndarray:
@@ -91,7 +116,7 @@ def unit(i: int) -> np.ndarray:
 
 
 def write_thuman(
-    out: Path, seeds: Sequence[int] = TIGHT, kinds: Sequence[str] = "AC", texture_size: int = 1024, vertices: Any = None
+    out: Path, seeds: Sequence[int] = SEEDS, kinds: Sequence[str] = "AC", texture_size: int = 1024, vertices: Any = None
 ) -> Path:
     """out/body.npz and out/thuman with a scan for each seed, fits of these kinds; returns the data set.
 
@@ -268,7 +293,7 @@ class Video:
 
 def write_avatarrex(
     out: Path,
-    seed: int = TIGHT[0],
+    seed: int = SEEDS[0],
     frames: int = 3,
     cameras: int = 4,
     size: tuple[int, int] = (150, 204),
@@ -286,7 +311,7 @@ def write_avatarrex(
 
 def write_thuman4(
     out: Path,
-    seed: int = TIGHT[0],
+    seed: int = SEEDS[0],
     frames: int = 3,
     cameras: int = 4,
     size: tuple[int, int] = (166, 144),
@@ -305,7 +330,7 @@ def write_thuman4(
 
 def write_actorshq(
     out: Path,
-    seed: int = TIGHT[0],
+    seed: int = SEEDS[0],
     frames: int = 2,
     cameras: int = 3,
     size: tuple[int, int] = (150, 204),
@@ -337,7 +362,7 @@ def write_actorshq(
 
 def write_dna(
     out: Path,
-    seed: int = TIGHT[0],
+    seed: int = SEEDS[0],
     frames: int = 2,
     cameras: int = 3,
     size: tuple[int, int] = (150, 204),
@@ -412,7 +437,7 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=2, help="scans of thuman")
     arguments = parser.parse_args()
     for layout in arguments.layouts:
-        options = {"seeds": (*TIGHT, *DEMO)[: arguments.people]} if layout == "thuman" else {}
+        options = {"seeds": range(SEEDS[0], SEEDS[0] + arguments.people)} if layout == "thuman" else {}
         print(WRITERS[layout](arguments.out / layout, **options))
 
 

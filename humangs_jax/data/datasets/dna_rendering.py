@@ -47,7 +47,7 @@ class Smc:
         try:
             h5py: Any = importlib.import_module("h5py")  # optional
         except ImportError:
-            raise CaptureError(path, "", "HDF5 files need the package h5py: pip install h5py") from None
+            raise CaptureError(path, "", "HDF5 files need the package h5py: pip install humangs_jax[hdf5]") from None
         with reading(path, "HDF5 file", CaptureError):
             open_file(path).close()  # devices, pipes, folders
             self.file = h5py.File(path, "r")
