@@ -25,7 +25,7 @@ from humangs_jax.core.workers import end_with_parent
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.io.atomic import replace_folder
+from humangs_jax.io.atomic import check_writable, replace_folder
 from humangs_jax.people.baking import export_scan
 from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
 from humangs_jax.people.manifest import begin_set, write_manifest
@@ -194,9 +194,11 @@ def write_set(
     workers: processes that make people; more than one use the CPU, write the same files, and need the calling script to be
     guarded by `if __name__ == "__main__"`. body: default: the body that comes with the package. progress: show a bar.
     Returns the folders. Raises: ValueError if the people reach beyond the split, `out` was written with other settings or by
-    another version of the generator, or (at the end, the others being written) some could not be made.
+    another version of the generator, or (at the end, the others being written) some could not be made; OSError if nothing can be
+    written there.
     """
     out, seeds, settings = Path(out), seeds_of(split, first, subjects), dataclasses.asdict(layout)
+    check_writable(out)
     begin_set(out, split, settings)
     folders = {seed: out / f"{seed:07d}" for seed in seeds}
     missing = [seed for seed, folder in folders.items() if not (folder / "capture.json").is_file()]

@@ -14,6 +14,7 @@ import contextlib
 import dataclasses
 import json
 import logging
+import shutil
 import zlib
 from collections.abc import Generator
 from pathlib import Path
@@ -63,7 +64,7 @@ class Checkpoints:
         if unreadable := _without_score(folder):
             if read_only:
                 raise FileError(unreadable[0], "", "a damaged checkpoint: continue the run to have it set aside")
-            _set_aside(unreadable)
+            _set_aside(_not_being_deleted(folder, unreadable, keep))
         logging.getLogger("absl").addFilter(_not_of_orbax)
         self._manager = ocp.CheckpointManager(folder, options=options)
 
@@ -214,6 +215,18 @@ def _without_score(folder: Path) -> list[Path]:
             except (OSError, ValueError, LookupError, TypeError):
                 found.append(step)
     return sorted(found)
+
+
+def _not_being_deleted(folder: Path, unreadable: list[Path], keep: int) -> list[Path]:
+    """Those that were not being deleted when the run was killed: of which fewer than `keep` newer ones are there.
+
+    The others are deleted: no checkpoint without a score is the best one.
+    """
+    steps = [int(path.name) for path in folder.glob("[0-9]*") if path.name.isdecimal() and path not in unreadable]
+    deleted = [path for path in unreadable if sum(step > int(path.name) for step in steps) >= keep]
+    for path in deleted if jax.process_index() == 0 else ():
+        shutil.rmtree(path, ignore_errors=True)
+    return [path for path in unreadable if path not in deleted]
 
 
 def _set_aside(steps: list[Path]) -> None:

@@ -64,8 +64,8 @@ class Command:
     """arguments: with {inputs} for the folder of inputs and {v} for 1 or 2, the number of the variant.
 
     copies: inputs that are copied into the place first. first: arguments of the run that made what is there before, None for
-    nothing. varies: files that no two runs write equally, as patterns; `own`: those whose names differ, too. once: it refuses a
-    place where it has come to its end.
+    nothing. varies: files that no two runs write equally, as patterns; `own`: those whose names differ, too; `often`: those
+    that one run writes several times. once: it refuses a place where it has come to its end.
     """
 
     name: str
@@ -74,6 +74,7 @@ class Command:
     first: str | None = ""
     varies: tuple[str, ...] = ()
     own: tuple[str, ...] = ()
+    often: tuple[str, ...] = ()
     once: bool = False
 
     def words(self, inputs: Path, variant: int) -> list[str]:
@@ -115,6 +116,7 @@ COMMANDS = (
         first=None,
         varies=("run/log.jsonl",),
         own=RUN,
+        often=("run/*.safetensors",),
     ),
     Command(
         "train --on-the-fly",
@@ -122,6 +124,7 @@ COMMANDS = (
         first=None,
         varies=("run/log.jsonl",),
         own=RUN,
+        often=("run/*.safetensors",),
     ),
     Command("convert", "convert {inputs}/any.pt --out w.safetensors --losses l.safetensors"),
 )
@@ -598,10 +601,30 @@ def snapshot(place: Path) -> tuple[dict[str, str], dict[str, str]]:
         relative = path.relative_to(place)
         kind = other if any(temporary(part) for part in relative.parts) else final
         if path.is_file():
-            kind[str(relative)] = hashlib.sha256(path.read_bytes()).hexdigest()
+            kind[str(relative)] = hashlib.sha256(contents(path)).hexdigest()
         elif kind is other:
             kind[f"{relative}/"] = ""
     return final, other
+
+
+def contents(path: Path) -> bytes:
+    """The bytes of a file; of weights in one order: their header is written in another one by each run."""
+    data = path.read_bytes()
+    if path.suffix != ".safetensors" or not weights_are_whole(data):
+        return data
+    size = 8 + int.from_bytes(data[:8], "little")
+    return json.dumps(json.loads(data[8:size]), sort_keys=True).encode() + data[size:]
+
+
+def weights_are_whole(data: bytes) -> bool:
+    try:
+        size = 8 + int.from_bytes(data[:8], "little")
+        header = json.loads(data[8:size])
+        return size + max(each["data_offsets"][1] for name, each in header.items() if name != "__metadata__") == len(
+            data
+        )
+    except (ValueError, LookupError):
+        return False
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
@@ -610,6 +633,8 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
 
 def whole(path: Path) -> bool:
     """Whether a file that no two runs write equally is complete: a log may end in a part of a line."""
+    if path.suffix == ".safetensors":
+        return weights_are_whole(path.read_bytes())
     text = path.read_text()
     lines = text.splitlines() if path.suffix == ".jsonl" else [text]
     for line in lines[:-1] if path.suffix == ".jsonl" and not text.endswith("\n") else lines:
@@ -627,7 +652,7 @@ def half_written(command: Command, place: Path, before: dict, after: dict) -> li
     for name, content in final.items():
         if matches(name, command.own):
             continue
-        if matches(name, command.varies):
+        if matches(name, command.varies + command.often):
             if not whole(place / name):
                 found.append(f"{name}: half-written")
         elif content not in (before.get(name), after.get(name)):

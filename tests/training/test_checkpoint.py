@@ -131,6 +131,18 @@ def test_a_damaged_checkpoint_is_set_aside_and_the_one_before_is_used(tmp_path, 
         assert sorted(path.name for path in folder.iterdir()) == ["1", "2", "3", "damaged-3"], damage
 
 
+def test_a_checkpoint_that_a_killed_run_was_deleting_goes(tmp_path, same, caplog):
+    first = Checkpoints(tmp_path / "c", keep=3)
+    for step in (1, 2, 3):
+        first.save(state_at(step))
+    first.close()
+    shutil.rmtree(tmp_path / "c" / "1" / "metrics")
+    again = Checkpoints(tmp_path / "c", keep=2)
+    assert same(again.restore(state_at(0)), state_at(3)) and caplog.text == ""
+    again.close()
+    assert sorted(path.name for path in (tmp_path / "c").iterdir()) == ["2", "3"]
+
+
 def test_no_good_checkpoint_is_one_line_and_changes_nothing(tmp_path):
     first = Checkpoints(tmp_path / "c", keep=3)
     for step in (1, 2):
