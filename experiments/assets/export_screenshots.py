@@ -1,16 +1,19 @@
 """Screenshots of exported files in programs that are not ours, for docs/export.md: in Chromium with software WebGL.
 
     npm install --prefix FOLDER playcanvas @sparkjsdev/spark three
-    python experiments/assets/export_screenshots.py AVATAR --modules FOLDER/node_modules [--out docs/images]
+    python -m venv BLENDER && BLENDER/bin/pip install bpy
+    python experiments/assets/export_screenshots.py AVATAR --modules FOLDER/node_modules --blender BLENDER/bin/python
 
 Gaussians: the PlayCanvas engine (SuperSplat's) opens .ply and .glb, Spark .splat and .spz. The mesh: three.js opens .glb, at four
 times of the shipped walk, and .obj. Every page gets files and modules from a server on this machine; nothing else is loaded.
+Blender (its Python module, a version for the Python at hand) opens both and renders them with Cycles.
 """
 
 import argparse
 import contextlib
 import functools
 import json
+import subprocess
 import sys
 import tempfile
 import threading
@@ -129,7 +132,41 @@ window.humangs = { ready: (async () => {
   }
 })() };
 """
-ABOUT_X = "1, 0, 0, 0"
+BLENDER = """
+import math, sys
+import bpy
+from mathutils import Vector
+out, frames = sys.argv[1], [int(text) for text in sys.argv[2].split(",")]
+def rendered(name, frame):
+    scene = bpy.context.scene
+    scene.frame_set(frame)
+    body = next(part for part in bpy.data.objects if part.type == "MESH" and len(part.data.vertices) > 1000)
+    shown = body.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    points = [shown.matrix_world @ vertex.co for vertex in shown.to_mesh().vertices]
+    middle = Vector((sum(p.x for p in points) / len(points), sum(p.y for p in points) / len(points), 0.85))
+    camera = bpy.data.objects.new("camera", bpy.data.cameras.new("camera"))
+    scene.collection.objects.link(camera)
+    scene.camera, camera.data.sensor_fit, camera.data.angle = camera, "VERTICAL", math.radians(30)
+    camera.location = middle + Vector((1.35, -4.1, 0.4))
+    camera.rotation_euler = (middle - camera.location).to_track_quat("-Z", "Y").to_euler()
+    scene.world = bpy.data.worlds.new("white")
+    scene.world.use_nodes = True
+    scene.world.node_tree.nodes["Background"].inputs[0].default_value = (1, 1, 1, 1)
+    scene.render.engine, scene.cycles.device, scene.cycles.samples = "CYCLES", "CPU", 8
+    scene.view_settings.view_transform = "Standard"
+    scene.render.resolution_x, scene.render.resolution_y = %(width)d, %(height)d
+    scene.render.filepath = f"{out}/{name}.png"
+    bpy.ops.render.render(write_still=True)
+for frame in frames:
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.context.scene.render.fps = 24
+    bpy.ops.import_scene.gltf(filepath=f"{out}/mesh.glb")
+    rendered(f"glb_{frame}", frame)
+bpy.ops.wm.read_factory_settings(use_empty=True)
+bpy.ops.wm.obj_import(filepath=f"{out}/mesh.obj")
+rendered("obj", 0)
+"""
+BLENDER_FRAMES = (0, 12, 24, 36)
 ABOUT_Y = "0, 1, 0, 0"
 BOTH = "0, 0, 1, 0"
 SHEETS = {
@@ -152,8 +189,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("avatar", type=Path, help="file written by humangs reconstruct")
     parser.add_argument("--modules", type=Path, required=True, help="folder node_modules with the programs")
+    parser.add_argument("--blender", type=Path, help="a Python that has Blender's module bpy")
     parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder for the images")
-    parser.add_argument("--only", choices=sorted(SHEETS), nargs="+", default=sorted(SHEETS))
+    parser.add_argument("--only", choices=sorted(SHEETS), nargs="*", default=sorted(SHEETS))
     arguments = parser.parse_args()
     from experiments.common import chromium
 
@@ -161,8 +199,10 @@ def main() -> None:
         parser.error(reason)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        (folder / "node_modules").symlink_to(arguments.modules.resolve())
         write_files(folder, arguments.avatar)
+        if arguments.blender is not None:
+            write_blender_sheet(arguments.out / "export_blender.jpg", folder, arguments.blender)
+        (folder / "node_modules").symlink_to(arguments.modules.resolve())
         with served(folder) as address, chromium.Chromium(WIDTH, HEIGHT) as browser:
             for sheet in arguments.only:
                 write_sheet(arguments.out / f"{sheet}.jpg", folder, address, browser, SHEETS[sheet])
@@ -200,7 +240,6 @@ def served(folder: Path) -> Iterator[str]:
 def write_sheet(path: Path, folder: Path, address: str, browser, shots) -> None:
     """Take the screenshots of a sheet and write them side by side. Raises: RuntimeError for a page that shows nothing."""
     import numpy as np
-    from PIL import Image
 
     images = []
     for title, page, values in shots:
@@ -214,6 +253,24 @@ def write_sheet(path: Path, folder: Path, address: str, browser, shots) -> None:
         if person < 0.02:
             raise RuntimeError(f"{title}: nothing is seen")
         images.append(image)
+    save_sheet(path, images)
+
+
+def write_blender_sheet(path: Path, folder: Path, python: Path) -> None:
+    """Render the mesh in Blender and write the images side by side. Raises: CalledProcessError."""
+    from humangs_jax.io.images import read_image
+
+    script = BLENDER % {"width": WIDTH, "height": HEIGHT}
+    subprocess.run([python, "-c", script, folder, ",".join(map(str, BLENDER_FRAMES))], check=True, capture_output=True)
+    names = [*(f"glb_{frame}" for frame in BLENDER_FRAMES), "obj"]
+    save_sheet(path, [read_image(folder / f"{name}.png")[0] for name in names])
+
+
+def save_sheet(path: Path, images: list) -> None:
+    """Write images of the same height side by side."""
+    import numpy as np
+    from PIL import Image
+
     pixels = np.rint(255 * np.concatenate(images, axis=1)).astype(np.uint8)
     Image.fromarray(pixels).save(path, quality=85, optimize=True)
     print(f"{path}: {path.stat().st_size / 1000:.0f} kB")

@@ -28,6 +28,8 @@ from humangs_jax.rendering.gaussians import Gaussians
 
 VALIDATOR = Path(os.environ.get("HUMANGS_NPM", ".")) / "node_modules" / "gltf-validator"
 """Where `npm install gltf-validator` was run: the environment variable HUMANGS_NPM."""
+BLENDER = os.environ.get("HUMANGS_BLENDER", "")
+"""A Python that has Blender's module (`pip install bpy`): the environment variable HUMANGS_BLENDER."""
 TEXTURE = 256
 
 
@@ -240,3 +242,47 @@ def test_khronos_validator_finds_nothing(tmp_path):
     codes = {issue["code"] for issue in found["gaussians"]}
     assert codes == {"UNSUPPORTED_EXTENSION", "MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
     assert all("KHR_gaussian_splatting" in issue["pointer"] + issue["message"] for issue in found["gaussians"])
+
+
+THROUGH_BLENDER = """
+import sys
+import bpy
+from numpy import array, save
+folder = sys.argv[1]
+bpy.ops.wm.read_factory_settings(use_empty=True)
+scene = bpy.context.scene
+scene.render.fps = 24
+bpy.ops.import_scene.gltf(filepath=f"{folder}/ours.glb")
+scene.frame_start, scene.frame_end = 0, 3
+armature = next(part for part in bpy.data.objects if part.type == "ARMATURE")
+body = next(part for part in bpy.data.objects if part.type == "MESH" and part.vertex_groups)
+scene.frame_set(2)
+shown = body.evaluated_get(bpy.context.evaluated_depsgraph_get())
+save(f"{folder}/frame.npy", array([shown.matrix_world @ vertex.co for vertex in shown.to_mesh().vertices]))
+bpy.ops.export_scene.gltf(filepath=f"{folder}/theirs.glb", export_format="GLB")
+for part in bpy.data.objects:
+    part.select_set(part is armature)
+bpy.context.view_layer.objects.active = armature
+bpy.ops.export_anim.bvh(filepath=f"{folder}/theirs.bvh", frame_start=0, frame_end=3, rotate_mode="NATIVE")
+"""
+
+
+@pytest.mark.skipif(not BLENDER, reason="needs a Python with Blender's module bpy (HUMANGS_BLENDER: its path)")
+@pytest.mark.slow
+def test_blender_shows_our_frames_and_we_read_its_files(tmp_path):
+    """Vertices of a frame in Blender are ours with z up; its .glb and .bvh of our motion are that motion."""
+    one = avatar()
+    rest = RestBody(one.rest_vertices, one.rest_joints)
+    motion = grounded(dance(4), rest, PARENTS)
+    write_mesh_glb(tmp_path / "ours.glb", one, mesh(), motion)
+    done = subprocess.run([BLENDER, "-c", THROUGH_BLENDER, tmp_path], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    shown = np.load(tmp_path / "frame.npy") @ [[1, 0, 0], [0, 0, -1], [0, 1, 0]]  # z up to y up
+    np.testing.assert_allclose(shown, skinned(tmp_path / "ours.glb", 2), atol=1e-4)
+    matrices = lambda m: Rotation.from_rotvec(np.asarray(m.rotations).reshape(-1, 3)).as_matrix().reshape(4, 55, 3, 3)
+    bodied = [j for j, name in enumerate(JOINT_NAMES) if "eye" not in name and name != "jaw"]
+    for name in ("theirs.glb", "theirs.bvh"):
+        back = grounded(load_motion(tmp_path / name, rest_joints=one.rest_joints), rest, PARENTS)
+        np.testing.assert_allclose(matrices(back)[:, bodied], matrices(motion)[:, bodied], atol=1e-3, err_msg=name)
+        np.testing.assert_allclose(back.translations, motion.translations, atol=1e-3, err_msg=name)
+        assert back.fps == pytest.approx(24, rel=1e-4)
