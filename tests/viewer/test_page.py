@@ -120,7 +120,7 @@ def test_export_of_a_page_writes_nothing_else(avatar_file, tmp_path, monkeypatch
         (("export", "me.npz", "--html", "no/p.html"), r"--html no/p\.html: the folder no does not exist"),
         (
             ("export", "me.npz", "--html", "p.html", "--motion", "walk52.npz"),
-            "the motion has 52 joints, the avatar has 3",
+            "rotations: expected 3 joints, got 52",
         ),
         (("view", "nobody.npz"), r"nobody\.npz: no such file"),
         (("view", "me.npz", "--port", "99999"), "--port 99999"),

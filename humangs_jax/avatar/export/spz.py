@@ -2,8 +2,8 @@
 
 Positions are 24-bit fixed-point numbers, scales exp(k / 16 - 10) metres, opacities k / 255, colours
 f_dc = (k / 255 - 1/2) / 0.15, quaternions their three smallest components in 10 bits each. Axes are right, up and back: a person
-that faces +z in a `.glb` faces -z here, as converters (Niantic's own, splat-transform) have it. Written here because the libraries
-for Python that write it bring a compiler of 200 MB (gsply: numba) or do not install (PyPI's spz).
+that faces +z in a `.glb` faces -z here, as converters (Niantic's own, splat-transform) have it. Written here because the
+libraries for Python that write it bring a compiler of 200 MB (gsply: numba) or do not install (PyPI's spz).
 """
 
 import gzip

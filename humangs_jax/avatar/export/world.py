@@ -3,8 +3,8 @@
 Ours are metres with y up, the person faces +z, quaternions wxyz, linear scales, opacities and colours in [0, 1]. glTF's world is
 the same. Viewers of `.ply` and `.splat` take y for down: SuperSplat and PlayCanvas turn what they read by half a turn about z.
 `.spz` has axes to the right, up and back, half a turn about y from ours. So converters make the same of all of them.
-`grounded_gaussians`, `turned` and `rotated` bring a person into these worlds; `plain_arrays` and `sh_of` are the numbers of the
-files.
+`grounded_gaussians`, `turned` and `rotated` bring a person into these worlds; `plain_arrays` and `sh_of` are the numbers that
+files hold.
 """
 
 from typing import Literal, get_args
