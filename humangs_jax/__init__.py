@@ -24,6 +24,7 @@ _PUBLIC = {
     "RefineConfig": "refinement.config",
     "Rendering": "rendering.drawing",
     "SPLAT_PRESETS": "rendering.splat_config",
+    "Shot": "avatar.shot",
     "SplatConfig": "rendering.splat_config",
     "SubjectViews": "data.views",
     "TrainConfig": "training.config",
@@ -44,6 +45,7 @@ _PUBLIC = {
     "load_motion": "data.motion",
     "load_weights": "network.weights",
     "look_at": "geometry.camera",
+    "motion_frames": "avatar.frames",
     "orbit": "geometry.camera",
     "plan_buffers": "rendering.buffers",
     "pose_body": "body.model",
@@ -71,6 +73,7 @@ _PUBLIC = {
     "train": "training.loop",
     "write_page": "viewer.page",
     "write_ply": "avatar.export",
+    "write_video": "avatar.video",
 }
 
 __all__ = ["__version__", *_PUBLIC]

@@ -224,7 +224,12 @@ def motion_views(
 
     Arguments: turn: degrees that the camera travels around the person. follow: the camera goes along with the person; else it
     stands still and is so far away that the person stays in the image.
+
+    Raises: ValueError if the motion has another number of joints than the avatar, or the shot is out of range.
     """
+    joints = motion.rotations.shape[1]
+    if joints != len(avatar.parents):
+        raise ValueError(f"the motion has {joints} joints, the avatar has {len(avatar.parents)}")
     motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
     count = len(motion.translations)
     poses = jax.vmap(BodyPose)(motion.rotations, motion.translations)

@@ -59,7 +59,7 @@ class LiveView:
             self.server = viser.ViserServer(host="127.0.0.1", port=_free_port(port), label="humangs", verbose=False)
         self.url = f"http://127.0.0.1:{self.server.get_port()}/"
         self.server.scene.set_up_direction("+y")
-        self.server.gui.configure_theme(show_logo=False, show_share_button=False, control_layout="collapsible")
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)
         self.status = self.server.gui.add_markdown("Waiting for the first avatar ...")
         self.pose = self.server.gui.add_dropdown("pose", POSES)
         last = len(self.motion.translations) - 1

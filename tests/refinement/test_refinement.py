@@ -36,8 +36,10 @@ def person(body):
 
 def test_comes_closer_to_photos_of_a_moving_person(person):
     avatar, capture = person
-    report = refinement.refine_with_report(avatar, capture, STEPS)
+    so_far = []
+    report = refinement.refine_with_report(avatar, capture, STEPS, watch=so_far.append)
     assert report.kept and report.steps == 12
+    assert len(so_far) == STEPS.checks and (so_far[0].gaussians.colors != so_far[-1].gaussians.colors).any()
     assert report.loss[1] < 0.8 * report.loss[0]
     assert report.psnr[1] > report.psnr[0] + 1
     assert "12 steps" in report.summary()
