@@ -376,6 +376,25 @@ def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
     assert PATIENCE <= time.monotonic() - began < 30
 
 
+def test_an_interrupt_that_python_drops_is_repeated():
+    code = (
+        "import gc, signal, time; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from humangs_jax import cli\n"
+        "class Collected:\n"
+        "    def run(self):\n"
+        "        gc.callbacks.append(lambda *_: done.append(1) or len(done) == 1 and signal.raise_signal(signal.SIGINT))\n"
+        "        gc.collect()\n"
+        "        time.sleep(20)\n"
+        "done = []\n"
+        "cli._parsed = lambda arguments: Collected()\n"
+        "cli.main()"
+    )
+    began = time.monotonic()
+    program = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (program.returncode, program.stderr) == (cli.INTERRUPTED, "humangs: interrupted\n")
+    assert time.monotonic() - began < 15
+
+
 def test_the_logs_of_libraries_stay_off_the_screen():
     """Orbax's warnings go through absl's logger; ours are shown."""
     code = (
