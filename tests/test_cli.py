@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -241,6 +242,20 @@ def test_training_goes_on_from_weights_as_they_were_trained(tmp_path, monkeypatc
     assert [settings.model.conventions.rendering for settings in started] == ["inria", "inria"]
 
 
+@pytest.mark.parametrize(("done", "code"), [(3, cli.INTERRUPTED), (5, 0)])
+def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, monkeypatch, capsys):
+    """Ctrl-C: `train` saves and returns, and the exit code still tells that it was interrupted."""
+    from humangs_jax.training import loop, sources
+
+    monkeypatch.setattr(sources, "training_people", lambda *arguments: None)
+    monkeypatch.setattr(loop, "train", lambda *arguments, **options: SimpleNamespace(step=done))
+    words = ["train", "--config", "tiny", "--steps", "5", "--on-the-fly", "1", "--out", str(tmp_path)]
+    assert cli.execute(words) == code
+    out, err = capsys.readouterr()
+    assert f"{tmp_path}: {done} of 5 steps" in out and ("interrupted" in err) == (code != 0)
+    assert (f"--weights {tmp_path / 'weights.safetensors'}" in out) == (code == 0)
+
+
 def test_import_of_what_is_no_calibration_is_one_line(folder, tmp_path, monkeypatch, capsys):
     code, _, err = run(
         monkeypatch,
@@ -373,7 +388,26 @@ def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
     program.send_signal(signal.SIGINT)
     _, error = program.communicate(timeout=60)
     assert program.returncode == cli.INTERRUPTED and error.endswith(b"humangs: interrupted\n")
-    assert PATIENCE <= time.monotonic() - began < 30
+    assert PATIENCE <= time.monotonic() - began < 50
+
+
+def test_an_interrupt_that_python_drops_is_repeated():
+    code = (
+        "import gc, signal, time; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from humangs_jax import cli\n"
+        "class Collected:\n"
+        "    def run(self):\n"
+        "        gc.callbacks.append(lambda *_: done.append(1) or len(done) == 1 and signal.raise_signal(signal.SIGINT))\n"
+        "        gc.collect()\n"
+        "        time.sleep(300)\n"
+        "done = []\n"
+        "cli._parsed = lambda arguments: Collected()\n"
+        "cli.main()"
+    )
+    began = time.monotonic()
+    program = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (program.returncode, program.stderr) == (cli.INTERRUPTED, "humangs: interrupted\n")
+    assert time.monotonic() - began < 200
 
 
 def test_the_logs_of_libraries_stay_off_the_screen():

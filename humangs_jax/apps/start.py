@@ -155,14 +155,14 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
 
 
 def _photos(folder: Path) -> Iterator[Path]:
-    """The photos of a folder and of those in it, except for masks and captures."""
+    """The photos of a folder and of those in it, except for masks, captures, and what other programs have made of photos."""
     if not folder.is_dir():
         return
     for path in folder.iterdir():
         if path.name.startswith("."):
             continue
         if path.is_dir():
-            if path.name not in MASK_FOLDERS and not (path / "capture.json").exists():
+            if path.name not in (*MASK_FOLDERS, *KEYPOINT_FILES, "colmap") and not (path / "capture.json").exists():
                 yield from _photos(path)
         elif path.suffix in SUFFIXES:
             yield path

@@ -94,6 +94,8 @@ def execute(arguments: Sequence[str]) -> int:
         return _failed(error, verbose)
     except KeyboardInterrupt:
         return _interrupted()
+    finally:
+        screen.end()
 
 
 def _prepare(verbose: bool) -> None:

@@ -1,4 +1,8 @@
-"""Ctrl-C while a program compiles or runs: Python hears of it only when that returns, which can be minutes later."""
+"""Ctrl-C that would get lost.
+
+While a program compiles or runs, Python hears of it only when that returns, which can be minutes later. And in callbacks of the
+garbage collector (JAX has one) and destructors, Python drops the KeyboardInterrupt with a note, and the command would go on.
+"""
 
 import os
 import signal
@@ -8,6 +12,8 @@ import time
 
 INTERRUPTED = 130
 """The exit code: 128 and the number of the signal, as in shells."""
+AGAIN = 0.02
+"""Seconds after which an interrupt that was dropped is repeated."""
 PATIENCE = 2.0
 """Seconds that Python gets to hear of it and to tidy up; files are written by calls that are shorter."""
 
@@ -40,3 +46,12 @@ def end_within_seconds() -> None:
                 os._exit(INTERRUPTED)
 
     threading.Thread(target=watch, daemon=True).start()
+    note = sys.unraisablehook
+
+    def dropped(what):
+        if what.exc_type is KeyboardInterrupt:
+            threading.Timer(AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
+        else:
+            note(what)
+
+    sys.unraisablehook = dropped

@@ -1,6 +1,6 @@
 """What a command shows: stages while it works, warnings, what it wrote, how long its stages took, and what to do next.
 
-Commands use `stage`, `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `begin` and `finish` around them.
+Commands use `stage`, `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `begin`, `finish` and `end`.
 Results go to stdout, everything else to stderr. --quiet leaves results and errors, --verbose shows what libraries log as well.
 """
 
@@ -16,7 +16,7 @@ from pathlib import Path
 from humangs_jax.core import progress
 from humangs_jax.core.progress import stage
 
-__all__ = ["begin", "finish", "stage", "suggest", "tell", "warn", "wrote"]
+__all__ = ["begin", "end", "finish", "stage", "suggest", "tell", "warn", "wrote"]
 
 XLA_LEVELS = {False: "3", True: "0"}
 """TF_CPP_MIN_LOG_LEVEL without and with --verbose. 3 leaves fatal errors: XLA logs its boxes about slow compilation as errors,
@@ -67,7 +67,8 @@ def wrote(path: str | Path, what: str) -> None:
 
 def warn(text: object) -> None:
     """Something looks wrong, and the command goes on."""
-    print(f"humangs: warning: {text}", file=sys.stderr, flush=True)
+    clear = progress.CLEAR if _screen.measured.ticking else ""
+    print(f"{clear}humangs: warning: {text}", file=sys.stderr, flush=True)
 
 
 def suggest(*command: str | Path) -> None:
@@ -83,4 +84,8 @@ def finish() -> None:
         print(f"took {total:.1f} s: {parts}")
     if not _screen.quiet and _screen.next:
         print(f"next: {'  or  '.join(_screen.next)}")
+
+
+def end() -> None:
+    """Stages of the library are shown no more, however the command has ended."""
     progress.end()

@@ -68,7 +68,7 @@ class Start:
         if needed:
             tell("\nto be made:\n" + "\n".join(map(str, needed)))
             suggest("humangs start", self.photos, "--out", self.out)
-            names = " and ".join(each.name for each in needed)
+            names = " and ".join(", ".join(each.name for each in needed).rsplit(", ", 1))
             raise ValueError(f"{self.photos}: {names} missing: make them as above and run the same command again")
         fitted = self._fit(material)
         self._check(fitted)

@@ -19,7 +19,8 @@ from typing import Any
 
 TICK = 0.2
 """Seconds between two updates of the line."""
-_CLEAR = "\r\033[K"
+CLEAR = "\r\033[K"
+"""Puts the cursor of a terminal at the beginning of an empty line."""
 
 
 @dataclasses.dataclass
@@ -81,7 +82,7 @@ def stage(name: str) -> Generator[None]:
         if outermost:
             current.seconds[name] = current.seconds.get(name, 0.0) + seconds
             if current.ticking or current.lines:
-                clear = _CLEAR if current.ticking else ""
+                clear = CLEAR if current.ticking else ""
                 print(f"{clear}{name}: {seconds:.1f} s", file=sys.stderr, flush=True)
 
 
@@ -94,7 +95,7 @@ def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, **how: Any
 
     if shown and _current.bars and _current.ticking and _current.names:
         _current.paused = True
-        sys.stderr.write(_CLEAR)
+        sys.stderr.write(CLEAR)
     return tqdm(iterable, disable=not (shown and _current.bars), **how)
 
 
@@ -107,5 +108,5 @@ def _tick(current, stop, started):
     while not stop.wait(TICK):
         if not current.paused and current.names:
             name = ": ".join(dict.fromkeys((current.names[0], current.names[-1])))
-            sys.stderr.write(f"{_CLEAR}{name} ... {time.perf_counter() - started:.0f} s")
+            sys.stderr.write(f"{CLEAR}{name} ... {time.perf_counter() - started:.0f} s")
             sys.stderr.flush()

@@ -53,6 +53,7 @@ def test_other_layouts_are_found(mine):
     (mine / "colmap" / "sparse" / "0" / "images.txt").write_text("")
     (mine / "keypoints").rename(mine / "my_keypoints")
     (mine / "masks").rename(mine / "matte")
+    shutil.copytree(mine / "matte", mine / "colmap" / "dense" / "images")
     found = look(mine)
     assert (found.images, found.photos, found.masks) == (mine, 4, mine / "matte")
     assert (found.cameras, found.keypoints) == (mine / "colmap", mine / "my_keypoints")
@@ -101,7 +102,7 @@ def test_all_that_is_missing_is_told_at_once(mine, capsys):
     (mine / "calibration.json").unlink()
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     out, err = capsys.readouterr()
-    assert "cameras and masks and keypoints missing" in err and [
+    assert "photos: cameras, masks and keypoints missing: make them" in err and [
         line for line in out.splitlines() if line.endswith("missing")
     ]
     assert list(Path().iterdir()) == [mine]
