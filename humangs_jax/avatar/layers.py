@@ -26,6 +26,7 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files
@@ -78,8 +79,6 @@ def write_views(
 
     Raises: ValueError if the layers of all views are more than an EXR file may hold (see docs/security.md); OSError.
     """
-    from tqdm import tqdm
-
     out, count = Path(out), len(poses)
     if exr is not None:
         exr.check()
@@ -93,7 +92,7 @@ def write_views(
     def write(folder: Path):
         drawn = draw(avatar, poses, cameras, jnp.zeros(3), how)
         views = []
-        for i, rendering in enumerate(tqdm(drawn, total=count, desc="render", unit="view", disable=not progress)):
+        for i, rendering in enumerate(bar(drawn, total=count, desc="render", unit="view", shown=progress)):
             write_png(folder / f"view_{i:03d}.png", image_of(rendering, shot.color()))
             if exr is not None:
                 views.append(exr_view(f"view_{i:03d}", avatar, poses[i], cameras[i], rendering, exr.layers, how))

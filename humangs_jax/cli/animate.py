@@ -1,16 +1,28 @@
 """`humangs animate`, `render`, `view`: videos and images of an avatar, and the avatar in the browser."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.cli.options import require_at_least, require_parent
+from humangs_jax.cli.options import (
+    UsageError,
+    require_at_least,
+    require_between,
+    require_folder,
+    require_parent,
+    require_suffix,
+)
+from humangs_jax.cli.screen import stage, suggest, tell, wrote
 
 TURN_SECONDS = 4.0
 """A turntable as a video turns once in this time."""
+SLOWEST, FASTEST = 0.01, 1000.0
+"""Frames per second."""
+SUFFIXES = (".mp4", ".webm", ".gif")
 FROM_THE_SIDE = Shot(azimuth=20.0)
 
 
@@ -44,27 +56,34 @@ class Animate:
     docs/video.md has what it saves."""
 
     def run(self) -> None:
-        from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.avatar.frames import excerpt, images, motion_views, splatting_of, without_unseen
-        from humangs_jax.avatar.video import check_video, write_video
-        from humangs_jax.data.motion import load_motion
+        _check_shot(self.shot)
+        require_between(-math.inf, math.inf, turn=self.turn)
+        require_between(SLOWEST, FASTEST, fps=self.fps)
+        _require_place(self.out)
+        with stage("starting"):
+            from humangs_jax.avatar.avatar import Avatar
+            from humangs_jax.avatar.frames import excerpt, images, motion_views, splatting_of, without_unseen
+            from humangs_jax.avatar.video import check_video, write_video
+            from humangs_jax.data.motion import load_motion
 
-        self.shot.check()
-        require_parent(self.out)
-        check_video(self.out, 0, *self.shot.resolution, transparent=self.shot.color() is None)
-        if self.fps is not None and not 0 < self.fps <= 1000:
-            raise ValueError(f"--fps {self.fps}: expected more than 0 and at most 1000")
-        avatar = Avatar.load(self.avatar)
-        motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
-        motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
-        check_video(self.out, len(motion.translations), *self.shot.resolution)
-        poses, cameras = motion_views(avatar, motion, self.shot, self.turn, self.follow)
+            check_video(self.out, 0, *self.shot.resolution, transparent=self.shot.color() is None)
+        with stage("reading"):
+            avatar = Avatar.load(self.avatar)
+            motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
+            motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
+            check_video(self.out, len(motion.translations), *self.shot.resolution)
+            poses, cameras = motion_views(avatar, motion, self.shot, self.turn, self.follow)
         if self.prune:
-            every = len(avatar.gaussians.means)
-            avatar = without_unseen(avatar, poses, cameras, splatting_of(self.shot, avatar), progress="look")
-            print(f"{every - len(avatar.gaussians.means):,} of {every:,} Gaussians are in no frame")
-        written = write_video(self.out, images(avatar, poses, cameras, self.shot, "animate"), motion.fps)
-        print(f"{self.out}: {written} frames of {_size(self.shot)} at {motion.fps:g} frames per second")
+            with stage("looking for unseen Gaussians"):
+                every = len(avatar.gaussians.means)
+                avatar = without_unseen(avatar, poses, cameras, splatting_of(self.shot, avatar), progress="look")
+            tell(f"{every - len(avatar.gaussians.means):,} of {every:,} Gaussians are in no frame")
+        with stage("drawing"):
+            written = write_video(self.out, images(avatar, poses, cameras, self.shot, "animate"), motion.fps)
+        wrote(self.out, f"{written} frames of {_size(self.shot)} at {motion.fps:g} frames per second")
+        suggest(
+            "humangs export", self.avatar, "--html avatar.html", *(("--motion", self.motion) if self.motion else ())
+        )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,50 +111,53 @@ class Render:
     """Numbers of views.exr. half: Z and positions still have 32 bits."""
 
     def run(self) -> None:
-        from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.avatar.frames import a_pose_of, capture_views, images, rest_pose_of, turntable_views
-        from humangs_jax.avatar.layers import ExrLayers, write_views
-        from humangs_jax.avatar.video import check_video, write_video
-        from humangs_jax.data.capture import load_capture
-
-        self.shot.check()
-        video = self.out.suffix != ""
-        if not 0 < self.fps <= 1000:
-            raise ValueError(f"--fps {self.fps}: expected more than 0 and at most 1000")
-        views = self.views
+        _check_shot(self.shot)
+        require_between(SLOWEST, FASTEST, fps=self.fps)
+        video, views = self.out.suffix != "", self.views
         if views is None:
             views = max(2, round(TURN_SECONDS * self.fps)) if video else 8
-        require_parent(self.out)
         require_at_least(1, views=views)
-        check_video(self.out, views, *self.shot.resolution, transparent=video and self.shot.color() is None)
+        _require_place(self.out)
+        if video and self.exr:
+            raise UsageError(f"--exr: {self.out} is a video: expected a folder")
         if self.capture is not None:
             self._require_defaults()
-        layers = ExrLayers(tuple(self.channels.split(",")), half=self.exr_type == "half")
-        layers.check()
-        if video and self.exr:
-            raise ValueError(f"--exr: {self.out} is a video: expected a folder")
-        avatar = Avatar.load(self.avatar)
-        if self.capture is not None:
-            poses, cameras = capture_views(avatar, load_capture(self.capture))
-        else:
-            pose = rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
-            poses, cameras = turntable_views(avatar, pose, views, self.shot)
-        if video:
-            written = write_video(self.out, images(avatar, poses, cameras, self.shot, "render"), self.fps)
-            print(f"{self.out}: {written} frames of {_size(self.shot)} at {self.fps:g} frames per second")
-        else:
-            written = write_views(self.out, avatar, poses, cameras, self.shot, layers if self.exr else None)
-            print(f"{self.out}: {written} views of {cameras.width} x {cameras.height}{' and views.exr' * self.exr}")
+        with stage("starting"):
+            from humangs_jax.avatar.avatar import Avatar
+            from humangs_jax.avatar.frames import a_pose_of, capture_views, images, rest_pose_of, turntable_views
+            from humangs_jax.avatar.layers import ExrLayers, write_views
+            from humangs_jax.avatar.video import check_video, write_video
+            from humangs_jax.data.capture import load_capture
+
+            check_video(self.out, views, *self.shot.resolution, transparent=video and self.shot.color() is None)
+            layers = ExrLayers(tuple(self.channels.split(",")), half=self.exr_type == "half")
+            layers.check()
+        with stage("reading"):
+            avatar = Avatar.load(self.avatar)
+            if self.capture is not None:
+                poses, cameras = capture_views(avatar, load_capture(self.capture))
+            else:
+                pose = rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
+                poses, cameras = turntable_views(avatar, pose, views, self.shot)
+        with stage("drawing"):
+            if video:
+                written = write_video(self.out, images(avatar, poses, cameras, self.shot, "render"), self.fps)
+                what = f"{written} frames of {_size(self.shot)} at {self.fps:g} frames per second"
+            else:
+                written = write_views(self.out, avatar, poses, cameras, self.shot, layers if self.exr else None)
+                what = f"{written} views of {cameras.width} x {cameras.height}{' and views.exr' * self.exr}"
+        wrote(self.out, what)
+        suggest("humangs animate", self.avatar)
 
     def _require_defaults(self):
-        """With --capture nothing is said about the cameras. Raises: ValueError naming the first option that does."""
+        """With --capture nothing is said about the cameras. Raises: UsageError naming the first option that does."""
         free, usual = ("background", "splat"), Shot()
         said = [name for name, value in vars(self.shot).items() if name not in free and value != getattr(usual, name)]
         said += ["views"] * (self.views is not None) + ["pose"] * (self.pose != "t")
         if said:
-            raise ValueError(f"--{said[0]}: not with --capture, which has cameras and poses of its own")
+            raise UsageError(f"--{said[0]}: not with --capture, which has cameras and poses of its own")
         if self.out.suffix:
-            raise ValueError(f"--out {self.out}: expected a folder: the views of a capture are no video")
+            raise UsageError(f"--out {self.out}: expected a folder: the views of a capture are no video")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +181,11 @@ class View:
     """--live of a training run: the capture of the person that it reconstructs. Default: the shipped one."""
 
     def run(self) -> None:
-        from humangs_jax.data.motion import load_motion
+        require_between(0, 65535, port=self.port)
+        if self.capture is not None and not self.live:
+            raise UsageError("--capture: only with --live")
+        with stage("starting"):
+            from humangs_jax.data.motion import load_motion
 
         if self.live:
             from humangs_jax.viewer.live import follow
@@ -170,16 +196,31 @@ class View:
             except ModuleNotFoundError as error:
                 raise ValueError(f"--live: {error}") from error
             return
-        from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.viewer.page import page_html, serve
+        with stage("making the page"):
+            from humangs_jax.avatar.avatar import Avatar
+            from humangs_jax.viewer.page import page_html, serve
 
-        if self.capture is not None:
-            raise ValueError("--capture: only with --live")
-        avatar = Avatar.load(self.avatar)
-        motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
-        name = None if self.motion is None else self.motion.stem
-        text = page_html(avatar, motion, self.avatar.stem, name)
+            avatar = Avatar.load(self.avatar)
+            motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
+            name = None if self.motion is None else self.motion.stem
+            text = page_html(avatar, motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)
+
+
+def _check_shot(shot):
+    try:
+        shot.check()
+    except ValueError as error:
+        raise UsageError(f"--{error}") from error
+
+
+def _require_place(out):
+    """A video, or a folder of PNG files. Raises: UsageError."""
+    if out.suffix:
+        require_suffix(out, SUFFIXES)
+        require_parent(out)
+    else:
+        require_folder(out)
 
 
 def _size(shot):

@@ -6,7 +6,8 @@ from typing import Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from humangs_jax.cli.options import require_at_least, require_parent, require_suffix
+from humangs_jax.cli.options import UsageError, require_at_least, require_parent, require_suffix
+from humangs_jax.cli.screen import stage, tell, wrote
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,30 +68,33 @@ class Evaluate:
             if path is not None:
                 require_parent(path, f"--{name}")
                 require_suffix(path, (suffixes[name],), f"--{name}")
-        from humangs_jax.evaluation.run import evaluate
-        from humangs_jax.objectives.loss_networks import load_lpips
+        with stage("starting"):
+            from humangs_jax.evaluation.run import evaluate
+            from humangs_jax.objectives.loss_networks import load_lpips
 
         networks = []
         for net in ("vgg", "alex", "squeeze"):
             if found := getattr(self.lpips, f"lpips_{net}"):
                 if len(found) > 2:
-                    raise ValueError(
+                    raise UsageError(
                         f"--lpips-{net}: expected a backbone and at most one file of heads, got {len(found)}"
                     )
                 networks.append(load_lpips(net, *found))
-        result = evaluate(
-            self.source,
-            avatar=self.avatar,
-            weights=self.weights,
-            predictions=self.predictions,
-            protocol=self.protocol,
-            inputs=self.inputs,
-            indices=self.indices,
-            lpips=networks,
-            page_images=self.page_images if self.html is not None else 0,
-            progress=True,
-        )
-        print(result.summary())
+        with stage("evaluating"):
+            result = evaluate(
+                self.source,
+                avatar=self.avatar,
+                weights=self.weights,
+                predictions=self.predictions,
+                protocol=self.protocol,
+                inputs=self.inputs,
+                indices=self.indices,
+                lpips=networks,
+                page_images=self.page_images if self.html is not None else 0,
+                progress=True,
+            )
+        tell(result.summary())
         result.write(**files)
-        for path in filter(None, files.values()):
-            print(path)
+        for name, path in files.items():
+            if path is not None:
+                wrote(path, {"json": "all numbers", "html": "the images, worst first"}.get(name, "a table"))

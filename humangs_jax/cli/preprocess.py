@@ -8,7 +8,8 @@ from typing import Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from humangs_jax.cli.options import require_at_least
+from humangs_jax.cli.options import UsageError, require_at_least, require_folder
+from humangs_jax.cli.screen import stage, suggest, wrote
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,14 +63,17 @@ class Preprocess:
         require_at_least(0, train=scans.train, test=scans.test)
         match = re.fullmatch(r"(\d+)/(\d+)", self.shard)
         if match is None or not int(match[1]) < int(match[2]):
-            raise ValueError(f"--shard {self.shard}: expected I/N with I from 0 to N - 1, as in 0/8")
+            raise UsageError(f"--shard {self.shard}: expected I/N with I from 0 to N - 1, as in 0/8")
         factors = (2.0, 2.0) if scans.near else scans.factors
         if not 0 < factors[0] <= factors[1]:
-            raise ValueError(f"--factors {factors[0]:g} {factors[1]:g}: expected a range of positive numbers")
+            raise UsageError(f"--factors {factors[0]:g} {factors[1]:g}: expected a range of positive numbers")
         if self.body is not None and not self.body.is_file():
             raise FileNotFoundError(f"--body {self.body}: no such file")
-        from humangs_jax.data.preprocess.run import preprocess
-        from humangs_jax.data.preprocess.scenes import Settings
+        require_at_least(1, workers=self.workers)
+        require_folder(self.out)
+        with stage("starting"):
+            from humangs_jax.data.preprocess.run import preprocess
+            from humangs_jax.data.preprocess.scenes import Settings
 
         settings = Settings(
             self.kind,
@@ -85,4 +89,7 @@ class Preprocess:
         cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         workers = cores if self.workers is None else self.workers
         part = int(match[1]), int(match[2])
-        print(preprocess(self.source, self.out, self.body, settings, part, workers))
+        with stage("preprocessing"):
+            report = preprocess(self.source, self.out, self.body, settings, part, workers)
+        wrote(self.out, str(report))
+        suggest("humangs train", self.out, "--out RUN")

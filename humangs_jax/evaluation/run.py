@@ -9,6 +9,7 @@ from typing import Any
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.loading.examples import Source
 from humangs_jax.evaluation.cases import Case, Indices, Method, choose_method, find_people, read_indices
@@ -223,9 +224,7 @@ def evaluate(
 
 
 def _progress(indices, progress):
-    from tqdm import tqdm
-
-    return tqdm(indices, desc="evaluate", unit="person", disable=not progress)
+    return bar(indices, desc="evaluate", unit="person", shown=progress)
 
 
 def _listed(names):

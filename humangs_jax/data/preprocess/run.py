@@ -18,6 +18,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from humangs_jax.core.progress import bar
 from humangs_jax.data.capture_checks import CaptureError, checked_json
 from humangs_jax.data.datasets.bodies import FileBody
 from humangs_jax.data.datasets.opening import VIDEOS
@@ -104,16 +105,14 @@ def _subjects(source, settings):
 
 def _make_videos(source, out, due, body, settings, workers, progress) -> Iterator[tuple[str, str | None]]:
     """One after the other; photos are decoded by threads."""
-    from tqdm import tqdm
-
     find, open_subject = VIDEOS[settings.kind]
     folders = {folder.name: folder for folder in find(source)}
     for name in due:
         try:
             subject = open_subject(folders[name], body)
             total = int((subject.frames % settings.every == 0).sum())
-            with tqdm(total=total, desc=name, unit="photo", disable=not progress) as bar:
-                write_video(out / name, name, subject, body, settings, bar.update)
+            with bar(total=total, desc=name, unit="photo", shown=progress) as shown:
+                write_video(out / name, name, subject, body, settings, shown.update)
         except (ValueError, ArithmeticError) as error:  # not OSError: a full disk ends everything
             yield name, str(error)
         else:
@@ -122,11 +121,9 @@ def _make_videos(source, out, due, body, settings, workers, progress) -> Iterato
 
 def _make_scans(source, out, due, body, settings, workers, progress) -> Iterator[tuple[str, str | None]]:
     """Several processes, which have one thread each."""
-    from tqdm import tqdm
-
-    with tqdm(total=len(due), desc="scans", disable=not progress) as bar:
+    with bar(total=len(due), desc="scans", shown=progress) as shown:
         for name, error in _in_processes(source, out, due, body, settings, min(workers, len(due))):
-            bar.update()
+            shown.update()
             yield name, error
 
 
@@ -159,8 +156,10 @@ def _start_worker(body_file):
 
     import jax
 
+    from humangs_jax.core.workers import end_with_parent
     from humangs_jax.data.capture import DEFAULT_BODY
 
+    end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
     jax.config.update("jax_platforms", "cpu")
