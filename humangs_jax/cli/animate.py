@@ -1,5 +1,6 @@
 """`humangs animate`, `render`, `view`: videos and images of an avatar, and the avatar in the browser."""
 
+import contextlib
 import dataclasses
 import math
 from pathlib import Path
@@ -56,7 +57,8 @@ class Animate:
     docs/video.md has what it saves."""
 
     def run(self) -> None:
-        _check_shot(self.shot)
+        with _options():
+            self.shot.check()
         require_between(-math.inf, math.inf, turn=self.turn)
         require_between(SLOWEST, FASTEST, fps=self.fps)
         _require_place(self.out)
@@ -70,7 +72,8 @@ class Animate:
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
             motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
-            motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
+            with _options():
+                motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
             check_video(self.out, len(motion.translations), *self.shot.resolution)
             poses, cameras = motion_views(avatar, motion, self.shot, self.turn, self.follow)
         if self.prune:
@@ -111,7 +114,8 @@ class Render:
     """Numbers of views.exr. half: Z and positions still have 32 bits."""
 
     def run(self) -> None:
-        _check_shot(self.shot)
+        with _options():
+            self.shot.check()
         require_between(SLOWEST, FASTEST, fps=self.fps)
         video, views = self.out.suffix != "", self.views
         if views is None:
@@ -131,7 +135,8 @@ class Render:
 
             check_video(self.out, views, *self.shot.resolution, transparent=video and self.shot.color() is None)
             layers = ExrLayers(tuple(self.channels.split(",")), half=self.exr_type == "half")
-            layers.check()
+            with _options():
+                layers.check()
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
             if self.capture is not None:
@@ -207,9 +212,11 @@ class View:
         serve(text, self.port, self.browser)
 
 
-def _check_shot(shot):
+@contextlib.contextmanager
+def _options():
+    """Errors of the library that begin with the name of an option are errors of the command line."""
     try:
-        shot.check()
+        yield
     except ValueError as error:
         raise UsageError(f"--{error}") from error
 

@@ -47,22 +47,22 @@ def folder(tmp_path, monkeypatch):
 
 
 BAD = {
-    "azimuth nan: expected": ("animate", "--azimuth", "nan"),
-    "size -5: expected 1 to 8192 pixels": ("animate", "--size", "-5"),
-    "height 100000: expected": ("render", "--height", "100000"),
-    "background 'blu': expected a colour": ("animate", "--background", "blu"),
+    "--azimuth nan: expected": ("animate", "--azimuth", "nan"),
+    "--size -5: expected 1 to 8192 pixels": ("animate", "--size", "-5"),
+    "--height 100000: expected": ("render", "--height", "100000"),
+    "--background 'blu': expected a colour": ("animate", "--background", "blu"),
     "--out b.mp4: .mp4 has no transparency": ("animate", "--background", "transparent", "--out", "b.mp4"),
     "--out c.gif: .gif has no transparency": ("render", "--background", "transparent", "--out", "c.gif"),
     "--out b.avi: expected a name ending in": ("animate", "--out", "b.avi"),
     "--out a.webm: is a folder": ("animate", "--out", "a.webm"),
     "--out file: is a file": ("render", "--out", "file"),
-    "the folder none does not exist": ("animate", "--out", "none/b.mp4"),
+    "--out none/b.mp4: the folder none does not exist": ("animate", "--out", "none/b.mp4"),
     "--fps 0.0: expected": ("animate", "--fps", "0"),
     "--fps nan: expected": ("render", "--fps", "nan"),
     "--views -1: expected at least 1": ("render", "--views", "-1"),
-    "start 3, stop 1: expected": ("animate", "--motion", "motion.npz", "--start", "3"),
-    "loop 0: expected": ("animate", "--motion", "motion.npz", "--loop", "0"),
-    "channels 'depth': expected some of": ("render", "--exr", "--channels", "rgba,depth"),
+    "--start 3, stop 1: expected": ("animate", "--motion", "motion.npz", "--start", "3"),
+    "--loop 0: expected": ("animate", "--motion", "motion.npz", "--loop", "0"),
+    "--channels 'depth': expected some of": ("render", "--exr", "--channels", "rgba,depth"),
     "--exr: b.mp4 is a video": ("render", "--exr", "--out", "b.mp4"),
     "--azimuth: not with --capture": ("render", "--capture", "demo_capture", "--azimuth", "3"),
     "--views: not with --capture": ("render", "--capture", "demo_capture", "--views", "3"),
@@ -80,7 +80,9 @@ def test_bad_options_are_one_line_and_nothing_is_written(message, folder, monkey
     before = sorted(folder.rglob("*"))
     command, *options = BAD[message]
     code, _, error = run(monkeypatch, capsys, command, "avatar.npz", *options)
-    assert code == 2 and message in error and error.count("\n") == 1, error
+    usage = message.startswith("--")
+    assert code == (cli.BAD_USAGE if usage else cli.BAD_DATA)
+    assert message in error and error.count("\n") == 1, error
     assert sorted(folder.rglob("*")) == before
 
 
