@@ -70,7 +70,7 @@ BAD = {
     "--out b.mp4: expected a folder": ("render", "--capture", "demo_capture", "--out", "b.mp4"),
     "the capture's poses have 55 joints, the avatar has 3": ("render", "--capture", "demo_capture"),
     "none.npz": ("animate", "--motion", "none.npz"),
-    "the motion has 55 joints, the avatar has 3": ("animate",),
+    "rotations: expected 3 joints, got 55": ("animate",),
     "--capture: only with --live": ("view", "--capture", "demo_capture"),
 }
 
