@@ -175,7 +175,7 @@ def evaluate(
     Raises: ValueError or OSError, one line: unknown protocol, nothing to compare, sizes that differ, files that cannot be read.
     """
     rules = find_protocol(protocol)
-    networks = {weights.net: weights for weights in lpips}
+    networks = {network.net: network for network in lpips}
     choice = read_indices(indices) if isinstance(indices, str | Path) else indices
     people = find_people(source, inputs, choice, body, avatar is None and predictions is None and method is None)
     name, predict = choose_method(len(people.names), avatar, weights, predictions, method)
