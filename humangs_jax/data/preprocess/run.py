@@ -49,7 +49,7 @@ class Report:
 def preprocess(
     source: str | Path,
     out: str | Path,
-    body_file: str | Path | None,
+    body_file: str | Path,
     settings: Settings,
     shard: tuple[int, int] = (0, 1),
     workers: int = 1,
@@ -57,8 +57,8 @@ def preprocess(
 ) -> Report:
     """Make or continue a set.
 
-    Arguments: source: the data set; of "thuman" the folder that holds model/ and smplx/. body_file: the model of its fits; None:
-    the body that comes with the package. shard: (i, n): the i-th of n parts, from 0. workers: processes, for scans.
+    Arguments: source: the data set; of "thuman" the folder that holds model/ and smplx/. body_file: the model of its
+    fits. shard: (i, n): the i-th of n parts, from 0. workers: processes, for scans.
     Raises: ValueError if there is nobody, `out` holds another set, or (at the end) nobody could be made.
     """
     source, out = Path(source), Path(out)
@@ -159,12 +159,10 @@ def _start_worker(body_file):
 
     import jax
 
-    from humangs_jax.data.capture import DEFAULT_BODY
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
     jax.config.update("jax_platforms", "cpu")
-    _worker["body"] = FileBody.load(None if body_file == DEFAULT_BODY else body_file)
+    _worker["body"] = FileBody.load(body_file)
 
 
 def _work(source, out, name, settings):
