@@ -90,7 +90,8 @@ def in_tight_clothes(seed: int, body: Any) -> Any:
         seen = describe(other, body)
         for garment in seen.garments:
             if garment.kind in wanted:
-                garments[garment.kind] = garment
+                sizes = {key: 0.0 if key == "loose" else size for key, size in garment.sizes.items()}
+                garments[garment.kind] = dataclasses.replace(garment, sizes=sizes)
                 wanted.discard(garment.kind)
         haircut = seen.haircut if haircut is None and seen.haircut.cut == "buzz" else haircut
         if not wanted and haircut is not None:

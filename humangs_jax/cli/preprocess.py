@@ -44,8 +44,8 @@ class Preprocess:
     scans: OmitArgPrefixes[ScanViews]
     out: Path
     """The folder to write: one folder for each scan or subject, lists, and manifest.json."""
-    body: Path | None = None
-    """The model of the fits, such as SMPLX_NEUTRAL.npz. Default: the body that comes with the package, for synthetic data."""
+    body: Path
+    """The model of the fits: SMPLX_NEUTRAL.npz or, for scans of THuman2.0, SMPLX_MALE.npz."""
     size: int = 512
     """Side of the photos in pixels."""
     every: int = 10
@@ -67,7 +67,7 @@ class Preprocess:
         factors = (2.0, 2.0) if scans.near else scans.factors
         if not 0 < factors[0] <= factors[1]:
             raise UsageError(f"--factors {factors[0]:g} {factors[1]:g}: expected a range of positive numbers")
-        if self.body is not None and not self.body.is_file():
+        if not self.body.is_file():
             raise FileNotFoundError(f"--body {self.body}: no such file")
         require_at_least(1, workers=self.workers)
         require_folder(self.out)

@@ -100,8 +100,14 @@ def coefficients(
 ) -> Float[np.ndarray, " all"]:
     """Coefficients of all of the body's directions: shape, then expression. Those that a file has not are 0.
 
-    Raises: CaptureError for more numbers than the body has directions, unless they are 0.
+    Raises: CaptureError for more numbers than the body has directions, unless they are 0; and for a body whose directions mean
+    something else than SMPL-X's.
     """
+    if not any(name.startswith("shape_") for name in body.shape_names):
+        problem = (
+            f"of SMPL-X, and body '{body.name}' has other directions: expected the path of an SMPL-X model (--body)"
+        )
+        raise CaptureError(file, "betas", problem)
     of_expression = [i for i, name in enumerate(body.shape_names) if name.startswith("expression_")]
     total = body.shape_directions.shape[-1]
     of_shape = [i for i in range(total) if i not in of_expression]

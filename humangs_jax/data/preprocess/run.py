@@ -6,7 +6,7 @@
     OUT/train.json, test.json, evaluation_N.json    of the layout "scenes"
 
 Finished folders are kept, so that the same command continues an interrupted set. Shards of one set may run at the same time; each
-ends by making lists and manifest of what is there, and the last one's are complete.
+ends by making lists and manifest of what is there. A run without shards, after them, finds nothing to make and lists everything.
 """
 
 import concurrent.futures
@@ -23,7 +23,7 @@ from humangs_jax.data.capture_checks import CaptureError, checked_json
 from humangs_jax.data.datasets.bodies import FileBody
 from humangs_jax.data.datasets.opening import VIDEOS
 from humangs_jax.data.datasets.scene_list import write_list
-from humangs_jax.data.datasets.thuman import open_thuman
+from humangs_jax.data.datasets.thuman import ThumanSet, open_thuman
 from humangs_jax.data.preprocess.protocol import INPUT_COUNTS, TARGETS, evaluation_indices, split_ids
 from humangs_jax.data.preprocess.scenes import SCENE, Settings, write_scan, write_video
 from humangs_jax.io.text import write_json
@@ -50,7 +50,7 @@ class Report:
 def preprocess(
     source: str | Path,
     out: str | Path,
-    body_file: str | Path | None,
+    body_file: str | Path,
     settings: Settings,
     shard: tuple[int, int] = (0, 1),
     workers: int = 1,
@@ -58,8 +58,8 @@ def preprocess(
 ) -> Report:
     """Make or continue a set.
 
-    Arguments: source: the data set; of "thuman" the folder that holds model/ and smplx/. body_file: the model of its fits; None:
-    the body that comes with the package. shard: (i, n): the i-th of n parts, from 0. workers: processes, for scans.
+    Arguments: source: the data set; of "thuman" the folder that holds model/ and smplx/. body_file: the model of its
+    fits. shard: (i, n): the i-th of n parts, from 0. workers: processes, for scans.
     Raises: ValueError if there is nobody, `out` holds another set, or (at the end) nobody could be made.
     """
     source, out = Path(source), Path(out)
@@ -157,13 +157,12 @@ def _start_worker(body_file):
     import jax
 
     from humangs_jax.core.workers import end_with_parent
-    from humangs_jax.data.capture import DEFAULT_BODY
 
     end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
     os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
     jax.config.update("jax_platforms", "cpu")
-    _worker["body"] = FileBody.load(None if body_file == DEFAULT_BODY else body_file)
+    _worker["body"] = FileBody.load(body_file)
 
 
 def _work(source, out, name, settings):
@@ -172,7 +171,7 @@ def _work(source, out, name, settings):
 
 def _attempt_scan(source, out, name, body, settings):
     try:
-        write_scan(out / name, name, open_thuman(source), body, settings)
+        write_scan(out / name, name, ThumanSet(source, (name,), {}), body, settings)
     except (ValueError, ArithmeticError) as error:
         return str(error)
 
@@ -214,12 +213,13 @@ def _skip(out, name, reason):
 
 def _finish(out: Path, names: Sequence[str], settings: Settings) -> dict[str, Any]:
     """Lists and manifest of what is there; again if other shards have added to it meanwhile."""
-    while True:
-        done = _finished(out, settings)
-        scenes = {name: checked_json(out / name / SCENE) for name in done}
-        manifest = _write_lists(out, names, scenes, settings)
-        if _finished(out, settings) == done:
-            return manifest
+    done, manifest = None, {}
+    for _ in range(2):  # not until nothing is added: that may be hours
+        if (found := _finished(out, settings)) != done:
+            done = found
+            scenes = {name: checked_json(out / name / SCENE) for name in done}
+            manifest = _write_lists(out, names, scenes, settings)
+    return manifest
 
 
 def _finished(out, settings):

@@ -5,6 +5,7 @@ No code of a file runs, nothing becomes large, nothing takes long. `EVERY` is do
 
 import json
 import pickle
+import shutil
 import time
 import tracemalloc
 import zipfile
@@ -14,8 +15,11 @@ import h5_or_skip
 import numpy as np
 import pytest
 
+from humangs_jax.data.datasets.bodies import BodyParameters, posed_people
 from humangs_jax.data.datasets.opening import open_people
-from humangs_jax.data.datasets.thuman import fit_error, fitted_body, open_thuman, read_fit, read_fit_mesh, read_scan
+from humangs_jax.data.datasets.thuman import open_thuman
+from humangs_jax.data.preprocess.run import preprocess
+from humangs_jax.data.preprocess.scenes import Settings, scan_content
 from humangs_jax.io.reading import FileError
 
 MOST_BYTES, MOST_SECONDS = 300 << 20, 10.0
@@ -27,16 +31,17 @@ SIZE = 16
 
 @pytest.fixture(scope="module")
 def body(tmp_path_factory):
-    return files.write_model(tmp_path_factory.mktemp("body"))
+    body = files.write_model(tmp_path_factory.mktemp("body"))
+    rest = BodyParameters(np.zeros(20), np.zeros((1, 55, 3)), np.zeros((1, 3)))
+    next(posed_people(body.model, rest))  # compiled before anything is timed
+    return body
 
 
 def read_thuman(folder, body):
+    """All that preprocessing reads and computes before it renders."""
     thuman = open_thuman(folder)
     for name in thuman.names:
-        fit = read_fit(thuman.fit_file(name), body)
-        mesh, _ = read_fit_mesh(fit.file.with_name("mesh_smplx.obj"))
-        fit_error(fitted_body(fit, body), mesh, fit)
-        read_scan(thuman.scan_file(name))
+        scan_content(name, thuman, body, Settings("thuman", views=1))
     return thuman.skipped
 
 
@@ -574,8 +579,6 @@ def honest(tmp_path_factory):
 def test_damage_is_one_line_that_names_file_and_key(
     layout, damage, words, honest, body, tmp_path, monkeypatch, request
 ):
-    import shutil
-
     folder = tmp_path / "set"
     shutil.copytree(honest(layout), folder)
     damage(folder)
@@ -607,3 +610,28 @@ def test_honest_sets_are_read(layout, honest, body):
 def test_there_are_thirty_kinds_of_damage_to_each_layout():
     counts = {layout: sum(case.values[0] == layout for case in CASES) for layout in WRITE}
     assert min(counts.values()) >= 30, counts
+
+
+@pytest.mark.parametrize("layout", ["avatarrex", "thuman4"])
+def test_preprocessing_names_all_damage_and_makes_the_rest(layout, honest, body, tmp_path):
+    """All of a layout's damage at once: each case is a subject of its own, beside an honest one."""
+    cases = [case.values for case in CASES if case.values[0] == layout]
+    shutil.copytree(honest(layout), tmp_path / "in" / "honest")
+    for i, (_, damage, _) in enumerate(cases):
+        shutil.copytree(honest(layout), tmp_path / "in" / f"damaged{i:03d}")
+        damage(tmp_path / "in" / f"damaged{i:03d}")
+    report = preprocess(tmp_path / "in", tmp_path / "out", body.file, Settings(layout, size=SIZE), progress=False)
+    scenes = json.loads((tmp_path / "out" / "manifest.json").read_text())["scenes"]
+    assert not scenes["honest"]["unreadable"]
+    for i, (_, _, words) in enumerate(cases):
+        name = f"damaged{i:03d}"
+        if name in report.skipped:
+            told = report.skipped[name]
+        elif name in scenes:  # one photo of a frame that is not among every tenth, or that cannot be read
+            continue
+        else:  # without a calibration it is no subject
+            assert not (tmp_path / "in" / name / "calibration.json").is_file()
+            assert not (tmp_path / "in" / name / "calibration_full.json").is_file()
+            continue
+        assert name in told and all(word in told for word in words), told
+    assert len(report.skipped) >= 25

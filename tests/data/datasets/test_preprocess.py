@@ -194,15 +194,16 @@ def test_scans_become_scenes_by_the_command(tmp_path, body, capsys):
 
 
 def test_wrong_options_are_one_line(tmp_path):
-    command = lambda scans=ScanViews(), **options: Preprocess(
-        "thuman", tmp_path / "in", scans, tmp_path / "out", **options
+    (tmp_path / "model.npz").write_bytes(b"")
+    command = lambda scans=ScanViews(), body="model.npz", **options: Preprocess(
+        "thuman", tmp_path / "in", scans, tmp_path / "out", tmp_path / body, **options
     )
     for made, words in (
         (command(shard="3/3"), "--shard 3/3"),
         (command(shard="x"), "--shard x"),
         (command(ScanViews(factors=(2.0, 1.0))), "--factors 2 1"),
         (command(ScanViews(views=0)), "--views 0"),
-        (command(body=tmp_path / "none.npz"), "--body"),
+        (command(body="none.npz"), "--body"),
         (command(), "model: no such folder"),
     ):
         with pytest.raises((ValueError, OSError), match=words):

@@ -168,6 +168,9 @@ def test_scans_without_a_fit_are_skipped_with_the_reason(tmp_path):
     assert found.names == ("0000", "0002") and "smplx_param.pkl: no such file" in found.skipped["0001"]
     with pytest.raises(ValueError, match="preprocess thuman"):
         open_people(folder, FileBody.load())
+    (person,) = open_people(write_avatarrex(tmp_path / "a"), FileBody.load())
+    with pytest.raises(ValueError, match=r"smpl_params.npz: betas: of SMPL-X, and body 'makehuman'"):
+        person.outline()
 
 
 def test_a_turned_world_moves_the_posed_body_along(body):
