@@ -22,6 +22,8 @@ from writers import COMMANDS, Command
 SIZE = 64 << 20
 SHARES = (0.0, 0.3, 0.6)
 """Of the bytes of what a command writes: so much is free."""
+LEAST = 1 << 10
+"""Bytes that a file may have where no disk can be mounted, at least: what a run says goes to a file, too."""
 PAIRS = 2
 GROWS = ("run", "people")
 """What training and `synth` have finished stays, and the next run goes on from there."""
@@ -111,7 +113,9 @@ def full(command: Command, disk: Disk, inputs: Path) -> list[str]:
         shutil.copytree(saved, place)
         if disk.mounted:
             disk.leave(int(share * size))
-        ending = writers.run(command, place, inputs, 2, most=None if disk.mounted else int(share * size / 4))
+        ending = writers.run(
+            command, place, inputs, 2, most=None if disk.mounted else max(LEAST, int(share * size / 4))
+        )
         found = [] if ending.code == 0 else refused(ending, targets(expected)) + changed(place, before)
         if disk.mounted:
             disk.leave(None)
