@@ -76,7 +76,6 @@ def forward_walk() -> "Motion":
 def write_sheet(path: Path, avatar: "Avatar", motion: "Motion") -> None:
     """A row each: the camera follows, it stands still, its angles, backgrounds and poses, layers."""
     import numpy as np
-
     from PIL import Image
 
     from humangs_jax.avatar.sheets import tile
