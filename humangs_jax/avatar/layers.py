@@ -41,7 +41,6 @@ LAYERS = ("rgba", "z", "position", "normal", "part")
 EXR_NAME = "views.exr"
 COVERED = 0.5
 """Pixels of less alpha have no part."""
-_BLACK = (0.0, 0.0, 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,10 +112,10 @@ def exr_view(
     how: SplatConfig,
 ) -> ExrView:
     """A view with its layers. rendering: of this avatar, pose and camera onto black."""
-    layers, alpha, depth = set(layers), np.asarray(rendering.alpha), np.asarray(rendering.depth)
+    layers, alpha = set(layers), np.asarray(rendering.alpha)
     channels, attributes = {}, {}
     if "position" in layers:
-        positions = np.where(alpha[..., None] > 0, unprojected(camera, depth), 0)
+        positions = np.where(alpha[..., None] > 0, unprojected(camera, np.asarray(rendering.depth)), 0)
         channels |= {f"position.{axis}": positions[..., i] for i, axis in enumerate("XYZ")}
     if layers & {"normal", "part"}:
         gaussians = posed(avatar, pose)
@@ -126,30 +125,31 @@ def exr_view(
         normals = np.divide(sums, length, out=np.zeros_like(sums), where=(length > 0) & (alpha[..., None] > 0))
         channels |= {f"normal.{axis}": normals[..., i] for i, axis in enumerate("XYZ")}
     if "part" in layers:
-        parts, present = gaussian_parts(avatar), None
+        parts = gaussian_parts(avatar)
         present = np.unique(parts)
         weights = splatted(gaussians, camera, how, jnp.asarray(parts[:, None] == present, jnp.float32))
         channels["part"] = np.where(alpha >= COVERED, 1 + present[weights.argmax(axis=-1)], 0).astype(np.float32)
         attributes["parts"] = ",".join(avatar.joint_names)
-    rgba = np.concatenate([np.asarray(rendering.rgb), alpha[..., None]], axis=-1)
-    matrices = {"K": np.asarray(camera.K), "cam_from_world": np.asarray(camera.cam_from_world)}
-    depth = depth if "z" in layers else None
-    return ExrView(rgba=rgba, depth=depth, name=name, channels=channels, attributes=attributes, **matrices)
+    plain = _plain_view(name, camera, rendering)
+    depth = plain.depth if "z" in layers else None
+    return dataclasses.replace(plain, depth=depth, channels=channels, attributes=attributes)
 
 
 def write_renderings_exr(path: str | os.PathLike, cameras: Camera, renderings: Iterable[Rendering]) -> None:
     """Renderings onto black as an EXR file of premultiplied RGBA in 32 bits, Z in metres and the camera, one part per view."""
-    views = [
-        ExrView(
-            name=f"view_{i:03d}",
-            rgba=np.concatenate([np.asarray(r.rgb), np.asarray(r.alpha)[..., None]], axis=-1),
-            depth=np.asarray(r.depth),
-            K=np.asarray(cameras.K[i]),
-            cam_from_world=np.asarray(cameras.cam_from_world[i]),
-        )
-        for i, r in enumerate(renderings)
-    ]
-    write_exr(Path(path), views)
+    each = enumerate(zip(cameras, renderings, strict=True))
+    write_exr(Path(path), [_plain_view(f"view_{i:03d}", camera, rendering) for i, (camera, rendering) in each])
+
+
+def _plain_view(name, camera, rendering) -> ExrView:
+    alpha = np.asarray(rendering.alpha)
+    return ExrView(
+        rgba=np.concatenate([np.asarray(rendering.rgb), alpha[..., None]], axis=-1),
+        depth=np.asarray(rendering.depth),
+        K=np.asarray(camera.K),
+        cam_from_world=np.asarray(camera.cam_from_world),
+        name=name,
+    )
 
 
 def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:

@@ -105,6 +105,8 @@ def test_exr_colours_are_premultiplied(tmp_path, monkeypatch):
     (view,) = read_exr(tmp_path / "views.exr")
     np.testing.assert_allclose(view.rgba[..., :3], 0.25 * alpha[..., None] * np.ones(3), atol=1e-6)
     np.testing.assert_array_equal(view.rgba[..., 3], alpha)
+    layers.write_renderings_exr(tmp_path / "same.exr", cameras, [rendering])
+    np.testing.assert_array_equal(read_exr(tmp_path / "same.exr")[0].rgba, view.rgba)
     over = 0.25 * alpha[..., None] + (1 - alpha[..., None]) * np.asarray([0.2, 0.4, 0.6])
     np.testing.assert_allclose(read_image(tmp_path / "view_000.png")[0], over, atol=0.5 / 255 + 1e-6)
 
