@@ -16,7 +16,7 @@ import pytest
 from humangs_jax import __version__, cli
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
-from humangs_jax.cli import fit, screen
+from humangs_jax.cli import fit, interrupts, screen
 from humangs_jax.cli.interrupts import PATIENCE
 from humangs_jax.cli.options import UsageError
 from humangs_jax.core import progress
@@ -330,6 +330,20 @@ def test_exit_codes(sample, capsys, fails, code):
     out, err = capsys.readouterr()
     last = err.splitlines()[-1]
     assert out == "" and last.startswith("humangs: interrupted" if fails == "keys" else "humangs: error: ")
+
+
+def test_another_error_because_of_an_interrupt_is_an_interrupt(sample, monkeypatch, capsys):
+    """Extensions that are interrupted while they are imported raise ImportError."""
+
+    def run(self):
+        interrupts.heard.set()
+        raise ImportError("while initializing the extension")
+
+    monkeypatch.setattr(Sample, "run", run)
+    assert cli.execute(["sample"]) == cli.INTERRUPTED and capsys.readouterr().err == "humangs: interrupted\n"
+    monkeypatch.setattr(Sample, "run", lambda self: 1 / 0)  # a mistake of ours is not hidden
+    with pytest.raises(ZeroDivisionError):
+        cli.execute(["sample"])
 
 
 def test_a_stage_on_a_terminal_counts_its_seconds(sample, monkeypatch, capsys):

@@ -155,6 +155,17 @@ def _write_by_ffmpeg(path, frames, fps, shape, quality):
         raise OSError(f"{path}: ffmpeg failed: {problem}")
 
 
+def _indexed(frame, palette, background):
+    """A frame (h, w, 3) in the palette's colours; Pillow looks up colours by their upper 6 bits, which white and 252 share."""
+    from PIL import Image
+
+    indices = np.array(Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE))
+    indices[(frame == background).all(axis=-1)] = 255
+    image = Image.fromarray(indices)
+    image.putpalette(palette.getpalette())
+    return image
+
+
 def _commonest(pixels):
     """The most frequent colour (3,) of (h, w, 3) pixels: the background, where it is of one colour."""
     packed = pixels.reshape(-1, 3).astype(np.int32) @ (1 << 16, 1 << 8, 1)
@@ -177,7 +188,7 @@ def _write_gif(path, frames, fps, _):
     colors[: len(known)] = known
     colors[255] = _commonest(sampled)  # else the background would become the mean of colours like it
     palette.putpalette(colors.tobytes())
-    images = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in kept]
+    images = [_indexed(frame, palette, colors[255]) for frame in kept]
     # durations are whole hundredths of a second; rounding the times, not the durations, keeps the speed
     times = np.rint(np.arange(len(images) + 1) * 100 / fps).astype(int)
     durations = [10 * int(x) for x in np.diff(times)]

@@ -14,11 +14,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 from humangs_jax import __version__
-from humangs_jax.cli.interrupts import INTERRUPTED, end_within_seconds
-from humangs_jax.cli.options import UsageError
 
-BAD_DATA, BAD_USAGE, BROKEN_PIPE = 1, 2, 141
-"""The last one: 128 and the number of the signal, as in shells."""
+BAD_DATA, BAD_USAGE, INTERRUPTED, BROKEN_PIPE = 1, 2, 130, 141
+"""The last two: 128 and the number of the signal, as in shells."""
 
 
 @runtime_checkable
@@ -56,9 +54,8 @@ DESCRIPTION = (
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Entry point of the console script. What takes time is imported where Ctrl-C is heard."""
     try:
-        end_within_seconds()
         _prepare("--verbose" in sys.argv)
         code = execute(sys.argv[1:])
     except KeyboardInterrupt:  # before the command has begun, or the second one
@@ -72,8 +69,9 @@ def main() -> None:
 
 def execute(arguments: Sequence[str]) -> int:
     """Run a command line in this process. Returns the exit code. Raises: SystemExit for --help and what tyro refuses."""
-    from humangs_jax.cli import screen
+    from humangs_jax.cli import interrupts, screen
 
+    interrupts.heard.clear()
     everywhere = {"--quiet", "--verbose", "--version"}
     given, arguments = everywhere & set(arguments), [word for word in arguments if word not in everywhere]
     verbose = "--verbose" in given
@@ -90,16 +88,23 @@ def execute(arguments: Sequence[str]) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes once more at its end
         return BROKEN_PIPE
-    except (ValueError, OSError) as error:
-        return _failed(error, verbose)
     except KeyboardInterrupt:
         return _interrupted()
+    except Exception as error:
+        if interrupts.heard.is_set():  # importing an extension makes another error of it
+            return _interrupted()
+        if isinstance(error, ValueError | OSError):
+            return _failed(error, verbose)
+        raise
     finally:
         screen.end()
 
 
 def _prepare(verbose: bool) -> None:
     """Settings of the process."""
+    from humangs_jax.cli.interrupts import end_within_seconds
+
+    end_within_seconds()
     from humangs_jax.cli.screen import silence
     from humangs_jax.core.allocator import keep_freed_memory
     from humangs_jax.core.compile_cache import enable_compile_cache
@@ -130,6 +135,8 @@ def _failed(error: Exception, verbose: bool) -> int:
         import traceback
 
         traceback.print_exc()
+    from humangs_jax.cli.options import UsageError
+
     print(f"humangs: error: {error}", file=sys.stderr)
     return BAD_USAGE if isinstance(error, UsageError) or str(error).startswith("--") else BAD_DATA
 

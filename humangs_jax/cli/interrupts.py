@@ -10,8 +10,10 @@ import sys
 import threading
 import time
 
-INTERRUPTED = 130
-"""The exit code: 128 and the number of the signal, as in shells."""
+from humangs_jax.cli import INTERRUPTED
+
+heard = threading.Event()
+"""Whether Python has heard of Ctrl-C in this command."""
 AGAIN = 0.02
 """Seconds after which an interrupt that was dropped is repeated."""
 PATIENCE = 2.0
@@ -25,7 +27,6 @@ def end_within_seconds() -> None:
     """
     if sys.platform == "win32" or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return  # there, wake-up descriptors are sockets; or somebody else handles it
-    heard = threading.Event()
 
     def interrupt(number, frame):
         heard.set()

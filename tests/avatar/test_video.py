@@ -164,7 +164,9 @@ def test_gif_background_is_exact(tmp_path, background):
     from PIL import Image
 
     frames = np.full((4, 48, 64, 3), background)
-    frames[:, 8:40, 16:48] = np.random.default_rng(0).uniform(0.3, 1.0, (4, 32, 32, 3))
+    near = np.linspace(background - 0.02, background + 0.02, 4 * 32 * 32).reshape(4, 32, 32, 1)
+    frames[:, 8:40, 16:48] = np.clip(near * np.random.default_rng(0).uniform(0.9, 1.1, (4, 32, 32, 1)), 0, 1)
+    frames[:, 12:36, 20:44] = np.random.default_rng(0).uniform(0, 1, (4, 24, 24, 3))
     write_video(tmp_path / "a.gif", frames, 24)
     with Image.open(tmp_path / "a.gif") as image:
         for i in range(4):
