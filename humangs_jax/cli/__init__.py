@@ -15,6 +15,7 @@ from humangs_jax.cli.avatars import Animate, Demo, Export, Reconstruct, Refine, 
 from humangs_jax.cli.captures import ImportCameras, Synth
 from humangs_jax.cli.evaluate import Evaluate
 from humangs_jax.cli.fit import Check, Fit
+from humangs_jax.cli.preprocess import Preprocess
 from humangs_jax.cli.training import Convert, Train
 from humangs_jax.core.allocator import keep_freed_memory
 from humangs_jax.core.compile_cache import enable_compile_cache
@@ -41,6 +42,7 @@ COMMANDS: dict[str, Callable[..., Command]] = {
     "evaluate": Evaluate,
     "view": View,
     "synth": Synth,
+    "preprocess": Preprocess,
     "train": Train,
     "convert": Convert,
 }

@@ -22,7 +22,7 @@ class ImportCameras:
     source: Positional[Path]
     """File or folder with the calibration; its format is detected."""
     images: Path
-    """Folder of the photos."""
+    """Folder of the photos, or of a video of each camera (CAMERA.mp4; all begin at the same moment)."""
     out: Path
     """The capture folder to write."""
     masks: Path | None = None
@@ -33,6 +33,10 @@ class ImportCameras:
     """Axis of the source's world that points up, like --up=+z or --up=-y. Default: the format's."""
     pixel_centers: Literal["integer", "half"] | None = None
     """Where the source has the centre of the first pixel: at 0 (integer) or 0.5 (half). Default: the format's."""
+    every: int = 1
+    """Take each so many-th frame of the videos."""
+    frames: int | None = None
+    """Take at most that many frames of the videos."""
     overwrite: bool = False
     """Replace the capture folder."""
 

@@ -51,7 +51,9 @@ class Train:
     networks: OmitArgPrefixes[LossNetworkFiles]
     processes: OmitArgPrefixes[Processes]
     data: Positional[Path | None] = None
-    """Folder of capture folders."""
+    """Folder of capture folders, a scene list (`humangs preprocess`), or a data set (docs/datasets.md)."""
+    body: Path | None = None
+    """Model file that DATA's parameters belong to, such as SMPLX_NEUTRAL.npz. Default: the body that comes with the package."""
     out: Path = Path("runs/train")
     """Checkpoints, log, TensorBoard curves, validation images and weights.safetensors."""
     config: str = "small"
@@ -74,6 +76,7 @@ class Train:
         require_at_least(0, on_the_fly=self.on_the_fly)
         self.processes.join()  # before anything asks for devices
         from humangs_jax.body.library import load_body
+        from humangs_jax.data.capture import DEFAULT_BODY
         from humangs_jax.network.weights import load_weights
         from humangs_jax.objectives.loss_networks import load_loss_networks
         from humangs_jax.people.manifest import find_people
@@ -95,8 +98,9 @@ class Train:
             settings = dataclasses.replace(
                 settings, model=model, splat=drawn_as(settings.splat, model.conventions.rendering)
             )
-        body = load_body()
-        people = training_people(self.data, self.on_the_fly, self.out, body)
+        body = load_body(self.body)
+        body_file = DEFAULT_BODY if self.body is None else self.body
+        people = training_people(self.data, self.on_the_fly, self.out, body, body_file)
         if self.diagnose:
             print(diagnose_run(self.out, body, people, networks=networks, variables=variables))
             return

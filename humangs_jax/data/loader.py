@@ -1,12 +1,12 @@
 """The loader: which views of whom come when is a pure function of (seed, step); a run that resumes sees the same batches.
 
-A `Source` has examples by number: `CaptureSource` (folders of photos, written synthetic sets), `GeneratedSource` (people
-made on the fly from keys) and `Mixture` (several of these by weight). `Loader` makes batches of one: each process the rows
-of its devices, some batches ahead, by grain where it is installed and by plain threads where it is not.
+A `Source` has examples by number: `CaptureSource` (people on disk: capture folders, written synthetic sets, data sets),
+`GeneratedSource` (people made on the fly from keys) and `Mixture` (several of these by weight). `Loader` makes batches of one:
+each process the rows of its devices, some batches ahead, by grain where it is installed and by plain threads where it is not.
 """
 
 from humangs_jax.data.loading.batches import Loader
-from humangs_jax.data.loading.captures import CaptureCache, CaptureSource, find_captures
+from humangs_jax.data.loading.captures import CaptureCache, CaptureSource, PeopleCache, find_captures
 from humangs_jax.data.loading.examples import (
     Example,
     Source,
@@ -26,6 +26,7 @@ __all__ = [
     "Example",
     "Loader",
     "Mixture",
+    "PeopleCache",
     "Source",
     "StoredSubject",
     "ViewSampling",

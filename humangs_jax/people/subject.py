@@ -122,14 +122,14 @@ class SyntheticSubject:
 _shape = jax.jit(shape_body)
 
 
-def make_subject(seed: int, body: BodyModel) -> SyntheticSubject:
-    """The person of a seed.
+def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> SyntheticSubject:
+    """The person of a seed. person: another description than that of the seed, such as one in other clothes.
 
     Raises: ValueError if the body is not the package's own: cuts and paint are given in its coordinates.
     """
     if body.name != anatomy_module.BODY_NAME or body.template.shape[0] != anatomy_module.BODY_VERTICES:
         raise ValueError(f"synthetic people need the shipped body '{anatomy_module.BODY_NAME}', got '{body.name}'")
-    person = describe(seed, body)
+    person = describe(seed, body) if person is None else person
     rest = _shape(body, jnp.asarray(person.betas))
     template, faces, weights, *_ = _host_arrays(body)
     vertices, joints = np.asarray(rest.vertices), np.asarray(rest.joints)

@@ -1,4 +1,4 @@
-"""Where a run's examples come from: capture folders, people made on the fly, or both.
+"""Where a run's examples come from: capture folders, data sets, people made on the fly, or several of these.
 
 A run asks for a new source at every stage, because image sizes differ.
 """
@@ -13,7 +13,10 @@ import jax
 from jax.sharding import Mesh
 
 from humangs_jax.body.model import BodyModel
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture, Source
+from humangs_jax.data.capture import DEFAULT_BODY
+from humangs_jax.data.datasets.bodies import FileBody
+from humangs_jax.data.datasets.opening import open_people
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, Mixture, PeopleCache, Source
 from humangs_jax.people.bank import PeopleBank, build_bank, load_bank, save_bank
 from humangs_jax.people.manifest import find_people
 from humangs_jax.people.on_the_fly import ON_THE_FLY, OnTheFlyConfig
@@ -36,9 +39,13 @@ def stage_loader(make_source: MakeSource, config: TrainConfig, step: int, mesh: 
     return Loader(make_source(part), part.batch_size, part.seed, sharding, first_step=step, first_example=before)
 
 
-def captured_people(folders: Sequence[str | Path], body: BodyModel) -> MakeSource:
+def captured_people(folders: Sequence[str | Path], body: BodyModel, body_file: str | Path = DEFAULT_BODY) -> MakeSource:
     """Capture folders whose parameters belong to `body`; images that are decoded once serve all stages."""
-    cache = CaptureCache(folders, body)
+    return cached_people(CaptureCache(folders, body, body_file=body_file))
+
+
+def cached_people(cache: PeopleCache) -> MakeSource:
+    """People on disk; images that are decoded once serve all stages."""
     return lambda config: CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size)
 
 
@@ -72,14 +79,29 @@ def mixed_people(parts: Sequence[MakeSource], weights: Sequence[float | int]) ->
     return lambda config: Mixture(tuple(part(config) for part in parts), tuple(weights))
 
 
-def training_people(data: Path | None, on_the_fly: int, out: Path, body: BodyModel) -> MakeSource:
-    """The people of a folder of captures, `on_the_fly` synthetic people rendered for every step, or both by halves.
+def people_on_disk(data: Path, body: FileBody) -> MakeSource:
+    """The people of a folder of captures, of a scene list, or of a data set (docs/datasets.md), whose body is `body`.
 
-    The latter are made once, into out/people.npz, by one process. Raises: ValueError if there are none.
+    Raises: ValueError if the folder has none of these.
+    """
+    if (data / "capture.json").is_file() or any(data.glob("*/capture.json")):
+        return captured_people(find_people(data), body.model, body.file)
+    return cached_people(PeopleCache(open_people(data, body)))
+
+
+def training_people(
+    data: Path | None, on_the_fly: int, out: Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY
+) -> MakeSource:
+    """The people of `people_on_disk`, `on_the_fly` synthetic people rendered for every step, or both by halves.
+
+    The latter are made once, into out/people.npz, by one process. Raises: ValueError if there are none, or if synthetic people
+    are asked for beside a body that is not theirs.
     """
     parts = []
     if data is not None:
-        parts.append(captured_people(find_people(data), body))
+        parts.append(people_on_disk(data, FileBody(body, str(body_file))))
+    if on_the_fly and str(body_file) != DEFAULT_BODY:
+        raise ValueError(f"synthetic people have the body that comes with the package, not {body_file}")
     if on_the_fly:
         parts.append(on_the_fly_people(_bank(on_the_fly, out, body)))
     if not parts:

@@ -23,6 +23,7 @@ from humangs_jax.data.calibration.calibration import (
 from humangs_jax.data.calibration.checks import Checks, check_calibration
 from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.calibration.photos import Photo, find_photo, find_photos, photo_size
+from humangs_jax.data.calibration.videos import photos_of_videos
 from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera
 from humangs_jax.data.photos import names_from_paths, read_checked, write_description
 from humangs_jax.io.atomic import replace_folder
@@ -83,16 +84,19 @@ def import_cameras(
     scale: float | None = None,
     up: str | None = None,
     pixel_centers: str | None = None,
+    every: int = 1,
+    frames: int | None = None,
     overwrite: bool = False,
 ) -> ImportReport:
     """Write a capture folder (all of it or nothing) of photos and their calibration; body.npz is still to be made.
 
     Arguments:
         source: file or folder of any format in docs/cameras.md; its content decides which one.
-        images: folder of the photos. masks: folder of their masks, named alike.
+        images: folder of the photos, or of a video of each camera (CAMERA.mp4). masks: folder of their masks, named alike.
         out: the capture folder. With `overwrite` a capture that is there is replaced as a whole.
         scale: metres per unit of the source; 1 if None.
         up: the axis of the source's world that points up, "+y", "-z", ...; None: the format's.
+        every, frames: of videos, take each so many-th frame, and at most that many.
         pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0), "half": (0.5, 0.5);
             None: as the format says.
 
@@ -102,7 +106,15 @@ def import_cameras(
     masks = None if masks is None else Path(masks)
     scale = 1.0 if scale is None else scale
     _check_options(scale, up, pixel_centers)
+    for name, value in (("every", every), ("frames", frames)):
+        if value is not None and value < 1:
+            raise ValueError(f"--{name} {value}: expected at least 1")
     _check_folders(source, images, masks, out, overwrite)
+    with photos_of_videos(images, masks, out, every, frames) as (images, masks):
+        return _import(source, images, masks, out, scale, up, pixel_centers)
+
+
+def _import(source, images, masks, out, scale, up, pixel_centers):
     calibration = read_calibration(source, lambda name: _size_by_name(images, name, source))
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
     photos = find_photos(calibration, images, masks)

@@ -1,14 +1,16 @@
-"""Capture folders as a source: images are kept decoded as bytes; a folder that cannot be used is left out, and reported."""
+"""People on disk as a source: images are kept decoded as bytes; who cannot be used is left out, and reported."""
 
 import dataclasses
 import logging
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.array_types import UInt8
 from humangs_jax.data.capture import DEFAULT_BODY, load_capture, read_parameters
 from humangs_jax.data.capture_checks import CaptureError, body_parameters, checked_camera
 from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_views, shrink, subject_views
@@ -94,10 +96,141 @@ def _check_image(file):
     return read_checked(check_image, file)
 
 
-class CaptureCache:
-    """Capture folders: each is checked when first asked for; images are decoded when needed, and kept as bytes up to a limit.
+@runtime_checkable
+class StoredPerson(Protocol):
+    """One person on disk, of a capture folder or of a data set (`datasets.subject.Person`)."""
 
-    Several threads may ask at once. broken: folder -> what is wrong with it, in the order in which it was found.
+    @property
+    def name(self) -> Path | str:
+        """What the log and `broken` call it."""
+        ...
+
+    def outline(self) -> StoredSubject:
+        """All of it but pixels, perhaps without poses. Raises: ValueError or OSError if it cannot be used."""
+        ...
+
+    def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
+        """Images and masks of these views. Raises: as `outline`."""
+        ...
+
+    def posed(self, subject: StoredSubject) -> StoredSubject:
+        """Some views of the outline, with at least the poses that they show. Raises: as `outline`."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class CaptureFolder:
+    """A capture folder as a `StoredPerson`."""
+
+    name: Path
+    body: BodyModel
+    body_file: str | Path = DEFAULT_BODY
+
+    def outline(self) -> StoredSubject:
+        """See `read_outline`."""
+        return read_outline(self.name, self.body, self.body_file)
+
+    def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
+        """See `StoredPerson`."""
+        capture = load_capture(self.name, body=self.body, views=views)
+        assert capture.masks is not None  # the outline has seen them
+        return to_uint8(capture.images), to_uint8(capture.masks)
+
+    def posed(self, subject: StoredSubject) -> StoredSubject:
+        """The same: the outline has all poses."""
+        return subject
+
+
+class PeopleCache:
+    """People on disk: each is checked when first asked for; images are decoded when needed, and kept as bytes up to a limit.
+
+    Several threads may ask at once. broken: name -> what is wrong with it, in the order in which it was found.
+    """
+
+    def __init__(self, people: Sequence[StoredPerson], limit_bytes: int = 4 << 30):
+        if not people:
+            raise ValueError("no capture folders")
+        self.people = tuple(people)
+        self.broken: dict[Path | str, str] = {}
+        self._free_bytes = limit_bytes
+        self._left_out: set[Path | str] = set()
+        self._outlines: dict[Path | str, StoredSubject] = {}
+        self._images: dict[tuple[Path | str, int], tuple[np.ndarray, np.ndarray]] = {}
+        self._lock = threading.Lock()
+
+    def __len__(self) -> int:
+        return len(self.people)
+
+    def name(self, index: int) -> Path | str:
+        """What errors call person `index`."""
+        return self.people[index].name
+
+    def outline(self, index: int) -> StoredSubject | None:
+        """Person `index` without images, see `StoredPerson`; None if it is broken, which is reported once."""
+        name = self.name(index)
+        with self._lock:
+            if name in self._left_out:
+                return None
+            if name in self._outlines:
+                return self._outlines[name]
+        try:
+            outline = self.people[index].outline()
+        except (ValueError, OSError) as error:
+            self.report(index, str(error))
+            return None
+        with self._lock:
+            return self._outlines.setdefault(name, outline)
+
+    def some_views(self, index: int, views: Sequence[int]) -> StoredSubject:
+        """Person `index` with these views alone, in this order. Raises: ValueError naming file and field."""
+        person, name = self.people[index], self.name(index)
+        with self._lock:
+            outline = self._outlines.get(name)
+            decoded = {view: self._images[name, view] for view in views if (name, view) in self._images}
+        outline = person.outline() if outline is None else outline
+        if missing := [view for view in views if view not in decoded]:
+            for view, image, mask in zip(missing, *person.decode(missing), strict=True):
+                decoded[view] = image, mask
+                self._keep(name, view, image, mask)
+        chosen = np.asarray(views)
+        images, masks = (np.stack(column) for column in zip(*(decoded[view] for view in views), strict=True))
+        of_views = {name: getattr(outline, name)[chosen] for name in ("K", "cam_from_world", "frames", "azimuths")}
+        return person.posed(outline._replace(images=images, masks=masks, **of_views))
+
+    def note(self, index: int, problem: str) -> None:
+        """Record person `index` as broken, and log it the first time; other views of it are still used."""
+        name = self.name(index)
+        with self._lock:
+            known = name in self.broken
+            self.broken.setdefault(name, problem)
+            count = len(self.broken)
+        if not known:
+            logger.warning("left out %s (%d of %d folders so far): %s", name, count, len(self), problem)
+
+    def report(self, index: int, problem: str) -> None:
+        """Leave person `index` out from now on. The reason must depend on the files alone, so that the order stays reproducible.
+
+        Raises: ValueError, naming the last problem, once everybody is left out.
+        """
+        self.note(index, problem)
+        with self._lock:
+            self._left_out.add(self.name(index))
+            count = len(self._left_out)
+        if count == len({person.name for person in self.people}):
+            raise ValueError(f"none of the {len(self)} capture folders can be used; the last one: {problem}")
+
+    def _keep(self, name, view, image, mask):
+        size = image.nbytes + mask.nbytes
+        with self._lock:
+            if (name, view) not in self._images and size <= self._free_bytes:
+                # copies: a slice would keep the memory of all views that were read with it
+                self._images[name, view] = image.copy(), mask.copy()
+                self._free_bytes -= size
+
+
+class CaptureCache(PeopleCache):
+    """The people of capture folders.
+
     body_file: where `body` comes from; captures that name another one are broken.
     """
 
@@ -108,93 +241,18 @@ class CaptureCache:
         limit_bytes: int = 4 << 30,
         body_file: str | Path = DEFAULT_BODY,
     ):
-        if not folders:
-            raise ValueError("no capture folders")
         self.folders = tuple(Path(folder) for folder in folders)
-        self.broken: dict[Path, str] = {}
-        self._body, self._body_file, self._free_bytes = body, body_file, limit_bytes
-        self._left_out: set[Path] = set()
-        self._outlines: dict[Path, StoredSubject] = {}
-        self._images: dict[tuple[Path, int], tuple[np.ndarray, np.ndarray]] = {}
-        self._lock = threading.Lock()
-
-    def __len__(self) -> int:
-        return len(self.folders)
-
-    def outline(self, index: int) -> StoredSubject | None:
-        """The subject of folder `index` without images, see `read_outline`; None if it is broken, which is reported once."""
-        folder = self.folders[index]
-        with self._lock:
-            if folder in self._left_out:
-                return None
-            if folder in self._outlines:
-                return self._outlines[folder]
-        try:
-            outline = read_outline(folder, self._body, self._body_file)
-        except (ValueError, OSError) as error:
-            self.report(index, str(error))
-            return None
-        with self._lock:
-            return self._outlines.setdefault(folder, outline)
-
-    def some_views(self, index: int, views: Sequence[int]) -> StoredSubject:
-        """The subject of folder `index` with these views alone, in this order. Raises: ValueError naming file and field."""
-        folder = self.folders[index]
-        with self._lock:
-            outline = self._outlines.get(folder)
-            decoded = {view: self._images[folder, view] for view in views if (folder, view) in self._images}
-        outline = read_outline(folder, self._body, self._body_file) if outline is None else outline
-        if missing := [view for view in views if view not in decoded]:
-            capture = load_capture(folder, body=self._body, views=missing)
-            assert capture.masks is not None  # the outline has seen them
-            images, masks = to_uint8(capture.images), to_uint8(capture.masks)
-            for view, image, mask in zip(missing, images, masks, strict=True):
-                decoded[view] = image, mask
-                self._keep(folder, view, image, mask)
-        chosen = np.asarray(views)
-        images, masks = (np.stack(column) for column in zip(*(decoded[view] for view in views), strict=True))
-        of_views = {name: getattr(outline, name)[chosen] for name in ("K", "cam_from_world", "frames", "azimuths")}
-        return outline._replace(images=images, masks=masks, **of_views)
-
-    def note(self, index: int, problem: str) -> None:
-        """Record folder `index` as broken, and log it the first time; its other views are still used."""
-        folder = self.folders[index]
-        with self._lock:
-            known = folder in self.broken
-            self.broken.setdefault(folder, problem)
-            count = len(self.broken)
-        if not known:
-            logger.warning("left out %s (%d of %d folders so far): %s", folder, count, len(self), problem)
-
-    def report(self, index: int, problem: str) -> None:
-        """Leave folder `index` out from now on. The reason must depend on the folder alone, so that the order stays reproducible.
-
-        Raises: ValueError, naming the last problem, once every folder is left out.
-        """
-        self.note(index, problem)
-        with self._lock:
-            self._left_out.add(self.folders[index])
-            count = len(self._left_out)
-        if count == len(set(self.folders)):
-            raise ValueError(f"none of the {len(self)} capture folders can be used; the last one: {problem}")
-
-    def _keep(self, folder, view, image, mask):
-        size = image.nbytes + mask.nbytes
-        with self._lock:
-            if (folder, view) not in self._images and size <= self._free_bytes:
-                # copies: a slice would keep the memory of all views that were read with it
-                self._images[folder, view] = image.copy(), mask.copy()
-                self._free_bytes -= size
+        super().__init__([CaptureFolder(folder, body, body_file) for folder in self.folders], limit_bytes)
 
 
 @dataclasses.dataclass(frozen=True)
 class CaptureSource:
-    """Captures as a `Source`. Example e shows subject e mod n of a permutation drawn for each pass over the n folders.
+    """People on disk as a `Source`. Example e shows subject e mod n of a permutation drawn for each pass over the n people.
 
-    input_size, target_size: pixels a side of the square views. A broken folder is replaced by the next one in the order.
+    input_size, target_size: pixels a side of the square views. A broken person is replaced by the next one in the order.
     """
 
-    cache: CaptureCache
+    cache: PeopleCache
     sampling: ViewSampling
     input_size: int
     target_size: int
@@ -206,8 +264,8 @@ class CaptureSource:
 
     @property
     def broken(self) -> Mapping[str, str]:
-        """Folders left out so far: path -> what is wrong with it."""
-        return {str(folder): problem for folder, problem in self.cache.broken.items()}
+        """People left out so far: name -> what is wrong with it."""
+        return {str(name): problem for name, problem in self.cache.broken.items()}
 
     def __len__(self) -> int:
         return len(self.cache)
@@ -225,7 +283,7 @@ class CaptureSource:
                 for size in (self.input_size, self.target_size):
                     shrink(outline.images, size)  # without views: whether images of this size can be shrunk so
             except ValueError as error:
-                self.cache.report(subject_index, f"{self.cache.folders[subject_index]}: {error}")
+                self.cache.report(subject_index, f"{self.cache.name(subject_index)}: {error}")
                 continue
             try:
                 seen = self.cache.some_views(subject_index, [*inputs, *targets])

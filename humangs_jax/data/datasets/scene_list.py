@@ -1,0 +1,281 @@
+"""The layout of the published network's data: lists of scenes with cameras, and the body of each frame as arrays.
+
+    train.json, test.json   [{"scene_name", "mesh_transform" 4 x 4,
+                              "frames": [{"image_path", "w2c" 4 x 4 OpenCV, "fxfycxcy", "smpl_path"}]}]
+    smpl_path               npz of v_posed (n, 3), v_cano (n, 3), faces (f, 3), joint_transforms (55, 4, 4)
+    evaluation_N.json       {scene: {"context": [views], "target": [views]}}, N input views
+
+Paths are relative to the list. Images are square, on white. The arrays are in the units of the scene, and `v_posed` is `v_cano`
+moved by `joint_transforms`, pose correctives apart. Unit, shape and pose are recovered from them, so that lists of other programs
+need nothing more; cameras become metric. We also write `mask_path`; where it is missing, what is not white is the person.
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_json, required
+from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, recover_pose, recover_shape
+from humangs_jax.data.datasets.subject import STORED_SIZE, Person, Subject
+from humangs_jax.data.datasets.values import ArrayFile, checked_numbers
+from humangs_jax.data.photos import read_checked
+from humangs_jax.io.images import image_size, read_grey, read_image
+from humangs_jax.io.npz import write_npz
+from humangs_jax.io.reading import inside, reading
+from humangs_jax.io.text import write_json
+
+LISTS = ("train.json", "test.json")
+WHITE = 250 / 255
+"""A pixel with a channel below is the person where there is no mask; 8-bit JPEG images ripple by a few levels."""
+KEPT_FRAMES = 64
+"""Poses of a scene that are kept in memory."""
+SIGNIFICANT = 9
+"""Digits of numbers in the lists: those of float32."""
+
+
+class SceneFrame(NamedTuple):
+    """A view of a scene. image, mask, arrays: paths relative to the list. K: (3, 3) pixels. cam_from_world: (4, 4)."""
+
+    image: str
+    cam_from_world: Float[np.ndarray, "4 4"]
+    K: Float[np.ndarray, "3 3"]
+    arrays: str
+    mask: str | None = None
+
+
+def is_scene_list(path: str | Path) -> bool:
+    """Whether this is a list of scenes, or a folder that holds one."""
+    path = Path(path)
+    return (path.is_file() and path.suffix == ".json") or any((path / name).is_file() for name in LISTS)
+
+
+def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
+    """The scenes of a list by name, as they stand in it. path: the JSON file, or a folder (train.json, else test.json).
+
+    Raises: CaptureError naming file and key.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = next((file / name for name in LISTS if (file / name).is_file()), file / LISTS[0])
+    content = checked_json(file)
+    if not isinstance(content, list) or not content:
+        raise CaptureError(file, "", f"expected a list of scenes, got {type(content).__name__}")
+    scenes = {}
+    for i, scene in enumerate(content):
+        if not isinstance(scene, dict):
+            raise CaptureError(file, f"[{i}]", f"expected a JSON object, got {type(scene).__name__}")
+        name = required(scene, "scene_name", file, f"[{i}].")
+        if not isinstance(name, str) or not name or name in scenes:
+            raise CaptureError(file, f"[{i}].scene_name", f"expected a name of its own, got {name!r}")
+        scenes[name] = scene
+    return scenes
+
+
+def open_scene_list(path: str | Path, body: FileBody, size: int | None = None) -> tuple[Person, ...]:
+    """The people of a list, each opened when it is asked for. size: of the stored squares; None: that of the images.
+
+    Raises: CaptureError if the list cannot be read.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = next((file / name for name in LISTS if (file / name).is_file()), file / LISTS[0])
+    scenes = read_scene_list(file)
+    if size is None:
+        size = _first_size(file, scenes)
+    opened = lambda name, scene: functools.partial(open_scene, file, name, scene, body)
+    return tuple(Person(f"{file}: {name}", opened(name, scene), size) for name, scene in scenes.items())
+
+
+def _first_size(file, scenes):
+    """Side of the first image that is there."""
+    for name, scene in scenes.items():
+        for frame in _frames(scene, file, name)[:1]:
+            path = file.parent / str(frame.get("image_path", ""))
+            if path.is_file():
+                return max(read_checked(image_size, path))
+    return STORED_SIZE
+
+
+def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) -> Subject:
+    """One scene of a list in metres. Images that are not there are left out and counted. Raises: CaptureError."""
+    views, missing = _present(file, name, scene)
+    smpl, frames = np.unique([view.arrays for view in views], return_inverse=True)
+    arrays = [_inside(file, name, path) for path in smpl.tolist()]
+    first = ArrayFile(arrays[0])
+    scale, betas = recover_shape(body, first.numbers("v_cano", (None, 3)), first.path)
+
+    @functools.lru_cache(maxsize=KEPT_FRAMES)
+    def pose(frame: int):
+        values = ArrayFile(arrays[frame])
+        transforms = values.numbers("joint_transforms", (len(body.model.parents), 4, 4))
+        return recover_pose(body, betas, scale, transforms, values.path)
+
+    def parameters(chosen: Sequence[int]) -> BodyParameters:
+        poses = [pose(frame) for frame in chosen]
+        joints = len(body.model.parents)
+        rotations = np.asarray([rotation for rotation, _ in poses]).reshape(-1, joints, 3)
+        return BodyParameters(betas, rotations, np.asarray([t for _, t in poses]).reshape(-1, 3))
+
+    def read(view: int):
+        return _read_view(file, name, views[view])
+
+    sizes = np.asarray([_view_size(file, name, views[0])] * len(views))
+    K, poses = np.stack([view.K for view in views]), np.stack([view.cam_from_world for view in views])
+    for i in range(len(views)):
+        checked_camera(K[i], poses[i], *sizes[i].tolist(), file, f"{name}.frames[{i}]")
+    poses[:, :3, 3] /= scale
+    return Subject(
+        name=f"{file}: {name}",
+        K=K,
+        cam_from_world=poses,
+        sizes=sizes,
+        frames=frames.astype(np.int32),
+        cameras=np.arange(len(views)),
+        frame_count=len(arrays),
+        view_name=lambda view: f"{view:05d}",
+        read=read,
+        parameters=parameters,
+        missing=missing,
+    )
+
+
+def scene_frames(file: Path, name: str, scene: Mapping[str, Any]) -> list[SceneFrame]:
+    """The frames of a scene, checked. Raises: CaptureError naming file and key."""
+    views = []
+    for i, frame in enumerate(_frames(scene, file, name)):
+        at = f"{name}.frames[{i}]."
+        if not isinstance(frame, dict):
+            raise CaptureError(file, at[:-1], f"expected a JSON object, got {type(frame).__name__}")
+        texts = [required(frame, key, file, at) for key in ("image_path", "smpl_path")]
+        for key, text in zip(("image_path", "smpl_path"), texts, strict=True):
+            if not isinstance(text, str) or not text:
+                raise CaptureError(file, at + key, f"expected the path of a file, got {text!r}")
+        pose = checked_numbers(_array(frame, "w2c", file, at), file, f"{at}w2c", (4, 4))
+        fx, fy, cx, cy = checked_numbers(_array(frame, "fxfycxcy", file, at), file, f"{at}fxfycxcy", (4,))
+        K = np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        views.append(SceneFrame(texts[0], pose, K, texts[1], frame.get("mask_path")))
+    return views
+
+
+def _array(frame, key, file, at):
+    value = required(frame, key, file, at)
+    try:
+        return np.asarray(value)
+    except ValueError:
+        raise CaptureError(file, at + key, "expected rows of one length") from None
+
+
+def _frames(scene, file, name):
+    frames = required(scene, "frames", file, f"{name}.")
+    if not isinstance(frames, list) or not frames:
+        raise CaptureError(file, f"{name}.frames", "expected a list of at least one frame")
+    return frames
+
+
+def _present(file, name, scene):
+    """Frames whose image and arrays are there, and how many are not."""
+    views, missing = [], {"no image": 0, "no smpl_path": 0}
+    known: dict[str, bool] = {}
+    for view in scene_frames(file, name, scene):
+        if view.arrays not in known:
+            known[view.arrays] = _inside(file, name, view.arrays).is_file()
+        if not known[view.arrays]:
+            missing["no smpl_path"] += 1
+        elif not _inside(file, name, view.image).is_file():
+            missing["no image"] += 1
+        else:
+            views.append(view)
+    if not views:
+        raise CaptureError(file, name, f"no view with its image and arrays ({missing})")
+    return views, {reason: count for reason, count in missing.items() if count}
+
+
+def _inside(file, name, path):
+    with reading(f"{file}: {name}", "path", CaptureError):
+        return inside(file.parent, path, photo=True)
+
+
+def _view_size(file, name, view):
+    return read_checked(image_size, _inside(file, name, view.image))
+
+
+def _read_view(file, name, view):
+    path = _inside(file, name, view.image)
+    image, alpha = read_checked(read_image, path)
+    if view.mask is not None:
+        return image, read_checked(read_grey, _inside(file, name, view.mask))
+    if alpha is not None:
+        return image * alpha[..., None] + (1 - alpha[..., None]), alpha
+    return image, not_white(image).astype(np.float32)
+
+
+def not_white(image: Float[np.ndarray, "h w 3"]) -> Bool[np.ndarray, "h w"]:
+    """Pixels of the person in an image on white: those below `WHITE`, and what they enclose."""
+    from scipy.ndimage import binary_fill_holes
+
+    return np.asarray(binary_fill_holes(image.min(axis=-1) < WHITE))
+
+
+# Writing --------------------------------------------------------------------------------------------------------------
+
+
+def scene_entry(name: str, mesh_transform: Float[np.ndarray, "4 4"], frames: Sequence[SceneFrame]) -> dict[str, Any]:
+    """A scene as it stands in a list."""
+    return {
+        "scene_name": name,
+        "mesh_transform": rounded(mesh_transform),
+        "frames": [
+            {
+                "image_path": frame.image,
+                **({} if frame.mask is None else {"mask_path": frame.mask}),
+                "w2c": rounded(frame.cam_from_world),
+                "fxfycxcy": rounded(frame.K[[0, 1, 0, 1], [0, 1, 2, 2]]),
+                "smpl_path": frame.arrays,
+            }
+            for frame in frames
+        ],
+    }
+
+
+def rounded(array: Float[np.ndarray, "..."]) -> Any:
+    """Nested lists of numbers of `SIGNIFICANT` digits."""
+    short = lambda x: [short(row) for row in x] if isinstance(x, list) else float(f"{x:.{SIGNIFICANT}g}")
+    return short(array.tolist())
+
+
+def write_arrays(
+    path: Path,
+    posed: Float[np.ndarray, "n 3"],
+    rest: Float[np.ndarray, "n 3"],
+    faces: np.ndarray,
+    joint_transforms: Float[np.ndarray, "j 4 4"],
+) -> None:
+    """The npz of a frame."""
+    arrays = {"v_posed": posed, "v_cano": rest, "joint_transforms": joint_transforms}
+    write_npz(
+        path, {name: array.astype(np.float32) for name, array in arrays.items()} | {"faces": faces.astype(np.int32)}
+    )
+
+
+def write_list(path: Path, entries: Sequence[Mapping[str, Any]]) -> None:
+    """A list of scenes; compact, since 2,300 scenes of 60 views are 50 MB."""
+    write_json(path, list(entries), indent=None)
+
+
+def read_evaluation(path: str | Path) -> dict[str, dict[str, list[int]]]:
+    """Context and target views of each scene. Raises: CaptureError naming file and key."""
+    file = Path(path)
+    content = checked_json(file)
+    if not isinstance(content, dict):
+        raise CaptureError(file, "", f"expected scenes by name, got {type(content).__name__}")
+    for name, views in content.items():
+        for key in ("context", "target"):
+            chosen = required(views, key, file, f"{name}.") if isinstance(views, dict) else None
+            whole = isinstance(chosen, list) and all(type(view) is int and view >= 0 for view in chosen)
+            if not whole or not chosen:
+                raise CaptureError(file, f"{name}.{key}", f"expected numbers of views, got {str(chosen)[:40]}")
+    return content

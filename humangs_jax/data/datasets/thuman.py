@@ -1,0 +1,228 @@
+"""THuman2.0 and 2.1: textured scans with SMPL-X fits (https://github.com/ytrock/THuman2.0-Dataset). Static, not metric.
+
+    model/<id>/<id>.obj with its .mtl and JPEG texture      smplx/<id>/smplx_param.pkl and mesh_smplx.obj
+
+Three kinds of fits exist; the keys and the length of the hand poses tell which one a file is:
+
+    kind   keys                hands                              model     scan coordinates of a model vertex V
+    A      scale, translation  12 principal components            male      V scale + translation
+    B      scale, translation  45 axis-angle                      male      V scale + translation
+    C      scale, transl       45 axis-angle                      neutral   (V + transl) scale
+
+In all of them hand poses are relative to the mean hand (flat_hand_mean False). mesh_smplx.obj is the fitted body as the authors
+posed it: the error of our body against it says whether fit, kind and model file belong together.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from humangs_jax.core.array_types import Float, Int, UInt8
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, PosedPerson, coefficients, posed_people
+from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, ArrayFile
+from humangs_jax.io.images import check_image
+from humangs_jax.io.mesh import read_meshes
+from humangs_jax.io.reading import Refused, reading
+from humangs_jax.io.text import read_text
+
+Kind = Literal["A", "B", "C"]
+PCA_NUMBERS, HAND_NUMBERS = 12, 45
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png")
+FIT, FIT_MESH = "smplx_param.pkl", "mesh_smplx.obj"
+TOLERANCE = 2e-3
+"""Metres of the body, mean over vertices, up to which a fit reproduces mesh_smplx.obj. Rounding of OBJ files is far below;
+another gender moves vertices by centimetres, a wrong hand convention the fingers by as much."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Fit:
+    """The body of a scan.
+
+    kind: see the module. betas: (s,) of all of the body's directions. rotations: (55, 3). translation: (3,) metres of the model.
+    scale: scan units per metre. A vertex V of the posed body (translation included) lies at V scale in the scan.
+    """
+
+    file: Path
+    kind: Kind
+    betas: Float[np.ndarray, " s"]
+    rotations: Float[np.ndarray, "55 3"]
+    translation: Float[np.ndarray, "3"]
+    scale: float
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scan:
+    """A textured triangle mesh. uvs: (n, 2), v up. texture: (t, t, 3) bytes, row 0 on top."""
+
+    vertices: Float[np.ndarray, "n 3"]
+    faces: Int[np.ndarray, "f 3"]
+    uvs: Float[np.ndarray, "n 2"]
+    texture: UInt8[np.ndarray, "th tw 3"]
+
+
+@dataclasses.dataclass(frozen=True)
+class ThumanSet:
+    """The scans of a folder. names: sorted. skipped: name -> why it cannot be used, of those that lack a file."""
+
+    folder: Path
+    names: tuple[str, ...]
+    skipped: Mapping[str, str]
+
+    def scan_file(self, name: str) -> Path:
+        """The mesh of a scan."""
+        return self.folder / "model" / name / f"{name}.obj"
+
+    def fit_file(self, name: str) -> Path:
+        """The fit of a scan."""
+        return self.folder / "smplx" / name / FIT
+
+
+def open_thuman(folder: str | Path) -> ThumanSet:
+    """The scans of a folder that holds model/ and smplx/; nothing is read yet. Raises: CaptureError if there are none."""
+    folder = Path(folder)
+    models = folder / "model"
+    if not models.is_dir():
+        raise CaptureError(folder, "model", "no such folder: expected THuman's model/ and smplx/")
+    found = ThumanSet(folder, (), {})
+    names, skipped = [], {}
+    for name in sorted(entry.name for entry in models.iterdir() if entry.is_dir() and not entry.name.startswith(".")):
+        missing = [path for path in (found.scan_file(name), found.fit_file(name)) if not path.is_file()]
+        if missing:
+            skipped[name] = f"{missing[0]}: no such file"
+        else:
+            names.append(name)
+    if not names:
+        why = f" ({next(iter(skipped.values()))})" if skipped else ""
+        raise CaptureError(folder, "", f"no scan with a fit{why}: expected model/ID/ID.obj and smplx/ID/{FIT}")
+    return ThumanSet(folder, tuple(names), skipped)
+
+
+# Fits -----------------------------------------------------------------------------------------------------------------
+
+
+def read_fit(file: str | Path, body: FileBody) -> Fit:
+    """Read smplx_param.pkl, without running anything in it. Raises: CaptureError naming file and key."""
+    values = ArrayFile(file)
+    file = values.path
+    if ("transl" in values) == ("translation" in values):
+        raise CaptureError(file, "transl", "expected either transl (THuman2.1, fixed fits) or translation (older fits)")
+    of_kind = "transl" if "transl" in values else "translation"
+    hands = [values.numbers(f"{side}_hand_pose", (1, None), LARGEST_ANGLE)[0] for side in ("left", "right")]
+    length = len(hands[0])
+    lengths = (HAND_NUMBERS,) if of_kind == "transl" else (PCA_NUMBERS, HAND_NUMBERS)
+    for side, hand in zip(("left", "right"), hands, strict=True):
+        if len(hand) not in lengths or len(hand) != length:
+            wanted = " or ".join(map(str, lengths))
+            raise CaptureError(
+                file, f"{side}_hand_pose", f"expected {wanted} numbers beside {of_kind}, got {len(hand)}"
+            )
+    kind: Kind = "C" if of_kind == "transl" else "A" if length == PCA_NUMBERS else "B"
+    scale = values.number("scale")
+    if not scale > 0:
+        raise CaptureError(file, "scale", f"expected a positive number, got {scale:g}")
+    offset = values.numbers(of_kind, (1, 3))[0]
+    translation = offset if kind == "C" else offset / scale
+    if np.abs(translation).max() > FARTHEST:
+        problem = f"expected at most {FARTHEST:g} m from the origin, got {np.abs(translation).max():.4g}: another unit?"
+        raise CaptureError(file, of_kind, problem)
+    parts = [values.numbers(key, (1, size), LARGEST_ANGLE)[0] for key, size in _ANGLES.items()]
+    if kind == "A":
+        components = np.asarray(body.hands.components, np.float64)
+        hands = [hand @ components[side, :length] for side, hand in enumerate(hands)]
+    means = np.asarray(body.hands.means, np.float64)
+    rotations = np.concatenate([*parts, *(hand + means[side] for side, hand in enumerate(hands))]).reshape(-1, 3)
+    shape = [values.numbers(key, (1, None), LARGEST_COEFFICIENT)[0] for key in ("betas", "expression")]
+    return Fit(file, kind, coefficients(body.model, shape[0], shape[1], file), rotations, translation, scale)
+
+
+_ANGLES = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
+
+
+def fitted_body(fit: Fit, body: FileBody) -> PosedPerson:
+    """The body of a scan in scan units."""
+    parameters = BodyParameters(fit.betas, fit.rotations[None], fit.translation[None])
+    return next(posed_people(body.model, parameters, fit.scale))
+
+
+def fit_error(fitted: PosedPerson, mesh: Float[np.ndarray, "n 3"], fit: Fit) -> tuple[float, float]:
+    """Mean and largest distance between the vertices of the fitted body and mesh_smplx.obj, metres of the body.
+
+    Raises: CaptureError, saying the error, if the mean is above `TOLERANCE` or the numbers of vertices differ.
+    """
+    file = fit.file.with_name(FIT_MESH)
+    if len(mesh) != len(fitted.vertices):
+        problem = f"{len(mesh)} vertices, but the body model has {len(fitted.vertices)}: expected the model of the fit"
+        raise CaptureError(file, "", problem)
+    apart = np.linalg.norm(mesh - fitted.vertices, axis=1) / fit.scale
+    mean, largest = float(apart.mean()), float(apart.max())
+    if mean > TOLERANCE:
+        gender = "neutral" if fit.kind == "C" else "male"
+        problem = (
+            f"the fit (kind {fit.kind}) is {1e3 * mean:.3g} mm from this mesh on average, {1e3 * largest:.3g} mm at most: "
+            f"expected below {1e3 * TOLERANCE:g} mm on average; fits of this kind need the {gender} model"
+        )
+        raise CaptureError(file, "", problem)
+    return mean, largest
+
+
+def read_fit_mesh(file: str | Path) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "f 3"]]:
+    """Vertices and triangles of an OBJ file, every vertex once and in the order of the file. Raises: CaptureError."""
+    with reading(file, "mesh", CaptureError):
+        vertices, faces = [], []
+        for number, line in enumerate(read_text(file).splitlines(), 1):
+            kind, _, rest = line.partition(" ")
+            if kind not in ("v", "f"):
+                continue
+            words = rest.split()
+            try:
+                (vertices if kind == "v" else faces).append(
+                    [float(word) for word in words[:3]] if kind == "v" else [int(w.partition("/")[0]) for w in words]
+                )
+            except ValueError:
+                raise Refused(f"line {number}: expected numbers, got {line[:60]!r}") from None
+            if len(words) != 3 and (kind == "f" or len(words) < 3):
+                raise Refused(f"line {number}: expected three numbers, got {len(words)}")
+        if not vertices or not faces:
+            raise Refused(f"{len(vertices)} vertices and {len(faces)} faces: expected a mesh")
+        points, corners = np.asarray(vertices), np.asarray(faces) - 1
+        if not np.isfinite(points).all():
+            raise Refused("v: expected finite numbers")
+        if corners.min() < 0 or corners.max() >= len(points):
+            raise Refused(f"f: expected vertices 1 to {len(points)}, got {corners.min() + 1} to {corners.max() + 1}")
+        return points, corners
+
+
+# Scans ----------------------------------------------------------------------------------------------------------------
+
+
+def read_scan(file: str | Path) -> Scan:
+    """The mesh of a scan with its texture. Raises: CaptureError naming the file."""
+    with reading(file, "scan", CaptureError):
+        meshes = read_meshes(file, textures=True)
+        if len(meshes) != 1:
+            raise Refused(f"{len(meshes)} meshes: expected one mesh with one texture")
+        mesh = meshes[0]
+        uvs = getattr(mesh.visual, "uv", None)
+        image = getattr(getattr(mesh.visual, "material", None), "image", None)
+        if uvs is None:
+            raise Refused("no texture coordinates: expected a textured scan")
+        if image is None or max(image.size) <= 2:  # trimesh leaves out what it cannot read, or puts a placeholder there
+            _find_fault(Path(file).parent)
+            raise Refused("no texture image: expected a material (.mtl) beside the scan that names a PNG or JPEG file")
+        vertices, uvs = np.asarray(mesh.vertices, np.float64), np.asarray(uvs, np.float32)
+        for name, values in (("vertices", vertices), ("texture coordinates", uvs)):
+            if not np.isfinite(values).all():
+                raise Refused(f"{name}: expected finite numbers")
+        texture = np.asarray(image.convert("RGB"))
+        return Scan(vertices, np.asarray(mesh.faces, np.int32), uvs, texture)
+
+
+def _find_fault(folder):
+    """Raises: FileError for the first image of a folder that cannot be read."""
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in PHOTO_SUFFIXES:
+            check_image(path)

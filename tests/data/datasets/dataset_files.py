@@ -1,0 +1,274 @@
+"""Tiny data sets in every layout, from random numbers: nobody would recognise a person, but every file is as it should be."""
+
+import csv
+import json
+import pickle
+
+import numpy as np
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.body.joints import PARENTS
+from humangs_jax.data.datasets.bodies import FileBody
+
+VERTICES, COLUMNS, FRAMES, CAMERAS = 80, 10, 3, 2
+WIDTH, HEIGHT = 12, 16
+HANDS = ("left", "right")
+ANGLES = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
+
+
+def model_arrays(seed=0):
+    """An SMPL-X model file of a few vertices."""
+    rng = np.random.default_rng(seed)
+    joints = len(PARENTS)
+    template = rng.normal(size=(VERTICES, 3)) * [0.2, 0.5, 0.1]
+    template[0], template[12] = (0, -0.3, 0), (0, 0.2, 0.05)  # pelvis and neck
+    weights = rng.uniform(size=(VERTICES, joints)) ** 6
+    weights[:40, 25:] = 0  # not of the hands
+    return {
+        "v_template": template,
+        "f": rng.permutation(VERTICES)[:60].reshape(20, 3),
+        "shapedirs": 0.03 * rng.normal(size=(VERTICES, 3, 2 * COLUMNS)),
+        "posedirs": 0.01 * rng.normal(size=(VERTICES, 3, 9 * (joints - 1))),
+        "J_regressor": np.eye(joints, VERTICES),
+        "weights": weights / weights.sum(1, keepdims=True),
+        "kintree_table": np.stack([np.where(np.asarray(PARENTS) < 0, 2**32 - 1, PARENTS), np.arange(joints)]),
+        "hands_meanl": 0.2 * rng.normal(size=45),
+        "hands_meanr": 0.2 * rng.normal(size=45),
+        "hands_componentsl": rng.normal(size=(45, 45)),
+        "hands_componentsr": rng.normal(size=(45, 45)),
+    }
+
+
+def write_model(folder, seed=0):
+    np.savez(folder / "SMPLX_TINY.npz", **model_arrays(seed))
+    return FileBody.load(folder / "SMPLX_TINY.npz")
+
+
+def oracle(arrays, betas, rotations, translation):
+    """(rest, vertices, joint transforms) of SMPL-X's equations in numpy, joint by joint."""
+    rest = arrays["v_template"] + arrays["shapedirs"] @ betas
+    joints = arrays["J_regressor"] @ rest
+    local = Rotation.from_rotvec(rotations).as_matrix()
+    shaped = rest + arrays["posedirs"] @ (local[1:] - np.eye(3)).reshape(-1)
+    frames = []
+    for j, parent in enumerate(PARENTS):
+        frame = np.eye(4)
+        frame[:3, :3], frame[:3, 3] = local[j], joints[j] - (joints[parent] if parent >= 0 else 0)
+        frames.append(frame if parent < 0 else frames[parent] @ frame)
+    transforms = np.stack(frames)
+    transforms[:, :3, 3] += translation - np.einsum("jab,jb->ja", transforms[:, :3, :3], joints)
+    blended = np.einsum("nj,jab->nab", arrays["weights"], transforms)
+    return rest, np.einsum("nab,nb->na", blended[:, :3, :3], shaped) + blended[:, :3, 3], transforms
+
+
+# THuman ---------------------------------------------------------------------------------------------------------------
+
+
+def fit_values(kind, seed=0):
+    """smplx_param.pkl of random numbers."""
+    rng = np.random.default_rng([seed, ord(kind)])
+    values = {key: 0.3 * rng.normal(size=(1, size)) for key, size in ANGLES.items()}
+    length = 12 if kind == "A" else 45
+    values |= {f"{hand}_hand_pose": 0.3 * rng.normal(size=(1, length)) for hand in HANDS}
+    values |= {"betas": rng.normal(size=(1, COLUMNS)), "expression": rng.normal(size=(1, COLUMNS))}
+    values |= {"scale": np.asarray([0.7 + rng.random()])}
+    values |= {"transl" if kind == "C" else "translation": rng.normal(size=(1, 3))}
+    return {key: np.asarray(value, np.float32) for key, value in values.items()}
+
+
+def scan_vertices(arrays, values):
+    """(rest, mesh_smplx.obj, joint transforms) by the table of docs/datasets.md: in scan units."""
+    hands = []
+    for hand in HANDS:
+        numbers = values[f"{hand}_hand_pose"][0].astype(float)
+        if len(numbers) == 12:
+            numbers = numbers @ arrays[f"hands_components{hand[0]}"][:12]
+        hands.append(numbers + arrays[f"hands_mean{hand[0]}"])
+    pose = np.concatenate([*(values[key][0] for key in ANGLES), *hands]).reshape(-1, 3).astype(float)
+    betas = np.concatenate([values["betas"][0], values["expression"][0]]).astype(float)
+    scale = float(values["scale"][0])
+    rest, vertices, transforms = oracle(arrays, betas, pose, np.zeros(3))
+    offset = scale * values["transl"][0] if "transl" in values else values["translation"][0]
+    transforms[:, :3, 3] = scale * transforms[:, :3, 3] + offset
+    return scale * rest, scale * vertices + offset, transforms
+
+
+def write_obj(path, vertices, faces, uvs=None):
+    lines = [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in np.asarray(vertices, float).tolist()]
+    corner = (lambda i: f"{i}/{i}") if uvs is not None else str
+    if uvs is not None:
+        lines = ["mtllib material0.mtl", *lines, *(f"vt {u:.7g} {v:.7g}" for u, v in uvs.tolist()), "usemtl material0"]
+    lines += ["f " + " ".join(corner(i) for i in face) for face in (np.asarray(faces, int) + 1).tolist()]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write_thuman(folder, arrays, kinds="ABC"):
+    """A scan for each kind of fit: a cube around the body."""
+    for i, kind in enumerate(kinds):
+        values, name = fit_values(kind, i), f"{i:04d}"
+        _, mesh, _ = scan_vertices(arrays, values)
+        fit, model = folder / "smplx" / name, folder / "model" / name
+        fit.mkdir(parents=True)
+        model.mkdir(parents=True)
+        (fit / "smplx_param.pkl").write_bytes(pickle.dumps(values))
+        write_obj(fit / "mesh_smplx.obj", mesh, arrays["f"])
+        low, high = mesh.min(0), mesh.max(0)
+        corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+        faces = np.asarray([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]])
+        faces = np.concatenate([faces, [[2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]]])
+        write_obj(model / f"{name}.obj", low + corners * (high - low), faces, corners[:, :2].astype(float))
+        (model / "material0.mtl").write_text("newmtl material0\nmap_Kd material0.jpeg\n")
+        Image.fromarray(np.full((8, 8, 3), 90, np.uint8)).save(model / "material0.jpeg")
+    return folder
+
+
+# Videos ---------------------------------------------------------------------------------------------------------------
+
+
+def cameras():
+    """R, T of cameras that look at the origin from 3 m, K."""
+    poses = []
+    for azimuth in np.arange(CAMERAS) * 2 * np.pi / CAMERAS:
+        s, c = np.sin(azimuth), np.cos(azimuth)
+        poses.append((np.asarray([[c, 0, -s], [0, -1, 0], [-s, 0, -c]]), np.asarray([0, 0, 3.0])))
+    return poses, np.asarray([[20.0, 0, 5.5], [0, 20, 7.5], [0, 0, 1]])
+
+
+def write_photo(photo, mask, level=100):
+    for path in (photo, mask):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.full((HEIGHT, WIDTH, 3), level, np.uint8)).save(photo, quality=95)
+    person = np.zeros((HEIGHT, WIDTH), np.uint8)
+    person[4:12, 3:9] = 255
+    Image.fromarray(person).save(mask, quality=95)
+
+
+def parameter_arrays(seed=0, frames=FRAMES):
+    rng = np.random.default_rng(seed)
+    sizes = {"global_orient": 3, "body_pose": 63, "jaw_pose": 3, "left_hand_pose": 45, "right_hand_pose": 45}
+    arrays = {key: 0.3 * rng.normal(size=(frames, size)) for key, size in sizes.items()}
+    arrays |= {"transl": 0.1 * rng.normal(size=(frames, 3)), "betas": np.tile(rng.normal(size=COLUMNS), (frames, 1))}
+    return {key: x.astype(np.float32) for key, x in (arrays | {"expression": np.zeros((frames, COLUMNS))}).items()}
+
+
+def calibration(names):
+    poses, K = cameras()
+    flat = lambda x: np.asarray(x, float).reshape(-1).tolist()
+    size = [WIDTH, HEIGHT]
+    return {
+        n: {"K": flat(K), "R": flat(R), "T": flat(T), "imgSize": size} for n, (R, T) in zip(names, poses, strict=True)
+    }
+
+
+def write_avatarrex(folder, frames=FRAMES):
+    names = ["22010708", "22010710"]
+    for name in names:
+        for frame in range(frames):
+            file = f"{frame:08d}.jpg"
+            write_photo(folder / name / file, folder / name / "mask" / "pha" / file, 100 + frame)
+    (folder / "calibration_full.json").write_text(json.dumps(calibration(names)))
+    np.savez(folder / "smpl_params.npz", **parameter_arrays(frames=frames))
+    return folder
+
+
+def write_thuman4(folder, frames=FRAMES):
+    names = ["cam00", "cam01"]
+    for name in names:
+        for frame in range(frames):
+            file = f"{frame:08d}.jpg"
+            write_photo(folder / "images" / name / file, folder / "masks" / name / file)
+    (folder / "calibration.json").write_text(json.dumps(calibration(names)))
+    (folder / "missing_img_files.txt").write_text("images\\cam01\\00000001.jpg\n")
+    np.savez(folder / "smpl_params.npz", **parameter_arrays(frames=frames))
+    return folder
+
+
+def write_actorshq(folder, frames=FRAMES):
+    poses, K = cameras()
+    scale = folder / "4x"
+    for number in range(1, CAMERAS + 1):
+        name = f"Cam{number:03d}"
+        for frame in range(frames):
+            photo = scale / "rgbs" / name / f"{name}_rgb{frame:06d}.jpg"
+            write_photo(photo, scale / "masks" / name / f"{name}_mask{frame:06d}.png")
+    with open(scale / "calibration.csv", "w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["name", "w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"])
+        for i, (R, T) in enumerate(poses):
+            inner = K[0, 0] / WIDTH, K[1, 1] / HEIGHT, (K[0, 2] + 0.5) / WIDTH, (K[1, 2] + 0.5) / HEIGHT
+            turn = Rotation.from_matrix(R.T).as_rotvec()
+            table.writerow([f"Cam{i + 1:03d}", WIDTH, HEIGHT, *turn, *(-R.T @ T), *inner])
+    np.savez(folder / "smpl_params.npz", **parameter_arrays(frames=frames))
+    return folder
+
+
+def write_dna(folder, h5py, frames=FRAMES):
+    import io
+
+    poses, K = cameras()
+    for part in ("main", "annotations"):
+        (folder / part).mkdir(parents=True)
+    encode = lambda pixels: np.frombuffer(encoded(pixels, io.BytesIO()), np.uint8)
+    person = np.zeros((HEIGHT, WIDTH), np.uint8)
+    person[4:12, 3:9] = 255
+    values = parameter_arrays(frames=frames)
+    with (
+        h5py.File(folder / "main" / "0001_01.smc", "w") as main,
+        h5py.File(folder / "annotations" / "0001_01_annots.smc", "w") as notes,
+    ):
+        for c, (R, T) in enumerate(poses):
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = R, T
+            at = f"Camera_Parameter/{c:02d}"
+            notes[f"{at}/K"], notes[f"{at}/D"], notes[f"{at}/RT"] = K, np.zeros(5), np.linalg.inv(pose)
+            for frame in range(frames):
+                main[f"Camera_5mp/{c}/color/{frame}"] = encode(np.full((HEIGHT, WIDTH, 3), 100, np.uint8))
+                notes[f"Mask/{c}/mask/{frame}"] = encode(person)
+        full = [values["global_orient"], values["body_pose"], values["jaw_pose"], np.zeros((frames, 6))]
+        full = np.concatenate([*full, values["left_hand_pose"], values["right_hand_pose"]], 1)
+        notes["SMPLx/fullpose"], notes["SMPLx/transl"] = full.reshape(frames, 55, 3), values["transl"]
+        for key in ("betas", "expression"):
+            notes[f"SMPLx/{key}"] = values[key]
+    return folder
+
+
+def encoded(pixels, stream):
+    Image.fromarray(pixels).save(stream, "PNG")
+    return stream.getvalue()
+
+
+# Scene list -----------------------------------------------------------------------------------------------------------
+
+
+def write_scenes(folder, arrays, scale=1.3, views=3):
+    """One scene of two frames in units of its own; returns the list and what the arrays were made from."""
+    rng = np.random.default_rng(5)
+    poses, K = cameras()
+    betas = 0.5 * rng.normal(size=2 * COLUMNS)
+    known = []
+    frames = []
+    for i in range(2):
+        rotations, translation = 0.3 * rng.normal(size=(55, 3)), 0.1 * rng.normal(size=3)
+        rest, vertices, transforms = oracle(arrays, betas, rotations, translation)
+        transforms[:, :3, 3] *= scale
+        (folder / "smpl").mkdir(parents=True, exist_ok=True)
+        numbers = {"v_posed": scale * vertices, "v_cano": scale * rest, "joint_transforms": transforms}
+        numbers = {key: x.astype(np.float32) for key, x in numbers.items()}
+        np.savez(folder / "smpl" / f"{i}.npz", faces=arrays["f"], **numbers)
+        known.append((rotations, translation))
+        for view in range(views):
+            R, T = poses[view % CAMERAS]
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = R, scale * T
+            path = f"images/{i}_{view}.png"
+            image = np.full((HEIGHT, HEIGHT, 3), 255, np.uint8)
+            image[4:12, 3:9] = 100
+            image[6:8, 5:7] = 255  # a white spot on the clothes
+            (folder / "images").mkdir(exist_ok=True)
+            Image.fromarray(image).save(folder / path)
+            inner = [K[0, 0], K[1, 1], HEIGHT / 2, HEIGHT / 2]
+            frames.append({"image_path": path, "w2c": pose.tolist(), "fxfycxcy": inner, "smpl_path": f"smpl/{i}.npz"})
+    content = [{"scene_name": "s0", "mesh_transform": np.eye(4).tolist(), "frames": frames}]
+    (folder / "train.json").write_text(json.dumps(content))
+    return folder / "train.json", betas, known

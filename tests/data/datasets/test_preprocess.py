@@ -1,0 +1,236 @@
+"""`humangs preprocess`: what is written, what is skipped and why; interrupted, resumed, in shards."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from dataset_files import CAMERAS, FRAMES, model_arrays, write_avatarrex, write_model, write_thuman, write_thuman4
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.cli.preprocess import Preprocess, ScanViews
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.datasets.bodies import posed_people
+from humangs_jax.data.datasets.opening import open_people
+from humangs_jax.data.datasets.scene_list import read_scene_list
+from humangs_jax.data.loader import find_captures
+from humangs_jax.data.preprocess.rendering import AMBIENT, HEADLIGHT, ScanRenderer, smooth_normals
+from humangs_jax.data.preprocess.run import preprocess
+from humangs_jax.data.preprocess.scenes import Settings
+from humangs_jax.io import atomic
+from humangs_jax.io.images import read_image
+
+SIZE = 16
+MILLIMETRE = 1e-3
+
+
+@pytest.fixture(scope="module")
+def body(tmp_path_factory):
+    return write_model(tmp_path_factory.mktemp("body"))
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory):
+    """Two subjects, one with a photo that cannot be read."""
+    folder = tmp_path_factory.mktemp("videos")
+    write_avatarrex(folder / "avatarrex_a")
+    write_avatarrex(folder / "avatarrex_b")
+    (folder / "avatarrex_b" / "22010708" / "00000002.jpg").write_bytes(b"\xff\xd8 cut off")
+    return folder
+
+
+def settings(layout="scenes", **changes):
+    return Settings("avatarrex", layout, SIZE, every=1, **changes)
+
+
+def run(source, out, body, asked, **options):
+    return preprocess(source, out, body.file, asked, progress=False, **options)
+
+
+def test_a_video_becomes_a_scene_in_an_upright_world(videos, tmp_path, body):
+    report = run(videos, tmp_path / "out", body, settings())
+    views = FRAMES * CAMERAS
+    assert (report.made, report.scenes, report.views) == (2, 2, 2 * views - 1) and not report.skipped
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert manifest["counts"]["unreadable_photos"] == 1
+    (problem,) = manifest["scenes"]["avatarrex_b"]["unreadable"].values()
+    assert "00000002.jpg" in problem
+    scenes = read_scene_list(tmp_path / "out" / "test.json")
+    assert list(scenes) == ["avatarrex_a", "avatarrex_b"]
+    assert json.loads((tmp_path / "out" / "evaluation_1.json").read_text())["avatarrex_a"]["target"]
+    raw = open_people(videos, body, SIZE)[0].subject
+    found = open_people(tmp_path / "out", body)[0].subject
+    # frame 0 stands upright in the middle; photos and cameras show the same as before
+    posed = next(posed_people(body.model, found.parameters([0])))
+    spine = posed.joints[12] - posed.joints[0]
+    assert spine[1] / np.linalg.norm(spine) > 1 - 1e-6
+    np.testing.assert_allclose((posed.vertices.min(0) + posed.vertices.max(0)) / 2, 0, atol=MILLIMETRE)
+    before = next(posed_people(body.model, raw.parameters([1]))).vertices
+    after = next(posed_people(body.model, found.parameters([1]))).vertices
+    for view, other in ((2, 2), (3, 3)):
+        seen = [
+            (subject.cam_from_world[i] @ np.concatenate([points, np.ones((len(points), 1))], 1).T)[:3]
+            for subject, points, i in ((raw, before, view), (found, after, other))
+        ]
+        np.testing.assert_allclose(*seen, atol=MILLIMETRE)
+        np.testing.assert_allclose(found.squared_K([other], SIZE), raw.squared_K([view], SIZE), atol=1e-4)
+    np.testing.assert_array_equal(found.photo(1, SIZE)[0], raw.photo(1, SIZE)[0])
+    np.testing.assert_array_equal(found.photo(1, SIZE)[1], raw.photo(1, SIZE)[1])
+
+
+def test_the_other_layout_is_capture_folders(videos, tmp_path, body):
+    shutil.copy(body.file, tmp_path / "SMPLX_TINY.npz")
+    run(videos, tmp_path / "out", body, settings("capture"))
+    folders = find_captures(tmp_path / "out")
+    assert [folder.name for folder in folders] == ["avatarrex_a", "avatarrex_b"]
+    capture = load_capture(folders[0])
+    assert capture.body.name == "SMPLX_TINY" and capture.view_count == FRAMES * CAMERAS
+    raw = open_people(videos, body, SIZE)[0].subject
+    K = np.asarray(capture.cameras.K)
+    np.testing.assert_allclose(K, raw.squared_K(np.arange(len(raw)), SIZE), atol=1e-4)
+    np.testing.assert_allclose(np.asarray(capture.betas)[:10], raw.parameters([]).betas[:10], atol=1e-5)
+
+
+def test_a_finished_set_is_kept_and_other_settings_are_refused(videos, tmp_path, body):
+    out = tmp_path / "out"
+    assert run(videos, out, body, settings(), shard=(0, 2)).scenes == 1
+    kept = (out / "avatarrex_a" / "scene.json").stat().st_mtime_ns
+    report = run(videos, out, body, settings(), shard=(1, 2))
+    assert (report.made, report.scenes) == (1, 2) and len(read_scene_list(out)) == 2
+    assert run(videos, out, body, settings()).made == 0
+    assert (out / "avatarrex_a" / "scene.json").stat().st_mtime_ns == kept
+    with pytest.raises(ValueError, match=r"manifest.json: settings: .*size 16 -> 32.*another folder"):
+        run(videos, out, body, Settings("avatarrex", "scenes", 32, every=1))
+    with pytest.raises(ValueError, match="lies in the data set"):
+        run(videos, videos / "out", body, settings())
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "letter.txt").write_text("dear")
+    with pytest.raises(ValueError, match="not empty"):
+        run(videos, tmp_path / "mine", body, settings())
+    with pytest.raises(ValueError, match="no subject in the layout of avatarrex"):
+        run(tmp_path / "mine", tmp_path / "new", body, settings())
+
+
+def test_a_kill_leaves_nothing_half_written(videos, tmp_path, body, monkeypatch):
+    from humangs_jax.data.preprocess import scenes
+
+    written, write = [], scenes.write_png
+
+    def die(path, image):
+        written.append(path)
+        if len(written) > 5:
+            raise KeyboardInterrupt
+        write(path, image)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(scenes, "write_png", die)
+        run(videos, tmp_path / "out", body, settings())
+    assert not list((tmp_path / "out").glob("*/scene.json")) and not list((tmp_path / "out").glob(".*"))
+    # a process that is killed at once leaves a temporary folder, which the next one removes
+    abandoned = tmp_path / "out" / f".avatarrex_a.new-{atomic.MACHINE}-999999999-01234567"
+    (abandoned / "images").mkdir(parents=True)
+    atomic._sweep.cache_clear()
+    assert run(videos, tmp_path / "out", body, settings()).scenes == 2
+    assert not abandoned.exists()
+
+
+def test_a_subject_that_cannot_be_read_is_skipped_with_the_reason(videos, tmp_path, body):
+    source, out = tmp_path / "source", tmp_path / "out"
+    shutil.copytree(videos, source)
+    good = (source / "avatarrex_a" / "smpl_params.npz").read_bytes()
+    (source / "avatarrex_a" / "smpl_params.npz").write_bytes(good[:100])
+    report = run(source, out, body, settings())
+    assert report.scenes == 1 and "smpl_params.npz: not a readable npz archive" in report.skipped["avatarrex_a"]
+    assert "skipped avatarrex_a" in str(report)
+    (source / "avatarrex_a" / "smpl_params.npz").write_bytes(good)  # mended: tried again
+    report = run(source, out, body, settings())
+    assert report.scenes == 2 and not report.skipped
+    shutil.rmtree(source / "avatarrex_b")
+    (source / "avatarrex_a" / "smpl_params.npz").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"none of 1 subjects could be made.*smpl_params.npz"):
+        run(source, tmp_path / "none", body, settings())
+
+
+def test_scans_become_scenes_by_the_command(tmp_path, body, capsys):
+    arrays = model_arrays()
+    source = write_thuman(tmp_path / "thuman", arrays)
+    (source / "smplx" / "0002" / "mesh_smplx.obj").unlink()
+    views = ScanViews(views=5, near=True, supersample=1, train=1, test=1)
+    command = Preprocess("thuman", source, views, tmp_path / "out", Path(body.file), size=SIZE, workers=1)
+    command.run()
+    assert "2 scenes, 10 views" in capsys.readouterr().out
+    manifest = json.loads((tmp_path / "out" / "manifest.json").read_text())
+    assert "mesh_smplx.obj: no such file" in manifest["skipped"]["0002"]
+    assert manifest["settings"]["factors"] == [2.0, 2.0] and manifest["scenes"]["0001"]["fit_kind"] == "B"
+    people = [
+        p
+        for part in ("train", "test")
+        if (tmp_path / "out" / f"{part}.json").is_file()
+        for p in open_people(tmp_path / "out" / f"{part}.json", body)
+    ]
+    for person in people:
+        subject = person.subject
+        name = person.name.rsplit(" ", 1)[1]
+        known = manifest["scenes"][name]
+        distance = subject.cam_from_world[:, 2, 3] * known["units_per_metre"]
+        np.testing.assert_allclose(distance, 2 * known["radius"], rtol=1e-4)
+        image, mask = subject.photo(0, SIZE)
+        assert 0.05 < (mask > 0).mean() < 0.6 and (image[mask == 0] == 255).all()
+    captures = Preprocess(
+        "thuman", source, views, tmp_path / "captures", Path(body.file), size=SIZE, workers=1, layout="capture"
+    )
+    captures.run()
+    capture = load_capture(tmp_path / "captures" / people[0].name.rsplit(" ", 1)[1])
+    wanted = people[0].subject
+    np.testing.assert_allclose(np.asarray(capture.cameras.cam_from_world), wanted.cam_from_world, atol=MILLIMETRE)
+    # as matrices: a turn by more than half a circle is also one the other way round
+    matrices = lambda rotations: Rotation.from_rotvec(np.asarray(rotations, float).reshape(-1, 3)).as_matrix()
+    found = matrices(capture.poses.rotations)
+    np.testing.assert_allclose(found, matrices(wanted.parameters([0]).rotations), atol=1e-4)
+    np.testing.assert_allclose(
+        np.asarray(capture.poses.translation), wanted.parameters([0]).translations, atol=MILLIMETRE
+    )
+
+
+def test_wrong_options_are_one_line(tmp_path):
+    command = lambda scans=ScanViews(), **options: Preprocess(
+        "thuman", tmp_path / "in", scans, tmp_path / "out", **options
+    )
+    for made, words in (
+        (command(shard="3/3"), "--shard 3/3"),
+        (command(shard="x"), "--shard x"),
+        (command(ScanViews(factors=(2.0, 1.0))), "--factors 2 1"),
+        (command(ScanViews(views=0)), "--views 0"),
+        (command(body=tmp_path / "none.npz"), "--body"),
+        (command(), "model: no such folder"),
+    ):
+        with pytest.raises((ValueError, OSError), match=words):
+            made.run()
+
+
+def test_a_face_before_the_camera_has_the_colour_of_its_texture():
+    from humangs_jax.data.datasets.thuman import Scan
+
+    corners = np.asarray([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0]])
+    faces = np.asarray([[0, 1, 2], [0, 2, 3]], np.int32)
+    texture = np.zeros((64, 64, 3), np.uint8)
+    texture[::2] = 200  # finer than the samples: on average 100
+    scan = Scan(corners, faces, ((corners[:, :2] + 5) / 10).astype(np.float32), texture)
+    np.testing.assert_allclose(smooth_normals(corners, faces), np.tile([0, 0, 1], (4, 1)), atol=1e-12)
+    pose = np.diag([1.0, -1, -1, 1])
+    pose[2, 3] = 8
+    image, mask = ScanRenderer.of(scan, corners).render(pose, SIZE, 1)
+    assert (mask == 255).all()
+    across = np.hypot(*np.meshgrid(*[(np.arange(SIZE) + 0.5 - SIZE / 2) / (SIZE / 2) * np.tan(np.pi / 6)] * 2))
+    light = AMBIENT + HEADLIGHT / np.sqrt(1 + across**2)
+    np.testing.assert_allclose(image, np.repeat(np.rint(100 * light)[..., None], 3, -1), atol=1)
+
+
+def test_listed_missing_photos_are_in_the_manifest(tmp_path, body):
+    write_thuman4(tmp_path / "subject00")
+    preprocess(tmp_path, tmp_path.parent / "out4", body.file, Settings("thuman4", size=SIZE, every=2), progress=False)
+    manifest = json.loads((tmp_path.parent / "out4" / "manifest.json").read_text())
+    assert manifest["counts"]["missing_photos"] == 1 and manifest["scenes"]["subject00"]["views"] == 2 * CAMERAS
+    image, _ = read_image(tmp_path.parent / "out4" / "subject00" / "images" / "cam00_00000002.png")
+    assert image.shape == (SIZE, SIZE, 3)

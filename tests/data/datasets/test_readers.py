@@ -1,0 +1,226 @@
+"""Every layout is read as it was written; nothing is decoded before it is asked for; what is missing is counted."""
+
+import time
+
+import h5_or_skip
+import numpy as np
+import pytest
+from dataset_files import (
+    CAMERAS,
+    FRAMES,
+    HEIGHT,
+    WIDTH,
+    cameras,
+    model_arrays,
+    parameter_arrays,
+    write_actorshq,
+    write_avatarrex,
+    write_dna,
+    write_model,
+    write_photo,
+    write_scenes,
+    write_thuman,
+    write_thuman4,
+)
+
+from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, posed_people, turned
+from humangs_jax.data.datasets.opening import open_people
+from humangs_jax.data.datasets.scene_list import read_evaluation, read_scene_list, scene_frames
+from humangs_jax.data.datasets.thuman import open_thuman
+from humangs_jax.data.loader import CaptureSource, Loader, PeopleCache, Source, ViewSampling
+from humangs_jax.io.text import write_json
+
+FLOAT32 = 1e-6
+JPEG = 3
+"""Levels that JPEG images of one grey are off."""
+SIZE = 16
+
+
+@pytest.fixture(scope="module")
+def body(tmp_path_factory):
+    return write_model(tmp_path_factory.mktemp("body"))
+
+
+def write_every(folder):
+    return {
+        "avatarrex": write_avatarrex(folder / "avatarrex_zzr"),
+        "thuman4": write_thuman4(folder / "subject00"),
+        "actorshq": write_actorshq(folder / "Actor01" / "Sequence1"),
+    }
+
+
+@pytest.fixture(scope="module")
+def videos(tmp_path_factory):
+    return write_every(tmp_path_factory.mktemp("videos"))
+
+
+@pytest.mark.parametrize("layout", ["avatarrex", "thuman4", "actorshq"])
+def test_a_video_is_read_as_it_was_written(layout, videos, body):
+    (person,) = open_people(videos[layout], body, SIZE)
+    subject = person.subject
+    shown = [(frame, camera) for frame in range(FRAMES) for camera in range(CAMERAS)]
+    if layout == "thuman4":  # one is listed as missing
+        shown.remove((1, 1))
+        assert subject.missing == {"listed as missing": 1}
+    else:
+        assert not subject.missing
+    assert list(zip(subject.frames, subject.cameras, strict=True)) == shown and subject.frame_count == FRAMES
+    poses, K = cameras()
+    for view, (_, camera) in enumerate(shown):
+        R, T = poses[camera]
+        np.testing.assert_allclose(subject.cam_from_world[view, :3, :3], R, atol=FLOAT32)
+        np.testing.assert_allclose(subject.cam_from_world[view, :3, 3], T, atol=FLOAT32)
+        # pixel centres at +0.5; padded by 2 columns on each side
+        np.testing.assert_allclose(subject.K[view, :2, 2], K[:2, 2] + 0.5)
+        np.testing.assert_allclose(subject.squared_K([view], SIZE)[0, :2, 2], K[:2, 2] + 0.5 + [2, 0])
+    values = parameter_arrays()
+    betas, rotations, translations = subject.parameters([2, 0])
+    np.testing.assert_allclose(betas[:10], values["betas"][0], atol=FLOAT32)
+    np.testing.assert_allclose(translations, values["transl"][[2, 0]], atol=FLOAT32)
+    np.testing.assert_allclose(rotations[:, :22].reshape(2, -1)[:, 3:], values["body_pose"][[2, 0]], atol=FLOAT32)
+    np.testing.assert_array_equal(rotations[:, 23:25], 0)  # no poses of the eyes
+    # flat_hand_mean is True: the numbers are whole rotations
+    np.testing.assert_allclose(rotations[:, 40:].reshape(2, -1), values["right_hand_pose"][[2, 0]], atol=FLOAT32)
+    image, mask = subject.photo(0, SIZE)
+    assert image.shape == (SIZE, SIZE, 3) and set(np.unique(mask)) == {0, 255}
+    person_box = np.zeros((SIZE, SIZE), bool)
+    person_box[4:12, 5:11] = True
+    np.testing.assert_array_equal(mask > 0, person_box)
+    assert (image[~person_box] == 255).all() and np.abs(image[person_box].astype(int) - 100).max() <= JPEG
+    capture = subject.capture([0, 2], body, SIZE)
+    assert capture.view_count == 2 and capture.names[0].endswith("00000000")
+
+
+def test_photos_without_mask_or_pose_and_missing_ones_are_counted(tmp_path, body):
+    folder = write_avatarrex(tmp_path / "a")
+    (folder / "22010708" / "00000000.jpg").unlink()
+    (folder / "22010710" / "mask" / "pha" / "00000002.jpg").unlink()
+    write_photo(folder / "22010710" / "00000009.jpg", folder / "22010710" / "mask" / "pha" / "00000009.jpg")
+    (folder / "22010710" / "notes.txt").write_text("not a photo")
+    (person,) = open_people(folder, body)
+    assert person.subject.missing == {"no photo": 1, "no mask": 1, "no pose": 1}
+    assert len(person.subject) == 2 * 3 - 2
+
+
+def test_hdf5_is_read_as_it_was_written(tmp_path, body):
+    h5py = h5_or_skip.h5py()
+    (person,) = open_people(write_dna(tmp_path / "dna", h5py), body, SIZE)
+    subject, values = person.subject, parameter_arrays()
+    assert len(subject) == FRAMES * CAMERAS and not subject.missing
+    np.testing.assert_allclose(subject.cam_from_world[1, :3, 3], cameras()[0][1][1], atol=FLOAT32)
+    np.testing.assert_allclose(subject.K[0, :2, 2], cameras()[1][:2, 2] + 0.5)
+    _, rotations, translations = subject.parameters([1])
+    hands = values["right_hand_pose"][1] + model_arrays()["hands_meanr"]  # flat_hand_mean is False
+    np.testing.assert_allclose(rotations[0, 40:].reshape(-1), hands, atol=FLOAT32)
+    np.testing.assert_allclose(translations[0], values["transl"][1], atol=FLOAT32)
+    image, mask = subject.photo(3, SIZE)
+    assert (image[mask > 0] == 100).all() and (image[mask == 0] == 255).all() and mask[8, 8] == 255
+
+
+def test_a_scene_list_gives_back_shape_pose_and_metres(tmp_path, body):
+    file, betas, known = write_scenes(tmp_path, model_arrays())
+    (person,) = open_people(file, body)
+    subject = person.subject
+    found, rotations, translations = subject.parameters([1, 0])
+    np.testing.assert_allclose(found, betas, atol=1e-3)
+    for i, frame in enumerate((1, 0)):
+        wanted, translation = known[frame]
+        np.testing.assert_allclose(rotations[i], wanted, atol=1e-5)
+        np.testing.assert_allclose(translations[i], translation, atol=1e-4)
+    np.testing.assert_allclose(subject.cam_from_world[:, 2, 3], 3.0, atol=1e-4)  # not 3.9
+    image, mask = subject.photo(0, HEIGHT)
+    assert mask[7, 6] == 255 and mask.sum() == 255 * 8 * 6  # a white spot inside is the person's
+    assert (image[mask == 0] == 255).all()
+
+
+def test_a_scene_list_leaves_out_and_counts_what_is_missing(tmp_path, body):
+    write_scenes(tmp_path, model_arrays())
+    (tmp_path / "images" / "0_1.png").unlink()
+    (tmp_path / "smpl" / "1.npz").unlink()
+    (person,) = open_people(tmp_path, body)
+    assert person.subject.missing == {"no image": 1, "no smpl_path": 3} and len(person.subject) == 2
+
+
+def test_canonical_hands_that_the_release_bent_do_not_matter(tmp_path, body):
+    arrays = model_arrays()
+    file, betas, _ = write_scenes(tmp_path, arrays)
+    of_hands = arrays["weights"][:, 25:].sum(1) > 0
+    for i in range(2):
+        values = dict(np.load(tmp_path / "smpl" / f"{i}.npz"))
+        values["v_cano"][of_hands] += 0.05
+        np.savez(tmp_path / "smpl" / f"{i}.npz", **values)
+    found = open_people(file, body)[0].subject.parameters([0]).betas
+    np.testing.assert_allclose(found, betas, atol=1e-3)
+
+
+def test_evaluation_indices_are_read_and_checked(tmp_path):
+    write_json(tmp_path / "e.json", {"s": {"context": [0, 3], "target": [1]}})
+    assert read_evaluation(tmp_path / "e.json")["s"]["context"] == [0, 3]
+    write_json(tmp_path / "e.json", {"s": {"context": [0, -3], "target": [1]}})
+    with pytest.raises(ValueError, match=r"e.json: s.context: expected numbers of views"):
+        read_evaluation(tmp_path / "e.json")
+
+
+def test_scans_without_a_fit_are_skipped_with_the_reason(tmp_path):
+    folder = write_thuman(tmp_path / "t", model_arrays())
+    (folder / "smplx" / "0001" / "smplx_param.pkl").unlink()
+    found = open_thuman(folder)
+    assert found.names == ("0000", "0002") and "smplx_param.pkl: no such file" in found.skipped["0001"]
+    with pytest.raises(ValueError, match="preprocess thuman"):
+        open_people(folder, FileBody.load())
+
+
+def test_a_turned_world_moves_the_posed_body_along(body):
+    rng = np.random.default_rng(3)
+    parameters = BodyParameters(0.3 * rng.normal(size=20), 0.4 * rng.normal(size=(1, 55, 3)), rng.normal(size=(1, 3)))
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [0.3, -2, 1]
+    before = next(posed_people(body.model, parameters)).vertices
+    after = next(posed_people(body.model, turned(parameters, matrix, body.rest_joints(parameters.betas)[0]))).vertices
+    np.testing.assert_allclose(after, before @ matrix[:3, :3].T + matrix[:3, 3], atol=1e-5)
+
+
+def test_five_thousand_frames_open_in_under_a_second(tmp_path, body):
+    """Names of 10,000 files, their contents never looked at."""
+    folder, count = write_avatarrex(tmp_path / "a", frames=1), 5000
+    for part in (folder / "22010708", folder / "22010708" / "mask" / "pha"):
+        for frame in range(1, count):
+            (part / f"{frame:08d}.jpg").touch()
+    np.savez(folder / "smpl_params.npz", **parameter_arrays(frames=count))
+    spent = []
+    for _ in range(3):  # other programs may take the processor
+        began = time.process_time()
+        (person,) = open_people(folder, body, SIZE)
+        assert len(person.outline().frames) == count + 1
+        spent.append(time.process_time() - began)
+    assert min(spent) < 1
+    assert person.subject.photo(0, SIZE)[0].shape == (SIZE, SIZE, 3)
+
+
+def test_every_data_set_is_a_source_of_the_loader(tmp_path, body):
+    folders = write_every(tmp_path)
+    folders["scenes"] = write_scenes(tmp_path / "scenes", model_arrays())[0]
+    people = [person for folder in folders.values() for person in open_people(folder, body, SIZE)]
+    (tmp_path / "avatarrex_zzr" / "22010708" / "00000001.jpg").write_bytes(b"\xff\xd8 not a photo")
+    source = CaptureSource(PeopleCache(people), ViewSampling(input_counts=(2,), target_count=2), SIZE // 2, SIZE)
+    assert isinstance(source, Source) and len(source) == 4
+    loader = Loader(source, batch_size=4, seed=1)
+    batch = loader.batch_at(0)
+    assert batch.inputs.images.shape == (4, 2, SIZE // 2, SIZE // 2, 3)
+    assert batch.targets.images.shape == (4, 2, SIZE, SIZE, 3) and batch.inputs.rotations.shape == (4, 2, 55, 3)
+    again = Loader(CaptureSource(PeopleCache(people), source.sampling, SIZE // 2, SIZE), batch_size=4, seed=1).batch_at(
+        0
+    )
+    np.testing.assert_array_equal(batch.targets.images, again.targets.images)
+    for step in range(1, 8):
+        loader.batch_at(step)
+    (problem,) = source.broken.values()
+    assert "00000001.jpg" in problem and len(read_scene_list(folders["scenes"])) == 1
+
+
+def test_written_lists_are_read_again(tmp_path):
+    file, *_ = write_scenes(tmp_path, model_arrays())
+    ((name, scene),) = read_scene_list(file).items()
+    frames = scene_frames(file, name, scene)
+    assert [frame.arrays for frame in frames] == ["smpl/0.npz"] * 3 + ["smpl/1.npz"] * 3
+    assert frames[0].K[0, 0] == 20 and (WIDTH, HEIGHT) == (12, 16)
