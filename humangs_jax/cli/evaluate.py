@@ -32,7 +32,7 @@ class Evaluate:
 
     lpips: OmitArgPrefixes[LpipsFiles]
     source: Positional[Path]
-    """A capture folder, or a folder of them."""
+    """A capture folder, a folder of them, a scene list, or a data set (docs/datasets.md)."""
     avatar: Path | None = None
     """File written by `humangs reconstruct`, or a folder with PERSON.npz."""
     weights: Path | None = None
@@ -41,6 +41,8 @@ class Evaluate:
     """Folder with PERSON/VIEW.png, named like the photos; VIEW.png for one capture."""
     protocol: Literal["humangs", "animatable-gaussians", "ghg", "giga", "lhm", "lhm++", "lvsm"] = "humangs"
     """Whose backgrounds, crops, networks and SSIM."""
+    body: Path | None = None
+    """Model file that the parameters of a data set belong to. Default: the body that comes with the package."""
     inputs: int | None = None
     """How many photos are inputs, evenly spaced. Default: 4."""
     indices: Path | None = None
@@ -90,6 +92,7 @@ class Evaluate:
                 inputs=self.inputs,
                 indices=self.indices,
                 lpips=networks,
+                body=self.body,
                 page_images=self.page_images if self.html is not None else 0,
                 progress=True,
             )

@@ -17,18 +17,21 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture import Capture, load_capture
+from humangs_jax.data.datasets.bodies import FileBody
+from humangs_jax.data.datasets.opening import open_people
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.loading.examples import Source
 from humangs_jax.data.photos import capture_folder
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.io.images import read_image
-from humangs_jax.io.text import read_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 
 HELD_OUT = "held_out"
 """A capture in this folder of another one has views that are no inputs; `humangs synth` writes them."""
 DEFAULT_INPUTS = 4
+MOST_TARGETS = 2000
+"""Views of one person that are compared: they are in memory together."""
 SUFFIXES = (".png", ".jpg", ".jpeg")
 Indices = Mapping[str, Mapping[str, Sequence[int]]]
 """By person: "context", the views that are inputs, and "target", those to compare with, by their numbers in the capture."""
@@ -69,14 +72,16 @@ def find_people(
     source: str | Path | Capture | Case | Source | Iterable[Case],
     inputs: int | None = None,
     indices: Indices | None = None,
-    body: BodyModel | None = None,
+    body: BodyModel | str | Path | None = None,
     reconstructs: bool = True,
 ) -> People:
     """The people of a source.
 
     Arguments:
-        source: a capture folder or a folder of them, a capture, cases, or a `Source`, whose examples give inputs and targets and
-            whose parameters belong to `body` (default: the one that comes with the package).
+        source: a capture folder or a folder of them; a scene list or a data set of any layout of `datasets.opening`; a capture;
+            cases; or a `Source`, whose examples give inputs and targets.
+        body: the model that the parameters of data sets and sources belong to, or its file (default: the one that comes with the
+            package). Captures name theirs.
         inputs: how many photos are inputs: evenly spaced around the person, of the first view's frame. Default: 4, or all of them
             where a capture with a folder held_out has fewer. indices: says it by person instead.
         reconstructs: whether the method needs inputs. One that does not, and is given neither `inputs` nor `indices`, is compared
@@ -89,7 +94,11 @@ def find_people(
     if isinstance(source, Capture):
         return People(("capture",), lambda index: _split("capture", source, inputs, indices, reconstructs))
     if isinstance(source, str | Path):
-        folders = find_captures(capture_folder(source))
+        path = capture_folder(source)
+        if not (path / "capture.json").is_file() and not any(path.glob("*/capture.json")):
+            return _find_in_data_set(path, inputs, indices, body, reconstructs)
+        body = _model(body)
+        folders = find_captures(path)
         names = tuple(folder.name for folder in folders)
         if indices is not None and (unknown := [name for name in indices if name not in names]):
             raise ValueError(f"indices: {unknown[0]!r} is no capture in {source}")
@@ -97,24 +106,9 @@ def find_people(
         return People(names, load)
     if isinstance(source, Source):
         names = tuple(f"{index:04d}" for index in range(len(source)))
-        return People(names, lambda index: _from_source(source, index, names[index], inputs, body))
+        return People(names, lambda index: _from_source(source, index, names[index], inputs, _model(body)))
     cases = list(source)
     return People(tuple(case.name for case in cases), cases.__getitem__)
-
-
-def read_indices(path: str | Path) -> Indices:
-    """{person: {"context": [...], "target": [...]}} from a JSON file. Raises: FileError; ValueError naming file and key."""
-    content = read_json(path)
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: expected an object with a person for each key, got {type(content).__name__}")
-    for name, views in content.items():
-        for key in ("context", "target"):
-            numbers = views.get(key) if isinstance(views, dict) else None
-            if not isinstance(numbers, list) or any(type(i) is not int or i < 0 for i in numbers):
-                raise ValueError(
-                    f"{path}: {name}.{key}: expected a list of view numbers from 0, got {str(numbers)[:40]}"
-                )
-    return content
 
 
 def _load(folder, inputs, indices, body, reconstructs):
@@ -125,6 +119,29 @@ def _load(folder, inputs, indices, body, reconstructs):
     count = min(DEFAULT_INPUTS, first) if inputs is None else inputs
     chosen = spread_views(folder.name, capture.frames, np.asarray(capture.cameras.cam_from_world), count)
     return Case(folder.name, load_capture(held_out, body=capture.body), capture.select(chosen))
+
+
+def _model(body):
+    return load_body(body) if isinstance(body, str | Path) else body
+
+
+def _find_in_data_set(path, inputs, indices, body, reconstructs):
+    """The people of a data set; photos are read when a case is loaded."""
+    file_body = FileBody(body) if isinstance(body, BodyModel) else FileBody.load(body)
+    people = open_people(path, file_body)
+    names = tuple(Path(person.name.rpartition(": ")[2]).name for person in people)
+
+    def load(index: int) -> Case:
+        subject, size, name = people[index].subject, people[index].size, names[index]
+        chosen, targets = choose_views(name, subject.frames, subject.cam_from_world, inputs, indices, reconstructs)
+        if len(targets) > MOST_TARGETS:
+            raise ValueError(
+                f"{name}: {len(targets)} views to compare with, at most {MOST_TARGETS}: choose some by indices"
+            )
+        seen = subject.capture(chosen, file_body, size) if chosen else None
+        return Case(name, subject.capture(targets, file_body, size), seen)
+
+    return People(names, load)
 
 
 def _split(name, capture, inputs, indices, reconstructs):

@@ -11,8 +11,9 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading.examples import Source
-from humangs_jax.evaluation.cases import Case, Indices, Method, choose_method, find_people, read_indices
+from humangs_jax.evaluation.cases import Case, Indices, Method, choose_method, find_people
 from humangs_jax.evaluation.protocol import EvaluationProtocol, find_protocol
 from humangs_jax.evaluation.report import Gallery, page_html
 from humangs_jax.evaluation.scores import missing_reasons, on_background, score_names, score_views
@@ -156,7 +157,7 @@ def evaluate(
     inputs: int | None = None,
     indices: str | Path | Indices | None = None,
     lpips: Sequence[Lpips] = (),
-    body: BodyModel | None = None,
+    body: BodyModel | str | Path | None = None,
     page_images: int = PAGE_IMAGES,
     progress: bool = False,
 ) -> Evaluation:
@@ -176,7 +177,7 @@ def evaluate(
     """
     rules = find_protocol(protocol)
     networks = {network.net: network for network in lpips}
-    choice = read_indices(indices) if isinstance(indices, str | Path) else indices
+    choice = read_evaluation(indices) if isinstance(indices, str | Path) else indices
     people = find_people(source, inputs, choice, body, avatar is None and predictions is None and method is None)
     name, predict = choose_method(len(people.names), avatar, weights, predictions, method)
     rows, missing, sides, shown_inputs = [], [], set(), []

@@ -28,6 +28,8 @@ from humangs_jax.data.datasets.opening import open_people
 from humangs_jax.data.datasets.scene_list import read_evaluation, read_scene_list, scene_frames
 from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.loader import CaptureSource, Loader, PeopleCache, Source, ViewSampling
+from humangs_jax.evaluation.run import evaluate
+from humangs_jax.io.images import write_png
 from humangs_jax.io.text import write_json
 
 FLOAT32 = 1e-6
@@ -227,3 +229,18 @@ def test_written_lists_are_read_again(tmp_path):
     frames = scene_frames(file, name, scene)
     assert [frame.arrays for frame in frames] == ["smpl/0.npz"] * 3 + ["smpl/1.npz"] * 3
     assert frames[0].K[0, 0] == 20 and (WIDTH, HEIGHT) == (12, 16)
+
+
+def test_the_evaluator_compares_views_of_a_scene_list(tmp_path, body):
+    """By the published indices; predictions have the names of the views."""
+    file = write_scenes(tmp_path / "scenes", model_arrays())[0]
+    (name,) = read_scene_list(file)
+    (person,) = open_people(file, body)
+    write_json(tmp_path / "views.json", {name: {"context": [0], "target": [2, 1]}})
+    capture = person.subject.capture([2, 1], body, person.size)
+    (tmp_path / "theirs").mkdir()
+    for image, view in zip(capture.images, capture.names, strict=True):
+        write_png(tmp_path / "theirs" / f"{view}.png", image)
+    found = evaluate(file, predictions=tmp_path / "theirs", indices=tmp_path / "views.json", body=body.file)
+    assert [row.view for row in found.rows] == ["00002", "00001"] and found.rows[0].person == name
+    assert all(row.scores["psnr"] == 100 for row in found.rows)
