@@ -29,9 +29,9 @@ HERE = Path(__file__).resolve().parent
 SECONDS = 300
 """Longest that a run may take on a busy machine."""
 HEAVY = (
-    *("apps.check", "apps.demo", "avatar.frames", "avatar.video", "data.calibration.importing", "fitting.examination"),
-    *("fitting.fit_capture", "fitting.refine", "fitting.scan_views", "network.conversion", "people.writer"),
-    *("refinement.refine", "training.diagnose", "viewer.page"),
+    *("apps.check", "apps.demo", "avatar.frames", "avatar.layers", "avatar.video", "data.calibration.importing"),
+    *("fitting.examination", "fitting.fit_capture", "fitting.refine", "fitting.scan_views", "network.conversion"),
+    *("people.writer", "refinement.refine", "training.diagnose", "viewer.page"),
 )
 LATE = (
     "orbax.checkpoint",
@@ -44,7 +44,7 @@ LATE = (
     "grain",
 )
 WORK = {
-    *("reconstruct", "refine_with_report", "motion_frames", "turntable_renderings", "fit_photos", "refine_capture"),
+    *("reconstruct", "refine_with_report", "motion_frames", "images", "draw", "fit_photos", "refine_capture"),
     *("fit_scan", "load_checkpoint", "make_subject", "train_step", "build_bank"),
 }
 """Stand-ins for what takes long: nothing that is wrong with the place may be found only after these."""
@@ -95,8 +95,8 @@ COMMANDS = (
     Command("fit --scan --views", "fit --scan {inputs}/scan.obj --views views", first=None, once=True),
     Command("check", "check {inputs}/capture --out check.png"),
     Command("demo", "demo --out demo --refine 0 --size 16", varies=("demo/report.json",)),
-    Command("reconstruct", "reconstruct {inputs}/capture --out me.npz"),
-    Command("refine", "refine {inputs}/avatar1.npz {inputs}/capture --limit 1steps --out me.npz"),
+    Command("reconstruct", "reconstruct {inputs}/capture --out me.npz --no-check"),
+    Command("refine", "refine {inputs}/avatar1.npz {inputs}/capture --limit 1steps --out me.npz --no-check"),
     Command("animate mp4", "animate {inputs}/avatar1.npz --out me.mp4 --size 16"),
     Command("animate gif", "animate {inputs}/avatar1.npz --out me.gif --size 16"),
     Command("render", "render {inputs}/avatar1.npz --out views --views 3 --size 16 --exr"),
@@ -135,7 +135,7 @@ COMMANDS = (
 
 def import_everything():
     """In the process that is forked. Nothing here may start a backend of JAX: its threads would not survive."""
-    sys.path[:0] = [str(HERE), str(HERE.parent / "network")]
+    sys.path[:0] = [str(HERE), str(HERE.parent / "network"), str(HERE.parent)]
     os.environ |= {"JAX_PLATFORMS": "cpu", "TF_CPP_MIN_LOG_LEVEL": "2"}
     for name in (*LATE, *(f"humangs_jax.{name}" for name in ("cli", *HEAVY))):
         with contextlib.suppress(ModuleNotFoundError):  # grain is optional
@@ -243,8 +243,8 @@ def stand_ins(variant):
     import numpy as np
 
     from humangs_jax.avatar.avatar import Avatar
-    from humangs_jax.avatar.evaluate import Scores
     from humangs_jax.core.pytree import replace
+    from humangs_jax.evaluation.scores import Scores
     from humangs_jax.fitting.refine import RefinedCapture
     from humangs_jax.fitting.report import FitReport
     from humangs_jax.fitting.scan_fit import ScanFit
@@ -352,8 +352,14 @@ def stand_ins(variant):
             "refine_with_report",
             lambda *_, **__: Refinement(avatar(), 1, 1.0, 0.0, (1.0, 0.5), (20.0, 21.0), True),
         ),
-        ("avatar.frames", "motion_frames", frames),
-        ("avatar.frames", "turntable_renderings", lambda _, count, size: drawn(count, size)),
+        ("avatar.frames", "images", frames),
+        ("avatar.frames", "motion_views", lambda *_: (None, None)),
+        (
+            "avatar.frames",
+            "turntable_views",
+            lambda _avatar, _pose, views, _shot: ([None] * views, some_cameras(views)),
+        ),
+        ("avatar.layers", "draw", lambda _, poses, *__: iter(some_renderings(variant, len(poses)))),
         ("apps.check", "_body_image", shown),
         ("apps.check", "_posed_frames", lambda capture: {0: np.zeros((4, 3))}),
         ("apps.demo", "load_weights", lambda *_: (None, SimpleNamespace(with_execution=lambda **_: None))),
