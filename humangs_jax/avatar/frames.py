@@ -125,15 +125,20 @@ def capture_renderings(
 
 
 def write_renderings(out: str | os.PathLike, cameras: Camera, renderings: list[Rendering], exr: bool = False) -> int:
-    """Write renderings onto white as view_000.png ... into a folder, and views.exr if asked. Returns the number of views."""
+    """Write renderings onto white as view_000.png ... into a folder, and views.exr if asked; all of them or none.
+
+    Returns the number of views.
+    """
+    from humangs_jax.io.atomic import add_files
     from humangs_jax.io.images import write_png
 
-    out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
-    for i, rendering in enumerate(renderings):
-        write_png(out / f"view_{i:03d}.png", np.asarray(rendering.rgb))
-    if exr:
-        write_renderings_exr(out / "views.exr", cameras, renderings, background=1.0)
+    def write(folder: Path):
+        for i, rendering in enumerate(renderings):
+            write_png(folder / f"view_{i:03d}.png", np.asarray(rendering.rgb))
+        if exr:
+            write_renderings_exr(folder / "views.exr", cameras, renderings, background=1.0)
+
+    add_files(out, write)
     return len(renderings)
 
 
