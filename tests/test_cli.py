@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import os
 import re
 import shutil
 import signal
@@ -418,10 +419,33 @@ def test_an_interrupt_that_python_drops_is_repeated():
         "cli._parsed = lambda arguments: Collected()\n"
         "cli.main()"
     )
-    began = time.monotonic()
-    program = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (program.returncode, program.stderr) == (cli.INTERRUPTED, "humangs: interrupted\n")
-    assert time.monotonic() - began < 200
+    program = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=250)
+    assert program.returncode == cli.INTERRUPTED and program.stderr.endswith("humangs: interrupted\n"), program.stderr
+    assert "Traceback" not in program.stderr
+
+
+@pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs Linux's or macOS's signals")
+def test_an_interrupt_during_an_import_waits_for_it(tmp_path):
+    """Extensions crash or raise ImportError: `view` and `fit` were ended by SIGSEGV, 2 of 42 real runs."""
+    (tmp_path / "slow_to_import.py").write_text(
+        "import signal, time; signal.raise_signal(signal.SIGINT)\n"
+        "try:\n    time.sleep(0.2)\nexcept BaseException as error:\n    raise ImportError('half-imported') from error\n"
+        "print('imported', flush=True)\n"
+    )
+    code = (
+        "import signal, time; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from humangs_jax import cli\n"
+        "class Importing:\n"
+        "    def run(self):\n"
+        "        import slow_to_import\n"
+        "        time.sleep(300)\n"
+        "cli._parsed = lambda arguments: Importing()\n"
+        "cli.main()"
+    )
+    path = os.pathsep.join([str(tmp_path), str(Path(cli.__file__).parents[2])])
+    command, env = [sys.executable, "-c", code], os.environ | {"PYTHONPATH": path}
+    program = subprocess.run(command, capture_output=True, text=True, check=False, timeout=250, env=env)
+    assert (program.returncode, program.stdout) == (cli.INTERRUPTED, "imported\n"), program.stderr
 
 
 def test_the_logs_of_libraries_stay_off_the_screen():

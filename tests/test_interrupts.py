@@ -27,6 +27,7 @@ from humangs_jax.data.motion import Motion, load_motion, save_motion
 COUNT = int(os.environ.get("HUMANGS_INTERRUPTS", "100"))
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),  # an ffmpeg that has lost its parent
     pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs timers that raise signals"),
 ]
 

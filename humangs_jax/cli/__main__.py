@@ -2,4 +2,5 @@
 
 from humangs_jax.cli import main
 
-main()
+if __name__ == "__main__":  # processes that make people import this module again
+    main()

@@ -1,7 +1,8 @@
 """Ctrl-C that would get lost.
 
-While a program compiles or runs, Python hears of it only when that returns, which can be minutes later. And in callbacks of the
-garbage collector (JAX has one) and destructors, Python drops the KeyboardInterrupt with a note, and the command would go on.
+While a program compiles or runs, Python hears of it only when that returns, which can be minutes later. In callbacks of the
+garbage collector (JAX has one) and destructors, Python drops the KeyboardInterrupt with a note, and the command would go on. And
+extensions crash where it comes while they are imported.
 """
 
 import os
@@ -15,7 +16,7 @@ from humangs_jax.cli import INTERRUPTED
 heard = threading.Event()
 """Whether Python has heard of Ctrl-C in this command."""
 AGAIN = 0.02
-"""Seconds after which an interrupt that was dropped is repeated."""
+"""Seconds after which an interrupt that was dropped, or came at a bad time, is repeated."""
 PATIENCE = 2.0
 """Seconds that Python gets to hear of it and to tidy up; files are written by calls that are shorter."""
 
@@ -28,7 +29,13 @@ def end_within_seconds() -> None:
     if sys.platform == "win32" or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return  # there, wake-up descriptors are sockets; or somebody else handles it
 
+    def again():
+        threading.Timer(AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
+
     def interrupt(number, frame):
+        if _importing(frame):
+            again()
+            return
         heard.set()
         signal.default_int_handler(number, frame)
 
@@ -51,8 +58,17 @@ def end_within_seconds() -> None:
 
     def dropped(what):
         if what.exc_type is KeyboardInterrupt:
-            threading.Timer(AGAIN, os.kill, (os.getpid(), signal.SIGINT)).start()
+            again()
         else:
             note(what)
 
     sys.unraisablehook = dropped
+
+
+def _importing(frame):
+    """Whether a module is being imported: extensions that are interrupted while they begin crash, or raise other errors."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
