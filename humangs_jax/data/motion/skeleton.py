@@ -61,6 +61,7 @@ _NEXT = {name: chain[i + 1 :] for chain in _CHAINS for i, name in enumerate(chai
 _NEEDED = ("pelvis", *(f"{s}_{n}" for n in ("hip", "knee", "ankle", "shoulder", "elbow") for s in ("left", "right")))
 STANDING = -0.5
 """Cosine between legs and spine below which a person can stand in a rest pose."""
+RATE_ROUNDING = 1e-4
 FEW = 5
 """Joints that have to share the beginning of their names for it to be no part of them."""
 
@@ -86,6 +87,11 @@ class Clip:
 def bytes_of_clip(frames: int, joints: int) -> int:
     """Memory that a clip takes."""
     return 96 * frames * joints
+
+
+def whole_rate(fps: float) -> float:
+    """Frames per second, a whole number where they are one up to the rounding of the file: BVH has 0.0083333 for 120."""
+    return float(round(fps)) if abs(fps - round(fps)) < RATE_ROUNDING * fps else fps
 
 
 @functools.cache

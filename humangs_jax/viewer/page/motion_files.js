@@ -307,7 +307,8 @@ function retargetBvh(bvh, scene) {
   const low = standing ? soles(place, source, matrixFromQuat(UPRIGHT[nearestAxis(spine).axis]), legs(rest) / Math.max(legs((name) => place[source[name]]), 1e-9)) : null;
   const steps = stepsOf(posed, source, scale, low), own = stepsOfBody(global, scene, source, moves);
   const translations = moves.map((move, f) => subtract(add(move, [0, steps[f] - own[f], 0]), rest("pelvis")));
-  return { quats, translations, fps: bvh.fps };
+  const whole = Math.round(bvh.fps);  // BVH has 0.0083333 for 120
+  return { quats, translations, fps: Math.abs(bvh.fps - whole) < 1e-4 * bvh.fps ? whole : bvh.fps };
 }
 
 // The rotation about a bone that takes the mean twist about it out of rotations. The twist of (w, v) about b is 2 arg(w + i v.b).
