@@ -38,12 +38,16 @@ _SIDED = {
     "collar": ("collar", "clavicle", "shoulder"),
     "elbow": ("forearm", "lowarm", "lowerarm", "elbow"),
     "wrist": ("hand", "wrist"),
+    "eye": ("eye",),
     **{f"{finger}{i}": (f"hand{finger}{i}", f"{finger}{i}", f"{finger}0{i}") for finger in FINGERS for i in (1, 2, 3)},
 }
 """Joints with a side by the names of others, without it, lower case, letters and digits alone: CMU (cgspeed), Mixamo, LaFAN,
 MotionBuilder, Biovision, SMPL, Unreal. A joint of the file is taken once, by the first that wants it: "shoulder" is the upper arm
 where there is no other and else the collar bone."""
-_MIDDLE = {"pelvis": ("hips", "hip", "pelvis", "root"), "neck": ("neck", "neck1", "neck01"), "head": ("head",)}
+_MIDDLE = {
+    **{"pelvis": ("hips", "hip", "pelvis", "root"), "neck": ("neck", "neck1", "neck01")},
+    **{"head": ("head",), "jaw": ("jaw",)},
+}
 _CHAINS = (
     ("pelvis", "spine1", "spine2", "spine3", "neck", "head"),
     *(
@@ -62,6 +66,7 @@ _NEEDED = ("pelvis", *(f"{s}_{n}" for n in ("hip", "knee", "ankle", "shoulder", 
 STANDING = -0.5
 """Cosine between legs and spine below which a person can stand in a rest pose."""
 RATE_ROUNDING = 1e-4
+"""Relative error of a frame rate: BVH files have as few as four digits of the time of a frame."""
 FEW = 5
 """Joints that have to share the beginning of their names for it to be no part of them."""
 
