@@ -15,6 +15,7 @@ import numpy as np
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.transform import EXACT
 from humangs_jax.rendering.gaussians import Gaussians, factored
 
 Up = Literal["y", "-y", "z"]
@@ -53,7 +54,8 @@ def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Ga
     """Gaussians turned about the origin by a quaternion (wxyz) of quarters of a turn."""
     if gaussians.deformations is not None:
         gaussians = factored(gaussians)
-    means = gaussians.means @ jnp.asarray(_matrix(turn), gaussians.means.dtype).T
+    matrix = jnp.asarray(_matrix(turn), gaussians.means.dtype)
+    means = jnp.matmul(gaussians.means, matrix.T, precision=EXACT)
     quats = quaternion.multiply(jnp.asarray(turn, gaussians.quats.dtype), gaussians.quats)
     return replace(gaussians, means=means, quats=quats)
 
