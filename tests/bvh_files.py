@@ -23,6 +23,7 @@ MIXAMO |= {
     for finger in FINGERS
     for i in (1, 2, 3)
 }
+MIXAMO |= {"left_eye": "mixamorig:LeftEye", "right_eye": "mixamorig:RightEye"}
 BONES = [
     *(("pelvis", "spine1"), ("spine1", "spine2"), ("spine2", "spine3"), ("spine3", "neck"), ("neck", "head")),
     *(

@@ -29,7 +29,7 @@ def parse_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
     """
     start, _, _, length, kind = struct.unpack_from("<IIIII", data.ljust(20, b"\0"))
     if start != GLB_START or kind != JSON_CHUNK:
-        raise Refused("no GLB file")
+        raise Refused("not a mesh or skeleton that can be read: no GLB file")
     check_limit("slow_text_bytes", length, "bytes of JSON in a GLB")
     content = parse_json(data[20 : 20 + length].decode())
     binary = b""

@@ -54,7 +54,8 @@ def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Ga
     """Gaussians turned about the origin by a quaternion (wxyz) of quarters of a turn."""
     if gaussians.deformations is not None:
         gaussians = factored(gaussians)
-    means = jnp.matmul(gaussians.means, jnp.asarray(_matrix(turn), gaussians.means.dtype).T, precision=EXACT)
+    matrix = jnp.asarray(_matrix(turn), gaussians.means.dtype)
+    means = jnp.matmul(gaussians.means, matrix.T, precision=EXACT)
     quats = quaternion.multiply(jnp.asarray(turn, gaussians.quats.dtype), gaussians.quats)
     return replace(gaussians, means=means, quats=quats)
 

@@ -71,7 +71,7 @@ def _load(path, up, fps, hands, flat_hand_mean, rest_joints):
         rotations, translations = world.turned_upright(rotations, translations, up)
     else:
         clip = read(path)
-        file_fps = clip.fps
+        file_fps = skeleton.whole_rate(clip.fps)
         joints = skeleton.shipped_joints() if rest_joints is None else np.asarray(rest_joints, np.float64)
         with np.errstate(all="ignore"):  # of numbers without sense, which are refused below
             rotations, translations = skeleton.retargeted(clip, joints, up)

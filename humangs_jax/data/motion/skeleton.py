@@ -38,12 +38,16 @@ _SIDED = {
     "collar": ("collar", "clavicle", "shoulder"),
     "elbow": ("forearm", "lowarm", "lowerarm", "elbow"),
     "wrist": ("hand", "wrist"),
+    "eye": ("eye",),
     **{f"{finger}{i}": (f"hand{finger}{i}", f"{finger}{i}", f"{finger}0{i}") for finger in FINGERS for i in (1, 2, 3)},
 }
 """Joints with a side by the names of others, without it, lower case, letters and digits alone: CMU (cgspeed), Mixamo, LaFAN,
 MotionBuilder, Biovision, SMPL, Unreal. A joint of the file is taken once, by the first that wants it: "shoulder" is the upper arm
 where there is no other and else the collar bone."""
-_MIDDLE = {"pelvis": ("hips", "hip", "pelvis", "root"), "neck": ("neck", "neck1", "neck01"), "head": ("head",)}
+_MIDDLE = {
+    **{"pelvis": ("hips", "hip", "pelvis", "root"), "neck": ("neck", "neck1", "neck01")},
+    **{"head": ("head",), "jaw": ("jaw",)},
+}
 _CHAINS = (
     ("pelvis", "spine1", "spine2", "spine3", "neck", "head"),
     *(
@@ -61,6 +65,8 @@ _NEXT = {name: chain[i + 1 :] for chain in _CHAINS for i, name in enumerate(chai
 _NEEDED = ("pelvis", *(f"{s}_{n}" for n in ("hip", "knee", "ankle", "shoulder", "elbow") for s in ("left", "right")))
 STANDING = -0.5
 """Cosine between legs and spine below which a person can stand in a rest pose."""
+RATE_ROUNDING = 1e-4
+"""Relative error of a frame rate: BVH files have as few as four digits of the time of a frame."""
 FEW = 5
 """Joints that have to share the beginning of their names for it to be no part of them."""
 
@@ -86,6 +92,11 @@ class Clip:
 def bytes_of_clip(frames: int, joints: int) -> int:
     """Memory that a clip takes."""
     return 96 * frames * joints
+
+
+def whole_rate(fps: float) -> float:
+    """Frames per second, a whole number where they are one up to the rounding of the file: BVH has 0.0083333 for 120."""
+    return float(round(fps)) if abs(fps - round(fps)) < RATE_ROUNDING * fps else fps
 
 
 @functools.cache

@@ -201,12 +201,12 @@ function parseBvh(text) {
 // Biovision, SMPL, Unreal. Sides are "left", "l" before and "l" behind. A joint of the file is taken once, by the first that
 // wants it: "shoulder" is the upper arm where there is no other and else the collar bone.
 const FINGERS = ["index", "middle", "pinky", "ring", "thumb"], KNUCKLES = [1, 2, 3];
-const MIDDLE_NAMES = { pelvis: ["hips", "hip", "pelvis", "root"], neck: ["neck", "neck1", "neck01"], head: ["head"] };
+const MIDDLE_NAMES = { pelvis: ["hips", "hip", "pelvis", "root"], neck: ["neck", "neck1", "neck01"], head: ["head"], jaw: ["jaw"] };
 const SIDED_NAMES = {
   hip: ["upleg", "thigh", "hip"], knee: ["leg", "shin", "lowleg", "lowerleg", "calf", "knee"],
   ankle: ["ankle", "foot"], foot: ["toebase", "toe", "ball", "foot"],
   shoulder: ["arm", "uparm", "upperarm", "shldr", "shoulder"], collar: ["collar", "clavicle", "shoulder"],
-  elbow: ["forearm", "lowarm", "lowerarm", "elbow"], wrist: ["hand", "wrist"],
+  elbow: ["forearm", "lowarm", "lowerarm", "elbow"], wrist: ["hand", "wrist"], eye: ["eye"],
 };
 for (const finger of FINGERS) for (const i of KNUCKLES) SIDED_NAMES[finger + i] = [`hand${finger}${i}`, `${finger}${i}`, `${finger}0${i}`];
 // Bones: a joint points to the next of its last chain that the file has; others are moved as their parents are.
@@ -307,7 +307,8 @@ function retargetBvh(bvh, scene) {
   const low = standing ? soles(place, source, matrixFromQuat(UPRIGHT[nearestAxis(spine).axis]), legs(rest) / Math.max(legs((name) => place[source[name]]), 1e-9)) : null;
   const steps = stepsOf(posed, source, scale, low), own = stepsOfBody(global, scene, source, moves);
   const translations = moves.map((move, f) => subtract(add(move, [0, steps[f] - own[f], 0]), rest("pelvis")));
-  return { quats, translations, fps: bvh.fps };
+  const whole = Math.round(bvh.fps);  // BVH has 0.0083333 for 120
+  return { quats, translations, fps: Math.abs(bvh.fps - whole) < 1e-4 * bvh.fps ? whole : bvh.fps };
 }
 
 // The rotation about a bone that takes the mean twist about it out of rotations. The twist of (w, v) about b is 2 arg(w + i v.b).
