@@ -39,13 +39,10 @@ class Animate:
     """Where to end, in seconds of the motion."""
     loop: int = 1
     """Play the motion so many times; each time goes on from the place where the last one has ended."""
-    prune: bool = False
-    """Leave out Gaussians that weigh less than 1/255 on every pixel of every frame. To find them all frames are drawn once more:
-    docs/video.md has what it saves."""
 
     def run(self) -> None:
         from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.avatar.frames import excerpt, images, motion_views, splatting_of, without_unseen
+        from humangs_jax.avatar.frames import excerpt, images, motion_views
         from humangs_jax.avatar.video import check_video, write_video
         from humangs_jax.data.motion import load_motion
 
@@ -58,10 +55,7 @@ class Animate:
         motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
         check_video(self.out, len(motion.translations), *self.shot.resolution)
         poses, cameras = motion_views(avatar, motion, self.shot, self.turn, self.follow)
-        if self.prune:
-            every = len(avatar.gaussians.means)
-            avatar = without_unseen(avatar, poses, cameras, splatting_of(self.shot, avatar), progress="look")
-            print(f"{every - len(avatar.gaussians.means):,} of {every:,} Gaussians are in no frame")
+        avatar = _pruned(avatar, poses, cameras, self.shot)
         written = write_video(self.out, images(avatar, poses, cameras, self.shot, "animate"), motion.fps)
         print(f"{self.out}: {written} frames of {_size(self.shot)} at {motion.fps:g} frames per second")
 
@@ -119,6 +113,7 @@ class Render:
         else:
             pose = rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
             poses, cameras = turntable_views(avatar, pose, views, self.shot)
+        avatar = _pruned(avatar, poses, cameras, self.shot)
         if video:
             written = write_video(self.out, images(avatar, poses, cameras, self.shot, "render"), self.fps)
             print(f"{self.out}: {written} frames of {_size(self.shot)} at {self.fps:g} frames per second")
@@ -128,7 +123,7 @@ class Render:
 
     def _require_defaults(self):
         """With --capture nothing is said about the cameras. Raises: ValueError naming the first option that does."""
-        free, usual = ("background", "splat"), Shot()
+        free, usual = ("background", "splat", "prune"), Shot()
         said = [name for name, value in vars(self.shot).items() if name not in free and value != getattr(usual, name)]
         said += ["views"] * (self.views is not None) + ["pose"] * (self.pose != "t")
         if said:
@@ -177,6 +172,18 @@ class View:
         name = None if self.motion is None else self.motion.stem
         text = page_html(Avatar.load(self.avatar), motion, self.avatar.stem, name)
         serve(text, self.port, self.browser)
+
+
+def _pruned(avatar, poses, cameras, shot):
+    """Without what no image shows, if asked, which is said."""
+    from humangs_jax.avatar.frames import splatting_of, without_unseen
+
+    if not shot.prune:
+        return avatar
+    seen = without_unseen(avatar, poses, cameras, splatting_of(shot, avatar), progress="look")
+    every = len(avatar.gaussians.means)
+    print(f"{every - len(seen.gaussians.means):,} of {every:,} Gaussians are in no image")
+    return seen
 
 
 def _size(shot):
