@@ -35,6 +35,9 @@ class Shot:
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = "as_trained"
     """How Gaussians are drawn: near_exact and fast trade accuracy for time (docs/performance.md), inria is the published
     rasterizer. Default: as the avatar's weights were trained."""
+    prune: bool = False
+    """Leave out Gaussians that weigh less than 1/255 on every pixel of every image. To find them all images are drawn once more:
+    docs/video.md has what it saves."""
 
     def check(self) -> None:
         """Raises: ValueError naming what is out of range."""  # not on construction: the command line would make a box of it

@@ -52,9 +52,6 @@ class Animate:
     """Where to end, in seconds of the motion."""
     loop: int = 1
     """Play the motion so many times; each time goes on from the place where the last one has ended."""
-    prune: bool = False
-    """Leave out Gaussians that weigh less than 1/255 on every pixel of every frame. To find them all frames are drawn once more:
-    docs/video.md has what it saves."""
 
     def run(self) -> None:
         with _options():
@@ -64,7 +61,7 @@ class Animate:
         _require_place(self.out)
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
-            from humangs_jax.avatar.frames import excerpt, images, motion_views, splatting_of, without_unseen
+            from humangs_jax.avatar.frames import excerpt, images, motion_views
             from humangs_jax.avatar.video import check_video, write_video
             from humangs_jax.data.motion import load_motion
 
@@ -76,11 +73,7 @@ class Animate:
                 motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
             check_video(self.out, len(motion.translations), *self.shot.resolution)
             poses, cameras = motion_views(avatar, motion, self.shot, self.turn, self.follow)
-        if self.prune:
-            with stage("looking for unseen Gaussians"):
-                every = len(avatar.gaussians.means)
-                avatar = without_unseen(avatar, poses, cameras, splatting_of(self.shot, avatar), progress="look")
-            tell(f"{every - len(avatar.gaussians.means):,} of {every:,} Gaussians are in no frame")
+        avatar = _pruned(avatar, poses, cameras, self.shot)
         with stage("drawing"):
             written = write_video(self.out, images(avatar, poses, cameras, self.shot, "animate"), motion.fps)
         wrote(self.out, f"{written} frames of {_size(self.shot)} at {motion.fps:g} frames per second")
@@ -144,6 +137,7 @@ class Render:
             else:
                 pose = rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
                 poses, cameras = turntable_views(avatar, pose, views, self.shot)
+        avatar = _pruned(avatar, poses, cameras, self.shot)
         with stage("drawing"):
             if video:
                 written = write_video(self.out, images(avatar, poses, cameras, self.shot, "render"), self.fps)
@@ -156,7 +150,7 @@ class Render:
 
     def _require_defaults(self):
         """With --capture nothing is said about the cameras. Raises: UsageError naming the first option that does."""
-        free, usual = ("background", "splat"), Shot()
+        free, usual = ("background", "splat", "prune"), Shot()
         said = [name for name, value in vars(self.shot).items() if name not in free and value != getattr(usual, name)]
         said += ["views"] * (self.views is not None) + ["pose"] * (self.pose != "t")
         if said:
@@ -228,6 +222,19 @@ def _require_place(out):
         require_parent(out)
     else:
         require_folder(out)
+
+
+def _pruned(avatar, poses, cameras, shot):
+    """Without what no image shows, if asked, which is said."""
+    from humangs_jax.avatar.frames import splatting_of, without_unseen
+
+    if not shot.prune:
+        return avatar
+    with stage("looking for unseen Gaussians"):
+        seen = without_unseen(avatar, poses, cameras, splatting_of(shot, avatar), progress="look")
+    every = len(avatar.gaussians.means)
+    tell(f"{every - len(seen.gaussians.means):,} of {every:,} Gaussians are in no image")
+    return seen
 
 
 def _size(shot):
