@@ -1,5 +1,6 @@
 """Every layout is read as it was written; nothing is decoded before it is asked for; what is missing is counted."""
 
+import dataclasses
 import time
 
 import h5_or_skip
@@ -31,6 +32,8 @@ from humangs_jax.data.loader import CaptureSource, Loader, PeopleCache, Source, 
 from humangs_jax.evaluation.run import evaluate
 from humangs_jax.io.images import write_png
 from humangs_jax.io.text import write_json
+from humangs_jax.training.config import tiny
+from humangs_jax.training.sources import training_people
 
 FLOAT32 = 1e-6
 JPEG = 3
@@ -221,6 +224,22 @@ def test_every_data_set_is_a_source_of_the_loader(tmp_path, body):
         loader.batch_at(step)
     (problem,) = source.broken.values()
     assert "00000001.jpg" in problem and len(read_scene_list(folders["scenes"])) == 1
+
+
+def test_training_takes_a_scene_list_and_a_data_set(tmp_path, body):
+    config = tiny()
+    model = config.model.with_conventions(image_size=SIZE)
+    views = ViewSampling(input_counts=(2,), target_count=2, rule="window")
+    config = dataclasses.replace(config, model=model, target_size=SIZE, views=views)
+    write_avatarrex(tmp_path / "videos" / "avatarrex_zzr")
+    for data in (write_scenes(tmp_path / "scenes", model_arrays())[0], tmp_path / "videos"):
+        make = training_people(data, 0, tmp_path / "run", body.model, body.file)
+        example = make(config).example(0, 0, 2)
+        assert example.inputs.rotations.shape == (2, 55, 3) and example.inputs.images.shape == (2, SIZE, SIZE, 3)
+    with pytest.raises(ValueError, match="synthetic people have the body that comes with the package"):
+        training_people(None, 5, tmp_path / "run", body.model, body.file)
+    with pytest.raises(ValueError, match=r"no captures, scene list or data set"):
+        training_people(tmp_path / "run", 0, tmp_path / "run", body.model, body.file)
 
 
 def test_written_lists_are_read_again(tmp_path):
