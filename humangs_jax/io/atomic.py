@@ -11,13 +11,13 @@ import os
 import platform
 import re
 import shutil
-import signal
-import threading
 import time
 import uuid
 import zlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
+
+from humangs_jax.core.signals import undisturbed
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
@@ -179,7 +179,7 @@ def add_files(
     temporary.mkdir()
     try:
         write(temporary)
-        with _undisturbed():
+        with undisturbed():
             folder.mkdir(exist_ok=True)
             for file in without:
                 (folder / file).unlink(missing_ok=True)
@@ -189,22 +189,6 @@ def add_files(
                 file.replace(target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _undisturbed():
-    """Ctrl-C waits until the block is over."""
-    if threading.current_thread() is not threading.main_thread():  # only that one gets it
-        yield
-        return
-    waiting = []
-    previous = signal.signal(signal.SIGINT, lambda *arguments: waiting.append(arguments))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
-        if waiting and callable(previous):
-            previous(*waiting[0])
 
 
 def _tag():

@@ -21,7 +21,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.progress import bar as progress_bar
-from humangs_jax.core.workers import started_deaf
+from humangs_jax.core.signals import started_deaf
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.geometry.camera import Camera
