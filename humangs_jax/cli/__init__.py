@@ -61,10 +61,6 @@ def main() -> None:
     except KeyboardInterrupt:  # before the command has begun, or the second one
         code = _interrupted()
     if code == INTERRUPTED:
-        if "multiprocessing.synchronize" in sys.modules:
-            import gc
-
-            gc.collect()  # gives back the semaphores of workers, else their tracker complains
         # XLA's threads may still be computing: they crash when the interpreter takes their arrays away
         os._exit(code)
     if code:

@@ -40,6 +40,7 @@ def silence(verbose: bool) -> None:
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", XLA_LEVELS[verbose])
     if not verbose and not sys.warnoptions:
         warnings.simplefilter("ignore")
+        os.environ.setdefault("PYTHONWARNINGS", "ignore")  # of processes that this one starts
     root = logging.getLogger()
     if not root.handlers:  # else Python prints the warnings of all loggers, Orbax's among them
         handler = logging.StreamHandler()

@@ -11,13 +11,13 @@ import os
 import platform
 import re
 import shutil
-import signal
-import threading
 import time
 import uuid
 import zlib
 from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
+
+from humangs_jax.core.signals import undisturbed
 
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
@@ -182,7 +182,7 @@ def add_files(
         with _naming(folder, temporary):
             temporary.mkdir()
             write(temporary)
-            with _undisturbed():
+            with undisturbed():
                 folder.mkdir(exist_ok=True)
                 with _locked(folder, wait=True):
                     for file in without:
@@ -256,22 +256,6 @@ def check_writable(path: str | os.PathLike) -> None:
         raise NotADirectoryError(f"{path}: cannot be made: {above} is no folder")
     if not os.access(above if above.is_dir() else above.parent, os.W_OK | os.X_OK):
         raise PermissionError(f"{path}: cannot be written: {above} is read-only or belongs to somebody else")
-
-
-@contextlib.contextmanager
-def _undisturbed():
-    """Ctrl-C waits until the block is over."""
-    if threading.current_thread() is not threading.main_thread():  # only that one gets it
-        yield
-        return
-    waiting = []
-    previous = signal.signal(signal.SIGINT, lambda *arguments: waiting.append(arguments))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, previous)
-        if waiting and callable(previous):
-            previous(*waiting[0])
 
 
 def _tag():

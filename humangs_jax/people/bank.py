@@ -18,6 +18,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.core.signals import started_deaf
 from humangs_jax.core.workers import end_with_parent
 from humangs_jax.io.arrays import check_array, check_indices, check_joints
 from humangs_jax.io.npz import read_npz, write_npz
@@ -113,7 +114,9 @@ def build_bank(
     else:
         context = multiprocessing.get_context("spawn")  # a forked process may hang in jax's threads
         with concurrent.futures.ProcessPoolExecutor(processes, context, end_with_parent) as pool:
-            people = list(shown(pool.map(make, seeds)))
+            with started_deaf():
+                made = pool.map(make, seeds)
+            people = list(shown(made))
     return _stacked(people, body, split)
 
 

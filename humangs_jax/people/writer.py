@@ -21,6 +21,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.progress import bar as progress_bar
+from humangs_jax.core.signals import started_deaf
 from humangs_jax.core.workers import end_with_parent
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.motion import Motion, save_motion
@@ -240,8 +241,9 @@ def _make(seeds, folders, layout, body, workers):
     context = multiprocessing.get_context("spawn")
     count = min(workers, len(seeds))
     with concurrent.futures.ProcessPoolExecutor(count, context, _start_worker, (body,)) as pool:
-        futures = {pool.submit(_work, folders[seed], seed, layout): seed for seed in seeds}
         try:
+            with started_deaf():
+                futures = {pool.submit(_work, folders[seed], seed, layout): seed for seed in seeds}
             for future in concurrent.futures.as_completed(futures):
                 yield futures[future], future.result()
         except concurrent.futures.process.BrokenProcessPool as error:
