@@ -146,7 +146,7 @@ def test_from_photos_to_images(folder, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for arguments in (
         ("reconstruct", folder, "--out", "avatar.npz"),
-        ("refine", "avatar.npz", folder, "--limit", "2steps", "--image-size", "64", "--out", "refined.npz"),
+        ("refine", "avatar.npz", folder, "--limit", "2steps", "--image-size", "64", "--live", "--out", "refined.npz"),
         ("render", "refined.npz", "--out", "views", "--views", "2", "--size", "64", "--exr"),
         ("export", "avatar.npz", "--out", "avatar.ply"),
         ("check", folder, "--out", "check.png"),
@@ -154,7 +154,7 @@ def test_from_photos_to_images(folder, tmp_path, monkeypatch, capsys):
         code, _, error = run(monkeypatch, capsys, *arguments)
         assert code == 0, error
     image, _ = read_image("views/view_000.png")
-    assert image.shape == (64, 64, 3) and image.std() > 10 / 255 and (image[0] == 1).all()
+    assert image.shape == (64, 64, 3) and image.std() > 10 / 255 and image[0].min() > 0.98  # tails of hair
     assert Path("views/views.exr").stat().st_size > 1000
     assert len(plyfile.PlyData.read("avatar.ply")["vertex"].data) > 10_000
     assert read_image("check.png")[0].std() > 10 / 255

@@ -25,7 +25,7 @@ from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig, drawn_as
 from humangs_jax.rendering.splatting import BufferOverflowError, Rendering, plan_buffers, render
 
-MARGIN = 1.08
+MARGIN = 1.12
 """Room around a person in the frame: the extent is measured at the centres of Gaussians."""
 FOLLOWING = 0.5
 """Seconds: standard deviation of the Gaussian that smooths the path of the camera. Steps and swinging arms, of about a second,

@@ -94,7 +94,7 @@ def test_the_camera_goes_along_and_does_not_bob():
     cameras = frames.shot_cameras(shot, points, np.zeros(len(points)), 0.5 * 30)
     seen = pixels(cameras, points)
     heights = np.ptp(seen[..., 1], axis=1)
-    assert heights.min() > 85  # standing still, it leaves the person less than half of the image:
+    assert heights.min() > 80  # standing still, it leaves the person less than half of the image:
     still = frames.shot_cameras(shot, points, np.zeros(len(points)), None)
     assert np.ptp(pixels(still, points)[..., 1], axis=1).max() < 50
     middle = 0.5 * (seen.min(axis=1) + seen.max(axis=1))
