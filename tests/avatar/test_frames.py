@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from avatar.avatar_cases import CENTRES, RADIUS, two_balls
+from avatar_cases import CENTRES, RADIUS, two_balls
 
 from humangs_jax.avatar import frames
 from humangs_jax.avatar.shot import Shot

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from avatar.avatar_cases import CENTRES, NAMES, RADIUS, SPLAT, two_balls
+from avatar_cases import CENTRES, NAMES, RADIUS, SPLAT, two_balls
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.avatar import frames, layers

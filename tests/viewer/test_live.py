@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from viewer.viewer_cases import small_avatar
+from viewer_cases import small_avatar
 
 from experiments.common import chromium
 from humangs_jax.avatar.avatar import Avatar

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 import pytest
-from avatar.avatar_cases import two_balls
+from avatar_cases import two_balls
 
 from humangs_jax import cli
 from humangs_jax.avatar.shot import Shot
