@@ -22,7 +22,6 @@ from humangs_jax.cli.interrupts import PATIENCE
 from humangs_jax.cli.options import UsageError
 from humangs_jax.core import progress
 from humangs_jax.core.progress import stage
-from humangs_jax.data import motion
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.io.images import read_image, write_png
 from humangs_jax.rendering.gaussians import Gaussians
@@ -603,13 +602,7 @@ BAD_INPUT = [
     (("start", "cloud.ply", "--out", "new"), "cloud.ply: is a file: expected a folder of photos"),
     (("animate", "me.npz", "--motion", "ten.npz"), "ten.npz: poses: expected"),
     (("animate", "me.npz", "--motion", "pickled.npz"), "pickled.npz: no motion: expected one of the keys"),
-    pytest.param(
-        *(("animate", "me.npz", "--motion", "far.npz"), "far.npz"),
-        marks=pytest.mark.skipif(
-            not hasattr(motion, "__path__"),
-            reason="comes with the readers of skeletons, which make data/motion a package",
-        ),
-    ),
+    (("animate", "me.npz", "--motion", "far.npz"), "far.npz"),
     (("convert", "nobody.pt"), "nobody.pt: no such file"),
     (("convert", "photo.png"), "photo.png"),
     *((("animate", "me.npz", "--size", size), f"--size {size}: expected") for size in ("-5", "0", HUGE)),

@@ -66,7 +66,7 @@ class Disk:
 def refused(ending: writers.Run, names: list[str]) -> list[str]:
     """What is wrong with how a run failed. names: one of these is in its line."""
     lines = writers.error_lines(ending.errors)
-    found = [] if ending.code == 2 else [f"exit status {ending.code}"]
+    found = [] if ending.code in (1, 2) else [f"exit status {ending.code}"]
     if len(lines) != 1 or not any(name in lines[0] for name in names):
         found.append(f"not one line that names the place: {lines}")
     return found
