@@ -9,6 +9,7 @@ files hold.
 
 from typing import Literal, get_args
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -62,7 +63,8 @@ def rotated(gaussians: Gaussians, turn: tuple[float, float, float, float]) -> Ga
 
 def _matrix(turn):
     """Of 0 and +-1."""
-    return np.asarray(quaternion.to_matrix(jnp.asarray(turn)), np.float32).round()
+    with jax.ensure_compile_time_eval():  # the turn is known inside of transformations, too
+        return np.asarray(quaternion.to_matrix(jnp.asarray(turn)), np.float32).round()
 
 
 def grounded_gaussians(gaussians: Gaussians) -> Gaussians:
