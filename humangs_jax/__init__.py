@@ -66,6 +66,7 @@ _PUBLIC = {
     "save_capture": "data.capture",
     "save_weights": "network.weights",
     "seen_from": "rendering.splatting",
+    "select_views": "data.view_selection",
     "shape_body": "body.model",
     "show": "viewer.page",
     "skin": "avatar.animate",

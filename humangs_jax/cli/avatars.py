@@ -16,7 +16,7 @@ from humangs_jax.cli.options import (
     require_parent,
     require_suffix,
 )
-from humangs_jax.cli.screen import stage, suggest, warn, wrote
+from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
@@ -59,6 +59,8 @@ class Reconstruct:
     """Folder with capture.json. "demo_capture", if there is no such folder: the one that comes with the package."""
     out: Path = Path("avatar.npz")
     """The avatar file to write; an avatar that is there is replaced."""
+    views: int | None = None
+    """Use this number of photos: those that together show most of the body. Default: all."""
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
     tokens: Literal["as_trained", "all", "foreground"] = "as_trained"
@@ -73,12 +75,18 @@ class Reconstruct:
 
     def run(self) -> None:
         limits = None if self.refine is None else refine_limits(self.refine, "--refine")
+        require_at_least(1, views=self.views)
         require_avatar(self.out)
         with stage("starting"):
             from humangs_jax.avatar.reconstruct import reconstruct
+            from humangs_jax.data.view_selection import select_views
             from humangs_jax.network.weights import load_weights
 
         photos = _read_capture(self.capture, self.check)
+        if self.views is not None and self.views < photos.view_count:
+            with stage("choosing photos"):
+                photos = photos.select(select_views(photos, self.views))
+            tell(f"photos: {', '.join(photos.names)}")
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
         tokens = None if self.tokens == "as_trained" else self.tokens
