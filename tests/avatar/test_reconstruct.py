@@ -53,6 +53,7 @@ def subject_views(seed, views=2):
     )
 
 
+@pytest.mark.slow
 def test_pixels_outside_the_masks_are_seen_by_no_vertex(body, network):
     _, config = network
     views = subject_views(0)

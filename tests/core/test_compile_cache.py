@@ -81,6 +81,7 @@ def test_the_programs_used_last_are_kept(tmp_path, monkeypatch):
     assert [file.exists() for file in (*files, other)] == [False, True, False, True]
 
 
+@pytest.mark.slow
 def test_a_second_program_finds_what_the_first_one_compiled(tmp_path):
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
     environment |= {VARIABLE: str(tmp_path), "JAX_PLATFORMS": "cpu"}

@@ -118,6 +118,7 @@ def test_a_person_is_made_once_and_rows_are_kept(weights, tmp_path, monkeypatch)
     assert [person["seed"] for person in report["others"]] == [second] and len(report["subjects"]) == 1
 
 
+@pytest.mark.slow
 def test_bodies_see_the_same_photos_and_what_they_cost_is_noted(weights, tmp_path, monkeypatch):
     seen, held_out = [], []
     drawings = {"ours": lambda views: np.clip(views.images + 0.1, 0, 1), "painted": lambda views: 0.5 * views.images}

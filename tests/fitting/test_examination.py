@@ -64,6 +64,7 @@ def test_a_good_fit(good):
     )
 
 
+@pytest.mark.slow
 def test_outliers_are_those_that_were_displaced(good):
     capture, keypoints = good
 

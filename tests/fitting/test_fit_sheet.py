@@ -47,6 +47,7 @@ def test_discs_are_where_the_keypoints_are(sheet):
     np.testing.assert_allclose(blue.mean(0), [2 * 16 - 0.5, 2 * 32 - 0.5 + GAP], atol=1.0)
 
 
+@pytest.mark.slow
 def test_outliers_are_hollow(sheet):
     image, _ = sheet
     top = image.shape[0] - 512 - GAP
@@ -65,6 +66,7 @@ def test_lines_lead_to_the_body(sheet):
     assert (np.abs(near - cross).max(-1) < 0.3).sum() >= 5
 
 
+@pytest.mark.slow
 def test_many_views_and_frames(tmp_path, monkeypatch):
     """An evenly chosen few of them, and a plot below."""
     monkeypatch.setattr(module, "LONGEST_SIDE", SIDE)

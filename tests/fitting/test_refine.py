@@ -152,6 +152,7 @@ def test_a_view_with_an_empty_mask_takes_no_part():
     assert np.abs(moved[1]).max() < 1e-4 < np.abs(moved[0]).max(), "nothing is known of its camera"
 
 
+@pytest.mark.slow
 def test_cameras_that_look_the_other_way_are_told_and_left():
     away = turned(truth(), 180.0)
     refined = refine_capture(away, config=CONFIG)

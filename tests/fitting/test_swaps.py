@@ -42,6 +42,7 @@ def test_nothing_is_found_where_nothing_is_wrong(views):
         assert found(*person(seed, 4, views, outliers=0.2)) == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("views", [3, 4, 8])
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
 def test_sides_of_single_views(views, outliers):

@@ -81,6 +81,7 @@ def test_equal_images_have_no_distance_and_no_gradient(net):
         assert value < bound(EQUAL) and np.abs(gradient).max() < bound(EQUAL)
 
 
+@pytest.mark.slow
 def test_a_batch_is_a_loop_and_order_does_not_matter():
     weights, (x, y) = made_up("squeeze"), pair("squeeze")
     batch = jax.jit(jax.vmap(lpips, (None, 0, 0)))(weights, jnp.stack([x, y]), jnp.stack([y, x]))

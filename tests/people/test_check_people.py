@@ -45,6 +45,7 @@ def test_a_dressed_person_has_hardly_any_fault(body, posed, camera):
     assert shares["poking"] < 0.01 and shares["hollow"] < 0.01 and shares["gaps"] < 0.01
 
 
+@pytest.mark.slow
 def test_skin_that_is_pushed_through_cloth_is_counted(body, posed, camera):
     _, before = faults(body, posed, camera)
     pushed = posed.vertices + 0.04 * posed.normals * (posed.subject.cover > 0)[:, None]

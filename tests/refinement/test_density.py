@@ -35,6 +35,7 @@ def state_of(avatar):
     )
 
 
+@pytest.mark.slow
 def test_errors_are_shared_by_weight(person):
     avatar, capture = person
     views = crop_to_person(capture)
@@ -52,6 +53,7 @@ def test_errors_are_shared_by_weight(person):
     assert float(jnp.sum(shares)) == pytest.approx(total, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_halves_have_the_mean_and_the_variance_of_the_whole(person):
     avatar = with_room(person[0], 1.5)
     count = len(person[0].gaussians.means)

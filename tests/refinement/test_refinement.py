@@ -34,6 +34,7 @@ def person(body):
     return toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), moving=True)
 
 
+@pytest.mark.slow
 def test_comes_closer_to_photos_of_a_moving_person(person):
     avatar, capture = person
     so_far = []

@@ -394,6 +394,7 @@ def test_gradients_reach_attributes_and_nothing_else():
     np.testing.assert_allclose(to_attributes.sum(), 100, rtol=1e-5)  # the square holds 10 x 10 pixel centres
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("platform", ["cpu", "cuda", "tpu"])
 def test_lowers_for_every_platform(platform):
     camera = flat_camera()
