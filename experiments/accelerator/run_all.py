@@ -46,7 +46,9 @@ def main() -> None:
         "--people", type=int, default=200, help="made on the host before training, if --bank names none"
     )
     parser.add_argument("--bank", type=Path, help="people.npz of another run")
-    parser.add_argument("--init-weights", type=Path, help="train on from these; the shipped ones if not given")
+    parser.add_argument(
+        "--init-weights", type=Path, help="weights to start the training from; default: the shipped ones"
+    )
     parser.add_argument("--tiny", action="store_true", help="sizes that a CPU rehearses in minutes")
     parser.add_argument("--page", type=Path, help="write the tables of --out to this page; nothing is run")
     arguments = parser.parse_args()

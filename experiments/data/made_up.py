@@ -276,7 +276,7 @@ class Video:
         }
 
     def write_parameters(self, path: Path, every: int = 1) -> None:
-        """smpl_params.npz. every: photos exist of each so many-th row; the rows between repeat the pose."""
+        """smpl_params.npz. every: 10 means photos of rows 0, 10, 20; the rows between repeat the pose."""
         rows = np.repeat(np.arange(len(self.parameters.rotations)), every)
         rotations = self.parameters.rotations[rows].reshape(len(rows), -1)
         arrays = {

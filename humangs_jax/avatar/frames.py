@@ -31,7 +31,7 @@ FOLLOWING = 0.5
 """Seconds: standard deviation of the Gaussian that smooths the path of the camera. Steps and swinging arms, of about a second,
 do not reach it; a walk does."""
 TRACKED, TRACKED_OPACITY = 1024, 0.5
-"""A person's extent is that of so many Gaussians, evenly spread, of at least this opacity."""
+"""A person's extent is measured on this number of Gaussians, evenly spread, of at least this opacity."""
 A_POSE = 48.0
 """Degrees that the arms hang down in the A-pose, as in the page."""
 

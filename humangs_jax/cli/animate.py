@@ -51,7 +51,7 @@ class Animate:
     stop: float | None = None
     """Where to end, in seconds of the motion."""
     loop: int = 1
-    """Play the motion so many times; each time goes on from the place where the last one has ended."""
+    """How often to play the motion; each repetition starts where the one before has ended."""
 
     def run(self) -> None:
         with _options():

@@ -38,7 +38,7 @@ class ImportCameras:
     pixel_centers: Literal["integer", "half"] | None = None
     """Where the source has the centre of the first pixel: at 0 (integer) or 0.5 (half). Default: the format's."""
     every: int = 1
-    """Take each so many-th frame of the videos."""
+    """Frame step of videos: 10 takes frames 0, 10, 20 and so on."""
     frames: int | None = None
     """Take at most that many frames of the videos."""
     overwrite: bool = False

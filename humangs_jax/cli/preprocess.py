@@ -49,7 +49,7 @@ class Preprocess:
     size: int = 512
     """Side of the photos in pixels."""
     every: int = 10
-    """Take every so many-th frame of a video."""
+    """Frame step of videos: 10 takes frames 0, 10, 20 and so on."""
     layout: Literal["scenes", "capture"] = "scenes"
     """The published scene lists, or capture folders."""
     shard: str = "0/1"

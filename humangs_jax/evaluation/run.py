@@ -170,7 +170,7 @@ def evaluate(
         avatar: a file, or a folder with PERSON.npz. weights: a file, or (variables, config). predictions: a folder of images, see
             `cases.predictions_method`. method: a function. One of them; the shipped weights if none is given.
         protocol: a name in `PROTOCOLS`, or a protocol of one's own.
-        lpips: networks from `objectives.loss_networks.load_lpips`; LPIPS of a net that is not given is None, with the reason.
+        lpips: networks from `objectives.loss_networks.load_lpips`; without one, its LPIPS is None and the reason is reported.
         page_images: how many images are kept for the page, the worst ones.
 
     Raises: ValueError or OSError, one line: unknown protocol, nothing to compare, sizes that differ, files that cannot be read.

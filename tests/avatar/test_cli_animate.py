@@ -10,6 +10,7 @@ import time
 import numpy as np
 import pytest
 from avatar_cases import two_balls
+from command_line import run
 
 from humangs_jax import cli
 from humangs_jax.avatar.shot import Shot
@@ -17,18 +18,6 @@ from humangs_jax.cli.animate import Animate, Render
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.io.exr import read_exr
 from humangs_jax.io.images import read_image
-
-
-def run(monkeypatch, capsys, *arguments):
-    """(exit code, stdout, stderr) of the command line, in this process."""
-    monkeypatch.setattr(sys, "argv", ["humangs", *map(str, arguments)])
-    try:
-        cli.main()
-        code = 0
-    except SystemExit as exit_:
-        code = exit_.code
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
 
 
 @pytest.fixture

@@ -3,7 +3,6 @@
 import html
 import json
 import re
-import sys
 import threading
 import urllib.error
 import urllib.request
@@ -11,9 +10,9 @@ from http.server import ThreadingHTTPServer
 
 import jax.numpy as jnp
 import pytest
+from command_line import run
 from viewer_cases import small_avatar
 
-from humangs_jax import cli
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.viewer import page
@@ -72,18 +71,6 @@ def test_the_server_serves_the_page_to_this_machine_and_nothing_else():
         server.shutdown()
         server.server_close()
         thread.join()
-
-
-def run(monkeypatch, capsys, *arguments):
-    """(exit code, stdout, stderr) of the command line, in this process."""
-    monkeypatch.setattr(sys, "argv", ["humangs", *map(str, arguments)])
-    try:
-        cli.main()
-        code = 0
-    except SystemExit as exit_:
-        code = exit_.code
-    captured = capsys.readouterr()
-    return code, captured.out, captured.err
 
 
 @pytest.fixture

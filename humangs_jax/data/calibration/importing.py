@@ -96,7 +96,7 @@ def import_cameras(
         out: the capture folder. With `overwrite` a capture that is there is replaced as a whole.
         scale: metres per unit of the source; 1 if None.
         up: the axis of the source's world that points up, "+y", "-z", ...; None: the format's.
-        every, frames: of videos, take each so many-th frame, and at most that many.
+        every, frames: of videos, the frame step and the largest number of frames.
         pixel_centers: where the source has the centre of its first pixel, "integer": (0, 0), "half": (0.5, 0.5);
             None: as the format says.
 

@@ -1,6 +1,6 @@
 """Videos of synchronised cameras -> photos, one folder for each camera; by ffmpeg, through imageio-ffmpeg.
 
-    CAMERA.mp4 (.mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : the first frame and each so many-th after it
+    CAMERA.mp4 (.mov, .mkv, .avi)    ->    CAMERA/00000000.png, 00000001.png, ... : frames 0, every, 2 every ...
 
 All videos have to begin at the same moment and to have the same rate. Masks are videos of the same names.
 """
@@ -38,7 +38,7 @@ def photos_of_videos(
 ) -> Generator[tuple[Path, Path | None]]:
     """Folders of photos and masks. Those of videos are written beside `place` and removed in the end; others are as given.
 
-    Arguments: every: take the first frame and each so many-th after it. most: photos of a camera, None: all.
+    Arguments: every: frame step, from frame 0. most: photos of a camera, None: all.
     Raises: CaptureError naming the video, also if every or most ask something of folders that hold none.
     """
     videos = {

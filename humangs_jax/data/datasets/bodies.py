@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -64,6 +64,11 @@ class BodyParameters(NamedTuple):
     betas: Float[np.ndarray, " s"]
     rotations: Float[np.ndarray, "m j 3"]
     translations: Float[np.ndarray, "m 3"]
+
+    def poses(self, rows: Sequence[int]) -> "BodyParameters":
+        """The shape with these poses alone."""
+        index = np.asarray(rows, int)
+        return BodyParameters(self.betas, self.rotations[index], self.translations[index])
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -9,7 +9,6 @@ The mask is the greatest channel. fullpose: 55 x 3, hands relative to the mean h
 """
 
 import importlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -132,10 +131,6 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
             image, mask = (undistort(x, camera.K, camera.distortion, 0.0) for x in (image, mask))
         return image * mask[..., None] + (1 - mask[..., None]), mask
 
-    def chosen(rows: Sequence[int]) -> BodyParameters:
-        index = np.asarray(rows, int)
-        return BodyParameters(parameters.betas, parameters.rotations[index], parameters.translations[index])
-
     return Subject(
         name=str(main),
         K=np.stack([camera.K for camera in cameras])[owners],
@@ -146,7 +141,7 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
         frame_count=count,
         view_name=lambda view: f"{numbers[owners[view]]:02d}_{frames[view]:06d}",
         read=read,
-        parameters=chosen,
+        parameters=parameters.poses,
         missing={reason: number for reason, number in missing.items() if number},
     )
 

@@ -181,10 +181,6 @@ def video_subject(
             return image, person
         return tuple(undistort(x, camera.K, camera.distortion, fill) for x, fill in ((image, 1.0), (person, 0.0)))
 
-    def chosen(rows: Sequence[int]) -> BodyParameters:
-        index = np.asarray(rows, int)
-        return BodyParameters(parameters.betas, parameters.rotations[index], parameters.translations[index])
-
     return Subject(
         name=str(name),
         K=np.stack([camera.K for camera in cameras])[owners],
@@ -195,7 +191,7 @@ def video_subject(
         frame_count=count,
         view_name=lambda view: f"{cameras[owners[view]].name}_{frames[view] + first_frame:08d}",
         read=read,
-        parameters=chosen,
+        parameters=parameters.poses,
         missing={reason: number for reason, number in missing.items() if number},
     )
 

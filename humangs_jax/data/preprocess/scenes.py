@@ -60,7 +60,7 @@ class Settings:
 
     kind: "thuman", "thuman4" or "avatarrex". layout: of the output. size: pixels a side.
     Of scans: views, factors (range of the distance in bounding radii), supersample (samples along a pixel), train and test
-    (scans of each split). Of videos: every (take each so many-th frame).
+    (scans of each split). Of videos: every (the frame step).
     """
 
     kind: str
@@ -128,7 +128,7 @@ def scan_content(name: str, thuman: ThumanSet, body: FileBody, settings: Setting
 
 
 def write_video(folder: Path, name: str, subject: Subject, body: FileBody, settings: Settings, tick: Tick) -> None:
-    """Every so many-th frame of a video from all cameras. tick: called after each photo. Raises: ValueError naming the file."""
+    """Frames of a video from all cameras, `every` apart. tick: called after each photo. Raises: ValueError naming the file."""
     chosen = np.flatnonzero(subject.frames % settings.every == 0)
     if not len(chosen):
         raise ValueError(f"{subject.name}: no photo of every {settings.every}th frame")
