@@ -141,7 +141,7 @@ def _changed(config, stage):
 
 
 def small() -> TrainConfig:
-    """The shipped weights: some hours on a CPU of two cores."""
+    """For the shipped network: some hours on a CPU of two cores. Its present weights had other losses (assets/weights.md)."""
     against_fog = LossConfig(
         squared=0.5, absolute=0.15, silhouette=0.0, outline=0.1, depth=0.3, distortion=1.0, opaque=0.001
     )

@@ -1,7 +1,7 @@
 """What is wrong with real captures, added to the inputs of training: exposure, masks, cameras, poses and shape.
 
-The targets stay true. The network learns to place Gaussians well although its photos and bodies are a little off, by what
-`humangs fit` leaves.
+The targets stay true. The network learns to place Gaussians well although its photos and bodies are a little off, as
+`humangs fit` leaves them.
 """
 
 import dataclasses
