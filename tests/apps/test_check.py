@@ -82,6 +82,7 @@ def test_a_right_capture_has_full_overlap_and_no_warning(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["check.png"]
 
 
+@pytest.mark.slow
 def test_left_is_blue_and_right_is_red_on_the_photo():
     body = boxes()
     front = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.6, SIZE, SIZE), SIZE, SIZE)[0]

@@ -10,6 +10,8 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.io.exr import read_exr
 from humangs_jax.refinement.config import RefineConfig
 
+pytestmark = pytest.mark.slow
+
 PRODUCTS = {
     "animation.gif",
     "animation.mp4",

@@ -77,6 +77,7 @@ def test_broken_files_are_refused_by_name(tmp_path):
             Avatar.load(path)
 
 
+@pytest.mark.slow
 def test_the_zero_pose_leaves_the_gaussians_where_they_are():
     avatar = make_avatar()
     still = animate(avatar, BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)))

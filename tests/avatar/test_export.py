@@ -282,6 +282,7 @@ def exported(monkeypatch, *words):
     cli.main()
 
 
+@pytest.mark.slow
 def test_a_sequence_of_frames_stands_on_one_floor(tmp_path, monkeypatch, capsys):
     source, rise = small_file(tmp_path), np.asarray([0, 0.5, 0.1, 2.0])
     moves = jnp.asarray(np.stack([0 * rise, rise, 0 * rise], axis=1), jnp.float32)

@@ -142,6 +142,7 @@ def test_a_body_without_collapses_finds_them():
     assert np.array_equal(decimate(small, 60).template, decimate(body, 60).template)  # the result carries its own
 
 
+@pytest.mark.slow
 def test_a_rim_stays_a_rim():
     vertices, faces = sphere(open_below=True)
     rim = lambda f: {e for e in edge_counts(f) if (e[1], e[0]) not in edge_counts(f)}

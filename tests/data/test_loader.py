@@ -236,6 +236,7 @@ def test_leaving_the_loop_ends_the_thread(source):
     assert not [t for t in threading.enumerate() if t.name == "humangs-loader"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("limit", [0, 20 * SIZE * SIZE * 4, 1 << 30])
 def test_only_drawn_views_are_read_and_the_memory_limit_costs_time_alone(folder, monkeypatch, limit):
     read = []

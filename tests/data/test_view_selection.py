@@ -29,6 +29,7 @@ def test_the_greedy_choice_keeps_its_guarantee(quality, count):
     assert covered(quality, chosen) >= GUARANTEE * best - 1e-9
 
 
+@pytest.mark.slow
 def test_repeated_photos_are_left_out(demo):
     """Of four photos, three of which are one, two different ones show more."""
     doubled = demo.select([0, 0, 2, 0])

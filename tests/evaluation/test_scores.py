@@ -88,6 +88,7 @@ def test_lpips_of_a_padded_image_is_that_of_the_image(networks, net, size):
     np.testing.assert_allclose(found, jax.jit(lpips)(networks[net], *pair), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_backgrounds_masks_and_crops_of_every_protocol():
     """Each preset's PSNR and SSIM from images that are put on its background, cut out and cropped by hand."""
     predicted, truth, masks = (x[0] for x in random_views(1, 1, 128, 128))

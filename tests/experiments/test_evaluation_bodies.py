@@ -69,6 +69,7 @@ def test_other_joints_are_no_smplx(body, tmp_path):
         bodies.write_smplx(tmp_path / "a.npz", replace(body, joint_names=("tail", *body.joint_names[1:])))
 
 
+@pytest.mark.slow
 def test_fractions_are_as_they_are_and_split(body, monkeypatch):
     monkeypatch.setattr(bodies, "SMPLX_SEED_VERTICES", 600)
     config = tiny().with_conventions(body_vertices=1000, longest_edge=0.05)

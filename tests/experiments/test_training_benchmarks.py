@@ -98,6 +98,7 @@ def test_convolutions_are_timed_in_a_loop_and_out_of_it(page):
     assert "| 2 x 4 x 5 x 3 -> 6 |" in path.read_text()
 
 
+@pytest.mark.slow
 def test_checkpoints_are_saved_restored_and_weighed(page, tmp_path):
     path = page("scaling.md")
     result = json.loads(json.dumps(checkpoints.measure("tiny", tmp_path / "checkpoints", repeats=1)))

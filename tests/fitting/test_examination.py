@@ -138,6 +138,7 @@ def test_frames_and_views_without_keypoints(good):
     assert not nothing.report.ok and "nan" not in str(nothing.report)
 
 
+@pytest.mark.slow
 def test_frames_without_views(good):
     """A capture may have more poses than its views show, before the last and after it."""
     capture, keypoints = good

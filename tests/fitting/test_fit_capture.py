@@ -78,6 +78,7 @@ def test_written_in_place_and_read_again(folder, fitted, tmp_path):
     check_place(path, None, overwrite=True)
 
 
+@pytest.mark.slow
 def test_a_fit_in_place_is_written_whole_or_not_at_all(folder, fitted, tmp_path, monkeypatch):
     """Cameras that were moved belong to the body that was found with them."""
     path = copied(folder[0], tmp_path)
@@ -94,6 +95,7 @@ def test_a_fit_in_place_is_written_whole_or_not_at_all(folder, fitted, tmp_path,
     np.testing.assert_array_equal(load_capture(path).cameras.cam_from_world, moved)
 
 
+@pytest.mark.slow
 def test_a_body_in_a_folder_of_its_own_is_written_and_read_again(folder, fitted, tmp_path):
     path = copied(folder[0], tmp_path)
     description = json.loads((path / "capture.json").read_text()) | {"body": "params/body.npz"}
@@ -105,6 +107,7 @@ def test_a_body_in_a_folder_of_its_own_is_written_and_read_again(folder, fitted,
         assert (target / "params" / "body.npz").is_file()
 
 
+@pytest.mark.slow
 def test_records_of_earlier_versions_are_read(folder, fitted, tmp_path):
     path = copied(folder[0], tmp_path)
     write_fitted(path, path, fitted.capture, fitted.report, fitted.record)
@@ -116,6 +119,7 @@ def test_records_of_earlier_versions_are_read(folder, fitted, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_written_elsewhere_with_its_images_and_new_cameras(folder, fitted, tmp_path, monkeypatch):
     moved = fitted.capture.cameras.cam_from_world.at[3, 0, 3].add(0.25)
     capture = dataclasses.replace(fitted.capture, cameras=replace(fitted.capture.cameras, cam_from_world=moved))
@@ -197,6 +201,7 @@ def test_what_cannot_be_fitted_is_one_error(folder, change, message):
         fit_photos(load_photos(folder[0]), keypoints, default_body())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "message"),
     [

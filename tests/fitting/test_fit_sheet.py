@@ -57,6 +57,7 @@ def test_outliers_are_hollow(sheet):
     assert ((around[..., 0] - around[..., 2]) > 0.3).sum() > 10 and RIGHT[0] > RIGHT[2]
 
 
+@pytest.mark.slow
 def test_lines_lead_to_the_body(sheet):
     image, examination = sheet
     top = image.shape[0] - 512 - GAP
@@ -85,6 +86,7 @@ def test_many_views_and_frames(tmp_path, monkeypatch):
     np.testing.assert_allclose(image[-len(plot) :], plot, atol=1 / 255)
 
 
+@pytest.mark.slow
 def test_labels(sheet):
     views = (ViewReport("a", 0, 17, 2.06, 4.0, 0.0), ViewReport("b", 0, 0, np.nan, np.nan, 0.0))
     examination = dataclasses.replace(sheet[1], report=FitReport("keypoints", views=views))

@@ -27,6 +27,7 @@ def noisy():
     return joints, betas, seen, fit_landmarks(model_of(), seen, CONFIG)
 
 
+@pytest.mark.slow
 def test_keypoints_without_noise():
     joints, _, seen = observe(NAMES, seed=3)
     fit = fit_landmarks(model_of(), seen, CONFIG)
@@ -46,6 +47,7 @@ def test_keypoints_with_noise(noisy):
         assert (np.asarray(outcome.steps) > 0).all()
 
 
+@pytest.mark.slow
 def test_limits_are_kept(noisy):
     prior = pose_prior(model_of().joint_names)
     for rotations in np.asarray(noisy[3].poses.rotations)[[NAMES.index("standing"), NAMES.index("crouching")]]:

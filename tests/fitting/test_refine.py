@@ -168,6 +168,7 @@ def test_one_view_is_refined_by_its_outline():
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masks", [None, np.zeros((VIEWS, SIZE, SIZE), np.float32)])
 def test_nothing_to_refine_by_is_an_error(masks):
     blind = dataclasses.replace(truth(), masks=masks)

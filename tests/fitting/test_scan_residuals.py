@@ -87,6 +87,7 @@ def test_columns_of_the_jacobian_are_derivatives(problem, case):
         np.testing.assert_allclose(column, one(leaves, direction), atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_smaller_scan_is_no_nearer(problem, case):
     """Shrinking body and scan together changes no distance: in the body's own metres it would."""
     matches, given, tolerances, state = case

@@ -22,6 +22,7 @@ def blocks(path, up=2):
     return np.asarray(mesh.vertices)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("up", [2, 0])
 def test_images_show_the_scan_upright_and_in_its_colours(tmp_path, up):
     blocks(tmp_path / "scan.ply", up)

@@ -56,6 +56,7 @@ def test_sides_of_single_views(views, outliers):
     assert "view m1v0: left and right of the keypoints seem exchanged" in [str(swap) for swap in swaps]
 
 
+@pytest.mark.slow
 def test_of_two_views_either_may_be_the_wrong_one():
     capture, keypoints = person(11, 4, 2)
     swaps = found(capture, changed(keypoints, flipped=[0, 5]))

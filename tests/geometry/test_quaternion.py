@@ -30,6 +30,7 @@ def test_multiplication_is_composition(seed, batch):
     assert close(product, quaternion.to_matrix(p) @ quaternion.to_matrix(q))
 
 
+@pytest.mark.slow
 @given(seeds, batches)
 def test_matrices_are_rotations_and_convert_back(seed, batch):
     q = unit(seed, batch)

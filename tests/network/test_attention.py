@@ -33,6 +33,7 @@ def oracle(q, k, v, count):
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [None, 5, LENGTH])
 @pytest.mark.parametrize(("implementation", "chunk"), [("xla", 1), ("chunked", 4), ("chunked", 13), ("chunked", 100)])
 def test_agrees_with_the_definition(implementation, chunk, count):
@@ -89,6 +90,7 @@ def test_auto_follows_backend_length_and_precision(monkeypatch, backend, tokens,
     assert resolve_implementation("xla", tokens, jnp.dtype(dtype)) == "xla"
 
 
+@pytest.mark.slow
 def test_query_key_norm_makes_attention_blind_to_their_lengths():
     tokens = jnp.asarray(np.random.default_rng(3).normal(size=(7, 8)), jnp.float32)
     for normed in (True, False):

@@ -110,6 +110,7 @@ def test_one_wrong_number_in_any_stage_fails(tmp_path, monkeypatch, capsys):
     assert check_parity.relative_errors(found, negative)["asset_rotations"] > 0.5
 
 
+@pytest.mark.slow
 def test_what_is_not_compared_fails(tmp_path, monkeypatch, capsys):
     def change(arrays):
         arrays["mid_something"] = np.zeros(3, np.float32)

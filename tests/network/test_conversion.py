@@ -41,6 +41,7 @@ def write(folder, state, **others):
     return write_checkpoint(folder / "a.pt", {"model": tensors(state), **others})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", VARIANTS)
 def test_the_configuration_is_read_off_the_shapes(options, tmp_path):
     state = oracle.random_state(options)

@@ -25,6 +25,7 @@ def reference(x, kernel):
     return sum(shifted(a, b) for a in range(3) for b in range(3))
 
 
+@pytest.mark.slow
 def test_it_is_the_sum_over_a_neighbourhood_with_its_gradients():
     with jax.enable_x64(True):
         x, kernel, weights = random(*SHAPE), random(3, 3, SHAPE[-1], FEATURES), random(*SHAPE[:3], FEATURES)

@@ -205,6 +205,7 @@ def test_short_number_types_are_close(dtype, tolerance):
     assert close(outputs.gaussians.colors, exact.gaussians.colors, 2 * tolerance)
 
 
+@pytest.mark.slow
 def test_unseen_vertices_are_grey_and_pool_nothing():
     inputs = replace(random_inputs(), depth_maps=jnp.full((2, 32, 32), -1.0))
     encoding = Encoding(jnp.ones((2, 16, 16, 4)), jnp.ones(16), jnp.int32(0))
@@ -291,6 +292,7 @@ def gradients(variables, continuous, inputs, config):
     return jax.grad(of, (0, 1))(variables["params"], continuous)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_and_reach_every_parameter():
     inputs = random_inputs()
     cameras = inputs.cameras
@@ -306,6 +308,7 @@ def test_gradients_are_finite_and_reach_every_parameter():
     assert not silent
 
 
+@pytest.mark.slow
 def test_a_vmap_over_subjects_is_a_loop():
     subjects = [random_inputs(seed) for seed in range(2)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
@@ -346,6 +349,7 @@ def test_images_must_be_those_of_the_cameras():
         apply(odd)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("missing", ["posed_normals", "canonical_normals"])
 def test_shells_need_normals(missing):
     inputs = replace(random_inputs(), **{missing: None})

@@ -77,6 +77,7 @@ def test_a_part_is_named_in_json_and_found_again():
         config_from_json(Architecture, '{"decoder": {"kind": "humangs_jax.network.execution.Execution"}}')
 
 
+@pytest.mark.slow
 def test_the_pass_is_its_three_parts_and_names_its_stages():
     variables, inputs, recorder = init_humangs(jax.random.key(0), TINY), random_inputs(), Recorder()
     outputs, _ = jax.jit(lambda v: apply_humangs(v, inputs, TINY))(variables)

@@ -68,6 +68,7 @@ def test_hull_and_share_tell_how_far_the_coat_reaches():
     assert np.allclose(shells.hull[certain, 3], inside.all(0)[certain], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_colours_are_of_the_views_that_face_the_point():
     arguments = scene()
     shells = read(arguments)

@@ -37,6 +37,7 @@ def test_blocks_may_be_looped_over_and_recomputed(how):
         assert np.allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE * max(1, np.abs(b).max()))
 
 
+@pytest.mark.slow
 def test_outputs_are_those_of_the_quarters():
     """A network that is cut off after a quarter gives the raw output of that quarter."""
     outputs = network(CONFIG).apply(VARIABLES, TOKENS)

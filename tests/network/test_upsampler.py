@@ -3,6 +3,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from network_cases import random_like
 
 from humangs_jax.network.bilinear import sample_bilinear
@@ -69,6 +70,7 @@ def test_final_features_only():
     assert shapes["params"]["fuse"]["kernel"].shape == (3, 3, CONFIG.hidden, 2 * CONFIG.hidden)
 
 
+@pytest.mark.slow
 def test_what_vertices_read_is_what_the_convolved_map_says():
     rng = np.random.default_rng(2)
     stem = jnp.asarray(rng.normal(size=(1, 6, 8, 3)), jnp.float32)

@@ -117,6 +117,7 @@ def test_shells_enter_the_decoder_and_start_at_the_surface():
     assert np.all(jax.nn.softmax(raw.shells)[..., 0] > 0.9)
 
 
+@pytest.mark.slow
 def test_in_the_frame_of_the_normal_gaussians_lie_flat_on_the_surface():
     frames = normal_frames(NORMALS)
     axes = quaternion.to_matrix(frames)

@@ -89,6 +89,7 @@ def test_a_batch_is_a_loop_and_order_does_not_matter():
     np.testing.assert_allclose(batch, [alone, alone], rtol=FLOAT32)
 
 
+@pytest.mark.slow
 def test_where_all_features_are_zero_gradients_are_finite():
     """The length of a zero vector has no gradient: the original gives NaN there."""
     weights = made_up("alex")

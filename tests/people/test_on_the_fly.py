@@ -116,6 +116,7 @@ def test_a_key_is_an_example_bit_for_bit(bank, example):
     assert np.abs(np.asarray(other.inputs.images) - np.asarray(example.inputs.images)).mean() > 0.01
 
 
+@pytest.mark.slow
 def test_examples_look_like_those_of_the_loader(bank, example, body):
     for views, count in ((example.inputs, 2), (example.targets, 1)):
         assert views.images.shape == (count, 48, 48, 3) and views.masks.shape == (count, 48, 48)
@@ -257,6 +258,7 @@ def test_mirroring_twice_changes_nothing(bank, example):
     assert np.abs(np.asarray(once.rotations - views.rotations)).max() > 0.1
 
 
+@pytest.mark.slow
 def test_poses_stand_on_the_ground_between_two_of_the_prior(bank, scene):
     np.testing.assert_allclose(np.asarray(scene.vertices)[..., 1].min(1), 0, atol=1e-5)
     a, b = bank.rotations[0, 0], bank.rotations[0, 1]

@@ -89,6 +89,7 @@ def test_a_written_person_has_all_views_in_all_forms(folder, body):
     assert manifest["subjects"] == [person.name] and manifest["settings"]["image_size"] == SIZE
 
 
+@pytest.mark.slow
 def test_maps_agree_with_the_body_where_it_is_bare(body):
     person = make_subject(DEMO[1], body)
     posed = writer.sample_pose(person, 0)

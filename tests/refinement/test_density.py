@@ -87,6 +87,7 @@ def covariance(gaussians, i):
     return axes @ np.diag(np.square(gaussians.scales[i])) @ axes.T
 
 
+@pytest.mark.slow
 def test_without_a_free_slot_nothing_is_split(person):
     avatar, _ = person
     state = state_of(avatar)
@@ -95,6 +96,7 @@ def test_without_a_free_slot_nothing_is_split(person):
     jax.tree.map(np.testing.assert_array_equal, same, avatar)
 
 
+@pytest.mark.slow
 def test_room_is_invisible_and_goes_again(person):
     avatar, _ = person
     roomy = with_room(avatar, 2.0)

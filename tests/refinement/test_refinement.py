@@ -59,6 +59,7 @@ def test_what_no_photo_sees_stays(body, person):
     assert np.abs(refined.gaussians.means[50:] - avatar.gaussians.means[50:]).max() > 1e-4
 
 
+@pytest.mark.slow
 def test_never_worse_than_the_start(person):
     avatar, capture = person
     truth = toy_capture(capture.body, avatar)
@@ -105,6 +106,7 @@ def test_parameters_invert(person):
         np.testing.assert_allclose(got, expected, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_crops_show_the_same_pixels(person):
     avatar, capture = person
     wide = np.pad(capture.images, ((0, 0), (40, 40), (30, 70), (0, 0)), constant_values=1.0)
@@ -202,6 +204,7 @@ def test_of_many_photos_one_is_held_out_whole_and_never_drawn(person, monkeypatc
     assert set(drawn) == set(np.flatnonzero(~held))
 
 
+@pytest.mark.slow
 def test_blocks_are_held_out_of_steps_and_checked(person):
     run = run_of(person, dataclasses.replace(STEPS, held_out=0.3))
     held = np.asarray(run.held.counted)

@@ -152,6 +152,7 @@ def check_sweep(scene):
     assert outcome.gradient < bound(SWEEP_GRADIENT), outcome
 
 
+@pytest.mark.slow
 @settings(max_examples=100)
 @given(st.integers(0, 2**20), decade(0, 6), decade(-1.99, 6), decade(0, 3), decade(-7, 3), decade(0, 2))
 def test_random_scenes_over_many_decades(seed, focal, nearest, depths, smallest, ratio):

@@ -173,6 +173,7 @@ def test_equals_the_other_schedule_on_any_lists(seed, lengths, faint):
         assert_equal(ours, expected, lists.counts)
 
 
+@pytest.mark.slow
 def test_a_batch_is_one_call():
     with jax.enable_x64(True):
         batch = [by_hand(seed, lengths, np.float64) for seed, lengths in ((1, LENGTHS), (2, LENGTHS[::-1]))]

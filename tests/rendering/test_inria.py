@@ -88,6 +88,7 @@ def draw(gaussians, view, background):
     return color + transmittance[..., None] * background, 1 - transmittance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_draws_what_the_release_draws(seed):
     with jax.enable_x64(True):

@@ -320,6 +320,7 @@ def test_tiny_faces_between_pixel_centers_are_not_seen():
     assert np.argwhere(ids == 0).tolist() == [[7, 7]]
 
 
+@pytest.mark.slow
 def test_images_of_one_pixel_and_meshes_of_nothing():
     vertices = jnp.asarray(SQUARE)
     assert draw(vertices, SQUARE_FACES, Camera.from_opencv(np.eye(3), np.eye(4), 1, 1)).face_ids == -1

@@ -141,6 +141,7 @@ def test_every_knob_means_the_same_as_in_the_reference():
         assert_close(ours, expected, FLOAT64)
 
 
+@pytest.mark.slow
 def test_float32_differs_only_by_rounding_and_by_decisions():
     gaussians, view = random_gaussians(8, np.float32), camera(np.float32)
     ours = tiled(gaussians, view, background(np.float32))
@@ -183,6 +184,7 @@ def views(dtype=np.float32):
     return stack_cameras([replace(camera(dtype), cam_from_world=tilt) for tilt in tilts])
 
 
+@pytest.mark.slow
 def test_batches_of_subjects_and_views_equal_the_loop():
     """Gradients of a sum over nested vmaps, through a checkpoint."""
     with jax.enable_x64(True):
@@ -208,6 +210,7 @@ def test_batches_of_subjects_and_views_equal_the_loop():
             assert_close(jax.tree.map(lambda leaf, i=i: leaf[i], gradients), total, FLOAT64)
 
 
+@pytest.mark.slow
 def test_render_views_equals_the_loop_and_fits_the_largest_view():
     with jax.enable_x64(True):
         gaussians, cameras = random_gaussians(1), views(np.float64)
@@ -224,6 +227,7 @@ def needed(gaussians, view):
     return int(str(error.value).split("max_pairs >= ")[1].split()[0])
 
 
+@pytest.mark.slow
 def test_overflow_is_counted_under_jit_and_refused_eagerly():
     gaussians, view = random_gaussians(2, np.float32), camera(np.float32)
     pairs = needed(gaussians, view)

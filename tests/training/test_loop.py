@@ -42,6 +42,7 @@ def test_resume_after_two_steps_ends_bit_for_bit_where_four_steps_end(body, capt
     assert losses(tmp_path) == losses(whole[1]) and len(losses(tmp_path)) == 4
 
 
+@pytest.mark.slow
 def test_a_finished_run_stays_as_it_is(body, captures, variables, whole, same):
     before = len(lines(whole[1]))
     again = train(CONFIG, body, captures[:2], whole[1], variables=variables, stop_at=4, progress=False)
@@ -57,6 +58,7 @@ def test_a_finished_run_goes_on_when_it_gets_more_steps(body, captures, variable
     assert [line["step"] for line in lines(tmp_path) if "loss" in line] == [1, 2, 3]
 
 
+@pytest.mark.slow
 def test_what_a_run_leaves_behind(whole):
     state, out = whole
     validations = [line for line in lines(out) if "val_psnr" in line]
@@ -94,6 +96,7 @@ def test_a_signal_saves_and_ends_the_run(body, captures, variables, tmp_path, mo
     checkpoints.close()
 
 
+@pytest.mark.slow
 def test_another_configuration_is_refused_before_anything_runs(body, captures, whole):
     with pytest.raises(ValueError, match="started with seed = 0, not 1"):
         train(dataclasses.replace(CONFIG, seed=1), body, captures[:2], whole[1], progress=False)
@@ -110,6 +113,7 @@ def test_a_broken_folder_is_named_and_logged(body, captures, variables, tmp_path
     assert lines(tmp_path / "out")[-1]["broken_folders"] == 1
 
 
+@pytest.mark.slow
 def test_a_run_on_people_of_any_source_asks_for_it_with_its_configuration(
     body, captures, variables, tmp_path, whole, same
 ):

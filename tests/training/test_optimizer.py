@@ -44,6 +44,7 @@ def test_weight_decay_acts_on_two_axes_and_more():
         np.testing.assert_allclose(leaf, shrunk if decayed(PARAMS)[name] else 1.0, rtol=FLOAT32)
 
 
+@pytest.mark.slow
 def test_first_step_is_adams_whatever_the_clipping():
     params, state = stepped(filled(3.0))
     assert float(state.norm) == pytest.approx(3 * np.sqrt(sum(x.size for x in PARAMS.values())), rel=bound(FLOAT32))

@@ -36,6 +36,7 @@ def on_eight_devices(name):
     assert finished.returncode == 0, finished.stdout + finished.stderr
 
 
+@pytest.mark.slow
 def test_parts_are_gathered_and_gradients_come_back_as_parts_of_the_mean():
     on_eight_devices("a_linear_model")
 

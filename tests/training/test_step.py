@@ -91,6 +91,7 @@ def test_steps_repeat_bit_for_bit(body, source, variables, same):
     assert same(first, second)
 
 
+@pytest.mark.slow
 def test_it_learns_a_batch(body, source, variables):
     state, batch, history = init_state(CONFIG, variables), source.batch_at(0), []
     for _ in range(CONFIG.steps):
