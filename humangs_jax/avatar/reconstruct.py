@@ -12,12 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.body.model import BodyModel, shape_body
+from humangs_jax.body.model import BodyModel, BodyPose, shape_body
+from humangs_jax.body.skinning import blend_transforms, joint_transforms, spread_weights
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, gaussian_body, pad_views, prepare_inputs, standardize
+from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import camera_values
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, needed_tokens
@@ -25,6 +27,9 @@ from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.buffers import round_up
+
+SMALLEST_VOLUME = 0.2
+"""Blended transforms of limbs that are turned against each other collapse; below this determinant they are not inverted."""
 
 
 def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar:
@@ -116,7 +121,37 @@ def make_avatar(outputs: HumanGSOutputs, body: BodyModel, betas: Float[Array, " 
 
 def _assemble(variables, config, body, views, inputs):
     outputs, _ = apply_humangs(variables, inputs, config)
-    return make_avatar(outputs, body, views.betas, config), outputs.dropped_tokens
+    avatar = make_avatar(outputs, body, views.betas, config)
+    if config.conventions.skinning_reach is not None:
+        avatar = with_spread_weights(
+            avatar, BodyPose(views.rotations[0], views.translations[0]), config.conventions.skinning_reach
+        )
+    return avatar, outputs.dropped_tokens
+
+
+def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
+    """The avatar with the weights of `spread_weights`, its means where they were in that pose, which is the one of the photos.
+
+    The shapes of Gaussians are not corrected. Gradients do not pass through the weights.
+    """
+    gaussians, vertices, own = avatar.gaussians, avatar.rest_vertices, avatar.skinning_weights
+    per_vertex = len(gaussians.means) // len(vertices)
+    points = jax.lax.stop_gradient(gaussians.means)
+    distances = jnp.linalg.norm(points - jnp.repeat(vertices, per_vertex, axis=0), axis=-1)
+    spread = spread_weights(points, distances, own, vertices, own[::per_vertex], reach)
+    transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
+    before, after = blend_transforms(own, transforms), blend_transforms(spread, transforms)
+    columns = jnp.moveaxis(after[:, :3, :3], -1, 0)
+    crossed = jnp.stack([jnp.cross(columns[i - 2], columns[i - 1]) for i in range(3)], axis=1)
+    volumes = jnp.sum(columns[0] * crossed[:, 0], axis=-1)
+    safe = volumes > SMALLEST_VOLUME
+    moved = transform.apply(before, gaussians.means) - after[:, :3, 3]
+    held = jnp.einsum(
+        "gab,gb->ga", crossed / jnp.where(safe, volumes, 1)[:, None, None], moved, precision=transform.EXACT
+    )
+    means = jnp.where(safe[:, None], held, gaussians.means)
+    weights = jnp.where(safe[:, None], spread, own)
+    return replace(avatar, gaussians=replace(gaussians, means=means), skinning_weights=weights)
 
 
 def _prepare_subjects(body, batch, config):

@@ -57,8 +57,10 @@ class Conventions:
     seen by no photo, and Gaussians of vertices that all photos show off the person are dropped. position_map: its shading.
     ray_origins: the release divides camera centres by s, and the ray origins taken from them once more, so that the moments of
     its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex (paper) or over all (release).
-    pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn. body_vertices, longest_edge:
-    number of vertices to which bodies are decimated, and metres to which their edges are split afterwards; None for neither.
+    pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn. skinning_reach: Gaussians
+    farther than this from their vertex, metres, move with the body around them (`body.skinning.spread_weights`); None: all with
+    their vertex, as in training. body_vertices, longest_edge: number of vertices to which bodies are decimated, and metres to
+    which their edges are split afterwards; None for neither.
     """
 
     image_size: int = knob(
@@ -75,6 +77,7 @@ class Conventions:
     pixel_grid: PixelGrid = "half_pixel"
     skinning: Literal["affine", "rotation"] = "affine"
     rendering: Literal["exact", "inria"] = "exact"
+    skinning_reach: float | None = None
     body_vertices: int | None = knob(
         None, cost="detail of the body", gain="Gaussians, reads and decoding in proportion", measured=EVALUATION
     )

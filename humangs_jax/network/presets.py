@@ -58,7 +58,14 @@ def small() -> HumanGSConfig:
                 residual_color=True,
             ),
         ),
-        Conventions(image_size=256, tokens="foreground", pixels="person", body_vertices=4000, longest_edge=0.03),
+        Conventions(
+            image_size=256,
+            tokens="foreground",
+            pixels="person",
+            skinning_reach=0.04,
+            body_vertices=4000,
+            longest_edge=0.03,
+        ),
         Execution(token_capacity=1344),
     )
 

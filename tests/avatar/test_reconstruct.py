@@ -6,15 +6,25 @@ import numpy as np
 import pytest
 
 from humangs_jax.avatar.animate import skin
-from humangs_jax.avatar.reconstruct import _assemble_compiled, reconstruct, reconstruct_batch, reconstruct_views
+from humangs_jax.avatar.reconstruct import (
+    _assemble_compiled,
+    make_avatar,
+    reconstruct,
+    reconstruct_batch,
+    reconstruct_views,
+    with_spread_weights,
+)
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
+from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.views import SubjectViews, pad_views, prepare_inputs, standardize
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.presets import tiny
+from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import SplatConfig, render
 
 SIZE = 32
@@ -93,8 +103,6 @@ def test_reconstruct_and_render_lower_for_every_platform(body, network):
 
     def drawn(variables, views):
         avatar, dropped = reconstruct_views(variables, config, body, views)
-        from humangs_jax.body.model import BodyPose
-
         gaussians = skin(avatar, BodyPose(views.rotations[0], views.translations[0]))
         return render(gaussians, views.cameras[0], SplatConfig()).rgb, dropped
 
@@ -103,6 +111,22 @@ def test_reconstruct_and_render_lower_for_every_platform(body, network):
     image, _ = exported.call(variables, subject_views(0))
     expected, _ = jax.jit(drawn)(variables, subject_views(0))
     np.testing.assert_allclose(image, expected, atol=1e-5)
+
+
+def test_spread_weights_leave_gaussians_where_the_photos_saw_them(body):
+    rng = np.random.default_rng(0)
+    pose = BodyPose(jnp.asarray(0.3 * rng.normal(size=(55, 3)), jnp.float32), jnp.ones(3))
+    count = len(body.template)
+    means = body.template + jnp.asarray(rng.normal(size=(count, 3)) * 0.1 * (rng.random((count, 1)) < 0.2), jnp.float32)
+    gaussians = Gaussians(means, jnp.ones((count, 4)), jnp.ones((count, 3)), jnp.ones(count), jnp.ones((count, 3)))
+    outputs = HumanGSOutputs(gaussians, jnp.zeros((count, 0, 3)), None, jnp.zeros((), int), jnp.zeros((), int))
+    avatar = make_avatar(outputs, body, jnp.zeros(4), tiny())
+    spread = with_spread_weights(avatar, pose, 0.04)
+    changed = np.any(spread.skinning_weights != avatar.skinning_weights, axis=1)
+    assert 0.05 < changed.mean() <= 0.25 and not changed[np.linalg.norm(means - body.template, axis=1) < 0.03].any()
+    np.testing.assert_allclose(skin(spread, pose).means, skin(avatar, pose).means, atol=1e-5)
+    other = BodyPose(-pose.rotations, pose.translation)
+    assert np.abs(skin(spread, other).means - skin(avatar, other).means).max() > 0.005
 
 
 def capture(body, height, width, views=2):

@@ -77,3 +77,19 @@ def test_nested_vmap_compiles():
     run = lambda joint, r: skinning.joint_transforms(joint, PARENTS, r, jnp.zeros(3))
     found = jax.jit(jax.vmap(jax.vmap(run, (None, 0))))(joints, rotations)
     assert np.allclose(found, np.eye(4), atol=ATOL)
+
+
+def test_points_between_two_limbs_go_with_both_and_points_on_them_with_their_own():
+    """Two upright rows of vertices, a joint each, 20 cm apart."""
+    heights = np.linspace(0, 1, 400)
+    row = lambda x: np.stack([np.full(400, x), heights, np.zeros(400)], axis=1)
+    vertices, joints = np.concatenate([row(-0.1), row(0.1)]), np.repeat(np.eye(2), 400, axis=0)
+    points = np.concatenate([row(0.0)[100:200], row(-0.1), row(0.1)])
+    own = np.concatenate([joints[:100], joints])
+    distances = np.concatenate([np.full(100, 0.1), np.zeros(800)])
+    run = jax.jit(skinning.spread_weights, static_argnums=5)
+    arrays = [jnp.asarray(x, jnp.float32) for x in (points, distances, own, vertices, joints)]
+    found = run(*arrays, 0.04)
+    np.testing.assert_allclose(found[:100], 0.5, atol=ATOL)
+    np.testing.assert_array_equal(found[100:], own[100:])
+    np.testing.assert_allclose(np.sum(found, axis=1), 1, atol=ATOL)
