@@ -29,6 +29,8 @@ LONGEST_TURN = 2 * math.pi + 0.5
 """Radians: rotation vectors are at most half a turn, and a whole one where someone counted on; degrees are far beyond."""
 BETTER = 0.1
 """IoU by which an exchange has to explain each view better than the capture does."""
+DARKEST, BURNT = 0.12, 0.98
+"""Brightness that 2 % of a person's pixels exceed in any light; and that 60 % exceed only in photos that are burnt out."""
 NAMED = 4
 """Views that are named in a warning; the others are counted."""
 
@@ -62,13 +64,15 @@ MISTAKES = {
 class _Views:
     """What is compared, in numpy: JAX would compile each of the small operations.
 
-    points: on the skin, by frame. masks: cells of each view, or None. largest: the longest rotation vector of all poses.
+    points: on the skin, by frame. masks: cells of each view, or None. exposures: see `_exposure`.
+    largest: the longest rotation vector of all poses.
     """
 
     names: tuple[str, ...]
     frames: list[int]
     points: dict[int, np.ndarray]
     masks: list[np.ndarray] | None
+    exposures: list[str | None]
     K: np.ndarray
     cam_from_world: np.ndarray
     translations: np.ndarray
@@ -95,12 +99,13 @@ def _views(capture) -> _Views:
     ).tolist()
     rotations = np.asarray(capture.poses.rotations, float)
     translations = np.asarray(capture.poses.translation, float)
-    frames = [int(capture.frames[i]) for i in chosen]
+    frames, masks = [int(capture.frames[i]) for i in chosen], capture.masks
     return _Views(
         names=tuple(capture.names[i] for i in chosen),
         frames=frames,
         points=_surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames),
-        masks=None if capture.masks is None else [_mask_cells(np.asarray(capture.masks[i])) for i in chosen],
+        masks=None if masks is None else [_mask_cells(np.asarray(masks[i])) for i in chosen],
+        exposures=[_exposure(capture.images[i], None if masks is None else masks[i]) for i in chosen],
         K=np.asarray(capture.cameras.K, float)[chosen],
         cam_from_world=np.asarray(capture.cameras.cam_from_world, float)[chosen],
         translations=translations,
@@ -120,6 +125,16 @@ def _whole_capture(views):
         return (), set()
     pairs = [f"{views.names[i]} by the camera of {views.names[j]}" for i, j in exchanged.items()]
     return (f"cameras are exchanged: the body would fit {_listed(pairs)}",), set(exchanged)
+
+
+def _exposure(image, mask) -> str | None:
+    """What is wrong with a photo on which the person is nearly black or burnt out: nothing is to be seen there."""
+    person = image if mask is None else image[mask > 0.99]  # without its blended edge
+    if person.size and np.quantile(person, 0.98) < DARKEST:
+        return "the person is nearly black; is the photo underexposed, or were its 8 bits divided twice"
+    if person.size and mask is not None and np.quantile(person, 0.4) > BURNT:
+        return "most of the person is white; is the photo overexposed"
+    return None
 
 
 def _exchanged_cameras(views) -> dict[int, int]:
@@ -161,7 +176,7 @@ def _problem(views, i):
         return "the mask is empty"
     own = None if mask is None else _overlap(covered, mask)
     if inside >= LEAST_INSIDE and (own is None or own >= LEAST_IOU):
-        return None
+        return views.exposures[i]
     told = "most of the body is outside the frame" if own is None else "body and mask do not agree"
     cause = _cause(views, i, covered, mask)
     return told if cause is None else f"{told}; they would if {cause}"

@@ -254,6 +254,8 @@ class Check:
     detections: OmitArgPrefixes[Detections]
     out: Path = Path("check.png")
     """The contact sheet to write, .png; that of the keypoints is NAME_fit.png beside it."""
+    limits: bool = False
+    """Also print the ranges in which avatars stay good, and where this capture lies in them (docs/stability.md)."""
 
     def run(self) -> None:
         sheet = self.out.with_name(f"{self.out.stem}_fit{self.out.suffix}")
@@ -275,6 +277,10 @@ class Check:
         with stage("drawing the body"):
             report = check_capture(capture, self.out)
         tell(report)
+        if self.limits:
+            from humangs_jax.apps.limits import limits_table
+
+            tell(limits_table(capture))
         wrote(self.out, "the body over the photos")
         ok = report.ok
         if record is not None or keypoints is not None:

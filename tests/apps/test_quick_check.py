@@ -28,6 +28,11 @@ def with_cameras(capture, order):
     return {"cameras": replace(cameras, K=cameras.K[order], cam_from_world=cameras.cam_from_world[order])}
 
 
+def on_white(capture, images):
+    masks = capture.masks[..., None]
+    return masks * np.minimum(images, 1) + 1 - masks
+
+
 CHANGES = {
     "masks are inverted": (lambda c: {"masks": 1 - c.masks}, "if the mask is inverted: view 0_00, 0_01, 0_02, 0_03"),
     "photos are mirrored": (
@@ -38,6 +43,8 @@ CHANGES = {
         lambda c: {"masks": np.concatenate([c.masks[:1] * 0, c.masks[1:]])},
         "the mask is empty: view 0_00",
     ),
+    "photos are underexposed": (lambda c: {"images": on_white(c, c.images / 16)}, "the person is nearly black"),
+    "photos are burnt out": (lambda c: {"images": on_white(c, c.images * 16)}, "most of the person is white"),
     "two cameras are exchanged": (
         lambda c: with_cameras(c, [1, 0, 2, 3]),
         "cameras are exchanged: the body would fit 0_00 by the camera of 0_01, 0_01 by the camera of 0_00",
