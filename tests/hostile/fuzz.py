@@ -380,6 +380,8 @@ NPZ = (
     "joints npz",
     "fit record",
     "bank",
+    "video poses",
+    "scene arrays",
 )
 STRUCTURES = {
     **dict.fromkeys(NPZ, mutated_npz),
@@ -389,9 +391,14 @@ STRUCTURES = {
     **dict.fromkeys(
         ("mmpose", "lhm", "joints json", "manifest", "capture", "photos", "outline", "import"), mutated_json
     ),
-    **dict.fromkeys(("pickle", "smplx pkl", "aist"), mutated_pickle),
+    **dict.fromkeys(
+        ("avatarrex", "scene list", "evaluation", "preprocessed set", "preprocessed scene", "skipped subject"),
+        mutated_json,
+    ),
+    **dict.fromkeys(("pickle", "smplx pkl", "aist", "thuman fit"), mutated_pickle),
     **dict.fromkeys(("image", "depth"), mutated_png),
     **dict.fromkeys(("opencv yaml", "easymocap", "colmap", "obj", "off", "log", "bvh"), mutated_text),
+    **dict.fromkeys(("missing photos", "actorshq", "thuman mesh", "thuman scan"), mutated_text),
     **{
         "torch zip": mutated_zip,
         "glb": mutated_glb,

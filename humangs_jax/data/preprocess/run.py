@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from humangs_jax.core.progress import bar
-from humangs_jax.data.capture_checks import CaptureError, checked_json
+from humangs_jax.data.capture_checks import CaptureError, checked_json, required
 from humangs_jax.data.datasets.bodies import FileBody
 from humangs_jax.data.datasets.opening import VIDEOS
 from humangs_jax.data.datasets.scene_list import write_list
@@ -217,7 +217,7 @@ def _finish(out: Path, names: Sequence[str], settings: Settings) -> dict[str, An
     for _ in range(2):  # not until nothing is added: that may be hours
         if (found := _finished(out, settings)) != done:
             done = found
-            scenes = {name: checked_json(out / name / SCENE) for name in done}
+            scenes = {name: _read_scene(out / name / SCENE, settings) for name in done}
             manifest = _write_lists(out, names, scenes, settings)
     return manifest
 
@@ -226,9 +226,33 @@ def _finished(out, settings):
     return sorted(path.parent.name for path in out.glob(f"*/{settings.mark}") if not path.parent.name.startswith("."))
 
 
+def _read_scene(file, settings):
+    """What a finished folder says of itself. Raises: CaptureError naming file and key."""
+    content = checked_json(file)
+    known = _of_kind(content, "known", dict, file)
+    _of_kind(known, "views", int, file, "known.")
+    for reason in _of_kind(known, "missing", dict, file, "known.") if "missing" in known else ():
+        _of_kind(known["missing"], reason, int, file, "known.missing.")
+    if "unreadable" in known:
+        _of_kind(known, "unreadable", dict, file, "known.")
+    if settings.layout == "scenes":
+        _of_kind(_of_kind(content, "entry", dict, file), "frames", list, file, "entry.")
+    return content
+
+
+def _of_kind(mapping, key, kind, file, prefix=""):
+    value = required(mapping, key, file, prefix) if isinstance(mapping, dict) else None
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise CaptureError(file, prefix + key, f"expected {_KINDS[kind]}, got {type(value).__name__}")
+    return value
+
+
+_KINDS = {dict: "a JSON object", list: "a list", int: "a whole number", str: "a text"}
+
+
 def _write_lists(out, names, scenes, settings):
     skipped = {
-        file.stem: str(checked_json(file).get("reason"))
+        file.stem: _of_kind(checked_json(file), "reason", str, file)
         for file in sorted((out / SKIPPED).glob("*.json"))
         if file.stem not in scenes
     }
