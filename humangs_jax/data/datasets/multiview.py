@@ -14,7 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration, in_capture_convention, undistort
+from humangs_jax.data.calibration.calibration import (
+    CalibratedCamera,
+    Calibration,
+    in_capture_convention,
+    undistort_person,
+)
 from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.capture_checks import CaptureError, checked_camera
 from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, coefficients
@@ -179,7 +184,7 @@ def video_subject(
         image, person = on_white(folder.photos / photo, folder.masks / mask)
         if camera.distortion is None:
             return image, person
-        return tuple(undistort(x, camera.K, camera.distortion, fill) for x, fill in ((image, 1.0), (person, 0.0)))
+        return undistort_person(image, person, camera.K, camera.distortion)
 
     return Subject(
         name=str(name),
