@@ -204,20 +204,22 @@ def main() -> None:
         out = Path(folder)
         sources = [name for name in NAMES if name in arguments.sources and (name != "dna" or have_h5py())]
         preprocessed = [*PREPROCESSED] if "preprocessing" in arguments.parts else []
-        needed = {"thuman" if name == "scenes" else name for name in sources}
-        of_scenes = ["thuman"] if "scenes" in sources and not preprocessed else []
+        whole = "reading" in arguments.parts or "memory" in arguments.parts
+        needed = {"thuman" if name == "scenes" else name for name in sources if whole}
+        of_scenes = ["thuman"] if "thuman" in needed and not preprocessed else []
         sets = {name: write_set(name, out / name, True) for name in needed.union(preprocessed)}
         made = measure_preprocessing(out, sets, preprocessed or of_scenes, arguments.views)
         result["preprocessing"].update(made if preprocessed else {})
         for name in sources:
-            path, body_file = sets["thuman" if name == "scenes" else name]
-            body, path = FileBody.load(body_file), out / "thuman_scenes" / "test.json" if name == "scenes" else path
-            people = open_people(path, body)
-            if "reading" in arguments.parts:
-                note(name, measure_reading(people, arguments.samples))
-            if "memory" in arguments.parts:
-                watched = arguments.flat if name == "scenes" else arguments.flat_photos
-                note(name, {"grown_bytes": grown_bytes(people, watched), "samples_of_memory": watched})
+            if whole:
+                path, body_file = sets["thuman" if name == "scenes" else name]
+                body, path = FileBody.load(body_file), out / "thuman_scenes" / "test.json" if name == "scenes" else path
+                people = open_people(path, body)
+                if "reading" in arguments.parts:
+                    note(name, measure_reading(people, arguments.samples))
+                if "memory" in arguments.parts:
+                    watched = arguments.flat if name == "scenes" else arguments.flat_photos
+                    note(name, {"grown_bytes": grown_bytes(people, watched), "samples_of_memory": watched})
             if "small" in arguments.parts and name != "scenes":
                 path, body_file = write_set(name, out / f"{name}_small", False)
                 grown = grown_bytes(open_people(path, FileBody.load(body_file)), arguments.flat)
