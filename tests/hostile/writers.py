@@ -128,10 +128,11 @@ COMMANDS = (
     ),
     Command(
         "start",
-        "start {inputs}/photos --cameras {inputs}/transforms.json --keypoints {inputs}/keypoints.npz --out new "
+        "start {inputs}/photos --cameras {inputs}/transforms.json --keypoints {inputs}/keypoints.npz --out begun "
         "--without-masks --no-browser",
         first=None,
-        often=("new/capture.json",),
+        often=("begun/capture.json",),
+        once=True,
     ),
     Command(
         "preprocess",

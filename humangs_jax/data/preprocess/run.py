@@ -9,16 +9,13 @@ Finished folders are kept, so that the same command continues an interrupted set
 ends by making lists and manifest of what is there. A run without shards, after them, finds nothing to make and lists everything.
 """
 
-import concurrent.futures
-import concurrent.futures.process
 import dataclasses
-import multiprocessing
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from humangs_jax.core.progress import bar
+from humangs_jax.core.workers import in_processes
 from humangs_jax.data.capture_checks import CaptureError, checked_json, required
 from humangs_jax.data.datasets.bodies import FileBody
 from humangs_jax.data.datasets.opening import VIDEOS
@@ -132,37 +129,15 @@ def _in_processes(source, out, due, body, settings, workers):
         for name in due:
             yield name, _attempt_scan(source, out, name, body, settings)
         return
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, context, _start_worker, (body.file,)) as pool:
-        futures = {pool.submit(_work, source, out, name, settings): name for name in due}
-        try:
-            for future in concurrent.futures.as_completed(futures):
-                yield futures[future], future.result()
-        except concurrent.futures.process.BrokenProcessPool as error:
-            raise OSError("a process was killed, perhaps for want of memory: try fewer workers") from error
-        except BaseException:  # interrupted: what is unfinished is dropped
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+    tasks = {name: (source, out, name, settings) for name in due}
+    yield from in_processes(_work, tasks, workers, _load_body, body.file)
 
 
 _worker: dict[str, Any] = {}
 
 
-def _start_worker(body_file):
-    """One thread each: the processes are the parallelism."""
-    import signal
-
-    import jax
-
-    from humangs_jax.core.workers import end_with_parent
-
-    end_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
-    jax.config.update("jax_platforms", "cpu")
-    _worker["body"] = FileBody.load(body_file)
+def _load_body(file):
+    _worker["body"] = FileBody.load(file)
 
 
 def _work(source, out, name, settings):
