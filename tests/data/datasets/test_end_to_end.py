@@ -3,6 +3,7 @@
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -111,7 +112,7 @@ def test_videos_and_keypoints_become_a_capture_of_several_frames(tmp_path):
     fitted = load_capture(me)
     assert fitted.frame_count == frames and fitted.frames.tolist() == photos.frames.tolist()
     vertices = [
-        np.asarray(pose_body(body, shape_body(body, each.betas), each.pose(f)).vertices)
+        np.asarray(pose_body(body, shape_body(body, jnp.asarray(each.betas)), each.pose(f)).vertices)
         for each in (fitted, truth)
         for f in range(frames)
     ]
