@@ -4,9 +4,9 @@ Honest files are taken apart as their format has it (arrays of an archive, value
 PNG, words of a text), a few parts are exchanged for hostile ones, and the file is put together again; or bytes change at random.
 What is found is shrunk by hypothesis, saved as FOLDER/found-READER, and becomes a case of `attacks_*.py`.
 
-`CHUNK` inputs at a time go to the reader that had the fewest, until each has INPUTS. The record (default: FOLDER/record.json) has the figures
-of each reader; a later call with the same record goes on from there, and tries what was found again; so does, on another
-machine, one with --page docs/security.md, from docs/results/fuzz.json.
+`CHUNK` inputs at a time go to the reader that had the fewest, until each has INPUTS. The record (default: FOLDER/record.json)
+has the figures of each reader; a later call with the same record goes on from there, and tries what was found again; so does, on
+another machine, one with --page docs/security.md, from docs/results/fuzz.json.
 """
 
 import argparse
