@@ -138,6 +138,11 @@ COMMANDS = (
         "preprocess",
         "preprocess avatarrex {inputs}/videos --out set --body {inputs}/SMPLX_TINY.npz --size 16 --every 1",
     ),
+    Command(
+        "evaluate",
+        "evaluate {inputs}/capture --predictions {inputs}/capture/images --json a.json --html a.html --csv a.csv "
+        "--markdown a.md --latex a.tex",
+    ),
     Command("convert", "convert {inputs}/any.pt --out w.safetensors --losses l.safetensors"),
 )
 
@@ -354,6 +359,11 @@ def stand_ins(variant):
     def converted(*_):
         return SimpleNamespace(variables=some_variables(), config=tiny(), skipped=1)
 
+    def scored(images, _truth, rules, *_):
+        from humangs_jax.evaluation.scores import score_names
+
+        return [dict.fromkeys(score_names(rules), variant / 8) for _ in images]
+
     mesh_views = lambda *_: iter([(np.full((32, 32, 3), variant / 4), np.ones((32, 32)))] * 8)
     avatar = lambda *_, **__: Avatar.load(Path(os.environ["KILLS_INPUTS"]) / f"avatar{variant}.npz")
     return (
@@ -382,6 +392,7 @@ def stand_ins(variant):
         ("apps.demo", "painted_body", lambda _: None),
         ("apps.demo", "draw_painted_body", lambda *_: None),
         ("apps.demo", "motion_frames", frames),
+        ("evaluation.run", "score_views", scored),
         ("fitting.fit_capture", "fit_photos", fitted),
         ("fitting.refine", "refine_capture", refined),
         ("fitting.scan_fit", "fit_scan", in_scan),
