@@ -129,8 +129,8 @@ def read_missing(file: Path) -> set[tuple[str, int]]:
         if not line.strip():
             continue
         parts = [part for part in re.split(r"[\\/]+", line.strip()) if part]
-        frame = parts[-1].partition(".")[0]
-        if len(parts) < 2 or not frame.isdecimal():
+        frame = parts[-1].partition(".")[0] if parts else ""
+        if len(parts) < 2 or not re.fullmatch(r"[0-9]{1,18}", frame):
             raise CaptureError(file, f"line {number}", f"expected CAMERA/FRAME.jpg, got {line.strip()[:60]!r}")
         found.add((parts[-2], int(frame)))
     return found
