@@ -373,18 +373,26 @@ def test_a_reader_that_has_gone_ends_a_command_quietly(tmp_path):
 
 
 def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
-    """As in a compilation: a long call into C, which gives Python no turn."""
+    """As in a compilation: a long call into C, which gives Python no turn. What it was writing goes, too."""
     code = (
         "import hashlib, signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from humangs_jax import cli\n"
+        "from humangs_jax.io import atomic\n"
         "class Long:\n"
         "    def run(self):\n"
-        "        print('begun', flush=True)\n"
-        "        hashlib.pbkdf2_hmac('sha256', b'', b'', 200_000_000)\n"
+        "        write = lambda folder: atomic.replace_file('file', lambda file: work(folder, file))\n"
+        "        atomic.replace_folder('new', write, mark='x')\n"
+        "def work(folder, file):\n"
+        "    folder.mkdir()\n"
+        "    for path in (file, folder / 'x'):\n"
+        "        path.write_text('half')\n"
+        "    print('begun', flush=True)\n"
+        "    hashlib.pbkdf2_hmac('sha256', b'', b'', 200_000_000)\n"
         "cli._parsed = lambda arguments: Long()\n"
         "cli.main()"
     )
-    program = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    command = [sys.executable, "-c", code]
+    program = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path)
     assert program.stdout.readline() == b"begun\n"
     time.sleep(0.5)  # now it is in there
     began = time.monotonic()
@@ -392,6 +400,7 @@ def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
     _, error = program.communicate(timeout=60)
     assert program.returncode == cli.INTERRUPTED and error.endswith(b"humangs: interrupted\n")
     assert PATIENCE <= time.monotonic() - began < 50
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_interrupt_that_python_drops_is_repeated():

@@ -1,6 +1,6 @@
 """Synthetic people in the layouts of real data sets, for tests, documentation and benchmarks.
 
-    python experiments/data/made_up.py thuman avatarrex thuman4 actorshq --out DIR [--people 2]
+    python experiments/data/made_up.py thuman avatarrex thuman4 actorshq dna --out DIR [--people 2]
 
 DIR/body.npz is the body of the package as an SMPL-X model file; DIR/LAYOUT holds the data set. The real ones need a licence.
 Person i of the file has the shape coefficient i at 1 and all others at 0. About a minute a layout on 2 CPU cores.
@@ -368,8 +368,14 @@ def write_dna(
     cameras: int = 3,
     size: tuple[int, int] = (150, 204),
     vertices: Any = None,
+    enlarged: int = 1,
+    lens: Sequence[float] = (0.0,) * 5,
 ) -> Path:
-    """out/body.npz and out/dna with main/0001_01.smc and its annotations; returns the data set. Needs h5py."""
+    """out/body.npz and out/dna with main/0001_01.smc and its annotations; returns the data set. Needs h5py.
+
+    enlarged: how many pixels a side each rendered one becomes. lens: k1 k2 p1 p2 k3 that the file names, for measuring what
+    undistortion takes; photos are rendered without.
+    """
     import importlib
     import io
 
@@ -386,7 +392,8 @@ def write_dna(
 
     def encoded(pixels: np.ndarray, kind: str) -> np.ndarray:
         stream = io.BytesIO()
-        Image.fromarray(to_uint8(pixels)).save(stream, kind, quality=95)
+        image = Image.fromarray(to_uint8(pixels))
+        image.resize((enlarged * image.width, enlarged * image.height)).save(stream, kind, quality=95)
         return np.frombuffer(stream.getvalue(), np.uint8)
 
     with (
@@ -398,8 +405,9 @@ def write_dna(
             pose = np.eye(4)
             pose[:3, :3], pose[:3, 3] = video.R[c], video.T[c]
             K = video.K.copy()
+            K[:2] *= enlarged
             K[:2, 2] -= 0.5
-            inner = {"K": K, "D": np.zeros(5), "RT": np.linalg.inv(pose), "Color_Calibration": np.eye(3)}
+            inner = {"K": K, "D": np.asarray(lens), "RT": np.linalg.inv(pose), "Color_Calibration": np.eye(3)}
             for key, value in inner.items():
                 notes[f"Camera_Parameter/{c:02d}/{key}"] = value
             for f, posed in enumerate(video.posed):

@@ -46,19 +46,21 @@ def measure(arguments: argparse.Namespace) -> dict[str, float]:
     import numpy as np
 
     from humangs_jax.body.library import load_body
-    from humangs_jax.data.loader import CaptureCache, ViewSampling, find_captures
+    from humangs_jax.data.loader import ViewSampling, find_captures
     from humangs_jax.data.views import gaussian_body
     from humangs_jax.network.weights import load_weights
     from humangs_jax.training.config import TrainConfig
     from humangs_jax.training.forward import predict
+    from humangs_jax.training.sources import captured_people
     from humangs_jax.training.validation import validation_examples
 
     variables, model = load_weights(arguments.weights)
     views = ViewSampling(input_counts=(arguments.views,), target_count=arguments.targets)
     config = TrainConfig(model=model, views=views)
     body = load_body()
-    cache = CaptureCache(find_captures(arguments.people), body)
-    examples, body = validation_examples(cache, config, len(cache)), gaussian_body(body, model)
+    folders = find_captures(arguments.people)
+    examples = validation_examples(captured_people(folders, body), config, len(folders))
+    body = gaussian_body(body, model)
     draw = jax.jit(predict, static_argnames="config")
     rows = []
     for example in examples:

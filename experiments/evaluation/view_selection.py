@@ -43,8 +43,8 @@ def evaluate(subjects, count):
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.body.library import load_body
     from humangs_jax.data.view_selection import select_views
+    from humangs_jax.evaluation.scores import score
     from humangs_jax.network.weights import load_weights
-    from humangs_jax.objectives.metrics import masked_psnr, psnr
     from humangs_jax.people.cameras import cameras_around
     from humangs_jax.people.seeds import seeds_of
     from humangs_jax.people.subject import make_subject
@@ -61,24 +61,18 @@ def evaluate(subjects, count):
         capture = capture_views(subject, body, [pose], views)
         photos, held_out = capture.select(range(PHOTOS)), capture.select(range(PHOTOS, PHOTOS + HELD_OUT))
 
-        assert held_out.masks is not None  # `capture_views` draws them
-
-        def score(chosen, photos=photos, held_out=held_out, masks=held_out.masks):
+        def score_of(chosen, photos=photos, held_out=held_out):
             drawn = capture_renderings(reconstruct(variables, config, photos.select(chosen)), held_out)[1]
-            views = [(r.rgb, image) for r, image in zip(drawn, held_out.images, strict=True)]
-            on_person = [masked_psnr(*view, mask) for view, mask in zip(views, masks, strict=True)]
-            return {
-                "psnr": float(np.mean([psnr(*view) for view in views])),
-                "psnr_foreground": float(np.mean(on_person)),
-            }
+            found = score(np.stack([np.asarray(rendering.rgb) for rendering in drawn]), held_out)
+            return {"psnr": found.psnr, "psnr_foreground": found.psnr_foreground}
 
         select_views(photos, count)  # compiles
         began = time.perf_counter()
         chosen = select_views(photos, count)
         seconds = time.perf_counter() - began
-        draws = [score(rng.choice(PHOTOS, count, replace=False)) for _ in range(DRAWS)]
+        draws = [score_of(rng.choice(PHOTOS, count, replace=False)) for _ in range(DRAWS)]
         random = {name: float(np.mean([draw[name] for draw in draws])) for name in draws[0]}
-        row = {"chosen": score(chosen), "random": random, "all": score(range(PHOTOS))}
+        row = {"chosen": score_of(chosen), "random": random, "all": score_of(range(PHOTOS))}
         people.append({"seed": seed, "seconds": seconds, "photos": chosen, **row})
     return people
 

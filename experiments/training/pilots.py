@@ -176,7 +176,7 @@ def pilot(arguments, config, on_the_fly, started, name) -> dict:
     import jax
 
     from humangs_jax.body.library import load_body
-    from humangs_jax.data.loader import CaptureCache, find_captures
+    from humangs_jax.data.loader import find_captures
     from humangs_jax.data.views import gaussian_body
     from humangs_jax.network.weights import fit_variables
     from humangs_jax.objectives.metrics import outline_psnr
@@ -200,8 +200,8 @@ def pilot(arguments, config, on_the_fly, started, name) -> dict:
     # the same validation for all runs
     views = dataclasses.replace(config.views, input_counts=(4,), target_count=6)
     compared = dataclasses.replace(config, views=views)
-    cache = CaptureCache(find_captures(arguments.validation), body)
-    examples = validation_examples(cache, compared, len(cache))
+    folders = find_captures(arguments.validation)
+    examples = validation_examples(captured_people(folders, body), compared, len(folders))
     numbers, shown = validate(jax.device_get(state.variables), gaussian_body(body, config.model), examples, compared)
     bands = [
         outline_psnr(*view)

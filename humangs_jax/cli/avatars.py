@@ -219,19 +219,26 @@ class Export:
                 require_parent(path, option)
                 require_suffix(path, allowed, option)
         self._check(out)
-        from humangs_jax.avatar.avatar import Avatar
-        from humangs_jax.data.motion import load_motion
+        with stage("starting"):
+            from humangs_jax.avatar.avatar import Avatar
+            from humangs_jax.data.motion import load_motion
 
-        avatar = Avatar.load(self.avatar)
-        motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
+            avatar = Avatar.load(self.avatar)
+            motion = None if self.motion is None else load_motion(self.motion, rest_joints=avatar.rest_joints)
         if self.html is not None:
-            from humangs_jax.viewer.page import write_page
+            with stage("making the page"):
+                from humangs_jax.viewer.page import write_page
 
-            name = None if self.motion is None else self.motion.stem
-            size = write_page(self.html, avatar, motion, self.avatar.stem, name)
+                name = None if self.motion is None else self.motion.stem
+                size = write_page(self.html, avatar, motion, self.avatar.stem, name)
             wrote(self.html, f"{len(avatar.gaussians.means):,} Gaussians, {size / 1e6:.1f} MB; open it in a browser")
         if out is not None:
             self._write(out, avatar, motion)
+        played = () if self.motion is None else ("--motion", self.motion)
+        if self.html is None:
+            suggest("humangs export", self.avatar, "--html avatar.html", *played)
+        else:
+            suggest("humangs animate", self.avatar, *played, "--out video.mp4")
 
     def _check(self, out: Path | None) -> None:
         """What does not go together is said before anything is read. Raises: ValueError."""
@@ -253,9 +260,9 @@ class Export:
         if motion is not None:
             motion, numbers = self._frames(motion, animated)
         mesh = self.mesh or out.suffix.lower() == ".obj"
-        files = export(
-            out, avatar, motion, None if animated else numbers, mesh=mesh, up=self.up, rest_fields=self.rest, name=name
-        )
+        numbers = None if animated else numbers
+        with stage("writing"):
+            files = export(out, avatar, motion, numbers, mesh=mesh, up=self.up, rest_fields=self.rest, name=name)
         what = f"{len(avatar.faces):,} triangles" if mesh else f"{len(avatar.gaussians.means):,} Gaussians"
         poses = f", {len(motion.translations)} frames" if motion is not None and animated else ""
         written = str(out) if len(files) == 1 else f"{files[0]} to {files[-1].name}: {len(files)} files"

@@ -7,7 +7,7 @@ from typing import Literal
 from tyro.conf import OmitArgPrefixes, Positional
 
 from humangs_jax.cli.options import UsageError, require_at_least, require_parent, require_suffix
-from humangs_jax.cli.screen import stage, tell, wrote
+from humangs_jax.cli.screen import stage, suggest, tell, wrote
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,3 +101,7 @@ class Evaluate:
         for name, path in files.items():
             if path is not None:
                 wrote(path, {"json": "all numbers", "html": "the images, worst first"}.get(name, "a table"))
+        if self.html is None:
+            given = {"--avatar": self.avatar, "--weights": self.weights, "--predictions": self.predictions}
+            parts = [part for option, path in given.items() if path is not None for part in (option, path)]
+            suggest("humangs evaluate", self.source, *parts, "--html scores.html")

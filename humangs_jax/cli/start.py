@@ -46,21 +46,33 @@ class Start:
     browser: bool = True
     """Open the page at the end."""
     overwrite: bool = False
-    """Replace a capture that has a body already."""
+    """Replace a capture that is finished; begin one anew that has a body already."""
 
     def run(self) -> None:
         limits = None if self.refine is None else refine_limits(self.refine, "--refine")
         require_at_least(0, person=self.person)
         if limits is not None and self.without_masks:
             raise UsageError("--refine needs masks: leave out --without-masks")
-        begun = not (self.out / "body.npz").exists()  # by an earlier run that missed something: nothing is lost
+        # by an earlier run that missed something, or was interrupted: nothing is lost
+        begun = not (self.out / "body.npz").exists()
+        fitted = (self.out / "fit.json").exists() and not (
+            begun or (self.out / "avatar.html").exists() or self.overwrite
+        )
         inputs = (self.photos, self.cameras, self.masks, self.keypoints)
-        require_replaceable(self.out, self.overwrite or begun, "capture.json", inputs)
+        require_replaceable(self.out, self.overwrite or begun or fitted, "capture.json", inputs)
         with stage("starting"):
             from humangs_jax.apps.start import look, missing
 
         material = look(self.photos, cameras=self.cameras, masks=self.masks, keypoints=self.keypoints)
         tell(material)
+        if fitted:
+            with stage("reading the fit of an earlier run"):
+                from humangs_jax.data.capture import load_capture
+
+                capture = load_capture(self.out)
+            tell(f"{self.out} has a body: going on from there (--overwrite begins anew)")
+            self._finish(capture, limits)
+            return
         if self.overwrite:
             tell_deleted(self.out)
         undistorted = self._import(material) if material.cameras is not None else None
@@ -70,9 +82,12 @@ class Start:
             suggest("humangs start", self.photos, "--out", self.out)
             names = " and ".join(", ".join(each.name for each in needed).rsplit(", ", 1))
             raise ValueError(f"{self.photos}: {names} missing: make them as above and run the same command again")
-        fitted = self._fit(material)
-        self._check(fitted)
-        self._reconstruct(fitted, limits)
+        self._finish(self._fit(material), limits)
+
+    def _finish(self, capture: "Capture", limits: dict[str, Any] | None) -> None:
+        """What comes behind the fit."""
+        self._check(capture)
+        self._reconstruct(capture, limits)
 
     def _import(self, material: "Material") -> Path | None:
         """Photos and cameras as a capture folder; the folder of its photos if lens distortion was removed from them."""

@@ -62,7 +62,7 @@ class Train:
     on_the_fly: int = 0
     """Also (or without DATA only) train on this number of synthetic people who are rendered anew for every step."""
     validation: Path | None = None
-    """Folder of capture folders of other people, evaluated now and then."""
+    """Other people, evaluated now and then: whatever DATA may be."""
     steps: int | None = None
     """Length of the run. Default: that of the configuration. More than a finished run has: it goes on, with the learning rate of
     the longer run."""
@@ -82,16 +82,14 @@ class Train:
             raise UsageError("nobody to train on: name a folder of captures, or give --on-the-fly a number of people")
         with stage("starting"):
             self.processes.join()  # before anything asks for devices
-            from humangs_jax.body.library import load_body
-            from humangs_jax.data.capture import DEFAULT_BODY
+            from humangs_jax.data.datasets.bodies import FileBody
             from humangs_jax.network.weights import load_weights
             from humangs_jax.objectives.loss_networks import load_loss_networks
-            from humangs_jax.people.manifest import find_people
             from humangs_jax.rendering.splat_config import drawn_as
             from humangs_jax.training.config import fitting_losses, read_config
             from humangs_jax.training.diagnose import diagnose_run
             from humangs_jax.training.loop import train
-            from humangs_jax.training.sources import training_people
+            from humangs_jax.training.sources import people_on_disk, training_people
 
             files = self.networks
             networks = load_loss_networks(files.vgg19, files.lpips_backbone, files.lpips_heads, files.lpips_net)
@@ -104,11 +102,11 @@ class Train:
                 model = dataclasses.replace(model, execution=settings.model.execution)
                 drawn = drawn_as(settings.splat, model.conventions.rendering)
                 settings = dataclasses.replace(settings, model=model, splat=drawn)
-            body = load_body(self.body)
+            file_body = FileBody.load(self.body)
+            body = file_body.model
         with stage("finding people"):
-            body_file = DEFAULT_BODY if self.body is None else self.body
-            people = training_people(self.data, self.on_the_fly, self.out, body, body_file)
-            others = find_people(self.validation, None) if self.validation is not None else ()
+            people = training_people(self.data, self.on_the_fly, self.out, body, file_body.file)
+            others = () if self.validation is None else people_on_disk(self.validation, file_body, split=None)
         if self.diagnose:
             with stage("diagnosing"):
                 diagnosis = diagnose_run(self.out, body, people, networks=networks, variables=variables)

@@ -53,7 +53,8 @@ def replace_file(path: str | os.PathLike, write: Callable[[Path], object]) -> No
     temporary = path.with_name(f".{path.stem}.new-{_tag()}{path.suffix}")
     try:
         with _naming(path, temporary):
-            write(temporary)
+            with _unfinished(temporary):
+                write(temporary)
             temporary.replace(path)
     finally:
         _delete(temporary)
@@ -75,11 +76,30 @@ def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *
     temporary, aside = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("new", "old"))
     try:
         with _naming(folder, temporary):
-            write(temporary)
+            with _unfinished(temporary):
+                write(temporary)
             _exchange(folder, temporary, aside)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
     shutil.rmtree(aside, ignore_errors=True)
+
+
+_being_written: set[Path] = set()
+
+
+@contextlib.contextmanager
+def _unfinished(temporary):
+    _being_written.add(temporary.absolute())
+    try:
+        yield
+    finally:
+        _being_written.discard(temporary.absolute())
+
+
+def remove_unfinished() -> None:
+    """Removes what other threads of this process are writing, for its end at once; nothing under a final name is among it."""
+    for temporary in tuple(_being_written):
+        shutil.rmtree(temporary, ignore_errors=True) if temporary.is_dir() else _delete(temporary)
 
 
 def _exchange(folder, temporary, aside):
@@ -180,8 +200,9 @@ def add_files(
     temporary = (folder if inside else folder.parent) / f".{folder.resolve().name}.new-{_tag()}"
     try:
         with _naming(folder, temporary):
-            temporary.mkdir()
-            write(temporary)
+            with _unfinished(temporary):
+                temporary.mkdir()
+                write(temporary)
             with undisturbed():
                 folder.mkdir(exist_ok=True)
                 with _locked(folder, wait=True):

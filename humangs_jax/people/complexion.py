@@ -29,7 +29,7 @@ FAIR_ODDS, DARK_ODDS = np.asarray([[0.2, 0.35, 0.22, 0.08, 0.06, 0.05], [0.80, 0
 
 @dataclasses.dataclass(frozen=True)
 class Complexion:
-    """Colours (3,) of skin, lips, hair, iris and nails; the rest are strengths in [0, 1].
+    """Colours (3,) of skin, lips, hair and iris; the rest are strengths in [0, 1].
 
     brow: of the brows. freckles. wrinkles: of age. shadow: make-up on the lids, with its colour. liner: around the eyes.
     blush: on the cheeks. tan: of arms and face against the rest.
@@ -39,7 +39,6 @@ class Complexion:
     lips: np.ndarray
     hair: np.ndarray
     iris: np.ndarray
-    nails: np.ndarray
     shadow_colour: np.ndarray
     brow: float
     freckles: float
@@ -72,15 +71,13 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
     hair = colour(*colours[kind])
     brown = darkness > 0.45 or rng.random() < 0.4
     iris = colour(0.07, 0.6, rng.uniform(0.1, 0.3)) if brown else colour(rng.uniform(0.25, 0.62), 0.4, 0.5)
-    nails = skin * [1.02, 0.9, 0.9]
-    if made_up and rng.random() < 0.5:
-        nails = colour(rng.choice([rng.uniform(0.9, 1.05), rng.random()]), rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.8))
+    if made_up and rng.random() < 0.5:  # varnish, which nothing shows: drawn so that a seed stays the same person
+        colour(rng.choice([rng.uniform(0.9, 1.05), rng.random()]), rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.8))
     return Complexion(
         skin=skin.astype(np.float32),
         lips=np.asarray(lips, np.float32),
         hair=hair,
         iris=iris,
-        nails=np.asarray(nails, np.float32),
         shadow_colour=colour(rng.random(), rng.uniform(0.2, 0.6), rng.uniform(0.2, 0.6)),
         brow=rng.uniform(0.55, 0.95),
         freckles=rng.uniform(0.3, 0.8) if darkness < 0.35 and rng.random() < 0.22 else 0.0,

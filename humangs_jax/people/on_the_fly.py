@@ -50,19 +50,7 @@ def rotations_from(u: Float[Array, "2"], bank: PeopleBank, person: Int[Array, ""
     """(j, 3) rotation vectors of a pose of a person; u in [0, 1) says which and how far on the way to the next."""
     pose = pick(u[0], bank.rotations.shape[1])
     other = bank.nearest[person, pose]
-    return between(bank.rotations[person, pose], bank.rotations[person, other], MIXING * u[1])
-
-
-def between(a: Float[Array, "j 3"], b: Float[Array, "j 3"], amount: Float[Array, ""] | float) -> Float[Array, "j 3"]:
-    """Rotation vectors on the shortest way from a (amount 0) to b (amount 1), joint by joint (slerp)."""
-    p, q = quaternion.from_axis_angle(a), quaternion.from_axis_angle(b)
-    cosine = jnp.sum(p * q, -1, keepdims=True)
-    q = jnp.where(cosine < 0, -q, q)
-    angle = jnp.arccos(jnp.clip(jnp.abs(cosine), 0, 1))
-    near = angle < 1e-3
-    sine = jnp.where(near, 1.0, jnp.sin(angle))
-    share = lambda t: jnp.where(near, t, jnp.sin(t * angle) / sine)
-    return quaternion.to_axis_angle(share(1 - amount) * p + share(amount) * q)
+    return quaternion.interpolate(bank.rotations[person, pose], bank.rotations[person, other], MIXING * u[1])
 
 
 def pose_person(

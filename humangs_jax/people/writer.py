@@ -9,7 +9,6 @@ out/SEED/depth/NAME.png, maps/NAME.exr    where asked for, see `maps`; also in h
 """
 
 import dataclasses
-import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,8 +20,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.progress import bar as progress_bar
-from humangs_jax.core.signals import started_deaf
-from humangs_jax.core.workers import end_with_parent
+from humangs_jax.core.workers import in_processes
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.geometry.camera import Camera
@@ -235,26 +233,8 @@ def _make(seeds, folders, layout, body, workers):
         for seed in seeds:
             yield seed, _attempt(folders[seed], seed, body, layout)
         return
-    import concurrent.futures.process
-    import multiprocessing
-
-    context = multiprocessing.get_context("spawn")
-    count = min(workers, len(seeds))
-    with concurrent.futures.ProcessPoolExecutor(count, context, _start_worker, (body,)) as pool:
-        try:
-            with started_deaf():
-                futures = {pool.submit(_work, folders[seed], seed, layout): seed for seed in seeds}
-            for future in concurrent.futures.as_completed(futures):
-                yield futures[future], future.result()
-        except concurrent.futures.process.BrokenProcessPool as error:
-            raise OSError(
-                "a process that makes people was killed, perhaps for want of memory: try fewer workers"
-            ) from error
-        except BaseException:  # interrupted: unfinished people are dropped
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+    tasks = {seed: (folders[seed], seed, layout) for seed in seeds}
+    yield from in_processes(_work, tasks, workers, _load_body, body)
 
 
 def _attempt(folder, seed, body, layout):
@@ -268,14 +248,7 @@ def _attempt(folder, seed, body, layout):
 _worker: dict[str, Any] = {}
 
 
-def _start_worker(body):
-    """One thread each: the processes are the parallelism."""
-    import signal
-
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    end_with_parent()
-    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
-    jax.config.update("jax_platforms", "cpu")
+def _load_body(body):
     from humangs_jax.body.library import load_body
 
     _worker["body"] = load_body() if body is None else body

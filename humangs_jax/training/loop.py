@@ -21,7 +21,7 @@ import jax
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.progress import stage
-from humangs_jax.data.loader import CaptureCache, Waiting
+from humangs_jax.data.loader import Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import only_writer
 from humangs_jax.io.images import write_png
@@ -51,7 +51,7 @@ def train(
     training: Sequence[str | Path] | MakeSource,
     out: str | Path,
     *,
-    validation: Sequence[str | Path] = (),
+    validation: Sequence[str | Path] | MakeSource = (),
     variables: Variables | None = None,
     networks: LossNetworks = NO_NETWORKS,
     fsdp: int | None = None,
@@ -63,7 +63,7 @@ def train(
     Arguments:
         body: the model that the captures' parameters belong to; made into the model's `gaussian_body` here.
         training: capture folders, or what makes another source of examples (`sources`).
-        validation: capture folders of other people; no validation without.
+        validation: the same of other people; no validation without.
         variables: where to start a new run, for instance shipped weights; None for fresh ones.
         networks: of the losses that need them.
         fsdp: how many devices share one copy of the state, see `sharding.training_mesh`.
@@ -82,8 +82,8 @@ def train(
 
 def _train(config, body, training, out, leading, validation, variables, networks, fsdp, stop_at, progress):
     save_config(out, config, write=leading)
-    make_source = captured_people(training, body) if isinstance(training, Sequence) else training
-    unseen = CaptureCache(validation, body) if validation else None
+    of = lambda people: captured_people(people, body) if isinstance(people, Sequence) else people
+    make_source, unseen = of(training), of(validation) if validation else None
     body = gaussian_body(body, config.model)
 
     mesh = training_mesh(fsdp)

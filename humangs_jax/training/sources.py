@@ -107,13 +107,14 @@ def mixed_people(parts: Sequence[MakeSource], weights: Sequence[float | int]) ->
     return lambda config: Mixture(tuple(part(config) for part in parts), tuple(weights))
 
 
-def people_on_disk(data: Path, body: FileBody) -> MakeSource:
+def people_on_disk(data: Path, body: FileBody, split: str | None = "train") -> MakeSource:
     """The people of a folder of captures, of a scene list, or of a data set (docs/datasets.md), whose body is `body`.
 
+    split: of synthetic captures, see `find_people`.
     Raises: ValueError if the folder has none of these.
     """
     if (data / "capture.json").is_file() or any(data.glob("*/capture.json")):
-        return captured_people(find_people(data), body.model, body.file)
+        return captured_people(find_people(data, split), body.model, body.file)
     return cached_people(PeopleCache(open_people(data, body)))
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, ViewSampling
+from humangs_jax.data.loader import Example, ViewSampling
 from humangs_jax.network.parts import Variables
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import lpips
@@ -21,12 +21,13 @@ from humangs_jax.objectives.metrics import fog, masked_psnr, psnr
 from humangs_jax.objectives.ssim import similarity_map
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.forward import predict
+from humangs_jax.training.sources import MakeSource
 
 NO_NETWORKS = LossNetworks()
 METRICS = ("psnr", "psnr_mask", "ssim", "fog", "dropped_tokens", "dropped_reads", "overflow")
 
 
-def validation_examples(cache: CaptureCache, config: TrainConfig, count: int) -> list[Example]:
+def validation_examples(make_source: MakeSource, config: TrainConfig, count: int) -> list[Example]:
     """This process's examples of the first `count` subjects: inputs evenly spaced and of one pose, as many as in the
     middle one of the training's counts; targets as large as the inputs.
     """
@@ -38,8 +39,8 @@ def validation_examples(cache: CaptureCache, config: TrainConfig, count: int) ->
         scattered_share=0.0,
         mixed_pose_share=0.0,
     )
-    source = CaptureSource(cache, views, config.model.conventions.image_size, config.model.conventions.image_size)
-    own = range(jax.process_index(), min(count, len(cache)), jax.process_count())
+    source = make_source(dataclasses.replace(config, views=views, target_size=config.model.conventions.image_size))
+    own = range(jax.process_index(), min(count, len(source)), jax.process_count())
     return [jax.tree.map(jnp.asarray, source.example(0, i, views.input_counts[0])) for i in own]
 
 

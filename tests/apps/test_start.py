@@ -163,3 +163,9 @@ def test_from_photos_to_the_page(mine, capsys, monkeypatch):
     error = np.linalg.norm(np.asarray(fitted.pose(0).translation) - np.asarray(truth.pose(0).translation))
     assert error < 0.05
     assert {path.name for path in Path("me").iterdir()} >= {"check.png", "avatar.html", "fit.json", "body.npz"}
+    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_USAGE  # finished
+    Path("me/avatar.html").unlink()  # as after an interrupt
+    written = Path("me/body.npz").stat().st_mtime_ns
+    assert cli.execute(["start", str(mine), "--out", "me"]) == 0 and Path("me/avatar.html").exists()
+    assert "me has a body: going on from there" in capsys.readouterr().out
+    assert Path("me/body.npz").stat().st_mtime_ns == written

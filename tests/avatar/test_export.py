@@ -262,7 +262,8 @@ def test_the_suffix_decides_the_format_and_its_world(name, axis, tmp_path, monke
     source = small_file(tmp_path)
     monkeypatch.setattr(sys, "argv", ["humangs", "export", str(source), "--out", str(tmp_path / name)])
     cli.main()
-    assert "20 Gaussians" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "20 Gaussians" in out and out.splitlines()[-1] == f"next: humangs export {source} --html avatar.html"
     if name.endswith(".ply"):
         means = np.asarray(read_ply(tmp_path / name).means)
     elif name.endswith(".spz"):

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from humangs_jax.data.calibration.calibration import CONVENTIONS, WORLD_FROM_CAM_OPENGL, distort, undistort
+from humangs_jax.data.calibration.calibration import (
+    CONVENTIONS,
+    WORLD_FROM_CAM_OPENGL,
+    distort,
+    undistort,
+    undistort_person,
+)
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import read_description, read_view
@@ -156,6 +162,20 @@ def test_dots_land_where_the_pinhole_says():
         near = straight * (np.hypot(columns - where[0], rows - where[1]) < 5)
         centroid = np.asarray([(near * columns).sum(), (near * rows).sum()]) / near.sum()
         np.testing.assert_allclose(centroid, where, atol=0.06)  # of bilinear lookups; the dots move by up to 4.9 px
+
+
+@pytest.mark.parametrize("focal, coefficients", [(400, [-0.1, 0.03, 1e-3, -1e-3, 0]), (60, [-0.3, 0, 0, 0, 0])])
+def test_a_person_is_undistorted_as_the_whole_photo_is(focal, coefficients):
+    """Also where the lens folds, and with nobody in the photo."""
+    K, coefficients = np.asarray([[focal, 0, 66.0], [0, focal, 50], [0, 0, 1]]), np.asarray(coefficients)
+    random = np.random.default_rng(0)
+    for rows, columns in ((slice(30, 70), slice(50, 75)), (slice(0, 20), slice(100, 130)), (slice(0), slice(0))):
+        mask = np.zeros((100, 130), np.float32)
+        mask[rows, columns] = 1
+        image = np.where(mask[..., None] > 0, random.random((100, 130, 3), np.float32), np.float32(1))
+        straight, person = undistort_person(image, mask, K, coefficients)
+        np.testing.assert_array_equal(person, undistort(mask, K, coefficients, fill=0.0))
+        np.testing.assert_allclose(straight, undistort(image, K, coefficients, fill=1.0), atol=1e-6)
 
 
 def test_distortion_is_opencvs():

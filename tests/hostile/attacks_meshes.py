@@ -1,10 +1,11 @@
 """Scans: accessors, instances, textures, and formats that are not read."""
 
+import re
 import struct
 
 import readers
 from attacks_photos import EPS, PHOTOS
-from hostile_cases import case, setting, written
+from hostile_cases import case, changed, setting, written
 
 # Scans --------------------------------------------------------------------------------------------------------------------
 
@@ -92,6 +93,12 @@ case("a material that has moved", "obj", obj_with(material="moved.mtl"), "read",
 case("a texture that is EPS", "obj", obj_with(EPS), "read", 4)
 case("a texture of 13,000 x 13,000", "obj", obj_with(PHOTOS["13,000 x 13,000"][0]), "read", 5)
 case("a material outside", "obj", obj_with(material="../../../../etc/passwd"), "read", 2)
+short, short_uvs = (
+    lambda data, kind=kind: re.sub(rb"^(%s \S+) .*$" % kind, rb"\1", data, flags=re.MULTILINE) for kind in (b"v", b"vt")
+)
+case("vertices of one number", "obj", changed("obj", short), item=6)
+case("vertices of one number", "thuman scan", changed("thuman scan", short), item=6)
+case("texture coordinates of one number", "thuman scan", changed("thuman scan", short_uvs), "either", 6)
 case("a texture outside", "obj", lambda folder: readers.textured_obj(folder, "../../../../etc/passwd"), "read", 2)
 MESHES = {
     "a corner of 2^30": ("scan.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 1073741824\n" * 60),

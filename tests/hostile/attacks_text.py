@@ -3,7 +3,7 @@
 import json
 
 import readers
-from hostile_cases import case, setting, written
+from hostile_cases import case, changed, setting, written
 from readers import SEEDS
 
 from humangs_jax.core.configuration import config_to_json
@@ -195,3 +195,9 @@ def weights_changed(folder):
 
 
 case("one flipped bit in a tensor", "weights", weights_changed, item=3)
+for kind, line in {
+    "a slash": b"/",
+    "a frame of 5,000 digits": b"cam00/" + b"9" * 5000,
+    "no camera": b"00000001.jpg",
+}.items():
+    case(f"a line of {kind}", "missing photos", changed("missing photos", lambda _, line=line: line), item=6)

@@ -25,8 +25,8 @@ SHARES = (0.0, 0.3, 0.6)
 LEAST = 1 << 10
 """Bytes that a file may have where no disk can be mounted, at least: what a run says goes to a file, too."""
 PAIRS = 2
-GROWS = ("run", "people")
-"""What training and `synth` have finished stays, and the next run goes on from there."""
+GROWS = ("run", "people", "set", "begun")
+"""What training, `synth`, `preprocess` and the stages of `start` have finished stays, and the next run goes on from there."""
 
 
 class Disk:

@@ -4,9 +4,9 @@ Honest files are taken apart as their format has it (arrays of an archive, value
 PNG, words of a text), a few parts are exchanged for hostile ones, and the file is put together again; or bytes change at random.
 What is found is shrunk by hypothesis, saved as FOLDER/found-READER, and becomes a case of `attacks_*.py`.
 
-The readers take turns, `CHUNK` inputs at a time, until each has INPUTS. The record (default: FOLDER/record.json) has the figures
-of each reader; a later call with the same record goes on from there, and tries what was found again; so does, on another
-machine, one with --page docs/security.md, from docs/results/fuzz.json.
+`CHUNK` inputs at a time go to the reader that had the fewest, until each has INPUTS. The record (default: FOLDER/record.json)
+has the figures of each reader; a later call with the same record goes on from there, and tries what was found again; so does, on
+another machine, one with --page docs/security.md, from docs/results/fuzz.json.
 """
 
 import argparse
@@ -380,6 +380,8 @@ NPZ = (
     "joints npz",
     "fit record",
     "bank",
+    "video poses",
+    "scene arrays",
 )
 STRUCTURES = {
     **dict.fromkeys(NPZ, mutated_npz),
@@ -389,9 +391,14 @@ STRUCTURES = {
     **dict.fromkeys(
         ("mmpose", "lhm", "joints json", "manifest", "capture", "photos", "outline", "import"), mutated_json
     ),
-    **dict.fromkeys(("pickle", "smplx pkl", "aist"), mutated_pickle),
+    **dict.fromkeys(
+        ("avatarrex", "scene list", "evaluation", "preprocessed set", "preprocessed scene", "skipped subject"),
+        mutated_json,
+    ),
+    **dict.fromkeys(("pickle", "smplx pkl", "aist", "thuman fit"), mutated_pickle),
     **dict.fromkeys(("image", "depth"), mutated_png),
     **dict.fromkeys(("opencv yaml", "easymocap", "colmap", "obj", "off", "log", "bvh"), mutated_text),
+    **dict.fromkeys(("missing photos", "actorshq", "thuman mesh", "thuman scan"), mutated_text),
     **{
         "torch zip": mutated_zip,
         "glb": mutated_glb,
@@ -482,20 +489,20 @@ def main():
     while waiting := [
         name for name in names if figures[name]["inputs"] < arguments.inputs and not figures[name]["found"]
     ]:
-        for name in waiting:
-            own = figures[name]
-            chunk = min(CHUNK, arguments.inputs - own["inputs"])
-            for key, value in fuzz(name, folder, chunk, own["chunks"], watch).items():
-                own[key] = round(own[key] + value, 1) if key != "found" else value
-            replacement = record_file.with_suffix(".new")
-            replacement.write_text(json.dumps(record | figures, indent=1) + "\n")
-            replacement.replace(record_file)
-            if own["found"]:
-                print(f"{name}: {own['found']}", flush=True)
-            jax.clear_caches()
-            gc.collect()
-            if Path("/proc/self/maps").read_bytes().count(b"\n") > MOST_MAPPINGS:
-                os.execv(sys.executable, [sys.executable, *sys.argv])
+        name = min(waiting, key=lambda each: figures[each]["inputs"])
+        own = figures[name]
+        chunk = min(CHUNK, arguments.inputs - own["inputs"])
+        for key, value in fuzz(name, folder, chunk, own["chunks"], watch).items():
+            own[key] = round(own[key] + value, 1) if key != "found" else value
+        replacement = record_file.with_suffix(".new")
+        replacement.write_text(json.dumps(record | figures, indent=1) + "\n")
+        replacement.replace(record_file)
+        if own["found"]:
+            print(f"{name}: {own['found']}", flush=True)
+        jax.clear_caches()
+        gc.collect()
+        if Path("/proc/self/maps").read_bytes().count(b"\n") > MOST_MAPPINGS:
+            os.execv(sys.executable, [sys.executable, *sys.argv])
     if arguments.page is not None:
         write_page(arguments.page, record | figures)
     print(json.dumps(figures))

@@ -1,8 +1,12 @@
 """Kills every command that writes at random moments: python kills.py FOLDER [--moments 10] [--json FILE] [COMMAND ...]
+Interrupts them instead, as Ctrl-C does: python kills.py FOLDER --interrupts 100 [--json FILE] [COMMAND ...]
 
 A run is killed with SIGKILL, its whole group of processes, just before one of its changes of files, some time after one, or at
 any time. Then no file under a final name may be half-written or lost, and the next run has to make what a run that nobody
 disturbed makes, and to remove what the killed one left. See `writers` for what the commands compute meanwhile.
+
+A run that is interrupted, at any time, has to exit with 130 and one line, and to leave nothing half-written and no temporary name
+itself; after the last of them the next run has to work. The commands take turns, so that a record (--json) can be continued.
 """
 
 import argparse
@@ -10,6 +14,7 @@ import dataclasses
 import json
 import random
 import shutil
+import signal
 import sys
 import time
 from pathlib import Path
@@ -21,6 +26,8 @@ from writers import COMMANDS, Command, Moment
 
 LONGEST = 1.0
 """Seconds after a change of a file at which a run is killed, at most."""
+INTERRUPTED, TURN = 130, 10
+"""The exit status of a command that was interrupted; interrupts until the next command has its turn."""
 BEFORE, AFTER = 0.45, 0.85
 """Shares of the moments just before a change, and up to some time after one; the rest is at any time."""
 
@@ -74,6 +81,64 @@ def kill(command: Command, folder: Path, inputs: Path, count: int, seed: int = 0
     }
 
 
+def interrupt(command: Command, folder: Path, inputs: Path, count: int, seed: int) -> dict:
+    """Interrupts a command until so many runs were; at most twice as many come to their end. Figures and faults."""
+    began, faults, codes = time.monotonic(), [], {0: 0, INTERRUPTED: 0}
+    place = writers.place_of(command, folder, inputs, "interrupted")
+    if command.first is not None:
+        assert writers.run(command, place, inputs, 1).code == 0, command.name
+    kept = folder / "before"
+    shutil.rmtree(kept, ignore_errors=True)
+    shutil.copytree(place, kept)
+    before = writers.snapshot(place)[0]
+    undisturbed = writers.run(command, place, inputs, 2)
+    assert undisturbed.code == 0, (command.name, undisturbed.errors)
+    expected, last = writers.snapshot(place)[0], undisturbed.changes[-1][0]
+    generator = random.Random(f"{command.name} {seed}")
+    while codes[INTERRUPTED] < count and codes[0] < 2 * count:
+        shutil.rmtree(place)
+        shutil.copytree(kept, place)
+        moment = Moment(None, generator.uniform(0, last), signal.SIGINT)
+        disturbed = writers.run(command, place, inputs, 2, moment)
+        found = writers.half_written(command, place, before, expected)
+        found += [f"{name}: left behind" for name in writers.snapshot(place)[1]]
+        lines = writers.error_lines(disturbed.errors)
+        if disturbed.code not in codes or (disturbed.code and lines[-1:] != ["humangs: interrupted"]):
+            found.append(f"exit status {disturbed.code}: {disturbed.errors[-500:]}")
+        codes[disturbed.code] = codes.get(disturbed.code, 0) + 1
+        faults += [f"{moment.seconds:.3f} s: {fault}" for fault in found]
+    faults += writers.next_run(command, place, inputs, expected)
+    seconds = round(time.monotonic() - began)
+    return {"interrupted": codes[INTERRUPTED], "came_to_their_end": codes[0], "faults": faults, "seconds": seconds}
+
+
+def interrupt_all(folder: Path, count: int, names: list[str], record: Path | None = None) -> dict[str, dict]:
+    """Figures by command; the record is added to until each has so many, `TURN` at a time."""
+    writers.import_everything()
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    writers.prepare(folder / "inputs")
+    figures = json.loads(record.read_text()) if record is not None and record.exists() else {}
+    none = {"interrupted": 0, "came_to_their_end": 0, "faults": [], "seconds": 0, "turns": 0}
+    chosen = [command for command in COMMANDS if not names or command.name in names]
+    failed = set()
+    while due := [c for c in chosen if c.name not in failed and figures.get(c.name, none)["interrupted"] < count]:
+        for command in due:
+            own = figures.get(command.name, none)
+            turn = min(TURN, count - own["interrupted"])
+            try:
+                found = interrupt(command, folder, folder / "inputs", turn, own["turns"]) | {"turns": 1}
+            except AssertionError as error:  # of a machine that is too busy: next time
+                print(command.name, error, flush=True)
+                failed.add(command.name)
+                continue
+            figures[command.name] = {key: own[key] + found[key] for key in none}
+            print(command.name, figures[command.name], flush=True)
+            if record is not None:
+                record.write_text(json.dumps(figures, indent=1) + "\n")
+    return figures
+
+
 def kill_all(folder: Path, count: int, names: list[str], record: Path | None = None, seed: int = 0) -> dict[str, dict]:
     """Figures by command. A record is continued: commands that are killed again replace what it has of them."""
     writers.import_everything()
@@ -100,11 +165,30 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="record of the figures by command; an earlier one is continued")
     parser.add_argument("--page", type=Path, help="page whose table kills is written, with its docs/results/kills.json")
+    parser.add_argument("--interrupts", type=int, help="interrupt each command so many times instead")
     arguments = parser.parse_args()
+    if arguments.interrupts is not None:
+        figures = interrupt_all(arguments.folder, arguments.interrupts, arguments.commands, arguments.json)
+        if arguments.page is not None:
+            publish_interrupts(arguments.page, figures)
+        sys.exit(any(each["faults"] for each in figures.values()))
     figures = kill_all(arguments.folder, arguments.moments, arguments.commands, arguments.json, arguments.seed)
     if arguments.page is not None:
         write_page(arguments.page, figures)
     sys.exit(any(each["faults"] for each in figures.values()))
+
+
+def publish_interrupts(page: Path, figures: dict[str, dict]) -> None:
+    sys.path.insert(0, str(Path(__file__).parents[2]))
+    from experiments.common.results import markdown_table, publish
+
+    total = lambda key: sum(each[key] for each in figures.values())
+    fewest = min(each["interrupted"] for each in figures.values())
+    header = ["commands that write", "interrupted, exit 130", "fewest of a command", "came to their end before"]
+    header += ["another exit status, left something, or the next run failed"]
+    faults = sum(len(each["faults"]) for each in figures.values())
+    rows = [[len(figures), f"{total('interrupted'):,}", fewest, total("came_to_their_end"), faults]]
+    publish(page, "interrupts", markdown_table(header, rows, "r" * len(header)), figures)
 
 
 def write_page(page: Path, figures: dict[str, dict]) -> None:

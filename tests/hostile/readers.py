@@ -4,12 +4,15 @@
 """
 
 import functools
+import importlib.util
 import json
 import pickle
 import struct
+import tempfile
 from pathlib import Path
 
 import bvh_files
+import dataset_files
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,12 +30,17 @@ from humangs_jax.core.configuration import config_to_json
 from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture import load_capture
+from humangs_jax.data.datasets.opening import open_people
+from humangs_jax.data.datasets.scene_list import read_evaluation
+from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.loading.captures import read_outline
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.data.photos import load_photos
+from humangs_jax.data.preprocess.run import preprocess
+from humangs_jax.data.preprocess.scenes import Settings, scan_content
 from humangs_jax.fitting.files import KEYS, read_fit_record
 from humangs_jax.fitting.scan_reading import read_joints, read_mesh
 from humangs_jax.io.exr import ExrView, read_exr, write_exr
@@ -101,6 +109,38 @@ def import_into(path):
     return import_cameras(path, path.parent / "photos", path.parent / "imported", overwrite=True)
 
 
+@functools.cache
+def data_body():
+    """The body of the data sets below; nothing is read of its file any more."""
+    with tempfile.TemporaryDirectory() as folder:
+        body = dataset_files.write_model(Path(folder))
+        assert body.hands and body.arrays
+    return body
+
+
+def read_data_set(folder):
+    """All people of a data set, with all that there is of them."""
+    for person in open_people(folder, data_body(), SIDE):
+        subject = person.subject
+        subject.parameters(range(subject.frame_count))
+        subject.photos(range(len(subject)), SIDE)
+
+
+def read_scans(folder):
+    """What preprocessing reads and computes of scans before it renders them."""
+    thuman = open_thuman(folder)
+    for name in thuman.names:
+        scan_content(name, thuman, data_body(), Settings("thuman", views=1))
+
+
+def continue_preprocessing(folder):
+    """Of a set whose only subject is finished."""
+    body = folder / "SMPLX_TINY.npz"
+    preprocess(folder / "raw", folder / "out", body, PREPROCESSED, progress=False)
+
+
+SIDE = 16
+PREPROCESSED = Settings("avatarrex", size=SIDE)
 READERS = {
     "npz": read_npz,
     "json": read_json,
@@ -154,6 +194,21 @@ READERS = {
     "bank": load_bank,
     "manifest": lambda path: read_manifest(path.parent),
     "log": first_failed_step,
+    "avatarrex": read_data_set,
+    "video poses": read_data_set,
+    "missing photos": read_data_set,
+    "actorshq": read_data_set,
+    "dna photos": read_data_set,
+    "dna notes": read_data_set,
+    "scene list": read_data_set,
+    "scene arrays": read_data_set,
+    "evaluation": read_evaluation,
+    "thuman fit": read_scans,
+    "thuman mesh": read_scans,
+    "thuman scan": read_scans,
+    "preprocessed set": continue_preprocessing,
+    "preprocessed scene": continue_preprocessing,
+    "skipped subject": continue_preprocessing,
 }
 
 
@@ -456,7 +511,34 @@ def matconvnet():
     return {"layers": cells({"type": "conv", "name": "conv1", "weights": weights}, {"type": "relu", "name": "relu1"})}
 
 
+def data_set(write, *arguments, **options):
+    """A seed: the folder of a data set."""
+
+    def seed(folder):
+        write(folder, *arguments, **options)
+        return folder
+
+    return seed
+
+
+def write_dna(folder):
+    import h5py
+
+    return dataset_files.write_dna(folder, h5py, frames=1)
+
+
+def write_preprocessed(folder):
+    """One subject that is finished, and another one that was skipped."""
+    for name in ("a", "b"):
+        dataset_files.write_avatarrex(folder / "raw" / name, frames=1)
+    (folder / "raw" / "b" / "smpl_params.npz").unlink()
+    dataset_files.write_model(folder)
+    continue_preprocessing(folder)
+    return folder
+
+
 STATE = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.asarray([1, 2], np.int64)}
+MODEL = dataset_files.model_arrays()
 MANIFEST = {"format": "humangs-synthetic", "version": 2, "generator_version": 1, "split": "train", "settings": {}}
 
 SEEDS = {
@@ -526,12 +608,30 @@ SEEDS = {
     "bank": npz("bank.npz", bank_arrays),
     "manifest": text("manifest.json", json.dumps(MANIFEST)),
     "log": text("log.jsonl", '{"step": 1, "loss": 2.0}\n{"step": 2, "event": "skipped"}\n'),
+    **dict.fromkeys(("avatarrex", "video poses"), data_set(dataset_files.write_avatarrex, frames=2)),
+    "missing photos": data_set(dataset_files.write_thuman4, frames=2),
+    "actorshq": data_set(dataset_files.write_actorshq, frames=1),
+    **dict.fromkeys(("dna photos", "dna notes"), write_dna if importlib.util.find_spec("h5py") else None),
+    **dict.fromkeys(("scene list", "scene arrays"), data_set(dataset_files.write_scenes, MODEL, views=2)),
+    "evaluation": text("evaluation_2.json", json.dumps({"s0": {"context": [0, 3], "target": [1]}})),
+    **dict.fromkeys(
+        ("thuman fit", "thuman mesh", "thuman scan"), data_set(dataset_files.write_thuman, MODEL, kinds="C")
+    ),
+    **dict.fromkeys(("preprocessed set", "preprocessed scene", "skipped subject"), write_preprocessed),
 }
 
 
 def damaged_file(name: str, path: Path) -> Path:
     """The file of a seed that damage goes into: of a folder, the one that is read first."""
-    inside = {"easymocap": "intri.yml", "colmap": "images.txt"}
+    inside = {
+        **{"easymocap": "intri.yml", "colmap": "images.txt", "avatarrex": "calibration_full.json"},
+        **{"video poses": "smpl_params.npz", "missing photos": "missing_img_files.txt"},
+        **{"actorshq": "4x/calibration.csv", "scene list": "train.json", "scene arrays": "smpl/0.npz"},
+        **{"dna photos": "main/0001_01.smc", "dna notes": "annotations/0001_01_annots.smc"},
+        **{"thuman fit": "smplx/0000/smplx_param.pkl", "thuman mesh": "smplx/0000/mesh_smplx.obj"},
+        **{"thuman scan": "model/0000/0000.obj", "preprocessed set": "out/manifest.json"},
+        **{"preprocessed scene": "out/a/scene.json", "skipped subject": "out/skipped/b.json"},
+    }
     return path / inside.get(name, "capture.json") if path.is_dir() else path
 
 

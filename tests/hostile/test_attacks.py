@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE.parent / "network"), str(HERE.parent)]
+sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data/datasets", ""))]
 
 from hostile_cases import all_cases  # noqa: E402
 from readers import READERS, SEEDS  # noqa: E402

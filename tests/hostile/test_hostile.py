@@ -64,7 +64,7 @@ def run_cases(folder: Path, names: list[str]) -> dict[str, dict]:
 
 
 def all_cases():
-    sys.path[:0] = [str(HERE), str(HERE.parent / "network"), str(HERE.parent)]
+    sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data/datasets", ""))]
     import hostile_cases
 
     return hostile_cases.all_cases()

@@ -26,11 +26,10 @@ def test_killed_at_any_moment_nothing_is_half_written_or_lost_and_the_next_run_w
     assert record.exists(), done.stderr[-3000:]
     commands = json.loads(record.read_text())["commands"]
     assert not {name: each["faults"] for name, each in commands.items() if each["faults"]}
+    assert done.returncode == 0 and len(commands) >= 25
     assert (
-        done.returncode == 0
-        and len(commands) >= 21
-        and sum(each["killed"] for each in commands.values()) > len(commands)
-    )
+        sum(each["killed"] for each in commands.values()) > MOMENTS * len(commands) / 2
+    )  # some come to their end before
 
 
 @pytest.mark.slow
@@ -38,4 +37,4 @@ def test_full_and_read_only_disks_and_two_runs_at_once_end_in_one_line_and_lose_
     done = run("disks.py", tmp_path / "disks")
     found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     assert not [each for each in found if any(each.values())]
-    assert done.returncode == 0 and len(found) >= 21, done.stderr[-3000:]
+    assert done.returncode == 0 and len(found) >= 25, done.stderr[-3000:]

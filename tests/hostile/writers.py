@@ -126,6 +126,23 @@ COMMANDS = (
         own=RUN,
         often=("run/*.safetensors",),
     ),
+    Command(
+        "start",
+        "start {inputs}/photos --cameras {inputs}/transforms.json --keypoints {inputs}/keypoints.npz --out begun "
+        "--without-masks --no-browser",
+        first=None,
+        often=("begun/capture.json",),
+        once=True,
+    ),
+    Command(
+        "preprocess",
+        "preprocess avatarrex {inputs}/videos --out set --body {inputs}/SMPLX_TINY.npz --size 16 --every 1",
+    ),
+    Command(
+        "evaluate",
+        "evaluate {inputs}/capture --predictions {inputs}/capture/images --json a.json --html a.html --csv a.csv "
+        "--markdown a.md --latex a.tex",
+    ),
     Command("convert", "convert {inputs}/any.pt --out w.safetensors --losses l.safetensors"),
 )
 
@@ -135,7 +152,7 @@ COMMANDS = (
 
 def import_everything():
     """In the process that is forked. Nothing here may start a backend of JAX: its threads would not survive."""
-    sys.path[:0] = [str(HERE), str(HERE.parent / "network"), str(HERE.parent)]
+    sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data/datasets", ""))]
     os.environ |= {"JAX_PLATFORMS": "cpu", "TF_CPP_MIN_LOG_LEVEL": "2"}
     for name in (*LATE, *(f"humangs_jax.{name}" for name in ("cli", *HEAVY))):
         with contextlib.suppress(ModuleNotFoundError):  # grain is optional
@@ -342,6 +359,11 @@ def stand_ins(variant):
     def converted(*_):
         return SimpleNamespace(variables=some_variables(), config=tiny(), skipped=1)
 
+    def scored(images, _truth, rules, *_):
+        from humangs_jax.evaluation.scores import score_names
+
+        return [dict.fromkeys(score_names(rules), variant / 8) for _ in images]
+
     mesh_views = lambda *_: iter([(np.full((32, 32, 3), variant / 4), np.ones((32, 32)))] * 8)
     avatar = lambda *_, **__: Avatar.load(Path(os.environ["KILLS_INPUTS"]) / f"avatar{variant}.npz")
     return (
@@ -370,6 +392,7 @@ def stand_ins(variant):
         ("apps.demo", "painted_body", lambda _: None),
         ("apps.demo", "draw_painted_body", lambda *_: None),
         ("apps.demo", "motion_frames", frames),
+        ("evaluation.run", "score_views", scored),
         ("fitting.fit_capture", "fit_photos", fitted),
         ("fitting.refine", "refine_capture", refined),
         ("fitting.scan_fit", "fit_scan", in_scan),
@@ -402,10 +425,14 @@ def stand_ins(variant):
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
-    """When a run is killed: `seconds` after its `event`-th change of a file, at 0 just before it; event None: after the start."""
+    """When a run is killed: `seconds` after its `event`-th change of a file, at 0 just before it; event None: after the start.
+
+    by: the signal; SIGINT, as Ctrl-C in a terminal, only with event None, and the start is that of the command line.
+    """
 
     event: int | None
     seconds: float
+    by: int = signal.SIGKILL
 
 
 @dataclasses.dataclass(frozen=True)
@@ -488,6 +515,8 @@ def perform(command, place, inputs, variant, moment, tell, most, log):
         noted = lambda *given, _name=name, _work=replacement, **named: (called.append(_name), _work(*given, **named))[1]
         mock.patch.object(importlib.import_module(f"humangs_jax.{module}"), name, noted).start()
     sys.argv = ["humangs", *command.words(inputs, variant)]
+    if moment is not None and moment.by == signal.SIGINT:
+        hear_from_the_start(cli, tell)
     changes, code = Changes(place, moment, tell), 0
     if most is not None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (most, resource.RLIM_INFINITY))
@@ -495,9 +524,12 @@ def perform(command, place, inputs, variant, moment, tell, most, log):
         cli.main()
     except SystemExit as ending:
         code = ending.code
+    except KeyboardInterrupt:  # behind the end of the command line
+        code = 0
     except BaseException:
         traceback.print_exc()
         code = 1
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     sys.stdout.flush()
     sys.stderr.flush()
     if most is not None:
@@ -507,13 +539,27 @@ def perform(command, place, inputs, variant, moment, tell, most, log):
     return code
 
 
+def hear_from_the_start(cli, tell):
+    """Says when the command line begins; an interrupt before it comes then."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # shells start what runs in the background without it
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    prepare = cli._prepare
+
+    def begins(verbose):
+        os.write(tell, b"!")
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        prepare(verbose)
+
+    mock.patch.object(cli, "_prepare", begins).start()
+
+
 def end(begun) -> Run:
     """Waits for a run, kills it at its moment."""
     pid, ready, log, moment = begun
     deadline = time.monotonic() + SECONDS
     killed = False
     try:
-        if moment is not None and moment.event is None:
+        if moment is not None and moment.event is None and moment.by == signal.SIGKILL:
             killed = not select.select([ready], [], [], moment.seconds)[0]
         else:
             assert select.select([ready], [], [], SECONDS)[0], f"{log}: did not end"
@@ -522,7 +568,7 @@ def end(begun) -> Run:
                 killed = True
         if killed:
             with contextlib.suppress(ProcessLookupError):
-                os.killpg(pid, signal.SIGKILL)
+                os.killpg(pid, moment.by)
     finally:
         os.close(ready)
     status = None
@@ -563,6 +609,7 @@ def make_inputs(inputs: Path) -> None:
 
     import jax
     import numpy as np
+    from dataset_files import write_avatarrex, write_model
     from readers import sphere, write_import
 
     from humangs_jax.core.configuration import config_to_json
@@ -575,6 +622,8 @@ def make_inputs(inputs: Path) -> None:
     zeros = jax.tree.map(lambda x: np.zeros(x.shape, np.float32), expected_variables(tiny().model))
     (inputs / "variables.pkl").write_bytes(pickle.dumps(zeros))
     write_import(inputs)
+    write_avatarrex(inputs / "videos" / "a", frames=1)
+    write_model(inputs)
     save_capture(inputs / "capture", some_capture(0))
     for name in "ab":
         save_capture(inputs / "people" / name, some_capture(ord(name)))

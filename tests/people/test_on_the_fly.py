@@ -12,6 +12,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews, prepare_inputs
+from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import project
 from humangs_jax.network.inputs import subject_unit
 from humangs_jax.network.presets import tiny
@@ -38,7 +39,7 @@ LIKE_RENDERED = 30
 
 draw_view, rasterize = jax.jit(on_the_fly.draw_view), jax.jit(rasterize_mesh)
 camera_from = jax.jit(cameras.camera_from, static_argnames="size")
-between, dyes = jax.jit(on_the_fly.between), jax.jit(shading.dyes_from)
+between, dyes = jax.jit(quaternion.interpolate), jax.jit(shading.dyes_from)
 
 
 @pytest.fixture(scope="module")

@@ -5,25 +5,25 @@ import dataclasses
 import jax
 import numpy as np
 
-from humangs_jax.data.loader import CaptureCache
 from humangs_jax.training.config import tiny
+from humangs_jax.training.sources import captured_people
 from humangs_jax.training.validation import sheet, validation_examples
 
 CONFIG = dataclasses.replace(tiny(), views=dataclasses.replace(tiny().views, input_counts=(3, 1, 2)))
 
 
 def test_the_middle_number_of_views_the_same_ones_again(body, captures, same):
-    first, again = (validation_examples(CaptureCache(captures, body), CONFIG, 2) for _ in range(2))
+    first, again = (validation_examples(captured_people(captures, body), CONFIG, 2) for _ in range(2))
     assert len(first) == 2 and same(first, again)
     size = CONFIG.model.conventions.image_size
     for example in first:
         assert example.inputs.images.shape == (2, size, size, 3)
         assert example.targets.images.shape == (CONFIG.views.target_count, size, size, 3)
-    assert len(validation_examples(CaptureCache(captures, body), CONFIG, 8)) == len(captures)
+    assert len(validation_examples(captured_people(captures, body), CONFIG, 8)) == len(captures)
 
 
 def test_a_row_of_the_sheet_is_inputs_and_then_pairs(body, captures):
-    examples = validation_examples(CaptureCache(captures, body), CONFIG, 2)
+    examples = validation_examples(captured_people(captures, body), CONFIG, 2)
     shown = [np.full(example.targets.images.shape, 0.25 * i) for i, example in enumerate(examples)]
     image, size = sheet(examples, shown), CONFIG.model.conventions.image_size
     assert image.shape == (2 * size, (2 + 2 * 2) * size, 3)

@@ -83,6 +83,7 @@ def test_export_writes_page_and_ply(avatar_file, tmp_path, monkeypatch, capsys):
     written = tmp_path / "me.html", tmp_path / "me.ply"
     code, out, err = run(monkeypatch, capsys, "export", avatar_file, "--html", written[0], "--out", written[1])
     assert (code, err) == (0, "") and str(written[0]) in out and "MB" in out and str(written[1]) in out
+    assert out.splitlines()[-1] == f"next: humangs animate {avatar_file} --out video.mp4"
     assert written[0].read_text() == page.page_html(small_avatar(), title="me") and written[1].exists()
 
 

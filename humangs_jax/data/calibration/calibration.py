@@ -197,23 +197,59 @@ def distort(points: Float[np.ndarray, "*n 2"], coefficients: Float[np.ndarray, "
 
 
 def undistort(
-    image: Float[np.ndarray, "h w *c"], K: Float[np.ndarray, "3 3"], coefficients: Float[np.ndarray, "5"], fill: float
+    image: Float[np.ndarray, "h w *c"],
+    K: Float[np.ndarray, "3 3"],
+    coefficients: Float[np.ndarray, "5"],
+    fill: float,
+    box: tuple[slice, slice] = (slice(None), slice(None)),
 ) -> Float[np.ndarray, "h w *c"]:
     """The photo that a pinhole of the same K (pixel centres at +0.5) would have taken, bilinear, float32.
 
-    Pixels that the photo does not show get the value `fill`.
+    Pixels that the photo does not show, and those outside of `box` (rows, columns), get the value `fill`.
     """
     from skimage.transform import warp
 
     height, width = image.shape[:2]
-    columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    plane = (np.stack([columns, rows], axis=-1) - K[:2, 2]) / np.diag(K)[:2]
-    source = distort(plane, coefficients) * np.diag(K)[:2] + K[:2, 2] - 0.5
-    source[(plane**2).sum(axis=-1) >= _squared_reach(coefficients)] = -2  # outside of the photo
-    where = np.moveaxis(source, -1, 0)[::-1]
+    columns, rows = np.meshgrid(np.arange(width)[box[1]] + 0.5, np.arange(height)[box[0]] + 0.5)
+    where = np.moveaxis(_in_photo(np.stack([columns, rows], axis=-1), K, coefficients) - 0.5, -1, 0)[::-1]
     channels = np.atleast_3d(image).transpose(2, 0, 1)
     warped = [warp(c, where, order=1, mode="constant", cval=fill, preserve_range=True) for c in channels]
-    return np.stack(warped, axis=-1).reshape(image.shape).astype(np.float32)
+    result = np.full(image.shape, fill, np.float32)
+    result[box] = np.stack(warped, axis=-1).reshape(result[box].shape)
+    return result
+
+
+def undistort_person(
+    image: Float[np.ndarray, "h w 3"],
+    mask: Float[np.ndarray, "h w"],
+    K: Float[np.ndarray, "3 3"],
+    coefficients: Float[np.ndarray, "5"],
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    """A photo on white and its mask without distortion: `undistort`, in the box around the person alone, which is faster."""
+    step = 16
+    corners = [np.arange(0.0, size + step, step) for size in mask.shape]
+    grid = np.stack(np.meshgrid(*corners[::-1]), axis=-1)
+    on_person = [np.flatnonzero(mask.max(axis=axis) > 0) for axis in (0, 1)]
+    nobody = np.ones_like(image), np.zeros_like(mask)
+    if not len(on_person[0]):
+        return nobody
+    low, high = ([each[i] - step for each in on_person] for i in (0, -1))  # a cell more than the person on every side
+    source = _in_photo(grid, K, coefficients)
+    near = ((source > low) & (source < np.add(high, 2 * step))).all(axis=-1)
+    if not near.any():
+        return nobody
+    slices = [np.flatnonzero(near.any(axis=axis)) * step for axis in (1, 0)]
+    box = tuple(slice(max(0, each[0] - step), each[-1] + step) for each in slices)
+    both = undistort(np.dstack([1 - image, mask]), K, coefficients, 0.0, (box[0], box[1]))
+    return 1 - both[..., :3], both[..., 3]
+
+
+def _in_photo(pixels, K, coefficients):
+    """Where the lens puts pixels (edges of the photo at whole numbers); far outside if it does not show them."""
+    plane = (pixels - K[:2, 2]) / np.diag(K)[:2]
+    source = distort(plane, coefficients) * np.diag(K)[:2] + K[:2, 2]
+    source[(plane**2).sum(axis=-1) >= _squared_reach(coefficients)] = -1e4
+    return source
 
 
 def _squared_reach(coefficients):

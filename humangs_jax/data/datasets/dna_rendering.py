@@ -20,7 +20,7 @@ from humangs_jax.data.calibration.calibration import (
     Calibration,
     brown_conrady,
     in_capture_convention,
-    undistort,
+    undistort_person,
 )
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, coefficients
@@ -124,12 +124,14 @@ def open_dna_rendering(main: str | Path, body: FileBody) -> Subject:
     def read(view: int):
         number, camera, frame = numbers[owners[view]], cameras[owners[view]], frames[view]
         image = photos.image(f"{places[number]}/{number}/color/{frame}")
-        mask = (notes.image(f"Mask/{number}/mask/{frame}").max(axis=-1) > ON_PERSON).astype(np.float32)
+        channels = np.moveaxis(notes.image(f"Mask/{number}/mask/{frame}"), -1, 0)
+        mask = (np.maximum.reduce(list(channels)) > ON_PERSON).astype(np.float32)
         if mask.shape != image.shape[:2]:
             raise CaptureError(notes.path, f"Mask/{number}/mask/{frame}", f"{mask.shape}, its photo {image.shape[:2]}")
-        if camera.distortion is not None:
-            image, mask = (undistort(x, camera.K, camera.distortion, 0.0) for x in (image, mask))
-        return image * mask[..., None] + (1 - mask[..., None]), mask
+        image = np.where(mask[..., None] > 0, image, np.float32(1))
+        return (
+            (image, mask) if camera.distortion is None else undistort_person(image, mask, camera.K, camera.distortion)
+        )
 
     return Subject(
         name=str(main),

@@ -14,7 +14,12 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.calibration.calibration import CalibratedCamera, Calibration, in_capture_convention, undistort
+from humangs_jax.data.calibration.calibration import (
+    CalibratedCamera,
+    Calibration,
+    in_capture_convention,
+    undistort_person,
+)
 from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.capture_checks import CaptureError, checked_camera
 from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, coefficients
@@ -124,8 +129,8 @@ def read_missing(file: Path) -> set[tuple[str, int]]:
         if not line.strip():
             continue
         parts = [part for part in re.split(r"[\\/]+", line.strip()) if part]
-        frame = parts[-1].partition(".")[0]
-        if len(parts) < 2 or not frame.isdecimal():
+        frame = parts[-1].partition(".")[0] if parts else ""
+        if len(parts) < 2 or not re.fullmatch(r"[0-9]{1,18}", frame):
             raise CaptureError(file, f"line {number}", f"expected CAMERA/FRAME.jpg, got {line.strip()[:60]!r}")
         found.add((parts[-2], int(frame)))
     return found
@@ -179,7 +184,7 @@ def video_subject(
         image, person = on_white(folder.photos / photo, folder.masks / mask)
         if camera.distortion is None:
             return image, person
-        return tuple(undistort(x, camera.K, camera.distortion, fill) for x, fill in ((image, 1.0), (person, 0.0)))
+        return undistort_person(image, person, camera.K, camera.distortion)
 
     return Subject(
         name=str(name),

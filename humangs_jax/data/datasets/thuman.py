@@ -214,6 +214,8 @@ def read_scan(file: str | Path) -> Scan:
             _find_fault(Path(file).parent)
             raise Refused("no texture image: expected a material (.mtl) beside the scan that names a PNG or JPEG file")
         vertices, uvs = np.asarray(mesh.vertices, np.float64), np.asarray(uvs, np.float32)
+        if uvs.shape != (len(vertices), 2):
+            raise Refused(f"texture coordinates: expected shape ({len(vertices)}, 2), got {uvs.shape}")
         for name, values in (("vertices", vertices), ("texture coordinates", uvs)):
             if not np.isfinite(values).all():
                 raise Refused(f"{name}: expected finite numbers")

@@ -9,17 +9,14 @@ Finished folders are kept, so that the same command continues an interrupted set
 ends by making lists and manifest of what is there. A run without shards, after them, finds nothing to make and lists everything.
 """
 
-import concurrent.futures
-import concurrent.futures.process
 import dataclasses
-import multiprocessing
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from humangs_jax.core.progress import bar
-from humangs_jax.data.capture_checks import CaptureError, checked_json
+from humangs_jax.core.workers import in_processes
+from humangs_jax.data.capture_checks import CaptureError, checked_json, required
 from humangs_jax.data.datasets.bodies import FileBody
 from humangs_jax.data.datasets.opening import VIDEOS
 from humangs_jax.data.datasets.scene_list import write_list
@@ -132,37 +129,15 @@ def _in_processes(source, out, due, body, settings, workers):
         for name in due:
             yield name, _attempt_scan(source, out, name, body, settings)
         return
-    context = multiprocessing.get_context("spawn")
-    with concurrent.futures.ProcessPoolExecutor(workers, context, _start_worker, (body.file,)) as pool:
-        futures = {pool.submit(_work, source, out, name, settings): name for name in due}
-        try:
-            for future in concurrent.futures.as_completed(futures):
-                yield futures[future], future.result()
-        except concurrent.futures.process.BrokenProcessPool as error:
-            raise OSError("a process was killed, perhaps for want of memory: try fewer workers") from error
-        except BaseException:  # interrupted: what is unfinished is dropped
-            pool.shutdown(wait=False, cancel_futures=True)
-            for process in multiprocessing.active_children():
-                process.terminate()
-            raise
+    tasks = {name: (source, out, name, settings) for name in due}
+    yield from in_processes(_work, tasks, workers, _load_body, body.file)
 
 
 _worker: dict[str, Any] = {}
 
 
-def _start_worker(body_file):
-    """One thread each: the processes are the parallelism."""
-    import signal
-
-    import jax
-
-    from humangs_jax.core.workers import end_with_parent
-
-    end_with_parent()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_cpu_multi_thread_eigen=false"
-    jax.config.update("jax_platforms", "cpu")
-    _worker["body"] = FileBody.load(body_file)
+def _load_body(file):
+    _worker["body"] = FileBody.load(file)
 
 
 def _work(source, out, name, settings):
@@ -217,7 +192,7 @@ def _finish(out: Path, names: Sequence[str], settings: Settings) -> dict[str, An
     for _ in range(2):  # not until nothing is added: that may be hours
         if (found := _finished(out, settings)) != done:
             done = found
-            scenes = {name: checked_json(out / name / SCENE) for name in done}
+            scenes = {name: _read_scene(out / name / SCENE, settings) for name in done}
             manifest = _write_lists(out, names, scenes, settings)
     return manifest
 
@@ -226,9 +201,33 @@ def _finished(out, settings):
     return sorted(path.parent.name for path in out.glob(f"*/{settings.mark}") if not path.parent.name.startswith("."))
 
 
+def _read_scene(file, settings):
+    """What a finished folder says of itself. Raises: CaptureError naming file and key."""
+    content = checked_json(file)
+    known = _of_kind(content, "known", dict, file)
+    _of_kind(known, "views", int, file, "known.")
+    for reason in _of_kind(known, "missing", dict, file, "known.") if "missing" in known else ():
+        _of_kind(known["missing"], reason, int, file, "known.missing.")
+    if "unreadable" in known:
+        _of_kind(known, "unreadable", dict, file, "known.")
+    if settings.layout == "scenes":
+        _of_kind(_of_kind(content, "entry", dict, file), "frames", list, file, "entry.")
+    return content
+
+
+def _of_kind(mapping, key, kind, file, prefix=""):
+    value = required(mapping, key, file, prefix) if isinstance(mapping, dict) else None
+    if not isinstance(value, kind) or isinstance(value, bool):
+        raise CaptureError(file, prefix + key, f"expected {_KINDS[kind]}, got {type(value).__name__}")
+    return value
+
+
+_KINDS = {dict: "a JSON object", list: "a list", int: "a whole number", str: "a text"}
+
+
 def _write_lists(out, names, scenes, settings):
     skipped = {
-        file.stem: str(checked_json(file).get("reason"))
+        file.stem: _of_kind(checked_json(file), "reason", str, file)
         for file in sorted((out / SKIPPED).glob("*.json"))
         if file.stem not in scenes
     }

@@ -1,19 +1,31 @@
-"""Synthetic people in the layouts of real data sets: preprocessed, loaded, reconstructed and animated."""
+"""Synthetic people in the layouts of real data sets: preprocessed, loaded, reconstructed and animated; and in videos: fitted."""
+
+import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments.data import made_up
+from experiments.fitting.your_photos import landmarks_in
+from humangs_jax import cli
 from humangs_jax.apps.check import check_capture
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.avatar.video import write_video
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import pose_body, shape_body
+from humangs_jax.data.capture import capture_from_arrays, load_capture
 from humangs_jax.data.datasets.bodies import FileBody
 from humangs_jax.data.datasets.opening import open_people
+from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
+from humangs_jax.data.photos import load_photos
 from humangs_jax.data.preprocess.run import preprocess
 from humangs_jax.data.preprocess.scenes import Settings
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import tiny
+from humangs_jax.people.rendering import render_view
 
 TIGHT_IOU = 0.9
 """Least mean overlap of the posed body and the silhouette of a person in tight clothes."""
@@ -51,3 +63,60 @@ def test_a_person_goes_all_the_way(layout, tmp_path):
     middle = np.asarray(moved.means).mean(axis=0)
     assert np.isfinite(np.asarray(moved.means)).all()
     assert np.linalg.norm(middle - np.asarray(last.translation)) < 1  # an untrained network, in its place
+
+
+FIT_ERROR = 0.015
+"""Metres, mean over vertices, of bodies fitted to exact keypoints of three cameras."""
+
+
+@pytest.mark.slow
+def test_videos_and_keypoints_become_a_capture_of_several_frames(tmp_path):
+    """Imported and fitted by the command line: every frame has the pose of the person."""
+    names, frames, size = ("a", "b", "c"), 3, (288, 400)
+    video = made_up.Video(tmp_path, made_up.SEEDS[0], frames, len(names), size, None)
+    poses = np.stack([np.asarray(camera.cam_from_world, np.float64) for camera in video.cameras])
+    video.R, video.T = poses[:, :3, :3], poses[:, :3, 3]  # of the world of the people, y up
+    (tmp_path / "rig.json").write_text(json.dumps(video.calibration(names)))
+    views = [[render_view(posed, camera, made_up.BACKGROUND) for camera in video.cameras] for posed in video.posed]
+    for part, kind in enumerate(("photos", "masks")):
+        (tmp_path / kind).mkdir()
+        for c, name in enumerate(names):
+            shown = [np.broadcast_to(np.atleast_3d(of[c][part]), (*size[::-1], 3)) for of in views]
+            write_video(tmp_path / kind / f"{name}.mp4", shown, 30)
+    me, k = tmp_path / "me", tmp_path / "keypoints.npz"
+    options = ["--images", tmp_path / "photos", "--masks", tmp_path / "masks", "--up=+y", "--out", me]
+    assert cli.execute(["import", "cameras", str(tmp_path / "rig.json"), *map(str, options)]) == 0
+    photos = load_photos(me)
+    assert photos.frames.tolist() == np.repeat(np.arange(frames), len(names)).tolist()
+
+    body = load_body()
+    images, masks = (np.stack([view[i] for of in views for view in of]) for i in (0, 1))
+    truth = capture_from_arrays(
+        images,
+        np.stack([camera.K for camera in video.cameras] * frames),
+        np.concatenate([poses] * frames),
+        np.stack([posed.rotations for posed in video.posed]),
+        np.stack([posed.translation for posed in video.posed]),
+        betas=video.posed[0].subject.betas,
+        masks=masks,
+        frames=photos.frames,
+        body=body,
+    )
+    points = landmarks_in(truth)
+    known = np.isfinite(points).all(-1)
+    confidences = np.where(known, 0.9, 0.0)
+    points = np.where(known[..., None], points, 0)
+    np.savez(k, set=COCO_WHOLEBODY_133.name, names=photos.names, points=points, confidences=confidences)
+    assert cli.execute(["fit", str(me), "--keypoints", str(k)]) == 0
+
+    fitted = load_capture(me)
+    assert fitted.frame_count == frames and fitted.frames.tolist() == photos.frames.tolist()
+    vertices = [
+        np.asarray(pose_body(body, shape_body(body, jnp.asarray(each.betas)), each.pose(f)).vertices)
+        for each in (fitted, truth)
+        for f in range(frames)
+    ]
+    found, expected = np.stack(vertices[:frames]), np.stack(vertices[frames:])
+    assert np.linalg.norm(found - expected, axis=-1).mean() < FIT_ERROR
+    moved = np.linalg.norm(np.diff(expected, axis=0), axis=-1).mean()
+    assert moved > 4 * FIT_ERROR  # the frames differ

@@ -33,7 +33,8 @@ from humangs_jax.evaluation.run import evaluate
 from humangs_jax.io.images import write_png
 from humangs_jax.io.text import write_json
 from humangs_jax.training.config import tiny
-from humangs_jax.training.sources import training_people
+from humangs_jax.training.sources import people_on_disk, training_people
+from humangs_jax.training.validation import validation_examples
 
 FLOAT32 = 1e-6
 JPEG = 3
@@ -236,6 +237,8 @@ def test_training_takes_a_scene_list_and_a_data_set(tmp_path, body):
         make = training_people(data, 0, tmp_path / "run", body.model, body.file)
         example = make(config).example(0, 0, 2)
         assert example.inputs.rotations.shape == (2, 55, 3) and example.inputs.images.shape == (2, SIZE, SIZE, 3)
+        (example,) = validation_examples(people_on_disk(data, body, split=None), config, 8)
+        assert example.targets.images.shape == (2, SIZE, SIZE, 3)
     with pytest.raises(ValueError, match="synthetic people have the body that comes with the package"):
         training_people(None, 5, tmp_path / "run", body.model, body.file)
     with pytest.raises(ValueError, match=r"no captures, scene list or data set"):
