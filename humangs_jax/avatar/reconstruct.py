@@ -98,12 +98,19 @@ def reconstruct_views(
 
 
 def make_avatar(outputs: HumanGSOutputs, body: BodyModel, betas: Float[Array, " s"], config: HumanGSConfig) -> Avatar:
-    """Canonical Gaussians on the body of a person: what can be posed."""
+    """Canonical Gaussians on the body of a person: what can be posed. Raises: ValueError if there are none."""
+    if outputs.is_empty:
+        name = type(config.architecture.decoder).__name__
+        raise ValueError(
+            f"{name} draws images of targets without Gaussians: it makes no avatar, and nothing to animate"
+        )
     rest = shape_body(body, betas)
-    per_vertex = outputs.gaussians.means.shape[0] // body.template.shape[0]
+    weights, per_vertex = outputs.skinning_weights, outputs.gaussians.means.shape[0] // body.template.shape[0]
+    if weights is None:
+        weights = corrected_skinning_weights(body.skinning_weights, outputs.skinning_offsets, per_vertex)
     return Avatar(
         gaussians=outputs.gaussians,
-        skinning_weights=corrected_skinning_weights(body.skinning_weights, outputs.skinning_offsets, per_vertex),
+        skinning_weights=weights,
         rest_vertices=rest.vertices,
         rest_joints=rest.joints,
         faces=body.faces,

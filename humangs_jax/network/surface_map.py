@@ -1,0 +1,70 @@
+"""Maps of the body's surface, for networks that work on texels: which point of the body each texel shows.
+
+A part asks for a map by its field `surface_map`. `data.views.gaussian_body` makes it, once per body, and the inputs of the
+network carry it: `HumanGSInputs.texels`. Texels name vertices, so that one map serves every shape and pose of a body.
+"""
+
+import dataclasses
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+
+from humangs_jax.body.model import BodyModel, Texels
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.rendering.mesh.atlas import CELLS, Atlas, texels, unwrap
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+
+MARGIN = 0.95
+"""Share of the side of a view from the front or back that the body takes."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceMap:
+    """A map of the surface.
+
+    kind: "atlas": the texture coordinates of the body, or charts cut for it; every point of the surface once. "front_back":
+    the T-pose seen from the front, and beside it, mirrored, from the back, by parallel rays. size: texels a side; "front_back" is
+    twice as wide.
+    """
+
+    kind: Literal["atlas", "front_back"] = "atlas"
+    size: int = 512
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width."""
+        return self.size, self.size * (2 if self.kind == "front_back" else 1)
+
+
+def surface_texels(body: BodyModel, wanted: SurfaceMap) -> Texels:
+    """The map of a body, on the host; texels that show nothing have no weights."""
+    faces = np.asarray(body.faces)
+    ids, weights = _atlas(body, wanted.size) if wanted.kind == "atlas" else _front_and_back(body, wanted.size)
+    corners = np.where(ids[..., None] >= 0, faces[np.maximum(ids, 0)], 0)
+    return Texels(jnp.asarray(corners, jnp.int32), jnp.asarray(weights, body.template.dtype))
+
+
+def _atlas(body, size):
+    vertices, faces = np.asarray(body.template, np.float32), np.asarray(body.faces)
+    if body.uvs is not None and body.uv_faces is not None:
+        atlas = Atlas(np.asarray(body.uvs), np.asarray(body.uv_faces), np.zeros(0), np.zeros(0), size, 1.0)
+    else:
+        one = np.zeros(len(faces), np.int64)
+        atlas = unwrap(vertices, faces, one, -(-size // CELLS) * CELLS, one + 1.0)
+    return texels(dataclasses.replace(atlas, size=size))
+
+
+def _front_and_back(body, size):
+    """A camera very far away has parallel rays: points are placed at their pixel, at a depth of 2 to 3."""
+    vertices = np.asarray(body.template)
+    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    right, up, front = ((vertices - (low + high) / 2) / (high - low)[:2].max()).T * MARGIN
+    seen = []
+    for side in (1, -1):
+        depth = 2.5 - 0.5 * side * front / max(np.abs(front).max(), 1e-6)
+        points = np.stack([size * (0.5 + side * right) * depth, size * (0.5 - up) * depth, depth], axis=-1)
+        camera = Camera(jnp.eye(3), jnp.eye(4), size, size)
+        seen.append(rasterize_mesh(jnp.asarray(points, jnp.float32), body.faces, camera))
+    beside = lambda name: np.concatenate([np.asarray(getattr(one, name)) for one in seen], axis=1)
+    return beside("face_ids"), beside("barycentrics")
