@@ -18,6 +18,8 @@ from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.grouped import GroupDecoder, GroupReader
 from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.shell_textures import PlainPhotos, ShellDecoder, ShellTextureReader
+from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.two_stream import TwoStreamReader
@@ -109,6 +111,18 @@ def gst(size: Size = "published") -> HumanGSConfig:
     return config.with_parts(reader=reader, decoder=GroupDecoder(group_size=96))
 
 
+def ghg(size: Size = "published") -> HumanGSConfig:
+    """GHG-style (`shell_textures`): copied colours on five shells; no transformer."""
+    published = size == "published"
+    reader = ShellTextureReader(SurfaceMap("atlas", 1024 if published else 64))
+    # texels of the bench are 3 cm wide on the innermost shell
+    decoder = ShellDecoder() if published else ShellDecoder((16, 24, 48), largest_scale=0.03)
+    conventions = dataclasses.replace(
+        Conventions(pixels="person") if published else bench().conventions, tokens="all", longest_edge=None
+    )
+    return HumanGSConfig(Architecture(PlainPhotos(), reader, decoder), conventions)
+
+
 def _photo_encoder(transformer: TransformerConfig, patch_size: int = 8) -> PatchTransformer:
     """Of photos without cameras and poses: nothing reads the neural texture, so it is as small as can be."""
     return PatchTransformer(patch_size, "place", TriplaneConfig(2, 1), transformer, upsampler=None)
@@ -122,6 +136,7 @@ SYSTEMS: dict[str, Callable[[Size], HumanGSConfig]] = {
     "lhm_views": lhm_views,
     "lhm_plus": lhm_plus,
     "gst": gst,
+    "ghg": ghg,
 }
 """By name; each is called with a `Size`."""
 ONE_PHOTO = ("lhm", "gst")
