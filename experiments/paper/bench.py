@@ -16,6 +16,10 @@ SCORES = {"psnr": ("PSNR, dB", 2), "psnr_mask": ("on the person, dB", 2), "ssim"
 PHOTOS, TARGETS = 4, 6
 """Photos that a network is trained with, unless it takes one; views of each person that all are compared on."""
 VIEW_COUNTS = (1, 2, 4, 6, 8)
+PER_PERSON = ("animatable",)
+"""Systems that are fitted to one person, and so have no place in a training on many."""
+NOISE = "noise"
+"""The claim of variants that differ from another one in the seed alone."""
 
 PAPER = "paper"
 """Marks a row of the printed paper in every table."""
@@ -74,13 +78,14 @@ class Variant(NamedTuple):
 def variants(steps: int) -> dict[str, Variant]:
     """All that `train_all.py` trains, by name, in the order of its queue."""
     from humangs_jax.data.loader import ViewSampling
+    from humangs_jax.network.config import paper_parts
     from humangs_jax.network.systems import ONE_PHOTO, SYSTEMS
     from humangs_jax.network.upsampler import UpsamplerConfig
     from humangs_jax.training.config import LossConfig, TrainConfig
     from humangs_jax.training.optimizer import OptimizerConfig
 
     def run(model: Any, photos: int = PHOTOS, **fields: Any) -> Any:
-        capacity = -(-model.execution.token_capacity * photos // PHOTOS)
+        capacity = -(-model.execution.token_capacity * (photos + 1) // (PHOTOS + 1))  # one may show more than its share
         settings: dict[str, Any] = {
             "model": model.with_execution(token_capacity=capacity),
             "views": ViewSampling(input_counts=(photos,)),
@@ -96,20 +101,19 @@ def variants(steps: int) -> dict[str, Variant]:
 
     replace, systems = dataclasses.replace, {name: make("bench") for name, make in SYSTEMS.items()}
     ours, plain = systems["humangs"], systems["back_projection"]
-    parts = ours.architecture
-    part = lambda name, **fields: ours.with_parts(**{name: replace(getattr(parts, name), **fields)})
-    bare = part("reader", shells=())
-    transformer = replace(parts.encoder.transformer, class_token=False)
-    gray = bare.with_parts(
-        reader=replace(bare.architecture.reader, sample_rgb=False), decoder=replace(parts.decoder, residual_color=False)
-    )
+    encoder, reader, decoder = paper_parts(ours.architecture)
+    tight = lambda weight: run(ours, loss=LossConfig(tightness=weight))
+    per_vertex = lambda free: run(ours.with_parts(decoder=replace(decoder, tight=1, free=free)))
+    flat = replace(reader, shells=())
+    bare = ours.with_parts(reader=flat)
+    gray = {"reader": replace(flat, sample_rgb=False), "decoder": replace(decoder, residual_color=False)}
+    tokenless = replace(encoder, transformer=replace(encoder.transformer, class_token=False))
+    everywhere = ours.with_conventions(tokens="all").with_execution(token_capacity=0)
 
-    def upsampled(features: str) -> Any:
-        hidden = parts.encoder.transformer.width // 3
-        return ours.with_parts(
-            encoder=replace(parts.encoder, upsampler=UpsamplerConfig(hidden, features)),
-            reader=replace(parts.reader, output_width=parts.encoder.transformer.width),
-        )
+    def upsampled(features: Any) -> Any:
+        width = encoder.transformer.width
+        raised = replace(encoder, upsampler=UpsamplerConfig(width // 3, features))
+        return run(ours.with_parts(encoder=raised, reader=replace(reader, output_width=width)))
 
     found = {
         "back-projection": Variant(run(plain)),
@@ -117,29 +121,25 @@ def variants(steps: int) -> dict[str, Variant]:
         "humangs": Variant(run(ours)),
         "pooling over all views": Variant(run(ours.with_conventions(pool="all")), "humangs", "pooling"),
         "no shells": Variant(run(bare), "humangs", "shells (ours)"),
-        "no global token": Variant(run(part("encoder", transformer=transformer)), "humangs", "global token"),
-        "back-projection, another seed": Variant(run(plain, seed=1), "back-projection", "noise"),
-        "humangs, another seed": Variant(run(ours, seed=1), "humangs", "noise"),
-        "no photo colours": Variant(run(gray), "no shells", "photo colours (ours)"),
+        "no global token": Variant(run(ours.with_parts(encoder=tokenless)), "humangs", "global token"),
+        "back-projection, another seed": Variant(run(plain, seed=1), "back-projection", NOISE),
+        "humangs, another seed": Variant(run(ours, seed=1), "humangs", NOISE),
+        "no photo colours": Variant(run(ours.with_parts(**gray)), "no shells", "photo colours (ours)"),
         "canonical frame": Variant(
-            run(bare.with_parts(decoder=replace(parts.decoder, frame="canonical"))), "no shells", "normal frame (ours)"
+            run(bare.with_parts(decoder=replace(decoder, frame="canonical"))), "no shells", "normal frame (ours)"
         ),
-        "all tokens": Variant(
-            run(ours.with_conventions(tokens="all").with_execution(token_capacity=0)),
-            "humangs",
-            "foreground tokens (ours)",
-        ),
-        "features of four depths": Variant(run(upsampled("intermediate")), "features of the last layer", "depths"),
-        "features of the last layer": Variant(run(upsampled("final"))),
-        "1 Gaussian a vertex": Variant(run(part("decoder", tight=1, free=0)), "humangs", "Gaussians a vertex"),
-        "1 + 4 Gaussians a vertex": Variant(run(part("decoder", free=4)), "1 Gaussian a vertex", "Gaussians a vertex"),
-        "1 + 8 Gaussians a vertex": Variant(run(part("decoder", free=8)), "1 Gaussian a vertex", "Gaussians a vertex"),
-        "tightness 0": Variant(run(ours, loss=LossConfig(tightness=0.0)), "humangs", "tightness"),
-        "tightness 10": Variant(run(ours, loss=LossConfig(tightness=10.0)), "humangs", "tightness"),
+        "all tokens": Variant(run(everywhere), "humangs", "foreground tokens (ours)"),
+        "features of the last layer": Variant(upsampled("final")),
+        "features of four depths": Variant(upsampled("intermediate"), "features of the last layer", "depths"),
+        "1 Gaussian a vertex": Variant(per_vertex(0)),
+        "1 + 4 Gaussians a vertex": Variant(per_vertex(4), "1 Gaussian a vertex", "Gaussians a vertex"),
+        "1 + 8 Gaussians a vertex": Variant(per_vertex(8), "1 Gaussian a vertex", "Gaussians a vertex"),
+        "tightness 0": Variant(tight(0.0), "humangs", "tightness"),
+        "tightness 10": Variant(tight(10.0), "humangs", "tightness"),
         "humangs, 1 photo": Variant(run(ours, 1)),
     }
     for name, model in systems.items():
-        if name not in ("humangs", "back_projection", "cross_attention"):
+        if name not in ("humangs", "back_projection", "cross_attention", *PER_PERSON):
             alone = name in ONE_PHOTO
             against = "humangs, 1 photo" if alone else "humangs"
             found[name] = Variant(run(model, 1 if alone else PHOTOS), against, "systems")
@@ -199,11 +199,9 @@ def score(variables: Any, body: Any, config: Any, people: Any, count: int) -> di
     """Means over people of `TARGETS` views each, with that number of photos."""
     from humangs_jax.training.validation import validate, validation_examples
 
-    own = config.views.input_counts[0]
-    capacity = -(-config.model.execution.token_capacity * count // own)
     compared = dataclasses.replace(
         config,
-        model=config.model.with_execution(token_capacity=capacity),
+        model=config.model.with_execution(token_capacity=0),
         views=dataclasses.replace(config.views, input_counts=(count,), target_count=TARGETS),
     )
     numbers, _ = validate(variables, body, validation_examples(people, compared, len(people)), compared)

@@ -232,16 +232,10 @@ def text_of(result: dict[str, Any]) -> str:
             ]
             for name, x in networks.items()
         ]
+        printed = {name: ANIMATION[name][3] or 0.0 for name in (OURS, "LHM (single view)")}
         lines += [
-            [
-                f"{name}, printed seconds",
-                "",
-                "",
-                "",
-                significant(ANIMATION[name][3]),
-                f"{ANIMATION[name][3] / ANIMATION[OURS][3]:.1f}",
-            ]
-            for name in (OURS, "LHM (single view)")
+            [f"{name}, printed seconds", "", "", "", significant(x), f"{x / printed[OURS]:.1f}"]
+            for name, x in printed.items()
         ]
         texts += [
             "Whole networks in published sizes, all patches tokens: operations counted, not run. The last rows are the paper's "

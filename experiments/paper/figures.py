@@ -134,6 +134,8 @@ def features(systems: dict[str, Any], networks: Any, arguments: argparse.Namespa
     methods = [weights_method(*systems[name]) for name in DEPTHS]
     for index in range(len(people.names)):
         case = people.load(index)
+        if case.truth.masks is None:
+            raise ValueError(f"{case.name}: the patches of a person are found by masks, and there are none")
         without, with_them = (method(case, 1.0).images for method in methods)
         for truth, mask, a, b in zip(case.truth.images, case.truth.masks, without, with_them, strict=True):
             side = max(1, truth.shape[0] // PATCHES)
@@ -190,12 +192,14 @@ def driven(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace
     rows = []
     for index in range(min(SHOWN, len(people.names))):
         case = people.load(index)
+        if case.inputs is None:
+            raise ValueError(f"{case.name}: no photos to reconstruct from")
+        own = jax.tree.map(lambda x: x[:1], case.inputs.poses)
         avatar, camera = reconstruct(*weights, case.inputs), case.inputs.cameras[0]
         row = [case.inputs.images[0]]
         for step in range(1, SHOWN + 1):
             poses = others.load((index + step) % len(others.names)).truth.poses
             pose = jax.tree.map(lambda x: x[-1:], poses)  # the last one: an unseen pose where there is one
-            own = jax.tree.map(lambda x: x[:1], case.inputs.poses)
             standing = replace(pose, translation=own.translation)  # where the person stood, before the same camera
             cameras = jax.tree.map(lambda x: x[None], camera)
             row.append(np.clip(np.asarray(next(iter(draw(avatar, standing, cameras, jnp.ones(3)))).rgb), 0, 1))

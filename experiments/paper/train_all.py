@@ -25,6 +25,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.paper.bench import (
+    NOISE,
     PAGE,
     SCORES,
     folder_of,
@@ -153,7 +154,7 @@ def table(rows: Mapping[str, Any], queue: Mapping[str, Any], settings: Mapping[s
         cells += [f"{scores[key]:.{digits}f}" for key, (_, digits) in SCORES.items()]
         if against in rows:
             change = scores["psnr_mask"] - headline(rows[against])["psnr_mask"]
-            said = "noise" if queue[name].claim == "noise" else verdict(change, noise(rows, "psnr_mask"))
+            said = NOISE if queue[name].claim == NOISE else verdict(change, noise(rows, "psnr_mask"))
             cells += [against, f"{change:+.2f}", said]
         else:
             cells += ["", "", ""]
