@@ -153,26 +153,25 @@ def view_counts(name: str, config: Any) -> tuple[int, ...]:
     return (1, 2, PHOTOS, 6) if "global token" in name or name == "humangs" else (PHOTOS,)
 
 
-def train_variant(config: Any, out: Path, bank: Any, validation: Any, views: tuple[int, ...]) -> dict[str, Any] | None:
+def train_variant(
+    config: Any, out: Path, people: Any, body: Any, validation: Any, views: tuple[int, ...]
+) -> dict[str, Any] | None:
     """Train in the folder `out`, or go on there, and score; None if it was interrupted.
 
-    validation: a `CaptureCache`. Returns scores by number of photos, steps, parameters, CPU and wall seconds of all calls.
+    people: a `sources.MakeSource`; body: the model of theirs and of `validation`, a `CaptureCache`. Returns scores by number of
+    photos, steps, parameters, CPU and wall seconds of all calls.
     """
     import json
 
     import jax
 
     from experiments.common.results import write_json
-    from humangs_jax.body.library import load_body
     from humangs_jax.data.views import gaussian_body
-    from humangs_jax.people.on_the_fly import OnTheFlyConfig
     from humangs_jax.training.loop import train
-    from humangs_jax.training.sources import on_the_fly_people
 
-    body, clock = load_body(), out / "seconds.json"
+    clock = out / "seconds.json"
     before = json.loads(clock.read_text()) if clock.exists() else {"cpu": 0.0, "wall": 0.0}
     cpu, wall = time.process_time(), time.perf_counter()
-    people = on_the_fly_people(bank, OnTheFlyConfig())
     state = train(config, body, people, out, progress=False)
     spent = {
         "cpu": before["cpu"] + time.process_time() - cpu,

@@ -2,7 +2,8 @@
 
     python experiments/paper/train_all.py --out runs/paper --people 64 --budget 8          # hours; the same command goes on
     python experiments/paper/train_all.py --out runs/paper --bank people.npz --validation VALIDATION --steps 20000 --budget 40
-    python experiments/paper/train_all.py ... --only back-projection cross-attention
+    python experiments/paper/train_all.py --out runs/paper --data TRAINING --validation OTHERS --budget 40     # your people
+    python experiments/paper/train_all.py --out runs/paper_quick --quick                                     # minutes
 
 Each variant of `bench.variants` has the same number of steps, people, views and losses; the learning rate ends at 0. What is done
 stays in OUT: finished variants are not repeated, an unfinished one goes on from its last checkpoint, also after Ctrl-C or a kill.
@@ -10,7 +11,8 @@ stays in OUT: finished variants are not repeated, an unfinished one goes on from
 variant, and two seeds of two of them say how large noise is: a difference that is no larger is called so.
 
 People are rendered on the fly from a bank of training seeds, the same ones for all; scores are of validation people: captures
-with at least 4 + 6 views of one pose. Both are made once in OUT unless given.
+with at least 4 + 6 views of one pose. Both are made once in OUT unless given. --quick trains the first two variants for 20 steps,
+which says that everything runs and nothing else.
 """
 
 import argparse
@@ -49,14 +51,21 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=3000, help="of each variant")
     parser.add_argument("--people", type=int, default=64, help="people of the bank that is made")
     parser.add_argument("--bank", type=Path, help="the people.npz of another run instead")
+    parser.add_argument("--data", type=Path, help="captures or a data set (docs/datasets.md) to train on instead")
+    parser.add_argument("--body", type=Path, help="body model of --data and --validation")
     parser.add_argument("--validation", type=Path, help="captures of other people; made if not given")
     parser.add_argument("--validated", type=int, default=VALIDATED, help="how many of them")
     parser.add_argument("--only", nargs="+", help="names of the variants to train; all if not given")
+    parser.add_argument("--quick", action="store_true", help="20 steps of the first two variants on 4 people")
     parser.add_argument("--list", action="store_true", help="print the variants and end")
     parser.add_argument("--page", type=Path, nargs="?", const=PAGE, help="write the table paper of this page")
     arguments = parser.parse_args()
+    if arguments.data is not None and arguments.validation is None:
+        parser.error("--data needs --validation: people of the same kind to compare on")
     if arguments.steps < 1 or arguments.people < 1 or (arguments.budget is not None and arguments.budget <= 0):
         parser.error("--steps and --people must be at least 1, --budget positive")
+    if arguments.quick:
+        arguments.steps, arguments.people, arguments.validated = 20, 4, 2
     from humangs_jax.core.allocator import keep_freed_memory
 
     keep_freed_memory()
@@ -64,7 +73,7 @@ def main() -> None:
     if arguments.list:
         print("\n".join(queue))
         return
-    names = arguments.only or list(queue)
+    names = arguments.only or list(queue)[: 2 if arguments.quick else None]
     if unknown := [name for name in names if name not in queue]:
         parser.error(f"--only {unknown[0]!r}: expected names of {', '.join(queue)}")
     run(arguments, queue, names, parser)
@@ -76,9 +85,10 @@ def run(arguments: argparse.Namespace, queue: Mapping[str, Any], names: list[str
 
     from experiments.common.results import check_section, publish, write_json
     from experiments.evaluation.results import file_digest
-    from humangs_jax.body.library import load_body
+    from humangs_jax.data.datasets.bodies import FileBody
     from humangs_jax.data.loader import CaptureCache, find_captures
     from humangs_jax.people.bank import load_bank
+    from humangs_jax.training.sources import on_the_fly_people, people_on_disk
 
     if arguments.page:
         check_section(arguments.page, TABLE)
@@ -86,17 +96,21 @@ def run(arguments: argparse.Namespace, queue: Mapping[str, Any], names: list[str
         timer = threading.Timer(3600 * arguments.budget, os.kill, (os.getpid(), signal.SIGTERM))
         timer.daemon = True
         timer.start()
-    bank_file, folder = made_people(arguments)
+    bank, folder = made_people(arguments)
     folders = find_captures(folder)[: arguments.validated]
-    settings = {"steps": arguments.steps, "bank": file_digest(bank_file), "validation": [x.name for x in folders]}
+    trained_on = str(arguments.data) if bank is None else file_digest(bank)
+    settings = {"steps": arguments.steps, "people": trained_on, "validation": [x.name for x in folders]}
     path = arguments.out / "results.json"
     rows = kept(path, settings, parser)
-    bank, unseen = load_bank(bank_file), CaptureCache(folders, load_body())
+    body = FileBody.load(arguments.body)
+    people = people_on_disk(arguments.data, body) if bank is None else on_the_fly_people(load_bank(bank))
+    unseen = CaptureCache(folders, body.model)
     for name in names:
         if name in rows:
             continue
         place = arguments.out / folder_of(name)
-        row = train_variant(queue[name].config, place, bank, unseen, view_counts(name, queue[name].config))
+        views = view_counts(name, queue[name].config)
+        row = train_variant(queue[name].config, place, people, body.model, unseen, views)
         if row is None:
             print(f"interrupted in {name!r}: the same command goes on there", file=sys.stderr)
             break
@@ -110,13 +124,13 @@ def run(arguments: argparse.Namespace, queue: Mapping[str, Any], names: list[str
             publish(arguments.page, TABLE, text, {"settings": settings, "runs": rows})
 
 
-def made_people(arguments: argparse.Namespace) -> tuple[Path, Path]:
-    """The bank of people to train on, and the folder of those to compare on; made in OUT unless given."""
+def made_people(arguments: argparse.Namespace) -> tuple[Path | None, Path]:
+    """The bank of people to train on (None with --data), and the folder of those to compare on; made in OUT unless given."""
     from humangs_jax.body.library import load_body
 
     arguments.out.mkdir(parents=True, exist_ok=True)
     bank, folder = arguments.bank, arguments.validation
-    if bank is None:
+    if bank is None and arguments.data is None:
         from humangs_jax.people.bank import build_bank, save_bank
         from humangs_jax.people.seeds import SPLITS
 
