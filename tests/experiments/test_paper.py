@@ -1,10 +1,13 @@
 """The experiments of the paper: variants that belong together, differences within noise, tables."""
 
 import argparse
+import json
+import sys
 
+import numpy as np
 import pytest
 
-from experiments.paper import bench, cost, tables, train_all
+from experiments.paper import bench, cost, figures, tables, train_all
 
 
 @pytest.fixture(scope="module")
@@ -99,3 +102,42 @@ def test_a_cost_table_has_the_ratio_of_the_readers():
         "| lhm | 4 | 10 | 100 | 8.00 | 4.0 |" in text
         and "| LHM (single view), printed seconds |  |  |  | 4.6 | 15.8 |" in text
     )
+
+
+@pytest.mark.slow
+def test_the_cost_of_the_readers_is_measured(tmp_path, monkeypatch):
+    files = tmp_path / "cost.json", tmp_path / "cost.png"
+    command = ["cost.py", "--quick", "--repeats", "1", "--json", str(files[0]), "--image", str(files[1])]
+    monkeypatch.setattr(sys, "argv", command)
+    cost.main()
+    rows = json.loads(files[0].read_text())["rows"]
+    assert [(row["views"], row["vertices"]) for row in rows] == [(1, 1000), (2, 1000), (1, 3000)]
+    attention = [row["cross-attention"]["operations"] for row in rows]
+    tokens, width = 8 * 8, 128
+    by_hand = 2 * 1000 * (39 * width + 2 * width**2 + 8 * width**2) + 4 * tokens * width**2 + 4 * 1000 * tokens * width
+    assert attention[0] == pytest.approx(by_hand, rel=0.01)
+    assert all(row["back-projection"]["operations"] < 0.02 * row["cross-attention"]["operations"] for row in rows)
+    assert files[1].stat().st_size > 1000
+
+
+def test_patches_are_those_that_the_person_fills():
+    mask = np.zeros((32, 32))
+    mask[8:20, 8:16] = 1
+    found = figures.patches(mask, 8)
+    assert [(rows.start, columns.start) for rows, columns in found] == [(8, 8)]  # the one below is half full
+    truth = np.zeros((32, 32, 3))
+    assert figures.patch_error(truth, truth + 0.5, found[0]) == pytest.approx(0.25)
+
+
+def test_photos_of_varying_poses_are_of_as_many_poses_as_there_are(tmp_path, monkeypatch):
+    from humangs_jax.data import capture
+    from humangs_jax.data.loading import captures
+
+    frames = argparse.Namespace(frames=np.repeat([0, 1, 2], 4))
+    monkeypatch.setattr(captures, "find_captures", lambda folder: [folder / "person"])
+    monkeypatch.setattr(capture, "load_capture", lambda folder: frames)
+    chosen = figures.varied(tmp_path, 4)["person"]
+    assert frames.frames[chosen["context"]].tolist() == [0, 1, 0, 1] and len(set(chosen["context"])) == 4
+    assert frames.frames[chosen["target"]].tolist() == [2] * 4  # an unseen pose
+    (tmp_path / "person" / "held_out").mkdir(parents=True)
+    assert figures.varied(tmp_path, 4) is None

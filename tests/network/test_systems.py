@@ -54,7 +54,7 @@ def close(a, b, bound=2e-5):
         np.testing.assert_allclose(x, y, atol=bound)
 
 
-@pytest.mark.parametrize("name", OURS)
+@pytest.mark.parametrize("name", ["cross_attention", "lhm_plus", "gst", "ghg"])
 def test_each_makes_gaussians_that_can_be_posed(name):
     config, inputs = small_system(name), photos(name)
     shapes = jax.eval_shape(lambda v: apply_humangs(v, inputs, config)[0], random_variables(config))
@@ -138,7 +138,7 @@ def test_attention_needs_a_token_a_patch_and_whole_heads():
 
 def test_neighbours_along_the_curve_are_neighbours_in_space():
     positions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (512, 3)), jnp.float32)
-    ranks = along_curve(positions)
+    ranks = jax.jit(along_curve)(positions)
     assert sorted(ranks.tolist()) == list(range(512))
     ordered = np.asarray(positions)[np.argsort(ranks)]
     steps = np.linalg.norm(np.diff(ordered, axis=0), axis=-1).mean()
@@ -175,6 +175,7 @@ def test_a_body_that_has_no_room_in_the_groups_is_refused():
         jax.eval_shape(lambda v: decode(v, tokens, inputs, config), random_variables(config))
 
 
+@pytest.mark.slow
 def test_a_seen_texel_has_the_colour_of_the_pixel_that_sees_it_best_and_every_mean_lies_on_a_shell():
     config, inputs = small_system("ghg"), photos("ghg")
     textures = read({}, encode({}, inputs, config), inputs, config)
@@ -210,13 +211,15 @@ def test_a_seen_texel_has_the_colour_of_the_pixel_that_sees_it_best_and_every_me
 
 
 def test_unseen_texels_are_filled_from_their_neighbours():
-    colors = jnp.zeros((4, 4, 3)).at[0, 0].set(0.8).at[3, 3].set(0.2)
-    seen = jnp.zeros((4, 4), bool).at[0, 0].set(True).at[3, 3].set(True)
-    filled = fill_unseen(colors, seen)
+    colors, seen = np.zeros((4, 4, 3), np.float32), np.zeros((4, 4), bool)
+    colors[0, 0], colors[3, 3] = 0.8, 0.2
+    seen[0, 0] = seen[3, 3] = True
+    fill = jax.jit(fill_unseen)
+    filled = fill(colors, seen)
     close(filled[0, 0], colors[0, 0], bound=0)
-    close(filled[1, 1], jnp.full(3, 0.8))  # of its square of 2 x 2
-    close(filled[0, 3], jnp.full(3, 0.5))  # of the whole map
-    close(fill_unseen(colors, jnp.zeros_like(seen)), jnp.full((4, 4, 3), 0.5))
+    close(filled[1, 1], np.full(3, 0.8))  # of its square of 2 x 2
+    close(filled[0, 3], np.full(3, 0.5))  # of the whole map
+    close(fill(colors, np.zeros_like(seen)), np.full((4, 4, 3), 0.5))
 
 
 def test_shells_and_maps_that_do_not_fit_are_refused():
