@@ -102,7 +102,7 @@ def loss_terms(
         "depth": rendering.depth,
         "spread": drawn.spread,
         "opacities": outputs.gaussians.opacities,
-        "tight_offsets": outputs.tight_offsets,
+        "tight_offsets": outputs.tight_offsets if drawn.tight_offsets is None else drawn.tight_offsets,
         "shell_spread": outputs.shell_spread,
     }
     used = [name for name in terms if name in ALWAYS or getattr(config, name)]
