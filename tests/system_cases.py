@@ -3,6 +3,7 @@
 import dataclasses
 
 from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.systems import SYSTEMS
 from humangs_jax.network.transformer import TransformerConfig
 
@@ -18,6 +19,7 @@ SMALL = {
     "group_size": 16,
     "hidden": WIDTH,
     "widths": (4, 8),
+    "surface_map": SurfaceMap("atlas", 8),
 }
 """Values of the fields of parts, where a part has such a field."""
 

@@ -68,7 +68,7 @@ class PlainPhotos:
 class ShellTextureReader:
     """The textures. shells: ascending distances from the surface, normalised units, the first 0."""
 
-    surface_map: SurfaceMap = SurfaceMap("atlas", 1024)
+    surface_map: SurfaceMap = dataclasses.field(default_factory=lambda: SurfaceMap("atlas", 1024))
     shells: tuple[float, ...] = DISTANCES
 
     def __post_init__(self):

@@ -21,7 +21,7 @@ from humangs_jax.network.grouped import GroupDecoder, GroupReader
 from humangs_jax.network.parts import Driver, Reader
 from humangs_jax.network.pixel_queries import NoReader, QueryDecoder, lvsm_transformer
 from humangs_jax.network.reader import PixelAlignedReader
-from humangs_jax.network.shell_textures import PlainPhotos
+from humangs_jax.network.shell_textures import PlainPhotos, ShellDecoder, ShellTextureReader
 from humangs_jax.network.surface_gaussians import PoseMapDriver, SurfaceDecoder, TextureDriver, TextureReader
 from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.tokenizer import TriplaneConfig
@@ -128,7 +128,8 @@ def cross_attention(size: Size = "published") -> HumanGSConfig:
 def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) -> HumanGSConfig:
     """LHM-style (`two_stream`), LHM-500M's sizes: one photo without its camera and pose.
 
-    Tokens have 16 pixels a side as those of Sapiens. A Gaussian a vertex; vertices lie as close as their 40,000 points.
+    Tokens have 16 pixels a side as those of Sapiens. A Gaussian a vertex; edges of 1 cm give the default body 58,855 vertices,
+    where theirs has 40,000 points.
     """
     if size == "published":
         encoder = _photo_encoder(TransformerConfig(width=1024, class_token=False), patch_size=16)
@@ -168,6 +169,18 @@ def gst(size: Size = "published") -> HumanGSConfig:
     return config.with_parts(reader=reader, decoder=GroupDecoder(group_size=96))
 
 
+def ghg(size: Size = "published") -> HumanGSConfig:
+    """GHG-style (`shell_textures`): copied colours on five shells; no transformer."""
+    published = size == "published"
+    reader = ShellTextureReader(SurfaceMap("atlas", 1024 if published else 64))
+    # texels of the bench are 3 cm wide on the innermost shell
+    decoder = ShellDecoder() if published else ShellDecoder((16, 24, 48), largest_scale=0.03)
+    conventions = dataclasses.replace(
+        Conventions(pixels="person") if published else bench().conventions, tokens="all", longest_edge=None
+    )
+    return HumanGSConfig(Architecture(PlainPhotos(), reader, decoder), conventions)
+
+
 def _photo_encoder(transformer: TransformerConfig, patch_size: int = 8) -> PatchTransformer:
     """Of photos without cameras and poses: nothing reads the neural texture, so it is as small as can be."""
     return PatchTransformer(patch_size, "place", TriplaneConfig(2, 1), transformer, upsampler=None)
@@ -186,6 +199,7 @@ SYSTEMS: dict[str, Callable[[Size], HumanGSConfig]] = {
     "lhm_views": lhm_views,
     "lhm_plus": lhm_plus,
     "gst": gst,
+    "ghg": ghg,
 }
 """By name; each is called with a `Size`."""
 ONE_PHOTO = ("lhm", "gst")

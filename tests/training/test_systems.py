@@ -1,0 +1,37 @@
+"""The comparison systems learn a person by heart, with the same step as the network of the paper."""
+
+import dataclasses
+
+import pytest
+from system_cases import small_system
+
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
+from humangs_jax.data.views import gaussian_body
+from humangs_jax.network.surface_map import SurfaceMap
+from humangs_jax.network.systems import ONE_PHOTO
+from humangs_jax.training.config import tiny
+from humangs_jax.training.state import init_state
+from humangs_jax.training.step import train_step
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cross_attention", "lhm", "lhm_views", "lhm_plus", "gst", "ghg"])
+def test_a_system_learns_one_person(name, body, captures):
+    model = small_system(name)
+    if name == "ghg":  # texels of the tube are wide
+        reader, decoder = model.architecture.reader, model.architecture.decoder
+        model = model.with_parts(
+            reader=dataclasses.replace(reader, surface_map=SurfaceMap("atlas", 16)),
+            decoder=dataclasses.replace(decoder, largest_scale=0.2),
+        )
+    views = ViewSampling(input_counts=(1 if name in ONE_PHOTO else 2,), target_count=2)
+    config = dataclasses.replace(tiny(), model=model, views=views)
+    source = CaptureSource(CaptureCache(captures[:1], body), views, 32, config.target_size)
+    batch, own_body, state = Loader(source, 1).batch_at(0), gaussian_body(body, model), init_state(config)
+    history = []
+    for _ in range(config.steps):
+        state, metrics = train_step(state, batch, own_body, config)
+        history.append({key: float(value) for key, value in metrics.items()})
+    first, last = history[0], history[-1]
+    assert last["skipped"] == last["dropped_tokens"] == last["overflow"] == 0
+    assert last["loss"] < 0.7 * first["loss"]
