@@ -18,7 +18,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import markdown_table, significant, write_json
-from experiments.paper.bench import add_people_options, load_networks, measured, triple
+from experiments.paper.bench import load_networks, measured, triple
 
 SYSTEM = "animatable"
 QUICK_STEPS, QUICK_SIZE = 60, 128
@@ -27,7 +27,10 @@ QUICK_STEPS, QUICK_SIZE = 60, 128
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    add_people_options(parser)
+    parser.add_argument("--people", type=Path, help="captures of several poses, with held_out/")
+    parser.add_argument("--lpips", type=Path, nargs="+", help="weights of LPIPS vgg: BACKBONE and HEADS")
+    parser.add_argument("--quick", action="store_true", help="a synthetic person of 128 pixels, and few steps")
+    parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument("--out", type=Path, help="folder of the fits; default: they are not kept")
     parser.add_argument("--steps", type=int, default=3000, help="of each fit (default 3000; theirs 800,000)")
     parser.add_argument("--size", choices=("bench", "published"), default="bench", help="of the maps and networks")
@@ -60,7 +63,7 @@ def fit_all(arguments: argparse.Namespace, out: Path) -> None:
     networks, rows = load_networks(arguments.lpips), {}
     for capture in find_captures(arguments.people):
         weights, seconds = fit(capture, out / capture.name, arguments.steps, arguments.size)
-        found = measured(weights, capture, 1, arguments.body, networks)
+        found = measured(weights, capture, 1, None, networks)
         if found is not None:
             rows[capture.name] = found | {"fit_s": seconds, "steps": arguments.steps, "size": arguments.size}
     header = ["person", "fit, s", "frame, s", "pose of the capture", "another pose"]
