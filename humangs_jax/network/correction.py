@@ -20,6 +20,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.parts import HumanGSOutputs, Pass, Variables
+from humangs_jax.network.transformer import MOST_LAYERS
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -79,6 +80,11 @@ class CorrectionMLP:
     layers: int = 3
     joints: int = 55
     offset_scale: float = 0.05
+
+    def __post_init__(self):
+        """Raises ValueError for a number of layers that no network has."""
+        if not 1 <= self.layers <= MOST_LAYERS:
+            raise ValueError(f"driver.layers {self.layers}: expected 1 to {MOST_LAYERS}")
 
     def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of the MLP. Raises: ValueError for features or a decoder without what it needs."""

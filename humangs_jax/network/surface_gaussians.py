@@ -48,6 +48,8 @@ COVERAGE, THICKNESS = 0.7, 0.2
 """Standard deviations of a Gaussian along the surface over the distance between texels, and across over along it."""
 OPACITY = 0.9
 """Of Gaussians before corrections."""
+MOST_SCALES = 12
+"""Of a U-Net: the coarsest map of the largest one has two texels."""
 
 
 @pytree_dataclass
@@ -160,6 +162,10 @@ class TextureDriver:
     joints: int = 55
     offset_scale: float = 0.1
 
+    def __post_init__(self):
+        """Raises ValueError for a number of scales that no map has."""
+        _check_scales(self.widths)
+
     def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of the U-Net and the MLP in it."""
         side = 2 ** (len(self.widths) - 1)
@@ -193,6 +199,10 @@ class PoseMapDriver:
     widths: tuple[int, ...] = (64, 128, 256, 512)
     offset_scale: float = 0.05
 
+    def __post_init__(self):
+        """Raises ValueError for a number of scales that no map has."""
+        _check_scales(self.widths)
+
     def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of the U-Nets."""
         side = 2 ** (len(self.widths) - 1)
@@ -208,6 +218,11 @@ class PoseMapDriver:
         maps = surface.texels.interpolate(relative)
         raw = PoseMapModule(self.widths).apply(variables, maps[None])
         return _driven(outputs, cast(Array, raw)[0], self.offset_scale)
+
+
+def _check_scales(widths):
+    if not 1 <= len(widths) <= MOST_SCALES:
+        raise ValueError(f"driver.widths: {len(widths)} scales: expected 1 to {MOST_SCALES}")
 
 
 def _driven(outputs, raw, offset_scale):

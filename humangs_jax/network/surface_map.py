@@ -18,6 +18,8 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 MARGIN = 0.95
 """Share of the side of a view from the front or back that the body takes."""
+MOST_TEXELS = 4096
+"""A side; a file that says more would fill the memory."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +33,11 @@ class SurfaceMap:
 
     kind: Literal["atlas", "front_back"] = "atlas"
     size: int = 512
+
+    def __post_init__(self):
+        """Raises ValueError for a size that no map has."""
+        if not 1 <= self.size <= MOST_TEXELS:
+            raise ValueError(f"surface_map.size {self.size}: expected 1 to {MOST_TEXELS} texels a side")
 
     @property
     def shape(self) -> tuple[int, int]:

@@ -58,13 +58,14 @@ def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
 
 class DrawnTargets(NamedTuple):
     """Renderings of the v targets; those of a `PixelDecoder` have alpha 1 and depth 0 everywhere. spread: (v, h, w)
-    `losses.ray_spread` in square metres, None unless it has a weight. tight_offsets: those that a driver gave, of all targets one
-    after the other; None: those of the outputs count.
+    `losses.ray_spread` in square metres, None unless it has a weight. tight_offsets, opacities: those that a driver gave, of all
+    targets one after the other; None: those of the outputs count.
     """
 
     rendering: Rendering
     spread: Float[Array, "v h w"] | None = None
     tight_offsets: Float[Array, "n t 3"] | None = None
+    opacities: Float[Array, " g"] | None = None
 
 
 def draw_targets(
@@ -118,17 +119,19 @@ def draw_targets(
 
         return jax.lax.map(draw, (projected, opacities, colors, targets.cameras, backgrounds))
 
+    driven = {}
     if config.model.architecture.driver is None:
-        posed, offsets = stage("posed Gaussians", pose_all, outputs), None
+        posed = stage("posed Gaussians", pose_all, outputs)
     else:
         posed, offsets = stage("posed Gaussians", drive_all, outputs)
-        offsets = None if offsets is None else offsets.reshape(-1, *offsets.shape[2:])
+        flat = lambda x: None if x is None else x.reshape(-1, *x.shape[2:])
+        driven = {"tight_offsets": flat(offsets), "opacities": flat(posed.opacities)}
     like = jax.tree.map(lambda x: x[0], posed)
     shapes = replace(posed, opacities=None, colors=None)
     opaque = lambda shapes: replace(shapes, opacities=posed.opacities, colors=posed.colors)
     projected = stage("projected splats", lambda shapes: project_all(opaque(shapes)), shapes)
     drawn = stage("images", draw_all, projected, posed.opacities, posed.colors)
-    return drawn if offsets is None else drawn._replace(tight_offsets=offsets)
+    return drawn._replace(**driven)
 
 
 def _opaque(images):

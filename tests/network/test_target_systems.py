@@ -20,6 +20,7 @@ from humangs_jax.network.config import Architecture
 from humangs_jax.network.correction import CorrectionMLP, corrected
 from humangs_jax.network.humangs import apply_humangs, draw_pixels
 from humangs_jax.network.parts import Driver, PixelDecoder
+from humangs_jax.network.surface_gaussians import PoseMapDriver, TextureDriver
 from humangs_jax.network.surface_map import SurfaceMap, surface_texels
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN
 
@@ -268,6 +269,14 @@ def test_parts_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="class_token: expected false"):
         decoder = small("lvsm").architecture.decoder
         dataclasses.replace(decoder, transformer=dataclasses.replace(BLOCKS, class_token=True))
+    for wrong in (
+        lambda: SurfaceMap(size=10**6),
+        lambda: TextureDriver(widths=(8,) * 99),
+        lambda: PoseMapDriver(widths=()),
+        lambda: CorrectionMLP(layers=10**6),
+    ):
+        with pytest.raises(ValueError, match=r"(surface_map.size|scales|driver.layers).*expected 1 to"):
+            wrong()
     many = small("lca").with_parts(driver=CorrectionMLP(8, 1, joints=5))
     with pytest.raises(ValueError, match=r"driver\.joints 5: the pose has 2 joints"):
         outputs = jax.eval_shape(lambda v: apply_humangs(v, inputs_of("lca"), many)[0], random_variables(many))
