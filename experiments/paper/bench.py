@@ -204,7 +204,10 @@ def score(variables: Any, body: Any, config: Any, people: Any, count: int) -> di
         views=dataclasses.replace(config.views, input_counts=(count,), target_count=TARGETS),
     )
     numbers, _ = validate(variables, body, validation_examples(people, compared, len(people)), compared)
-    return {name: numbers[name] for name in (*SCORES, "fog", "dropped_tokens", "overflow")}
+    names = (*SCORES, "fog", "dropped_tokens", "overflow")
+    return {
+        name: x for name in names if (x := numbers[name]) == x
+    }  # JSON has no NaN: networks that draw pixels have no fog
 
 
 def headline(row: Mapping[str, Any]) -> dict[str, float]:

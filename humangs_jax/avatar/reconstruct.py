@@ -32,9 +32,11 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
 
     The photos are brought to the network's image size (white, centred square), the body to the vertices that the weights
     want (`gaussian_body`), and the token capacity to what these photos need. Up to 8 views each number has a program of
-    its own, beyond that at most a fifth of the views is padding.
+    its own, beyond that at most a fifth of the views is padding. Of a network with a driver this is the avatar before any
+    correction of a frame, see `avatar.targets`.
 
-    Raises: ValueError if the capture has no view, or values that are not finite or out of range, naming the array.
+    Raises: ValueError if the network makes no Gaussians, the capture has no view, or values that are not finite or out of range,
+    naming the array.
     """
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)

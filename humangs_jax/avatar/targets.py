@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.animate import skin
-from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import draw_gaussians
 from humangs_jax.avatar.reconstruct import fit_buffers, make_avatar
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
@@ -29,17 +28,16 @@ from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 
 
-def frame_avatar(
+def frame_outputs(
     variables: Variables,
     outputs: HumanGSOutputs,
     body: BodyModel,
     betas: Float[Array, " s"],
     pose: BodyPose,
     config: HumanGSConfig,
-) -> Avatar:
-    """The avatar of one frame: corrected by the driver for its pose, and still to be posed by `animate.skin`."""
-    driven = drive_outputs(variables, outputs, pose, person_vertices(body, betas, pose), config)
-    return make_avatar(driven, body, betas, config)
+) -> HumanGSOutputs:
+    """Canonical Gaussians of one frame, corrected by the driver for its pose; `make_avatar` and `animate.skin` pose them."""
+    return drive_outputs(variables, outputs, pose, person_vertices(body, betas, pose), config)
 
 
 def target_queries(body: BodyModel, targets: SubjectViews, config: HumanGSConfig) -> Float[Array, "v h w 9"]:
@@ -118,4 +116,5 @@ def _pixels(variables, outputs, body, target, config):
 
 @functools.partial(jax.jit, static_argnames="config")
 def _posed(variables, outputs, body, betas, pose, config):
-    return skin(frame_avatar(variables, outputs, body, betas, pose, config), pose)
+    driven = frame_outputs(variables, outputs, body, betas, pose, config)
+    return skin(make_avatar(driven, body, betas, config), pose)

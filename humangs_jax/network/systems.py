@@ -13,12 +13,16 @@ from typing import Literal
 
 from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
+from humangs_jax.network.correction import CorrectionMLP
 from humangs_jax.network.cross_attention import CrossAttentionReader
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.grouped import GroupDecoder, GroupReader
+from humangs_jax.network.parts import Driver, Reader
+from humangs_jax.network.pixel_queries import NoReader, QueryDecoder, lvsm_transformer
 from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.shell_textures import PlainPhotos, ShellDecoder, ShellTextureReader
+from humangs_jax.network.surface_gaussians import PoseMapDriver, SurfaceDecoder, TextureDriver, TextureReader
 from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
@@ -49,6 +53,59 @@ def bench() -> HumanGSConfig:
 def humangs(size: Size = "published") -> HumanGSConfig:
     """The paper's network; on the bench the one that we ship, in small."""
     return presets.paper() if size == "published" else bench()
+
+
+def lvsm(size: Size = "published") -> HumanGSConfig:
+    """LVSM-style (`pixel_queries`), decoder-only, 24 layers. Novel views only: it cannot be animated."""
+    encoder, conventions = PlainPhotos(patch_size=8), Conventions(image_size=256)
+    if size == "published":
+        return HumanGSConfig(
+            Architecture(encoder, NoReader(), QueryDecoder()), conventions, Execution(dtype="bfloat16")
+        )
+    blocks = dataclasses.replace(BENCH_TRANSFORMER, class_token=False)
+    conventions = dataclasses.replace(bench().conventions, tokens="all", pixels="all")
+    return HumanGSConfig(Architecture(encoder, NoReader(), QueryDecoder(blocks)), conventions)
+
+
+def humanram(size: Size = "published") -> HumanGSConfig:
+    """HumanRAM-style (`pixel_queries`): LVSM of 12 layers with the neural texture, and a convolutional decoder, at 512 pixels."""
+    config = lvsm(size)
+    if size == "published":
+        decoder = QueryDecoder(lvsm_transformer(12), TriplaneConfig(), fusion=256)
+        return config.with_parts(decoder=decoder).with_conventions(image_size=512)
+    blocks = dataclasses.replace(BENCH_TRANSFORMER, class_token=False)
+    return config.with_parts(decoder=QueryDecoder(blocks, TriplaneConfig(resolution=32, channels=8), fusion=32))
+
+
+def giga(size: Size = "published") -> HumanGSConfig:
+    """GIGA-style (`surface_gaussians`): a texture of 512 texels, a U-Net for every pose, one Gaussian a texel."""
+    driver = TextureDriver() if size == "published" else TextureDriver((16, 32, 64, BENCH_WIDTH), BENCH_WIDTH, 8)
+    surface = SurfaceMap("atlas", 512 if size == "published" else 96)
+    return _on_the_surface(size, TextureReader(surface), surface, driver)
+
+
+def animatable(size: Size = "published") -> HumanGSConfig:
+    """Animatable-Gaussians-style (`surface_gaussians`): maps of front and back, fitted to ONE person: train it on that person's
+    photos alone, and anew for the next. Photos are no input: those that reconstruction or evaluation give are not looked at.
+    """
+    driver = PoseMapDriver() if size == "published" else PoseMapDriver((16, 32, 64))
+    surface = SurfaceMap("front_back", 1024 if size == "published" else 96)
+    return _on_the_surface(size, NoReader(), surface, driver)
+
+
+def lca(size: Size = "published") -> HumanGSConfig:
+    """LCA-style: LHM with the tokens of all photos for the canonical Gaussians, and an MLP that corrects them for every driving
+    frame (`correction`). Their sizes are not known.
+    """
+    driver = CorrectionMLP() if size == "published" else CorrectionMLP(BENCH_WIDTH, 2)
+    return lhm_views(size).with_parts(driver=driver)
+
+
+def _on_the_surface(size: Size, reader: Reader, surface: SurfaceMap, driver: Driver) -> HumanGSConfig:
+    """Systems whose Gaussians are texels: their photos and bodies are those of the others."""
+    conventions = Conventions(pixels="person") if size == "published" else bench().conventions
+    parts = Architecture(PlainPhotos(), reader, SurfaceDecoder(surface), driver)
+    return HumanGSConfig(parts, dataclasses.replace(conventions, tokens="all"))
 
 
 def back_projection(size: Size = "published") -> HumanGSConfig:
@@ -131,6 +188,11 @@ def _photo_encoder(transformer: TransformerConfig, patch_size: int = 8) -> Patch
 
 SYSTEMS: dict[str, Callable[[Size], HumanGSConfig]] = {
     "humangs": humangs,
+    "lvsm": lvsm,
+    "humanram": humanram,
+    "giga": giga,
+    "animatable": animatable,
+    "lca": lca,
     "back_projection": back_projection,
     "cross_attention": cross_attention,
     "lhm": lhm,

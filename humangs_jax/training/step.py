@@ -101,8 +101,8 @@ def loss_terms(
         "alpha": rendering.alpha,
         "depth": rendering.depth,
         "spread": drawn.spread,
-        "opacities": outputs.gaussians.opacities,
-        "tight_offsets": outputs.tight_offsets,
+        "opacities": outputs.gaussians.opacities if drawn.opacities is None else drawn.opacities,
+        "tight_offsets": outputs.tight_offsets if drawn.tight_offsets is None else drawn.tight_offsets,
         "shell_spread": outputs.shell_spread,
     }
     used = [name for name in terms if name in ALWAYS or getattr(config, name)]
