@@ -91,7 +91,10 @@ def run(arguments: argparse.Namespace, queue: Mapping[str, Any], names: list[str
     from humangs_jax.training.sources import on_the_fly_people, people_on_disk
 
     if arguments.page:
-        check_section(arguments.page, TABLE)
+        try:
+            check_section(arguments.page, TABLE)
+        except (ValueError, OSError) as error:
+            parser.error(str(error))
     if arguments.budget is not None:
         timer = threading.Timer(3600 * arguments.budget, os.kill, (os.getpid(), signal.SIGTERM))
         timer.daemon = True

@@ -162,11 +162,11 @@ def gst(size: Size = "published") -> HumanGSConfig:
         encoder = _photo_encoder(
             TransformerConfig(width=1280, layers=32, class_token=False, head_width=80), patch_size=16
         )
-        conventions = Conventions(image_size=256)
-        return HumanGSConfig(Architecture(encoder, GroupReader(), GroupDecoder(group_size=420)), conventions)
+        conventions = Conventions(image_size=256, body_vertices=6890)  # those of SMPL
+        return HumanGSConfig(Architecture(encoder, GroupReader(), GroupDecoder()), conventions)
     config = lhm("bench")
     reader = GroupReader(26, BENCH_WIDTH, 2, 2, BENCH_HEAD)
-    return config.with_parts(reader=reader, decoder=GroupDecoder(group_size=96))
+    return config.with_parts(reader=reader, decoder=GroupDecoder(group_size=128))
 
 
 def ghg(size: Size = "published") -> HumanGSConfig:
