@@ -18,6 +18,7 @@ SMALL = {
     "groups": 4,
     "group_size": 16,
     "hidden": WIDTH,
+    "initial_log_scale": -2.0,  # 13 cm: vertices of the bodies of tests are that far apart
     "widths": (4, 8),
     "surface_map": SurfaceMap("atlas", 8),
 }

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 from system_cases import small_system
 
@@ -32,6 +33,11 @@ def test_a_system_learns_one_person(name, body, captures):
     for _ in range(config.steps):
         state, metrics = train_step(state, batch, own_body, config)
         history.append({key: float(value) for key, value in metrics.items()})
-    first, last = history[0], history[-1]
-    assert last["skipped"] == last["dropped_tokens"] == last["overflow"] == 0
-    assert last["loss"] < 0.7 * first["loss"]
+    assert history[-1]["skipped"] == history[-1]["dropped_tokens"] == history[-1]["overflow"] == 0
+    # a half of the steps has random backgrounds, before which errors are others
+    mean = lambda steps, term: float(np.mean([metrics[term] for metrics in steps]))
+    first, last = (
+        {term: mean(steps, term) for term in ("squared", "silhouette")} for steps in (history[:10], history[-10:])
+    )
+    print(name, first, last)
+    assert last["squared"] < 0.8 * first["squared"] and last["silhouette"] < 0.8 * first["silhouette"]
