@@ -37,9 +37,11 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
 
     The photos are brought to the network's image size (white, centred square), the body to the vertices that the weights
     want (`gaussian_body`), and the token capacity to what these photos need. Up to 8 views each number has a program of
-    its own, beyond that at most a fifth of the views is padding.
+    its own, beyond that at most a fifth of the views is padding. Of a network with a driver this is the avatar before any
+    correction of a frame, see `avatar.targets`.
 
-    Raises: ValueError if the capture has no view, or values that are not finite or out of range, naming the array.
+    Raises: ValueError if the network makes no Gaussians, the capture has no view, or values that are not finite or out of range,
+    naming the array.
     """
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
@@ -103,12 +105,19 @@ def reconstruct_views(
 
 
 def make_avatar(outputs: HumanGSOutputs, body: BodyModel, betas: Float[Array, " s"], config: HumanGSConfig) -> Avatar:
-    """Canonical Gaussians on the body of a person: what can be posed."""
+    """Canonical Gaussians on the body of a person: what can be posed. Raises: ValueError if there are none."""
+    if outputs.is_empty:
+        name = type(config.architecture.decoder).__name__
+        raise ValueError(
+            f"{name} draws images of targets without Gaussians: it makes no avatar, and nothing to animate"
+        )
     rest = shape_body(body, betas)
-    per_vertex = outputs.gaussians.means.shape[0] // body.template.shape[0]
+    weights, per_vertex = outputs.skinning_weights, outputs.gaussians.means.shape[0] // body.template.shape[0]
+    if weights is None:
+        weights = corrected_skinning_weights(body.skinning_weights, outputs.skinning_offsets, per_vertex)
     return Avatar(
         gaussians=outputs.gaussians,
-        skinning_weights=corrected_skinning_weights(body.skinning_weights, outputs.skinning_offsets, per_vertex),
+        skinning_weights=weights,
         rest_vertices=rest.vertices,
         rest_joints=rest.joints,
         faces=body.faces,

@@ -11,9 +11,30 @@ package another (`humangs_jax.body.library.load_body`).
 import jax.numpy as jnp
 
 from humangs_jax.body import skinning
-from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
+
+
+@pytree_dataclass
+class Texels:
+    """Which point of the body's surface each texel of a map shows; row 0 on top.
+
+    corners: (h, w, 3) vertices of the texel's face. weights: (h, w, 3) of these vertices, of sum 1; 0 where it shows nothing.
+    """
+
+    corners: Int[Array, "h w 3"]
+    weights: Float[Array, "h w 3"]
+
+    @property
+    def covered(self) -> Bool[Array, "h w"]:
+        """Which texels show the surface."""
+        return jnp.any(self.weights > 0, axis=-1)
+
+    def interpolate(self, values: Float[Array, "n c"]) -> Float[Array, "h w c"]:
+        """Values at vertices, as the texels have them; 0 where a texel shows nothing."""
+        a, b, c = (self.weights[..., i : i + 1] * values[self.corners[..., i]] for i in range(3))
+        return a + b + c
 
 
 @pytree_dataclass
@@ -29,6 +50,7 @@ class BodyModel:
     uvs, uv_faces: (u, 2) texture coordinates (v up) and (f, 3) indices into them, or None.
     collapse_order, collapse_into: (n,) or None: progressive decimation, see `humangs_jax.body.decimation`.
     spacing: (n,) or None: distance to neighbouring vertices relative to the mesh that was subdivided, see `body.subdivision`.
+    texels: a map of the surface for networks that work on one, see `network.surface_map`; or None.
     parents: static, parent of each joint, -1 for the root. joint_names, shape_names, name: static.
     """
 
@@ -43,6 +65,7 @@ class BodyModel:
     collapse_order: Int[Array, " n"] | None = None
     collapse_into: Int[Array, " n"] | None = None
     spacing: Float[Array, " n"] | None = None
+    texels: Texels | None = None
     parents: tuple[int, ...] = static_field(default=())
     joint_names: tuple[str, ...] = static_field(default=())
     shape_names: tuple[str, ...] = static_field(default=())

@@ -39,8 +39,13 @@ def _plain(value: Any, kind: bool = False) -> Any:
         annotations = typing.get_type_hints(type(value))
         named = {KIND: f"{type(value).__module__}.{type(value).__qualname__}"} if kind else {}
         names = [field.name for field in dataclasses.fields(value)]
-        return named | {name: _plain(getattr(value, name), _is_protocol(annotations[name])) for name in names}
+        return named | {name: _plain(getattr(value, name), _holds_part(annotations[name])) for name in names}
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def _holds_part(annotation):
+    """Whether a field holds a part, or a part or None."""
+    return _is_protocol(annotation) or any(map(_is_protocol, typing.get_args(annotation)))
 
 
 def _is_protocol(annotation):

@@ -13,6 +13,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
+from humangs_jax.network.surface_map import surface_texels
 from humangs_jax.rendering.mesh.position_map import (
     BACKGROUND,
     BACKGROUND_DEPTH,
@@ -60,7 +61,8 @@ def pad_views(views: SubjectViews, count: int) -> SubjectViews:
 
 
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
-    """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it.
+    """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it; with the map
+    of its surface where the network works on one.
 
     Its `spacing` is relative to the mesh that the weights were trained with: 1 unless `execution.longest_edge` asks for more.
     """
@@ -69,7 +71,10 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
         body = decimate(body, vertices)
     if edge is not None:
         body = replace(split_long_edges(body, edge), spacing=None)
-    return body if config.execution.longest_edge is None else split_long_edges(body, config.execution.longest_edge)
+    if config.execution.longest_edge is not None:
+        body = split_long_edges(body, config.execution.longest_edge)
+    wanted = config.architecture.surface_map
+    return body if wanted is None else replace(body, texels=surface_texels(body, wanted))
 
 
 def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
@@ -113,6 +118,8 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
         posed_normals=jax.vmap(normals)(posed),
         canonical_normals=normals(rest.vertices),
         spacing=body.spacing,
+        skinning_weights=body.skinning_weights,
+        texels=body.texels,
     )
 
 

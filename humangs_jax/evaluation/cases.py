@@ -13,6 +13,7 @@ import numpy as np
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.avatar.targets import show_targets
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Float, Int
@@ -254,11 +255,14 @@ def avatar_method(avatar: str | Path | Avatar, people: int) -> Method:
 
 
 def weights_method(variables: Variables, config: HumanGSConfig) -> Method:
-    """Reconstruction from the inputs of a case."""
+    """Reconstruction from the inputs of a case; networks that run again for every view are run so, see `avatar.targets`."""
 
     def method(case: Case, background: float) -> Predicted:
         if case.inputs is None:
             raise ValueError(f"{case.name}: no inputs to reconstruct from")
+        if config.architecture.runs_per_target:
+            images, alpha = show_targets(variables, config, case.inputs, case.truth, background)
+            return Predicted(images, alpha, tuple(range(len(images))))
         return draw_views(reconstruct(variables, config, case.inputs), case.truth, background)
 
     return method

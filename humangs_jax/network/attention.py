@@ -1,4 +1,4 @@
-"""Self-attention over the tokens of all views: softmax(q k^T / sqrt(e)) v per head, with normalised q and k.
+"""Attention over the tokens of all views: softmax(q k^T / sqrt(e)) v per head, with normalised q and k.
 
 Tokens that are padding stand at the end; the first `count` ones are attended to. Three exact implementations:
 
@@ -41,12 +41,12 @@ def resolve_implementation(implementation: str, tokens: int, dtype: Any) -> Atte
 
 
 def chunked_attention(
-    q: Float[Array, "l h e"],
+    q: Float[Array, "m h e"],
     k: Float[Array, "l h e"],
     v: Float[Array, "l h e"],
     count: Int[Array, ""] | None,
     query_chunk: int,
-) -> Float[Array, "l h e"]:
+) -> Float[Array, "m h e"]:
     """Exact attention, head by head and one block of queries after the other; softmax statistics in float32 at least."""
     length, heads, width = q.shape
     blocks = -(-length // query_chunk)
@@ -54,7 +54,7 @@ def chunked_attention(
     q, k, v = (jnp.swapaxes(x, 0, 1) for x in (q * width**-0.5, k, v))
     q = jnp.pad(q, ((0, 0), (0, blocks * block - length), (0, 0))).reshape(heads, blocks, block, width)
     statistics = jnp.promote_types(q.dtype, jnp.float32)
-    absent = None if count is None else jnp.arange(length) >= count
+    absent = None if count is None else jnp.arange(k.shape[1]) >= count
 
     @jax.checkpoint
     def attend(queries, keys, values):
@@ -75,15 +75,15 @@ def chunked_attention(
 
 
 def attention(
-    q: Float[Array, "l h e"],
+    q: Float[Array, "m h e"],
     k: Float[Array, "l h e"],
     v: Float[Array, "l h e"],
     count: Int[Array, ""] | None = None,
     implementation: str = "auto",
     query_chunk: int = 1024,
-) -> Float[Array, "l h e"]:
-    """Attention of every token to the first `count` tokens (None: to all)."""
-    resolved = resolve_implementation(implementation, q.shape[0], q.dtype)
+) -> Float[Array, "m h e"]:
+    """Attention of every query to the first `count` tokens (None: to all)."""
+    resolved = resolve_implementation(implementation, max(len(q), len(k)), q.dtype)
     if resolved == "chunked":
         return chunked_attention(q, k, v, count, query_chunk)
     lengths = None if count is None else count.astype(jnp.int32)[None]

@@ -10,8 +10,9 @@ from humangs_jax.core.configuration import knob
 from humangs_jax.network.bilinear import PixelGrid
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.execution import Execution, TokenSelection
-from humangs_jax.network.parts import Decoder, Encoder, Reader
+from humangs_jax.network.parts import Decoder, Driver, Encoder, PixelDecoder, Reader
 from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.vertex_decoder import VertexDecoder
 
 SCALING, EVALUATION = "performance_reconstruction.md", "evaluation.md"
@@ -19,11 +20,15 @@ SCALING, EVALUATION = "performance_reconstruction.md", "evaluation.md"
 
 @dataclasses.dataclass(frozen=True)
 class Architecture:
-    """What the weights are: the parts of the network with their sizes. It fixes the shape of every tensor."""
+    """What the weights are: the parts of the network with their sizes. It fixes the shape of every tensor.
+
+    driver: corrects the Gaussians for every driving frame; None: skinning alone moves them.
+    """
 
     encoder: Encoder = dataclasses.field(default_factory=PatchTransformer)
     reader: Reader = dataclasses.field(default_factory=PixelAlignedReader)
     decoder: Decoder = dataclasses.field(default_factory=VertexDecoder)
+    driver: Driver | None = None
 
     def __post_init__(self):
         """Raises ValueError for parts that do not fit together."""
@@ -33,6 +38,35 @@ class Architecture:
                 raise ValueError("decoder.residual_color needs reader.sample_rgb: there is no photo colour to correct")
             if reader.shells and decoder.frame != "normal":
                 raise ValueError('reader.shells lie along the normals: they need decoder.frame = "normal"')
+        if self.driver is not None and self.draws_pixels:
+            raise ValueError(f"driver: {type(decoder).__name__} makes no Gaussians that it could correct")
+        if len(maps := self._surface_maps) > 1:
+            raise ValueError(f"surface_map: expected one for all parts, got {sorted(map(str, maps))}")
+
+    @property
+    def parts(self) -> tuple[Encoder | Reader | Decoder | Driver, ...]:
+        """Those that there are."""
+        return tuple(part for part in (self.encoder, self.reader, self.decoder, self.driver) if part is not None)
+
+    @property
+    def draws_pixels(self) -> bool:
+        """Whether the decoder makes images and no Gaussians: nothing can be animated or exported."""
+        return isinstance(self.decoder, PixelDecoder)
+
+    @property
+    def runs_per_target(self) -> bool:
+        """Whether a part of the network runs again for every target: see `avatar.targets`."""
+        return self.driver is not None or self.draws_pixels
+
+    @property
+    def surface_map(self) -> SurfaceMap | None:
+        """The map of the body's surface that parts work on."""
+        return next(iter(self._surface_maps), None)
+
+    @property
+    def _surface_maps(self) -> set[SurfaceMap]:
+        wanted = (getattr(part, "surface_map", None) for part in self.parts)
+        return {one for one in wanted if one is not None}
 
 
 def paper_parts(architecture: Architecture) -> tuple[PatchTransformer, PixelAlignedReader, VertexDecoder]:

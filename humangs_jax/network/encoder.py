@@ -1,7 +1,7 @@
 """Photos -> patches -> tokens of all views -> transformer -> feature maps and a global token."""
 
 import dataclasses
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import flax.linen as nn
 import jax
@@ -23,10 +23,12 @@ class PatchTransformer:
     """The paper's encoder: one token per patch of every view, attention over all of them, an upsampler.
 
     patch_size: side of a token's patch, pixels. texture: the neural texture. upsampler: None: the maps are those of the last
-    layer (ablation).
+    layer (ablation). geometry: what a pixel knows besides its colour: its ray and the canonical position seen there, or only its
+    place in the photo, for systems whose photos have neither cameras nor poses.
     """
 
     patch_size: int = 8
+    geometry: Literal["rays_and_positions", "place"] = "rays_and_positions"
     texture: TriplaneConfig = dataclasses.field(default_factory=TriplaneConfig)
     transformer: TransformerConfig = dataclasses.field(default_factory=TransformerConfig)
     upsampler: UpsamplerConfig | None = knob(
@@ -52,7 +54,8 @@ class PatchTransformer:
 
     def apply(self, variables: Variables, inputs: HumanGSInputs, run: Pass) -> tuple[Encoding, Variables]:
         """See `parts.Encoder`. Raises: ValueError if images and cameras differ in size, or are not made of whole patches."""
-        pixels = run.stage("pixels", lambda: encoder_pixels(inputs, run))
+        see = encoder_pixels if self.geometry == "rays_and_positions" else photo_pixels
+        pixels = run.stage("pixels", lambda: see(inputs, run))
         packing, dropped = None, jnp.zeros((), jnp.int32)
         if run.config.tokens == "foreground":
             touched = touched_patches(inputs, self.patch_size)
@@ -87,6 +90,18 @@ def encoder_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]
     twice = run.config.conventions.ray_origins == "twice_normalized"
     rays = jax.vmap(plucker_rays)(cameras.in_units(unit) if twice else cameras).astype(inputs.images.dtype)
     return jnp.concatenate([inputs.images, rays, inputs.position_maps], axis=-1)
+
+
+def photo_pixels(inputs: HumanGSInputs, run: Pass) -> Float[Array, "v h w 12"]:
+    """What an encoder without cameras and poses sees of every pixel: rgb, then its place (x, y) in [-1, 1] and waves of it where
+    rays would be, and zeros for the canonical position.
+    """
+    height, width = inputs.images.shape[1:3]
+    at = lambda size: (jnp.arange(size, dtype=inputs.images.dtype) + 0.5) * (2 / size) - 1
+    place = jnp.stack(jnp.meshgrid(at(width), at(height)), axis=-1)
+    waves = jnp.concatenate([place, jnp.sin(jnp.pi * place), jnp.cos(jnp.pi * place)], axis=-1)
+    waves = jnp.broadcast_to(waves, (*inputs.images.shape[:3], waves.shape[-1]))
+    return jnp.concatenate([inputs.images, waves, jnp.zeros_like(inputs.images)], axis=-1)
 
 
 def touched_patches(inputs: HumanGSInputs, patch_size: int) -> Bool[Array, " p"]:

@@ -4,6 +4,8 @@
     read     feature maps -> features of every body vertex
     decode   features -> K Gaussians per vertex of the canonical body
 
+Other networks may run a part again for every target: `drive_outputs`, `draw_pixels`.
+
 Each is a part that the configuration chooses (`network.parts`); the pass itself is written here and nowhere else. Everything is
 written for ONE subject; batch with `jax.vmap` over `inputs` (variables unbatched). Callers jit, with `config` static.
 """
@@ -14,17 +16,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Int, Key
+from humangs_jax.body.model import BodyPose, Texels
+from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import touched_patches
 from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
+from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, PixelDecoder, Variables
 from humangs_jax.network.reader import project_and_test, view_weights
 from humangs_jax.network.stages import StageCaller, call
 
-PARTS = ("encoder", "reader", "decoder")
+PARTS = ("encoder", "reader", "decoder", "driver")
 
 
 def apply_humangs(
@@ -49,6 +52,8 @@ def apply_humangs(
     encoding, statistics = stage("encoding", lambda: parts.encoder.apply(of("encoder"), inputs, run))
     features = stage("vertex features", lambda e: parts.reader.apply(of("reader"), e, inputs, run), encoding)
     outputs = parts.decoder.apply(of("decoder"), features, inputs, run)
+    if parts.driver is not None and outputs.scene is None:
+        outputs = replace(outputs, scene=features)
     kept = variables.get("batch_stats", {})
     return replace(outputs, dropped_tokens=encoding.dropped_tokens), kept | (
         {"encoder": statistics} if statistics else {}
@@ -57,7 +62,7 @@ def apply_humangs(
 
 @functools.partial(jax.jit, static_argnames="config")
 def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
-    """Fresh variables {"params": {"encoder", "reader", "decoder"}, "batch_stats": {"encoder"}}, float32.
+    """Fresh variables {"params": {"encoder", "reader", "decoder", "driver"}, "batch_stats": {"encoder"}}, float32.
 
     A part without parameters or running statistics is absent.
     """
@@ -71,7 +76,9 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     features = jax.eval_shape(lambda v: parts.reader.apply(v, encoding, inputs, run), reader)
     features = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), features)
     decoder = parts.decoder.init(decoder_key, features, inputs, run)
-    made = dict(zip(PARTS, (encoder, reader, decoder), strict=True))
+    made = {"encoder": encoder, "reader": reader, "decoder": decoder}
+    if parts.driver is not None:
+        made["driver"] = parts.driver.init(jax.random.fold_in(key, 3), features, inputs, run)
     collect = lambda kind: {name: own[kind] for name, own in made.items() if kind in own}
     return {"params": collect("params"), "batch_stats": collect("batch_stats")}
 
@@ -92,6 +99,26 @@ def read(variables: Variables, encoding: Encoding, inputs: HumanGSInputs, config
 def decode(variables: Variables, features: Any, inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSOutputs:
     """The third part of `apply_humangs`: canonical Gaussians, metric; `dropped_tokens` is 0 (it belongs to the encoding)."""
     return config.architecture.decoder.apply(part_variables(variables, "decoder"), features, inputs, Pass(config))
+
+
+def drive_outputs(
+    variables: Variables, outputs: HumanGSOutputs, pose: BodyPose, posed: Float[Array, "n 3"], config: HumanGSConfig
+) -> HumanGSOutputs:
+    """The outputs corrected by the driver for one frame; the outputs themselves where there is none. See `parts.Driver`."""
+    driver = config.architecture.driver
+    if driver is None:
+        return outputs
+    return driver.apply(part_variables(variables, "driver"), outputs, pose, posed, Pass(config))
+
+
+def draw_pixels(
+    variables: Variables, outputs: HumanGSOutputs, queries: Float[Array, "v h w 9"], config: HumanGSConfig
+) -> Float[Array, "v h w 3"]:
+    """The images of a `parts.PixelDecoder`. Raises: ValueError if the decoder is none."""
+    decoder = config.architecture.decoder
+    if not isinstance(decoder, PixelDecoder):
+        raise ValueError(f"{type(decoder).__name__} makes Gaussians: expected a decoder that draws pixels")
+    return decoder.draw(part_variables(variables, "decoder"), outputs.scene, queries, Pass(config))
 
 
 def part_variables(variables: Variables, part: str) -> Variables:
@@ -115,7 +142,7 @@ def _example_inputs(config):
     """One view of two by two patches with one vertex: enough to find shapes."""
     side = 2 * config.architecture.encoder.patch_size
     camera = Camera(jnp.eye(3), jnp.eye(4), side, side)
-    grid, vertex = jnp.zeros((1, side, side)), jnp.zeros((1, 1, 3))
+    grid, vertex, wanted = jnp.zeros((1, side, side)), jnp.zeros((1, 1, 3)), config.architecture.surface_map
     return HumanGSInputs(
         images=jnp.zeros((1, side, side, 3)),
         cameras=jax.tree.map(lambda x: x[None], camera),
@@ -126,4 +153,8 @@ def _example_inputs(config):
         foreground=grid > 0,
         posed_normals=vertex,
         canonical_normals=vertex[0],
+        skinning_weights=jnp.ones((1, 1)),
+        texels=None
+        if wanted is None
+        else Texels(jnp.zeros((*wanted.shape, 3), jnp.int32), jnp.zeros((*wanted.shape, 3))),
     )

@@ -6,6 +6,7 @@ Lengths inside the network are normalised units: metres divided by s = (height o
 
 import jax.numpy as jnp
 
+from humangs_jax.body.model import Texels
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Scalar
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry.camera import Camera
@@ -24,7 +25,8 @@ class HumanGSInputs:
     on background. foreground: (v, h, w) pixels of the person (used where tokens are "foreground"). view_count: the number of
     real views, which come first; the others are padding and change nothing. None: all are real. posed_normals: (v, n, 3)
     unit, used with shells. canonical_normals: (n, 3) unit, used where the decoder's frame is "normal". spacing: (n,) distance
-    between vertices relative to the mesh that the weights were trained with; None: 1.
+    between vertices relative to the mesh that the weights were trained with; None: 1. skinning_weights: (n, j) of the body, and
+    texels: the map of its surface (`network.surface_map`), for decoders whose Gaussians are not those of vertices.
     """
 
     images: Float[Array, "v h w 3"]
@@ -38,6 +40,8 @@ class HumanGSInputs:
     posed_normals: Float[Array, "v n 3"] | None = None
     canonical_normals: Float[Array, "n 3"] | None = None
     spacing: Float[Array, " n"] | None = None
+    skinning_weights: Float[Array, "n j"] | None = None
+    texels: Texels | None = None
 
     @property
     def present(self) -> Bool[Array, " v"]:

@@ -1,16 +1,25 @@
-"""What an encoder, a reader and a decoder are, so that each can be exchanged.
+"""What an encoder, a reader, a decoder and a driver are, so that each can be exchanged.
 
     encoding = encoder(photos)        features = reader(encoding)        Gaussians = decoder(features)
+
+That is one pass per person. What runs again for every target is a driver, which corrects the canonical Gaussians for a pose
+(`Driver`), or a decoder that makes images without Gaussians (`PixelDecoder`). Both are called in `network.humangs` alone.
 
 A part is a frozen dataclass: its fields are its configuration, which weights files record, and its methods are pure functions.
 A new part is a new file with such a class, and one line of a preset that names it. Variables of a part are {"params": ...,
 "batch_stats": ...}, the latter only where it has running statistics, which only encoders update.
 
+A part that works on a map of the body's surface says which one in a field or property `surface_map`, see `network.surface_map`.
+
 Weights files name a part by module and class: a part that moves leaves an alias at its old place.
 """
 
+import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
+import jax.numpy as jnp
+
+from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.network.inputs import HumanGSInputs
@@ -52,19 +61,29 @@ class Encoding(NamedTuple):
 class HumanGSOutputs:
     """Canonical Gaussians of one subject.
 
-    gaussians: g = n * k of them, metric, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from the vertex, normalised
-    units (for the tightness loss). shell_spread: (n, k) variance of the distances that a Gaussian mixes, normalised units; None
-    without shells. skinning_offsets: (n * k, j) logits of the skinning head, or None (see
-    `vertex_decoder.corrected_skinning_weights`). dropped_tokens: foreground patches for which the token capacity had no room.
-    dropped_reads: vertices, summed over views, for which the vertex capacity had no room.
+    gaussians: metric. Without `skinning_weights` g = n * k of them, vertex-major, k fastest. tight_offsets: (n, k_tight, 3) from
+    the vertex, or of each Gaussian from where it belongs, normalised units (for the tightness loss, which is 0 for None).
+    shell_spread: (n, k) variance of the distances that a Gaussian mixes, normalised units; None without shells. skinning_offsets:
+    (n * k, j) logits of the skinning head, or None (see `vertex_decoder.corrected_skinning_weights`). dropped_tokens: foreground
+    patches for which the token capacity had no room. dropped_reads: vertices, summed over views, for which the vertex capacity
+    had no room. skinning_weights: (g, j), rows of sum 1, of Gaussians that do not belong to one vertex each; None: the body's.
+    scene: what a driver or a `PixelDecoder` works from for every target; a decoder may set it, else the pass sets the features
+    where there is a driver.
     """
 
     gaussians: Gaussians
-    tight_offsets: Float[Array, "n t 3"]
-    skinning_offsets: Float[Array, "g j"] | None
-    dropped_tokens: Int[Array, ""]
-    dropped_reads: Int[Array, ""]
+    tight_offsets: Float[Array, "n t 3"] | None = None
+    skinning_offsets: Float[Array, "g j"] | None = None
+    dropped_tokens: Int[Array, ""] = dataclasses.field(default_factory=lambda: jnp.zeros((), jnp.int32))
+    dropped_reads: Int[Array, ""] = dataclasses.field(default_factory=lambda: jnp.zeros((), jnp.int32))
     shell_spread: Float[Array, "n k"] | None = None
+    skinning_weights: Float[Array, "g j"] | None = None
+    scene: Any = None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no Gaussian, as a `PixelDecoder` leaves it."""
+        return self.gaussians.opacities.shape[-1] == 0
 
 
 @runtime_checkable
@@ -109,3 +128,40 @@ class Decoder(Protocol):
     def apply(self, variables: Variables, features: Any, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
         """Gaussians; `dropped_tokens` is set by the pass."""
         ...
+
+
+@runtime_checkable
+class Driver(Protocol):
+    """Canonical Gaussians -> canonical Gaussians of one driving frame, by a network that runs again for every frame."""
+
+    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """Fresh variables; `features` are those of the reader."""
+        ...
+
+    def apply(
+        self, variables: Variables, outputs: HumanGSOutputs, pose: BodyPose, posed: Float[Array, "n 3"], run: Pass
+    ) -> HumanGSOutputs:
+        """The outputs with Gaussians as they are, before skinning, in a pose; `posed`: the body's vertices in it, metres."""
+        ...
+
+
+@runtime_checkable
+class PixelDecoder(Decoder, Protocol):
+    """A decoder that makes images of targets without Gaussians. `apply` gives `scene_outputs`: nothing that could be animated.
+
+    Images are on white: the background is not known to it, and there is no alpha.
+    """
+
+    def draw(
+        self, variables: Variables, scene: Any, queries: Float[Array, "v h w 9"], run: Pass
+    ) -> Float[Array, "v h w 3"]:
+        """Images in [0, 1]. queries: of every target pixel the ray (moment, direction) and the canonical position of the body in
+        the target's pose (1 on background), normalised units; sides are multiples of the encoder's patch size.
+        """
+        ...
+
+
+def scene_outputs(scene: Any) -> HumanGSOutputs:
+    """Outputs without Gaussians, of a `PixelDecoder`."""
+    empty = lambda *shape: jnp.zeros((0, *shape))
+    return HumanGSOutputs(Gaussians(empty(3), empty(4), empty(3), empty(), empty(3)), scene=scene)

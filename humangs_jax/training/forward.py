@@ -7,6 +7,7 @@ import jax.numpy as jnp
 
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.reconstruct import make_avatar
+from humangs_jax.avatar.targets import frame_outputs, target_pixels
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.numerics import safe_divide
@@ -56,10 +57,15 @@ def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
 
 
 class DrawnTargets(NamedTuple):
-    """Renderings of the v targets. spread: (v, h, w) `losses.ray_spread` in square metres, None unless it has a weight."""
+    """Renderings of the v targets; those of a `PixelDecoder` have alpha 1 and depth 0 everywhere. spread: (v, h, w)
+    `losses.ray_spread` in square metres, None unless it has a weight. tight_offsets, opacities: those that a driver gave, of all
+    targets one after the other; None: those of the outputs count.
+    """
 
     rendering: Rendering
     spread: Float[Array, "v h w"] | None = None
+    tight_offsets: Float[Array, "n t 3"] | None = None
+    opacities: Float[Array, " g"] | None = None
 
 
 def draw_targets(
@@ -69,13 +75,31 @@ def draw_targets(
     backgrounds: Float[Array, "v 3"],
     config: TrainConfig,
     stage: StageCaller = call,
+    variables: Variables | None = None,
 ) -> DrawnTargets:
-    """The Gaussians in the pose and before the camera of every target."""
+    """The Gaussians in the pose and before the camera of every target. variables: of a network that runs again for every
+    target (a driver, or a decoder that draws pixels, on white whatever the backgrounds); others need none.
+    """
     poses = (targets.rotations, targets.translations)
+    if variables is None:
+        if config.model.architecture.runs_per_target:
+            raise ValueError("draw_targets: this network runs again for every target and needs its variables")
+        variables = {}
+    if config.model.architecture.draws_pixels:
+        pixels = lambda outputs: _opaque(target_pixels(variables, outputs, body, targets, config.model))
+        return DrawnTargets(stage("images", pixels, outputs))
 
     def pose_all(outputs):
         avatar = make_avatar(outputs, body, targets.betas, config.model)
         return jax.lax.map(lambda pose: skin(avatar, BodyPose(*pose)), poses)
+
+    def drive_all(outputs):
+        def drive(pose):
+            driven = frame_outputs(variables, outputs, body, targets.betas, BodyPose(*pose), config.model)
+            avatar = make_avatar(driven, body, targets.betas, config.model)
+            return skin(avatar, BodyPose(*pose)), driven.tight_offsets
+
+        return jax.lax.map(drive, poses)
 
     def project_all(shapes):
         return jax.lax.map(lambda x: project_gaussians(*x, config.splat), (shapes, targets.cameras))
@@ -95,12 +119,25 @@ def draw_targets(
 
         return jax.lax.map(draw, (projected, opacities, colors, targets.cameras, backgrounds))
 
-    posed = stage("posed Gaussians", pose_all, outputs)
+    driven = {}
+    if config.model.architecture.driver is None:
+        posed = stage("posed Gaussians", pose_all, outputs)
+    else:
+        posed, offsets = stage("posed Gaussians", drive_all, outputs)
+        flat = lambda x: None if x is None else x.reshape(-1, *x.shape[2:])
+        driven = {"tight_offsets": flat(offsets), "opacities": flat(posed.opacities)}
     like = jax.tree.map(lambda x: x[0], posed)
     shapes = replace(posed, opacities=None, colors=None)
     opaque = lambda shapes: replace(shapes, opacities=posed.opacities, colors=posed.colors)
     projected = stage("projected splats", lambda shapes: project_all(opaque(shapes)), shapes)
-    return stage("images", draw_all, projected, posed.opacities, posed.colors)
+    drawn = stage("images", draw_all, projected, posed.opacities, posed.colors)
+    return drawn._replace(**driven)
+
+
+def _opaque(images):
+    """Renderings that are known as colours only."""
+    full = lambda rgb: Rendering(rgb, jnp.ones(rgb.shape[:2]), jnp.zeros(rgb.shape[:2]), jnp.zeros((), jnp.int32))
+    return jax.vmap(full)(images)
 
 
 def white_backgrounds(targets: SubjectViews) -> Float[Array, "v 3"]:
@@ -112,5 +149,6 @@ def predict(
 ) -> tuple[Rendering, HumanGSOutputs]:
     """What the trained network shows of an example's targets, on white, and the Gaussians that it shows."""
     outputs, _ = reconstruct_example(variables, body, example.inputs, config)
-    drawn = draw_targets(outputs, body, example.targets, white_backgrounds(example.targets), config)
+    backgrounds = white_backgrounds(example.targets)
+    drawn = draw_targets(outputs, body, example.targets, backgrounds, config, variables=variables)
     return drawn.rendering, outputs

@@ -36,6 +36,8 @@ COUNTS = ("dropped_tokens", "dropped_reads", "overflow")
 """Metrics that are sums over a batch; all others are means."""
 ALWAYS = ("squared", "structural", "silhouette", "tightness")
 """Terms that are computed, for the log, whatever their weight."""
+OF_COLORS = ("squared", "structural", "absolute", "perceptual", "lpips")
+"""Terms that compare colours: those of a network that draws pixels. For it the others do not exist, whatever their weight."""
 DISTURBED = 1
 """Makes the key of a subject's disturbances from that of its backgrounds."""
 NO_NETWORKS = LossNetworks()
@@ -77,7 +79,7 @@ def loss_terms(
         "squared": lambda t: squared_error(t["rgb"], images),
         "structural": lambda t: jax.vmap(dissimilarity)(t["rgb"], images),
         "silhouette": lambda t: squared_error(t["alpha"], masks),
-        "tightness": lambda t: tightness(t["tight_offsets"]),
+        "tightness": lambda t: jnp.zeros(()) if t["tight_offsets"] is None else tightness(t["tight_offsets"]),
         "absolute": lambda t: jnp.abs(t["rgb"] - images),
         "outline": lambda t: jnp.abs(t["alpha"] - masks),
         "opaque": lambda t: translucency(t["opacities"]),
@@ -99,11 +101,13 @@ def loss_terms(
         "alpha": rendering.alpha,
         "depth": rendering.depth,
         "spread": drawn.spread,
-        "opacities": outputs.gaussians.opacities,
-        "tight_offsets": outputs.tight_offsets,
+        "opacities": outputs.gaussians.opacities if drawn.opacities is None else drawn.opacities,
+        "tight_offsets": outputs.tight_offsets if drawn.tight_offsets is None else drawn.tight_offsets,
         "shell_spread": outputs.shell_spread,
     }
     used = [name for name in terms if name in ALWAYS or getattr(config, name)]
+    if outputs.is_empty:
+        used = [name for name in used if name in OF_COLORS]
     mean = lambda term: lambda seen: jnp.mean(term(seen))
     return {name: stage(f"loss: {name}", mean(terms[name]), learned) for name in used}
 
@@ -141,10 +145,11 @@ def subject_loss(
     variables = {"params": params, "batch_stats": batch_stats}
     outputs, batch_stats = reconstruct_example(variables, body, example.inputs, config, True, axis_name, stage)
     targets = example.targets
-    backgrounds = random_backgrounds(key, len(targets.translations), config.loss.random_background)
+    colored = 0.0 if config.model.architecture.draws_pixels else config.loss.random_background
+    backgrounds = random_backgrounds(key, len(targets.translations), colored)
     backgrounds = backgrounds.astype(targets.images.dtype)
     images = change_background(targets, backgrounds)
-    drawn = draw_targets(outputs, body, targets, backgrounds, config, stage)
+    drawn = draw_targets(outputs, body, targets, backgrounds, config, stage, variables)
     terms = loss_terms(drawn, outputs, images, targets, config.loss, networks, stage)
     total = lambda terms: sum(getattr(config.loss, name) * term for name, term in terms.items())
     loss = stage("loss", total, terms)

@@ -49,7 +49,7 @@ def evaluate(
     variables: Variables, body: BodyModel, example: Example, config: TrainConfig, networks: LossNetworks = NO_NETWORKS
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
     """The images of one example's targets and their mean psnr, psnr_mask (both dB), ssim, fog, and lpips if its network
-    is there.
+    is there. fog is NaN where the network draws pixels: there is no alpha.
     """
     drawn, outputs = predict(variables, body, example, config)
     images, masks = example.targets.images, example.targets.masks
@@ -58,7 +58,7 @@ def evaluate(
         "psnr": jnp.mean(jax.vmap(psnr)(shown, images)),
         "psnr_mask": jnp.mean(jax.vmap(masked_psnr)(shown, images, masks)),
         "ssim": jnp.mean(jax.vmap(similarity_map)(shown, images)),
-        "fog": jnp.mean(jax.vmap(fog)(drawn.alpha, masks)),
+        "fog": jnp.full((), jnp.nan) if outputs.is_empty else jnp.mean(jax.vmap(fog)(drawn.alpha, masks)),
         "dropped_tokens": outputs.dropped_tokens.astype(shown.dtype),
         "dropped_reads": outputs.dropped_reads.astype(shown.dtype),
         "overflow": jnp.sum(drawn.overflow).astype(shown.dtype),

@@ -1,0 +1,347 @@
+"""What the scripts of this folder share: the variants that are trained, how one is trained and scored, and the paper's numbers.
+
+Every variant is a `TrainConfig` that differs from another one in what its name says. All see the same people, views and targets
+in the same order, have the same losses and number of steps, and are compared on the same views of the same unseen people.
+"""
+
+import dataclasses
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "paper.md"
+SCORES = {"psnr": ("PSNR, dB", 2), "psnr_mask": ("on the person, dB", 2), "ssim": ("SSIM", 4)}
+PHOTOS, TARGETS = 4, 6
+"""Photos that a network is trained with, unless it takes one; views of each person that all are compared on."""
+VIEW_COUNTS = (1, 2, 4, 6, 8)
+PER_PERSON = ("animatable",)
+"""Systems that are fitted to one person, and so have no place in a training on many."""
+NOISE = "noise"
+"""The claim of variants that differ from another one in the seed alone."""
+
+PAPER = "paper"
+"""Marks a row of the printed paper in every table."""
+HUMANRAM, LVSM, GHG, OURS = "HumanRAM", "LVSM", "GHG", "HumanGS"
+ANIMATION = {
+    "LHM (single view)": (23.72, 0.95, 0.045, 4.59, 0.053),
+    HUMANRAM: (24.58, 0.96, 0.042, None, 0.287),
+    "Animatable Gaussians": (25.51, 0.96, 0.041, 12000, 0.245),
+    OURS: (25.24, 0.96, 0.04, 0.29, 0.048),
+}
+"""Table 1, AvatarReX: PSNR, SSIM, LPIPS, seconds to model, seconds a frame."""
+RECONSTRUCTION = {
+    HUMANRAM: ((28.98, 0.97, 0.021), (25.10, 0.96, 0.029)),
+    LVSM: ((24.38, 0.96, 0.036), None),
+    GHG: ((22.49, 0.95, 0.043), None),
+    OURS: ((27.99, 0.97, 0.025), (25.53, 0.96, 0.029)),
+}
+"""Table 2, THuman4.0: reconstruction, and reconstruction + animation."""
+DOMAINS = {
+    HUMANRAM: ((33.16, 0.98, 0.018), (27.76, 0.97, 0.029)),
+    LVSM: ((27.13, 0.95, 0.051), (20.86, 0.94, 0.056)),
+    GHG: ((26.91, 0.96, 0.039), (22.69, 0.93, 0.088)),
+    "GHG, released weights": ((22.80, 0.91, 0.067), None),
+    "GST, released weights": ((21.58, 0.92, 0.091), None),
+    OURS: ((30.81, 0.98, 0.024), (27.27, 0.97, 0.033)),
+    "GIGA, on its split": ((20.19, 0.794, 0.070), None),
+    "HumanGS, on GIGA's split": ((26.00, 0.945, 0.061), None),
+}
+"""Table 3, reconstruction: in the domain of training (THuman2.1), and in another one (AvatarReX)."""
+VIEWS = {
+    HUMANRAM: ((25.44, 0.946, 0.052), (27.39, 0.950, 0.044), (29.10, 0.960, 0.039), (29.90, 0.966, 0.036)),
+    LVSM: ((17.78, 0.900, 0.101), (22.64, 0.930, 0.066), (25.96, 0.950, 0.055), (27.03, 0.950, 0.051)),
+    GHG: ((21.71, 0.920, 0.094), (22.43, 0.930, 0.089), (22.69, 0.930, 0.088), (22.72, 0.930, 0.088)),
+    OURS: ((24.07, 0.936, 0.068), (25.71, 0.946, 0.059), (27.19, 0.950, 0.054), (27.84, 0.950, 0.051)),
+}
+"""THuman2.1 near, with 1, 2, 4 and 6 photos."""
+GAUSSIANS = {
+    "THuman2.1": ((30.66, 0.970, 0.028), (30.81, 0.980, 0.024)),
+    "THuman2.1 near": ((27.09, 0.950, 0.062), (27.19, 0.950, 0.054)),
+    "AvatarReX": ((25.20, 0.960, 0.044), (25.24, 0.960, 0.040)),
+    "THuman4.0": ((25.42, 0.960, 0.034), (25.53, 0.960, 0.029)),
+}
+"""1 Gaussian a vertex, and 1 tight + 4 free."""
+FASTER_MODELLING = 15
+"""Times that HumanGS models faster than LHM: 4.59 s against 0.29."""
+
+
+class Variant(NamedTuple):
+    """against: the variant that it is compared with; None for those that others are compared with. claim: what that tests."""
+
+    config: Any
+    against: str | None = None
+    claim: str = ""
+
+
+def variants(steps: int) -> dict[str, Variant]:
+    """All that `train_all.py` trains, by name, in the order of its queue."""
+    from humangs_jax.data.loader import ViewSampling
+    from humangs_jax.network.config import paper_parts
+    from humangs_jax.network.systems import ONE_PHOTO, SYSTEMS
+    from humangs_jax.network.upsampler import UpsamplerConfig
+    from humangs_jax.training.config import LossConfig, TrainConfig
+    from humangs_jax.training.optimizer import OptimizerConfig
+
+    def run(model: Any, photos: int = PHOTOS, **fields: Any) -> Any:
+        capacity = -(-model.execution.token_capacity * (photos + 1) // (PHOTOS + 1))  # one may show more than its share
+        settings: dict[str, Any] = {
+            "model": model.with_execution(token_capacity=capacity),
+            "views": ViewSampling(input_counts=(photos,)),
+            "loss": LossConfig(),
+            "optimizer": OptimizerConfig(learning_rate=1e-3, warmup_steps=min(50, steps // 4)),
+            "target_size": 128,
+            "steps": steps,
+            "validate_every": steps,
+            "checkpoint_every": min(100, steps),
+            "log_every": min(20, steps),
+        }
+        return TrainConfig(**(settings | fields))
+
+    replace, systems = dataclasses.replace, {name: make("bench") for name, make in SYSTEMS.items()}
+    ours, plain = systems["humangs"], systems["back_projection"]
+    encoder, reader, decoder = paper_parts(ours.architecture)
+    tight = lambda weight: run(ours, loss=LossConfig(tightness=weight))
+    per_vertex = lambda free: run(ours.with_parts(decoder=replace(decoder, tight=1, free=free)))
+    flat = replace(reader, shells=())
+    bare = ours.with_parts(reader=flat)
+    gray = {"reader": replace(flat, sample_rgb=False), "decoder": replace(decoder, residual_color=False)}
+    tokenless = replace(encoder, transformer=replace(encoder.transformer, class_token=False))
+    everywhere = ours.with_conventions(tokens="all").with_execution(token_capacity=0)
+
+    def upsampled(features: Any) -> Any:
+        width = encoder.transformer.width
+        raised = replace(encoder, upsampler=UpsamplerConfig(width // 3, features))
+        return run(ours.with_parts(encoder=raised, reader=replace(reader, output_width=width)))
+
+    found = {
+        "back-projection": Variant(run(plain)),
+        "cross-attention": Variant(run(systems["cross_attention"]), "back-projection", "what reads the photos"),
+        "humangs": Variant(run(ours)),
+        "pooling over all views": Variant(run(ours.with_conventions(pool="all")), "humangs", "pooling"),
+        "no shells": Variant(run(bare), "humangs", "shells (ours)"),
+        "no global token": Variant(run(ours.with_parts(encoder=tokenless)), "humangs", "global token"),
+        "back-projection, another seed": Variant(run(plain, seed=1), "back-projection", NOISE),
+        "humangs, another seed": Variant(run(ours, seed=1), "humangs", NOISE),
+        "no photo colours": Variant(run(ours.with_parts(**gray)), "no shells", "photo colours (ours)"),
+        "canonical frame": Variant(
+            run(bare.with_parts(decoder=replace(decoder, frame="canonical"))), "no shells", "normal frame (ours)"
+        ),
+        "all tokens": Variant(run(everywhere), "humangs", "foreground tokens (ours)"),
+        "features of the last layer": Variant(upsampled("final")),
+        "features of four depths": Variant(upsampled("intermediate"), "features of the last layer", "depths"),
+        "1 Gaussian a vertex": Variant(per_vertex(0)),
+        "1 + 4 Gaussians a vertex": Variant(per_vertex(4), "1 Gaussian a vertex", "Gaussians a vertex"),
+        "1 + 8 Gaussians a vertex": Variant(per_vertex(8), "1 Gaussian a vertex", "Gaussians a vertex"),
+        "tightness 0": Variant(tight(0.0), "humangs", "tightness"),
+        "tightness 10": Variant(tight(10.0), "humangs", "tightness"),
+        "humangs, 1 photo": Variant(run(ours, 1)),
+    }
+    for name, model in systems.items():
+        if name not in ("humangs", "back_projection", "cross_attention", *PER_PERSON):
+            alone = name in ONE_PHOTO
+            against = "humangs, 1 photo" if alone else "humangs"
+            found[name] = Variant(run(model, 1 if alone else PHOTOS), against, "systems")
+    return found
+
+
+def view_counts(name: str, config: Any) -> tuple[int, ...]:
+    """Numbers of photos that a variant is scored with; only those that claims about few photos need have several."""
+    if config.views.input_counts == (1,):
+        return (1,)
+    return (1, 2, PHOTOS, 6) if "global token" in name or name == "humangs" else (PHOTOS,)
+
+
+def train_variant(
+    config: Any, out: Path, people: Any, body: Any, validation: Any, views: tuple[int, ...]
+) -> dict[str, Any] | None:
+    """Train in the folder `out`, or go on there, and score; None if it was interrupted.
+
+    people: a `sources.MakeSource`; body: the model of theirs and of `validation`, a `CaptureCache`. Returns scores by number of
+    photos, steps, parameters, CPU and wall seconds of all calls.
+    """
+    import json
+
+    import jax
+
+    from experiments.common.results import write_json
+    from humangs_jax.data.views import gaussian_body
+    from humangs_jax.training.loop import train
+
+    clock = out / "seconds.json"
+    before = json.loads(clock.read_text()) if clock.exists() else {"cpu": 0.0, "wall": 0.0}
+    cpu, wall = time.process_time(), time.perf_counter()
+    state = train(config, body, people, out, progress=False)
+    spent = {
+        "cpu": before["cpu"] + time.process_time() - cpu,
+        "wall": before["wall"] + time.perf_counter() - wall,
+    }
+    write_json(clock, spent)
+    if int(state.step) < config.steps:
+        return None
+    variables = jax.device_get(state.variables)
+    by_views = {
+        str(count): score(variables, gaussian_body(body, config.model), config, validation, count) for count in views
+    }
+    return {
+        "by_views": by_views,
+        "photos": config.views.input_counts[0],
+        "steps": config.steps,
+        "parameters": sum(x.size for x in jax.tree.leaves(variables["params"])),
+        "cpu_seconds": round(spent["cpu"], 1),
+        "wall_seconds": round(spent["wall"], 1),
+    }
+
+
+def score(variables: Any, body: Any, config: Any, people: Any, count: int) -> dict[str, float]:
+    """Means over people of `TARGETS` views each, with that number of photos."""
+    from humangs_jax.training.validation import validate, validation_examples
+
+    compared = dataclasses.replace(
+        config,
+        model=config.model.with_execution(token_capacity=0),
+        views=dataclasses.replace(config.views, input_counts=(count,), target_count=TARGETS),
+    )
+    numbers, _ = validate(variables, body, validation_examples(people, compared, len(people)), compared)
+    names = (*SCORES, "fog", "dropped_tokens", "overflow")
+    return {
+        name: x for name in names if (x := numbers[name]) == x
+    }  # JSON has no NaN: networks that draw pixels have no fog
+
+
+def headline(row: Mapping[str, Any]) -> dict[str, float]:
+    """The scores of a run with as many photos as it was trained with."""
+    return row["by_views"][str(row["photos"])]
+
+
+def noise(rows: Mapping[str, Any], score: str) -> float | None:
+    """The largest difference between two runs that differ in their seed alone; None without such a pair."""
+    pairs = [(name, name.removesuffix(", another seed")) for name in rows if name.endswith(", another seed")]
+    found = [abs(headline(rows[a])[score] - headline(rows[b])[score]) for a, b in pairs if b in rows]
+    return max(found) if found else None
+
+
+def verdict(difference: float, noise: float | None) -> str:
+    """What a difference is worth beside that of another seed."""
+    if noise is None:
+        return "noise unknown"
+    return "within noise" if abs(difference) <= noise else "better" if difference > 0 else "worse"
+
+
+# Trained systems on people of a folder -----------------------------------------------------------------------------------
+
+QUICK_PEOPLE, QUICK_SIZE = 2, 128
+
+
+def add_people_options(parser: Any) -> None:
+    """Options of the scripts that compare trained systems."""
+    parser.add_argument("--runs", type=Path, help="the OUT of train_all.py; without it the shipped weights alone")
+    parser.add_argument("--people", type=Path, help="captures with held_out/, or any data set (docs/datasets.md)")
+    parser.add_argument("--body", type=Path, help="body model of a data set")
+    parser.add_argument("--lpips", type=Path, nargs="+", help="weights of LPIPS vgg: BACKBONE and HEADS")
+    parser.add_argument("--quick", action="store_true", help="two synthetic people of 128 pixels, made in a minute")
+    parser.add_argument("--json", type=Path, help="write the numbers here")
+
+
+def quick_people(folder: Path, split: str = "test") -> Path:
+    """Small synthetic captures: 12 photos of one pose, held-out views of it and of another pose."""
+    from humangs_jax.people.writer import Layout, write_set
+
+    write_set(folder, QUICK_PEOPLE, Layout(QUICK_SIZE, views=12, held_out_views=2, novel_poses=1), split)
+    return folder
+
+
+def load_networks(paths: Any) -> tuple[Any, ...]:
+    """LPIPS for the evaluator, or nothing."""
+    from humangs_jax.objectives.loss_networks import load_loss_networks
+
+    found = load_loss_networks(None, paths[0], paths[1] if len(paths) > 1 else None, "vgg").lpips if paths else None
+    return () if found is None else (found,)
+
+
+def folder_of(name: str) -> str:
+    """Of a variant, inside OUT."""
+    return name.replace(" ", "_").replace(",", "").replace("+", "and")
+
+
+def trained(runs: Path | None, names: Any = None) -> dict[str, tuple[Any, Any]]:
+    """(variables, configuration) by name: the variants whose training is finished, and the shipped weights."""
+    import json
+
+    from humangs_jax.network.weights import load_weights
+
+    found = {}
+    if runs is not None:
+        finished = json.loads((runs / "results.json").read_text())["runs"]
+        for name in finished if names is None else [name for name in names if name in finished]:
+            found[name] = load_weights(runs / folder_of(name) / "weights.safetensors")
+    return found | {"HumanGS, shipped": load_weights()}
+
+
+def measured(
+    weights: tuple[Any, Any], people: Path, photos: int, body: Path | None, networks: Any, indices: Any = None
+) -> dict[str, Any] | None:
+    """Scores of the views in the pose of the photos and in others, and the seconds to model and to draw a frame.
+
+    None if the system takes no such number of photos. Seconds are of the second and further people: the first one compiles.
+    """
+    import jax
+
+    from humangs_jax.avatar.reconstruct import reconstruct
+    from humangs_jax.avatar.targets import show_targets
+    from humangs_jax.evaluation.cases import Predicted, draw_views
+    from humangs_jax.evaluation.run import evaluate
+    from humangs_jax.evaluation.tables import mean_scores
+
+    variables, config = weights
+    if takes_one(config) and photos > 1:
+        return None
+    seconds: dict[str, list[float]] = {"model": [], "frame": []}
+
+    def method(case: Any, background: float) -> Any:
+        views, again = case.truth.view_count, not seconds["frame"]
+        for _ in range(1 + again):
+            start = time.perf_counter()
+            if config.architecture.runs_per_target:
+                images, alpha = show_targets(variables, config, case.inputs, case.truth, background)
+                modelled, predicted = start, Predicted(images, alpha, tuple(range(views)))
+            else:
+                avatar = jax.block_until_ready(reconstruct(variables, config, case.inputs))
+                modelled, predicted = time.perf_counter(), draw_views(avatar, case.truth, background)
+        seconds["model"].append(modelled - start)
+        seconds["frame"].append((time.perf_counter() - modelled) / views)
+        return predicted
+
+    found = evaluate(
+        people, method=method, inputs=None if indices else photos, indices=indices, lpips=networks, body=body
+    )
+    means: dict[str, Any] = {"photos": photos}
+    for task, rows in (
+        ("reconstruction", [row.scores for row in found.rows if row.frame == 0]),
+        ("animation", [row.scores for row in found.rows if row.frame != 0]),
+    ):
+        means[task] = mean_scores(rows) if rows else None
+    per_target = config.architecture.runs_per_target
+    means["model_s"] = None if per_target else sum(seconds["model"]) / len(seconds["model"])
+    means["frame_s"] = sum(seconds["frame"]) / len(seconds["frame"])
+    return means
+
+
+def takes_one(config: Any) -> bool:
+    """Whether a system refuses a second photo."""
+    from humangs_jax.network.grouped import GroupReader
+
+    reader = config.architecture.reader
+    return isinstance(reader, GroupReader) or getattr(reader, "most_views", None) == 1
+
+
+def triple(scores: Any) -> str:
+    """PSNR / SSIM / LPIPS of a measured row or of a printed one; a dash where it is missing."""
+    if scores is None:
+        return "-"
+    values = scores if isinstance(scores, tuple) else (scores["psnr"], scores["ssim"], scores.get("lpips_vgg"))
+    texts = [
+        f"{value:.{digits}f}" if value is not None else "-" for value, digits in zip(values, (2, 3, 3), strict=True)
+    ]
+    return " / ".join(texts)

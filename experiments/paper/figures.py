@@ -1,0 +1,238 @@
+"""The paper's figures, of trained variants.
+
+    python experiments/paper/figures.py --runs runs/paper --people PEOPLE --out figures
+    python experiments/paper/figures.py --quick --out figures --figure varying driven          # with the shipped weights
+
+varying   PSNR of unseen poses over 1, 2, 4 and 6 photos, each photo of another pose where the capture has as many
+token     PSNR with and without the global token over 1, 2, 4, 6 and 8 photos; the paper: a gain at 1 and 2, none from 4 on
+features  histogram of what the features of four depths change in a patch of 64 x 64 pixels (at 512; in proportion otherwise) more
+          than half of which is the person: LPIPS where --lpips is given, squared error otherwise; the paper: a positive skew
+driven    people of --people in the poses of other people (--motions; of each other without)
+
+Variants that are not trained are left out, with a line that says so.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import write_json
+from experiments.paper.bench import (
+    PHOTOS,
+    VIEW_COUNTS,
+    add_people_options,
+    load_networks,
+    measured,
+    quick_people,
+    trained,
+)
+
+SHIPPED = "HumanGS, shipped"
+TOKENS = ("humangs", "no global token")
+DEPTHS = ("features of the last layer", "features of four depths")
+PATCHES = 8
+"""Patches along a side of an image: 64 of 512 pixels."""
+SHOWN = 4
+"""People, and poses, on the sheet of driven people."""
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_people_options(parser)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the images")
+    parser.add_argument("--motions", type=Path, help="captures whose poses drive the others")
+    parser.add_argument("--figure", nargs="+", default=list(FIGURES), choices=tuple(FIGURES), help="which ones")
+    arguments = parser.parse_args()
+    if not (arguments.people or arguments.quick):
+        parser.error("--people is needed, or --quick")
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            if arguments.people is None:
+                arguments.people = quick_people(Path(folder) / "people")
+            systems, networks = trained(arguments.runs), load_networks(arguments.lpips)
+            arguments.out.mkdir(parents=True, exist_ok=True)
+            numbers = {name: FIGURES[name](systems, networks, arguments) for name in arguments.figure}
+            if arguments.json:
+                write_json(arguments.json, numbers)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+
+
+def present(systems: dict[str, Any], names: tuple[str, ...], figure: str) -> bool:
+    """Whether all of these are trained; says which one is not."""
+    missing = [name for name in names if name not in systems]
+    if missing:
+        print(f"{figure}: {missing[0]!r} is not trained", file=sys.stderr)
+    return not missing
+
+
+def varying(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, dict[int, float]]:
+    """Unseen poses from photos of varying poses."""
+    curves: dict[str, dict[int, float]] = {}
+    for name in (name for name in ("humangs", "cross-attention", SHIPPED) if name in systems):
+        for count in VIEW_COUNTS[:PHOTOS]:
+            indices = varied(arguments.people, count)
+            found = measured(systems[name], arguments.people, count, arguments.body, networks, indices)
+            if found is not None and (scores := found["animation"] or found["reconstruction"]):
+                curves.setdefault(name, {})[count] = scores["psnr"]
+    draw_curves(curves, arguments.out / "varying.png", "photos of varying poses")
+    return curves
+
+
+def varied(people: Path, count: int) -> dict[str, dict[str, list[int]]] | None:
+    """Views of as many frames as there are, in turns, for captures without held_out/; None: as the evaluator chooses."""
+    from humangs_jax.data.capture import load_capture
+    from humangs_jax.data.loading.captures import find_captures
+
+    chosen = {}
+    for folder in find_captures(people) if people.is_dir() else []:
+        if (folder / "held_out").is_dir():
+            return None
+        frames = np.asarray(load_capture(folder).frames)
+        shown = sorted(set(frames.tolist()))[:-1] or [0]  # the last pose is unseen
+        context = [int(np.flatnonzero(frames == shown[i % len(shown)])[i // len(shown)]) for i in range(count)]
+        chosen[folder.name] = {"context": context, "target": np.flatnonzero(frames == frames.max()).tolist()}
+    return chosen or None
+
+
+def token(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, dict[int, float]]:
+    """With and without the global token."""
+    curves: dict[str, dict[int, float]] = {}
+    if present(systems, TOKENS, "token"):
+        for name in TOKENS:
+            for count in VIEW_COUNTS:
+                try:
+                    found = measured(systems[name], arguments.people, count, arguments.body, networks)
+                except ValueError as error:  # not as many photos that are evenly spaced
+                    print(f"token: {error}", file=sys.stderr)
+                    continue
+                if found is not None and found["reconstruction"] is not None:
+                    curves.setdefault(name, {})[count] = found["reconstruction"]["psnr"]
+        draw_curves(curves, arguments.out / "token.png", "photos")
+    return curves
+
+
+def features(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, float]:
+    """What the features of four depths change, by patches."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from humangs_jax.evaluation.cases import find_people, weights_method
+
+    if not present(systems, DEPTHS, "features"):
+        return {}
+    people, changes = find_people(arguments.people, PHOTOS, None, arguments.body), []
+    methods = [weights_method(*systems[name]) for name in DEPTHS]
+    for index in range(len(people.names)):
+        case = people.load(index)
+        if case.truth.masks is None:
+            raise ValueError(f"{case.name}: the patches of a person are found by masks, and there are none")
+        without, with_them = (method(case, 1.0).images for method in methods)
+        for truth, mask, a, b in zip(case.truth.images, case.truth.masks, without, with_them, strict=True):
+            side = max(1, truth.shape[0] // PATCHES)
+            error = patch_lpips(networks[0]) if networks else patch_error
+            changes += [error(truth, a, box) - error(truth, b, box) for box in patches(mask, side)]
+    figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
+    axes.hist(changes, bins=60, color="#1f6f8b")
+    axes.axvline(0, color="black", linewidth=0.8)
+    axes.set_xlabel(f"{'LPIPS' if networks else 'squared error'} without - with features of four depths")
+    figure.savefig(arguments.out / "features.png", dpi=110)
+    centred = np.asarray(changes) - np.mean(changes)
+    skew = float(np.mean(centred**3) / max(np.mean(centred**2) ** 1.5, 1e-30))
+    return {"patches": len(changes), "mean": float(np.mean(changes)), "skewness": skew}
+
+
+def patches(mask: np.ndarray, side: int) -> list[tuple[slice, slice]]:
+    """Squares more than half of which the mask covers."""
+    corners = [
+        (y, x) for y in range(0, mask.shape[0] - side + 1, side) for x in range(0, mask.shape[1] - side + 1, side)
+    ]
+    boxes = [(slice(y, y + side), slice(x, x + side)) for y, x in corners]
+    return [box for box in boxes if mask[box].mean() > 0.5]
+
+
+def patch_error(truth: np.ndarray, shown: np.ndarray, box: tuple[slice, slice]) -> float:
+    """Mean squared error."""
+    return float(np.mean((truth[box] - shown[box]) ** 2))
+
+
+def patch_lpips(network: Any) -> Callable[..., float]:
+    """LPIPS of a patch."""
+    import jax
+
+    from humangs_jax.objectives.lpips import lpips
+
+    compare = jax.jit(lpips)
+    return lambda truth, shown, box: float(compare(network, shown[box], truth[box]))
+
+
+def driven(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, list[str]]:
+    """A row a person: one photo, then the person in poses of others, seen from the camera of that photo."""
+    import jax
+    import jax.numpy as jnp
+
+    from humangs_jax.avatar.frames import draw
+    from humangs_jax.avatar.reconstruct import reconstruct
+    from humangs_jax.core.pytree import replace
+    from humangs_jax.evaluation.cases import find_people
+    from humangs_jax.io.images import write_png
+
+    weights = systems.get("humangs", systems[SHIPPED])
+    people = find_people(arguments.people, PHOTOS, None, arguments.body)
+    others = find_people(arguments.motions, PHOTOS, None, arguments.body) if arguments.motions else people
+    rows = []
+    for index in range(min(SHOWN, len(people.names))):
+        case = people.load(index)
+        if case.inputs is None:
+            raise ValueError(f"{case.name}: no photos to reconstruct from")
+        own = jax.tree.map(lambda x: x[:1], case.inputs.poses)
+        avatar, camera = reconstruct(*weights, case.inputs), case.inputs.cameras[0]
+        row = [case.inputs.images[0]]
+        for step in range(1, SHOWN + 1):
+            poses = others.load((index + step) % len(others.names)).truth.poses
+            pose = jax.tree.map(lambda x: x[-1:], poses)  # the last one: an unseen pose where there is one
+            standing = replace(pose, translation=own.translation)  # where the person stood, before the same camera
+            cameras = jax.tree.map(lambda x: x[None], camera)
+            row.append(np.clip(np.asarray(next(iter(draw(avatar, standing, cameras, jnp.ones(3)))).rgb), 0, 1))
+        rows.append(np.concatenate(row, axis=1))
+    width = max(row.shape[1] for row in rows)
+    rows = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=1.0) for row in rows]
+    write_png(arguments.out / "driven.png", np.concatenate(rows))
+    return {"people": list(people.names[:SHOWN])}
+
+
+def draw_curves(curves: dict[str, dict[int, float]], path: Path, label: str) -> None:
+    """PSNR over numbers of photos."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
+    for name, points in curves.items():
+        axes.plot(list(points), list(points.values()), "o-", label=name)
+    axes.set_xlabel(label)
+    axes.set_ylabel("PSNR, dB")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.savefig(path, dpi=110)
+
+
+FIGURES: dict[str, Callable[[dict[str, Any], Any, argparse.Namespace], Any]] = {
+    "varying": varying,
+    "token": token,
+    "features": features,
+    "driven": driven,
+}
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""The paper's tables with our rows beside the printed ones.
+
+    python experiments/paper/tables.py --quick                                                 # minutes, synthetic people
+    python experiments/paper/tables.py --runs runs/paper --people PEOPLE --other OTHER --near NEAR --table all
+    python experiments/paper/tables.py ... --table animation --json tables.json
+
+animation        table 1: unseen poses and views, with the seconds to model a person and to draw a frame
+reconstruction   table 2: views in the pose of the photos, and in others
+domains          table 3: reconstruction of people like those of training (--people), and of others (--other)
+views            1, 2, 4 and 6 photos, cameras at the distance of training (--people) and nearer (--near)
+gaussians        1 against 1 + 4 and 1 + 8 Gaussians a vertex
+
+PSNR / SSIM / LPIPS by the protocol of the paper; LPIPS needs weights (--lpips). Printed rows say so and are of the paper's data
+and training: they are no measure of ours. Systems are those whose training is finished in --runs, and the shipped weights;
+those that take one photo get the first. People of another kind are any other folder: captures of `humangs synth` with other
+settings, or a data set.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import markdown_table, significant, write_json
+from experiments.paper.bench import (
+    ANIMATION,
+    DOMAINS,
+    GAUSSIANS,
+    PAPER,
+    PHOTOS,
+    RECONSTRUCTION,
+    VIEWS,
+    add_people_options,
+    load_networks,
+    measured,
+    quick_people,
+    takes_one,
+    trained,
+    triple,
+)
+
+COUNTS = (1, 2, 4, 6)
+K_VARIANTS = ("1 Gaussian a vertex", "humangs", "1 + 4 Gaussians a vertex", "1 + 8 Gaussians a vertex")
+ABLATIONS = (", another seed", "tightness", "Gaussian", "no ", "features", "pooling", "all tokens", "canonical")
+"""Marks of names that are no system of tables 1 to 3."""
+Measure = Callable[[str, Path | None, int], dict[str, Any] | None]
+"""(system, people, photos) -> what `bench.measured` gives; each is measured once."""
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_people_options(parser)
+    parser.add_argument("--other", type=Path, help="people of another kind")
+    parser.add_argument("--near", type=Path, help="people seen by nearer cameras")
+    parser.add_argument("--table", nargs="+", default=["all"], choices=(*TABLES, "all"), help="which ones")
+    arguments = parser.parse_args()
+    if not (arguments.people or arguments.quick):
+        parser.error("--people is needed, or --quick")
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            if arguments.people is None:
+                arguments.people = quick_people(Path(folder) / "people")
+            write(arguments)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+
+
+def write(arguments: argparse.Namespace) -> None:
+    """Measure and print what was asked for."""
+    systems, networks = trained(arguments.runs), load_networks(arguments.lpips)
+    numbers: dict[str, Any] = {}
+
+    def measure(name: str, people: Path | None, photos: int) -> dict[str, Any] | None:
+        if people is None or name not in systems:
+            return None
+        photos = 1 if takes_one(systems[name][1]) and photos == PHOTOS else photos
+        key = f"{name}, {people.name}, {photos}"
+        if key not in numbers:
+            numbers[key] = measured(systems[name], people, photos, arguments.body, networks)
+        return numbers[key]
+
+    names = [name for name in systems if not any(mark in name for mark in ABLATIONS)]
+    for table in TABLES if "all" in arguments.table else arguments.table:
+        print(f"## {table}\n\n{TABLES[table](names, measure, arguments)}\n", flush=True)
+    if arguments.json:
+        write_json(arguments.json, numbers)
+
+
+def of(found: Mapping[str, Any] | None, task: str) -> str:
+    """Scores of one task as text."""
+    return "-" if found is None else triple(found[task])
+
+
+def seconds(value: float | None) -> str:
+    """A time, or a dash."""
+    return "-" if value is None else significant(value)
+
+
+def animation(names: list[str], measure: Measure, arguments: argparse.Namespace) -> str:
+    """Table 1."""
+    rows = [[name, PAPER, triple(x[:3]), seconds(x[3]), seconds(x[4])] for name, x in ANIMATION.items()]
+    for name in names:
+        found = measure(name, arguments.people, PHOTOS)
+        if found is not None:
+            times = (seconds(found["model_s"]), seconds(found["frame_s"]))
+            rows.append([name, f"{found['photos']} photos", of(found, "animation"), *times])
+    return markdown_table(["method", "", "PSNR / SSIM / LPIPS", "modelling s", "synthesis s"], rows, "llrrr")
+
+
+def reconstruction(names: list[str], measure: Measure, arguments: argparse.Namespace) -> str:
+    """Table 2."""
+    rows = [[name, PAPER, *map(triple, x)] for name, x in RECONSTRUCTION.items()]
+    for name in names:
+        found = measure(name, arguments.people, PHOTOS)
+        if found is not None:
+            rows.append([name, f"{found['photos']} photos", of(found, "reconstruction"), of(found, "animation")])
+    return markdown_table(["method", "", "reconstruction", "reconstruction + animation"], rows, "llrr")
+
+
+def domains(names: list[str], measure: Measure, arguments: argparse.Namespace) -> str:
+    """Table 3."""
+    rows = [[name, PAPER, *map(triple, x)] for name, x in DOMAINS.items()]
+    for name in names:
+        found = [measure(name, people, PHOTOS) for people in (arguments.people, arguments.other)]
+        if found[0] is not None:
+            rows.append([name, f"{found[0]['photos']} photos", *(of(x, "reconstruction") for x in found)])
+    return markdown_table(["method", "", "in domain", "cross-domain"], rows, "llrr")
+
+
+def views(names: list[str], measure: Measure, arguments: argparse.Namespace) -> str:
+    """Numbers of photos."""
+    rows = [[name, f"{PAPER}, near", *map(triple, x)] for name, x in VIEWS.items()]
+    for kind, people in (("standard", arguments.people), ("near", arguments.near)):
+        for name in names:
+            found = [of(measure(name, people, count), "reconstruction") for count in COUNTS]
+            if set(found) != {"-"}:
+                rows.append([name, kind, *found])
+    return markdown_table(["method", "cameras", *map(str, COUNTS)], rows, "ll" + "r" * len(COUNTS))
+
+
+def gaussians(names: list[str], measure: Measure, arguments: argparse.Namespace) -> str:
+    """Gaussians a vertex."""
+    rows = [[f"1, {name}", PAPER, triple(one)] for name, (one, _) in GAUSSIANS.items()]
+    rows += [[f"1 tight + 4 free, {name}", PAPER, triple(five)] for name, (_, five) in GAUSSIANS.items()]
+    for name in K_VARIANTS:
+        found = measure(name, arguments.people, PHOTOS)
+        if found is not None:
+            rows.append([name, f"{found['photos']} photos", of(found, "reconstruction")])
+    return markdown_table(["Gaussians a vertex", "", "PSNR / SSIM / LPIPS"], rows, "llr")
+
+
+TABLES: dict[str, Callable[[list[str], Measure, argparse.Namespace], str]] = {
+    "animation": animation,
+    "reconstruction": reconstruction,
+    "domains": domains,
+    "views": views,
+    "gaussians": gaussians,
+}
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,201 @@
+"""GHG-style: textures of shells of the body, copied from the photos, and a U-Net that makes a Gaussian of every texel.
+
+Theirs (Kwon et al. 2024, https://arxiv.org/abs/2407.12777): UV maps of 1024 x 1024 texels of the surface of the body and of four
+shells around it, up to 4 cm off along the normals. A texel has the colour of the photo that sees it best; a network of gated
+convolutions fills the rest of the innermost one, the outer ones keep what was seen. A convolutional U-Net takes the colours and
+the offsets of the shells and gives rotation, scale (at most 1 cm) and opacity. Means and colours are not predicted.
+
+Our reading: the best view is the one whose ray meets the posed normal most directly; unseen texels of the innermost shell are
+filled from their neighbours through coarser and coarser maps (pull-push, Gortler et al. 1996), without a network; texels of outer
+shells that no photo shows on the person are transparent. Theirs is of one pose; here texels have the skinning weights of their
+points, so that the person can be animated. The encoder is `PlainPhotos`: none.
+"""
+
+import dataclasses
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.core.array_types import Array, Bool, Float, Key
+from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.geometry import quaternion
+from humangs_jax.network.bilinear import sample_bilinear, sample_nearest, texel_indices
+from humangs_jax.network.inputs import HumanGSInputs, subject_unit
+from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
+from humangs_jax.network.pixel_aligned import DEPTH_TOLERANCE, UNSEEN_COLOR, project_vertices
+from humangs_jax.network.surface_map import SurfaceMap
+from humangs_jax.network.unet import UNet, doubled, halved
+from humangs_jax.network.vertex_decoder import INITIAL_OPACITY
+from humangs_jax.rendering.gaussians import Gaussians
+
+DISTANCES = (0.0, 0.01, 0.02, 0.03, 0.04)
+LENGTH_EPSILON = 1e-6
+"""Added to lengths of interpolated normals before dividing."""
+NUMBERS = (4, 3, 1)
+"""Of a quaternion, a scale and an opacity."""
+
+
+@pytree_dataclass
+class ShellTextures:
+    """What the photos show of every texel of s shells.
+
+    distances: (s,) from the surface, normalised units. colors: (s, h, w, 3), the innermost filled, others `UNSEEN_COLOR` where
+    nothing was seen. seen: (s, h, w) whether a photo shows the person there.
+    """
+
+    distances: Float[Array, " s"]
+    colors: Float[Array, "s h w 3"]
+    seen: Bool[Array, "s h w"]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlainPhotos:
+    """The encoder of systems that read the photos themselves: its maps are their colours."""
+
+    patch_size: int = 1
+
+    def init(self, key: Key, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{}: nothing is learned."""
+        return {}
+
+    def apply(self, variables: Variables, inputs: HumanGSInputs, run: Pass) -> tuple[Encoding, Variables]:
+        """See `parts.Encoder`."""
+        return Encoding(inputs.images, None, jnp.zeros((), jnp.int32)), {}
+
+
+@dataclasses.dataclass(frozen=True)
+class ShellTextureReader:
+    """The textures. shells: ascending distances from the surface, normalised units, the first 0."""
+
+    surface_map: SurfaceMap = dataclasses.field(default_factory=lambda: SurfaceMap("atlas", 1024))
+    shells: tuple[float, ...] = DISTANCES
+
+    def __post_init__(self):
+        """Raises ValueError unless the shells begin at the surface and ascend."""
+        if not self.shells or self.shells[0] != 0 or list(self.shells) != sorted(set(self.shells)):
+            raise ValueError(f"reader.shells {self.shells}: expected ascending distances, the first 0")
+
+    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{}: nothing is learned."""
+        return {}
+
+    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> ShellTextures:
+        """Textures of the shells. Raises: ValueError if the inputs lack the map of the surface or posed normals."""
+        if inputs.texels is None or inputs.posed_normals is None:
+            raise ValueError("shell textures need texels and posed_normals of the inputs, see `prepare_inputs`")
+        unit, texels = subject_unit(inputs.canonical_vertices), inputs.texels
+        steps = jnp.asarray(self.shells, inputs.images.dtype)
+        size, grid = (inputs.cameras.width, inputs.cameras.height), run.config.conventions.pixel_grid
+        covered = texels.covered
+
+        def look(best, view):
+            image, foreground, depth_map, camera, vertices, normals, present = view
+            surface_normals = unit_length(texels.interpolate(normals))
+            points = texels.interpolate(vertices) + steps[:, None, None, None] * surface_normals
+            shape, points = points.shape[:-1], points.reshape(-1, 3)
+            pixels, depths = project_vertices(camera, points)
+            indices = texel_indices(pixels, size, size, grid)
+            surface, person = sample_nearest(depth_map, indices), sample_nearest(foreground, indices) > 0
+            framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (depths > 0)
+            visible = framed & person & ((surface < 0) | (depths < surface + DEPTH_TOLERANCE)) & present
+            towards = unit_length(camera.center - points).reshape(*shape, 3)
+            facing = jnp.sum(towards * surface_normals, axis=-1)
+            facing = jnp.where(visible.reshape(shape) & covered, facing, 0.0)
+            colors = sample_bilinear(image, indices).reshape(*shape, 3)
+            better = facing > best[0]
+            return (jnp.where(better, facing, best[0]), jnp.where(better[..., None], colors, best[1])), None
+
+        shape = (len(self.shells), *covered.shape)
+        nothing = jnp.zeros(shape), jnp.full((*shape, 3), UNSEEN_COLOR)
+        views = (
+            inputs.images,
+            inputs.foreground.astype(inputs.images.dtype),
+            inputs.depth_maps,
+            inputs.cameras.in_units(unit),
+            inputs.posed_vertices / unit,
+            inputs.posed_normals,
+            inputs.present,
+        )
+        (facing, colors), _ = jax.lax.scan(look, nothing, views)
+        seen = facing > 0
+        return ShellTextures(steps, colors.at[0].set(fill_unseen(colors[0], seen[0])), seen)
+
+
+def unit_length(vectors: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    """Vectors over their lengths; 0 stays 0."""
+    return vectors / jnp.sqrt(jnp.sum(vectors**2, axis=-1, keepdims=True) + LENGTH_EPSILON**2)
+
+
+def fill_unseen(colors: Float[Array, "h w 3"], seen: Bool[Array, "h w"]) -> Float[Array, "h w 3"]:
+    """Seen texels as they are, others from the finest coarser map that has seen something; grey if nothing was seen at all."""
+    weights = seen[None, ..., None].astype(colors.dtype)
+    return _filled(colors[None] * weights, weights)[0]
+
+
+def _filled(sums, weights):
+    """Means where there are weights, and what coarser maps have elsewhere."""
+    mean = sums / jnp.where(weights > 0, weights, 1)
+    _, height, width, _ = sums.shape
+    if height % 2 or width % 2:
+        total = jnp.sum(weights, axis=(1, 2), keepdims=True)
+        coarse = jnp.where(
+            total > 0, jnp.sum(sums, axis=(1, 2), keepdims=True) / jnp.where(total > 0, total, 1), UNSEEN_COLOR
+        )
+    else:
+        coarse = doubled(_filled(halved(sums), halved(weights)))
+    return jnp.where(weights > 0, mean, coarse)
+
+
+@dataclasses.dataclass(frozen=True)
+class ShellDecoder:
+    """The U-Net. widths: its features, the finest scale first. largest_scale: of a Gaussian, normalised units."""
+
+    widths: tuple[int, ...] = (32, 48, 96)
+    largest_scale: float = 0.01
+
+    def init(self, key: Key, features: ShellTextures, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{"params"} of the U-Net."""
+        side = 2 ** (len(self.widths) - 1)
+        channels = 3 * (2 * len(features.distances) - 1)
+        return cast(Variables, self._network(features).init(key, jnp.zeros((1, side, side, channels))))
+
+    def apply(self, variables: Variables, features: ShellTextures, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+        """A Gaussian a texel of every shell; those that show no point of the body, or were not seen, are transparent.
+
+        Raises: ValueError if the inputs lack the map of the surface, normals or skinning weights.
+        """
+        texels, normals, weights = inputs.texels, inputs.canonical_normals, inputs.skinning_weights
+        if texels is None or normals is None or weights is None:
+            raise ValueError("shell textures need texels, canonical_normals and skinning_weights of the inputs")
+        unit, shells = subject_unit(inputs.canonical_vertices), len(features.distances)
+        covered = texels.covered
+        surface = texels.interpolate(inputs.canonical_vertices / unit)
+        offsets = features.distances[:, None, None, None] * unit_length(texels.interpolate(normals))
+
+        def heads(colors):
+            channels = jnp.concatenate([2 * colors - 1, offsets[1:]])
+            entering = jnp.moveaxis(channels, 0, 2).reshape(1, *covered.shape, -1)
+            raw = cast(Array, self._network(features).apply(variables, entering))[0]
+            return jnp.moveaxis(raw.reshape(*covered.shape, shells, -1), 2, 0)
+
+        def assemble(raw):
+            quats, scales, opacities = jnp.split(raw, (NUMBERS[0], NUMBERS[0] + NUMBERS[1]), axis=-1)
+            shown = covered & features.seen.at[0].set(True)
+            flat = lambda x: x.reshape(-1, x.shape[-1])
+            return Gaussians(
+                means=flat(surface + offsets) * unit,
+                quats=quaternion.normalize(flat(quats) + jnp.asarray(quaternion.IDENTITY, raw.dtype)),
+                scales=flat(self.largest_scale * jax.nn.sigmoid(scales)) * unit,
+                opacities=jnp.where(shown, jax.nn.sigmoid(opacities[..., 0] + INITIAL_OPACITY), 0.0).reshape(-1),
+                colors=flat(features.colors),
+            )
+
+        raw = run.stage("raw heads", heads, features.colors)
+        gaussians = run.stage("canonical Gaussians", assemble, raw)
+        rows = texels.interpolate(weights).at[..., 0].add(1.0 - covered)  # what shows nothing stays at the root
+        rows = jnp.tile(rows.reshape(-1, rows.shape[-1]), (shells, 1))
+        return HumanGSOutputs(gaussians, skinning_weights=rows)
+
+    def _network(self, features: ShellTextures):
+        return UNet(self.widths, sum(NUMBERS) * len(features.distances))

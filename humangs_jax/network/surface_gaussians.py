@@ -1,0 +1,258 @@
+"""GIGA-style and Animatable-Gaussians-style: a Gaussian for every texel of a map of the body, by U-Nets that run for every pose.
+
+GIGA (Zubekhin et al. 2025, https://arxiv.org/abs/2504.07144): photos of the CURRENT frame are projected onto a texture of 512
+x 512 texels, the visible views weighted by the softmax of 5 times the cosine at which they see a texel. Encoders for textures
+and for canonical positions (64 x 1, 2, 4, 8 channels), whose coarsest maps attend to an MLP of the pose (162 numbers, width
+1024), and decoders of 3, 3 and 8 channels give colour, offset and the rest of a Gaussian a texel, which skinning poses. SSIM
+0.5, L1 0.5, alpha 0.2, perceptual 0.5 and penalties of offsets, opacities and scales. Our reading: one U-Net of 3 + 1 + 3
+channels (colour, whether seen, position) and 14; no static texture of other frames, which half of their steps drop; the pose
+is that of the target.
+
+Animatable Gaussians (Li et al. 2023, https://arxiv.org/abs/2311.16096) is fitted to ONE person: maps of the front and the
+back of the T-pose, 1024 x 1024 texels each, a Gaussian for every texel that shows the body; three StyleUNets turn a map of
+posed positions into colours, offsets (times 0.05) and the rest. L1 + 0.1 LPIPS + 0.005 of squared offsets, Adam 5e-4, 800,000
+steps of one person. It reads no photo: the person is in the weights, which belong to nobody else. Our reading: plain U-Nets
+on maps of one size, colours that do not depend on the view, no PCA of novel poses, positions relative to the middle and the
+root's rotation.
+
+Both start from the same Gaussians, flat ones on the surface: with zero corrections the body itself. Texels that show nothing
+are transparent.
+"""
+
+import dataclasses
+from typing import Any, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.body.model import BodyPose, Texels
+from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.numerics import safe_divide, safe_normalize
+from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.geometry import quaternion
+from humangs_jax.geometry.transform import EXACT
+from humangs_jax.network.bilinear import sample_bilinear, texel_indices
+from humangs_jax.network.correction import NUMBERS, corrected, pose_vector
+from humangs_jax.network.inputs import HumanGSInputs, subject_unit
+from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
+from humangs_jax.network.pixel_aligned import UNSEEN_COLOR, project_vertices, visible_vertices
+from humangs_jax.network.surface_map import SurfaceMap
+from humangs_jax.network.unet import UNet
+from humangs_jax.network.vertex_decoder import normal_frames
+from humangs_jax.rendering.gaussians import Gaussians
+
+AREA = 1.9
+"""Surface of a body of height 1.8, square metres."""
+COVERAGE, THICKNESS = 0.7, 0.2
+"""Standard deviations of a Gaussian along the surface over the distance between texels, and across over along it."""
+OPACITY = 0.9
+"""Of Gaussians before corrections."""
+MOST_SCALES = 12
+"""Of a U-Net: the coarsest map of the largest one has two texels."""
+
+
+@pytree_dataclass
+class SurfaceTexture:
+    """colors: (h, w, 3), grey where unseen. seen: (h, w) 1 where a photo shows the texel, else 0."""
+
+    colors: Float[Array, "h w 3"]
+    seen: Float[Array, "h w"]
+
+
+@pytree_dataclass
+class Surface:
+    """What drivers work from. texture: or None. positions: (h, w, 3) canonical, normalised units. texels: the map."""
+
+    texture: SurfaceTexture | None
+    positions: Float[Array, "h w 3"]
+    texels: Texels
+
+
+@dataclasses.dataclass(frozen=True)
+class TextureReader:
+    """Photos -> the texture of the body. sharpness: of the softmax over the cosines of visible views; larger: the best view."""
+
+    surface_map: SurfaceMap = dataclasses.field(default_factory=SurfaceMap)
+    sharpness: float = 5.0
+
+    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{}: nothing is learned."""
+        return {}
+
+    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> SurfaceTexture:
+        """The texture. Raises: ValueError if the inputs lack the map of the surface or posed normals."""
+        texels = _texels(inputs)
+        if inputs.posed_normals is None:
+            raise ValueError("a TextureReader needs posed_normals of the inputs, see `prepare_inputs`")
+        unit, covered = subject_unit(inputs.canonical_vertices), texels.covered.reshape(-1)
+        size, grid = (inputs.cameras.width, inputs.cameras.height), run.config.conventions.pixel_grid
+
+        def view(image, depth_map, camera, vertices, normals, present):
+            points = texels.interpolate(vertices).reshape(-1, 3)
+            pixels, depths = project_vertices(camera, points)
+            visible = visible_vertices(pixels, depths, depth_map, size, grid) & covered & present
+            away = lambda x: safe_normalize(x, jnp.zeros(3))
+            cosines = jnp.sum(away(texels.interpolate(normals).reshape(-1, 3)) * away(camera.center - points), axis=-1)
+            weights = jnp.where(visible & (cosines > 0), jnp.exp(self.sharpness * (cosines - 1)), 0.0)
+            return sample_bilinear(image, texel_indices(pixels, size, size, grid)), weights
+
+        arguments = (inputs.images, inputs.depth_maps, inputs.cameras.in_units(unit), inputs.posed_vertices / unit)
+        colors, weights = jax.vmap(view)(*arguments, inputs.posed_normals, inputs.present)
+        total = jnp.sum(weights, axis=0)
+        mean = jnp.einsum("vtc,vt->tc", colors, safe_divide(weights, total), precision=EXACT)
+        seen, shape = total > 0, texels.covered.shape
+        colors = jnp.where(seen[:, None], mean, UNSEEN_COLOR)
+        return SurfaceTexture(colors.reshape(*shape, 3), seen.reshape(shape).astype(colors.dtype))
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceDecoder:
+    """A flat Gaussian on the surface for every texel, row-major, with the texture's colour: what drivers correct.
+
+    Nothing is learned. Without a texture, features of any other kind, colours are grey.
+    """
+
+    surface_map: SurfaceMap = dataclasses.field(default_factory=SurfaceMap)
+
+    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{}: nothing is learned."""
+        return {}
+
+    def apply(self, variables: Variables, features: Any, inputs: HumanGSInputs, run: Pass) -> HumanGSOutputs:
+        """See `parts.Decoder`. Raises: ValueError if the inputs lack the map, the normals or the weights of the body."""
+        texels = _texels(inputs)
+        if inputs.canonical_normals is None or inputs.skinning_weights is None:
+            raise ValueError("a SurfaceDecoder needs canonical_normals and skinning_weights, see `prepare_inputs`")
+        texture = features if isinstance(features, SurfaceTexture) else None
+        unit, covered = subject_unit(inputs.canonical_vertices), texels.covered.reshape(-1)
+        flat = lambda values: texels.interpolate(values).reshape(len(covered), -1)
+        up = jnp.asarray([0.0, 0.0, 1.0])
+        along = COVERAGE * jnp.sqrt(AREA / jnp.maximum(jnp.sum(covered), 1)) * unit
+        root = jnp.zeros(inputs.skinning_weights.shape[1]).at[0].set(1.0)
+        gaussians = Gaussians(
+            means=flat(inputs.canonical_vertices),
+            quats=normal_frames(safe_normalize(flat(inputs.canonical_normals), up)),
+            scales=jnp.broadcast_to(along * jnp.asarray([1.0, 1.0, THICKNESS]), (len(covered), 3)),
+            opacities=jnp.where(covered, OPACITY, 0.0),
+            colors=jnp.full((len(covered), 3), UNSEEN_COLOR) if texture is None else texture.colors.reshape(-1, 3),
+        )
+        weights = jnp.where(covered[:, None], flat(inputs.skinning_weights), root)
+        positions = texels.interpolate(inputs.canonical_vertices) / unit
+        return HumanGSOutputs(gaussians, skinning_weights=weights, scene=Surface(texture, positions, texels))
+
+
+def _texels(inputs: HumanGSInputs) -> Texels:
+    if inputs.texels is None:
+        raise ValueError("this network works on a map of the surface: use `gaussian_body` and `prepare_inputs`")
+    return inputs.texels
+
+
+@dataclasses.dataclass(frozen=True)
+class TextureDriver:
+    """GIGA-style: one U-Net on the texture, seen or not, and positions; its coarsest maps attend to the pose.
+
+    widths: of the U-Net. pose_width, pose_tokens: of the MLP of the pose. joints: of the body. offset_scale: metres, bound of
+    the offsets.
+    """
+
+    widths: tuple[int, ...] = (64, 128, 256, 512)
+    pose_width: int = 1024
+    pose_tokens: int = 16
+    joints: int = 55
+    offset_scale: float = 0.1
+
+    def __post_init__(self):
+        """Raises ValueError for a number of scales that no map has."""
+        _check_scales(self.widths)
+
+    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{"params"} of the U-Net and the MLP in it."""
+        side = 2 ** (len(self.widths) - 1)
+        return cast(
+            Variables, self._module().init(key, jnp.zeros((1, side, side, 7)), jnp.zeros(3 * (self.joints - 1)))
+        )
+
+    def apply(
+        self, variables: Variables, outputs: HumanGSOutputs, pose: BodyPose, posed: Float[Array, "n 3"], run: Pass
+    ) -> HumanGSOutputs:
+        """See `parts.Driver`. Raises: ValueError for a decoder without a texture; see `correction.pose_vector`."""
+        surface: Surface = outputs.scene
+        if surface.texture is None:
+            raise ValueError("a TextureDriver needs a TextureReader")
+        texture = surface.texture
+        maps = jnp.concatenate([2 * texture.colors - 1, texture.seen[..., None], surface.positions], axis=-1)
+        raw = self._module().apply(variables, maps[None], pose_vector(pose, self.joints))
+        return _driven(outputs, cast(Array, raw)[0], self.offset_scale)
+
+    def _module(self):
+        return UNet(self.widths, NUMBERS, PoseAttention(self.pose_width, self.pose_tokens, parent=None))
+
+
+@dataclasses.dataclass(frozen=True)
+class PoseMapDriver:
+    """Animatable-Gaussians-style: three U-Nets on the map of posed positions, for offsets, shapes and colours.
+
+    widths: of each U-Net. offset_scale: metres, bound of the offsets.
+    """
+
+    widths: tuple[int, ...] = (64, 128, 256, 512)
+    offset_scale: float = 0.05
+
+    def __post_init__(self):
+        """Raises ValueError for a number of scales that no map has."""
+        _check_scales(self.widths)
+
+    def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{"params"} of the U-Nets."""
+        side = 2 ** (len(self.widths) - 1)
+        return cast(Variables, PoseMapModule(self.widths).init(key, jnp.zeros((1, side, side, 3))))
+
+    def apply(
+        self, variables: Variables, outputs: HumanGSOutputs, pose: BodyPose, posed: Float[Array, "n 3"], run: Pass
+    ) -> HumanGSOutputs:
+        """See `parts.Driver`."""
+        surface: Surface = outputs.scene
+        upright = quaternion.matrix_from_axis_angle(pose.rotations[0])
+        relative = jnp.matmul(posed - jnp.mean(posed, axis=0), upright, precision=EXACT)  # rows times R: R^T p
+        maps = surface.texels.interpolate(relative)
+        raw = PoseMapModule(self.widths).apply(variables, maps[None])
+        return _driven(outputs, cast(Array, raw)[0], self.offset_scale)
+
+
+def _check_scales(widths):
+    if not 1 <= len(widths) <= MOST_SCALES:
+        raise ValueError(f"driver.widths: {len(widths)} scales: expected 1 to {MOST_SCALES}")
+
+
+def _driven(outputs, raw, offset_scale):
+    gaussians, offsets = corrected(outputs.gaussians, raw.reshape(-1, NUMBERS), offset_scale)
+    return replace(outputs, gaussians=gaussians, tight_offsets=offsets[:, None])
+
+
+class PoseMapModule(nn.Module):
+    """Maps (1, h, w, 3) -> raw corrections (1, h, w, 14)."""
+
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, maps: Float[Array, "v h w 3"]) -> Float[Array, "v h w 14"]:
+        nets = {"offsets": 3, "shapes": 8, "colors": 3}  # in the order of `correction.NUMBERS`
+        return jnp.concatenate([UNet(self.widths, n, name=name)(maps) for name, n in nets.items()], axis=-1)
+
+
+class PoseAttention(nn.Module):
+    """The bottleneck of a U-Net: every texel of its maps (1, h, w, d) attends to tokens that an MLP makes of the pose (q,)."""
+
+    width: int
+    tokens: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v h w d"], pose: Float[Array, " q"]) -> Float[Array, "v h w d"]:
+        features = x.shape[-1]
+        hidden = jax.nn.silu(nn.Dense(self.width, name="pose_0")(pose))
+        context = nn.Dense(self.tokens * features, name="pose_1")(hidden).reshape(self.tokens, features)
+        dense = lambda name: nn.Dense(features, use_bias=False, name=name)
+        queries, keys, values = dense("query")(x), dense("key")(context), dense("value")(context)
+        attention = jax.nn.softmax(queries @ keys.T * features**-0.5, axis=-1)
+        return x + dense("out")(attention @ values)

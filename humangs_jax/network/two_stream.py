@@ -1,0 +1,167 @@
+"""LHM-style reading: points of the body and image tokens attend to each other and to themselves, in two streams.
+
+Theirs (Qiu et al. 2025, https://arxiv.org/abs/2503.10625): encoded canonical points of the body meet the tokens of one photo in
+blocks of the kind of Stable Diffusion 3 (Esser et al. 2024, https://arxiv.org/abs/2403.03206): joint attention over both, each
+stream with weights of its own, modulated by the pooled image features; a small MLP makes a Gaussian of every point. There is no
+camera and no pose of the photo. LHM++ (https://arxiv.org/abs/2506.13766): the same on pooled points, for several photos.
+
+Our reading: the points are the vertices of the body; our patch transformer, trained with the rest, stands for their frozen
+Sapiens and DINOv2; there is no second branch for the head, whose crop our inputs do not have; points are pooled along a Morton
+curve, as Point Transformer V3 does (https://arxiv.org/abs/2312.10035), once and not in a U-Net, and Gaussians are drawn as they
+are, not as features for a second network. The cost grows with (points + tokens)^2.
+"""
+
+import dataclasses
+from typing import cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.network.attention import NORM_EPSILON, attention
+from humangs_jax.network.cross_attention import INIT, check_heads, image_tokens
+from humangs_jax.network.execution import Execution
+from humangs_jax.network.inputs import HumanGSInputs, subject_unit
+from humangs_jax.network.parts import Encoding, Pass, Variables
+from humangs_jax.network.reader import VertexFeatures
+from humangs_jax.network.transformer import layer_norm
+from humangs_jax.network.vertex_decoder import positional_encoding
+
+CURVE_BITS = 10
+"""Cells along each axis of the Morton curve: 2^10, over a cube of side 2 * `CURVE_REACH`."""
+CURVE_REACH = 1.2
+"""Normalised units: canonical bodies are 1.8 high and less than 2 wide."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TwoStreamReader:
+    """Joint attention of points and tokens.
+
+    width, mlp_ratio, head_width: of both streams, as in `TransformerConfig`. blocks: how many. pooling: vertices that share a
+    point; 1: every vertex is one. most_views: more photos than this are refused, None: none are (LHM takes 1).
+    """
+
+    width: int = 1024
+    blocks: int = 5
+    mlp_ratio: int = 4
+    head_width: int = 64
+    pooling: int = 1
+    most_views: int | None = None
+
+    def __post_init__(self):
+        """Raises ValueError for sizes that do not fit together."""
+        check_heads("reader", self.width, self.head_width)
+        if min(self.blocks, self.pooling) < 1:
+            raise ValueError(f"reader: blocks {self.blocks}, pooling {self.pooling}: expected at least 1")
+
+    def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
+        """{"params"} of `TwoStreams`."""
+        tokens = jnp.zeros((1, encoding.maps.shape[-1]))
+        return cast(Variables, self._module(run).init(key, jnp.zeros((1, 3)), tokens, None))
+
+    def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
+        """Features of the n vertices. Raises ValueError for too many views, or an encoder with an upsampler."""
+        check_views(inputs, self.most_views)
+        canonical = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
+        local = self._module(run).apply(variables, canonical, *image_tokens(encoding, inputs, run))
+        return VertexFeatures(cast(Array, local), encoding.global_token, normals=inputs.canonical_normals)
+
+    def _module(self, run: Pass):
+        return TwoStreams(self, run.config.execution)
+
+
+def check_views(inputs: HumanGSInputs, most: int | None) -> None:
+    """Raises ValueError for more photos than a system takes."""
+    if most is not None and len(inputs.images) > most:
+        raise ValueError(f"{len(inputs.images)} photos: this system takes {most}")
+
+
+def along_curve(positions: Float[Array, "n 3"]) -> Int[Array, " n"]:
+    """Rank of each position (normalised units) along a Morton curve: those of similar rank are near each other."""
+    cells = 2**CURVE_BITS
+    at = jnp.floor((positions / (2 * CURVE_REACH) + 0.5) * cells).astype(jnp.int32)
+    at, bits = jnp.clip(at, 0, cells - 1), jnp.arange(CURVE_BITS)
+    digits = (at[:, :, None] >> bits) & 1
+    codes = jnp.sum(digits << (3 * bits + jnp.arange(3)[:, None]), axis=(1, 2))
+    order = jnp.argsort(codes, stable=True)
+    return jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=order.dtype))
+
+
+class TwoStreams(nn.Module):
+    """Canonical positions (n, 3) and tokens (l, e) -> features (n, d)."""
+
+    config: TwoStreamReader
+    execution: Execution
+
+    @nn.compact
+    def __call__(
+        self, positions: Float[Array, "n 3"], tokens: Float[Array, "l e"], count: Int[Array, ""] | None
+    ) -> Float[Array, "n d"]:
+        config = self.config
+        dense = lambda name: nn.Dense(config.width, kernel_init=INIT, name=name)
+        embedded = dense("position_out")(jax.nn.silu(dense("position_in")(positional_encoding(positions))))
+        points, cluster = embedded, None
+        if config.pooling > 1:
+            cluster, clusters = along_curve(positions) // config.pooling, -(-len(positions) // config.pooling)
+            members = jax.ops.segment_sum(jnp.ones(len(positions)), cluster, clusters)
+            points = jax.ops.segment_sum(embedded, cluster, clusters) / members[:, None]
+        tokens = layer_norm(None, "token_norm")(dense("tokens")(tokens))
+        present = jnp.ones(len(tokens)) if count is None else (jnp.arange(len(tokens)) < count).astype(jnp.float32)
+        pooled = jnp.sum(tokens * present[:, None], axis=0) / jnp.maximum(jnp.sum(present), 1)
+        for index in range(config.blocks):
+            block = TwoStreamBlock(config, self.execution, index + 1 == config.blocks, name=f"block_{index}")
+            points, tokens = block(points, tokens, count, pooled)
+        points = layer_norm(None, "norm", use_bias=True)(points)
+        return points if cluster is None else points[cluster] + dense("skip")(embedded)
+
+
+class TwoStreamBlock(nn.Module):
+    """Points (n, d) and tokens (l, d) -> both, the tokens as they were after the `last` one, which nothing reads.
+
+    The modulation starts as the identity, and gates at 0 (Peebles & Xie 2023, https://arxiv.org/abs/2212.09748).
+    """
+
+    config: TwoStreamReader
+    execution: Execution
+    last: bool
+
+    @nn.compact
+    def __call__(
+        self,
+        points: Float[Array, "n d"],
+        tokens: Float[Array, "l d"],
+        count: Int[Array, ""] | None,
+        pooled: Float[Array, " d"],
+    ) -> tuple[Float[Array, "n d"], Float[Array, "l d"]]:
+        config, dtype = self.config, self.execution.compute_dtype
+        width, vertices = config.width, len(points)
+        dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
+
+        def modulations(name, number):
+            made = nn.Dense(number * width, kernel_init=nn.initializers.zeros, name=f"{name}_modulation")
+            return jnp.split(made(jax.nn.silu(pooled)), number)
+
+        def heads(x, name, modulation, ask):
+            shift, scale = modulation
+            x = layer_norm(dtype, f"{name}_norm1")(x) * (1 + scale) + shift
+            made = dense((2 + ask) * width, f"{name}_kvq")(x).reshape(len(x), -1, config.head_width)
+            k, v, *q = jnp.split(made, 2 + ask, axis=1)
+            rms = lambda y, which: nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name=f"{name}_{which}_norm")(y)
+            return [rms(k, "k"), v, *(rms(y, "q") for y in q)]
+
+        def update(x, seen, name, modulation):
+            gate1, shift, scale, gate2 = modulation
+            x = x + gate1 * dense(width, f"{name}_out")(seen.reshape(len(x), width))
+            hidden = layer_norm(dtype, f"{name}_norm2")(x) * (1 + scale) + shift
+            hidden = jax.nn.gelu(dense(config.mlp_ratio * width, f"{name}_mlp_in")(hidden), approximate=False)
+            return x + gate2 * dense(width, f"{name}_mlp_out")(hidden)
+
+        of_points, of_tokens = modulations("points", 6), modulations("tokens", 2 if self.last else 6)
+        k, v, q = heads(points, "points", of_points[:2], ask=True)
+        token_k, token_v, *token_q = heads(tokens, "tokens", of_tokens[:2], ask=not self.last)
+        k, v, q = jnp.concatenate([k, token_k]), jnp.concatenate([v, token_v]), jnp.concatenate([q, *token_q])
+        total = None if count is None else vertices + count
+        seen = attention(q, k, v, total, self.execution.attention, self.execution.attention_chunk)
+        points = update(points, seen[:vertices], "points", of_points[2:])
+        return points, tokens if self.last else update(tokens, seen[vertices:], "tokens", of_tokens[2:])

@@ -1,0 +1,65 @@
+"""A small U-Net over maps, for systems that predict Gaussians texel by texel.
+
+At each scale two 3x3 convolutions with a ReLU; 2x2 means going down, nearest texels going up, joined with the maps of the same
+scale. A last 3x3 convolution gives the output, which starts near 0 (Ronneberger et al. 2015, https://arxiv.org/abs/1505.04597).
+"""
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from humangs_jax.core.array_types import Array, Float
+from humangs_jax.network.convolution import Convolution
+from humangs_jax.network.upsampler import KAIMING
+
+LAST_STD = 0.001
+
+
+class UNet(nn.Module):
+    """Maps (v, h, w, c) -> (v, h, w, features).
+
+    widths: features at every scale, the finest first; both sides are multiples of 2^(len(widths) - 1), or ValueError. bottleneck:
+    a module that changes the coarsest maps, (v, h', w', widths[-1]) and what the call gives as `context` -> the same shape.
+    """
+
+    widths: tuple[int, ...]
+    features: int
+    bottleneck: nn.Module | None = None
+    dtype: Any = None
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "v h w c"], context: Any = None) -> Float[Array, "v h w features"]:
+        coarsest = 2 ** (len(self.widths) - 1)
+        if x.shape[1] % coarsest or x.shape[2] % coarsest:
+            raise ValueError(
+                f"maps of {x.shape[2]} x {x.shape[1]}: a U-Net of {len(self.widths)} scales needs multiples of {coarsest}"
+            )
+
+        def convolved(x, width, name):
+            for i in range(2):
+                x = jax.nn.relu(Convolution(width, KAIMING, self.dtype, name=f"{name}_{i}")(x))
+            return x
+
+        kept = []
+        for i, width in enumerate(self.widths):
+            x = convolved(x if i == 0 else halved(x), width, f"down_{i}")
+            kept.append(x)
+        x = kept.pop()
+        if self.bottleneck is not None:
+            x = self.bottleneck(x, context)
+        for i, skip in reversed(list(enumerate(kept))):
+            x = convolved(jnp.concatenate([doubled(x), skip], axis=-1), self.widths[i], f"up_{i}")
+        return Convolution(self.features, nn.initializers.normal(LAST_STD), self.dtype, name="out")(x)
+
+
+def halved(x: Float[Array, "v h w c"]) -> Float[Array, "v i j c"]:
+    """Means of squares of 2 x 2."""
+    views, height, width, channels = x.shape
+    return jnp.mean(x.reshape(views, height // 2, 2, width // 2, 2, channels), axis=(2, 4))
+
+
+def doubled(x: Float[Array, "v h w c"]) -> Float[Array, "v i j c"]:
+    """Every element as a square of 2 x 2."""
+    return jnp.repeat(jnp.repeat(x, 2, axis=1), 2, axis=2)

@@ -1,0 +1,318 @@
+"""Systems that run again for every target: gradients, and the properties that make each of them that system."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from network_cases import random_inputs, random_variables
+from target_cases import BLOCKS, DRIVEN, PATCH, PIXELS, SIZE, mapped_tube, small, views
+from training.training_cases import tube
+
+from humangs_jax.avatar.reconstruct import make_avatar
+from humangs_jax.avatar.targets import frame_outputs, target_pixels, target_queries
+from humangs_jax.body.model import BodyPose
+from humangs_jax.core.configuration import config_from_json, config_to_json
+from humangs_jax.core.pytree import replace
+from humangs_jax.network.config import Architecture
+from humangs_jax.network.correction import CorrectionMLP, corrected
+from humangs_jax.network.humangs import apply_humangs, draw_pixels
+from humangs_jax.network.parts import Driver, PixelDecoder
+from humangs_jax.network.surface_gaussians import PoseMapDriver, TextureDriver
+from humangs_jax.network.surface_map import SurfaceMap, surface_texels
+from humangs_jax.network.vertex_decoder import COLOR_MARGIN
+
+TARGETS = views(seed=1, count=3)
+BETAS = jnp.zeros(1)
+QUERIES = jnp.asarray(np.random.default_rng(1).uniform(-1, 1, (3, SIZE, SIZE, 9)), jnp.float32)
+OTHER_POSE = QUERIES.at[..., 6:].set(-QUERIES[..., 6:])
+ask = jax.jit(target_queries, static_argnames="config")
+
+
+@functools.cache
+def inputs_of(name):
+    """Photos of noise; a body as large as the tube, with its map."""
+    body = mapped_tube(small(name))
+    inputs = random_inputs(vertices=len(body.template), size=SIZE)
+    return replace(inputs, texels=body.texels, skinning_weights=body.skinning_weights)
+
+
+@functools.cache
+def drawing(name):
+    """(variables, inputs, queries) -> images."""
+    config = small(name)
+    return jax.jit(lambda v, x, q: draw_pixels(v, apply_humangs(v, x, config)[0], q, config))
+
+
+@functools.cache
+def driving(name):
+    """(variables, inputs, pose) -> canonical Gaussians of a frame, and the outputs before."""
+    config, body = small(name), mapped_tube(small(name))
+
+    def run(variables, inputs, pose):
+        outputs, _ = apply_humangs(variables, inputs, config)
+        return frame_outputs(variables, outputs, body, BETAS, pose, config), outputs
+
+    return jax.jit(run)
+
+
+def pose(seed=2, root=None):
+    rotations = jnp.asarray(np.random.default_rng(seed).normal(size=(2, 3)) * 0.5, jnp.float32)
+    rotations = rotations if root is None else rotations.at[0].set(root)
+    return BodyPose(rotations, jnp.asarray([0.3, 0.0, 0.1]))
+
+
+def driven(name, inputs=None, at=None, variables=None):
+    variables = random_variables(small(name)) if variables is None else variables
+    return driving(name)(variables, inputs_of(name) if inputs is None else inputs, pose() if at is None else at)
+
+
+def close(a, b, bound=2e-5):
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, atol=bound)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*PIXELS, *DRIVEN])
+def test_every_parameter_has_a_finite_gradient(name):
+    config, run = small(name), drawing(name) if name in PIXELS else driving(name)
+    last = QUERIES if name in PIXELS else pose()
+    variables = random_variables(config)
+
+    def loss(params):
+        made = run({**variables, "params": params}, inputs_of(name), last)
+        made = made if name in PIXELS else (made[0].gaussians, made[0].tight_offsets)
+        return sum(jnp.sum(jnp.sin(7 * x)) for x in jax.tree.leaves(made))
+
+    gradients = jax.grad(loss)(variables["params"])
+    for path, gradient in jax.tree_util.tree_leaves_with_path(gradients):
+        assert np.isfinite(gradient).all(), path
+        assert np.abs(gradient).max() > 0, path
+
+
+# Pixels --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PIXELS)
+def test_every_target_is_its_own_pass_and_the_order_of_photos_is_irrelevant(name):
+    variables, inputs, asked = random_variables(small(name)), inputs_of(name), np.asarray(QUERIES)
+    images = drawing(name)(variables, inputs, asked)
+    assert images.shape == (3, SIZE, SIZE, 3) and 0 <= images.min() < images.max() <= 1
+    close(images, drawing(name)(variables, inputs, asked[::-1])[::-1])
+    changed = asked + np.asarray([0, 0.1, 0], np.float32)[:, None, None, None]
+    np.testing.assert_array_equal(drawing(name)(variables, inputs, changed)[::2], images[::2])
+    turn = lambda field: jax.tree.map(lambda x: np.asarray(x)[::-1], getattr(inputs, field))
+    turned = replace(inputs, **{field: turn(field) for field in ("images", "cameras", "position_maps")})
+    close(images, drawing(name)(variables, turned, asked))
+    padded = replace(inputs, view_count=np.asarray(1, np.int32))  # the other one is padding
+    alone = drawing(name)(variables, padded, asked)
+    assert np.abs(alone - images).max() > 1e-4
+    hidden = replace(padded, images=np.asarray(inputs.images) * np.asarray([1, 0], np.float32)[:, None, None, None])
+    close(alone, drawing(name)(variables, hidden, asked))
+
+
+def test_body_and_pose_change_nothing_of_lvsm_and_the_target_s_position_map_tells_humanram_the_pose():
+    for name, differs in (("lvsm", False), ("humanram", True)):
+        variables, inputs = random_variables(small(name)), inputs_of(name)
+        images = [drawing(name)(variables, inputs, asked) for asked in (QUERIES, OTHER_POSE)]
+        posed = replace(inputs, posed_vertices=2 * inputs.posed_vertices, depth_maps=0 * inputs.depth_maps)
+        np.testing.assert_array_equal(drawing(name)(variables, posed, QUERIES), images[0])
+        mapped = replace(inputs, position_maps=-inputs.position_maps)
+        for image in (images[1], drawing(name)(variables, mapped, QUERIES)):
+            assert (np.abs(image - images[0]).max() > 1e-4) == differs
+
+
+@pytest.mark.slow
+def test_targets_ask_by_rays_and_their_pose_and_their_photos_are_not_read():
+    config = small("humanram")
+    asked = ask(tube(), TARGETS, config)
+    moved = ask(tube(), replace(TARGETS, rotations=TARGETS.rotations + 0.3), config)
+    np.testing.assert_array_equal(moved[..., :6], asked[..., :6])
+    assert np.abs(moved[..., 6:] - asked[..., 6:]).max() > 0.1
+    blank = replace(TARGETS, images=0 * TARGETS.images, masks=0 * TARGETS.masks)
+    np.testing.assert_array_equal(ask(tube(), blank, config.with_conventions(pixels="person")), asked)
+
+
+def test_humanram_without_its_texture_and_convolutions_is_lvsm():
+    config = small("humanram")
+    config = config.with_parts(decoder=dataclasses.replace(config.architecture.decoder, fusion=None))
+    variables = random_variables(config)
+    params = dict(variables["params"]["decoder"])
+    assert params["texture"].shape == (3, 8, 8, 2)
+    untextured = {**params, "texture": jnp.zeros((3, 8, 8, 2))}
+    lvsm = {name: value for name, value in params.items() if name != "texture"}
+    for name, channels in (("photo_tokens", 9), ("target_tokens", 6)):
+        kernel = params[name]["kernel"].reshape(PATCH**2, channels + 6, -1)
+        lvsm[name] = {"kernel": kernel[:, :channels].reshape(PATCH**2 * channels, -1)}
+    in_place = lambda params: {"params": {"decoder": params}, "batch_stats": {}}
+    draw = jax.jit(lambda v: draw_pixels(v, apply_humangs(v, inputs_of("lvsm"), config)[0], QUERIES, config))
+    theirs = draw(in_place(untextured))
+    close(theirs, drawing("lvsm")(in_place(lvsm), inputs_of("lvsm"), QUERIES))
+
+
+@pytest.mark.slow
+def test_a_target_of_any_size_is_drawn():
+    config, variables, inputs = small("humanram"), random_variables(small("humanram")), inputs_of("humanram")
+    cameras = replace(TARGETS.cameras, width=SIZE - 3, height=SIZE - 9)
+    cut = replace(TARGETS, cameras=cameras, images=TARGETS.images[:, : SIZE - 9, : SIZE - 3])
+    draw = lambda v: target_pixels(v, apply_humangs(v, inputs, config)[0], tube(), cut, config)
+    images = jax.jit(draw)(variables)
+    assert images.shape == (3, SIZE - 9, SIZE - 3, 3)
+    whole = drawing("humanram")(variables, inputs, ask(tube(), TARGETS, config)[:, : SIZE - 8])
+    close(images, whole[:, : SIZE - 9, : SIZE - 3])
+
+
+def test_a_network_that_draws_pixels_makes_no_avatar_and_others_draw_none():
+    config = small("lvsm")
+    outputs = jax.eval_shape(lambda v: apply_humangs(v, inputs_of("lvsm"), config)[0], random_variables(config))
+    with pytest.raises(ValueError, match="QueryDecoder draws images of targets without Gaussians"):
+        make_avatar(outputs, tube(), BETAS, config)
+    with pytest.raises(ValueError, match="VertexDecoder makes Gaussians"):
+        draw_pixels({}, outputs, QUERIES, small("lca"))
+
+
+# Drivers -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", DRIVEN)
+def test_a_frame_has_its_own_gaussians_and_untrained_corrections_are_none(name):
+    frame, outputs = driven(name)
+    other, same = driven(name, at=pose(seed=3))
+    close(outputs.gaussians, same.gaussians, bound=0)  # the canonical ones know no target
+    assert np.abs(frame.gaussians.means - other.gaussians.means).max() > 1e-4
+    assert (
+        np.abs(frame.gaussians.means - outputs.gaussians.means).max()
+        < small(name).architecture.driver.offset_scale + 1e-6
+    )
+    fresh = random_variables(small(name))
+    zeros = jax.tree_util.tree_map_with_path(
+        lambda path, x: 0 * x if any(entry.key == "out" for entry in path) else x, fresh["params"]["driver"]
+    )
+    fresh["params"]["driver"] = zeros
+    frame, outputs = driven(name, variables=fresh)
+    shown = jnp.clip(outputs.gaussians.colors, COLOR_MARGIN, 1 - COLOR_MARGIN)
+    close(frame.gaussians, replace(outputs.gaussians, colors=shown), bound=2e-6)
+    assert np.abs(frame.tight_offsets).max() == 0
+
+
+@pytest.mark.parametrize("name", ["giga", "animatable"])
+def test_texels_lie_on_the_surface_and_empty_ones_are_transparent(name):
+    body = mapped_tube(small(name))
+    frame, outputs = driven(name)
+    covered = np.asarray(body.texels.covered).reshape(-1)
+    assert 0 < covered.sum() < len(covered) == len(frame.gaussians.opacities)
+    corners, weights = (np.asarray(x).reshape(-1, 3) for x in (body.texels.corners, body.texels.weights))
+    surface = np.einsum("tk,tkc->tc", weights, np.asarray(inputs_of(name).canonical_vertices)[corners])
+    np.testing.assert_allclose(outputs.gaussians.means[covered], surface[covered], atol=1e-6)
+    for gaussians in (frame.gaussians, outputs.gaussians):
+        assert not gaussians.opacities[~covered].any() and (gaussians.opacities[covered] > 0).all()
+    avatar = make_avatar(frame, body, BETAS, small(name))
+    np.testing.assert_allclose(avatar.skinning_weights.sum(axis=1), 1, atol=1e-6)
+    expected = np.einsum("tk,tkj->tj", weights, np.asarray(body.skinning_weights)[corners])
+    np.testing.assert_allclose(avatar.skinning_weights[covered], expected[covered], atol=1e-6)
+
+
+def test_the_texture_is_what_the_photos_show():
+    inputs = inputs_of("giga")
+    red = replace(inputs, images=jnp.broadcast_to(jnp.asarray([0.8, 0.2, 0.1]), inputs.images.shape))
+    outputs = driven("giga", red)[1]
+    seen = np.asarray(outputs.scene.texture.seen).astype(bool)
+    assert 0 < seen.sum() < seen.size
+    np.testing.assert_allclose(outputs.scene.texture.colors[seen], np.tile([0.8, 0.2, 0.1], (seen.sum(), 1)), atol=1e-5)
+    np.testing.assert_allclose(outputs.scene.texture.colors[~seen], 0.5)
+
+
+def test_animatable_reads_no_photo_and_a_place_in_the_world_is_no_pose():
+    inputs = inputs_of("animatable")
+    frame, _ = driven("animatable")
+    noise = replace(
+        inputs, images=1 - inputs.images, foreground=~inputs.foreground, posed_vertices=2 * inputs.posed_vertices
+    )
+    close(driven("animatable", noise)[0].gaussians, frame.gaussians, bound=0)
+    turned = driven("animatable", at=replace(pose(root=[0.0, 2.0, 0.0]), translation=jnp.ones(3)))[0]
+    straight = driven("animatable", at=pose(root=[0.0, 0.0, 0.0]))[0]
+    close(turned.gaussians, straight.gaussians)
+
+
+def test_corrections_are_bounded_and_zeros_are_none():
+    gaussians = driven("giga")[1].gaussians
+    correct = jax.jit(lambda raw: corrected(gaussians, jnp.full((len(gaussians.opacities), 14), raw), 0.1))
+    nothing, offsets = correct(0.0)
+    shown = jnp.clip(gaussians.colors, COLOR_MARGIN, 1 - COLOR_MARGIN)
+    close(nothing, replace(gaussians, colors=shown), bound=2e-6)
+    assert not offsets.any()
+    most, offsets = correct(1e4)
+    assert all(np.isfinite(x).all() for x in jax.tree.leaves(most))
+    np.testing.assert_allclose(jnp.linalg.norm(offsets, axis=1), 0.1 * 3**0.5, rtol=1e-5)
+
+
+# Parts ---------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [*PIXELS, *DRIVEN])
+def test_architectures_are_recorded_whole(name):
+    architecture = small(name).architecture
+    assert config_from_json(Architecture, config_to_json(architecture)) == architecture
+    assert isinstance(architecture.decoder, PixelDecoder) == architecture.draws_pixels == (name in PIXELS)
+    assert isinstance(architecture.driver, Driver) == (name in DRIVEN)
+    assert architecture.runs_per_target
+
+
+def test_parts_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="driver: QueryDecoder makes no Gaussians"):
+        small("lvsm").with_parts(driver=CorrectionMLP())
+    decoder = dataclasses.replace(small("giga").architecture.decoder, surface_map=SurfaceMap("atlas", 99))
+    with pytest.raises(ValueError, match=r"surface_map: expected one for all parts, got .*99"):
+        small("giga").with_parts(decoder=decoder)
+    with pytest.raises(ValueError, match="class_token: expected false"):
+        decoder = small("lvsm").architecture.decoder
+        dataclasses.replace(decoder, transformer=dataclasses.replace(BLOCKS, class_token=True))
+    for wrong in (
+        lambda: SurfaceMap(size=10**6),
+        lambda: TextureDriver(widths=(8,) * 99),
+        lambda: PoseMapDriver(widths=()),
+        lambda: CorrectionMLP(layers=10**6),
+    ):
+        with pytest.raises(ValueError, match=r"(surface_map.size|scales|driver.layers).*expected 1 to"):
+            wrong()
+    many = small("lca").with_parts(driver=CorrectionMLP(8, 1, joints=5))
+    with pytest.raises(ValueError, match=r"driver\.joints 5: the pose has 2 joints"):
+        outputs = jax.eval_shape(lambda v: apply_humangs(v, inputs_of("lca"), many)[0], random_variables(many))
+        jax.eval_shape(lambda v, o: frame_outputs(v, o, tube(), BETAS, pose(), many), random_variables(many), outputs)
+    with pytest.raises(ValueError, match="works on a map of the surface"):
+        jax.eval_shape(lambda: apply_humangs({}, replace(inputs_of("animatable"), texels=None), small("animatable"))[0])
+
+
+@pytest.mark.slow
+def test_front_and_back_show_both_sides_of_the_body():
+    body = tube()
+    texels = surface_texels(body, SurfaceMap("front_back", 16))
+    assert texels.corners.shape == (16, 32, 3)
+    sums = np.asarray(texels.weights.sum(axis=-1))
+    covered = np.asarray(texels.covered)
+    np.testing.assert_allclose(sums[covered], 1, atol=1e-6)
+    points = np.asarray(texels.interpolate(body.template))
+    front, back = points[:, :16], points[:, 16:]
+    np.testing.assert_array_equal(covered[:, :16], covered[:, 16:][:, ::-1])
+    middle = covered[:, 4:12].sum() / 2
+    assert (front[..., 2] > 0.05).sum() >= middle / 2 and (back[..., 2] < -0.05).sum() >= middle / 2
+    assert not (front[..., 2] < -0.05).any() and not (back[..., 2] > 0.05).any()
+    rows, columns = np.nonzero(covered[:, :16])
+    assert (
+        np.corrcoef(columns, front[rows, columns, 0])[0, 1]
+        > 0.9
+        > -0.9
+        > np.corrcoef(rows, front[rows, columns, 1])[0, 1]
+    )
+
+
+@pytest.mark.slow
+def test_an_atlas_shows_the_whole_surface_once():
+    body = tube()
+    texels = surface_texels(body, SurfaceMap("atlas", 64))
+    covered = np.asarray(texels.covered)
+    shown = np.unique(np.sort(np.asarray(texels.corners)[covered], axis=-1), axis=0)
+    assert len(shown) == len(body.faces)
+    np.testing.assert_allclose(np.asarray(texels.weights.sum(axis=-1))[covered], 1, atol=1e-6)

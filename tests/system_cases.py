@@ -1,0 +1,37 @@
+"""The systems of `network.systems` in sizes for tests: every stage, as small as can be."""
+
+import dataclasses
+
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.surface_map import SurfaceMap
+from humangs_jax.network.systems import SYSTEMS
+from humangs_jax.network.transformer import TransformerConfig
+
+WIDTH, HEAD = 16, 8
+SMALL = {
+    "transformer": TransformerConfig(width=WIDTH, layers=1, head_width=HEAD, class_token=False),
+    "width": WIDTH,
+    "head_width": HEAD,
+    "layers": 1,
+    "blocks": 2,
+    "mlp_ratio": 1,
+    "groups": 4,
+    "group_size": 16,
+    "hidden": WIDTH,
+    "initial_log_scale": -2.0,  # 13 cm: vertices of the bodies of tests are that far apart
+    "widths": (4, 8),
+    "surface_map": SurfaceMap("atlas", 8),
+}
+"""Values of the fields of parts, where a part has such a field."""
+
+
+def small_system(name: str) -> HumanGSConfig:
+    config = SYSTEMS[name]("bench")
+    parts = config.architecture
+    shrunk = {}
+    for field in ("encoder", "reader", "decoder"):
+        part = getattr(parts, field)
+        own = {key: value for key, value in SMALL.items() if key in {f.name for f in dataclasses.fields(part)}}
+        shrunk[field] = dataclasses.replace(part, **own)
+    config = config.with_parts(**shrunk).with_execution(token_capacity=0)
+    return config.with_conventions(image_size=32, body_vertices=None, longest_edge=None, tokens="all")
