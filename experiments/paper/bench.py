@@ -196,6 +196,7 @@ def train_variant(
 
 def score(variables: Any, body: Any, config: Any, people: Any, count: int) -> dict[str, float]:
     """Means over people of `TARGETS` views each, with that number of photos."""
+    from humangs_jax.training.sources import cached_people
     from humangs_jax.training.validation import validate, validation_examples
 
     compared = dataclasses.replace(
@@ -203,11 +204,11 @@ def score(variables: Any, body: Any, config: Any, people: Any, count: int) -> di
         model=config.model.with_execution(token_capacity=0),
         views=dataclasses.replace(config.views, input_counts=(count,), target_count=TARGETS),
     )
-    numbers, _ = validate(variables, body, validation_examples(people, compared, len(people)), compared)
+    examples = validation_examples(cached_people(people), compared, len(people))
+    numbers, _ = validate(variables, body, examples, compared)
     names = (*SCORES, "fog", "dropped_tokens", "overflow")
-    return {
-        name: x for name in names if (x := numbers[name]) == x
-    }  # JSON has no NaN: networks that draw pixels have no fog
+    # JSON has no NaN: networks that draw pixels have no fog
+    return {name: x for name in names if (x := numbers[name]) == x}
 
 
 def headline(row: Mapping[str, Any]) -> dict[str, float]:

@@ -131,7 +131,7 @@ def make_avatar(outputs: HumanGSOutputs, body: BodyModel, betas: Float[Array, " 
 def _assemble(variables, config, body, views, inputs):
     outputs, _ = apply_humangs(variables, inputs, config)
     avatar = make_avatar(outputs, body, views.betas, config)
-    if config.conventions.skinning_reach is not None:
+    if config.conventions.skinning_reach is not None and outputs.skinning_weights is None:
         avatar = with_spread_weights(
             avatar, BodyPose(views.rotations[0], views.translations[0]), config.conventions.skinning_reach
         )
