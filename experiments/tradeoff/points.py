@@ -38,7 +38,15 @@ DEFAULT = point("default", "default")
 
 def points() -> list[Point]:
     """All of them, the default first."""
-    found = [DEFAULT]
+    found = [DEFAULT]  # then what shares its programs
+    found += [point(name, "splat preset", splat=name) for name in ("near_exact", "fast", "inria")]
+    found += [point(f"frames of {n}", "frame size", size=n) for n in (128, 256, 384, 1024)]
+    found += [point("pruned", "Gaussians", prune=True), point("painted body", "naive", start="painted body")]
+    found += [point(f"{n} steps", "refinement", refine_steps=n, refine_size=256) for n in (25, 50, 100, 200)]
+    for n in (0, 50, 200):
+        random: dict[str, Any] = {"refine_steps": n, "refine_size": 256}
+        found += [point(f"random colours, {n} steps", "naive", start="random colours", **random)]
+    found += [Point(f"preset {name}", "preset", settings) for name, settings in PRESETS.items()]
     found += [point(f"{n} photos" if n > 1 else "1 photo", "photos", views=n) for n in (1, 2, 3, 6)]
     found += [point(f"photos of {n}", "photo size", image_size=n) for n in (128, 192, 384, 512)]
     found += [point("all tokens", "tokens", tokens="all"), point("cropped", "tokens", crop=True)]
@@ -46,16 +54,7 @@ def points() -> list[Point]:
     found += [point(dtype, "precision", dtype=dtype) for dtype in ("bfloat16", "float16")]
     found += [point(f"body of {n}", "Gaussians", body_vertices=n) for n in (1000, 2000, 3000)]
     found += [point(f"edges of {edge * 1e3:g} mm", "Gaussians", longest_edge=edge) for edge in (0.024, 0.02, 0.017)]
-    found += [point("pruned", "Gaussians", prune=True)]
-    found += [point(f"{n} steps", "refinement", refine_steps=n, refine_size=256) for n in (25, 50, 100, 200)]
-    found += [point(f"{n} steps at 512", "refinement", refine_steps=n, refine_size=512) for n in (100,)]
-    found += [point(f"frames of {n}", "frame size", size=n) for n in (128, 256, 384, 1024)]
-    found += [point(name, "splat preset", splat=name) for name in ("near_exact", "fast", "inria")]
-    found += [point("painted body", "naive", start="painted body")]
-    for n in (0, 50, 200):
-        random = {"refine_steps": n, "refine_size": 256}
-        found += [point(f"random colours, {n} steps", "naive", start="random colours", **random)]
-    found += [Point(f"preset {name}", "preset", settings) for name, settings in PRESETS.items()]
+    found += [point("100 steps at 512", "refinement", refine_steps=100, refine_size=512)]
     found += [combined(**fields) for fields in COMBINED]
     found += [
         point(f"published, {t} tokens", "published", start="published network", tokens=t) for t in ("foreground", "all")

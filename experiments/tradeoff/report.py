@@ -125,8 +125,8 @@ def about(result: dict[str, Any]) -> str:
     people, took = len(default["people"]), f"{default['reconstruct_ms']:.0f} ms a reconstruction"
     return (
         f"Weights with SHA-256 {result['settings']['weights'][:16]}...; {people} of the people kept for this "
-        f'(split "tradeoff"). Times are shares of the default point\'s, measured in turns with it: {took} and '
-        f"{default['frame_ms']:.0f} ms a frame of {SIZE} pixels, beside other programs."
+        f'(split "tradeoff"). CPU times of all threads are shares of the default point\'s, in turns with it: {took} and '
+        f"{default['frame_ms']:.0f} ms a frame of {SIZE} pixels."
     )
 
 

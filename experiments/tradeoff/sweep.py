@@ -5,10 +5,10 @@
 
 The points are those of `points.py`. Quality is the mean over people of the split "tradeoff", whom nothing else has seen:
 PSNR, SSIM and PSNR on the person, of new views in the pose of the photos and in unseen poses. Photos and true images have
-512 pixels; frames of another size are brought to 512 before they are compared. Times are of the first person, take turns
-with the default point's, and are kept as ratios of medians: another machine, or a busy one, changes both. Refinement is
-counted in steps, which do not depend on the machine's load. Compilation does not count. Memory: what making the avatar or
-drawing a frame adds to the process at its peak.
+512 pixels; frames of another size are brought to 512 before they are compared. Times are
+CPU times of all threads, of the first person, in turns with the default point's, and kept as ratios of medians: other
+programs stretch wall times by far more. Refinement is counted in steps, which do not depend on the load either. Compilation
+does not count. Memory: what making the avatar or refining it adds to the process at its peak.
 
 Every point is written as it is measured; a later run continues. `--front` writes the Pareto front to
 humangs_jax/assets/front.json, where `humangs tune` finds it. About 50 minutes on one core.
@@ -38,6 +38,8 @@ PHOTOS = (1, 2, 3, 4, 6)
 TRUE_SIZE = 512
 MAKES, FRAMES = 2, 10
 """Timed rounds of making an avatar, and of drawing a frame."""
+SHORT_RUNS = (5, 15)
+"""Steps of the refinements that are timed."""
 QUALITY = ("psnr", "ssim", "psnr_foreground")
 
 
@@ -178,22 +180,18 @@ class Bench:
         if key not in self.kept:
             photos = self.person(i).inputs(settings.views)
             if point.start == "painted body":
-                avatar, seconds = painted_body(photos), 0.0
+                avatar = painted_body(photos)
             else:
                 plain = dataclasses.replace(settings, refine_steps=0)
-                avatar, seconds = make_avatar(plain, self.variables, self.config, photos), 0.0
+                avatar = make_avatar(plain, self.variables, self.config, photos)
                 if point.start == "random colours":
                     avatar = random_start(avatar, self.person(i).seed)
                 if settings.refinement is not None:
-                    before = self.default_make_ms() if i == 0 and point != self.default else 0.0
-                    run = refine_with_report(avatar, photos, settings.refinement)
-                    avatar = run.avatar
-                    if i == 0:
-                        seconds = 1e3 * run.seconds / np.mean([before, self.default_make_ms()])
+                    avatar = refine_with_report(avatar, photos, settings.refinement).avatar
             if len(self.kept) > 8:
                 self.kept.pop(next(k for k in self.kept if k[0] != self.default.settings))
-            self.kept[key] = (avatar, seconds)
-        return self.kept[key][0]
+            self.kept[key] = avatar
+        return self.kept[key]
 
     def scores(self, point, avatar, person):
         """Scores by task, of frames brought to the size of the truth."""
@@ -241,7 +239,7 @@ class Bench:
 
     def default_make_ms(self) -> float:
         """Of the default point, now."""
-        return timed(lambda: self.make(self.default.settings))[0]
+        return timed(lambda: self.make(self.default.settings))[1]
 
     def make_times(self, point) -> dict[str, Any]:
         """Time of making the avatar over the default's, with refinement; the default's ms; peak memory, MiB."""
@@ -251,35 +249,36 @@ class Bench:
         same = (settings.views, settings.execution) == (usual.views, usual.execution)
         pairs = []
         for _ in range(0 if same and point is not self.default else MAKES):
-            pairs.append((timed(lambda: self.make(settings))[0], self.default_make_ms()))
+            pairs.append((timed(lambda: self.make(settings))[1], self.default_make_ms()))
         own, default = np.median(pairs, axis=0) if pairs else (1.0, 1.0)
         ratio = 0.0 if point.start == "random colours" else float(own / default)
-        key = (dataclasses.replace(settings, splat="as_trained", prune=False), point.start, 0)
-        refined = float(self.kept[key][1])
         with peak_memory() as peak:
             self.make(settings)
-        memory = peak[0]
+        refined, memory = 0.0, peak[0]
         if settings.refinement is not None:
-            memory = max(memory or 0.0, self.refining_memory(settings) or 0.0)
+            refined_ms, more = self.refining(settings)
+            refined, memory = refined_ms / self.default_make_ms(), max(memory or 0.0, more or 0.0)
         times = {"reconstruct": ratio + refined, "refine_share": refined, "memory_mb": memory}
         return times | ({"reconstruct_ms": float(own)} if point is self.default else {})
 
-    def refining_memory(self, settings) -> float | None:
-        """Of some steps, MiB; what they need does not grow with their number."""
+    def refining(self, settings) -> tuple[float, float | None]:
+        """CPU ms of a refinement, from two short ones without compilation, and its MiB, which do not grow with the steps."""
         from humangs_jax.core.allocator import peak_memory
         from humangs_jax.refinement.refine import refine_with_report
 
         photos, avatar = self.person(0).inputs(settings.views), self.make(settings)
-        few = dataclasses.replace(settings, refine_steps=2).refinement
+        run = lambda n: refine_with_report(avatar, photos, dataclasses.replace(settings, refine_steps=n).refinement)
+        few, many = SHORT_RUNS
+        first = timed(lambda: run(few))[1]
         with peak_memory() as peak:
-            refine_with_report(avatar, photos, few)
-        return peak[0]
+            second = timed(lambda: run(many))[1]
+        return first + (settings.refine_steps - few) * max(0.0, second - first) / (many - few), peak[0]
 
     def frame_times(self, point, drawn) -> dict[str, Any]:
         """Time of a frame over the default's, and the default's ms."""
         ours = self.frames(drawn, point.size, self.how(point, drawn))
         usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
-        pairs = [[timed(lambda f=f: next(f))[0] for f in (ours, usual)] for _ in range(FRAMES + 1)][1:]
+        pairs = [[timed(lambda f=f: next(f))[1] for f in (ours, usual)] for _ in range(FRAMES + 1)][1:]
         own, default = np.median(pairs, axis=0)
         return {"frame": float(own / default)} | ({"frame_ms": float(default)} if point is self.default else {})
 
@@ -304,11 +303,11 @@ class Bench:
         one = held_out.select([0])
         colors = painted_body(photos)
         draw_painted_body(colors, one)
-        makes = [(timed(lambda: np.asarray(painted_body(photos)))[0], self.default_make_ms()) for _ in range(MAKES)]
+        makes = [(timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(MAKES)]
         usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
         next(usual)
         frames = [
-            (timed(lambda: draw_painted_body(colors, one))[0], timed(lambda: next(usual))[0]) for _ in range(FRAMES)
+            (timed(lambda: draw_painted_body(colors, one))[1], timed(lambda: next(usual))[1]) for _ in range(FRAMES)
         ]
         make, frame = (np.median(pairs, axis=0) for pairs in (makes, frames))
         return {"reconstruct": float(make[0] / make[1]), "refine_share": 0.0, "frame": float(frame[0] / frame[1])}
@@ -324,7 +323,7 @@ class Bench:
         variables, photos = random_variables(config), self.person(0).inputs(4)
         make = lambda: make_avatar(point.settings, variables, config, photos)
         make()
-        pairs = [(timed(make)[0], self.default_make_ms()) for _ in range(2)]
+        pairs = [(timed(make)[1], self.default_make_ms()) for _ in range(2)]
         own, default = np.median(pairs, axis=0)
         with peak_memory() as peak:
             avatar = make()
@@ -350,7 +349,7 @@ class Bench:
                 reconstruct_batch(self.variables, self.config, captures)
             )
             run()
-            pairs = np.asarray([(timed(run)[0], self.default_make_ms()) for _ in range(MAKES)])
+            pairs = np.asarray([(timed(run)[1], self.default_make_ms()) for _ in range(MAKES)])
             batch[str(count)] = float(np.divide(*np.median(pairs, axis=0)))
         small = self.person(0).held_out.cameras.resized(256, 256)
         how = self.how(self.default, self.default_avatar)
@@ -360,7 +359,7 @@ class Bench:
             boxes[side] = self.frames(
                 self.default_avatar, side, how, replace(small, K=small.K + shift, width=side, height=side)
             )
-        rounds = [[timed(lambda f=f: next(f))[0] for f in boxes.values()] for _ in range(FRAMES + 1)][1:]
+        rounds = [[timed(lambda f=f: next(f))[1] for f in boxes.values()] for _ in range(FRAMES + 1)][1:]
         times = np.median(rounds, axis=0)
         return {"batch": batch, "box": {str(side): float(t / times[0]) for side, t in zip(boxes, times, strict=True)}}
 

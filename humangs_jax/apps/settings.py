@@ -14,7 +14,7 @@ import jax
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.core.configuration import config_from_json, config_to_json
+from humangs_jax.core.configuration import config_from_json, config_to_json, knob
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.view_selection import select_views
 from humangs_jax.io.reading import Refused, reading
@@ -25,6 +25,7 @@ from humangs_jax.network.parts import Variables
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
 
+MEASURED = "tradeoff.md"
 KIND = "humangs_jax settings"
 """Of a file of settings, its field "kind"."""
 
@@ -38,12 +39,14 @@ class Settings:
     as `Shot.splat`. prune: as `Shot.prune`.
     """
 
-    views: int | None = None
+    views: int | None = knob(None, cost="what the other photos show", gain="time in proportion", measured=MEASURED)
     execution: Execution = dataclasses.field(default_factory=Execution)
-    refine_steps: int = 0
-    refine_size: int | None = None
-    splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = "as_trained"
-    prune: bool = False
+    refine_steps: int = knob(0, cost="blur at few", gain="time in proportion", measured=MEASURED)
+    refine_size: int | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
+    splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
+        "as_trained", cost="see performance.md", gain="time of a frame", measured=MEASURED
+    )
+    prune: bool = knob(False, cost="3 of 255 levels", gain="time of frames that are drawn often", measured="video.md")
 
     def __post_init__(self):
         """Raises ValueError for settings out of range, naming them."""
