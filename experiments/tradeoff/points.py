@@ -38,7 +38,8 @@ DEFAULT = point("default", "default")
 
 def points() -> list[Point]:
     """All of them, the default first."""
-    found = [DEFAULT]  # then what shares its programs
+    found = [DEFAULT]
+    found += [Point(f"preset {name}", "preset", settings) for name, settings in PRESETS.items()]
     found += [point(name, "splat preset", splat=name) for name in ("near_exact", "fast", "inria")]
     found += [point(f"frames of {n}", "frame size", size=n) for n in (128, 256, 384, 1024)]
     found += [point("pruned", "Gaussians", prune=True), point("painted body", "naive", start="painted body")]
@@ -46,7 +47,6 @@ def points() -> list[Point]:
     for n in (0, 50, 200):
         random: dict[str, Any] = {"refine_steps": n, "refine_size": 256}
         found += [point(f"random colours, {n} steps", "naive", start="random colours", **random)]
-    found += [Point(f"preset {name}", "preset", settings) for name, settings in PRESETS.items()]
     found += [point(f"{n} photos" if n > 1 else "1 photo", "photos", views=n) for n in (1, 2, 3, 6)]
     found += [point(f"photos of {n}", "photo size", image_size=n) for n in (128, 192, 384, 512)]
     found += [point("all tokens", "tokens", tokens="all"), point("cropped", "tokens", crop=True)]

@@ -40,6 +40,8 @@ def main() -> None:
 
 def write(result: dict[str, Any], page: Path | None, image: Path | None, front: bool) -> None:
     """Everything that is asked for; the table of the presets is printed."""
+    measured = {name: found for name, found in result["points"].items() if "reconstruct" in found}
+    result = result | {"points": measured}
     rows = rows_of(result)
     print(preset_table(rows, result))
     if front:
@@ -63,8 +65,7 @@ def rows_of(result: dict[str, Any]) -> list[Row]:
         for task in TASKS:
             scores = [person[task] for person in found["people"]]
             row[task] = {key: float(np.mean([score[key] for score in scores])) for key in SCORES} if scores else None
-        if "reconstruct" in row:
-            rows.append(row)
+        rows.append(row)
     return rows
 
 
@@ -219,7 +220,7 @@ def growth_table(rows: list[Row], result: dict[str, Any]) -> str:
         "pixels of a photo": [
             ((options(r)["image_size"] or trained) ** 2, r["reconstruct"]) for r in [default, *of("photo size")]
         ],
-        "people in a batch": [(int(n), share) for n, share in result["growth"]["batch"].items()],
+        "people in a batch": [(int(n), share) for n, share in result["growth"].get("batch", {}).items()],
         "Gaussians, of a frame": [
             (r["gaussians"], r["frame"]) for r in [default, *of("Gaussians")] if not r["settings"]["prune"]
         ],
@@ -229,7 +230,7 @@ def growth_table(rows: list[Row], result: dict[str, Any]) -> str:
             for r in of("refinement")
             if r["settings"]["refine_size"] == trained
         ],
-        "background pixels of a frame": [(int(n) ** 2, share) for n, share in result["growth"]["box"].items()],
+        "background pixels of a frame": [(int(n) ** 2, share) for n, share in result["growth"].get("box", {}).items()],
     }
     table = []
     for name, pairs in series.items():

@@ -36,8 +36,8 @@ SHOTS = {"held_out": 3, "poses": 2, "pose_views": 1}
 """Held-out views of a person: of the pose of the photos; unseen poses; views of each."""
 PHOTOS = (1, 2, 3, 4, 6)
 TRUE_SIZE = 512
-MAKES, FRAMES = 2, 10
-"""Timed rounds of making an avatar, and of drawing a frame."""
+FRAMES = 10
+"""Timed rounds of drawing a frame."""
 SHORT_RUNS = (5, 15)
 """Steps of the refinements that are timed."""
 QUALITY = ("psnr", "ssim", "psnr_foreground")
@@ -49,24 +49,26 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True, help="points that are there are not measured again")
     parser.add_argument("--subjects", type=int, default=2, help="how many people")
     parser.add_argument("--people", type=Path, help="folder where rendered people are kept for later runs")
+    parser.add_argument("--rounds", type=int, default=2, help="timed rounds of making an avatar")
     parser.add_argument("--only", nargs="+", help="knobs to measure")
     parser.add_argument("--page", type=Path, help="page whose tables are written")
     parser.add_argument("--image", type=Path, help="draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png")
     parser.add_argument("--front", action="store_true", help="write humangs_jax/assets/front.json")
     arguments = parser.parse_args()
     prepare_process()
-    result = sweep(arguments.json, arguments.subjects, arguments.only, arguments.people)
+    result = sweep(arguments)
     from experiments.tradeoff import report
 
     report.write(result, arguments.page, arguments.image, arguments.front)
 
 
-def sweep(path: Path, subjects: int, only: list[str] | None, people: Path | None) -> dict[str, Any]:
+def sweep(arguments: argparse.Namespace) -> dict[str, Any]:
     """Measures what the file does not have."""
     from tqdm import tqdm
 
     from experiments.tradeoff.points import points
 
+    path, subjects, only = arguments.json, arguments.subjects, arguments.only
     settings = settings_of()
     result = json.loads(path.read_text()) if path.exists() else {}
     if result.get("settings") != settings:
@@ -79,7 +81,7 @@ def sweep(path: Path, subjects: int, only: list[str] | None, people: Path | None
     missing = [(i, p) for i, p in missing if p.start != "published network" or "reconstruct" not in rows[p.name]]
     if not missing and result["growth"]:
         return result
-    bench = Bench(subjects, people)
+    bench = Bench(subjects, arguments.people, arguments.rounds)
     for i, each in tqdm(missing, desc="points"):  # all of one person, then the next: times are of the first
         bench.measure(each, i, rows[each.name])
         write_json(path, result)
@@ -135,7 +137,7 @@ def person_of(seed: int, body, folder: Path | None):
 class Bench:
     """The people, the network, and the default point, with which others take turns."""
 
-    def __init__(self, subjects: int, people: Path | None):
+    def __init__(self, subjects: int, people: Path | None, rounds: int = 2):
         from experiments.tradeoff.points import DEFAULT
         from humangs_jax.body.library import load_body
         from humangs_jax.network.weights import load_weights
@@ -145,7 +147,7 @@ class Bench:
         body = load_body()
         seeds = seeds_of("tradeoff", 0, subjects)
         self.person = functools.cache(lambda i: person_of(seeds[i], body, people))
-        self.default = DEFAULT
+        self.default, self.rounds = DEFAULT, rounds
         self.kept: dict[Any, Any] = {}
         self.default_avatar = self.made(DEFAULT, 0)
 
@@ -248,10 +250,10 @@ class Bench:
         settings, usual = point.settings, self.default.settings
         same = (settings.views, settings.execution) == (usual.views, usual.execution)
         pairs = []
-        for _ in range(0 if same and point is not self.default else MAKES):
+        for _ in range(0 if same and point is not self.default else self.rounds):
             pairs.append((timed(lambda: self.make(settings))[1], self.default_make_ms()))
         own, default = np.median(pairs, axis=0) if pairs else (1.0, 1.0)
-        ratio = 0.0 if point.start == "random colours" else float(own / default)
+        ratio = 0.0 if point.start == "random colours" else 1.0 if point is self.default else float(own / default)
         with peak_memory() as peak:
             self.make(settings)
         refined, memory = 0.0, peak[0]
@@ -280,7 +282,7 @@ class Bench:
         usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
         pairs = [[timed(lambda f=f: next(f))[1] for f in (ours, usual)] for _ in range(FRAMES + 1)][1:]
         own, default = np.median(pairs, axis=0)
-        return {"frame": float(own / default)} | ({"frame_ms": float(default)} if point is self.default else {})
+        return {"frame": 1.0, "frame_ms": float(default)} if point is self.default else {"frame": float(own / default)}
 
     def frames(self, avatar, size, how, cameras=None):
         """Frames without end, in the poses of the held-out views."""
@@ -303,7 +305,9 @@ class Bench:
         one = held_out.select([0])
         colors = painted_body(photos)
         draw_painted_body(colors, one)
-        makes = [(timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(MAKES)]
+        makes = [
+            (timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(self.rounds)
+        ]
         usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
         next(usual)
         frames = [
@@ -349,7 +353,7 @@ class Bench:
                 reconstruct_batch(self.variables, self.config, captures)
             )
             run()
-            pairs = np.asarray([(timed(run)[1], self.default_make_ms()) for _ in range(MAKES)])
+            pairs = np.asarray([(timed(run)[1], self.default_make_ms()) for _ in range(self.rounds)])
             batch[str(count)] = float(np.divide(*np.median(pairs, axis=0)))
         small = self.person(0).held_out.cameras.resized(256, 256)
         how = self.how(self.default, self.default_avatar)
