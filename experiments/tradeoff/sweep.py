@@ -180,7 +180,7 @@ class Bench:
         settings = dataclasses.replace(point.settings, splat="as_trained", prune=False)
         key = (settings, point.start, i)
         if key not in self.kept:
-            photos = self.person(i).inputs(settings.views)
+            photos = self.person(i).inputs(settings.views or 4)
             if point.start == "painted body":
                 avatar = painted_body(photos)
             else:
@@ -237,7 +237,7 @@ class Bench:
         from humangs_jax.apps.settings import make_avatar
 
         plain = dataclasses.replace(settings, refine_steps=0)
-        return make_avatar(plain, self.variables, self.config, self.person(0).inputs(settings.views))
+        return make_avatar(plain, self.variables, self.config, self.person(0).inputs(settings.views or 4))
 
     def default_make_ms(self) -> float:
         """Of the default point, now."""
@@ -268,7 +268,7 @@ class Bench:
         from humangs_jax.core.allocator import peak_memory
         from humangs_jax.refinement.refine import refine_with_report
 
-        photos, avatar = self.person(0).inputs(settings.views), self.make(settings)
+        photos, avatar = self.person(0).inputs(settings.views or 4), self.make(settings)
         run = lambda n: refine_with_report(avatar, photos, dataclasses.replace(settings, refine_steps=n).refinement)
         few, many = SHORT_RUNS
         first = timed(lambda: run(few))[1]

@@ -82,10 +82,8 @@ class Settings:
 PRESETS: dict[str, Settings] = {
     "realtime": Settings(views=2, execution=EXECUTIONS["realtime"], splat="fast"),
     "balanced": Settings(views=4, execution=EXECUTIONS["balanced"], splat="near_exact"),
-    "quality": Settings(
-        views=4, execution=EXECUTIONS["quality"], refine_steps=100, refine_size=256, splat="near_exact"
-    ),
-    "best": Settings(views=6, execution=EXECUTIONS["best"], refine_steps=200, refine_size=384, splat="exact"),
+    "quality": Settings(views=4, execution=EXECUTIONS["quality"], refine_steps=50, refine_size=256, splat="near_exact"),
+    "best": Settings(execution=EXECUTIONS["best"], refine_steps=200, refine_size=256),
 }
 """From the fastest to the best; docs/tradeoff.md has what each takes and gains."""
 
