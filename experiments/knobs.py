@@ -23,10 +23,19 @@ The linked page has the measurement and its conditions.
 | knob | default | costs | buys | measured in |
 |---|---|---|---|---|
 """
+PRESETS_HEAD = """
+## Presets
+
+`hg.PRESETS`, `--preset` of `reconstruct`, `animate`, `render`, `demo`; measured in [tradeoff.md](tradeoff.md).
+
+| preset | settings | `Execution.preset` |
+|---|---|---|
+"""
 
 
 def page() -> str:
     """The page in Markdown."""
+    from humangs_jax.apps.settings import Settings
     from humangs_jax.network.config import Conventions
     from humangs_jax.network.encoder import PatchTransformer
     from humangs_jax.network.execution import Execution
@@ -47,9 +56,27 @@ def page() -> str:
         RefineConfig,
         TrainConfig,
         OnTheFlyConfig,
+        Settings,
     )
     rows = [row for cls in classes for row in knob_rows(cls)]
-    return HEAD + "\n".join(rows) + "\n"
+    return HEAD + "\n".join(rows) + "\n" + PRESETS_HEAD + "\n".join(preset_rows()) + "\n"
+
+
+def preset_rows() -> list[str]:
+    """A row for each preset: what differs from the defaults."""
+    from humangs_jax.apps.settings import PRESETS, Settings
+    from humangs_jax.network.execution import Execution
+
+    def changes(value: Any, usual: Any) -> list[str]:
+        names = [field.name for field in dataclasses.fields(value) if field.name != "execution"]
+        return [f"{name} {getattr(value, name)}" for name in names if getattr(value, name) != getattr(usual, name)]
+
+    plain = Settings(), Execution()
+    rows = []
+    for name, preset in PRESETS.items():
+        own, network = ", ".join(changes(preset, plain[0])), ", ".join(changes(preset.execution, plain[1]))
+        rows.append(f"| `{name}` | {own} | {network or 'as trained'} |")
+    return rows
 
 
 def knob_rows(cls: Any) -> list[str]:

@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.apps.settings import Settings
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import write_ply
-from humangs_jax.avatar.frames import capture_renderings, motion_frames
+from humangs_jax.avatar.frames import capture_renderings, motion_frames, splatting_of
 from humangs_jax.avatar.layers import write_renderings_exr
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.sheets import contact_sheet, side_by_side
@@ -43,10 +44,12 @@ def run_demo(
     weights: str | os.PathLike | None = None,
     frame_size: int = 256,
     refine: RefineConfig | None = None,
+    settings: Settings | None = None,
 ) -> dict[str, Any]:
     """Run every stage and write its products into `out`; returns what report.json holds.
 
-    refine: how the avatar is fitted to its photos; None: not at all.
+    refine: how the avatar is fitted to its photos; None: not at all. settings: which photos are used, how the network runs,
+    how frames are drawn (their refinement is not used); None: all photos, as the weights were trained.
 
     Files: inputs.png, novel_views.png (truth, feed-forward, error), novel_views.exr, animation.mp4 and .gif, avatar.npz,
     avatar.ply, avatar.html (see docs/viewer.md), report.json; with `refine` also refined.png (truth, feed-forward, refined), and
@@ -56,7 +59,7 @@ def run_demo(
     started, report = time.perf_counter(), {}
 
     def write(folder: Path):
-        report.update(_write_products(folder, weights, frame_size, refine))
+        report.update(_write_products(folder, weights, frame_size, refine, settings or Settings()))
         report["total_seconds"] = round(time.perf_counter() - started, 3)
         write_json(folder / "report.json", report, indent=2)
 
@@ -78,27 +81,28 @@ def summary(report: dict[str, Any]) -> str:
 
 
 def _write_products(
-    out: Path, weights: str | os.PathLike | None, frame_size: int, refine: RefineConfig | None
+    out: Path, weights: str | os.PathLike | None, frame_size: int, refine: RefineConfig | None, settings: Settings
 ) -> dict[str, Any]:
     timings: dict[str, dict[str, float]] = {}
     with stage("loading"):
-        inputs = _timed(timings, "load_capture", lambda: load_capture(DEMO_CAPTURE))
+        inputs = settings.photos(_timed(timings, "load_capture", lambda: load_capture(DEMO_CAPTURE)))
         truth = load_capture(f"{DEMO_CAPTURE}/held_out")
         variables, config = _timed(timings, "load_weights", lambda: load_weights(weights))
-        motion = load_motion()
+        config, motion = settings.network(config), load_motion()
     with stage("reconstructing"):
         avatar = _timed(timings, "reconstruct", lambda: reconstruct(variables, config, inputs), twice=True)
         _timed(timings, "animate", lambda: animate(avatar, motion.pose(0)), twice=True)
     with stage("rendering"):
-        draw = lambda background: capture_renderings(avatar, truth, background)
+        how = splatting_of(settings.shot(Shot()), avatar)
+        draw = lambda background: capture_renderings(avatar, truth, background, how)
         cameras, renderings = _timed(timings, "render_held_out", lambda: draw(jnp.ones(3)), twice=True)
         ours = np.stack([np.asarray(r.rgb) for r in renderings])
         scores, refined = score(ours, truth), {}
     if refine is not None:
         with stage("refining"):
-            avatar, refined = _refine(avatar, inputs, truth, ours, refine, out / "refined.png")
+            avatar, refined = _refine(avatar, inputs, truth, ours, refine, out / "refined.png", how)
     with stage("animating"):
-        shot = Shot(size=frame_size, azimuth=25.0)
+        shot = settings.shot(Shot(size=frame_size, azimuth=25.0))
         draw_motion = lambda: np.stack(list(motion_frames(avatar, motion, shot, turn=40.0)))
         frames = _timed(timings, "animation_frames", draw_motion)
     with stage("writing"):
@@ -133,12 +137,12 @@ def _write_files(out, avatar, inputs, truth, ours, frames, motion):
     write_page(out / "avatar.html", avatar, motion)
 
 
-def _refine(avatar, inputs, truth, feed_forward, config, sheet: Path) -> tuple[Avatar, dict[str, Any]]:
+def _refine(avatar, inputs, truth, feed_forward, config, sheet: Path, how) -> tuple[Avatar, dict[str, Any]]:
     """The refined avatar, and what the report says of it; draws both beside the truth."""
     run = refine_with_report(avatar, inputs, config, progress=True)
     if run.interrupted:
         raise KeyboardInterrupt
-    drawn = np.stack([np.asarray(r.rgb) for r in capture_renderings(run.avatar, truth)[1]])
+    drawn = np.stack([np.asarray(r.rgb) for r in capture_renderings(run.avatar, truth, how=how)[1]])
     rows = np.stack([truth.images, feed_forward, np.clip(drawn, 0, 1)], axis=1).reshape(-1, *drawn.shape[1:])
     contact_sheet(np.clip(rows, 0, 1), sheet, headers=("truth", "feed-forward", "refined") * 2, columns=6)
     numbers = {name: round(value, 4) for name, value in dataclasses.asdict(score(drawn, truth)).items()}

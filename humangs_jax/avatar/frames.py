@@ -260,11 +260,11 @@ def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
 
 
 def capture_renderings(
-    avatar: Avatar, capture: Capture, background: Float[Array, "3"] | None = None
+    avatar: Avatar, capture: Capture, background: Float[Array, "3"] | None = None, how: SplatConfig | None = None
 ) -> tuple[Camera, list[Rendering]]:
-    """The avatar in the poses and from the cameras of a capture. Raises: as `capture_views`."""
+    """The avatar in the poses and from the cameras of a capture. how: as for `draw`. Raises: as `capture_views`."""
     poses, cameras = capture_views(avatar, capture)
-    return cameras, list(draw(avatar, poses, cameras, background))
+    return cameras, list(draw(avatar, poses, cameras, background, how))
 
 
 def images(

@@ -45,7 +45,7 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     """
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
-    views = standardize(capture, config.conventions.image_size)
+    views = standardize(capture, config.image_size, config.execution.crop)
     bucket = round_up(capture.view_count, smallest=1)
     if bucket > capture.view_count:
         views = pad_views(views, bucket)
@@ -75,7 +75,7 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
     coefficients = max(len(capture.betas) for capture in captures)
     subjects = []
     for capture in captures:
-        views = pad_views(standardize(capture, config.conventions.image_size), bucket)
+        views = pad_views(standardize(capture, config.image_size, config.execution.crop), bucket)
         betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
         subjects.append(replace(views, betas=betas))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)

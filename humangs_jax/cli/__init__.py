@@ -36,6 +36,7 @@ COMMANDS = {
     "demo": "avatars.Demo",
     "reconstruct": "avatars.Reconstruct",
     "refine": "avatars.Refine",
+    "tune": "avatars.Tune",
     "animate": "animate.Animate",
     "render": "animate.Render",
     "export": "avatars.Export",

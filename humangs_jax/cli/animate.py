@@ -10,7 +10,9 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.cli.options import (
+    Preset,
     UsageError,
+    chosen_settings,
     require_at_least,
     require_between,
     require_folder,
@@ -52,6 +54,10 @@ class Animate:
     """Where to end, in seconds of the motion."""
     loop: int = 1
     """How often to play the motion; each repetition starts where the one before has ended."""
+    preset: Preset | None = None
+    """Speed against accuracy: how it is drawn, where --splat does not say (docs/tradeoff.md)."""
+    config: Path | None = None
+    """As --preset, from a file of `humangs tune`."""
 
     def run(self) -> None:
         with _options():
@@ -66,16 +72,17 @@ class Animate:
             from humangs_jax.data.motion import load_motion
 
             check_video(self.out, 0, *self.shot.resolution, transparent=self.shot.color() is None)
+            shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
             motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
             with _options():
                 motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
             check_video(self.out, len(motion.translations), *self.shot.resolution)
-            poses, cameras = motion_views(avatar, motion, self.shot, self.turn, self.follow)
-        avatar = _pruned(avatar, poses, cameras, self.shot)
+            poses, cameras = motion_views(avatar, motion, shot, self.turn, self.follow)
+        avatar = _pruned(avatar, poses, cameras, shot)
         with stage("drawing"):
-            written = write_video(self.out, images(avatar, poses, cameras, self.shot, "animate"), motion.fps)
+            written = write_video(self.out, images(avatar, poses, cameras, shot, "animate"), motion.fps)
         wrote(self.out, f"{written} frames of {_size(self.shot)} at {motion.fps:g} frames per second")
         suggest(
             "humangs export", self.avatar, "--html avatar.html", *(("--motion", self.motion) if self.motion else ())
@@ -105,6 +112,10 @@ class Render:
     """Of views.exr: rgba (always there), z, position, normal, part, separated by commas."""
     exr_type: Literal["float", "half"] = "float"
     """Numbers of views.exr. half: Z and positions still have 32 bits."""
+    preset: Preset | None = None
+    """Speed against accuracy: how it is drawn, where --splat does not say (docs/tradeoff.md)."""
+    config: Path | None = None
+    """As --preset, from a file of `humangs tune`."""
 
     def run(self) -> None:
         with _options():
@@ -130,20 +141,21 @@ class Render:
             layers = ExrLayers(tuple(self.channels.split(",")), half=self.exr_type == "half")
             with _options():
                 layers.check()
+            shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
             if self.capture is not None:
                 poses, cameras = capture_views(avatar, load_capture(self.capture))
             else:
                 pose = rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
-                poses, cameras = turntable_views(avatar, pose, views, self.shot)
-        avatar = _pruned(avatar, poses, cameras, self.shot)
+                poses, cameras = turntable_views(avatar, pose, views, shot)
+        avatar = _pruned(avatar, poses, cameras, shot)
         with stage("drawing"):
             if video:
-                written = write_video(self.out, images(avatar, poses, cameras, self.shot, "render"), self.fps)
+                written = write_video(self.out, images(avatar, poses, cameras, shot, "render"), self.fps)
                 what = f"{written} frames of {_size(self.shot)} at {self.fps:g} frames per second"
             else:
-                written = write_views(self.out, avatar, poses, cameras, self.shot, layers if self.exr else None)
+                written = write_views(self.out, avatar, poses, cameras, shot, layers if self.exr else None)
                 what = f"{written} views of {cameras.width} x {cameras.height}{' and views.exr' * self.exr}"
         wrote(self.out, what)
         suggest("humangs animate", self.avatar)
@@ -222,6 +234,12 @@ def _require_place(out):
         require_parent(out)
     else:
         require_folder(out)
+
+
+def _drawn_by(shot, preset, config):
+    """The shot, drawn as a preset or a file of settings says."""
+    settings = chosen_settings(preset, config)
+    return shot if settings is None else settings.shot(shot)
 
 
 def _pruned(avatar, poses, cameras, shot):

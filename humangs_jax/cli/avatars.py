@@ -8,6 +8,9 @@ from tyro.conf import Positional
 
 from humangs_jax.cli.options import (
     LARGEST_IMAGE,
+    Preset,
+    UsageError,
+    chosen_settings,
     refine_limits,
     require_at_least,
     require_avatar,
@@ -36,6 +39,8 @@ class Demo:
     """Side of the animation's frames in pixels."""
     refine: float = 10.0
     """Seconds for which the avatar is fitted to its photos; 0 for none."""
+    preset: Preset | None = None
+    """Speed against accuracy (docs/tradeoff.md): photos, network, refinement in place of --refine, drawing."""
 
     def run(self) -> None:
         require_at_least(0, refine=self.refine)
@@ -45,8 +50,10 @@ class Demo:
             from humangs_jax.apps.demo import run_demo, summary
             from humangs_jax.refinement.config import RefineConfig
 
+        settings = chosen_settings(self.preset, None)
         refine = RefineConfig(seconds=self.refine) if self.refine else None
-        report = run_demo(self.out, weights=self.weights, frame_size=self.size, refine=refine)
+        refine = refine if settings is None else settings.refinement
+        report = run_demo(self.out, self.weights, self.size, refine, settings)
         wrote(self.out, summary(report))
         suggest("humangs view", self.out / "avatar.npz")
 
@@ -59,8 +66,8 @@ class Reconstruct:
     """Folder with capture.json. "demo_capture", if there is no such folder: the one that comes with the package."""
     out: Path = Path("avatar.npz")
     """The avatar file to write; an avatar that is there is replaced."""
-    views: int | None = None
-    """Use this number of photos: those that together show most of the body. Default: all."""
+    views: int | Literal["auto"] | None = None
+    """Use this number of photos: those that together show most of the body; auto: those that add something. Default: all."""
     weights: Path | None = None
     """Network weights (.safetensors). Default: the shipped ones."""
     tokens: Literal["as_trained", "all", "foreground"] = "as_trained"
@@ -70,31 +77,39 @@ class Reconstruct:
     """Number type of the encoder's matrix products ("as_trained": float32). The short ones are faster on GPU and TPU."""
     refine: str | None = None
     """Fit the avatar to the photos afterwards for so long: seconds ("15s") or steps ("100steps"); see `humangs refine`."""
+    preset: Preset | None = None
+    """Speed against accuracy (docs/tradeoff.md): photos, network and refinement, where the options above do not say."""
+    config: Path | None = None
+    """As --preset, from a file of `humangs tune`."""
     check: bool = True
     """Look first whether photos, cameras and poses belong together, the quick part of `humangs check`; --no-check skips it."""
 
     def run(self) -> None:
-        limits = None if self.refine is None else refine_limits(self.refine, "--refine")
-        require_at_least(1, views=self.views)
+        limits: dict[str, Any] | None = None if self.refine is None else refine_limits(self.refine, "--refine")
+        require_at_least(1, views=None if self.views == "auto" else self.views)
         require_avatar(self.out)
         with stage("starting"):
             from humangs_jax.avatar.reconstruct import reconstruct
             from humangs_jax.data.view_selection import select_views
             from humangs_jax.network.weights import load_weights
 
+            settings = chosen_settings(self.preset, self.config)
         photos = _read_capture(self.capture, self.check)
-        if self.views is not None and self.views < photos.view_count:
+        views = settings.views if settings is not None and self.views is None else self.views
+        if views == "auto" or (views is not None and views < photos.view_count):
             with stage("choosing photos"):
-                photos = photos.select(select_views(photos, self.views))
+                photos = photos.select(select_views(photos, None if views == "auto" else views))
             tell(f"photos: {', '.join(photos.names)}")
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
-        tokens = None if self.tokens == "as_trained" else self.tokens
-        dtype = "float32" if self.dtype == "as_trained" else self.dtype
-        config = config.with_execution(tokens=tokens, dtype=dtype)
+        config = config if settings is None else settings.network(config)
+        said = {"tokens": self.tokens, "dtype": self.dtype}
+        config = config.with_execution(**{name: value for name, value in said.items() if value != "as_trained"})
         with stage("reconstructing"):
             avatar = reconstruct(variables, config, photos)
             avatar.gaussians.means.block_until_ready()
+        if limits is None and settings is not None and settings.refinement is not None:
+            limits = {"steps": settings.refine_steps, "seconds": None, "image_size": settings.refine_size}
         if limits is None:
             _save(avatar, self.out, f"from {photos.view_count} photos")
         else:
@@ -287,3 +302,56 @@ class Export:
         fps = motion.fps / numbers.step
         motion = replace(motion, rotations=motion.rotations[chosen], translations=motion.translations[chosen], fps=fps)
         return motion, None if self.frames is None else numbers
+
+
+@dataclasses.dataclass(frozen=True)
+class Tune:
+    """Find the best settings within a budget, measured on this machine with this person, for `humangs reconstruct --config`.
+
+    Tries a few settings of docs/tradeoff.md, the fastest first. Times are without compilation, which happens once. The exit code
+    is 1, and nothing is written, if no setting is within the budget.
+    """
+
+    capture: Positional[Path]
+    """Folder with capture.json. "demo_capture", if there is no such folder: the one that comes with the package."""
+    out: Path = Path("tuned.json")
+    """The settings to write, for --config of `reconstruct`, `animate`, `render`; beside them an image, of the same name."""
+    reconstruct_ms: float | None = None
+    """The most that making the avatar may take, with refinement, milliseconds."""
+    frame_ms: float | None = None
+    """The most that a frame may take, milliseconds; 33 is 30 frames per second."""
+    memory_mb: float | None = None
+    """The most memory that this may add to the process, MiB."""
+    size: int = 512
+    """Side of the frames in pixels."""
+    weights: Path | None = None
+    """Network weights (.safetensors). Default: the shipped ones."""
+
+    def run(self) -> None:
+        budgets = {"reconstruct_ms": self.reconstruct_ms, "frame_ms": self.frame_ms, "memory_mb": self.memory_mb}
+        if all(value is None for value in budgets.values()):
+            raise UsageError("--reconstruct-ms, --frame-ms, --memory-mb: expected at least one of them")
+        for name, value in budgets.items():
+            if value is not None and not value > 0:
+                raise UsageError(f"--{name.replace('_', '-')} {value}: expected a positive number")
+        require_between(16, LARGEST_IMAGE, size=self.size)
+        require_suffix(self.out, (".json",))
+        for path in (self.out, self.out.with_suffix(".png")):
+            require_parent(path, inputs=(self.weights,))
+        with stage("starting"):
+            from humangs_jax.apps.tune import Budget, in_words, load_front, side_by_side, tune, write_tuned
+            from humangs_jax.network.weights import load_weights
+
+        photos = _read_capture(self.capture, check=False)
+        with stage("loading the network"):
+            variables, config = load_weights(self.weights)
+        front, budget = load_front(), Budget(**budgets)
+        best = max(front, key=lambda point: point.quality)
+        with stage("measuring"):
+            tuned = tune(variables, config, photos, budget, self.size, front, progress=True)
+        with stage("drawing both"):
+            image = side_by_side(variables, config, photos, tuned.point, best, self.size)
+        write_tuned(self.out, image, tuned, budget, self.size)
+        tell(in_words(tuned, best))
+        wrote(self.out, f"settings; {self.out.with_suffix('.png')}: the person made by them and by {best.name!r}")
+        suggest("humangs reconstruct", self.capture, "--config", self.out)

@@ -11,10 +11,17 @@ import tempfile
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    from humangs_jax.apps.settings import Settings
 
 LARGEST_IMAGE = 8192
 """Pixels along a side of what is drawn: an image of this size takes a gigabyte while it is drawn."""
+
+
+Preset = Literal["realtime", "balanced", "quality", "best"]
+"""Names of `humangs_jax.PRESETS`."""
 
 
 class UsageError(ValueError):
@@ -117,3 +124,16 @@ def refine_limits(text: str, option: str) -> dict[str, Any]:
     if not number > 0 or (in_steps and number != int(number)):
         raise UsageError(f'{option} {text!r}: expected how long to refine, as in "15s" or "100steps"')
     return {"steps": int(number), "seconds": None} if in_steps else {"steps": None, "seconds": number}
+
+
+def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings | None":
+    """The settings that --preset names or that --config holds, None without either. Raises: UsageError for both; FileError."""
+    if preset is not None and config is not None:
+        raise UsageError(f"--config {config}: does not go with --preset {preset}: expected one of them")
+    if preset is None and config is None:
+        return None  # without the import
+    from humangs_jax.apps.settings import PRESETS, load_settings
+
+    if config is not None:
+        return load_settings(config)
+    return None if preset is None else PRESETS[preset]

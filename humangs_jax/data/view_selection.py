@@ -18,10 +18,14 @@ SIZE = 128
 """Pixels a side of the depth maps: enough to know which side of the body a photo shows."""
 VERTICES = 2000
 """Of the body that is looked at."""
+LEAST_GAIN = 0.03
+"""Share of what is shown already that a further photo has to add, where the number of photos is not given."""
 
 
-def select_views(capture: Capture, count: int) -> list[int]:
+def select_views(capture: Capture, count: int | None) -> list[int]:
     """The numbers of `count` photos, in ascending order, that together show the body best; all of them if there are no more.
+
+    count: None leaves out the photos that add less than `LEAST_GAIN` to what the others show.
 
     Greedy: each next photo adds most to the sum, over the vertices, of area times the best `view_quality`. The sum
     is submodular, so the choice reaches at least 63 % of the best one (Nemhauser, Wolsey, Fisher 1978,
@@ -29,23 +33,28 @@ def select_views(capture: Capture, count: int) -> list[int]:
 
     Raises: ValueError for a count below 1.
     """
-    if count < 1:
+    if count is not None and count < 1:
         raise ValueError(f"select_views: expected at least 1 photo, got {count}")
-    if capture.view_count <= count:
+    if count is not None and capture.view_count <= count:
         return list(range(capture.view_count))
     body = decimate(capture.body, VERTICES) if len(capture.body.template) > VERTICES else capture.body
     quality = np.asarray(_quality(body, standardize(capture, SIZE)))
     area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
-    return sorted(greedy_cover(quality * area, count))
+    least = LEAST_GAIN if count is None else 0.0
+    return sorted(greedy_cover(quality * area, capture.view_count if count is None else count, least))
 
 
-def greedy_cover(quality: Float[np.ndarray, "v n"], count: int) -> list[int]:
-    """Rows of a matrix, one after the other, each of which raises the sum of the columns' maxima most."""
+def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0.0) -> list[int]:
+    """Rows of a matrix, one after the other, each of which raises the sum of the columns' maxima most; none after the first that
+    raises it by less than the share `least`.
+    """
     chosen: list[int] = []
     best = np.zeros(quality.shape[1])
     for _ in range(min(count, len(quality))):
         sums = np.maximum(quality, best).sum(axis=1)
         sums[chosen] = -np.inf
+        if chosen and sums.max() < (1 + least) * best.sum():
+            break
         chosen.append(int(np.argmax(sums)))
         best = np.maximum(best, quality[chosen[-1]])
     return chosen

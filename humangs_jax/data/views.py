@@ -1,5 +1,7 @@
 """Photos of one subject with the body parameters of each, and the inputs that the network computes from them."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,7 @@ from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.images import resized
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.surface_map import surface_texels
@@ -64,15 +67,28 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it; with the map
     of its surface where the network works on one.
 
-    Its `spacing` is relative to the mesh that the weights were trained with: 1 unless `execution.longest_edge` asks for more.
+    Its `spacing` is relative to the mesh that the weights were trained with: 1 unless `execution.longest_edge` asks for more
+    vertices or `execution.body_vertices` for fewer. Raises: ValueError for both.
     """
     vertices, edge = config.conventions.body_vertices, config.conventions.longest_edge
+    if None not in (config.execution.body_vertices, config.execution.longest_edge):
+        raise ValueError(
+            "execution: body_vertices asks for fewer vertices, longest_edge for more: expected one of them"
+        )
     if vertices is not None and vertices < len(body.template):
         body = decimate(body, vertices)
+    whole = body
     if edge is not None:
         body = replace(split_long_edges(body, edge), spacing=None)
-    if config.execution.longest_edge is not None:
-        body = split_long_edges(body, config.execution.longest_edge)
+    fewer, longest = config.execution.body_vertices, config.execution.longest_edge
+    if fewer is not None and fewer < len(whole.template):
+        coarse = decimate(whole, fewer)
+        if edge is not None:  # edges as much longer as the body has fewer vertices on the same area
+            coarse = split_long_edges(coarse, edge * np.sqrt(len(whole.template) / fewer))
+        wider = np.sqrt(len(body.template) / len(coarse.template))
+        body = replace(coarse, spacing=jnp.full(len(coarse.template), wider, body.template.dtype))
+    if longest is not None:
+        body = split_long_edges(body, longest)
     wanted = config.architecture.surface_map
     return body if wanted is None else replace(body, texels=surface_texels(body, wanted))
 
@@ -123,11 +139,56 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
     )
 
 
-def standardize(capture: Capture, size: int) -> SubjectViews:
+CROP_MARGIN = 0.04
+"""Of a crop's side, on each side of the person."""
+
+
+def cropped(capture: Capture) -> Capture:
+    """The photos, cut to squares around the masks, all of one size: of the smallest crop, so that the others are reduced.
+
+    Without masks, or where a mask is empty or fills the photo, they stay as they are.
+    """
+    if capture.masks is None:
+        return capture
+    height, width = capture.masks.shape[1:]
+    boxes = []
+    for mask in capture.masks > MASK_THRESHOLD:
+        rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
+        if not len(rows):
+            return capture
+        low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]]) + 1
+        side = int(np.ceil((high - low).max() / (1 - 2 * CROP_MARGIN)))
+        boxes.append((*((low + high - side) // 2), side))
+    size = min(side for *_, side in boxes)
+    if size >= max(height, width):
+        return capture
+    cut = lambda array, fill: np.stack(
+        [resized(_window(x, *box, fill), size, size) for x, box in zip(array, boxes, strict=True)]
+    )
+    left, top, sides = np.asarray(boxes, np.float32).T
+    shift = np.zeros((len(boxes), 3, 3), np.float32)
+    shift[:, 0, 2], shift[:, 1, 2] = left, top
+    scale = np.stack([size / sides, size / sides, np.ones_like(sides)], axis=-1)
+    cameras = replace(capture.cameras, K=(capture.cameras.K - shift) * scale[:, :, None], width=size, height=size)
+    return dataclasses.replace(capture, images=cut(capture.images, 1.0), masks=cut(capture.masks, 0.0), cameras=cameras)
+
+
+def _window(image, left, top, side, fill):
+    """A square of an image, filled up where it reaches beyond."""
+    height, width = image.shape[:2]
+    window = np.full((side, side, *image.shape[2:]), fill, np.float32)
+    rows, columns = slice(max(top, 0), min(top + side, height)), slice(max(left, 0), min(left + side, width))
+    window[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = image[rows, columns]
+    return window
+
+
+def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews:
     """A capture's photos as the network wants them: padded with white to a centred square and resized to `size`.
 
-    Intrinsics follow the pixels. Without masks only what the posed body covers will count as foreground.
+    Intrinsics follow the pixels. Without masks only what the posed body covers will count as foreground. crop: cut to the person
+    first, see `cropped`.
     """
+    capture = cropped(capture) if crop else capture
     images = capture.images
     masks = np.zeros(images.shape[:3], np.float32) if capture.masks is None else capture.masks
     height, width = images.shape[1:3]

@@ -131,13 +131,19 @@ class HumanGSConfig:
     def __post_init__(self):
         """Raises ValueError for photos that the encoder cannot cut into patches."""
         patch = self.architecture.encoder.patch_size
-        if self.conventions.image_size % patch:
-            raise ValueError(f"image_size {self.conventions.image_size} is not a multiple of patch_size {patch}")
+        for size in (self.conventions.image_size, self.image_size):
+            if size % patch:
+                raise ValueError(f"image_size {size} is not a multiple of patch_size {patch}")
 
     @property
     def tokens(self) -> TokenSelection:
         """The selection of tokens in force."""
         return self.execution.tokens or self.conventions.tokens
+
+    @property
+    def image_size(self) -> int:
+        """Side of the photos in force, pixels."""
+        return self.execution.image_size or self.conventions.image_size
 
     @property
     def trained(self) -> "HumanGSConfig":

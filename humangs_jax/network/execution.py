@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from humangs_jax.core.configuration import knob
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
-MEASURED = "performance_reconstruction.md"
+MEASURED, TRADE = "performance_reconstruction.md", "tradeoff.md"
 
 TokenSelection = Literal["all", "foreground"]
 AttentionKernel = Literal["xla", "cudnn", "chunked"]
@@ -29,7 +29,10 @@ class Execution:
     outside of loops.
     vertex_capacity: vertices for which a view is read at most, None: all.
     longest_edge: metres to which edges of the body are split beyond what the weights were trained with, None for no more.
-    Gaussians then shrink with the distance between vertices, so that they cover as much as before.
+    body_vertices: vertices to which the body is decimated, fewer than the weights were trained with, None for no fewer.
+    Gaussians shrink or grow with the distance between vertices, so that they cover as much as before.
+    image_size: side of the photos in pixels, a multiple of the patch size; None: as the weights were trained.
+    crop: photos are cut to the square around the person's mask before they are brought to that size.
     raster: buffers of the mesh rasterizer.
     """
 
@@ -67,9 +70,30 @@ class Execution:
         gain="detail where photos have more than the vertices of the body",
         measured="refinement.md",
     )
+    body_vertices: int | None = knob(
+        None, cost="detail of the body", gain="Gaussians and the time of a frame in proportion", measured=TRADE
+    )
+    image_size: int | None = knob(None, cost="detail of the photos", gain="tokens grow with its square", measured=TRADE)
+    crop: bool = knob(False, cost="none", gain="pixels of the person in place of background", measured=TRADE)
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
+
+    @staticmethod
+    def preset(name: str) -> "Execution":
+        """How the network runs in a preset of `apps.settings`: realtime, balanced, quality or best. Raises: ValueError."""
+        if name not in EXECUTIONS:
+            raise ValueError(f"Execution.preset: expected one of {', '.join(EXECUTIONS)}, got {name!r}")
+        return EXECUTIONS[name]
 
     @property
     def compute_dtype(self) -> Any:
         """For Linen modules; None promotes inputs and parameters, so that float64 stays float64."""
         return None if self.dtype == "float32" else jnp.dtype(self.dtype)
+
+
+EXECUTIONS = {
+    "realtime": Execution(image_size=128, crop=True),
+    "balanced": Execution(crop=True),
+    "quality": Execution(crop=True),
+    "best": Execution(crop=True),
+}
+"""The network's part of `apps.settings.PRESETS`, measured in docs/tradeoff.md."""

@@ -22,8 +22,17 @@ DEMO = range(3_000_000, 3_001_000)
 """People of the documentation and the tests."""
 FITTING = range(4_000_000, 4_001_000)
 """People that fitting and refinement are tuned and measured on: no other result sees them."""
+TRADEOFF = range(5_000_000, 5_001_000)
+"""People that the presets of speed and accuracy are chosen on."""
 
-SPLITS = {"train": TRAIN, "validation": VALIDATION, "test": TEST, "demo": DEMO, "fitting": FITTING}
+SPLITS = {
+    "train": TRAIN,
+    "validation": VALIDATION,
+    "test": TEST,
+    "demo": DEMO,
+    "fitting": FITTING,
+    "tradeoff": TRADEOFF,
+}
 
 KEY_KIND = "threefry2x32"
 """Implementation of all keys of people: the words of such a key are its seed."""

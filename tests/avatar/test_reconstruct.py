@@ -19,7 +19,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays
-from humangs_jax.data.views import SubjectViews, pad_views, prepare_inputs, standardize
+from humangs_jax.data.views import SubjectViews, cropped, gaussian_body, pad_views, prepare_inputs, standardize
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import HumanGSOutputs
@@ -162,6 +162,46 @@ def test_photos_of_any_size_become_squares_with_cameras_that_follow(body):
     before, _ = project(photos.cameras[1], point)
     after, _ = project(views.cameras[1], point)
     np.testing.assert_allclose(after, (np.asarray(before) + np.asarray([6, 0])) * SIZE / 48, atol=1e-3)
+
+
+def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
+    """The masks say where the person is; the pixel at which a camera shows a point has the same colour before and after."""
+    from humangs_jax.geometry.camera import project
+
+    photos = capture(body, 48, 36)
+    photos.masks[:] = 0
+    photos.masks[0, 10:26, 4:12], photos.masks[1, 20:48, 20:30] = 1, 1  # the second reaches the border
+    photos.images[0, 16:20, 6:10] = [0.2, 0.4, 0.6]
+    cut = cropped(photos)
+    assert cut.images.shape == (2, 18, 18, 3) and cut.cameras.width == cut.cameras.height == 18
+    assert cut.masks[0].any(0).sum() == 8 and cut.masks[0].any(1).sum() == 16
+    point = jnp.asarray([0.2, 1.1, 0.1])
+    for view, (low, side) in enumerate(((np.asarray([-1, 9]), 18), (np.asarray([9, 18]), 31))):
+        before, after = (np.asarray(project(c.cameras[view], point)[0]) for c in (photos, cut))
+        np.testing.assert_allclose(after, (before - low) * 18 / side, atol=1e-3)
+    np.testing.assert_allclose(
+        cut.images[0, 16 - 9 : 20 - 9, 6 + 1 : 10 + 1].reshape(-1, 3), [[0.2, 0.4, 0.6]] * 16, atol=1e-6
+    )
+    assert cropped(dataclasses.replace(photos, masks=None)).images is photos.images
+    empty = dataclasses.replace(photos, masks=0 * photos.masks)
+    assert cropped(empty) is empty
+
+
+def test_bodies_of_fewer_vertices_have_wider_gaussians(body):
+    config = tiny().with_conventions(body_vertices=400, longest_edge=0.2)
+    usual, fewer = gaussian_body(body, config), gaussian_body(body, config.with_execution(body_vertices=200))
+    assert len(fewer.template) < 0.7 * len(usual.template) and usual.spacing is None
+    np.testing.assert_allclose(fewer.spacing, np.sqrt(len(usual.template) / len(fewer.template)), rtol=1e-6)
+    assert gaussian_body(body, config.with_execution(body_vertices=900)).spacing is None  # no fewer than usual
+    with pytest.raises(ValueError, match="body_vertices asks for fewer vertices, longest_edge for more"):
+        gaussian_body(body, config.with_execution(body_vertices=200, longest_edge=0.1))
+
+
+def test_the_size_of_the_photos_is_a_choice_of_execution():
+    config = tiny().with_execution(image_size=64)
+    assert (tiny().image_size, config.image_size, config.conventions.image_size) == (32, 64, 32)
+    with pytest.raises(ValueError, match="image_size 33 is not a multiple of patch_size"):
+        tiny().with_execution(image_size=33)
 
 
 @pytest.mark.parametrize(

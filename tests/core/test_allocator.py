@@ -3,7 +3,10 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+
+from humangs_jax.core.allocator import peak_memory
 
 PROGRAM = """
 import resource
@@ -34,3 +37,16 @@ def test_freed_blocks_stay_with_the_process():
         pytest.skip("this C library has no such setting")
     assert faults < 10
     assert run("default")[1] > 10 * max(faults, 1)  # one for each 4 KiB page, or for each huge one
+
+
+def test_the_peak_is_that_of_the_work_inside():
+    """Not of what was freed before, nor of what is kept."""
+    kept = np.ones(16 << 20, np.uint8)
+    for size in (96, 32):
+        with peak_memory() as peak:
+            block = np.ones(size << 20, np.uint8)
+            del block
+        if peak[0] is None:
+            pytest.skip("this system does not tell")
+        assert size - 1 <= peak[0] < size + 24, peak
+    del kept

@@ -55,3 +55,18 @@ def test_few_photos_are_all_taken_and_none_is_refused(demo):
 @pytest.fixture(scope="module")
 def demo():
     return load_capture(DEMO_CAPTURE)
+
+
+def test_without_a_number_what_adds_nothing_is_left_out(demo):
+    """Photos from four sides add something each; their copies do not."""
+    assert select_views(demo, None) == [0, 1, 2, 3]
+    assert len(select_views(demo.select([0, 2, 0, 2]), None)) == 2
+
+
+@given(arrays(float, (6, 5), elements=st.floats(0, 1)), st.floats(0, 1))
+def test_the_choice_ends_where_the_gain_does(quality, least):
+    chosen = greedy_cover(quality, 6, least)
+    sums = [covered(quality, chosen[: i + 1]) for i in range(len(chosen))]
+    assert all(later >= (1 + least) * earlier for earlier, later in itertools.pairwise(sums))
+    rest = [covered(quality, [*chosen, row]) for row in range(6) if row not in chosen]
+    assert all(more < (1 + least) * sums[-1] for more in rest)

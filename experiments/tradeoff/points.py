@@ -1,0 +1,105 @@
+"""The points of the trade that `sweep.py` measures: settings of the whole path, one knob at a time and together."""
+
+import dataclasses
+from typing import Any
+
+from humangs_jax.apps.settings import PRESETS, Settings
+from humangs_jax.network.execution import Execution
+
+SIZE = 512
+"""Side of the frames in pixels, unless a point says otherwise."""
+STARTS = ("network", "random colours", "painted body", "published network")
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """A way to make an avatar and draw it. size: side of the frames, pixels. start: of `STARTS`: the last ones are to compare
+    with; of the published network, whose weights are not ours to ship, only time and memory are measured.
+    """
+
+    name: str
+    knob: str
+    settings: Settings
+    size: int = SIZE
+    start: str = "network"
+
+
+def point(name: str, knob: str, size: int = SIZE, start: str = "network", **changes: Any) -> Point:
+    """A point by what differs from the default one."""
+    fields = {field.name for field in dataclasses.fields(Execution)}
+    execution = Execution(**{key: value for key, value in changes.items() if key in fields})
+    rest: dict[str, Any] = {"views": 4} | {key: value for key, value in changes.items() if key not in fields}
+    return Point(name, knob, Settings(execution=execution, **rest), size, start)
+
+
+DEFAULT = point("default", "default")
+"""4 photos of 256 pixels, as the weights were trained, float32, no refinement; frames of 512 pixels, exact."""
+
+
+def points() -> list[Point]:
+    """All of them, the default first."""
+    found = [DEFAULT]
+    found += [Point(f"preset {name}", "preset", settings) for name, settings in PRESETS.items()]
+    found += [point(name, "splat preset", splat=name) for name in ("near_exact", "fast", "inria")]
+    found += [point(f"frames of {n}", "frame size", size=n) for n in (128, 256, 384, 1024)]
+    found += [point("pruned", "Gaussians", prune=True), point("painted body", "naive", start="painted body")]
+    found += [point(f"{n} steps", "refinement", refine_steps=n, refine_size=256) for n in (25, 50, 100, 200)]
+    for n in (0, 50, 200):
+        random: dict[str, Any] = {"refine_steps": n, "refine_size": 256}
+        found += [point(f"random colours, {n} steps", "naive", start="random colours", **random)]
+    found += [point(f"{n} photos" if n > 1 else "1 photo", "photos", views=n) for n in (1, 2, 3, 6)]
+    found += [point(f"photos of {n}", "photo size", image_size=n) for n in (128, 192, 384, 512)]
+    found += [point("all tokens", "tokens", tokens="all"), point("cropped", "tokens", crop=True)]
+    found += [point(f"cropped, photos of {n}", "tokens", crop=True, image_size=n) for n in (128, 192, 384)]
+    found += [point(dtype, "precision", dtype=dtype) for dtype in ("bfloat16", "float16")]
+    found += [point(f"body of {n}", "Gaussians", body_vertices=n) for n in (1000, 2000, 3000)]
+    found += [point(f"edges of {edge * 1e3:g} mm", "Gaussians", longest_edge=edge) for edge in (0.024, 0.02, 0.017)]
+    found += [point("100 steps at 512", "refinement", refine_steps=100, refine_size=512)]
+    found += [combined(**fields) for fields in COMBINED]
+    found += [
+        point(f"published, {t} tokens", "published", start="published network", tokens=t) for t in ("foreground", "all")
+    ]
+    return found
+
+
+COMBINED: tuple[dict[str, Any], ...] = (
+    {"views": 1, "crop": True},
+    {"views": 2, "crop": True},
+    {"views": 6, "crop": True},
+    {"views": 1, "crop": True, "image_size": 128, "splat": "fast"},
+    {"views": 2, "crop": True, "image_size": 128, "splat": "near_exact"},
+    {"views": 6, "crop": True, "image_size": 128},
+    {"views": 2, "crop": True, "image_size": 192},
+    {"views": 6, "crop": True, "image_size": 384},
+    {"body_vertices": 1000, "splat": "fast"},
+    {"body_vertices": 2000, "splat": "fast"},
+    {"body_vertices": 2000, "splat": "near_exact"},
+    {"views": 1, "crop": True, "image_size": 128, "body_vertices": 2000, "splat": "fast"},
+    {"views": 2, "crop": True, "refine_steps": 50, "refine_size": 256},
+    {"crop": True, "image_size": 128, "refine_steps": 50, "refine_size": 256},
+    {"crop": True, "refine_steps": 25, "refine_size": 256, "splat": "near_exact"},
+    {"crop": True, "refine_steps": 200, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_steps": 100, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_steps": 200, "refine_size": 256},
+    {"crop": True, "body_vertices": 2000, "refine_steps": 100, "refine_size": 256},
+    {"crop": True, "body_vertices": 2000, "refine_steps": 100, "refine_size": 256, "splat": "fast"},
+    {"crop": True, "longest_edge": 0.02, "refine_steps": 200, "refine_size": 256},
+    {"crop": True, "refine_steps": 200, "refine_size": 128},
+)
+"""Several knobs at once."""
+
+SHORT = {
+    "views": "{} photos",
+    "image_size": "of {}",
+    "crop": "cropped",
+    "body_vertices": "body of {}",
+    "longest_edge": "edges of {} m",
+    "refine_steps": "{} steps",
+    "refine_size": "at {}",
+    "splat": "{}",
+}
+
+
+def combined(**fields: Any) -> Point:
+    """A point named by its settings."""
+    return point(", ".join(SHORT[key].format(value) for key, value in fields.items()), "combined", **fields)

@@ -1,0 +1,297 @@
+"""The page, the images and the front of a sweep, from its JSON.
+
+python experiments/tradeoff/report.py --json OUT [--page docs/tradeoff.md] [--image docs/images/tradeoff] [--front]
+"""
+
+import argparse
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import REPOSITORY, markdown_table, publish, significant, write_json
+
+FRONT = REPOSITORY / "humangs_jax" / "assets" / "front.json"
+SIZE = 512
+"""Side of the frames that points are compared at."""
+EQUAL = 1.05
+"""Times of points that differ by less are taken for equal: they are measured beside other programs."""
+TASKS = {"novel": "same pose", "animation": "unseen poses"}
+SCORES = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 3), "psnr_foreground": ("on the person", 2)}
+NAIVE = ("painted body", "random colours")
+KINDS = {"feed-forward": "#1f6f8b", "refined": "#c0392b", "naive": "#7f8c8d"}
+Row = dict[str, Any]
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, required=True, help="written by sweep.py")
+    parser.add_argument("--page", type=Path, help="page whose tables are written")
+    parser.add_argument("--image", type=Path, help="draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png")
+    parser.add_argument("--front", action="store_true", help="write humangs_jax/assets/front.json")
+    arguments = parser.parse_args()
+    write(json.loads(arguments.json.read_text()), arguments.page, arguments.image, arguments.front)
+
+
+def write(result: dict[str, Any], page: Path | None, image: Path | None, front: bool) -> None:
+    """Everything that is asked for; the table of the presets is printed."""
+    measured = {name: found for name, found in result["points"].items() if "reconstruct" in found}
+    result = result | {"points": measured}
+    rows = rows_of(result)
+    print(preset_table(rows, result))
+    if front:
+        write_json(FRONT, front_file(rows, result))
+    if page:
+        publish(page, "tradeoff", point_table(rows, result), result)
+        publish(page, "tradeoff_presets", preset_table(rows, result))
+        publish(page, "tradeoff_naive", naive_table(rows))
+        publish(page, "tradeoff_growth", growth_table(rows, result))
+    if image:
+        for key in ("reconstruct", "frame"):
+            name = "reconstruction" if key == "reconstruct" else "frames"
+            draw(rows, key, image.with_name(f"{image.name}_{name}.png"))
+
+
+def rows_of(result: dict[str, Any]) -> list[Row]:
+    """A row for each measured point: what it is, times, memory, and means over people by task."""
+    rows = []
+    for name, found in result["points"].items():
+        row = {"name": name.removeprefix("preset "), **found["what"], **found}
+        for task in TASKS:
+            scores = [person[task] for person in found["people"]]
+            row[task] = {key: float(np.mean([score[key] for score in scores])) for key in SCORES} if scores else None
+        rows.append(row)
+    return rows
+
+
+def quality(row: Row) -> float:
+    """What points are ranked by, dB: the mean of both tasks."""
+    return 0.5 * (row["novel"]["psnr"] + row["animation"]["psnr"])
+
+
+def kind(row: Row) -> str:
+    """Of `KINDS`."""
+    if row["start"] in NAIVE:
+        return "naive"
+    return "refined" if row["settings"]["refine_steps"] else "feed-forward"
+
+
+def compared(rows: list[Row]) -> list[Row]:
+    """Those with scores, of frames of one size."""
+    return [row for row in rows if row["novel"] is not None and row["size"] == SIZE]
+
+
+def better(row: Row, rows: list[Row], keys: tuple[str, ...] = ("reconstruct", "frame")) -> list[Row]:
+    """The points that are better and take no longer."""
+    return [r for r in rows if quality(r) > quality(row) and all(r[key] <= EQUAL * row[key] for key in keys)]
+
+
+def front_of(rows: list[Row], keys: tuple[str, ...] = ("reconstruct", "frame")) -> list[Row]:
+    """The points of ours that no other one dominates, cheapest reconstruction first."""
+    ours = [row for row in compared(rows) if row["start"] == "network"]
+    return sorted((row for row in ours if not better(row, ours, keys)), key=lambda row: row["reconstruct"])
+
+
+def front_file(rows: list[Row], result: dict[str, Any]) -> dict[str, Any]:
+    """What `humangs tune` chooses from: the front, and the presets."""
+    chosen = front_of(rows)
+    chosen += [row for row in rows if row["knob"] == "preset" and row not in chosen]
+    points = [
+        {
+            "name": row["name"],
+            "settings": row["settings"],
+            "make": row["reconstruct"] - row["refine_share"],
+            "refine": row["refine_share"],
+            "frame": row["frame"],
+            "memory_mb": row["memory_mb"],
+            "psnr": row["novel"]["psnr"],
+            "psnr_poses": row["animation"]["psnr"],
+        }
+        for row in chosen
+    ]
+    return {"weights": result["settings"]["weights"], "points": points}
+
+
+# Tables ------------------------------------------------------------------------------------------------------------------
+
+
+def about(result: dict[str, Any]) -> str:
+    """Of which weights, people and machine the numbers are."""
+    default = result["points"]["default"]
+    people, took = len(default["people"]), f"{default['reconstruct_ms']:.0f} ms a reconstruction"
+    return (
+        f"Weights with SHA-256 {result['settings']['weights'][:16]}...; {people} of the people kept for this "
+        f'(split "tradeoff"). CPU times of all threads are shares of the default point\'s, in turns with it: {took} and '
+        f"{default['frame_ms']:.0f} ms a frame of {SIZE} pixels."
+    )
+
+
+def numbers(row: Row) -> list[str]:
+    """Times, memory and size."""
+    share = lambda key: significant(row[key]) if row.get(key) is not None else ""
+    return [share("reconstruct"), share("frame")] + [
+        f"{row[key]:,.{digits}f}" if row.get(key) is not None else ""
+        for key, digits in (("memory_mb", 0), ("file_mb", 2), ("gaussians", 0))
+    ]
+
+
+def scores(row: Row) -> list[str]:
+    """Of both tasks."""
+    if row["novel"] is None:
+        return [""] * (len(TASKS) * len(SCORES))
+    return [f"{row[task][key]:.{digits}f}" for task in TASKS for key, (_, digits) in SCORES.items()]
+
+
+MEASURES = ["reconstruction", "frame", "MiB", "file, MiB", "Gaussians"]
+HEADINGS = [
+    f"{name}: {heading}" if i == 0 else heading
+    for name in TASKS.values()
+    for i, (heading, _) in enumerate(SCORES.values())
+]
+
+
+def point_table(rows: list[Row], result: dict[str, Any]) -> str:
+    """All points; those of the front are bold."""
+    front = {row["name"] for row in front_of(rows)}
+    named = lambda row: f"**{row['name']}**" if row["name"] in front else row["name"]
+    table = [[row["knob"], named(row), *numbers(row), *scores(row)] for row in rows]
+    text = f"{about(result)} {len(rows)} points; bold: no other point is better and as fast in both."
+    header = ["knob", "point", *MEASURES, *HEADINGS]
+    return f"{text}\n\n{markdown_table(header, table, 'll' + 'r' * (len(header) - 2))}"
+
+
+def preset_table(rows: list[Row], result: dict[str, Any]) -> str:
+    """The presets, whether they are on the front, and what they give up."""
+    presets = [row for row in rows if row["knob"] == "preset"]
+    if not presets:
+        return "no preset has been measured"
+    front, best = {row["name"] for row in front_of(rows)}, max(presets, key=quality)
+    lost = lambda row: [f"{best[task]['psnr'] - row[task]['psnr']:.2f}" for task in TASKS]
+    table = [
+        [row["name"], *numbers(row), *scores(row), *lost(row), "yes" if row["name"] in front else "no"]
+        for row in presets
+    ]
+    header = ["preset", *MEASURES, *HEADINGS, "below best: same pose", "unseen poses", "on the front"]
+    return f"{about(result)}\n\n{markdown_table(header, table)}"
+
+
+def naive_table(rows: list[Row]) -> str:
+    """For each naive point the fastest of ours that dominates it."""
+    ours = [row for row in compared(rows) if row["start"] == "network"]
+    table = []
+    for row in compared(rows):
+        if kind(row) != "naive":
+            continue
+        above = better(row, ours)
+        found = min(above, key=lambda r: r["reconstruct"] + r["frame"]) if above else None
+        gain = "" if found is None else f"{quality(found) - quality(row):.2f}"
+        times = [significant(row[key]) for key in ("reconstruct", "frame")]
+        theirs = ["", ""] if found is None else [significant(found[key]) for key in ("reconstruct", "frame")]
+        table.append([row["name"], *times, f"{quality(row):.2f}", found["name"] if found else "none", *theirs, gain])
+    header = [
+        "naive point",
+        "reconstruction",
+        "frame",
+        "PSNR, both",
+        "better and as fast",
+        "reconstruction",
+        "frame",
+        "gain, dB",
+    ]
+    ours_front = front_of(rows)
+    refined = sum(kind(row) == "refined" for row in ours_front)
+    text = f"{len(ours_front)} of {len(ours)} points are on the front, {refined} of them refined."
+    return f"{text} PSNR, both: the mean of both tasks.\n\n{markdown_table(header, table, 'lrrrlrrr')}"
+
+
+def growth_table(rows: list[Row], result: dict[str, Any]) -> str:
+    """Slopes of log time over log size, of the one-knob points with the default."""
+    default = next(row for row in rows if row["name"] == "default")
+    of = lambda *knobs: [row for row in rows if row["knob"] in knobs and row["start"] == "network"]
+    options = lambda row: row["settings"]["execution"]
+    trained = 256
+    series = {
+        "photos": [(r["settings"]["views"], r["reconstruct"]) for r in [default, *of("photos")]],
+        "pixels of a photo": [
+            ((options(r)["image_size"] or trained) ** 2, r["reconstruct"]) for r in [default, *of("photo size")]
+        ],
+        "people in a batch": [(int(n), share) for n, share in result["growth"].get("batch", {}).items()],
+        "Gaussians, of a frame": [
+            (r["gaussians"], r["frame"]) for r in [default, *of("Gaussians")] if not r["settings"]["prune"]
+        ],
+        "pixels of a frame": [(r["size"] ** 2, r["frame"]) for r in [default, *of("frame size")]],
+        "steps of refinement": [
+            (r["settings"]["refine_steps"], r["refine_share"])
+            for r in of("refinement")
+            if r["settings"]["refine_size"] == trained
+        ],
+        "background pixels of a frame": [(int(n) ** 2, share) for n, share in result["growth"].get("box", {}).items()],
+    }
+    table = []
+    for name, pairs in series.items():
+        if len(pairs) < 2:
+            continue
+        pairs = sorted(pairs)
+        sizes, times = zip(*pairs, strict=True)
+        slope = np.polyfit(np.log(sizes), np.log(times), 1)[0]
+        table.append([name, ", ".join(f"{n:,}" for n in sizes), ", ".join(map(significant, times)), f"{slope:.2f}"])
+    text = "Slope 1: in proportion. Background: a person of 256 pixels in larger and larger frames: only what is empty grows."
+    return f"{text}\n\n{markdown_table(['growth with', 'sizes', 'time', 'slope'], table, 'lllr')}"
+
+
+# Images ------------------------------------------------------------------------------------------------------------------
+
+
+def draw(rows: list[Row], key: str, path: Path) -> None:
+    """PSNR of both tasks against a time, with the front."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    points = compared(rows)
+    figure, axes = plt.subplots(1, 2, figsize=(10, 4.4), sharex=True)
+    for axis, (task, title) in zip(axes, TASKS.items(), strict=True):
+        for name, color in KINDS.items():
+            chosen = [row for row in points if kind(row) == name]
+            marker = "x" if name == "naive" else "o"
+            x, y = [row[key] for row in chosen], [row[task]["psnr"] for row in chosen]
+            axis.scatter(x, y, s=18, color=color, marker=marker, label=name)
+        steps = staircase([(row[key], row[task]["psnr"]) for row in points if row["start"] == "network"])
+        axis.step(*zip(*steps, strict=True), where="post", color="k", lw=0.8, label="front")
+        for row in points:
+            if row["knob"] == "preset" or row["name"] == "default":
+                axis.annotate(
+                    row["name"], (row[key], row[task]["psnr"]), fontsize=7, xytext=(3, 3), textcoords="offset points"
+                )
+        axis.set(
+            xscale="log",
+            title=title,
+            ylabel="PSNR, dB",
+            xlabel=f"{'reconstruction' if key == 'reconstruct' else 'frame'} time / default",
+        )
+        axis.grid(alpha=0.3)
+    axes[0].legend(fontsize=7)
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def staircase(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    """The points that are better than all that are cheaper."""
+    steps, highest = [], -math.inf
+    for x, y in sorted(pairs):
+        if y > highest:
+            steps.append((x, y))
+            highest = y
+    return steps
+
+
+if __name__ == "__main__":
+    main()

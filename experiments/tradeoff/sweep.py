@@ -1,0 +1,374 @@
+"""Speed against accuracy of the whole path: what each knob costs in decibels and takes in time, memory and bytes.
+
+    python experiments/tradeoff/sweep.py --json OUT [--subjects 2] [--only KNOB ...] [--page docs/tradeoff.md]
+        [--image docs/images/tradeoff] [--front]
+
+The points are those of `points.py`. Quality is the mean over people of the split "tradeoff", whom nothing else has seen:
+PSNR, SSIM and PSNR on the person, of new views in the pose of the photos and in unseen poses. Photos and true images have
+512 pixels; frames of another size are brought to 512 before they are compared. Times are
+CPU times of all threads, of the first person, in turns with the default point's, and kept as ratios of medians: other
+programs stretch wall times by far more. Refinement is counted in steps, which do not depend on the load either. Compilation
+does not count. Memory: what making the avatar or refining it adds to the process at its peak.
+
+Every point is written as it is measured; a later run continues. `--front` writes the Pareto front to
+humangs_jax/assets/front.json, where `humangs tune` finds it. About 50 minutes on one core.
+"""
+
+import argparse
+import dataclasses
+import functools
+import itertools
+import json
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.interleaved import prepare_process, timed
+from experiments.common.results import write_json
+from experiments.evaluation.results import TASKS, file_digest
+
+SHOTS = {"held_out": 3, "poses": 2, "pose_views": 1}
+"""Held-out views of a person: of the pose of the photos; unseen poses; views of each."""
+PHOTOS = (1, 2, 3, 4, 6)
+TRUE_SIZE = 512
+FRAMES = 10
+"""Timed rounds of drawing a frame."""
+SHORT_RUNS = (5, 15)
+"""Steps of the refinements that are timed."""
+QUALITY = ("psnr", "ssim", "psnr_foreground")
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, required=True, help="points that are there are not measured again")
+    parser.add_argument("--subjects", type=int, default=2, help="how many people")
+    parser.add_argument("--people", type=Path, help="folder where rendered people are kept for later runs")
+    parser.add_argument("--rounds", type=int, default=2, help="timed rounds of making an avatar")
+    parser.add_argument("--only", nargs="+", help="knobs to measure")
+    parser.add_argument("--page", type=Path, help="page whose tables are written")
+    parser.add_argument("--image", type=Path, help="draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png")
+    parser.add_argument("--front", action="store_true", help="write humangs_jax/assets/front.json")
+    arguments = parser.parse_args()
+    prepare_process()
+    result = sweep(arguments)
+    from experiments.tradeoff import report
+
+    report.write(result, arguments.page, arguments.image, arguments.front)
+
+
+def sweep(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Measures what the file does not have."""
+    from tqdm import tqdm
+
+    from experiments.tradeoff.points import points
+
+    path, subjects, only = arguments.json, arguments.subjects, arguments.only
+    settings = settings_of()
+    result = json.loads(path.read_text()) if path.exists() else {}
+    if result.get("settings") != settings:
+        result = {"settings": settings, "points": {}, "growth": {}}
+    rows, wanted = result["points"], [p for p in points() if only is None or p.knob in only]
+    for each in wanted:
+        if described(each) != rows.get(each.name, {}).get("what"):
+            rows[each.name] = {"what": described(each), "people": []}
+    missing = [(i, p) for i in range(subjects) for p in wanted if len(rows[p.name]["people"]) <= i]
+    missing = [(i, p) for i, p in missing if p.start != "published network" or "reconstruct" not in rows[p.name]]
+    if not missing and result["growth"]:
+        return result
+    bench = Bench(subjects, arguments.people, arguments.rounds)
+    for i, each in tqdm(missing, desc="points"):  # all of one person, then the next: times are of the first
+        bench.measure(each, i, rows[each.name])
+        write_json(path, result)
+    if not result["growth"]:
+        result["growth"] = bench.growth()
+        write_json(path, result)
+    return result
+
+
+def settings_of() -> dict[str, Any]:
+    """What all points depend on."""
+    from importlib import resources
+
+    from humangs_jax.network.weights import SHIPPED
+    from humangs_jax.people.seeds import GENERATOR_VERSION
+
+    with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as weights:
+        digest = file_digest(weights)
+    return {"weights": digest, "generator": GENERATOR_VERSION, "size": TRUE_SIZE, **SHOTS}
+
+
+def described(point) -> dict[str, Any]:
+    """A point as data."""
+    from humangs_jax.core.configuration import config_to_json
+
+    return {
+        "knob": point.knob,
+        "size": point.size,
+        "start": point.start,
+        "settings": json.loads(config_to_json(point.settings)),
+    }
+
+
+def person_of(seed: int, body, folder: Path | None):
+    """A person with photos and held-out views; rendered once where there is a folder to keep them in."""
+    from experiments.evaluation.subjects import EvaluationSubject, HeldOut, make_evaluation_subject, ring_positions
+    from humangs_jax.data.capture import load_capture, save_capture
+
+    place = folder / str(seed) if folder else None
+    if place is None or not (place / "held_out" / "capture.json").exists():
+        held_out = HeldOut(SHOTS["held_out"], SHOTS["poses"], SHOTS["pose_views"])
+        person = make_evaluation_subject(seed, body, PHOTOS, TRUE_SIZE, held_out)
+        if place is None:
+            return person
+        place.mkdir(parents=True, exist_ok=True)
+        for name in ("photos", "held_out"):
+            save_capture(place / name, getattr(person, name))
+    photos, held_out = (load_capture(place / name, body=body) for name in ("photos", "held_out"))
+    positions = tuple(sorted({position for count in PHOTOS for position in ring_positions(count)}))
+    return EvaluationSubject(seed, photos, positions, held_out)
+
+
+class Bench:
+    """The people, the network, and the default point, with which others take turns."""
+
+    def __init__(self, subjects: int, people: Path | None, rounds: int = 2):
+        from experiments.tradeoff.points import DEFAULT
+        from humangs_jax.body.library import load_body
+        from humangs_jax.network.weights import load_weights
+        from humangs_jax.people.seeds import seeds_of
+
+        self.subjects, (self.variables, self.config) = subjects, load_weights()
+        body = load_body()
+        seeds = seeds_of("tradeoff", 0, subjects)
+        self.person = functools.cache(lambda i: person_of(seeds[i], body, people))
+        self.default, self.rounds = DEFAULT, rounds
+        self.kept: dict[Any, Any] = {}
+        self.default_avatar = self.made(DEFAULT, 0)
+
+    def measure(self, point, i: int, row: dict[str, Any]) -> None:
+        """Adds a person's scores to a point's row; with the first, also times, memory and bytes."""
+        if point.start == "published network":
+            row |= self.published(point)
+            return
+        avatar = self.made(point, i)
+        scores = self.scores(point, avatar, self.person(i))
+        if i == 0 and point.start == "painted body":
+            row |= self.painted_times()
+        elif i == 0:
+            with tempfile.TemporaryDirectory() as folder:
+                avatar.save(Path(folder) / "avatar.npz")
+                row["file_mb"] = (Path(folder) / "avatar.npz").stat().st_size / 2**20
+            drawn = self.pruned(point, avatar, self.person(0).held_out)
+            row |= self.make_times(point) | self.frame_times(point, drawn) | {"gaussians": len(drawn.gaussians.means)}
+        row["people"].append({task: {key: scores[task][key] for key in QUALITY} for task in TASKS})
+
+    # Avatars and their images ----------------------------------------------------------------------------------------
+
+    def made(self, point, i):
+        """The avatar of a point; those that only differ in how they are drawn are made once."""
+        from experiments.evaluation.refinement import random_start
+        from humangs_jax.apps.settings import make_avatar
+        from humangs_jax.evaluation.baseline import painted_body
+        from humangs_jax.refinement.refine import refine_with_report
+
+        settings = dataclasses.replace(point.settings, splat="as_trained", prune=False)
+        key = (settings, point.start, i)
+        if key not in self.kept:
+            photos = self.person(i).inputs(settings.views or 4)
+            if point.start == "painted body":
+                avatar = painted_body(photos)
+            else:
+                plain = dataclasses.replace(settings, refine_steps=0)
+                avatar = make_avatar(plain, self.variables, self.config, photos)
+                if point.start == "random colours":
+                    avatar = random_start(avatar, self.person(i).seed)
+                if settings.refinement is not None:
+                    avatar = refine_with_report(avatar, photos, settings.refinement).avatar
+            if len(self.kept) > 8:
+                self.kept.pop(next(k for k in self.kept if k[0] != self.default.settings))
+            self.kept[key] = avatar
+        return self.kept[key]
+
+    def scores(self, point, avatar, person):
+        """Scores by task, of frames brought to the size of the truth."""
+        from experiments.evaluation.subjects import score_tasks
+        from humangs_jax.avatar.frames import capture_views, draw
+        from humangs_jax.evaluation.baseline import draw_painted_body
+        from humangs_jax.io.images import resized
+
+        truth = person.held_out
+        if point.start == "painted body":
+            return score_tasks(draw_painted_body(avatar, truth), truth)
+        avatar = self.pruned(point, avatar, truth)
+        poses, cameras = capture_views(avatar, truth)
+        cameras = cameras.resized(point.size, point.size)
+        drawn = [np.clip(np.asarray(r.rgb), 0, 1) for r in draw(avatar, poses, cameras, how=self.how(point, avatar))]
+        if point.size != TRUE_SIZE:
+            drawn = [np.clip(resized(image, TRUE_SIZE, TRUE_SIZE), 0, 1) for image in drawn]
+        return score_tasks(np.stack(drawn), truth)
+
+    def pruned(self, point, avatar, held_out):
+        """Without what the held-out views do not show, where the point says so."""
+        from humangs_jax.avatar.frames import capture_views, without_unseen
+
+        if not point.settings.prune:
+            return avatar
+        poses, cameras = capture_views(avatar, held_out)
+        return without_unseen(avatar, poses, cameras, self.how(point, avatar))
+
+    @staticmethod
+    def how(point, avatar):
+        """How the point draws."""
+        from humangs_jax.avatar.frames import splatting_of
+        from humangs_jax.avatar.shot import Shot
+
+        return splatting_of(point.settings.shot(Shot()), avatar)
+
+    # Times and memory ------------------------------------------------------------------------------------------------
+
+    def make(self, settings):
+        """One reconstruction of the first person, without refinement."""
+        from humangs_jax.apps.settings import make_avatar
+
+        plain = dataclasses.replace(settings, refine_steps=0)
+        return make_avatar(plain, self.variables, self.config, self.person(0).inputs(settings.views or 4))
+
+    def default_make_ms(self) -> float:
+        """Of the default point, now."""
+        return timed(lambda: self.make(self.default.settings))[1]
+
+    def make_times(self, point) -> dict[str, Any]:
+        """Time of making the avatar over the default's, with refinement; the default's ms; peak memory, MiB."""
+        from humangs_jax.core.allocator import peak_memory
+
+        settings, usual = point.settings, self.default.settings
+        same = (settings.views, settings.execution) == (usual.views, usual.execution)
+        pairs = []
+        for _ in range(0 if same and point is not self.default else self.rounds):
+            pairs.append((timed(lambda: self.make(settings))[1], self.default_make_ms()))
+        own, default = np.median(pairs, axis=0) if pairs else (1.0, 1.0)
+        ratio = 0.0 if point.start == "random colours" else 1.0 if point is self.default else float(own / default)
+        with peak_memory() as peak:
+            self.make(settings)
+        refined, memory = 0.0, peak[0]
+        if settings.refinement is not None:
+            refined_ms, more = self.refining(settings)
+            refined, memory = refined_ms / self.default_make_ms(), max(memory or 0.0, more or 0.0)
+        times = {"reconstruct": ratio + refined, "refine_share": refined, "memory_mb": memory}
+        return times | ({"reconstruct_ms": float(own)} if point is self.default else {})
+
+    def refining(self, settings) -> tuple[float, float | None]:
+        """CPU ms of a refinement, from two short ones without compilation, and its MiB, which do not grow with the steps."""
+        from humangs_jax.core.allocator import peak_memory
+        from humangs_jax.refinement.refine import refine_with_report
+
+        photos, avatar = self.person(0).inputs(settings.views or 4), self.make(settings)
+        run = lambda n: refine_with_report(avatar, photos, dataclasses.replace(settings, refine_steps=n).refinement)
+        few, many = SHORT_RUNS
+        first = timed(lambda: run(few))[1]
+        with peak_memory() as peak:
+            second = timed(lambda: run(many))[1]
+        return first + (settings.refine_steps - few) * max(0.0, second - first) / (many - few), peak[0]
+
+    def frame_times(self, point, drawn) -> dict[str, Any]:
+        """Time of a frame over the default's, and the default's ms."""
+        ours = self.frames(drawn, point.size, self.how(point, drawn))
+        usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
+        pairs = [[timed(lambda f=f: next(f))[1] for f in (ours, usual)] for _ in range(FRAMES + 1)][1:]
+        own, default = np.median(pairs, axis=0)
+        return {"frame": 1.0, "frame_ms": float(default)} if point is self.default else {"frame": float(own / default)}
+
+    def frames(self, avatar, size, how, cameras=None):
+        """Frames without end, in the poses of the held-out views."""
+        import jax
+
+        from humangs_jax.avatar.frames import capture_views, draw
+
+        poses, views = capture_views(avatar, self.person(0).held_out)
+        cameras = views.resized(size, size) if cameras is None else cameras
+        turns = lambda: itertools.cycle(range(len(poses.rotations)))
+        pose = lambda i: jax.tree.map(lambda x: x[i], poses)
+        renderings = draw(avatar, (pose(i) for i in turns()), (cameras[i] for i in turns()), how=how)
+        return (jax.block_until_ready(rendering) for rendering in renderings)
+
+    def painted_times(self) -> dict[str, Any]:
+        """Of the painted body: the mesh with its colours, rasterized."""
+        from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
+
+        photos, held_out = self.person(0).inputs(4), self.person(0).held_out
+        one = held_out.select([0])
+        colors = painted_body(photos)
+        draw_painted_body(colors, one)
+        makes = [
+            (timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(self.rounds)
+        ]
+        usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
+        next(usual)
+        frames = [
+            (timed(lambda: draw_painted_body(colors, one))[1], timed(lambda: next(usual))[1]) for _ in range(FRAMES)
+        ]
+        make, frame = (np.median(pairs, axis=0) for pairs in (makes, frames))
+        return {"reconstruct": float(make[0] / make[1]), "refine_share": 0.0, "frame": float(frame[0] / frame[1])}
+
+    def published(self, point) -> dict[str, Any]:
+        """Time and memory of the published network with random weights, in float32, which is faster on a CPU."""
+        from experiments.reconstruction.cases import random_variables
+        from humangs_jax.apps.settings import make_avatar
+        from humangs_jax.core.allocator import peak_memory
+        from humangs_jax.network.presets import published
+
+        config = published().with_conventions(image_size=256)
+        variables, photos = random_variables(config), self.person(0).inputs(4)
+        make = lambda: make_avatar(point.settings, variables, config, photos)
+        make()
+        pairs = [(timed(make)[1], self.default_make_ms()) for _ in range(2)]
+        own, default = np.median(pairs, axis=0)
+        with peak_memory() as peak:
+            avatar = make()
+        return {
+            "reconstruct": float(own / default),
+            "memory_mb": peak[0],
+            "gaussians": len(avatar.gaussians.means),
+        }
+
+    def growth(self) -> dict[str, Any]:
+        """People in a batch over one person, and a large frame with the person in a small box over a frame of the box."""
+        import jax
+        import jax.numpy as jnp
+
+        from humangs_jax.avatar.reconstruct import reconstruct_batch
+        from humangs_jax.core.pytree import replace
+
+        photos = [self.person(i).inputs(4) for i in range(self.subjects)]
+        batch = {}
+        for count in (1, 2, 4):
+            captures = [photos[i % len(photos)] for i in range(count)]
+            run = lambda captures=captures: jax.block_until_ready(
+                reconstruct_batch(self.variables, self.config, captures)
+            )
+            run()
+            pairs = np.asarray([(timed(run)[1], self.default_make_ms()) for _ in range(self.rounds)])
+            batch[str(count)] = float(np.divide(*np.median(pairs, axis=0)))
+        small = self.person(0).held_out.cameras.resized(256, 256)
+        how = self.how(self.default, self.default_avatar)
+        boxes = {}
+        for side in (256, 512, 1024):
+            shift = jnp.zeros((3, 3)).at[:2, 2].set((side - 256) / 2)
+            boxes[side] = self.frames(
+                self.default_avatar, side, how, replace(small, K=small.K + shift, width=side, height=side)
+            )
+        rounds = [[timed(lambda f=f: next(f))[1] for f in boxes.values()] for _ in range(FRAMES + 1)][1:]
+        times = np.median(rounds, axis=0)
+        return {"batch": batch, "box": {str(side): float(t / times[0]) for side, t in zip(boxes, times, strict=True)}}
+
+
+if __name__ == "__main__":
+    started = time.perf_counter()
+    main()
+    print(f"took {(time.perf_counter() - started) / 60:.0f} min")

@@ -1,0 +1,122 @@
+"""Speed against accuracy in one value: how many photos, how the network runs, how long refinement takes, how frames are drawn.
+
+`PRESETS` are points of the front that experiments/tradeoff/sweep.py has measured (docs/tradeoff.md). `humangs tune` finds
+one for a machine, a person and a budget.
+"""
+
+import dataclasses
+import json
+import os
+from typing import Any, Literal
+
+import jax
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.core.configuration import config_from_json, config_to_json, knob
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.view_selection import select_views
+from humangs_jax.io.reading import Refused, reading
+from humangs_jax.io.text import parse_json, read_text, write_json
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.execution import EXECUTIONS, Execution
+from humangs_jax.network.parts import Variables
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.refine import refine_with_report
+
+MEASURED = "tradeoff.md"
+KIND = "humangs_jax settings"
+"""Of a file of settings, its field "kind"."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How an avatar is made and drawn. The size of the frames is not in it: it belongs to the screen.
+
+    views: photos that are used at most, chosen by `select_views`; None: all. execution: of the network. refine_steps: of
+    refinement, 0 for none; refine_size: photos whose longer side is larger are reduced to it for refinement, pixels. splat:
+    as `Shot.splat`. prune: as `Shot.prune`.
+    """
+
+    views: int | None = knob(None, cost="what the other photos show", gain="time in proportion", measured=MEASURED)
+    execution: Execution = dataclasses.field(default_factory=Execution)
+    refine_steps: int = knob(0, cost="blur at few", gain="time in proportion", measured=MEASURED)
+    refine_size: int | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
+    splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
+        "as_trained", cost="see performance.md", gain="time of a frame", measured=MEASURED
+    )
+    prune: bool = knob(False, cost="3 of 255 levels", gain="time of frames that are drawn often", measured="video.md")
+
+    def __post_init__(self):
+        """Raises ValueError for settings out of range, naming them."""
+        counts = {"views": self.views, "refine_size": self.refine_size}
+        if wrong := [name for name, value in counts.items() if value is not None and value < 1]:
+            raise ValueError(f"Settings: {', '.join(wrong)} must be at least 1")
+        if self.refine_steps < 0:
+            raise ValueError(f"Settings: refine_steps must not be negative, got {self.refine_steps}")
+
+    @property
+    def refinement(self) -> RefineConfig | None:
+        """What `refine` is given; None for no refinement."""
+        if not self.refine_steps:
+            return None
+        return RefineConfig(steps=self.refine_steps, seconds=None, image_size=self.refine_size)
+
+    def network(self, config: HumanGSConfig) -> HumanGSConfig:
+        """A network of these weights, run in this way."""
+        return dataclasses.replace(config, execution=self.execution)
+
+    def photos(self, capture: Capture) -> Capture:
+        """The photos that are used."""
+        if self.views is None or self.views >= capture.view_count:
+            return capture
+        return capture.select(select_views(capture, self.views))
+
+    def shot(self, shot: Shot) -> Shot:
+        """A shot, drawn in this way where it does not say how."""
+        splat = self.splat if shot.splat == "as_trained" else shot.splat
+        return dataclasses.replace(shot, splat=splat, prune=shot.prune or self.prune)
+
+
+PRESETS: dict[str, Settings] = {
+    "realtime": Settings(views=2, execution=EXECUTIONS["realtime"], splat="fast"),
+    "balanced": Settings(views=4, execution=EXECUTIONS["balanced"], splat="near_exact"),
+    "quality": Settings(views=4, execution=EXECUTIONS["quality"], refine_steps=50, refine_size=256, splat="near_exact"),
+    "best": Settings(execution=EXECUTIONS["best"], refine_steps=200, refine_size=256),
+}
+"""From the fastest to the best; docs/tradeoff.md has what each takes and gains."""
+
+
+def make_avatar(
+    settings: Settings, variables: Variables, config: HumanGSConfig, capture: Capture, progress: bool = False
+) -> Avatar:
+    """An avatar of the person of a capture: `reconstruct`, then `refine` where the settings say so.
+
+    Arguments: config: of the weights; its execution is replaced by that of the settings. capture: `Settings.photos` are used.
+    progress: show the bar of refinement.
+
+    Raises: ValueError as `reconstruct` and `refine`.
+    """
+    photos = settings.photos(capture)
+    avatar = reconstruct(variables, settings.network(config), photos)
+    if settings.refinement is not None:
+        avatar = refine_with_report(avatar, photos, settings.refinement, progress=progress).avatar
+    return jax.block_until_ready(avatar)
+
+
+def save_settings(path: str | os.PathLike, settings: Settings, **about: Any) -> None:
+    """Write settings as JSON, with what else is to be known about them. Raises: OSError."""
+    write_json(path, {"kind": KIND, "settings": parse_json(config_to_json(settings)), **about})
+
+
+def load_settings(path: str | os.PathLike) -> Settings:
+    """Settings that `save_settings` has written. Raises: FileNotFoundError; FileError naming the file and what is wrong."""
+    with reading(path, "settings file"):
+        content = parse_json(read_text(path))
+        if not isinstance(content, dict) or content.get("kind") != KIND:
+            raise Refused(f'no settings of `humangs tune`: expected "kind": "{KIND}"')
+        try:
+            return config_from_json(Settings, json.dumps(content.get("settings")))
+        except ValueError as error:
+            raise Refused(str(error)) from error

@@ -1,0 +1,210 @@
+"""Settings for a budget: presets, files of settings, the choice, and the command."""
+
+import dataclasses
+import json
+import typing
+
+import jax
+import pytest
+from command_line import run
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from humangs_jax.apps import tune as tuning
+from humangs_jax.apps.settings import PRESETS, Settings, load_settings, save_settings
+from humangs_jax.apps.tune import MARGIN, Budget, Cost, FrontPoint, choose, in_words, load_front, predict, tune
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.cli.options import Preset
+from humangs_jax.data.capture import load_capture, save_capture
+from humangs_jax.network import presets
+from humangs_jax.network.execution import EXECUTIONS, Execution
+from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.weights import save_weights
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_settings_come_back_from_their_file(name, tmp_path):
+    file = tmp_path / "tuned.json"
+    save_settings(file, PRESETS[name], measured={"frame_ms": 30.0})
+    assert load_settings(file) == PRESETS[name]
+    assert json.loads(file.read_text())["measured"] == {"frame_ms": 30.0}
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "line 1: not valid JSON"),
+        ("[]", 'expected "kind": "humangs_jax settings"'),
+        ('{"kind": "humangs_jax settings"}', "config: expected an object, got None"),
+        ('{"kind": "humangs_jax settings", "settings": {"speed": 9}}', "config.speed: Settings has no such field"),
+        ('{"kind": "humangs_jax settings", "settings": {"views": "two"}}', "config.views"),
+        ('{"kind": "humangs_jax settings", "settings": {"views": 0}}', "views must be at least 1"),
+        ('{"kind": "humangs_jax settings", "settings": {"splat": "blurred"}}', "config.splat"),
+    ],
+)
+def test_what_is_wrong_in_a_file_of_settings_is_one_line(content, said, tmp_path):
+    file = tmp_path / "tuned.json"
+    file.write_text(content)
+    with pytest.raises(ValueError) as caught:
+        load_settings(file)
+    text = str(caught.value)
+    assert text.startswith(f"{file}: ") and said in text and "\n" not in text
+
+
+def test_presets_have_one_set_of_names():
+    assert tuple(PRESETS) == tuple(EXECUTIONS) == typing.get_args(Preset)
+    assert all(settings.execution == Execution.preset(name) for name, settings in PRESETS.items())
+    with pytest.raises(ValueError, match="expected one of realtime, balanced, quality, best, got 'fast'"):
+        Execution.preset("fast")
+    assert not Settings().refinement and PRESETS["best"].refinement.steps == PRESETS["best"].refine_steps
+
+
+def test_what_a_shot_says_wins_over_the_settings():
+    settings = Settings(splat="fast", prune=True)
+    assert settings.shot(Shot(size=99)) == Shot(size=99, splat="fast", prune=True)
+    assert settings.shot(Shot(splat="exact")).splat == "exact"
+
+
+def test_every_preset_is_a_point_of_the_front_that_ships():
+    """With the settings that the sweep has measured; the best one is called so."""
+    front = {point.name: point for point in load_front()}
+    assert {name: front[name].settings for name in PRESETS} == PRESETS
+    qualities = [front[name].quality for name in PRESETS]
+    assert qualities == sorted(qualities), qualities
+
+
+# The choice --------------------------------------------------------------------------------------------------------------
+
+shares = st.floats(0.05, 20)
+
+
+@st.composite
+def fronts(draw):
+    count = draw(st.integers(1, 8))
+    rows = [
+        (draw(shares), draw(st.just(0.0) | shares), draw(shares), draw(st.floats(10, 2000)), draw(st.floats(15, 30)))
+        for _ in range(count)
+    ]
+    return [FrontPoint(str(i), Settings(), m, r, f, mib, q, q - 1) for i, (m, r, f, mib, q) in enumerate(rows)]
+
+
+def searched(front, machine, budget):
+    """(answer, names measured) of the search with a machine that says what a point costs."""
+    measured = {}
+    while (point := choose(front, measured, budget)) is not None and point.name not in measured:
+        measured[point.name] = machine(point)
+    return point, measured
+
+
+@given(fronts(), shares, shares, shares, st.floats(1, 3000), st.floats(1, 3000), st.floats(10, 2000))
+def test_the_choice_is_the_best_within_the_budget_where_ratios_carry_over(
+    front, make, refine, frame, most, each, memory
+):
+    machine = lambda p: Cost(100 * make * p.make, 100 * refine * p.refine, 10 * frame * p.frame, p.memory_mb)
+    budget = Budget(most, each, memory)
+    for point in front:  # where a point is at the edge of the budget, rounding decides
+        cost = machine(point)
+        assume(
+            all(
+                abs(a / b - 1) > 1e-6 for a, b in ((MARGIN * cost.reconstruct_ms, most), (MARGIN * cost.frame_ms, each))
+            )
+        )
+        assume(abs(cost.memory_mb / memory - 1) > 1e-6)
+    allowed = [point for point in front if budget.allows(machine(point))]
+    found, measured = searched(front, machine, budget)
+    if not allowed:
+        assert found is None
+    else:
+        assert found.quality == max(point.quality for point in allowed) and budget.allows(measured[found.name])
+
+
+@given(fronts(), st.randoms(use_true_random=False), st.floats(1, 3000))
+def test_what_is_chosen_has_been_measured_within_the_budget_on_any_machine(front, random, most):
+    machine = lambda p: Cost(random.uniform(1, 3000), random.uniform(0, 3000) if p.refine else 0.0, 1.0)
+    budget = Budget(reconstruct_ms=most)
+    found, measured = searched(front, machine, budget)
+    assert len(measured) <= len(front)
+    assert found is None or MARGIN * measured[found.name].reconstruct_ms <= most
+
+
+def test_costs_are_extrapolated_from_the_nearest_measured_point():
+    front = [
+        FrontPoint(name, Settings(), make, 0.0, frame, 100.0, 20.0, 19.0)
+        for name, make, frame in (("a", 1.0, 1.0), ("b", 4.0, 1.0), ("c", 8.0, 2.0))
+    ]
+    measured = {"a": Cost(100.0, 0.0, 10.0, 50.0), "b": Cost(300.0, 0.0, 10.0, 60.0)}
+    assert predict(front[2], front, measured) == Cost(600.0, 0.0, 20.0, 50.0)
+    assert choose(front, {}, Budget(frame_ms=1.0)).name == "a"  # the cheapest first
+
+
+def test_what_is_given_up_is_said():
+    low, best = (
+        FrontPoint(n, Settings(views=2), 1.0, 0.0, 1.0, 100.0, q, q - 2) for n, q in (("low", 20.0), ("best", 26.5))
+    )
+    text = in_words(tuning.Tuned(low, Cost(210.0, 0.0, 12.5, 300.0), {}), best)
+    assert "2 photos" in text and "takes 210 ms a reconstruction, 12.5 ms a frame, 300 MiB" in text
+    assert "gives up 6.5 dB in the pose of the photos and 6.5 dB in unseen poses against 'best'" in text
+    assert "is the best of all settings" in in_words(tuning.Tuned(best, Cost(1.0, 0.0, 1.0), {}), best)
+
+
+# The command -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("tune", "demo_capture"), 2, "--reconstruct-ms, --frame-ms, --memory-mb: expected at least one of them"),
+        (("tune", "demo_capture", "--frame-ms", "-1"), 2, "--frame-ms -1.0: expected a positive number"),
+        (("tune", "demo_capture", "--frame-ms", "9", "--out", "tuned.txt"), 2, "expected a name ending in .json"),
+        (
+            ("reconstruct", "demo_capture", "--preset", "best", "--config", "x.json"),
+            2,
+            "does not go with --preset best",
+        ),
+        (("reconstruct", "demo_capture", "--config", "missing.json"), 1, "missing.json: no such file"),
+        (("animate", "a.npz", "--config", "missing.json"), 1, "missing.json: no such file"),
+        (("render", "a.npz", "--preset", "best", "--config", "x.json"), 2, "does not go with --preset best"),
+    ],
+)
+def test_command_lines_that_cannot_be_meant(arguments, code, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    found, _, err = run(monkeypatch, capsys, *arguments)
+    assert found == code and said in err and len(err.splitlines()) == 1
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_tuning_for_real(tmp_path, monkeypatch, capsys):
+    """The smallest network finds the better of two settings in a large budget, none in a tiny one; `reconstruct`, `animate` and
+    `render` take the file.
+    """
+    monkeypatch.chdir(tmp_path)
+    config, demo = presets.tiny(), load_capture("demo_capture")
+    capture = dataclasses.replace(demo.resized(64), names=demo.names)
+    save_capture(tmp_path / "someone", capture)
+    variables = init_humangs(jax.random.key(0), config)
+    save_weights(tmp_path / "tiny.safetensors", variables, config)
+    small = Execution(image_size=32)
+    front = [
+        FrontPoint("one photo", Settings(views=1, execution=small, splat="fast"), 0.5, 0.0, 0.8, 100.0, 20.0, 19.0),
+        FrontPoint("refined", Settings(execution=small, refine_steps=3), 1.0, 2.0, 1.0, 150.0, 24.0, 21.0),
+    ]
+    assert tune(variables, config, capture, Budget(1e8, 1e8), 32, front).point.name == "refined"
+    monkeypatch.setattr(tuning, "load_front", lambda: front)
+    command = ("tune", "someone", "--weights", "tiny.safetensors", "--size", "32", "--out", "tuned.json")
+
+    code, _, err = run(monkeypatch, capsys, *command, "--reconstruct-ms", "0.001")
+    assert code == 1 and "no setting is within the budget" in err.splitlines()[-1]
+    assert not (tmp_path / "tuned.json").exists() and not (tmp_path / "tuned.png").exists()
+
+    code, out, err = run(monkeypatch, capsys, *command, "--reconstruct-ms", "1e7", "--frame-ms", "1e6")
+    assert code == 0, err
+    assert "refined: all photos" in out and "is the best of all settings" in out
+    assert load_settings(tmp_path / "tuned.json") == front[1].settings and (tmp_path / "tuned.png").exists()
+
+    run_with = lambda *words: run(monkeypatch, capsys, *words, "--config", "tuned.json")
+    code, _, err = run_with("reconstruct", "someone", "--weights", "tiny.safetensors", "--no-check")
+    assert code == 0 and len(Avatar.load("avatar.npz").gaussians.means), err
+    code, _, err = run_with("render", "avatar.npz", "--size", "32", "--views", "2")
+    assert code == 0 and len(list((tmp_path / "views").glob("*.png"))) == 2, err
