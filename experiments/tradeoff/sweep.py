@@ -173,7 +173,7 @@ class Bench:
     def made(self, point, i):
         """The avatar of a point; those that only differ in how they are drawn are made once."""
         from experiments.evaluation.refinement import random_start
-        from humangs_jax.apps.settings import make_avatar
+        from humangs_jax.apps.settings import reconstruct_with
         from humangs_jax.evaluation.baseline import painted_body
         from humangs_jax.refinement.refine import refine_with_report
 
@@ -185,7 +185,7 @@ class Bench:
                 avatar = painted_body(photos)
             else:
                 plain = dataclasses.replace(settings, refine_steps=0)
-                avatar = make_avatar(plain, self.variables, self.config, photos)
+                avatar = reconstruct_with(plain, self.variables, self.config, photos)
                 if point.start == "random colours":
                     avatar = random_start(avatar, self.person(i).seed)
                 if settings.refinement is not None:
@@ -234,10 +234,10 @@ class Bench:
 
     def make(self, settings):
         """One reconstruction of the first person, without refinement."""
-        from humangs_jax.apps.settings import make_avatar
+        from humangs_jax.apps.settings import reconstruct_with
 
         plain = dataclasses.replace(settings, refine_steps=0)
-        return make_avatar(plain, self.variables, self.config, self.person(0).inputs(settings.views or 4))
+        return reconstruct_with(plain, self.variables, self.config, self.person(0).inputs(settings.views or 4))
 
     def default_make_ms(self) -> float:
         """Of the default point, now."""
@@ -319,13 +319,13 @@ class Bench:
     def published(self, point) -> dict[str, Any]:
         """Time and memory of the published network with random weights, in float32, which is faster on a CPU."""
         from experiments.reconstruction.cases import random_variables
-        from humangs_jax.apps.settings import make_avatar
+        from humangs_jax.apps.settings import reconstruct_with
         from humangs_jax.core.allocator import peak_memory
         from humangs_jax.network.presets import published
 
         config = published().with_conventions(image_size=256)
         variables, photos = random_variables(config), self.person(0).inputs(4)
-        make = lambda: make_avatar(point.settings, variables, config, photos)
+        make = lambda: reconstruct_with(point.settings, variables, config, photos)
         make()
         pairs = [(timed(make)[1], self.default_make_ms()) for _ in range(2)]
         own, default = np.median(pairs, axis=0)

@@ -88,7 +88,7 @@ PRESETS: dict[str, Settings] = {
 """From the fastest to the best; docs/tradeoff.md has what each takes and gains."""
 
 
-def make_avatar(
+def reconstruct_with(
     settings: Settings, variables: Variables, config: HumanGSConfig, capture: Capture, progress: bool = False
 ) -> Avatar:
     """An avatar of the person of a capture: `reconstruct`, then `refine` where the settings say so.

@@ -17,7 +17,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from humangs_jax.apps.settings import Settings, make_avatar, save_settings
+from humangs_jax.apps.settings import Settings, reconstruct_with, save_settings
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import draw, rest_pose_of, splatting_of, turntable_views
 from humangs_jax.avatar.shot import Shot
@@ -194,7 +194,7 @@ def measure(settings: Settings, variables: Variables, config: HumanGSConfig, cap
     Compiling and choosing photos, which happen once for a set of cameras, do not count.
     """
     photos, plain = settings.photos(capture), dataclasses.replace(settings, refine_steps=0)
-    make = lambda: make_avatar(plain, variables, config, photos)
+    make = lambda: reconstruct_with(plain, variables, config, photos)
     avatar = make()  # compiles
     make_ms = max(_milliseconds(make) for _ in range(MAKES))
     refine_ms, refine = 0.0, lambda: None
@@ -251,7 +251,7 @@ def side_by_side(
     """The person of a capture as two settings make and draw it: left the chosen one, right the best."""
     images = []
     for point in (chosen, best):
-        avatar = make_avatar(point.settings, variables, config, capture, progress=True)
+        avatar = reconstruct_with(point.settings, variables, config, capture, progress=True)
         rgb = np.asarray(next(frames_of(avatar, point.settings, size)).rgb)
         images.append(np.clip(rgb, 0, 1))
     return np.concatenate(images, axis=1)
