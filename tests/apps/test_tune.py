@@ -180,7 +180,7 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     `render` take the file.
     """
     monkeypatch.chdir(tmp_path)
-    config, demo = presets.tiny(), load_capture("demo_capture")
+    config, demo = presets.tiny().with_conventions(body_vertices=500), load_capture("demo_capture")
     capture = dataclasses.replace(demo.resized(64), names=demo.names)
     save_capture(tmp_path / "someone", capture)
     variables = init_humangs(jax.random.key(0), config)
