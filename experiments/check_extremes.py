@@ -14,6 +14,7 @@ tried. Writes humangs_jax/assets/limits.json for `humangs check --limits`.
 
 import argparse
 import dataclasses
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -470,6 +471,8 @@ def interval(name: str, losses: dict[float, float]) -> dict[str, Any]:
 
     low, high = end(-1), end(1)
     low = 0.0 if low is None and points[0][0] == 0 else low  # errors that have no sign
+    if name == "photos" and low is not None:
+        low = math.ceil(low)
     return {"unit": unit, "low": low, "high": high}
 
 
