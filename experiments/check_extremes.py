@@ -187,7 +187,7 @@ def zoom(factor: float) -> Change:
         side = capture.images.shape[1]
         inner = max(1, round(side * min(factor, 1)))
 
-        def picture(image, empty):
+        def zoomed(image, empty):
             if factor < 1:
                 small = np.full_like(image, empty)
                 start = (side - inner) // 2
@@ -197,8 +197,8 @@ def zoom(factor: float) -> Change:
             start = (side - cut) // 2
             return resized(image[start : start + cut, start : start + cut], side, side)
 
-        images = np.clip([picture(image, 1.0) for image in capture.images], 0, 1).astype(np.float32)
-        shapes = np.clip([picture(mask, 0.0) for mask in capture.masks], 0, 1).astype(np.float32)
+        images = np.clip([zoomed(image, 1.0) for image in capture.images], 0, 1).astype(np.float32)
+        shapes = np.clip([zoomed(mask, 0.0) for mask in capture.masks], 0, 1).astype(np.float32)
         about = np.array([[factor, 0, side / 2 * (1 - factor)], [0, factor, side / 2 * (1 - factor)], [0, 0, 1]])
         moved = cameras(lambda K: about @ K)(capture)
         return dataclasses.replace(moved, images=images, masks=shapes)
@@ -399,13 +399,13 @@ def person_of(pixels: float) -> Change:
 LIMITS: dict[str, tuple[str, float | None, dict[float, Change]]] = {
     "photos": ("", 4, {n: lambda c, n=n: c.select(list(range(0, VIEWS, VIEWS // n))) for n in (1, 2)}),
     "noise": (
-        "of 1",
+        "standard deviation",
         0,
         {x: photos(lambda image, x=x: image + x * noise(4, image.shape)) for x in (0.05, 0.1, 0.2, 0.4)},
     ),
     "distance of the cameras": ("m", None, {x: far(x) for x in (1.2, 1.6, 2.0, 2.5, 3.0, 4.0, 6.0, 10.0, 30.0)}),
-    "height of the person": ("pixels", None, {x: person_of(x) for x in (25, 50, 75, 100, 130, 160, 190)}),
-    "masks too large or small": ("pixels", 0, {x: grown(x) for x in (-6, -3, -1, 1, 3, 6)}),
+    "height of the person": ("pixels of 256", None, {x: person_of(x) for x in (25, 50, 75, 100, 130, 160, 190)}),
+    "masks too large or small": ("pixels of 256", 0, {x: grown(x) for x in (-6, -3, -1, 1, 3, 6)}),
     "focal length": ("%", 0, {x: cameras(focal(1 + x / 100)) for x in (-10, -5, -2, 2, 5, 10)}),
     "cameras turned": ("degrees", 0, {x: turned_by(x) for x in (0.25, 0.5, 1, 2, 4)}),
     "joints turned": (

@@ -285,7 +285,8 @@ def measured(
 ) -> dict[str, Any] | None:
     """Scores of the views in the pose of the photos and in others, and the seconds to model and to draw a frame.
 
-    None if the system takes no such number of photos. Seconds are of the second and further people: the first one compiles.
+    None if the system takes no such number of photos. The first person is run twice, and only the second run is timed: the first
+    one compiles.
     """
     import jax
 

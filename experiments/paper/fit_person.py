@@ -10,6 +10,7 @@ capture, and in others. A fit that was interrupted goes on when it is called aga
 """
 
 import argparse
+import json
 import sys
 import tempfile
 import time
@@ -105,16 +106,19 @@ def configuration(steps: int, size: Any) -> Any:
 
 
 def fit(capture: Path, out: Path, steps: int, size: Any) -> tuple[tuple[Any, Any], float]:
-    """((variables, configuration), seconds of this call) of one person, whose run is the folder `out`."""
+    """((variables, configuration), seconds of all calls) of one person, whose run is the folder `out`."""
     from humangs_jax.data.capture import load_capture
     from humangs_jax.training.loop import train
 
     config, body = configuration(steps, size), load_capture(capture).body
-    start = time.perf_counter()
+    clock, start = out / "seconds.json", time.perf_counter()
+    before = json.loads(clock.read_text()) if clock.exists() else 0.0
     state = train(config, body, [capture], out, progress=False)
+    seconds = before + time.perf_counter() - start
+    write_json(clock, seconds)
     if int(state.step) < steps:
         raise ValueError(f"{out}: interrupted at step {int(state.step)} of {steps}: call it again to go on")
-    return (state.variables, config.model), time.perf_counter() - start
+    return (state.variables, config.model), seconds
 
 
 if __name__ == "__main__":

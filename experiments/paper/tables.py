@@ -78,7 +78,7 @@ def write(arguments: argparse.Namespace) -> None:
         if people is None or name not in systems:
             return None
         photos = 1 if takes_one(systems[name][1]) and photos == PHOTOS else photos
-        key = f"{name}, {people.name}, {photos}"
+        key = f"{name}, {people}, {photos}"
         if key not in numbers:
             numbers[key] = measured(systems[name], people, photos, arguments.body, networks)
         return numbers[key]

@@ -13,6 +13,8 @@ import numpy as np
 from humangs_jax.data.capture import Capture
 
 LIMITS = "assets/limits.json"
+PHOTO_SIZE = 256
+"""Side of the photos that the ranges were measured with, pixels, which is what the shipped weights take."""
 
 
 def load_limits() -> dict[str, Any]:
@@ -21,7 +23,9 @@ def load_limits() -> dict[str, Any]:
 
 
 def quantities(capture: Capture) -> dict[str, tuple[float, float]]:
-    """(least, most) over the views of what a capture itself shows: photos, camera distance, height of the person in pixels."""
+    """(least, most) over the views of what a capture itself shows: photos, camera distance in metres, height of the person in
+    pixels of a photo that is reduced to `PHOTO_SIZE`.
+    """
     frames = np.asarray(capture.frames)
     centers = np.asarray(capture.cameras.center, float)
     pelvis = np.asarray(capture.body.joint_regressor)[0] @ np.asarray(capture.body.template)
@@ -32,7 +36,8 @@ def quantities(capture: Capture) -> dict[str, tuple[float, float]]:
     }
     if capture.masks is not None:
         rows = [np.flatnonzero((mask > 0.5).any(axis=1)) for mask in capture.masks]
-        heights = [float(np.ptp(row) + 1) if len(row) else 0.0 for row in rows]
+        scale = PHOTO_SIZE / max(capture.masks.shape[1:])  # the network reduces larger photos
+        heights = [float(np.ptp(row) + 1) * scale if len(row) else 0.0 for row in rows]
         found["height of the person"] = (min(heights), max(heights))
     return found
 

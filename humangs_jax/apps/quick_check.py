@@ -30,7 +30,7 @@ LONGEST_TURN = 2 * math.pi + 0.5
 BETTER = 0.1
 """IoU by which an exchange has to explain each view better than the capture does."""
 DARKEST, BURNT = 0.12, 0.98
-"""Brightness that 2 % of a person's pixels exceed in any light; and that 60 % exceed only in photos that are burnt out."""
+"""A photo is too dark if 98 % of the person's values are below the first, and burnt out if 60 % are above the second."""
 NAMED = 4
 """Views that are named in a warning; the others are counted."""
 
@@ -131,7 +131,7 @@ def _exposure(image, mask) -> str | None:
     """What is wrong with a photo on which the person is nearly black or burnt out: nothing is to be seen there."""
     person = image if mask is None else image[mask > 0.99]  # without its blended edge
     if person.size and np.quantile(person, 0.98) < DARKEST:
-        return "the person is nearly black; is the photo underexposed, or were its 8 bits divided twice"
+        return "the person is nearly black; is the photo underexposed, or were its values divided by 255 twice"
     if person.size and mask is not None and np.quantile(person, 0.4) > BURNT:
         return "most of the person is white; is the photo overexposed"
     return None

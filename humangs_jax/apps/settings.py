@@ -41,7 +41,7 @@ class Settings:
 
     views: int | None = knob(None, cost="what the other photos show", gain="time in proportion", measured=MEASURED)
     execution: Execution = dataclasses.field(default_factory=Execution)
-    refine_steps: int = knob(0, cost="blur at few", gain="time in proportion", measured=MEASURED)
+    refine_steps: int = knob(0, cost="time in proportion", gain="detail of the photos", measured=MEASURED)
     refine_size: int | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
         "as_trained", cost="see performance.md", gain="time of a frame", measured=MEASURED
@@ -101,7 +101,10 @@ def reconstruct_with(
     photos = settings.photos(capture)
     avatar = reconstruct(variables, settings.network(config), photos)
     if settings.refinement is not None:
-        avatar = refine_with_report(avatar, photos, settings.refinement, progress=progress).avatar
+        run = refine_with_report(avatar, photos, settings.refinement, progress=progress)
+        if run.interrupted:
+            raise KeyboardInterrupt
+        avatar = run.avatar
     return jax.block_until_ready(avatar)
 
 

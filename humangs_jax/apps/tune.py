@@ -40,8 +40,8 @@ MAKES, FRAMES, STEPS = 3, 16, 6
 
 @dataclasses.dataclass(frozen=True)
 class FrontPoint:
-    """A point of the front: `make`, `step` and `frame` are times over those of the sweep's default point: of making the avatar
-    without refinement, of all steps of refinement, of a frame; memory_mb as in `Cost`. psnr, psnr_poses: dB, of new views
+    """A point of the front. `make`, `refine` and `frame`: times over those of the sweep's default point, of making the avatar
+    without refinement, of all steps of refinement, and of a frame. memory_mb as in `Cost`. psnr, psnr_poses: dB, of new views
     in the pose of the photos and in unseen poses.
     """
 
@@ -168,6 +168,8 @@ def tune(
     measured.
     """
     front = load_front() if front is None else front
+    if capture.masks is None:  # which refinement needs
+        front = [point for point in front if point.settings.refinement is None]
     measured: dict[str, Cost] = {}
     with bar(total=len(front), desc="tune", unit="setting", shown=progress) as shown:
         while (point := choose(front, measured, budget)) is not None:
@@ -200,7 +202,7 @@ def measure(settings: Settings, variables: Variables, config: HumanGSConfig, cap
     refine_ms, refine = 0.0, lambda: None
     if settings.refinement is not None:
         few = dataclasses.replace(settings, refine_steps=STEPS).refinement
-        refine = lambda: refine_with_report(avatar, photos, few)
+        refine = lambda: _uninterrupted(refine_with_report(avatar, photos, few))
         refine_ms = settings.refine_steps / STEPS * 1e3 * max(refine().seconds for _ in range(2))
     frames = frames_of(avatar, settings, size)
     next(frames)
@@ -209,17 +211,24 @@ def measure(settings: Settings, variables: Variables, config: HumanGSConfig, cap
         make()
         refine()
         next(frames)
-    return Cost(make_ms, refine_ms, frame_ms, peak[0])
+    on_host = jax.default_backend() == "cpu"  # what the process takes is known, what a device takes is not
+    return Cost(make_ms, refine_ms, frame_ms, peak[0] if on_host else None)
 
 
 def frames_of(avatar: Avatar, settings: Settings, size: int):
-    """Renderings without end, around the avatar in its T-pose."""
+    """Renderings without end, around the avatar in its T-pose. Nothing is pruned: that is of a motion and its cameras."""
     shot = settings.shot(Shot(size=size))
     poses, cameras = turntable_views(avatar, rest_pose_of(avatar), 8, shot)
     turns = [itertools.cycle(range(8)) for _ in range(2)]
     pose = lambda i: jax.tree.map(lambda x: x[i], poses)
     drawn = draw(avatar, map(pose, turns[0]), (cameras[i] for i in turns[1]), how=splatting_of(shot, avatar))
     return (jax.block_until_ready(rendering) for rendering in drawn)
+
+
+def _uninterrupted(run):
+    if run.interrupted:
+        raise KeyboardInterrupt
+    return run
 
 
 def _milliseconds(run):
@@ -245,7 +254,7 @@ def in_words(tuned: Tuned, best: FrontPoint) -> str:
     return f"{point.name}: {', '.join(parts)}\ntakes {takes}\n{gives}, on the people of docs/tradeoff.md"
 
 
-def side_by_side(
+def both_avatars(
     variables: Variables, config: HumanGSConfig, capture: Capture, chosen: FrontPoint, best: FrontPoint, size: int
 ) -> Float[np.ndarray, "h w 3"]:
     """The person of a capture as two settings make and draw it: left the chosen one, right the best."""

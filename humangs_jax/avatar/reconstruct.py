@@ -108,9 +108,7 @@ def make_avatar(outputs: HumanGSOutputs, body: BodyModel, betas: Float[Array, " 
     """Canonical Gaussians on the body of a person: what can be posed. Raises: ValueError if there are none."""
     if outputs.is_empty:
         name = type(config.architecture.decoder).__name__
-        raise ValueError(
-            f"{name} draws images of targets without Gaussians: it makes no avatar, and nothing to animate"
-        )
+        raise ValueError(f"{name} draws images without Gaussians: there is no avatar to make or animate")
     rest = shape_body(body, betas)
     weights, per_vertex = outputs.skinning_weights, outputs.gaussians.means.shape[0] // body.template.shape[0]
     if weights is None:
@@ -139,7 +137,7 @@ def _assemble(variables, config, body, views, inputs):
 
 
 def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
-    """The avatar with the weights of `spread_weights`, its means where they were in that pose, which is the one of the photos.
+    """The avatar with the weights of `spread_weights`. In `pose`, that of the first photo, the means stay where they were.
 
     The shapes of Gaussians are not corrected. Gradients do not pass through the weights.
     """

@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from humangs_jax.data.motion import Motion
 
 
+DEMO_SECONDS = 10.0
+"""Of refinement."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Demo:
     """Reconstruct the person that comes with the package from four photos, render new views, animate the avatar."""
@@ -37,10 +41,10 @@ class Demo:
     """Network weights (.safetensors). Default: the shipped ones."""
     size: int = 256
     """Side of the animation's frames in pixels."""
-    refine: float = 10.0
-    """Seconds for which the avatar is fitted to its photos; 0 for none."""
+    refine: float | None = None
+    """Seconds for which the avatar is fitted to its photos; 0 for none. Default: 10, or as long as --preset says."""
     preset: Preset | None = None
-    """Speed against accuracy (docs/tradeoff.md): photos, network, refinement in place of --refine, drawing."""
+    """Speed against accuracy (docs/tradeoff.md): photos, network, drawing, and refinement where --refine does not say."""
 
     def run(self) -> None:
         require_at_least(0, refine=self.refine)
@@ -51,8 +55,10 @@ class Demo:
             from humangs_jax.refinement.config import RefineConfig
 
         settings = chosen_settings(self.preset, None)
-        refine = RefineConfig(seconds=self.refine) if self.refine else None
-        refine = refine if settings is None else settings.refinement
+        seconds = DEMO_SECONDS if self.refine is None else self.refine
+        refine = RefineConfig(seconds=seconds) if seconds else None
+        if settings is not None and self.refine is None:
+            refine = settings.refinement
         report = run_demo(self.out, self.weights, self.size, refine, settings)
         wrote(self.out, summary(report))
         suggest("humangs view", self.out / "avatar.npz")
@@ -339,7 +345,7 @@ class Tune:
         for path in (self.out, self.out.with_suffix(".png")):
             require_parent(path, inputs=(self.weights,))
         with stage("starting"):
-            from humangs_jax.apps.tune import Budget, in_words, load_front, side_by_side, tune, write_tuned
+            from humangs_jax.apps.tune import Budget, both_avatars, in_words, load_front, tune, write_tuned
             from humangs_jax.network.weights import load_weights
 
         photos = _read_capture(self.capture, check=False)
@@ -350,7 +356,7 @@ class Tune:
         with stage("measuring"):
             tuned = tune(variables, config, photos, budget, self.size, front, progress=True)
         with stage("drawing both"):
-            image = side_by_side(variables, config, photos, tuned.point, best, self.size)
+            image = both_avatars(variables, config, photos, tuned.point, best, self.size)
         write_tuned(self.out, image, tuned, budget, self.size)
         tell(in_words(tuned, best))
         wrote(self.out, f"settings; {self.out.with_suffix('.png')}: the person made by them and by {best.name!r}")

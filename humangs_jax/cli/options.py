@@ -130,10 +130,12 @@ def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings |
     """The settings that --preset names or that --config holds, None without either. Raises: UsageError for both; FileError."""
     if preset is not None and config is not None:
         raise UsageError(f"--config {config}: does not go with --preset {preset}: expected one of them")
-    if preset is None and config is None:
-        return None  # without the import
-    from humangs_jax.apps.settings import PRESETS, load_settings
+    if preset is not None:
+        from humangs_jax.apps.settings import PRESETS
 
+        return PRESETS[preset]
     if config is not None:
+        from humangs_jax.apps.settings import load_settings
+
         return load_settings(config)
-    return None if preset is None else PRESETS[preset]
+    return None

@@ -46,7 +46,7 @@ class Start:
     browser: bool = True
     """Open the page at the end."""
     overwrite: bool = False
-    """Replace a capture that is finished; begin one anew that has a body already."""
+    """Start again, also where --out already has a body or a finished avatar."""
 
     def run(self) -> None:
         limits = None if self.refine is None else refine_limits(self.refine, "--refine")
@@ -85,7 +85,7 @@ class Start:
         self._finish(self._fit(material), limits)
 
     def _finish(self, capture: "Capture", limits: dict[str, Any] | None) -> None:
-        """What comes behind the fit."""
+        """The steps after the fit."""
         self._check(capture)
         self._reconstruct(capture, limits)
 
@@ -156,6 +156,8 @@ class Start:
                 refinement = refine_with_report(avatar, capture, RefineConfig(**limits), progress=True)
                 avatar = refinement.avatar
             tell(refinement.summary())
+            if refinement.interrupted:
+                raise KeyboardInterrupt
         with stage("writing the page"):
             avatar.save(self.out / "avatar.npz")
             page = self.out / "avatar.html"

@@ -62,7 +62,7 @@ class Train:
     on_the_fly: int = 0
     """Also (or without DATA only) train on this number of synthetic people who are rendered anew for every step."""
     validation: Path | None = None
-    """Other people, evaluated now and then: whatever DATA may be."""
+    """Other people to evaluate on now and then: anything that DATA accepts."""
     steps: int | None = None
     """Length of the run. Default: that of the configuration. More than a finished run has: it goes on, with the learning rate of
     the longer run."""

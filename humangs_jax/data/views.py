@@ -143,10 +143,10 @@ CROP_MARGIN = 0.04
 """Of a crop's side, on each side of the person."""
 
 
-def cropped(capture: Capture) -> Capture:
-    """The photos, cut to squares around the masks, all of one size: of the smallest crop, so that the others are reduced.
+def cropped(capture: Capture, size: int) -> Capture:
+    """The photos, each cut to a square around its mask and resized to `size` pixels.
 
-    Without masks, or where a mask is empty or fills the photo, they stay as they are.
+    All stay as they are if there are no masks, if one is empty, or if no crop is smaller than its photo.
     """
     if capture.masks is None:
         return capture
@@ -159,8 +159,7 @@ def cropped(capture: Capture) -> Capture:
         low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]]) + 1
         side = int(np.ceil((high - low).max() / (1 - 2 * CROP_MARGIN)))
         boxes.append((*((low + high - side) // 2), side))
-    size = min(side for *_, side in boxes)
-    if size >= max(height, width):
+    if min(side for *_, side in boxes) >= max(height, width):
         return capture
     cut = lambda array, fill: np.stack(
         [resized(_window(x, *box, fill), size, size) for x, box in zip(array, boxes, strict=True)]
@@ -188,7 +187,7 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
     Intrinsics follow the pixels. Without masks only what the posed body covers will count as foreground. crop: cut to the person
     first, see `cropped`.
     """
-    capture = cropped(capture) if crop else capture
+    capture = cropped(capture, size) if crop else capture
     images = capture.images
     masks = np.zeros(images.shape[:3], np.float32) if capture.masks is None else capture.masks
     height, width = images.shape[1:3]

@@ -97,7 +97,7 @@ def _unfinished(temporary):
 
 
 def remove_unfinished() -> None:
-    """Removes what other threads of this process are writing, for its end at once; nothing under a final name is among it."""
+    """Removes the temporary files that this process is still writing, just before it is ended. Final files are not touched."""
     for temporary in tuple(_being_written):
         shutil.rmtree(temporary, ignore_errors=True) if temporary.is_dir() else _delete(temporary)
 

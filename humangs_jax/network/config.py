@@ -4,6 +4,7 @@ Weights files record `Architecture` and `Conventions`. `Execution` belongs to th
 """
 
 import dataclasses
+import math
 from typing import Any, Literal
 
 from humangs_jax.core.configuration import knob
@@ -118,6 +119,11 @@ class Conventions:
     longest_edge: float | None = knob(
         None, cost="Gaussians grow as it shrinks", gain="detail where the body is coarse", measured=EVALUATION
     )
+
+    def __post_init__(self):
+        """Raises ValueError for a reach that is none."""
+        if self.skinning_reach is not None and not 0 < self.skinning_reach < math.inf:
+            raise ValueError(f"skinning_reach {self.skinning_reach}: expected a positive number of metres, or None")
 
 
 @dataclasses.dataclass(frozen=True)

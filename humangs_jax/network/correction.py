@@ -24,34 +24,34 @@ from humangs_jax.network.transformer import MOST_LAYERS
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
-NUMBERS = 14
+CHANNELS = 14
 """Of a correction: offset 3, quaternion 4, logarithm of the scale 3, logits of opacity 1 and colour 3."""
 SCALING = 2.0
 """Corrections of the logarithm of a scale are bounded to this."""
 
 
 class Corrected(NamedTuple):
-    """gaussians: canonical, of one frame. offsets: (g, 3) metres."""
+    """gaussians: canonical, of one frame. offsets: (g, 3) of the means, in the unit of `offset_scale`."""
 
     gaussians: Gaussians
     offsets: Float[Array, "g 3"]
 
 
-def corrected(gaussians: Gaussians, raw: Float[Array, "g 14"], offset_scale: float) -> Corrected:
-    """Gaussians with corrections: zeros change nothing (but colours closer to 0 or 1 than `COLOR_MARGIN`), and Gaussians of
-    opacity 0 keep it.
+def apply_corrections(gaussians: Gaussians, raw: Float[Array, "g 14"], offset_scale: float) -> Corrected:
+    """Gaussians with corrections, `CHANNELS` numbers each: zeros change nothing (but colours closer to 0 or 1 than
+    `COLOR_MARGIN`), and Gaussians of opacity 0 keep it.
 
     offset_scale: metres to which offsets, in canonical axes, are bounded by tanh.
     """
-    offsets, turns, scales, opacities, colors = jnp.split(raw, (3, 7, 10, 11), axis=-1)
+    offsets, rotations, scales, opacities, colors = jnp.split(raw, (3, 7, 10, 11), axis=-1)
     offsets = offset_scale * jnp.tanh(offsets)
-    turns = quaternion.normalize(turns + jnp.asarray(quaternion.IDENTITY, raw.dtype))
+    rotations = quaternion.normalize(rotations + jnp.asarray(quaternion.IDENTITY, raw.dtype))
     opaque = gaussians.opacities > 0
     base = jnp.where(opaque, gaussians.opacities, 0.5)
     moved = replace(
         gaussians,
         means=gaussians.means + offsets,
-        quats=quaternion.multiply(turns, gaussians.quats),
+        quats=quaternion.multiply(rotations, gaussians.quats),
         scales=gaussians.scales * jnp.exp(SCALING * jnp.tanh(scales / SCALING)),
         opacities=jnp.where(opaque, jax.nn.sigmoid(inverse_sigmoid(base) + opacities[:, 0]), 0.0),
         colors=jax.nn.sigmoid(inverse_sigmoid(gaussians.colors, COLOR_MARGIN) + colors),
@@ -104,8 +104,11 @@ class CorrectionMLP:
         per_vertex = len(outputs.gaussians.opacities) // len(local)
         vector = jnp.broadcast_to(pose_vector(pose, self.joints), (len(local), 3 * (self.joints - 1)))
         raw = self._module(per_vertex).apply(variables, jnp.concatenate([local, vector], axis=-1))
-        gaussians, offsets = corrected(outputs.gaussians, raw.reshape(-1, NUMBERS), self.offset_scale)
-        return replace(outputs, gaussians=gaussians, tight_offsets=offsets.reshape(len(local), per_vertex, 3))
+        gaussians, offsets = apply_corrections(outputs.gaussians, raw.reshape(-1, CHANNELS), self.offset_scale)
+        driven = offsets.reshape(len(local), per_vertex, 3)  # of a body of 1.8 m, metres are normalised units
+        if outputs.tight_offsets is not None:  # the canonical ones stay small, too
+            driven = jnp.concatenate([outputs.tight_offsets, driven], axis=1)
+        return replace(outputs, gaussians=gaussians, tight_offsets=driven)
 
     def _module(self, per_vertex):
         return CorrectionModule(self.hidden, self.layers, per_vertex)
@@ -123,4 +126,4 @@ class CorrectionModule(nn.Module):
         for i in range(self.layers):
             x = jax.nn.silu(nn.Dense(self.hidden, name=f"hidden_{i}")(x))
         last = nn.initializers.normal(LAST_STD)
-        return nn.Dense(NUMBERS * self.per_vertex, kernel_init=last, name="out")(x)
+        return nn.Dense(CHANNELS * self.per_vertex, kernel_init=last, name="out")(x)

@@ -23,7 +23,7 @@ from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, Pass, Variables
 from humangs_jax.network.reader import VertexFeatures
 from humangs_jax.network.tokenizer import pack_patches
-from humangs_jax.network.transformer import INIT_STD, layer_norm
+from humangs_jax.network.transformer import INIT_STD, MOST_LAYERS, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
 
 INIT = nn.initializers.normal(INIT_STD)
@@ -42,7 +42,7 @@ class CrossAttentionReader:
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
-        check_heads("reader", self.width, self.head_width)
+        check_layers("reader", self.width, self.head_width, self.layers)
 
     def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of the layers."""
@@ -82,8 +82,10 @@ def image_tokens(
     return tokens, None if inputs.view_count is None else inputs.view_count * (height * width)
 
 
-def check_heads(part: str, width: int, head_width: int) -> None:
-    """Raises ValueError unless heads of that width fill the features."""
+def check_layers(part: str, width: int, head_width: int, layers: int) -> None:
+    """Raises ValueError unless heads of that width fill the features, and there are 1 to `MOST_LAYERS` layers."""
+    if not 1 <= layers <= MOST_LAYERS:
+        raise ValueError(f"{part}: {layers} layers: expected 1 to {MOST_LAYERS}")
     if min(width, head_width) < 1 or width % head_width:
         raise ValueError(f"{part}: width {width} is not a multiple of head_width {head_width}")
 

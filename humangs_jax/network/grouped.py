@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.geometry import quaternion
-from humangs_jax.network.cross_attention import CrossBlock, check_heads, image_tokens
+from humangs_jax.network.cross_attention import CrossBlock, check_layers, image_tokens
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
@@ -46,7 +46,7 @@ class GroupReader:
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
-        check_heads("reader", self.width, self.head_width)
+        check_layers("reader", self.width, self.head_width, self.layers)
 
     def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of `GroupTokens`."""

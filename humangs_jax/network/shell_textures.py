@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, Key
+from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry import quaternion
 from humangs_jax.network.bilinear import sample_bilinear, sample_nearest, texel_indices
@@ -25,14 +26,12 @@ from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
 from humangs_jax.network.pixel_aligned import DEPTH_TOLERANCE, UNSEEN_COLOR, project_vertices
 from humangs_jax.network.surface_map import SurfaceMap
-from humangs_jax.network.unet import UNet, doubled, halved
+from humangs_jax.network.unet import UNet, check_scales, doubled, halved
 from humangs_jax.network.vertex_decoder import INITIAL_OPACITY
 from humangs_jax.rendering.gaussians import Gaussians
 
 DISTANCES = (0.0, 0.01, 0.02, 0.03, 0.04)
-LENGTH_EPSILON = 1e-6
-"""Added to lengths of interpolated normals before dividing."""
-NUMBERS = (4, 3, 1)
+CHANNELS = (4, 3, 1)
 """Of a quaternion, a scale and an opacity."""
 
 
@@ -91,7 +90,7 @@ class ShellTextureReader:
 
         def look(best, view):
             image, foreground, depth_map, camera, vertices, normals, present = view
-            surface_normals = unit_length(texels.interpolate(normals))
+            surface_normals = safe_normalize(texels.interpolate(normals), jnp.zeros(3))
             points = texels.interpolate(vertices) + steps[:, None, None, None] * surface_normals
             shape, points = points.shape[:-1], points.reshape(-1, 3)
             pixels, depths = project_vertices(camera, points)
@@ -99,7 +98,7 @@ class ShellTextureReader:
             surface, person = sample_nearest(depth_map, indices), sample_nearest(foreground, indices) > 0
             framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (depths > 0)
             visible = framed & person & ((surface < 0) | (depths < surface + DEPTH_TOLERANCE)) & present
-            towards = unit_length(camera.center - points).reshape(*shape, 3)
+            towards = safe_normalize(camera.center - points, jnp.zeros(3)).reshape(*shape, 3)
             facing = jnp.sum(towards * surface_normals, axis=-1)
             facing = jnp.where(visible.reshape(shape) & covered, facing, 0.0)
             colors = sample_bilinear(image, indices).reshape(*shape, 3)
@@ -120,11 +119,6 @@ class ShellTextureReader:
         (facing, colors), _ = jax.lax.scan(look, nothing, views)
         seen = facing > 0
         return ShellTextures(steps, colors.at[0].set(fill_unseen(colors[0], seen[0])), seen)
-
-
-def unit_length(vectors: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Vectors over their lengths; 0 stays 0."""
-    return vectors / jnp.sqrt(jnp.sum(vectors**2, axis=-1, keepdims=True) + LENGTH_EPSILON**2)
 
 
 def fill_unseen(colors: Float[Array, "h w 3"], seen: Bool[Array, "h w"]) -> Float[Array, "h w 3"]:
@@ -154,6 +148,10 @@ class ShellDecoder:
     widths: tuple[int, ...] = (32, 48, 96)
     largest_scale: float = 0.01
 
+    def __post_init__(self):
+        """Raises ValueError for widths that no U-Net has."""
+        check_scales("decoder.widths", self.widths)
+
     def init(self, key: Key, features: ShellTextures, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of the U-Net."""
         side = 2 ** (len(self.widths) - 1)
@@ -171,7 +169,7 @@ class ShellDecoder:
         unit, shells = subject_unit(inputs.canonical_vertices), len(features.distances)
         covered = texels.covered
         surface = texels.interpolate(inputs.canonical_vertices / unit)
-        offsets = features.distances[:, None, None, None] * unit_length(texels.interpolate(normals))
+        offsets = features.distances[:, None, None, None] * safe_normalize(texels.interpolate(normals), jnp.zeros(3))
 
         def heads(colors):
             channels = jnp.concatenate([2 * colors - 1, offsets[1:]])
@@ -180,7 +178,7 @@ class ShellDecoder:
             return jnp.moveaxis(raw.reshape(*covered.shape, shells, -1), 2, 0)
 
         def assemble(raw):
-            quats, scales, opacities = jnp.split(raw, (NUMBERS[0], NUMBERS[0] + NUMBERS[1]), axis=-1)
+            quats, scales, opacities = jnp.split(raw, (CHANNELS[0], CHANNELS[0] + CHANNELS[1]), axis=-1)
             shown = covered & features.seen.at[0].set(True)
             flat = lambda x: x.reshape(-1, x.shape[-1])
             return Gaussians(
@@ -198,4 +196,4 @@ class ShellDecoder:
         return HumanGSOutputs(gaussians, skinning_weights=rows)
 
     def _network(self, features: ShellTextures):
-        return UNet(self.widths, sum(NUMBERS) * len(features.distances))
+        return UNet(self.widths, sum(CHANNELS) * len(features.distances))

@@ -33,12 +33,12 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.network.bilinear import sample_bilinear, texel_indices
-from humangs_jax.network.correction import NUMBERS, corrected, pose_vector
+from humangs_jax.network.correction import CHANNELS, apply_corrections, pose_vector
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
 from humangs_jax.network.pixel_aligned import UNSEEN_COLOR, project_vertices, visible_vertices
 from humangs_jax.network.surface_map import SurfaceMap
-from humangs_jax.network.unet import UNet
+from humangs_jax.network.unet import UNet, check_scales
 from humangs_jax.network.vertex_decoder import normal_frames
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -48,8 +48,6 @@ COVERAGE, THICKNESS = 0.7, 0.2
 """Standard deviations of a Gaussian along the surface over the distance between texels, and across over along it."""
 OPACITY = 0.9
 """Of Gaussians before corrections."""
-MOST_SCALES = 12
-"""Of a U-Net: the coarsest map of the largest one has two texels."""
 
 
 @pytree_dataclass
@@ -164,7 +162,7 @@ class TextureDriver:
 
     def __post_init__(self):
         """Raises ValueError for a number of scales that no map has."""
-        _check_scales(self.widths)
+        check_scales("driver.widths", self.widths)
 
     def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of the U-Net and the MLP in it."""
@@ -186,7 +184,7 @@ class TextureDriver:
         return _driven(outputs, cast(Array, raw)[0], self.offset_scale)
 
     def _module(self):
-        return UNet(self.widths, NUMBERS, PoseAttention(self.pose_width, self.pose_tokens, parent=None))
+        return UNet(self.widths, CHANNELS, PoseAttention(self.pose_width, self.pose_tokens, parent=None))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,7 +199,7 @@ class PoseMapDriver:
 
     def __post_init__(self):
         """Raises ValueError for a number of scales that no map has."""
-        _check_scales(self.widths)
+        check_scales("driver.widths", self.widths)
 
     def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of the U-Nets."""
@@ -220,13 +218,8 @@ class PoseMapDriver:
         return _driven(outputs, cast(Array, raw)[0], self.offset_scale)
 
 
-def _check_scales(widths):
-    if not 1 <= len(widths) <= MOST_SCALES:
-        raise ValueError(f"driver.widths: {len(widths)} scales: expected 1 to {MOST_SCALES}")
-
-
 def _driven(outputs, raw, offset_scale):
-    gaussians, offsets = corrected(outputs.gaussians, raw.reshape(-1, NUMBERS), offset_scale)
+    gaussians, offsets = apply_corrections(outputs.gaussians, raw.reshape(-1, CHANNELS), offset_scale)
     return replace(outputs, gaussians=gaussians, tight_offsets=offsets[:, None])
 
 
@@ -237,7 +230,7 @@ class PoseMapModule(nn.Module):
 
     @nn.compact
     def __call__(self, maps: Float[Array, "v h w 3"]) -> Float[Array, "v h w 14"]:
-        nets = {"offsets": 3, "shapes": 8, "colors": 3}  # in the order of `correction.NUMBERS`
+        nets = {"offsets": 3, "shapes": 8, "colors": 3}  # in the order of `correction.CHANNELS`
         return jnp.concatenate([UNet(self.widths, n, name=name)(maps) for name, n in nets.items()], axis=-1)
 
 

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.network.attention import NORM_EPSILON, attention
-from humangs_jax.network.cross_attention import INIT, check_heads, image_tokens
+from humangs_jax.network.cross_attention import INIT, check_layers, image_tokens
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, Pass, Variables
@@ -51,9 +51,9 @@ class TwoStreamReader:
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
-        check_heads("reader", self.width, self.head_width)
-        if min(self.blocks, self.pooling) < 1:
-            raise ValueError(f"reader: blocks {self.blocks}, pooling {self.pooling}: expected at least 1")
+        check_layers("reader", self.width, self.head_width, self.blocks)
+        if self.pooling < 1:
+            raise ValueError(f"reader: pooling {self.pooling}: expected at least 1")
 
     def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of `TwoStreams`."""

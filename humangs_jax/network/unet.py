@@ -13,8 +13,16 @@ import jax.numpy as jnp
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.network.convolution import Convolution
 from humangs_jax.network.upsampler import KAIMING
+from humangs_jax.network.vertex_decoder import LAST_STD
 
-LAST_STD = 0.001
+MOST_SCALES = 12
+"""The coarsest map of the largest U-Net has two texels."""
+
+
+def check_scales(name: str, widths: tuple[int, ...]) -> None:
+    """Raises ValueError, naming the setting, unless there are 1 to `MOST_SCALES` positive widths."""
+    if not 1 <= len(widths) <= MOST_SCALES or min(widths) < 1:
+        raise ValueError(f"{name} {widths[:MOST_SCALES]}: expected 1 to {MOST_SCALES} positive numbers, one a scale")
 
 
 class UNet(nn.Module):

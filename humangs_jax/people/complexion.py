@@ -71,7 +71,7 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
     hair = colour(*colours[kind])
     brown = darkness > 0.45 or rng.random() < 0.4
     iris = colour(0.07, 0.6, rng.uniform(0.1, 0.3)) if brown else colour(rng.uniform(0.25, 0.62), 0.4, 0.5)
-    if made_up and rng.random() < 0.5:  # varnish, which nothing shows: drawn so that a seed stays the same person
+    if made_up and rng.random() < 0.5:  # nail varnish is not shown; a seed stays the same person
         colour(rng.choice([rng.uniform(0.9, 1.05), rng.random()]), rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.8))
     return Complexion(
         skin=skin.astype(np.float32),

@@ -172,7 +172,7 @@ def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
     photos.masks[:] = 0
     photos.masks[0, 10:26, 4:12], photos.masks[1, 20:48, 20:30] = 1, 1  # the second reaches the border
     photos.images[0, 16:20, 6:10] = [0.2, 0.4, 0.6]
-    cut = cropped(photos)
+    cut = cropped(photos, 18)
     assert cut.images.shape == (2, 18, 18, 3) and cut.cameras.width == cut.cameras.height == 18
     assert cut.masks[0].any(0).sum() == 8 and cut.masks[0].any(1).sum() == 16
     point = jnp.asarray([0.2, 1.1, 0.1])
@@ -182,9 +182,9 @@ def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
     np.testing.assert_allclose(
         cut.images[0, 16 - 9 : 20 - 9, 6 + 1 : 10 + 1].reshape(-1, 3), [[0.2, 0.4, 0.6]] * 16, atol=1e-6
     )
-    assert cropped(dataclasses.replace(photos, masks=None)).images is photos.images
+    assert cropped(dataclasses.replace(photos, masks=None), SIZE).images is photos.images
     empty = dataclasses.replace(photos, masks=0 * photos.masks)
-    assert cropped(empty) is empty
+    assert cropped(empty, SIZE) is empty
 
 
 def test_bodies_of_fewer_vertices_have_wider_gaussians(body):

@@ -52,7 +52,7 @@ class Likeness:
 def likeness(variables: PyTree, network: HumanGSConfig, capture: Capture) -> Likeness:
     """Reconstruct the person of a capture and compare with its photos."""
     avatar = reconstruct(variables, network, capture)
-    views = standardize(capture, network.conventions.image_size)
+    views = standardize(capture, network.image_size, network.execution.crop)
     poses = jax.vmap(BodyPose)(views.rotations, views.translations)
     splatting = _with_margin(avatar, poses, views.cameras)
     off = np.asarray(draw(avatar, poses, views.cameras, splatting) - views.images)
