@@ -17,7 +17,7 @@ from humangs_jax.body.model import BodyPose
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.core.pytree import replace
 from humangs_jax.network.config import Architecture
-from humangs_jax.network.correction import CorrectionMLP, corrected
+from humangs_jax.network.correction import CorrectionMLP, apply_corrections
 from humangs_jax.network.humangs import apply_humangs, draw_pixels
 from humangs_jax.network.parts import Driver, PixelDecoder
 from humangs_jax.network.surface_gaussians import PoseMapDriver, TextureDriver
@@ -167,7 +167,7 @@ def test_a_target_of_any_size_is_drawn():
 def test_a_network_that_draws_pixels_makes_no_avatar_and_others_draw_none():
     config = small("lvsm")
     outputs = jax.eval_shape(lambda v: apply_humangs(v, inputs_of("lvsm"), config)[0], random_variables(config))
-    with pytest.raises(ValueError, match="QueryDecoder draws images of targets without Gaussians"):
+    with pytest.raises(ValueError, match="QueryDecoder draws images without Gaussians"):
         make_avatar(outputs, tube(), BETAS, config)
     with pytest.raises(ValueError, match="VertexDecoder makes Gaussians"):
         draw_pixels({}, outputs, QUERIES, small("lca"))
@@ -194,7 +194,7 @@ def test_a_frame_has_its_own_gaussians_and_untrained_corrections_are_none(name):
     frame, outputs = driven(name, variables=fresh)
     shown = jnp.clip(outputs.gaussians.colors, COLOR_MARGIN, 1 - COLOR_MARGIN)
     close(frame.gaussians, replace(outputs.gaussians, colors=shown), bound=2e-6)
-    assert np.abs(frame.tight_offsets).max() == 0
+    assert np.abs(frame.tight_offsets[:, -1]).max() == 0  # the driver's; those of the decoder come first
 
 
 @pytest.mark.parametrize("name", ["giga", "animatable"])
@@ -238,7 +238,7 @@ def test_animatable_reads_no_photo_and_a_place_in_the_world_is_no_pose():
 
 def test_corrections_are_bounded_and_zeros_are_none():
     gaussians = driven("giga")[1].gaussians
-    correct = jax.jit(lambda raw: corrected(gaussians, jnp.full((len(gaussians.opacities), 14), raw), 0.1))
+    correct = jax.jit(lambda raw: apply_corrections(gaussians, jnp.full((len(gaussians.opacities), 14), raw), 0.1))
     nothing, offsets = correct(0.0)
     shown = jnp.clip(gaussians.colors, COLOR_MARGIN, 1 - COLOR_MARGIN)
     close(nothing, replace(gaussians, colors=shown), bound=2e-6)
@@ -275,7 +275,7 @@ def test_parts_that_do_not_fit_are_refused():
         lambda: PoseMapDriver(widths=()),
         lambda: CorrectionMLP(layers=10**6),
     ):
-        with pytest.raises(ValueError, match=r"(surface_map.size|scales|driver.layers).*expected 1 to"):
+        with pytest.raises(ValueError, match=r"(surface_map.size|driver.widths|driver.layers).*expected 1 to"):
             wrong()
     many = small("lca").with_parts(driver=CorrectionMLP(8, 1, joints=5))
     with pytest.raises(ValueError, match=r"driver\.joints 5: the pose has 2 joints"):
