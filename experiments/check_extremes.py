@@ -181,9 +181,10 @@ def far(meters: float) -> Change:
 
 def zoom(factor: float) -> Change:
     """The person smaller or larger in the frame, cameras to match."""
-    from humangs_jax.io.images import resized
 
     def changed(capture):
+        from humangs_jax.io.images import resized
+
         side = capture.images.shape[1]
         inner = max(1, round(side * min(factor, 1)))
 
@@ -337,11 +338,12 @@ def noise(seed: int, shape: tuple[int, ...]) -> np.ndarray:
 
 def turned_by(degrees: float) -> Change:
     """Every camera turned about an axis of its own."""
-    import jax.numpy as jnp
-
-    from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 
     def changed(capture):
+        import jax.numpy as jnp
+
+        from humangs_jax.geometry.quaternion import matrix_from_axis_angle
+
         count = capture.view_count
         axes = noise(2, (count, 3))
         axes *= np.radians(degrees) / np.linalg.norm(axes, axis=-1, keepdims=True)
@@ -370,13 +372,13 @@ def moved_by(centimeters: float) -> Change:
 
 def grown(pixels: int) -> Change:
     """Masks dilated (or eroded, below 0); what they show of the background is grey."""
-    from scipy.ndimage import grey_dilation, grey_erosion
-
     side = 2 * abs(pixels) + 1
-    change = lambda mask: (grey_dilation if pixels > 0 else grey_erosion)(mask, (side, side))
 
     def changed(capture):
-        found = np.stack([change(mask) for mask in capture.masks])
+        from scipy.ndimage import grey_dilation, grey_erosion
+
+        change = grey_dilation if pixels > 0 else grey_erosion
+        found = np.stack([change(mask, (side, side)) for mask in capture.masks])
         inside = np.minimum(found, capture.masks)[..., None]
         true = (capture.images - (1 - capture.masks[..., None])) / np.maximum(capture.masks[..., None], 1e-6)
         around = (found[..., None] - inside) * 0.5

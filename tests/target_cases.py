@@ -6,7 +6,7 @@ import functools
 import jax.numpy as jnp
 import numpy as np
 from system_cases import small_system
-from training.training_cases import POSES, tube
+from training_cases import POSES, tube
 
 from humangs_jax.body.model import Texels
 from humangs_jax.core.pytree import replace

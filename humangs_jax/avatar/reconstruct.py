@@ -28,6 +28,7 @@ from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.buffers import round_up
 
+LEGS = tuple(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
 SMALLEST_VOLUME = 0.2
 """Blended transforms of limbs that are turned against each other collapse; below this determinant they are not inverted."""
 
@@ -145,7 +146,8 @@ def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
     per_vertex = len(gaussians.means) // len(vertices)
     points = jax.lax.stop_gradient(gaussians.means)
     distances = jnp.linalg.norm(points - jnp.repeat(vertices, per_vertex, axis=0), axis=-1)
-    spread = spread_weights(points, distances, own, vertices, own[::per_vertex], reach)
+    legs = jnp.asarray([[name in names for name in avatar.joint_names] for names in LEGS])
+    spread = spread_weights(points, distances, own, vertices, own[::per_vertex], legs, reach)
     transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     before, after = blend_transforms(own, transforms), blend_transforms(spread, transforms)
     columns = jnp.moveaxis(after[:, :3, :3], -1, 0)

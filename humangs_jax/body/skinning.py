@@ -13,12 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.geometry import quaternion, transform
 
 EXACT = transform.EXACT
 THINNING = 8
 """Every so many vertices are enough to average skinning weights over centimetres."""
+BETWEEN = 0.1
+"""Share of either leg in the weights around a point from which on it is between them."""
 BLOCK = 2048
 """Points whose distances to these vertices are in memory at once."""
 
@@ -91,16 +93,19 @@ def spread_weights(
     weights: Float[Array, "g j"],
     vertices: Float[Array, "n 3"],
     vertex_weights: Float[Array, "n j"],
+    legs: Bool[Array, "2 j"],
     reach: float,
 ) -> Float[Array, "g j"]:
-    """Skinning weights of points off the skin, by the body around them and not by one vertex.
+    """Skinning weights of points off the skin between the legs, by the body around them and not by one vertex.
 
     A hem that belongs to the vertices of one leg tears when the legs part. A point at a distance d from the vertex that it
-    belongs to takes the mean of the weights of the vertices around it, by a normal kernel whose standard deviation is d; where d
-    is less than 3/4 of `reach` it keeps its own. At most a quarter of the points change, those with the largest d. LHM
+    belongs to takes the mean of the weights of the vertices around it, by a normal kernel whose standard deviation is d. It
+    keeps its own where d is less than 3/4 of `reach`, or where one of the legs has no share in that mean: hair and sleeves stay
+    as they are. At most a quarter of the points change, those with the largest d. LHM
     diffuses weights through a grid of voxels to the same end (https://arxiv.org/abs/2503.10625).
 
-    Arguments: points in the rest pose, metres. distances: from the vertex of each. weights: of that vertex.
+    Arguments: points in the rest pose, metres. distances: from the vertex of each. weights: of that vertex. legs: the joints of
+    each leg.
     """
     near, near_weights = vertices[::THINNING], vertex_weights[::THINNING]
     distances, far = jax.lax.top_k(distances, -(-len(points) // 4))
@@ -112,5 +117,6 @@ def spread_weights(
         return jnp.einsum("n,nj->j", jax.nn.softmax(exponents), near_weights, precision=EXACT)
 
     spread = jax.lax.map(around, (points[far], distances), batch_size=BLOCK)
-    share = jnp.clip(2 * distances / reach - 1.5, 0, 1)[:, None]
-    return weights.at[far].add(share * (spread - weights[far]))
+    between = jnp.min(jnp.einsum("gj,lj->gl", spread, legs.astype(spread.dtype), precision=EXACT), axis=-1)
+    share = jnp.clip(2 * distances / reach - 1.5, 0, 1) * jnp.clip(between / BETWEEN, 0, 1)
+    return weights.at[far].add(share[:, None] * (spread - weights[far]))

@@ -93,7 +93,7 @@ class Conventions:
     ray_origins: the release divides camera centres by s, and the ray origins taken from them once more, so that the moments of
     its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex (paper) or over all (release).
     pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn. skinning_reach: Gaussians
-    farther than this from their vertex, metres, move with the body around them (`body.skinning.spread_weights`); None: all with
+    between the legs farther than this from their vertex, metres, move with both (`body.skinning.spread_weights`); None: all with
     their vertex, as in training. body_vertices, longest_edge: number of vertices to which bodies are decimated, and metres to
     which their edges are split afterwards; None for neither.
     """

@@ -87,9 +87,11 @@ def test_points_between_two_limbs_go_with_both_and_points_on_them_with_their_own
     points = np.concatenate([row(0.0)[100:200], row(-0.1), row(0.1)])
     own = np.concatenate([joints[:100], joints])
     distances = np.concatenate([np.full(100, 0.1), np.zeros(800)])
-    run = jax.jit(skinning.spread_weights, static_argnums=5)
+    run = jax.jit(skinning.spread_weights, static_argnums=6)
     arrays = [jnp.asarray(x, jnp.float32) for x in (points, distances, own, vertices, joints)]
-    found = run(*arrays, 0.04)
+    legs = jnp.eye(2, dtype=bool)
+    found = run(*arrays, legs, 0.04)
     np.testing.assert_allclose(found[:100], 0.5, atol=ATOL)
     np.testing.assert_array_equal(found[100:], own[100:])
     np.testing.assert_allclose(np.sum(found, axis=1), 1, atol=ATOL)
+    np.testing.assert_array_equal(run(*arrays, legs[:1].repeat(2, 0) & False, 0.04), own)  # two limbs that are no legs

@@ -114,6 +114,7 @@ def test_batches_by_vmap_and_gradients_are_finite():
         assert np.isfinite(gradient).all() and np.any(gradient)
 
 
+@pytest.mark.slow
 def test_the_background_lends_no_colour():
     arguments = scene()
     shells = read(arguments)

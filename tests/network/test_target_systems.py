@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from network_cases import random_inputs, random_variables
 from target_cases import BLOCKS, DRIVEN, PATCH, PIXELS, SIZE, mapped_tube, small, views
-from training.training_cases import tube
+from training_cases import tube
 
 from humangs_jax.avatar.reconstruct import make_avatar
 from humangs_jax.avatar.targets import frame_outputs, target_pixels, target_queries

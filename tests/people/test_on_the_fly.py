@@ -228,6 +228,7 @@ def test_bare_skin_is_where_the_body_is(bank, scene, body):
     assert np.median(np.linalg.norm(np.asarray(seen) - pixels, axis=-1)) < 0.5
 
 
+@pytest.mark.slow
 def test_examples_are_of_the_body_mirrored_or_not(bank, body):
     keys = jax.random.split(jax.random.key(0), 8)
     numbers = jax.jit(jax.vmap(lambda key: on_the_fly._draw_numbers(bank, key, CONFIG)["mirrored"]))(keys)

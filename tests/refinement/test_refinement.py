@@ -46,6 +46,7 @@ def test_comes_closer_to_photos_of_a_moving_person(person):
     assert "12 steps" in report.summary()
 
 
+@pytest.mark.slow
 def test_a_share_that_holds_nothing_out_keeps_the_last_state(person):
     report = refinement.refine_with_report(*person, dataclasses.replace(STEPS, held_out=1e-6))
     assert report.kept and report.loss[1] < 0.8 * report.loss[0]

@@ -79,6 +79,7 @@ def test_what_a_run_leaves_behind(whole):
     checkpoints.close()
 
 
+@pytest.mark.slow
 def test_a_signal_saves_and_ends_the_run(body, captures, variables, tmp_path, monkeypatch, caplog):
     def interrupted(*arguments):
         result = step(*arguments)
