@@ -108,7 +108,7 @@ def published_case(seed, size):
     config = presets.published().with_conventions(image_size=size, body_vertices=4000)
     config = config.with_execution(dtype="float32", tokens="foreground")
     inputs = prepare_inputs(gaussian_body(body, config), standardize(capture, size), config)
-    variables = init_humangs(jax.random.key(seed), config, inputs)
+    variables = init_humangs(jax.random.key(seed), config)
     return variables, config, body, capture, load_capture("demo_capture/held_out").select(range(TARGETS))
 
 

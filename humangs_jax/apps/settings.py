@@ -80,10 +80,10 @@ class Settings:
 
 
 PRESETS: dict[str, Settings] = {
-    "realtime": Settings(views=2, execution=EXECUTIONS["realtime"], splat="fast"),
+    "realtime": Settings(views=4, execution=EXECUTIONS["realtime"], splat="fast"),
     "balanced": Settings(views=4, execution=EXECUTIONS["balanced"], splat="near_exact"),
     "quality": Settings(views=4, execution=EXECUTIONS["quality"], refine_steps=50, refine_size=256, splat="near_exact"),
-    "best": Settings(execution=EXECUTIONS["best"], refine_steps=200, refine_size=256),
+    "best": Settings(execution=EXECUTIONS["best"], refine_steps=100, refine_size=512),
 }
 """From the fastest to the best; docs/tradeoff.md has what each takes and gains."""
 

@@ -91,8 +91,8 @@ class Execution:
 
 
 EXECUTIONS = {
-    "realtime": Execution(image_size=128, crop=True),
-    "balanced": Execution(crop=True),
+    "realtime": Execution(crop=True, body_vertices=1000),
+    "balanced": Execution(crop=True, body_vertices=2000),
     "quality": Execution(crop=True),
     "best": Execution(crop=True),
 }
