@@ -100,14 +100,12 @@ def published_case(seed, size):
 
     from humangs_jax.body.library import load_body
     from humangs_jax.data.capture import load_capture
-    from humangs_jax.data.views import gaussian_body, prepare_inputs, standardize
     from humangs_jax.network import presets
     from humangs_jax.network.humangs import init_humangs
 
     body, capture = load_body(), load_capture("demo_capture")
     config = presets.published().with_conventions(image_size=size, body_vertices=4000)
     config = config.with_execution(dtype="float32", tokens="foreground")
-    inputs = prepare_inputs(gaussian_body(body, config), standardize(capture, size), config)
     variables = init_humangs(jax.random.key(seed), config)
     return variables, config, body, capture, load_capture("demo_capture/held_out").select(range(TARGETS))
 
