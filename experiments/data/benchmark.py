@@ -142,7 +142,7 @@ def measure_reading(people: Any, samples: int) -> dict[str, float]:
 
 
 def grown_bytes(people: Any, samples: int) -> float:
-    """Growth of the resident set over so many samples of two views, between means over 20 of them."""
+    """Growth of the resident set over a number of samples of two views : the mean of the last 20 less that of 20 early ones."""
     sizes = [resident_bytes() for i, _ in enumerate(examples(people, 1, 1, samples)) if i >= samples // 5]
     return (sum(sizes[-20:]) - sum(sizes[:20])) / 20
 

@@ -41,7 +41,7 @@ def frame_outputs(
 
 
 def target_queries(body: BodyModel, targets: SubjectViews, config: HumanGSConfig) -> Float[Array, "v h w 9"]:
-    """What a `PixelDecoder` is told of targets: rays and canonical positions of the body. Their photos and masks are not read."""
+    """What a `PixelDecoder` gets of targets: rays and canonical positions of the body. Their photos and masks are not used."""
     hidden = replace(targets, images=jnp.zeros_like(targets.images), masks=jnp.zeros_like(targets.masks))
     queries = encoder_pixels(prepare_inputs(body, hidden, config), Pass(config))[..., 3:]
     return jax.lax.stop_gradient(queries)

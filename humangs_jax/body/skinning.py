@@ -18,7 +18,7 @@ from humangs_jax.geometry import quaternion, transform
 
 EXACT = transform.EXACT
 THINNING = 8
-"""Every so many vertices are enough to average skinning weights over centimetres."""
+"""Only every eighth vertex is used: enough to average skinning weights over centimetres."""
 BETWEEN = 0.1
 """Share of either leg in the weights around a point from which on it is between them."""
 BLOCK = 2048
@@ -101,8 +101,8 @@ def spread_weights(
     A hem that belongs to the vertices of one leg tears when the legs part. A point at a distance d from the vertex that it
     belongs to takes the mean of the weights of the vertices around it, by a normal kernel whose standard deviation is d. It
     keeps its own where d is less than 3/4 of `reach`, or where one of the legs has no share in that mean: hair and sleeves stay
-    as they are. At most a quarter of the points change, those with the largest d. LHM
-    diffuses weights through a grid of voxels to the same end (https://arxiv.org/abs/2503.10625).
+    as they are. At most a quarter of the points change, those with the largest d. LHM diffuses weights through a grid of voxels
+    to the same end (https://arxiv.org/abs/2503.10625).
 
     Arguments: points in the rest pose, metres. distances: from the vertex of each. weights: of that vertex. legs: the joints of
     each leg.

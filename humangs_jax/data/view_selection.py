@@ -19,7 +19,7 @@ SIZE = 128
 VERTICES = 2000
 """Of the body that is looked at."""
 LEAST_GAIN = 0.03
-"""Share of what is shown already that a further photo has to add, where the number of photos is not given."""
+"""A further photo has to add this share to what the chosen ones show. Only where no number of photos is given."""
 
 
 def select_views(capture: Capture, count: int | None) -> list[int]:

@@ -47,19 +47,23 @@ def moments(changes: list, count: int, generator: random.Random) -> list[Moment]
     return found
 
 
-def kill(command: Command, folder: Path, inputs: Path, count: int, seed: int = 0) -> dict:
-    """Kills a command at so many moments; figures and faults."""
-    began, faults, killed, left = time.monotonic(), [], 0, 0
-    place = writers.place_of(command, folder, inputs, "whole")
+def run_undisturbed(command: Command, place: Path, kept: Path, inputs: Path) -> tuple[dict, writers.Run, dict]:
+    """The files before a run, the run, and the files after it. `kept` becomes a copy of the place before."""
     if command.first is not None:
         assert writers.run(command, place, inputs, 1).code == 0, command.name
-    kept = folder / "before"
     shutil.rmtree(kept, ignore_errors=True)
     shutil.copytree(place, kept)
     before = writers.snapshot(place)[0]
     undisturbed = writers.run(command, place, inputs, 2)
     assert undisturbed.code == 0, (command.name, undisturbed.errors)
-    expected = writers.snapshot(place)[0]
+    return before, undisturbed, writers.snapshot(place)[0]
+
+
+def kill(command: Command, folder: Path, inputs: Path, count: int, seed: int = 0) -> dict:
+    """Kills a command at `count` moments. Returns figures and faults."""
+    began, faults, killed, left = time.monotonic(), [], 0, 0
+    place, kept = writers.place_of(command, folder, inputs, "whole"), folder / "before"
+    before, undisturbed, expected = run_undisturbed(command, place, kept, inputs)
     faults += writers.unlike(command, place, expected)
     for moment in moments(undisturbed.changes, count, random.Random(f"{command.name} {seed}")):
         shutil.rmtree(place)
@@ -82,18 +86,11 @@ def kill(command: Command, folder: Path, inputs: Path, count: int, seed: int = 0
 
 
 def interrupt(command: Command, folder: Path, inputs: Path, count: int, seed: int) -> dict:
-    """Interrupts a command until so many runs were; at most twice as many come to their end. Figures and faults."""
+    """Interrupts a command a number of times; at most twice as many runs may end before. Returns figures and faults."""
     began, faults, codes = time.monotonic(), [], {0: 0, INTERRUPTED: 0}
-    place = writers.place_of(command, folder, inputs, "interrupted")
-    if command.first is not None:
-        assert writers.run(command, place, inputs, 1).code == 0, command.name
-    kept = folder / "before"
-    shutil.rmtree(kept, ignore_errors=True)
-    shutil.copytree(place, kept)
-    before = writers.snapshot(place)[0]
-    undisturbed = writers.run(command, place, inputs, 2)
-    assert undisturbed.code == 0, (command.name, undisturbed.errors)
-    expected, last = writers.snapshot(place)[0], undisturbed.changes[-1][0]
+    place, kept = writers.place_of(command, folder, inputs, "interrupted"), folder / "before"
+    before, undisturbed, expected = run_undisturbed(command, place, kept, inputs)
+    last = undisturbed.changes[-1][0]
     generator = random.Random(f"{command.name} {seed}")
     while codes[INTERRUPTED] < count and codes[0] < 2 * count:
         shutil.rmtree(place)
@@ -113,7 +110,7 @@ def interrupt(command: Command, folder: Path, inputs: Path, count: int, seed: in
 
 
 def interrupt_all(folder: Path, count: int, names: list[str], record: Path | None = None) -> dict[str, dict]:
-    """Figures by command; the record is added to until each has so many, `TURN` at a time."""
+    """Figures by command. The record grows by `TURN` interrupts at a time until each command has the number asked for."""
     writers.import_everything()
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -165,7 +162,7 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--json", type=Path, help="record of the figures by command; an earlier one is continued")
     parser.add_argument("--page", type=Path, help="page whose table kills is written, with its docs/results/kills.json")
-    parser.add_argument("--interrupts", type=int, help="interrupt each command so many times instead")
+    parser.add_argument("--interrupts", type=int, help="number of interrupts of each command, instead of kills")
     arguments = parser.parse_args()
     if arguments.interrupts is not None:
         figures = interrupt_all(arguments.folder, arguments.interrupts, arguments.commands, arguments.json)

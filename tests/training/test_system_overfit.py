@@ -1,4 +1,4 @@
-"""The comparison systems learn a person by heart, with the same step as the network of the paper."""
+"""The comparison systems overfit to one person, by the same training step as the paper's network."""
 
 import dataclasses
 
