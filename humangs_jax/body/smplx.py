@@ -8,7 +8,6 @@ the model's mean hand, which is added).
 The model's licence forbids redistribution: users bring the file.
 """
 
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,8 @@ from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.io.npz import read_npz
-from humangs_jax.io.reading import FileError, open_file, reading
-from humangs_jax.io.restricted_pickle import as_array, read_pickle
+from humangs_jax.io.array_file import ArrayFile
+from humangs_jax.io.reading import FileError, reading
 
 SHAPE_COLUMNS, EXPRESSION_COLUMNS = 300, 100
 """Columns of `shapedirs` in current files; older ones have 10 + 10."""
@@ -40,55 +38,6 @@ class HandBasis:
     components: Float[Array, "2 45 45"]
 
 
-class _ModelFile:
-    """Arrays of a model file by key, with errors that name both. wanted: which of an npz are read at all."""
-
-    def __init__(self, path: str | Path, wanted: Callable[[str], bool]) -> None:
-        self.path, self.pickled = Path(path), ()
-        if not self.path.exists():
-            raise FileNotFoundError(f"{path}: no such body model file")
-        with reading(path, "body model file"), open_file(path) as file:
-            start = file.read(2)
-        if start == b"PK" or self.path.suffix == ".npz":
-            content, self.pickled = read_npz(self.path, wanted)
-            self.content: Mapping[str, Any] = content
-        else:
-            self.content = read_pickle(self.path)
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.content
-
-    def read(self, key: str, shape: tuple[int | None, ...]) -> np.ndarray:
-        """The array under `key`; None in `shape` stands for any size."""
-        if key in self.pickled:
-            raise FileError(self.path, f"key '{key}'", "a pickled object, which is never read")
-        if key not in self.content:
-            raise ValueError(f"{self.path}: key '{key}' is missing (keys: {sorted(self.content)})")
-        try:
-            array = as_array(self.content[key])
-        except ValueError as error:
-            raise FileError(self.path, f"key '{key}'", error) from error
-        fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
-        if not fits:
-            raise ValueError(f"{self.path}: key '{key}': expected shape {_written(shape)}, got {array.shape}")
-        if array.dtype.kind not in "iuf":
-            raise ValueError(f"{self.path}: key '{key}': expected numbers, got dtype {array.dtype}")
-        if not np.isfinite(array).all():
-            raise ValueError(f"{self.path}: key '{key}' has numbers that are not finite")
-        return array
-
-    def indices(self, key: str, bound: int) -> np.ndarray:
-        """An integer array (f, 3) with entries in [0, bound)."""
-        array = self.read(key, (None, 3)).astype(np.int64)
-        if array.min(initial=0) < 0 or array.max(initial=-1) >= bound:
-            raise ValueError(f"{self.path}: key '{key}': indices must lie in [0, {bound})")
-        return array
-
-
-def _written(shape: tuple[int | None, ...]) -> str:
-    return "(" + ", ".join("any" if size is None else str(size) for size in shape) + ")"
-
-
 def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int = 10) -> BodyModel:
     """Read an SMPL-X model file, `.npz` (no pickled object in it is touched) or `.pkl` (see `restricted_pickle`).
 
@@ -101,19 +50,19 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
 
 
 def _load_smplx(path, shape_count, expression_count):
-    file = _ModelFile(path, lambda key: not key.startswith("hands_"))
-    template = file.read("v_template", (None, 3))
+    file = ArrayFile.open(path, wanted=lambda key: not key.startswith("hands_"))
+    template = file.numbers("v_template", (None, 3))
     n = len(template)
     directions, names = _shape_directions(file, n, shape_count, expression_count)
     has_uvs = "vt" in file and "ft" in file
-    uvs = file.read("vt", (None, 2)) if has_uvs else None
+    uvs = file.numbers("vt", (None, 2)) if has_uvs else None
     number = lambda x: jnp.asarray(x, jnp.result_type(float))
     return BodyModel(
         template=number(template),
         shape_directions=number(directions),
-        pose_directions=number(file.read("posedirs", (n, 3, 9 * (JOINTS - 1)))),
-        joint_regressor=number(file.read("J_regressor", (JOINTS, n))),
-        skinning_weights=number(file.read("weights", (n, JOINTS))),
+        pose_directions=number(file.numbers("posedirs", (n, 3, 9 * (JOINTS - 1)))),
+        joint_regressor=number(file.numbers("J_regressor", (JOINTS, n))),
+        skinning_weights=number(file.numbers("weights", (n, JOINTS))),
         faces=jnp.asarray(file.indices("f", n), jnp.int32),
         uvs=None if uvs is None else number(uvs),
         uv_faces=None if uvs is None else jnp.asarray(file.indices("ft", len(uvs)), jnp.int32),
@@ -124,39 +73,39 @@ def _load_smplx(path, shape_count, expression_count):
     )
 
 
-def _shape_directions(file: _ModelFile, n: int, shape_count: int, expression_count: int):
-    stored = file.read("shapedirs", (n, 3, None))
+def _shape_directions(file: ArrayFile, n: int, shape_count: int, expression_count: int):
+    stored = file.numbers("shapedirs", (n, 3, None))
     columns = stored.shape[-1]
     if columns >= SHAPE_COLUMNS + EXPRESSION_COLUMNS:
         available = SHAPE_COLUMNS, EXPRESSION_COLUMNS
     elif columns >= 2 * OLD_COLUMNS:
         available = OLD_COLUMNS, OLD_COLUMNS
     else:
-        raise ValueError(f"{file.path}: key 'shapedirs': expected 20 or 400 columns (shape, expression), got {columns}")
+        raise FileError(file.path, "shapedirs", f"expected 20 or 400 columns (shape, expression), got {columns}")
     for asked, limit, kind in zip((shape_count, expression_count), available, ("shape", "expression"), strict=True):
         if not 0 <= asked <= limit:
-            raise ValueError(f"{file.path}: key 'shapedirs' has {limit} {kind} directions, asked for {asked}")
+            raise FileError(file.path, "shapedirs", f"has {limit} {kind} directions, asked for {asked}")
     shape, expression = stored[..., :shape_count], stored[..., available[0] : available[0] + expression_count]
     names = (*(f"shape_{i}" for i in range(shape_count)), *(f"expression_{i}" for i in range(expression_count)))
     return np.concatenate([shape, expression], axis=-1), names
 
 
-def _parents(file: _ModelFile) -> tuple[int, ...]:
-    parents = file.read("kintree_table", (2, JOINTS))[0].astype(np.int64)
+def _parents(file: ArrayFile) -> tuple[int, ...]:
+    parents = file.numbers("kintree_table", (2, JOINTS))[0].astype(np.int64)
     found = (-1, *(int(p) for p in parents[1:]))  # the root's is stored as -1 or as 2^32 - 1
     if found != PARENTS:
-        raise ValueError(f"{file.path}: key 'kintree_table' is not SMPL-X's joint tree: {found}")
+        raise FileError(file.path, "kintree_table", f"expected SMPL-X's joint tree, got {found}")
     return found
 
 
 def load_hands(path: str | Path) -> HandBasis:
     """Mean and principal components of the hand poses of an SMPL-X model file. Raises as `load_smplx`."""
     with reading(path, "body model file"):
-        file = _ModelFile(path, lambda key: key.startswith("hands_"))
+        file = ArrayFile.open(path, wanted=lambda key: key.startswith("hands_"))
         number = lambda arrays: jnp.asarray(np.stack(arrays), jnp.result_type(float))
         return HandBasis(
-            means=number([file.read(f"hands_mean{side}", (45,)) for side in "lr"]),
-            components=number([file.read(f"hands_components{side}", (45, 45)) for side in "lr"]),
+            means=number([file.numbers(f"hands_mean{side}", (45,)) for side in "lr"]),
+            components=number([file.numbers(f"hands_components{side}", (45, 45)) for side in "lr"]),
         )
 
 

@@ -111,7 +111,7 @@ def test_current_files_hold_expressions_after_300_columns(tmp_path):
         3,
         400,
     )
-    with pytest.raises(ValueError, match="'shapedirs' has 300 shape directions, asked for 301"):
+    with pytest.raises(ValueError, match="shapedirs: has 300 shape directions, asked for 301"):
         load_smplx(tmp_path / "model.npz", shape_count=301)
 
 
@@ -193,15 +193,15 @@ def with_bad_number(key):
 @pytest.mark.parametrize(
     "content, message",
     [
-        (broken(weights=None), "key 'weights' is missing"),
-        (broken(weights=np.ones((9, 52))), r"key 'weights': expected shape \(9, 55\), got \(9, 52\)"),
-        (broken(v_template=np.ones((9, 4))), r"key 'v_template': expected shape \(any, 3\)"),
-        (broken(shapedirs=np.ones((9, 3, 12))), "key 'shapedirs': expected 20 or 400 columns"),
-        (broken(f=np.full((4, 3), 9, np.uint32)), r"key 'f': indices must lie in \[0, 9\)"),
-        (broken(kintree_table=np.zeros((2, 55), np.uint32)), "key 'kintree_table' is not SMPL-X's joint tree"),
-        (broken(J_regressor=np.asarray([None] * 3, dtype=object)), "key 'J_regressor'"),
-        (broken(posedirs=np.full((9, 3, 486), "a")), "key 'posedirs': expected numbers"),
-        (with_bad_number("posedirs"), "key 'posedirs' has numbers that are not finite"),
+        (broken(weights=None), r"weights: missing"),
+        (broken(weights=np.ones((9, 52))), r"weights: expected shape \(9, 55\), got \(9, 52\)"),
+        (broken(v_template=np.ones((9, 4))), r"v_template: expected shape \(any, 3\)"),
+        (broken(shapedirs=np.ones((9, 3, 12))), "shapedirs: expected 20 or 400 columns"),
+        (broken(f=np.full((4, 3), 9, np.uint32)), r"f: expected indices in \[0, 9\)"),
+        (broken(kintree_table=np.zeros((2, 55), np.uint32)), "kintree_table: expected SMPL-X's joint tree"),
+        (broken(J_regressor=np.asarray([None] * 3, dtype=object)), "J_regressor: "),
+        (broken(posedirs=np.full((9, 3, 486), "a")), "posedirs: expected real numbers"),
+        (with_bad_number("posedirs"), "posedirs: expected finite numbers"),
     ],
 )
 def test_bad_files_are_named_with_the_key(tmp_path, content, message):

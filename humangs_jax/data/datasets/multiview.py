@@ -24,7 +24,7 @@ from humangs_jax.data.calibration.formats import read_calibration
 from humangs_jax.data.capture_checks import CaptureError, checked_camera
 from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, coefficients
 from humangs_jax.data.datasets.subject import Subject
-from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, ArrayFile
+from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, open_arrays
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import read_grey, read_image
 from humangs_jax.io.text import read_text
@@ -41,7 +41,7 @@ def read_parameters(file: Path, body: FileBody) -> BodyParameters:
 
     Where shape or expression differ between frames, those of the first are taken: one person has one shape.
     """
-    values = ArrayFile(file)
+    values = open_arrays(file)
     count = len(values.numbers("global_orient", (None, 3), LARGEST_ANGLE))
     angles = {key: values.numbers(key, (count, size), LARGEST_ANGLE) for key, size in _ANGLES.items()}
     translations = values.numbers("transl", (count, 3), FARTHEST)

@@ -21,7 +21,7 @@ from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_json, required
 from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, recover_pose, recover_shape
 from humangs_jax.data.datasets.subject import STORED_SIZE, Person, Subject
-from humangs_jax.data.datasets.values import ArrayFile, checked_numbers
+from humangs_jax.data.datasets.values import checked_numbers, open_arrays
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import image_size, read_grey, read_image
 from humangs_jax.io.npz import write_npz
@@ -105,12 +105,12 @@ def open_scene(file: Path, name: str, scene: Mapping[str, Any], body: FileBody) 
     views, missing = _present(file, name, scene)
     smpl, frames = np.unique([view.arrays for view in views], return_inverse=True)
     arrays = [_inside(file, name, path) for path in smpl.tolist()]
-    first = ArrayFile(arrays[0])
+    first = open_arrays(arrays[0])
     scale, betas = recover_shape(body, first.numbers("v_cano", (None, 3)), first.path)
 
     @functools.lru_cache(maxsize=KEPT_FRAMES)
     def pose(frame: int):
-        values = ArrayFile(arrays[frame])
+        values = open_arrays(arrays[frame])
         transforms = values.numbers("joint_transforms", (len(body.model.parents), 4, 4))
         return recover_pose(body, betas, scale, transforms, values.path)
 

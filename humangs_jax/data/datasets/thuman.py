@@ -23,7 +23,7 @@ import numpy as np
 from humangs_jax.core.array_types import Float, Int, UInt8
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, PosedPerson, coefficients, posed_people
-from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, ArrayFile
+from humangs_jax.data.datasets.values import FARTHEST, LARGEST_ANGLE, LARGEST_COEFFICIENT, open_arrays
 from humangs_jax.io.images import check_image
 from humangs_jax.io.mesh import read_meshes
 from humangs_jax.io.reading import Refused, reading
@@ -106,7 +106,7 @@ def open_thuman(folder: str | Path) -> ThumanSet:
 
 def read_fit(file: str | Path, body: FileBody) -> Fit:
     """Read smplx_param.pkl, without running anything in it. Raises: CaptureError naming file and key."""
-    values = ArrayFile(file)
+    values = open_arrays(file)
     file = values.path
     if ("transl" in values) == ("translation" in values):
         raise CaptureError(file, "transl", "expected either transl (THuman2.1, fixed fits) or translation (older fits)")

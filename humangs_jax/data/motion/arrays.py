@@ -18,7 +18,6 @@ What a file does not have (fingers, eyes) is 0.
 """
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,10 +25,10 @@ import numpy as np
 
 from humangs_jax.body.joints import BODY_NAMES, JOINT_NAMES
 from humangs_jax.body.smplx import HandBasis
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.motion.motion import DEFAULT_FPS, MotionError
-from humangs_jax.io.npz import read_npz
+from humangs_jax.io.array_file import ArrayFile
 from humangs_jax.io.reading import open_file
-from humangs_jax.io.restricted_pickle import as_array, read_pickle
 from humangs_jax.io.text import read_json
 
 BODY_NUMBERS = 3 * len(BODY_NAMES)  # 66
@@ -114,7 +113,7 @@ def _smpl_params(file):
         expected = f"expected shape ({count}, {BODY_NUMBERS - 3}), or ({count}, 69) of SMPL"
         raise MotionError(file.path, "body_pose", f"{expected}, got {np.shape(file.values['body_pose'])}")
     body = np.concatenate([orient, body[:, : BODY_NUMBERS - 3]], axis=1)
-    face = [file.numbers(key, (count, 3), optional=True) for key in ("jaw_pose", "leye_pose", "reye_pose")]
+    face = [file.optional(key, (count, 3)) for key in ("jaw_pose", "leye_pose", "reye_pose")]
     hands = [file.hand(f"{side}_hand_pose", count, i) for i, side in enumerate(("left", "right"))]
     translations = file.numbers("transl", (count, 3))
     return file.assemble(body, face, hands), translations, file.rate(("fps", *AMASS_RATES), DEFAULT_FPS), "y"
@@ -125,7 +124,7 @@ def _lhm(file):
     count = len(root)
     root = file.numbers("root_pose", (count, 3))
     body = np.concatenate([root, file.numbers("body_pose", (count, 21, 3)).reshape(count, -1)], axis=1)
-    face = [file.numbers(key, (count, 3), optional=True) for key in ("jaw_pose", "leye_pose", "reye_pose")]
+    face = [file.optional(key, (count, 3)) for key in ("jaw_pose", "leye_pose", "reye_pose")]
     hands = [file.hand(key, count, i) for i, key in enumerate(("lhand_pose", "rhand_pose"))]
     return file.assemble(body, face, hands), file.numbers("trans", (count, 3)), DEFAULT_FPS, "y"
 
@@ -142,47 +141,21 @@ _FORMATS = {
 """Readers by a key that only their format has; the first that fits is used."""
 
 
-class _MotionFile:
-    """The values of a motion file by key, with errors that name both."""
+class _MotionFile(ArrayFile):
+    """The values of a motion file, and how its hands are written."""
 
     def __init__(self, path: Path, hands: HandBasis | None, flat_hand_mean: bool, fps: float | None):
-        self.path, self.hands, self.flat_hand_mean, self.fps = path, hands, flat_hand_mean, fps
-        self.pickled: tuple[str, ...] = ()
-        suffix = self.path.suffix.lower()
-        if self.path.is_dir() or suffix == ".json":
-            self.values: Mapping[str, Any] = _read_json_frames(self.path)
-        elif suffix in (".pkl", ".pickle"):
-            self.values = read_pickle(self.path)
+        self.hands, self.flat_hand_mean, self.fps = hands, flat_hand_mean, fps
+        if path.is_dir() or path.suffix.lower() == ".json":
+            super().__init__(path, _read_json_frames(path), error=MotionError)
         else:
-            if suffix != ".npz":
-                _check_npz(path)
-            self.values, self.pickled = read_npz(self.path)
+            _check_suffix(path)
+            file = ArrayFile.open(path, MotionError)
+            super().__init__(path, file.values, file.pickled, MotionError)
 
-    def numbers(self, key: str, shape: tuple[int | None, ...] | None, optional: bool = False) -> Any:
-        """Finite float64 numbers; None in `shape` is any size but 0, None for it any shape with at least one frame."""
-        if key not in self.values:
-            if optional:
-                return None
-            reason = "a pickled object, which is never read" if key in self.pickled else "missing"
-            raise MotionError(self.path, key, reason)
-        try:
-            array = as_array(self.values[key])
-            if array.dtype.kind not in "fiu":
-                raise ValueError
-            array = array.astype(np.float64)
-        except (ValueError, TypeError, OverflowError):
-            raise MotionError(self.path, key, "expected numbers") from None
-        if shape is not None:
-            wanted = ", ".join("any" if size is None else str(size) for size in shape)
-            fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
-            if not fits:
-                raise MotionError(self.path, key, f"expected shape ({wanted}), got {array.shape}")
-        if array.size == 0:
-            raise MotionError(self.path, key, f"expected at least one frame, got shape {array.shape}")
-        if not np.isfinite(array).all():
-            where = [int(i) for i in np.argwhere(~np.isfinite(array))[0]]
-            raise MotionError(self.path, key, f"expected finite numbers, got {array[tuple(where)]} at index {where}")
-        return array
+    def optional(self, key: str, shape: tuple[int | None, ...] | None) -> Float[np.ndarray, "..."] | None:
+        """As `numbers`; None if the file has no such key."""
+        return self.numbers(key, shape) if key in self.values else None
 
     def rate(self, keys: tuple[str, ...], default: float | None) -> float:
         """Frames per second: those asked for, or under the first of the keys that is there."""
@@ -200,7 +173,7 @@ class _MotionFile:
 
     def hand(self, key: str, count: int, side: int) -> Any:
         """(m, 45) axis-angle numbers of a hand, or None if the file has none."""
-        pose = self.numbers(key, None, optional=True)
+        pose = self.optional(key, None)
         if pose is None:
             return None
         pose = pose.reshape(len(pose), -1)
@@ -227,8 +200,10 @@ class _MotionFile:
         return np.concatenate([body, *face, *hands], axis=1).reshape(len(body), -1, 3)
 
 
-def _check_npz(path):
+def _check_suffix(path):
     """Raises: MotionError for a file of another name that is no npz archive either."""
+    if path.suffix.lower() in (".npz", ".pkl", ".pickle"):
+        return
     with open_file(path) as file:
         if file.read(2) != b"PK":
             found = path.suffix or "no suffix"
