@@ -403,6 +403,34 @@ def test_an_interrupt_that_python_does_not_hear_ends_the_process(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_a_run_that_saves_for_longer_than_our_patience_is_not_ended(tmp_path):
+    code = (
+        "import signal, time; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from humangs_jax import cli\n"
+        "from humangs_jax.cli import interrupts\n"
+        "from humangs_jax.training.loop import stop_requested\n"
+        "interrupts.PATIENCE = 0.2\n"
+        "class Training:\n"
+        "    def run(self):\n"
+        "        with stop_requested() as stopping:\n"
+        "            print('begun', flush=True)\n"
+        "            while not stopping(0):\n"
+        "                pass\n"
+        "            time.sleep(1)\n"
+        "        print('saved', flush=True)\n"
+        "        raise KeyboardInterrupt\n"
+        "cli._parsed = lambda arguments: Training()\n"
+        "cli.main()"
+    )
+    program = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=tmp_path
+    )
+    assert program.stdout.readline() == b"begun\n"
+    program.send_signal(signal.SIGINT)
+    out, _ = program.communicate(timeout=60)
+    assert out == b"saved\n" and program.returncode == cli.INTERRUPTED
+
+
 def test_an_interrupt_that_python_drops_is_repeated():
     code = (
         "import gc, signal, time; signal.signal(signal.SIGINT, signal.default_int_handler)\n"

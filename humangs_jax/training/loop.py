@@ -12,6 +12,7 @@ Of several processes all must see the same folder `out`; one of them writes all 
 import contextlib
 import functools
 import logging
+import os
 import signal
 import threading
 from collections.abc import Callable, Generator, Sequence
@@ -180,15 +181,18 @@ def stop_requested() -> Generator[Callable[[int], bool], None, None]:
 
 @contextlib.contextmanager
 def _own_signals():
-    """An event that SIGINT and SIGTERM set; the second SIGINT is a KeyboardInterrupt again."""
+    """An event that SIGINT and SIGTERM set; a second signal does what it did before."""
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():  # only the main thread may catch signals
         yield stop
         return
 
     def handle(number, _frame):
-        stop.set()
-        signal.signal(number, previous[number])
+        if stop.is_set():
+            signal.signal(number, previous[number])
+            os.kill(os.getpid(), number)
+            return
+        stop.set()  # the handler stays: with that of the command line again, saving would have to be done within seconds
         logger.warning("stopping after this step; what is done is saved")
 
     previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
