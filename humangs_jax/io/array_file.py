@@ -86,7 +86,9 @@ def checked_numbers(
         raise error(file, key, f"expected real numbers, got {array.dtype}")
     shape = (None,) * array.ndim if shape is None else shape
     fits = array.ndim == len(shape) and all(b in (None, a) for a, b in zip(array.shape, shape, strict=True))
-    if not fits or 0 in array.shape:
+    if 0 in array.shape:
+        raise error(file, key, f"expected at least one number, got shape {array.shape}")
+    if not fits:
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
         raise error(file, key, f"expected shape ({wanted}), got {array.shape}")
     array = array.astype(np.float64)

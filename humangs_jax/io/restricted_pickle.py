@@ -336,7 +336,10 @@ def as_array(value: Any) -> np.ndarray:
     if isinstance(value, list | tuple):
         _check_leaves(value)
     if isinstance(value, np.ndarray | np.generic | int | float | list | tuple):
-        return np.asarray(value)
+        try:
+            return np.asarray(value)
+        except (ValueError, OverflowError) as error:
+            raise ValueError("expected numbers in lists of equal lengths") from error
     raise ValueError(f"expected an array, got {type(value).__name__}")
 
 

@@ -81,6 +81,7 @@ def test_outliers_are_those_that_were_displaced(good):
     assert examination.report.ok  # a detector may err at times
 
 
+@pytest.mark.slow
 def test_a_camera_that_was_moved(good):
     capture, keypoints = good
     matrices = capture.cameras.cam_from_world.at[6, 0, 3].add(0.3)

@@ -95,6 +95,7 @@ def test_every_parameter_has_a_finite_gradient(name):
 # Pixels --------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PIXELS)
 def test_every_target_is_its_own_pass_and_the_order_of_photos_is_irrelevant(name):
     variables, inputs, asked = random_variables(small(name)), inputs_of(name), np.asarray(QUERIES)

@@ -121,6 +121,7 @@ def test_cloth_covers_and_leaves_the_body(body, people, posed):
         assert (person.face_materials[ids[dressed]] > 1).mean() > 0.5
 
 
+@pytest.mark.slow
 def test_hardly_any_skin_pokes_through(people, posed, views):
     for person, p, (batch, _, _) in zip(people, posed, views, strict=True):
         faces = person.surface.faces

@@ -272,6 +272,7 @@ def test_the_splits_share_no_seed():
         split_of(SPLITS["demo"].stop)
 
 
+@pytest.mark.slow
 @given(st.integers(0, len(SPLITS["train"]) - 1), st.integers(1, 50))
 @settings(deadline=None, max_examples=25)
 def test_written_training_people_are_training_people(first, count):

@@ -200,6 +200,7 @@ def test_the_share_of_random_backgrounds_is_kept():
     assert bool(jnp.all(random_backgrounds(keys[0], 3, 0.0) == 1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("views", "capacity"), [(6, 70), (4, 50), (1, 20)])
 def test_fewer_photos_have_their_share_of_the_token_capacity(views, capacity):
     config = dataclasses.replace(tiny(), views=ViewSampling(input_counts=(1, 4, 6)))

@@ -69,6 +69,7 @@ NOTHING_TO_SEE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", NOTHING_TO_SEE)
 def test_views_of_background_alone(body, batch, variables, what):
     _, metrics = step_without_harm(init_state(CONFIG, variables), NOTHING_TO_SEE[what](batch), body)
