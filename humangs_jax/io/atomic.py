@@ -78,10 +78,11 @@ def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *
         with _naming(folder, temporary):
             with _unfinished(temporary):
                 write(temporary)
-            _exchange(folder, temporary, aside)
+            with undisturbed():
+                _exchange(folder, temporary, aside)
+                shutil.rmtree(aside, ignore_errors=True)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
-    shutil.rmtree(aside, ignore_errors=True)
 
 
 _being_written: set[Path] = set()

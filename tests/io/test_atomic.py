@@ -3,6 +3,7 @@
 import errno
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -109,6 +110,20 @@ def test_an_interrupt_between_the_renames_loses_nothing(tmp_path, monkeypatch, r
     with pytest.raises(Interrupted):
         atomic.replace_folder(folder, writes("new"), mark=MARK)
     assert names(tmp_path) == ["folder"] and (folder / "a.txt").read_text() == "old"
+
+
+def test_an_interrupt_while_the_old_folder_is_deleted_leaves_nothing_of_it(tmp_path, monkeypatch):
+    folder, remove = folder_with(tmp_path / "folder", "old"), shutil.rmtree
+
+    def interrupted(path, **options):
+        if ".old-" in path.name:
+            signal.raise_signal(signal.SIGINT)
+        remove(path, **options)
+
+    monkeypatch.setattr(atomic.shutil, "rmtree", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        atomic.replace_folder(folder, writes("new"), mark=MARK)
+    assert names(tmp_path) == ["folder"] and (folder / "a.txt").read_text() == "new"
 
 
 def test_a_full_disk_names_what_was_to_be_written(tmp_path):
