@@ -398,7 +398,7 @@ def stand_ins(variant):
         ("avatar.layers", "draw", lambda _, poses, *__: iter(some_renderings(variant, len(poses)))),
         ("apps.check", "_body_image", shown),
         ("apps.check", "_posed_frames", lambda capture: {0: np.zeros((4, 3))}),
-        ("apps.demo", "load_weights", lambda *_: (None, SimpleNamespace(with_execution=lambda **_: None))),
+        ("apps.demo", "load_weights", lambda *_: (None, tiny())),
         ("apps.demo", "reconstruct", avatar),
         ("apps.demo", "animate", lambda avatar, _: avatar.gaussians),
         ("apps.demo", "capture_renderings", lambda _, truth, *__: drawn(truth.view_count, truth.cameras.width)),
