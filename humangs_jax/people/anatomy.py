@@ -51,11 +51,6 @@ def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
     return t * t * (3 - 2 * t)
 
 
-def arm_membership(template: np.ndarray) -> np.ndarray:
-    """(n,) 1 on the arms, 0 on the trunk, smooth across the shoulder seam."""
-    return smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])
-
-
 def leg_membership(template: np.ndarray) -> np.ndarray:
     """(n,) 1 on the legs, 0 on the trunk, smooth across the hip."""
     return smoothstep(-CROTCH - 0.1, -CROTCH + 0.05, -template[:, 1])
@@ -100,7 +95,9 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
 @functools.lru_cache(maxsize=1)
 def _fixed(template_bytes: bytes):
     template = np.frombuffer(template_bytes, np.float32).reshape(-1, 3)
-    return template, cloth_coordinates(template), arm_membership(template), leg_membership(template)
+    # 1 on the arms, 0 on the trunk, smooth across the shoulder seam
+    arm = smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])
+    return template, cloth_coordinates(template), arm, leg_membership(template)
 
 
 def measure(

@@ -69,6 +69,7 @@ def bend_arm(
 
     other_arm: keep clear of the other arm, too. Returns how clear the arm is (metres, negative: it is not).
     """
+    matrix, vector = kin.rotation_matrix, kin.rotation_vector
     collar, shoulder, elbow, wrist = ARMS[side]
     mirror, n, wanted = np.ones(3) if side == 0 else kin.MIRROR, CANDIDATES, GOALS[goal]
     rotations[collar] = np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
@@ -78,27 +79,25 @@ def bend_arm(
     twist[:, 0] = rng.uniform(-1.0, 0.8, n)
     flex[:, 1] = -rng.uniform(*wanted.flexed, n)
     pronation[:, 0] = rng.uniform(-0.4, 0.5)
-    if goal == "hang":  # a hanging arm swings about the axis of both shoulders
-        swing = kin.rotation_matrix(np.stack([forward[:, 1], down[:, 1], down[:, 2]], 1))
-    else:
-        swing = kin.rotation_matrix(forward) @ kin.rotation_matrix(down)
-    upper = kin.rotation_vector(swing @ kin.rotation_matrix(twist)) * mirror
-    lower = kin.rotation_vector(kin.rotation_matrix(flex) @ kin.rotation_matrix(pronation)) * mirror
+    about_both = np.stack(
+        [forward[:, 1], down[:, 1], down[:, 2]], 1
+    )  # a hanging arm swings about the axis of both shoulders
+    swing = matrix(about_both) if goal == "hang" else matrix(forward) @ matrix(down)
+    upper = vector(swing @ matrix(twist)) * mirror
+    lower = vector(matrix(flex) @ matrix(pronation)) * mirror
 
     world, positions = kin.joint_positions(build, rotations)
     rest = build.joints
-    upper_world = world[collar] @ kin.rotation_matrix(upper)
+    upper_world = world[collar] @ matrix(upper)
     elbows = positions[shoulder] + upper_world @ (rest[elbow] - rest[shoulder])
-    lower_world = upper_world @ kin.rotation_matrix(lower)
-    wrists = elbows + lower_world @ (rest[wrist] - rest[elbow])
-    tips = elbows + lower_world @ ((rest[wrist] - rest[elbow]) * (1 + HAND_LENGTH))
+    wrists = elbows + upper_world @ matrix(lower) @ (rest[wrist] - rest[elbow])
     reach = np.linalg.norm(rest[elbow] - rest[shoulder]) + np.linalg.norm(rest[wrist] - rest[elbow])
     offset = np.asarray(wanted.place) * [1 - 2 * side, 1, 1] + rng.normal(0, 0.08, 3)
     target = positions[shoulder] + reach * world[kin.SPINE3] @ offset
     capsules = _body_capsules(build, world, positions)
     if other_arm:
         capsules += _arm_capsules(build, positions, 1 - side)
-    clear = np.min([_clearance(build, capsules, points) for points in _along(elbows, wrists, tips)], axis=0)
+    clear = np.min([_clearance(build, capsules, points) for points in _along(elbows, wrists)], axis=0)
     beyond = np.maximum(np.linalg.norm(upper, axis=1) - kin.LIMITS[shoulder], 0)
     cost = np.linalg.norm(wrists - target, axis=1) + 20 * np.maximum(MARGIN - clear, 0) + 5 * beyond
     best = int(np.argmin(cost))
@@ -111,16 +110,10 @@ def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
     """How far (metres) both forearms and hands are from the body and each other; negative if one is inside."""
     world, positions = kin.joint_positions(build, rotations)
     body, worst = _body_capsules(build, world, positions), np.inf
-    for side in (0, 1):
-        points = np.stack(_along(*_forearm(positions, side)))
+    for side, (_, _, elbow, wrist) in enumerate(ARMS):
+        points = np.stack(_along(positions[elbow], positions[wrist]))
         worst = min(worst, _clearance(build, body + _arm_capsules(build, positions, 1 - side), points).min())
     return float(worst)
-
-
-def _forearm(positions, side):
-    """Elbow, wrist and a point of the fingers (3,)."""
-    elbow, wrist = positions[list(ARMS[side][2:])]
-    return elbow, wrist, wrist + HAND_LENGTH * (wrist - elbow)
 
 
 def _body_capsules(build, world, positions):
@@ -139,9 +132,9 @@ def _body_capsules(build, world, positions):
 
 def _arm_capsules(build, positions, side):
     """Upper arm, forearm and hand of one side."""
-    elbow, _, tip = _forearm(positions, side)
+    _, shoulder, elbow, wrist = (positions[joint] for joint in ARMS[side])
     radius = build.arm_radius + 0.01
-    return [(positions[ARMS[side][1]], elbow, radius), (elbow, tip, radius)]
+    return [(shoulder, elbow, radius), (elbow, wrist + HAND_LENGTH * (wrist - elbow), radius)]
 
 
 def _clearance(build, capsules, points):
@@ -154,50 +147,37 @@ def _clearance(build, capsules, points):
     return np.min(distances, axis=0) - build.arm_radius
 
 
-def _along(elbows, wrists, tips):
+def _along(elbows, wrists):
     """Points of the forearm and the hand that must not touch the body."""
+    tips = wrists + HAND_LENGTH * (wrists - elbows)
     return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]
 
 
 FINGERS = ((0, 1.0), (1, 0.15), (3, -1.2), (2, -0.6))
-"""Index, middle, pinky, ring, in the order of SMPL-X's joints: place in `Gesture.curl`, share of the spread; then the thumb."""
+"""Index, middle, pinky, ring, in the order of SMPL-X's joints: place among a gesture's curls, share of its spread."""
 BONE_SHARE = (0.85, 1.0, 0.7)
 """Share of a finger's curl at each knuckle, from the palm outwards."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Gesture:
-    """odds: of being drawn. curl: of index, middle, ring, pinky, radians a knuckle. spread: angle between fingers.
-
-    thumb: how far it lies across the palm, 0 beside it, 1 across.
-    """
-
-    odds: float
-    curl: tuple[float, float, float, float]
-    spread: float = 0.0
-    thumb: float = 0.2
-
-
 GESTURES = {
-    "relaxed": Gesture(0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25),
-    "flat": Gesture(0.15, (0.03, 0.03, 0.04, 0.05), 0.0, 0.05),
-    "spread": Gesture(0.1, (0.0, 0.0, 0.0, 0.0), 0.16, -0.3),
-    "fist": Gesture(0.12, (1.3, 1.35, 1.35, 1.35), 0.0, 1.0),
-    "point": Gesture(0.06, (0.02, 1.2, 1.3, 1.3), 0.0, 0.8),
-    "two": Gesture(0.03, (0.02, 0.02, 1.3, 1.3), 0.12, 0.9),
-    "thumb up": Gesture(0.03, (1.2, 1.3, 1.3, 1.3), 0.0, -0.4),
-    "hold": Gesture(0.11, (0.65, 0.7, 0.75, 0.8), 0.05, 0.6),
-}
+    "relaxed": (0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25), "flat": (0.15, (0.03, 0.03, 0.04, 0.05), 0.0, 0.05),
+    "spread": (0.1, (0.0, 0.0, 0.0, 0.0), 0.16, -0.3), "fist": (0.12, (1.3, 1.35, 1.35, 1.35), 0.0, 1.0),
+    "point": (0.06, (0.02, 1.2, 1.3, 1.3), 0.0, 0.8), "two": (0.03, (0.02, 0.02, 1.3, 1.3), 0.12, 0.9),
+    "thumb up": (0.03, (1.2, 1.3, 1.3, 1.3), 0.0, -0.4), "hold": (0.11, (0.65, 0.7, 0.75, 0.8), 0.05, 0.6),
+}  # fmt: skip
+"""Odds; curl of index, middle, ring and pinky, radians a knuckle; angle between fingers; how far the thumb lies across the palm,
+0 beside it, 1 across."""
 
 
 def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> None:
     """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a random gesture."""
     first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
-    goal = GESTURES[choice(rng, {name: gesture.odds for name, gesture in GESTURES.items()})]
-    start, t = GESTURES["relaxed"], rng.beta(2.5, 1.0)
-    mix = lambda a, b: (1 - t) * np.asarray(a) + t * np.asarray(b)
-    curls = mix(start.curl, goal.curl)
-    spread, thumb = mix(start.spread, goal.spread), mix(start.thumb, goal.thumb) + rng.normal(0, 0.08)
+    goal, t = choice(rng, {name: odds for name, (odds, *_) in GESTURES.items()}), rng.beta(2.5, 1.0)
+    blends = (
+        (1 - t) * np.asarray(a) + t * np.asarray(b) for a, b in zip(GESTURES["relaxed"], GESTURES[goal], strict=True)
+    )
+    _, curls, spread, thumb = blends
+    thumb = thumb + rng.normal(0, 0.08)
     for finger, (place, splay) in enumerate(FINGERS):
         curl = curls[place] * rng.uniform(0.85, 1.15) + rng.normal(0, 0.03)
         for bone, share in enumerate(BONE_SHARE):

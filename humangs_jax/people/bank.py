@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.progress import bar
@@ -129,27 +130,19 @@ def save_bank(path: str | Path, bank: PeopleBank) -> None:
 def load_bank(path: str | Path) -> PeopleBank:
     """Read a bank. Raises: FileNotFoundError; FileError if it holds no bank."""
     with reading(path, "bank of people"):
-        return _load_bank(path)
-
-
-def _load_bank(path):
-    arrays, _ = read_npz(path)
-    if str(arrays.get("format")) != FORMAT:
-        raise ValueError(f"{path}: not a bank of people")
-    if int(arrays["version"]) != VERSION:
-        raise ValueError(f"{path}: a bank of version {int(arrays['version'])}; this program reads version {VERSION}")
-    if missing := {*_ARRAYS, *_STATIC} - set(arrays):
-        raise ValueError(f"{path}: a bank without {sorted(missing)}")
-    _check_arrays(arrays)
-    split = str(arrays["split"])
-    _check_range(arrays["seeds"].tolist(), split, f"{path}: ")
-    return PeopleBank(
-        **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
-        parents=tuple(arrays["parents"].tolist()),
-        mirrored_joints=tuple(arrays["mirrored_joints"].tolist()),
-        split=split,
-        generator=int(arrays["generator"]),
-    )
+        arrays, _ = read_npz(path)
+        if str(arrays.get("format")) != FORMAT:
+            raise ValueError(f"{path}: not a bank of people")
+        if (version := int(arrays["version"])) != VERSION:
+            raise ValueError(f"{path}: a bank of version {version}; this program reads version {VERSION}")
+        if missing := {*_ARRAYS, *_STATIC} - set(arrays):
+            raise ValueError(f"{path}: a bank without {sorted(missing)}")
+        _check_arrays(arrays)
+        _check_range(arrays["seeds"].tolist(), str(arrays["split"]), f"{path}: ")
+        fields: dict[str, Any] = {name: jnp.asarray(arrays[name]) for name in _ARRAYS}
+        for name in ("parents", "mirrored_joints"):
+            fields[name] = tuple(arrays[name].tolist())
+        return PeopleBank(**fields, split=str(arrays["split"]), generator=int(arrays["generator"]))
 
 
 _STATIC = ("parents", "mirrored_joints", "split", "generator")
@@ -180,12 +173,7 @@ def _check_range(seeds, split, where=""):
             raise ValueError(f"{where}seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
 
 
-@functools.cache
-def _shipped_body():
-    """For processes of their own."""
-    from humangs_jax.body.library import load_body
-
-    return load_body()
+_shipped_body = functools.cache(load_body)
 
 
 def _person(seed, body=None, *, texture_size, pose_count):
@@ -195,8 +183,7 @@ def _person(seed, body=None, *, texture_size, pose_count):
     surface, atlas, materials = subject.surface, baked.atlas, subject.materials
     if len(materials) > MOST_MATERIALS or len(surface.vertices) > np.iinfo(np.uint16).max:
         raise ValueError(f"seed {seed}: {len(materials)} pieces, {len(surface.vertices)} vertices: too many")
-    uvs = atlas.uvs[atlas.faces]
-    uvs = np.round(UV_STEPS * np.stack([uvs[..., 0], 1 - uvs[..., 1]], -1)).astype(np.uint16)
+    u, v = np.moveaxis(atlas.uvs[atlas.faces], -1, 0)
     pad = lambda values, kind: np.pad(np.asarray(values), (0, MOST_MATERIALS - len(materials))).astype(kind)
     identities = [id(material) for material in materials]
     rotations = sample_poses(subject, pose_count)
@@ -211,7 +198,7 @@ def _person(seed, body=None, *, texture_size, pose_count):
         "joint_ids": joint_ids,
         "joint_weights": joint_weights.astype(np.float16),
         "faces": surface.faces.astype(np.uint16),
-        "uvs": uvs,
+        "uvs": np.round(UV_STEPS * np.stack([u, 1 - v], -1)).astype(np.uint16),
         "face_pieces": subject.face_materials.astype(np.uint8),
         "sheen": pad([material.sheen for material in materials], np.float32),
         "groups": pad([identities.index(i) for i in identities], np.uint8),

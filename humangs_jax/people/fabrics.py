@@ -15,7 +15,7 @@ import numpy as np
 from humangs_jax.core.array_types import Float
 from humangs_jax.people.anatomy import ARMHOLE, SAME_GIRTH, TRUNK_GIRTH, sewn_coordinates
 from humangs_jax.people.kinematics import Vector
-from humangs_jax.people.noise import Ripples, hashed, lattice
+from humangs_jax.people.noise import Ripples, choice, hashed, lattice
 from humangs_jax.people.surfaces import Field, Points
 
 SHOULDER_RIDGE = -0.02
@@ -70,10 +70,6 @@ class Material:
     wrinkles: float = 0.0
     sheen: float = 0.0
     draped: bool = False
-
-
-def _rgb(*values):
-    return np.asarray(values, np.float32)
 
 
 def colour(hue: float, saturation: float, value: float) -> Vector:
@@ -171,12 +167,9 @@ PATTERN_RULES = (
 
 def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabric:
     """A fabric that suits a kind of garment; with probability `plainness` in one dye or nearly so."""
-    if rng.random() < plainness:
-        pattern = str(rng.choice(["plain", "melange", "tweed"], p=[0.66, 0.2, 0.14]))
-    else:
-        names = [n for n in PATTERNS if PATTERNS[n][0] > 0]
-        odds = np.asarray([PATTERNS[n][0] for n in names])
-        pattern = str(rng.choice(names, p=odds / odds.sum()))
+    plain_ones = {"plain": 0.66, "melange": 0.2, "tweed": 0.14}
+    odds = plain_ones if rng.random() < plainness else {name: share for name, (share, _) in PATTERNS.items() if share}
+    pattern = choice(rng, odds)
     base = _dye(rng, kind)
     for kinds, usual, odds, kept in PATTERN_RULES:
         if kind in kinds and pattern not in kept and (odds == 1 or rng.random() < odds):
@@ -191,9 +184,6 @@ def _dye(rng, kind):
         if kind in kinds and rng.random() < share:
             return _colour_of(rng, ranges)
     return random_colour(rng)
-
-
-# Patterns: (points, random numbers, two dyes) -> colours (n, 3). ---------------------------------------------------------
 
 
 def _lines(x, period, width, shift=0.0):
@@ -252,7 +242,7 @@ def flowers(s, rng, base, other):
     r, a = np.sqrt(np.sum(d * d, -1)), np.arctan2(d[:, 1], d[:, 0]) + 6 * hashed(cell, seed + 2)
     petals = band(r, -1, period * (0.2 + 0.08 * np.cos(5 * a)), 0.002)
     dye = mix(other, third, (hashed(cell, seed + 3) > 0.5).astype(np.float32))
-    return mix(mix(base, dye, petals), _rgb(0.85, 0.75, 0.3), band(r, -1, period * 0.07, 0.002))
+    return mix(mix(base, dye, petals), np.asarray([0.85, 0.75, 0.3], np.float32), band(r, -1, period * 0.07, 0.002))
 
 
 def mottled(s, rng, base, other):
@@ -285,7 +275,7 @@ def denim(s, rng, base, _other):
         return result
     at = ((s.along + 0.72) / 0.03) ** 2 + (s.around / 0.05) ** 2
     frayed = band(at + 0.6 * _grain(s, 0.02, 0.004, seed + 2), -1, 0.8, 0.2)
-    return mix(result, _rgb(0.75, 0.74, 0.72), 0.8 * frayed * (s.cloth[:, 2] > 0))
+    return mix(result, np.asarray([0.75, 0.74, 0.72], np.float32), 0.8 * frayed * (s.cloth[:, 2] > 0))
 
 
 CAMOUFLAGES = np.asarray([
@@ -301,7 +291,7 @@ def camouflage(s, rng, _base, _other):
     """Torn blots of four colours, larger ones below smaller ones."""
     dyes = CAMOUFLAGES[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])]
     scale, seed = rng.uniform(0.045, 0.09), _seed(rng)
-    p = s.cloth[:, :3] / scale * _rgb(0.8, 1.4, 0.8)
+    p = s.cloth[:, :3] / scale * np.asarray([0.8, 1.4, 0.8], np.float32)
     warp = np.stack([lattice(2.3 * p + k, seed + k) for k in range(3)], -1) - 0.5
     result = np.broadcast_to(dyes[0], (len(p), 3))
     for k, level in ((1, 0.56), (2, 0.6), (3, 0.66)):

@@ -159,6 +159,10 @@ COAT_ENDS = {
     "coat": (-0.9, -0.6), "blazer": (-0.43, -0.38), "denim_jacket": (-0.34, -0.28), "puffer": (-0.42, -0.3),
     "vest": (-0.34, -0.27), "other": (-0.42, -0.31),
 }  # fmt: skip
+COAT_DETAILS = {
+    "jacket": {"collar", "pockets"}, "denim_jacket": {"collar", "pockets"}, "coat": {"pockets"}, "vest": {"pockets"},
+    "puffer": {"pockets"}, "hooded_jacket": {"hood"}, "blazer": {"lapels"},
+}  # fmt: skip
 SHAFTS = {
     "sneakers": OneOf((0.09, (0.11, 0.14)), (0.8, 0.2)), "flats": (0.068, 0.085), "sandals": 0.07,
     "ankle_boots": (0.13, 0.17), "boots": (0.24, 0.40),
@@ -244,22 +248,16 @@ def _skirt(rng, waist, tucked):
 
 
 def _pleats(rng, kind):
-    if kind == "pleated_skirt":
-        return {"pleats": float(rng.integers(14, 24)), "depth": rng.uniform(0.008, 0.014)}
-    return {"pleats": float(rng.integers(4, 10)), "depth": rng.uniform(0.004, 0.016)}
+    count, depth = ((14, 24), (0.008, 0.014)) if kind == "pleated_skirt" else ((4, 10), (0.004, 0.016))
+    return {"pleats": float(rng.integers(*count)), "depth": rng.uniform(*depth)}
 
 
 def _dress(rng, outer):
     kind = drawn(rng, {"short_dress": 4, "long_dress": 3, "shirt_dress": 1.5})
     end = rng.uniform(-1.14, -0.85) if kind == "long_dress" else rng.uniform(-0.78, -0.56)
-    sleeve = drawn(rng, OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25)))
+    sleeve = float(drawn(rng, OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25))))
     neck = "collar" if kind == "shirt_dress" else drawn(rng, {"crew": 1, "vee": 1.3, "scoop": 1.3})
-    sizes = {
-        "sleeve": float(sleeve),
-        "waist": rng.uniform(-0.235, -0.165),
-        "end": end,
-        "flare": rng.uniform(0.015, 0.17),
-    }
+    sizes = {"sleeve": sleeve, "waist": rng.uniform(-0.235, -0.165), "end": end, "flare": rng.uniform(0.015, 0.17)}
     sizes |= {"depth": rng.uniform(0.04, 0.1), "loose": 0.1 if outer else rng.uniform(0.0, 0.4), **_pleats(rng, kind)}
     details = {neck} | ({"sash"} if rng.random() < 0.35 else set())
     return [Garment(kind, sample_fabric(rng, kind, 0.3), sizes, frozenset(details))]
@@ -269,16 +267,13 @@ def _outer(rng, style, worn):
     kind = drawn(rng, style.coats)
     is_open = rng.random() < COAT_OPEN.get(kind, 0.75)
     bottom = row(rng, COAT_ENDS, kind)
-    details = {"open" if is_open else "closed"}
-    if kind in ("jacket", "denim_jacket", "coat", "vest", "puffer"):
-        details.add("pockets")
-    if (kind == "puffer" and rng.random() < 0.4) or kind == "hooded_jacket":
+    details = {"open" if is_open else "closed"} | COAT_DETAILS.get(kind, set())
+    if kind == "puffer" and rng.random() < 0.4:
         details.add("hood")
     if kind == "coat":
         details.add(drawn(rng, {"lapels": 2, "hood": 0.6, "collar": 1}))
         if not is_open and rng.random() < 0.4:
             details.add("sash")
-    details |= {"blazer": {"lapels"}, "jacket": {"collar"}, "denim_jacket": {"collar"}}.get(kind, set())
     sizes = {"sleeve": 0.2 if kind == "vest" else WRIST - rng.uniform(0.0, 0.035), "bottom": bottom}
     sizes |= {"gap": rng.uniform(0.012, 0.05) if is_open else -1.0, "spread": rng.uniform(0.05, 0.35)}
     sizes |= {"flare": rng.uniform(0.02, 0.1), "loose": rng.uniform(0.2, 1.0)}
@@ -344,8 +339,9 @@ def _extras(rng, style, male, years, worn):
     if eyes < 0.2 + 0.15 * (years > 50):
         put("glasses", 1.0, size=rng.uniform(0.85, 1.2), squareness=rng.uniform(2, 6), wire=rng.uniform(0.0011, 0.0028))
     elif eyes > style.no_sunglasses:
-        size, squareness, wire = rng.uniform(1.0, 1.3), rng.uniform(2, 5), rng.uniform(0.0015, 0.003)
-        put("sunglasses", 1.0, size=size, squareness=squareness, wire=wire)
+        put(
+            "sunglasses", 1.0, size=rng.uniform(1.0, 1.3), squareness=rng.uniform(2, 5), wire=rng.uniform(0.0015, 0.003)
+        )
     carried = rng.random()
     if carried < 0.09 and "headscarf" not in kinds:
         put("backpack", 0.7, size=rng.uniform(0.8, 1.15))

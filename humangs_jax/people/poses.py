@@ -24,7 +24,7 @@ class Stance:
     pelvis, left side up. lean: how far forward the trunk bends to keep the balance.
     """
 
-    feet: tuple[kin.Foot, kin.Foot]
+    feet: kin.Feet
     sink: float = 0.0
     tilt: float = 0.0
     roll: float = 0.0
@@ -49,12 +49,11 @@ def take_stance(build: kin.Build, rotations: kin.Rotations, heading: float, stan
     turn = kin.turned(y=heading) @ kin.turned(x=stance.tilt, z=stance.roll)
     rotations[kin.PELVIS] = kin.rotation_vector(turn)
     feet = in_world(stance.feet, build.leg, heading)
-    height = kin.highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg
-    pelvis = np.asarray([0.0, height, 0.0])
+    pelvis = np.asarray([0.0, kin.highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg, 0.0])
     return pelvis, kin.place_feet(build, rotations, pelvis, feet)
 
 
-def in_world(feet: tuple[kin.Foot, kin.Foot], leg: float, heading: float) -> tuple[kin.Foot, kin.Foot]:
+def in_world(feet: kin.Feet, leg: float, heading: float) -> kin.Feet:
     """The feet of a stance (lengths in legs, unturned) in metres, turned by the heading."""
     placed = []
     for foot in feet:
@@ -89,8 +88,7 @@ def _contrapposto(rng, width):
 
 def _stride(rng, width):
     feet, front = _pair(rng, 0.75 * width, spread=(-0.02, 0.03), turn_out=(-0.05, 0.2)), int(rng.integers(2))
-    length = rng.uniform(0.25, 0.85)
-    share = rng.uniform(0.35, 0.6)
+    length, share = rng.uniform(0.25, 0.85), rng.uniform(0.35, 0.6)
     feet[front] = dataclasses.replace(feet[front], z=0.08 + share * length, pitch=-rng.uniform(0, 0.3) * (length > 0.4))
     rear = rng.uniform(0.3, 0.7) * min(1.0, length / 0.5)
     feet[1 - front] = dataclasses.replace(feet[1 - front], z=0.08 - (1 - share) * length, pitch=rear)
@@ -157,12 +155,8 @@ STANCES: dict[str, tuple[float, Callable[[np.random.Generator, float], Stance]]]
 """Name -> probability, and a function of a generator and the distance of a hip from the middle in legs."""
 
 
-BOTH_ARMS = 0.45
-"""Share of people whose arms have the same goal."""
-ATTEMPTS = 3
-"""How many goals are tried for an arm that cannot keep clear of the body."""
-CLEAR = 0.0
-"""Least clearance of an accepted arm, metres."""
+BOTH_ARMS, ATTEMPTS = 0.45, 3
+"""Share of people whose arms have the same goal; how many goals are tried for an arm that cannot keep clear of the body."""
 
 
 def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotations:
@@ -175,7 +169,7 @@ def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotation
     for side in (0, 1):
         wanted = goal if both or side == 0 else draw_goal(rng)
         for _ in range(ATTEMPTS):
-            if bend_arm(rng, build, rotations, wanted, side, other_arm=side == 1) >= CLEAR:
+            if bend_arm(rng, build, rotations, wanted, side, other_arm=side == 1) >= 0:
                 break
             wanted = draw_goal(rng)
         pose_hand(rng, rotations, side)
