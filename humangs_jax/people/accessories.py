@@ -24,7 +24,7 @@ SIDEWAYS, UP, FORWARD = np.eye(3)
 def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float) -> list[tuple[Surface, Material]]:
     """Surfaces and materials of an accessory. ease: distance of the outermost layer from the trunk, metres."""
     kind, sizes, fabric = garment.kind, garment.sizes, garment.fabric
-    hat = functools.partial(hair.scalp_shell, rng, anatomy, line=hair.CAP_LINE, rim=0.011)
+    hat = functools.partial(hair.scalp_shell, rng, anatomy, hat=True)
     if kind in ("glasses", "sunglasses"):
         return glasses(anatomy, garment)
     if kind == "necklace":
@@ -234,39 +234,30 @@ def necklace(anatomy: Anatomy, length: float) -> Surface:
     return _followed(anatomy, path, UP, 0.0022, 6)
 
 
-def _bag(anatomy, center, half, turn, near):
-    """A rounded box with half axes (3,), turned about the vertical, that moves as the skin near it does on average."""
-    d, faces = surfaces.ball(14, 24)
-    unit_box = d / (np.sum(np.abs(d) ** 4.0, -1, keepdims=True) ** (1 / 4.0))
-    points = unit_box * np.asarray(half)
-    c, s = np.cos(turn), np.sin(turn)
+def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
+    """A rounded box on the back, or a flat one at the hip, that moves as the skin near it does on average."""
+    x, y, z = anatomy.skin.attributes["template"].T
+    size = garment.sizes["size"]
+    if garment.kind == "backpack":
+        near = (np.abs(x) < 0.1) & (y > -0.2) & (y < 0.08) & (z < -0.05)
+        half, turn = np.asarray([0.145, 0.21, 0.075]) * size, np.pi
+        height = float(tailoring.rest_height(anatomy, np.asarray([0.10]))[0]) - half[1]
+        behind = anatomy.trunk.radius(height + np.linspace(-0.6, 0.8, 9) * half[1], np.full(9, np.pi)).max()
+        center = np.asarray([0, height, -behind - ease - half[2] - 0.004])
+    else:
+        side = garment.sizes["side"]
+        near = (x * side > 0.1) & (x * side < 0.24) & (np.abs(y + 0.22) < 0.05)
+        half, turn = np.asarray([0.15, 0.11, 0.05]) * size, side * 1.75
+        height = float(tailoring.rest_height(anatomy, np.asarray([-0.29]))[0]) - 0.75 * half[1]
+        around = anatomy.hips_and_legs.radius(height + np.linspace(-0.3, 1, 7) * half[1], np.full(7, turn))
+        reach = around.mean() + ease + half[2] + 0.008
+        center = np.asarray([reach * np.sin(turn), height, reach * np.cos(turn)])
+    directions, faces = surfaces.ball(14, 24)
+    unit_box = directions / (np.sum(np.abs(directions) ** 4.0, -1, keepdims=True) ** (1 / 4.0))
+    points, c, s = unit_box * half, np.cos(turn), np.sin(turn)
     vertices = (points @ np.asarray([[c, 0, -s], [0, 1, 0], [s, 0, c]]) + center).astype(np.float32)
     weights = np.repeat(anatomy.skin.weights[near].mean(0, keepdims=True), len(vertices), 0)
     return Surface(vertices, faces, weights).painted(unit_box, points, 0.15)
-
-
-def backpack(anatomy: Anatomy, size: float, ease: float) -> Surface:
-    """A rounded box on the back."""
-    template = anatomy.skin.attributes["template"]
-    near = (np.abs(template[:, 0]) < 0.1) & (template[:, 1] > -0.2) & (template[:, 1] < 0.08) & (template[:, 2] < -0.05)
-    half = np.asarray([0.145, 0.21, 0.075]) * size
-    y = float(tailoring.rest_height(anatomy, np.asarray([0.10]))[0]) - half[1]
-    levels = y + np.linspace(-0.6, 0.8, 9) * half[1]
-    behind = anatomy.trunk.radius(levels, np.full(9, np.pi)).max()
-    return _bag(anatomy, np.asarray([0, y, -behind - ease - half[2] - 0.004]), half, np.pi, np.flatnonzero(near))
-
-
-def shoulder_bag(anatomy: Anatomy, size: float, side: float, ease: float) -> Surface:
-    """A flat rounded box at the hip."""
-    template = anatomy.skin.attributes["template"]
-    near = (template[:, 0] * side > 0.1) & (template[:, 0] * side < 0.24) & (np.abs(template[:, 1] + 0.22) < 0.05)
-    half = np.asarray([0.15, 0.11, 0.05]) * size
-    y = float(tailoring.rest_height(anatomy, np.asarray([-0.29]))[0]) - 0.75 * half[1]
-    angle = side * 1.75
-    levels = y + np.linspace(-0.3, 1, 7) * half[1]
-    reach = anatomy.hips_and_legs.radius(levels, np.full(7, angle)).mean() + ease + half[2] + 0.008
-    center = np.asarray([reach * np.sin(angle), y, reach * np.cos(angle)])
-    return _bag(anatomy, center, half, angle, np.flatnonzero(near))
 
 
 def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> Surface:

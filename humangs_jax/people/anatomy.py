@@ -10,11 +10,10 @@ import functools
 import numpy as np
 
 from humangs_jax.people.kinematics import LEFT_ANKLE, LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER, LEFT_WRIST
-from humangs_jax.people.surfaces import Outlines, Surface, blurred, outlines, vertex_normals
+from humangs_jax.people.surfaces import Faces, Outlines, Points, Surface, blurred, outlines, vertex_normals
 
 BODY_NAME, BODY_VERTICES = "makehuman", 13380
 """The body that the cuts below were measured on."""
-
 WAIST, CROTCH, ANKLE, FLOOR = -0.2, -0.425, -1.159, -1.2285
 ARM_HEIGHT, SHOULDER, WRIST = 0.096, 0.171, 0.651
 """Heights (y) of the trunk and legs, and distances from the middle (|x|) of the arms, in template coordinates."""
@@ -101,14 +100,14 @@ def _fixed(template_bytes: bytes):
 
 
 def measure(
-    vertices: np.ndarray, joints: np.ndarray, template: np.ndarray, faces: np.ndarray, weights: np.ndarray, parents
-):
+    vertices: Points, joints: np.ndarray, template: Points, faces: Faces, weights: np.ndarray, parents: tuple
+) -> Anatomy:
     """The `Anatomy` of a shaped body from its rest vertices (n, 3) and joints (j, 3)."""
     template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
     vertices = np.asarray(vertices, np.float32)
     attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}
     skin = Surface(vertices, faces, weights, attributes)
-    levels = np.arange(-1.3, 0.5, 0.02) * 1.0
+    levels, along = np.arange(-1.3, 0.5, 0.02), np.arange(0.05, 0.8, 0.02)
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)
     trunk_points = vertices[body & (template[:, 1] > -0.6)]
     spine = np.zeros((len(levels), 2))
@@ -116,12 +115,11 @@ def measure(
     lower = vertices[body & (template[:, 1] < WAIST + 0.03)]
     hips = outlines(lower[:, 1], lower[:, [0, 2]], levels, spine, 0.025)
     legs, arms = [], []
-    for side, offset in ((1, 0), (-1, 1)):
+    for offset, side in enumerate((1, -1)):
         line = joints[[LEFT_ANKLE + offset, LEFT_KNEE + offset, LEFT_HIP + offset]]
         centers = np.stack([np.interp(levels, line[:, 1], line[:, i]) for i in (0, 2)], -1)
         own = vertices[(template[:, 0] * side > 0.004) & (template[:, 1] < CROTCH + 0.1) & (template[:, 1] > -1.15)]
         legs.append(blurred(outlines(own[:, 1], own[:, [0, 2]], levels, centers, 0.025)))
-        along = np.arange(0.05, 0.8, 0.02)
         line = joints[[LEFT_SHOULDER + offset, LEFT_WRIST + offset]]
         centers = np.stack([np.interp(along, np.abs(line[:, 0]), line[:, i]) for i in (1, 2)], -1)
         own = vertices[(template[:, 0] * side > 0.2) & (template[:, 1] > -0.05) & (np.abs(template[:, 0]) < 0.68)]

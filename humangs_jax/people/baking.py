@@ -49,9 +49,14 @@ class BakedSubject:
 def bake_subject(subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1) -> BakedSubject:
     """The textures of a subject, texture_size texels a side, each the mean of samples x samples points.
 
+    No chart of the atlas is across two materials; faces (of people) are in finer detail.
     Raises: ValueError if the size is no multiple of the packing's `atlas.CELLS`.
     """
-    atlas = unwrap_subject(subject, texture_size)
+    surface, pieces = subject.surface, subject.face_materials
+    strongest = np.argmax(surface.weights[surface.faces[:, 0]], axis=1)
+    face = np.isin(strongest, HEAD_JOINTS) & np.isin(pieces, SKIN_AND_EYES)
+    density = np.where(face, FACE_DENSITY, 1.0).astype(np.float32)
+    atlas = unwrap(surface.vertices, surface.faces, 2 * pieces + face, texture_size, density)
     ids, weights = texels(dataclasses.replace(atlas, size=texture_size * samples))
     covered = ids >= 0
     albedo, slopes = paint(subject, ids[covered], spots_at(subject, ids[covered], weights[covered]))
@@ -61,15 +66,6 @@ def bake_subject(subject: SyntheticSubject, texture_size: int = 1024, samples: i
     filled = fill_gaps(sums[..., :6] / np.maximum(sums[..., 6:], 1), sums[..., 6] > 0)
     albedo, slopes = 255 * np.clip(filled[..., :3], 0, 1), np.clip(filled[..., 3:] / SLOPE_STEP, -127, 127)
     return BakedSubject(atlas, np.round(albedo).astype(np.uint8), np.round(SLOPE_ZERO + slopes).astype(np.uint8))
-
-
-def unwrap_subject(subject: SyntheticSubject, size: int) -> Atlas:
-    """The atlas of a subject: no chart across two materials; faces (of people) in finer detail."""
-    surface = subject.surface
-    strongest = np.argmax(surface.weights[surface.faces[:, 0]], axis=1)
-    face = np.isin(strongest, HEAD_JOINTS) & np.isin(subject.face_materials, SKIN_AND_EYES)
-    density = np.where(face, FACE_DENSITY, 1.0).astype(np.float32)
-    return unwrap(surface.vertices, surface.faces, 2 * subject.face_materials + face, size, density)
 
 
 def strongest_joints(weights: Float[np.ndarray, "n j"], count: int) -> tuple[np.ndarray, np.ndarray]:

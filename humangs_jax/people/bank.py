@@ -4,9 +4,7 @@ A bank holds people of ONE range of seeds (see `seeds`), so no key of a training
 3 MB a person at 512 texels a side.
 """
 
-import concurrent.futures
 import functools
-import multiprocessing
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +17,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.core.signals import started_deaf
-from humangs_jax.core.workers import end_with_parent
+from humangs_jax.core.workers import in_processes
 from humangs_jax.io.arrays import check_array, check_indices, check_joints
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import Refused, reading
@@ -28,7 +25,7 @@ from humangs_jax.people.baking import JOINTS_PER_VERTEX, bake_subject, strongest
 from humangs_jax.people.kinematics import joint_positions
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.seeds import GENERATOR_VERSION, split_of
-from humangs_jax.people.subject import SyntheticSubject, make_subject
+from humangs_jax.people.subject import make_subject
 from humangs_jax.people.surfaces import vertex_normals
 
 FORMAT, VERSION = "humangs-people", 1
@@ -101,7 +98,7 @@ def build_bank(
     """The people of some seeds, which must all lie in the range `split` of `seeds.SPLITS`.
 
     texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 those of 512.
-    processes: how many work at once; with more than one, each loads the shipped body itself.
+    processes: how many work at once; more than one use the CPU and load the shipped body themselves.
     Raises: ValueError if there are no seeds, a seed lies in another range, or the body is not the package's own.
     """
     seeds = list(seeds)
@@ -109,16 +106,12 @@ def build_bank(
         raise ValueError("no seeds")
     _check_range(seeds, split)
     make = functools.partial(_person, texture_size=texture_size, pose_count=pose_count)
-    shown = functools.partial(bar, total=len(seeds), desc="bank", shown=progress)
     if processes == 1:
-        people = list(shown(make(seed, body) for seed in seeds))
+        made = ((i, make(seed, body)) for i, seed in enumerate(seeds))
     else:
-        context = multiprocessing.get_context("spawn")  # a forked process may hang in jax's threads
-        with concurrent.futures.ProcessPoolExecutor(processes, context, end_with_parent) as pool:
-            with started_deaf():
-                made = pool.map(make, seeds)
-            people = list(shown(made))
-    return _stacked(people, body, split)
+        made = in_processes(make, {i: (seed,) for i, seed in enumerate(seeds)}, processes, _shipped_body)
+    people = dict(bar(made, total=len(seeds), desc="bank", shown=progress))
+    return _stacked([people[i] for i in range(len(seeds))], body, split)
 
 
 def save_bank(path: str | Path, bank: PeopleBank) -> None:
@@ -173,7 +166,9 @@ def _check_range(seeds, split, where=""):
             raise ValueError(f"{where}seed {seed} belongs to the range '{split_of(seed)}', not to '{split}'")
 
 
-_shipped_body = functools.cache(load_body)
+@functools.cache
+def _shipped_body():
+    return load_body()
 
 
 def _person(seed, body=None, *, texture_size, pose_count):
@@ -186,7 +181,8 @@ def _person(seed, body=None, *, texture_size, pose_count):
     u, v = np.moveaxis(atlas.uvs[atlas.faces], -1, 0)
     pad = lambda values, kind: np.pad(np.asarray(values), (0, MOST_MATERIALS - len(materials))).astype(kind)
     identities = [id(material) for material in materials]
-    rotations = sample_poses(subject, pose_count)
+    generators = (np.random.default_rng([seed, POSE_STREAM, i]) for i in range(pose_count))
+    rotations = np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(np.float32)
     joint_ids, joint_weights = strongest_joints(surface.weights, JOINTS_PER_VERTEX)
     return {
         "seeds": np.int32(seed),
@@ -207,12 +203,6 @@ def _person(seed, body=None, *, texture_size, pose_count):
         "rotations": rotations,
         "nearest": _nearest(subject.build, rotations),
     }
-
-
-def sample_poses(subject: SyntheticSubject, count: int) -> Float[np.ndarray, "q j 3"]:
-    """(q, j, 3) poses of a subject by the prior."""
-    generators = (np.random.default_rng([subject.seed, POSE_STREAM, i]) for i in range(count))
-    return np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(np.float32)
 
 
 def _nearest(build, rotations):

@@ -28,6 +28,7 @@ POINT_STEP = 4096
 CAMERA_NUMBERS = 5
 UP = (0.0, 1.0, 0.0)
 Angles = Float[np.ndarray, " v"]
+Number = Float[Array, ""] | float
 
 
 def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
@@ -85,28 +86,28 @@ def camera_from(
     u: Float[Array, "5"],
     vertices: Float[Array, "n 3"],
     count: Int[Array, ""] | int,
-    azimuth: Float[Array, ""],
-    close_share: Float[Array, ""] | float,
+    azimuth: Number,
+    close: Number,
     size: int,
 ) -> Camera:
     """A square camera of `size` pixels that looks at a posed person from an azimuth.
 
-    u: in [0, 1). count: vertices that are no padding. close_share: probability of a close camera; others see all of the person.
+    u: in [0, 1). count: vertices that are no padding. close: probability of a close camera; others see all of the person.
     """
     is_close, tilt, spread, outwards, place = u
     low, high = vertices.min(0), vertices.max(0)
     center = 0.5 * (low + high)
     radius = jnp.sqrt(jnp.max(jnp.sum((vertices - center) ** 2, -1)))
-    close = is_close < close_share
+    near = is_close < close
     elevation = _within(ELEVATION, tilt)
-    factor = jnp.where(close, _within(CLOSE_FACTOR, spread), _within(DISTANCE_FACTOR, spread))
+    factor = jnp.where(near, _within(CLOSE_FACTOR, spread), _within(DISTANCE_FACTOR, spread))
     towards_vertex = vertices[pick(place, count)] - center
-    target = center + jnp.where(close, CLOSE_SPREAD * outwards, 0.0) * towards_vertex
+    target = center + jnp.where(near, CLOSE_SPREAD * outwards, 0.0) * towards_vertex
     along = _along_axes(vertices - target, azimuth, elevation)
     ahead, above, aside = along
     beside = CLEARANCE**2 - (above * above + aside * aside)  # a camera on its axis comes no nearer than that to a point
     clear = jnp.max(jnp.where(beside > 0, ahead + jnp.sqrt(jnp.maximum(beside, 0)), -jnp.inf))
-    distance = jnp.maximum(factor * radius, jnp.where(close, clear, _nearest_distance(*along)))
+    distance = jnp.maximum(factor * radius, jnp.where(near, clear, _nearest_distance(*along)))
     K = intrinsics_from_fov(VERTICAL_FOV, size, size).astype(vertices.dtype)
     eye = target + distance * _axes(azimuth, elevation)[0]
     return look_at(eye, target, jnp.asarray(UP, vertices.dtype), K, size, size)

@@ -61,10 +61,7 @@ class Spots:
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """albedo: Spots -> (n, 3). wrinkles: strength of the creases painted into the normals. sheen: soft highlight in [0, 1].
-
-    draped: creases run down (skirts).
-    """
+    """albedo: Spots -> (n, 3). wrinkles: of the normals, strength; draped: they run down. sheen: soft highlight in [0, 1]."""
 
     albedo: Callable[[Spots], np.ndarray]
     wrinkles: float = 0.0
@@ -135,11 +132,9 @@ class Fabric:
 
 LEATHER_SHOES = ("flats", "sandals", "ankle_boots", "boots")
 USUAL = {
-    "denim": ((0.57, 0.63), (0.3, 0.75), (0.12, 0.6)),
-    "cotton": ((0.06, 0.13), (0.15, 0.5), (0.2, 0.75)),
-    "leather": ((0.05, 0.09), (0.2, 0.7), (0.06, 0.4)),
-    "suit": ((0.58, 0.68), (0.05, 0.35), (0.06, 0.4)),
-}
+    "denim": ((0.57, 0.63), (0.3, 0.75), (0.12, 0.6)), "cotton": ((0.06, 0.13), (0.15, 0.5), (0.2, 0.75)),
+    "leather": ((0.05, 0.09), (0.2, 0.7), (0.06, 0.4)), "suit": ((0.58, 0.68), (0.05, 0.35), (0.06, 0.4)),
+}  # fmt: skip
 """Hue, saturation and value of usual cloths."""
 CLOTHS = {
     "jeans": ("denim", 0.85), "denim_jacket": ("denim", 0.9), "chinos": ("cotton", 0.6), "cargo": ("cotton", 0.65),
@@ -212,15 +207,11 @@ def stripes(s, rng, base, other, upright=False):
 
 
 def checks(s, rng, base, other):
-    """Gingham or tartan."""
-    period = rng.choice([0.03, 0.05, 0.08])
-    third, thin = accent(rng, base), rng.random() < 0.6
-    across, along = (_lines(x, period, period / 2) for x in (s.around, s.along))
-    result = mix(base, other, 0.5 * (across + along))
-    if not thin:
-        return result
-    lines = np.maximum(*(_lines(x, period, 0.004, 0.25) for x in (s.around, s.along)))
-    return mix(result, third, 0.7 * lines)
+    """Gingham, or tartan with thin lines of a third dye."""
+    period, third, tartan = rng.choice([0.03, 0.05, 0.08]), accent(rng, base), rng.random() < 0.6
+    result = mix(base, other, 0.5 * (_lines(s.around, period, period / 2) + _lines(s.along, period, period / 2)))
+    lines = np.maximum(_lines(s.around, period, 0.004, 0.25), _lines(s.along, period, 0.004, 0.25))
+    return mix(result, third, 0.7 * lines) if tartan else result
 
 
 def dots(s, rng, base, other):
@@ -257,7 +248,7 @@ def mottled(s, rng, base, other):
 
 
 def melange(s, rng, base, other):
-    """Knit or tweed: fine grain."""
+    """Knit: fine grain."""
     seed, share = _seed(rng), rng.uniform(0.2, 0.5)
     return mix(base, other, share * _grain(s, 0.006, 0.009, seed))
 

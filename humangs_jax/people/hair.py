@@ -26,6 +26,8 @@ CUTS = {
 NOT_UNDER_HEADWEAR = ("curly", "afro", "quiff", "bun")
 """Cuts that no headwear fits over."""
 LONG_CUTS = ("bob", "long")
+SHELLS = {"curly": (0.3, 0.035, 0), "afro": (0.1, 0.05, 0), "quiff": (0.2, 0.05, 1), "short": (0.22, 0.035, 1)}
+"""Of hair on the scalp: height of its bumps as a share of the thickness, their width in metres, 1 if it is parted."""
 TAILS = {"ponytail": ((0.2, 0.38), 0.0), "braid": ((0.28, 0.42), 0.028)}
 """Range of their lengths; distance of the knots, metres."""
 FRINGES = {"straight": 0.28, "parted": 0.34, "side": 0.38}
@@ -107,20 +109,15 @@ FRINGE_LINES = {
 
 def style(rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: float = 0.0) -> list[Surface]:
     """The surfaces of a haircut, beard included, over clothes that are `over` metres from the skin."""
-    kind, thick, shift = haircut.cut, haircut.thickness, haircut.receding
-    parts = []
+    kind, parts = haircut.cut, []
     if kind in LONG_CUTS:
-        opening = fringe(rng, haircut)
-        parts.append(falling_tube(rng, anatomy, thick, haircut.bottom, opening, wave=haircut.wave, over=over))
-    elif kind in ("curly", "afro"):
-        bumps, size = (0.3, 0.035) if kind == "curly" else (0.1, 0.05)
-        parts.append(scalp_shell(rng, anatomy, thick, bumps, bump_size=size, shift=shift))
-    elif kind == "quiff":
-        up = rng.uniform(0.012, 0.026)
-        parts.append(scalp_shell(rng, anatomy, thick, 0.2, quiff=up, side=haircut.side, shift=shift))
+        opening, wave = fringe(rng, haircut), haircut.wave
+        parts.append(falling_tube(rng, anatomy, haircut.thickness, haircut.bottom, opening, wave=wave, over=over))
     elif kind not in ("buzz", "bald"):
-        bumps = 0.22 if kind == "short" else 0.12
-        parts.append(scalp_shell(rng, anatomy, thick, bumps, bump_size=0.035, side=haircut.side, shift=shift))
+        bumps, size, parted = SHELLS.get(kind, (0.12, 0.035, 1))
+        quiff = rng.uniform(0.012, 0.026) if kind == "quiff" else 0.0
+        look = {"bump_size": size, "quiff": quiff, "side": haircut.side * parted, "shift": haircut.receding}
+        parts.append(scalp_shell(rng, anatomy, haircut.thickness, bumps, **look))
     if kind in TAILS:
         length, knots = TAILS[kind]
         parts.append(tail(rng, anatomy, rng.uniform(*length), knots))
@@ -166,22 +163,21 @@ def scalp_shell(
     anatomy: Anatomy,
     thickness: float,
     bumps: float,
-    line: tuple = SHORT_LINE,
-    shift: float = 0.0,
-    crown: float = 0.0,
-    bump_size: float = 0.05,
-    quiff: float = 0.0,
-    side: float = 0.0,
-    rim: float = 0.0025,
+    hat=False,
+    shift=0.0,
+    crown=0.0,
+    bump_size=0.05,
+    quiff=0.0,
+    side=0.0,
 ) -> Surface:
     """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the hairline.
 
     bumps: share of the thickness, `bump_size` metres wide. crown, quiff: metres that the top and the front rise above that.
-    side: +1 or -1 for a parting on that side of the head, 0 for none. rim: metres that its edge stands off.
+    side: +1 or -1 for a parting on that side of the head, 0 for none. hat: with a straight edge that stands off.
     """
     template = anatomy.skin.attributes["template"]
-    above = above_line(template, line, shift)
-    if line is SHORT_LINE:
+    above, rim = above_line(template, CAP_LINE if hat else SHORT_LINE, shift), 0.011 if hat else 0.0025
+    if not hat:
         above = above + 0.0035 * ripples(rng, template, 0.018) * (np.abs(template[:, 0]) < 0.07)
     surface = cut(anatomy.skin.with_attributes(above=above), above)
     normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 8))
@@ -207,9 +203,9 @@ def falling_tube(
     thickness: float,
     bottom: float,
     opening: Opening,
-    wave: float = 0.004,
+    wave=0.004,
     ends: float | None = None,
-    over: float = 0.0,
+    over=0.0,
 ) -> Surface:
     """Long hair, a hood or a headscarf: the skull's outline scaled up, then falling to the height `bottom` at the back.
 

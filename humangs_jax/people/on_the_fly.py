@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 
 from humangs_jax.body.skinning import joint_transforms
-from humangs_jax.core.array_types import Array, Float, Int, Key, UInt8
+from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.configuration import knob
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace
@@ -131,7 +131,9 @@ def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: OnTheFlyConf
     """Who, in which poses, colours and light; numbers in [0, 1) by name."""
     person = pick(numbers["person"], bank.people)
     faces = bank.faces[person].astype(jnp.int32)
-    rotations = jax.vmap(lambda u: rotations_from(u, bank, person))(numbers["poses"])
+    which = pick(numbers["poses"][:, 0], bank.rotations.shape[1])
+    poses, nearest = bank.rotations[person, which], bank.rotations[person, bank.nearest[person, which]]
+    rotations = quaternion.interpolate(poses, nearest, MIXING * numbers["poses"][:, 1:])
     dyes = shading.dyes_from(numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
     dyes = jnp.where(numbers["dyed"] < config.dyed_share, dyes, jnp.eye(3))
     lights = shading.lights_from(numbers["lights"])
@@ -146,20 +148,15 @@ def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: OnTheFlyConf
     return Scene(person, rotations, translations, vertices, corners, dyes, lights)
 
 
-def rotations_from(u: Float[Array, "2"], bank: PeopleBank, person: Int[Array, ""]) -> Float[Array, "j 3"]:
-    """(j, 3) rotation vectors of a pose of a person; u in [0, 1) says which and how far on the way to the next."""
-    pose = pick(u[0], bank.rotations.shape[1])
-    other = bank.nearest[person, pose]
-    return quaternion.interpolate(bank.rotations[person, pose], bank.rotations[person, other], MIXING * u[1])
-
-
 def pose_person(
     bank: PeopleBank, person: Int[Array, ""], rotations: Float[Array, "j 3"]
 ) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "3"]]:
     """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the translation (3,)."""
     nowhere = jnp.zeros(3, rotations.dtype)
     transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[:, :3].reshape(-1, 12)
-    blended = _blend(transforms, bank.joint_ids[person], bank.joint_weights[person].astype(rotations.dtype))
+    ids, weights = bank.joint_ids[person].astype(jnp.int32), bank.joint_weights[person].astype(rotations.dtype)
+    weights = weights / weights.sum(-1, keepdims=True)  # they are stored in few bits
+    blended = sum(weights[:, i : i + 1] * transforms[ids[:, i]] for i in range(ids.shape[1]))
     x, y, z = jnp.split(bank.vertices[person], 3, axis=-1)
     nx, ny, nz = jnp.split(bank.normals[person].astype(rotations.dtype), 3, axis=-1)
     # written out: matrix products are of low precision on GPU and TPU
@@ -167,12 +164,6 @@ def pose_person(
     normals = blended[:, 0::4] * nx + blended[:, 1::4] * ny + blended[:, 2::4] * nz
     translation = nowhere.at[1].set(-vertices[:, 1].min())
     return vertices + translation, normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9), translation
-
-
-def _blend(transforms: Float[Array, "j 12"], ids: UInt8[Array, "n k"], weights: Float[Array, "n k"]):
-    """(n, 12) rows of the vertices' blended transforms. Weights are stored in few bits: their sum is made 1 again."""
-    weights = weights / weights.sum(-1, keepdims=True)
-    return sum(weights[:, i : i + 1] * transforms[ids[:, i].astype(jnp.int32)] for i in range(ids.shape[1]))
 
 
 def _plans(numbers, config):

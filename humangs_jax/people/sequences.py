@@ -12,9 +12,8 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.people import kinematics as kin
-from humangs_jax.people.arms import ARMS, arm_clearance, bend_arm, draw_goal, pose_hand
 from humangs_jax.people.noise import choice
-from humangs_jax.people.poses import STANCES, bend_trunk, in_world
+from humangs_jax.people.poses import ARMS, STANCES, arm_clearance, bend_arm, bend_trunk, draw_goal, in_world, pose_hand
 
 FPS, LONG_STEP = 30.0, 0.75
 """Frames a second; a long step in lengths of a leg."""

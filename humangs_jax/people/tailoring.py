@@ -200,7 +200,7 @@ def _drape(rng, anatomy, surface, fit):
         points = _push(points, (1, 2), along, outline, arm * (sign * points[:, 0] > 0), *wider)
         if not fit.skirted:
             shape = anatomy.legs[side]
-            inner = shape.with_radii(np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii))
+            inner = dataclasses.replace(shape, radii=np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii))
             wider = fit.ease, fit.leg * np.clip((-0.45 - points[:, 1]) / 0.65, 0, 1)
             own = leg * (sign * points[:, 0] > 0)
             points = _push(points, (0, 2), points[:, 1], hanging(inner, fit.leg_hang), own, *wider)
@@ -262,24 +262,14 @@ def _push(points, across, along, outline, amount, ease, extra):
 
 
 def skirt(
-    rng: np.random.Generator,
-    anatomy: Anatomy,
-    top: float,
-    bottom: float,
-    ease: float,
-    flare: float,
-    pleats: int,
-    pleat_depth: float,
-    *,
-    gap: float = -1.0,
-    spread: float = 0.0,
-    cling: float = 0.0,
+    rng, anatomy: Anatomy, heights: tuple, ease: float, flare: float, pleats: tuple, gap=-1.0, spread=0.0, cling=0.0
 ) -> Surface:
-    """A tube around the hips and both legs between two template heights, `ease` metres wider than they are.
+    """A tube around the hips and both legs between two template heights (top, bottom), `ease` metres wider than they are.
 
-    flare: metres added per metre further down. pleats: their number. gap: half width of an opening in front, metres, negative
+    flare: metres added per metre further down. pleats: number, depth. gap: half width of an opening in front, metres, negative
     for none; it widens by `spread` metres per metre downwards. cling: metres from the top over which it does not flare.
     """
+    top, bottom = heights
     rows = max(3, int(np.ceil((top - bottom) / TUBE_STEP)) + 1)
     template_y, angle, faces = surfaces.tube(np.linspace(top, bottom, rows), surfaces.circle(TUBE_COLUMNS))
     height, drop = rest_height(anatomy, template_y), top - template_y
@@ -289,7 +279,7 @@ def skirt(
     radius = radius - UNDER_A_HEM * np.clip(1 - below / 0.06, 0, 1) * (cling > 0)
     waves = ripples(rng, surfaces.around(1, angle, 0.3 * height), wavelength=0.9)
     loose = np.clip(below / 0.25, 0, 1) * (drop / max(top - bottom, 1e-6)) ** 0.5
-    radius = radius + loose * (pleat_depth * np.cos(pleats * angle) + 0.012 * (1 + 4 * flare) * waves)
+    radius = radius + loose * (pleats[1] * np.cos(pleats[0] * angle) + 0.012 * (1 + 4 * flare) * waves)
     vertices = surfaces.around(radius, angle, height).astype(np.float32)
     template = surfaces.around(0.16, angle, template_y, (0, 0.02))
     surface = Surface(vertices, faces, _skirt_weights(anatomy, vertices, template_y))

@@ -160,7 +160,7 @@ def _outer(rng, outfit, garment):
     _bodice(rng, outfit, garment, neck, 0.09, low, fit, material, 0.03, opening)
     if long:
         width, flare = max(outfit.legs, ease) + 0.002, sizes["flare"]
-        tube = skirt(rng, outfit.anatomy, WAIST + 0.02, bottom, width, flare, 5, 0.008, gap=gap, spread=0.5 * spread)
+        tube = skirt(rng, outfit.anatomy, (WAIST + 0.02, bottom), width, flare, (5, 0.008), gap, 0.5 * spread)
         if gap < 0:
             outfit.hide(lambda t: tailoring.hips_and_legs(t, WAIST, bottom), 0.02)
         outfit.add(tube, dataclasses.replace(material, draped=True))
@@ -206,10 +206,10 @@ def _trousers(rng, outfit, garment):
 
 def _let_hang_over(outfit, margin):
     """An untucked top hides the last piece below it, except for a margin inside of the top's hem."""
-    trousers = outfit.pieces[-1]
-    template = trousers.surface.attributes["template"]
-    hidden = (template[:, 1] > outfit.lowest + margin) & (np.abs(template[:, 0]) < tailoring.TRUNK_HALF_WIDTH)
-    outfit.pieces[-1] = dataclasses.replace(trousers, hidden=trousers.hidden | hidden)
+    lower = outfit.pieces[-1]
+    x, y, _ = lower.surface.attributes["template"].T
+    hidden = (y > outfit.lowest + margin) & (np.abs(x) < tailoring.TRUNK_HALF_WIDTH)
+    outfit.pieces[-1] = dataclasses.replace(lower, hidden=lower.hidden | hidden)
 
 
 def _skirt(rng, outfit, garment):
@@ -219,7 +219,7 @@ def _skirt(rng, outfit, garment):
     cling = 0.0 if tucked else max(0.0, top - outfit.lowest + 0.02)  # as far as the top reaches
     stitches = sewn(garment, end + 0.02, seams=False)
     waistband = lambda s: trimmings.banded(stitches(s), s, garment.fabric.base * 0.8, top - 0.035, top)
-    surface = skirt(rng, outfit.anatomy, top, end, ease, *_hem_of(sizes), cling=cling)
+    surface = skirt(rng, outfit.anatomy, (top, end), ease, *_hem_of(sizes), cling=cling)
     outfit.hide(lambda t: tailoring.hips_and_legs(t, top, end), 0.0, tucked)
     outfit.add(surface, Material(waistband, wrinkles=0.35, sheen=0.05, draped=True))
     outfit.legs = ease + 0.02
@@ -229,7 +229,7 @@ def _skirt(rng, outfit, garment):
 
 def _hem_of(sizes):
     """Of a skirt: metres wider per metre down, so that the hem of a short one stands off as far as a long one's; pleats."""
-    return sizes["flare"] / max(0.3, -0.2 - sizes["end"]), int(sizes["pleats"]), sizes["depth"]
+    return sizes["flare"] / max(0.3, -0.2 - sizes["end"]), (int(sizes["pleats"]), sizes["depth"])
 
 
 def _dress(rng, outfit, garment):
@@ -239,7 +239,7 @@ def _dress(rng, outfit, garment):
     material = Material(sewn(garment, end + 0.02, seams=False), wrinkles=0.3, sheen=0.05)
     margin = HEM_MARGIN + 0.02 * sizes["loose"]
     _bodice(rng, outfit, garment, _neck(garment), sizes["depth"], waist - 0.02, fit, material, margin)
-    surface = skirt(rng, anatomy, waist, end, 0.010, *_hem_of(sizes))
+    surface = skirt(rng, anatomy, (waist, end), 0.010, *_hem_of(sizes))
     outfit.hide(lambda t: tailoring.hips_and_legs(t, waist + 0.03, end), 0.0)
     outfit.add(surface, dataclasses.replace(material, draped=True))
     outfit.legs = 0.03
@@ -299,19 +299,18 @@ def _watch(rng, outfit, garment):
 
 def _bag(rng, outfit, garment):
     """A backpack or a shoulder bag, and its straps, which lie on what is worn."""
-    size, anatomy = garment.sizes["size"], outfit.anatomy
-    bag = lambda s: trimmings.bagged(s, garment)
-    if garment.kind == "backpack":
-        surface, material, sheen = accessories.backpack(anatomy, size, outfit.trunk), Material(bag, 0.1), 0.0
-        straps = tailoring.straps(outfit.template, -0.16, -0.03)
+    on_back, colours = garment.kind == "backpack", lambda s: trimmings.bagged(s, garment)
+    if on_back:
+        ease, material, straps = outfit.trunk, Material(colours, 0.1), tailoring.straps(outfit.template, -0.16, -0.03)
     else:
-        side, outer = garment.sizes["side"], max(outfit.trunk, min(outfit.legs, 0.02))
-        surface, material, sheen = accessories.shoulder_bag(anatomy, size, side, outer), Material(bag, 0.0, 0.12), 0.12
+        side, ease = garment.sizes["side"], max(outfit.trunk, min(outfit.legs, 0.02))
+        material = Material(colours, 0.0, 0.12)
         straps = tailoring.sash(outfit.template, -side * 0.105, side * 0.165, 0.014)
+    surface = accessories.bag(outfit.anatomy, garment, ease)
     outfit.add(surface, material, layered=False)
     raised = outfit.trunk + 0.009 + 1.5 * outfit.fit.fold
     flat = {"ease": raised, "inner": raised - 0.002, "fold": 0.0, "hem": 0.006, "quilt": 0.0, "skirted": True}
-    strap = Material(garment.fabric.colours, sheen=sheen)
+    strap = Material(garment.fabric.colours, sheen=material.sheen)
     _strip(rng, outfit, straps, dataclasses.replace(outfit.fit, **flat), strap)
 
 

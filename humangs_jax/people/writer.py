@@ -10,7 +10,6 @@ out/SEED/depth/NAME.png, maps/NAME.exr    where asked for, see `rendering`; also
 
 import dataclasses
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +24,7 @@ from humangs_jax.core.workers import in_processes
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.motion import Motion, save_motion
-from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
 from humangs_jax.io.text import read_json, write_json
 from humangs_jax.people.baking import export_scan
@@ -102,9 +101,7 @@ def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = Non
     return Motion(jnp.asarray(rotations), jnp.asarray(translations), sequence.fps)
 
 
-def capture_views(
-    subject: SyntheticSubject, body: BodyModel, poses: list[PosedSubject], views: Sequence[View]
-) -> Capture:
+def capture_views(subject: SyntheticSubject, body: BodyModel, poses: list[PosedSubject], views: list[View]) -> Capture:
     """A capture of these views."""
     rendered = [render_view(poses[view.frame], view.camera) for view in views]
     images, masks = (np.stack(x) for x in zip(*rendered, strict=True))
@@ -112,7 +109,7 @@ def capture_views(
     return Capture(
         images=images,
         masks=masks,
-        cameras=jax.tree.map(lambda *leaves: jnp.stack(leaves), *[view.camera for view in views]),
+        cameras=stack_cameras([view.camera for view in views]),
         frames=np.asarray([view.frame for view in views], np.int32),
         body=body,
         betas=subject.betas,
@@ -129,8 +126,8 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
         posed = [sample_pose(subject, i) for i in range(layout.poses)]
     else:
         shown = np.linspace(0, layout.frames - 1, layout.poses).round().astype(int)
-        rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
-        posed = [pose_subject(subject, rotations[i], translations[i]) for i in shown]
+        moments = zip(np.asarray(motion.rotations)[shown], np.asarray(motion.translations)[shown], strict=True)
+        posed = [pose_subject(subject, *moment) for moment in moments]
     others = [posed[0], *(sample_pose(subject, layout.poses + i) for i in range(layout.novel_poses))]
     size = layout.image_size
     views = _views([seed, CAMERA_STREAM], cameras_around, layout.views, posed, size)
@@ -148,21 +145,6 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
             export_scan(subject, temporary / "scan", pose, lit=True, texture_size=layout.scan_texture)
 
     replace_folder(folder, write, mark="capture.json")
-
-
-def write_subject(
-    folder: str | Path,
-    seed: int,
-    *,
-    body: BodyModel,
-    image_size: int = 512,
-    input_views: int = 4,
-    held_out_views: int = 8,
-    novel_poses: int = 0,
-) -> None:
-    """`write_person` with photos of one pose: `input_views` of them, and in `held_out/` other views of it and other poses."""
-    layout = Layout(image_size, views=input_views, held_out_views=held_out_views, novel_poses=novel_poses)
-    write_person(folder, seed, body, layout)
 
 
 def write_set(
