@@ -156,7 +156,7 @@ def pose_person(
     transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[:, :3].reshape(-1, 12)
     ids, weights = bank.joint_ids[person].astype(jnp.int32), bank.joint_weights[person].astype(rotations.dtype)
     weights = weights / weights.sum(-1, keepdims=True)  # they are stored in few bits
-    blended = sum(weights[:, i : i + 1] * transforms[ids[:, i]] for i in range(ids.shape[1]))
+    blended = jnp.asarray(sum(weights[:, i : i + 1] * transforms[ids[:, i]] for i in range(ids.shape[1])))
     x, y, z = jnp.split(bank.vertices[person], 3, axis=-1)
     nx, ny, nz = jnp.split(bank.normals[person].astype(rotations.dtype), 3, axis=-1)
     # written out: matrix products are of low precision on GPU and TPU

@@ -138,14 +138,10 @@ MENS_NECKS = NECKS | {"other": {"crew": 6, "vee": 2, "scoop": 0}}
 PLAIN_TOPS = {"tee": 0.5, "sweater": 0.4, "turtleneck": 0.65, "hoodie": 0.65, "shirt": 0.35, "tank": 0.55}
 """How often tops are in one dye; the others: 0.35."""
 TOP_DETAILS = (
-    ("print", ("tee", "hoodie", "longsleeve", "tank"), 0.5),
-    ("number", ("jersey",), 1),
-    ("zip", ("hoodie",), 0.4),
-    ("hood_up", ("hoodie",), 0.18),
-    ("ribbed", ("sweater", "turtleneck", "hoodie", "longsleeve"), 1),
-    ("pocket", ("shirt", "polo", "blouse"), 0.5),
-    ("open", ("shirt",), 0.2),
-)
+    ("print", ("tee", "hoodie", "longsleeve", "tank"), 0.5), ("number", ("jersey",), 1), ("zip", ("hoodie",), 0.4),
+    ("hood_up", ("hoodie",), 0.18), ("ribbed", ("sweater", "turtleneck", "hoodie", "longsleeve"), 1),
+    ("pocket", ("shirt", "polo", "blouse"), 0.5), ("open", ("shirt",), 0.2),
+)  # fmt: skip
 """Feature, kinds that can have it, how often they do."""
 LEG_ENDS = {"shorts": (-0.77, -0.56), "cropped": (-1.1, -0.93), "other": (-1.172, -1.14)}
 LEG_WIDTHS = {
@@ -184,6 +180,11 @@ def sample_outfit(rng: np.random.Generator, male: bool, years: float) -> tuple[G
     return tuple(worn)
 
 
+def _made(rng, kind, plainness, details=(), **sizes):
+    """A garment in a random fabric."""
+    return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
+
+
 def _separates(rng, name, male, outer):
     style = STYLES[name]
     kind = drawn(rng, style.tops)
@@ -195,7 +196,7 @@ def _separates(rng, name, male, outer):
     lower = _skirt(rng, waist, tucked) if skirted else _trousers(rng, style, male, waist, tucked, top)
     if "open" in top.details:
         below = {"sleeve": rng.uniform(0.14, 0.36), "bottom": top.sizes["bottom"] + 0.012, "loose": 0.0, "depth": 0.05}
-        return [Garment("tee", sample_fabric(rng, "tee", 0.7), below, frozenset({"crew"})), lower, top]
+        return [_made(rng, "tee", 0.7, {"crew"}, **below), lower, top]
     return [top, lower]
 
 
@@ -218,9 +219,9 @@ def _top(rng, style, kind, male, waist, tucked, outer):
     if tucked:
         details.add("tucked")
     sleeve, loose = float(min(sleeve, WRIST - 0.01) if outer else sleeve), min(loose, 0.2) if outer or tucked else loose
-    sizes = {"sleeve": sleeve, "bottom": bottom, "loose": loose, "depth": rng.uniform(0.04, 0.095)}
     plainness = 0.55 if style == "formal" else PLAIN_TOPS.get(kind, 0.35)
-    return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
+    depth = rng.uniform(0.04, 0.095)
+    return _made(rng, kind, plainness, details, sleeve=sleeve, bottom=bottom, loose=loose, depth=depth)
 
 
 def _trousers(rng, style, male, waist, tucked, top):
@@ -236,7 +237,7 @@ def _trousers(rng, style, male, waist, tucked, top):
     if kind == "jeans" and rng.random() < 0.25:
         details.add("turn_up")
     sizes = {"top": upper, "end": end, "width": float(width), "loose": loose, "waist": waist, "tucked": float(tucked)}
-    return Garment(kind, sample_fabric(rng, kind, 0.75), sizes, frozenset(details))
+    return _made(rng, kind, 0.75, details, **sizes)
 
 
 def _skirt(rng, waist, tucked):
@@ -244,7 +245,7 @@ def _skirt(rng, waist, tucked):
     end = rng.uniform(-1.1, -0.84) if kind == "long_skirt" else rng.uniform(-0.76, -0.57)
     flare = rng.uniform(0.0, 0.05) if rng.random() < 0.35 and kind != "pleated_skirt" else rng.uniform(0.05, 0.16)
     sizes = {"top": waist, "end": end, "flare": flare, "waist": waist, "tucked": float(tucked), **_pleats(rng, kind)}
-    return Garment(kind, sample_fabric(rng, kind, 0.35), sizes)
+    return _made(rng, kind, 0.35, **sizes)
 
 
 def _pleats(rng, kind):
@@ -259,8 +260,7 @@ def _dress(rng, outer):
     neck = "collar" if kind == "shirt_dress" else drawn(rng, {"crew": 1, "vee": 1.3, "scoop": 1.3})
     sizes = {"sleeve": sleeve, "waist": rng.uniform(-0.235, -0.165), "end": end, "flare": rng.uniform(0.015, 0.17)}
     sizes |= {"depth": rng.uniform(0.04, 0.1), "loose": 0.1 if outer else rng.uniform(0.0, 0.4), **_pleats(rng, kind)}
-    details = {neck} | ({"sash"} if rng.random() < 0.35 else set())
-    return [Garment(kind, sample_fabric(rng, kind, 0.3), sizes, frozenset(details))]
+    return [_made(rng, kind, 0.3, [neck, "sash"] if rng.random() < 0.35 else [neck], **sizes)]
 
 
 def _outer(rng, style, worn):
@@ -279,11 +279,9 @@ def _outer(rng, style, worn):
     sizes |= {"flare": rng.uniform(0.02, 0.1), "loose": rng.uniform(0.2, 1.0)}
     if kind == "vest":
         sizes["sleeve"] = rng.uniform(0.145, 0.165)
-    fabric = sample_fabric(rng, kind, 0.9 if kind in ("blazer", "coat", "puffer") else 0.72)
-    trousers = next((g for g in worn if g.kind in ("chinos", "slim", "wide")), None)
-    if kind == "blazer" and trousers is not None and rng.random() < 0.55:
-        fabric = trousers.fabric  # a suit
-    return Garment(kind, fabric, sizes, frozenset(details))
+    coat = _made(rng, kind, 0.9 if kind in ("blazer", "coat", "puffer") else 0.72, details, **sizes)
+    suited = [g.fabric for g in worn if g.kind in ("chinos", "slim", "wide")] if kind == "blazer" else []
+    return dataclasses.replace(coat, fabric=suited[0]) if suited and rng.random() < 0.55 else coat
 
 
 def _shoes(rng, style, male, worn):
@@ -293,14 +291,12 @@ def _shoes(rng, style, male, worn):
     narrow = not covered or (lower.kind in ("slim", "leggings", "jeans") and lower.sizes["width"] <= 0.01)
     if kind == "boots" and (male or not narrow):
         kind = "ankle_boots"
-    height, sole = row(rng, SHAFTS, kind), row(rng, SOLES, kind)
+    height, sole = float(row(rng, SHAFTS, kind)), float(row(rng, SOLES, kind))
     result = []
     if kind in ("sneakers", "ankle_boots") and not covered and rng.random() < 0.75:
         tall = drawn(rng, OneOf(((0.1, 0.17), (0.2, 0.4)), (0.75, 0.25)))
-        result.append(Garment("socks", sample_fabric(rng, "socks", 0.7), {"height": max(float(tall), height + 0.02)}))
-    fabric = sample_fabric(rng, kind, 0.9)
-    sizes = {"height": float(height), "sole": float(sole), "over": float(kind == "boots")}
-    return [*result, Garment(kind, fabric, sizes)]
+        result.append(_made(rng, "socks", 0.7, height=max(float(tall), height + 0.02)))
+    return [*result, _made(rng, kind, 0.9, height=height, sole=sole, over=float(kind == "boots"))]
 
 
 def _fastened(rng, style, male, worn):
@@ -309,12 +305,11 @@ def _fastened(rng, style, male, worn):
     trousers = next((g for g in worn if g.kind in BOTTOMS), None)
     belted = trousers is not None and trousers.sizes["tucked"] and trousers.kind not in ("track", "leggings")
     if belted and rng.random() < 0.7:
-        sizes = {"top": trousers.sizes["waist"] - 0.004, "width": rng.uniform(0.028, 0.042)}
-        result.append(Garment("belt", sample_fabric(rng, "belt", 1.0), sizes))
+        top = trousers.sizes["waist"] - 0.004
+        result.append(_made(rng, "belt", 1.0, top=top, width=rng.uniform(0.028, 0.042)))
     collared = any("collar" in g.details and g.kind == "shirt" and "open" not in g.details for g in worn)
     if style == "formal" and male and collared and rng.random() < 0.55:
-        sizes = {"length": rng.uniform(0.3, 0.36), "width": rng.uniform(0.018, 0.032)}
-        result.append(Garment("tie", sample_fabric(rng, "tie", 0.3), sizes))
+        result.append(_made(rng, "tie", 0.3, length=rng.uniform(0.3, 0.36), width=rng.uniform(0.018, 0.032)))
     return result
 
 
@@ -324,7 +319,7 @@ def _extras(rng, style, male, years, worn):
     result: list[Garment] = []
 
     def put(kind, plainness, **sizes):
-        result.append(Garment(kind, sample_fabric(rng, kind, plainness), sizes))
+        result.append(_made(rng, kind, plainness, **sizes))
         kinds.add(kind)
 
     if not hooded and rng.random() < style.scarf:
