@@ -31,11 +31,9 @@ def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: fl
         metal = colour(0.12, 0.5, 0.75) if fabric.rng(2).random() < 0.5 else colour(0.6, 0.04, 0.72)
         return [(necklace(anatomy, sizes["length"]), _painted(metal, 0.6))]
     if kind in ("cap", "brim_hat"):
-        is_cap = kind == "cap"
-        shell = hat(0.016, 0.0, crown=0.008) if is_cap else hat(0.017, 0.0, crown=0.05)
-        edge = peak(anatomy, sizes["brim"], sizes["backwards"] > 0) if is_cap else brim(rng, anatomy, sizes["brim"])
-        albedo = functools.partial(_panelled if is_cap else _ribboned, fabric)
-        return [(join([shell, edge]), Material(albedo, wrinkles=0.05))]
+        shell = hat(0.016, 0.0, crown=0.008) if kind == "cap" else hat(0.017, 0.0, crown=0.05)
+        albedo = functools.partial(_panelled if kind == "cap" else _ribboned, fabric)
+        return [(join([shell, hat_edge(rng, anatomy, garment)]), Material(albedo, wrinkles=0.05))]
     if kind == "scarf":
         surface = scarf(rng, anatomy, sizes["thickness"], sizes["tails"], ease)
     elif kind == "beanie":
@@ -69,13 +67,6 @@ def neck_ring(anatomy: Anatomy, lift: float) -> tuple[np.ndarray, np.ndarray]:
     """(RING, 3) rest points around the neck at a lift above the crew neckline, from front over left, and outward directions."""
     template = anatomy.skin.attributes["template"]
     return _ring(anatomy, np.abs(tailoring.neckline(template, "crew", 0.0) + lift) < 0.02, -0.005)
-
-
-def head_ring(anatomy: Anatomy) -> tuple[np.ndarray, np.ndarray]:
-    """(RING, 3) rest points around the head at the edge of a hat, from front over left, and outward directions."""
-    template = anatomy.skin.attributes["template"]
-    no_ear = (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
-    return _ring(anatomy, no_ear & (np.abs(hair.above_line(template, hair.CAP_LINE)) < 0.012), hair.SKULL[2])
 
 
 def _ring(anatomy, near, middle):
@@ -154,38 +145,29 @@ def _on_head(anatomy, vertices, faces, template):
     return surfaces.rigid(vertices, faces, HEAD, len(anatomy.joints)).painted(template, template, 0.09)
 
 
-def _flange(anatomy, ring, outwards, widths, droop, closed):
-    """A sheet from a ring outwards: widths (m,) metres, droop (m,) metres down at its edge."""
-    steps = np.linspace(0, 1, 5)
-    out = ring[None] + (steps[:, None] * widths[None])[..., None] * outwards[None]
-    out[..., 1] -= steps[:, None] ** 2 * droop[None]
-    vertices, faces = out.reshape(-1, 3), grid_faces(len(steps), len(ring), closed=closed)
+def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Surface:
+    """The brim of a hat, wider in front, or the peak of a cap: a sheet from the edge of the hat outwards."""
+    template, size, closed = anatomy.skin.attributes["template"], garment.sizes["brim"], garment.kind == "brim_hat"
+    no_ear = (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
+    ring, out = _ring(anatomy, no_ear & (np.abs(hair.above_line(template, hair.CAP_LINE)) < 0.012), hair.SKULL[2])
+    if closed:
+        start, widths = ring + out * 0.012, size * (1 + 0.12 * np.cos(AZIMUTH))
+        droop = rng.uniform(-0.012, 0.02) - 0.016 * np.cos(2 * AZIMUTH) * rng.uniform(0.2, 1)
+    else:
+        backwards, across = garment.sizes["backwards"] > 0, np.linspace(-1, 1, 15)
+        chosen = ((RING // 2 if backwards else 0) + np.arange(-7, 8)) % RING
+        start = ring[chosen] + out[chosen] * 0.011
+        out = unit(np.tile(-FORWARD if backwards else FORWARD, (15, 1)) + 0.25 * out[chosen])
+        widths = (0.030 + size * 0.75) * np.sqrt(np.clip(1 - 0.92 * across**2, 0, 1))
+        droop = 0.010 + 0.016 * across**2
+    start[:, 1] += 0.004
+    steps = np.linspace(0, 1, 5)[:, None]
+    sheet = start[None] + (steps * widths[None])[..., None] * out[None]
+    sheet[..., 1] -= steps**2 * droop[None]
+    vertices, faces = sheet.reshape(-1, 3), grid_faces(len(steps), len(start), closed=closed)
     template = vertices - anatomy.joints[HEAD]
-    template[:, 1] = np.repeat(0.4 + 0.05 * steps, len(ring))
+    template[:, 1] = np.repeat(0.4 + 0.05 * steps, len(start))
     return surfaces.turn_in_hems(_on_head(anatomy, vertices, faces, template), 0.004)
-
-
-def brim(rng: np.random.Generator, anatomy: Anatomy, width: float) -> Surface:
-    """The brim of a hat, wider in front."""
-    ring, outwards = head_ring(anatomy)
-    shape = width * (1 + 0.12 * np.cos(AZIMUTH))
-    droop = rng.uniform(-0.012, 0.02) - 0.016 * np.cos(2 * AZIMUTH) * rng.uniform(0.2, 1)
-    start = ring + outwards * 0.012
-    start[:, 1] += 0.004
-    return _flange(anatomy, start, outwards, shape, droop, closed=True)
-
-
-def peak(anatomy: Anatomy, length: float, backwards: bool) -> Surface:
-    """The peak of a cap."""
-    ring, outwards = head_ring(anatomy)
-    first = RING // 2 if backwards else 0
-    chosen = np.arange(first - 7, first + 8) % RING
-    across = np.linspace(-1, 1, len(chosen))
-    start = ring[chosen] + outwards[chosen] * 0.011
-    start[:, 1] += 0.004
-    forward = np.tile([0.0, 0.0, -1.0 if backwards else 1.0], (len(chosen), 1)) + 0.25 * outwards[chosen]
-    widths = (0.030 + length * 0.75) * np.sqrt(np.clip(1 - 0.92 * across**2, 0, 1))
-    return _flange(anatomy, start, unit(forward), widths, 0.010 + 0.016 * across**2, closed=False)
 
 
 def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]]:
@@ -273,7 +255,13 @@ def _shoe(anatomy, side, height, sole, ease):
     shaft = np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1)) if height > 0.1 else [height]
     low = np.asarray([0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072])
     levels = floor + np.concatenate([low[low < height - 0.004], shaft])
-    shape = hanging(_outlines(points, levels), 0.6)  # the sole is as wide as what is above it
+    # thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices
+    thin, thick = (surfaces.outlines(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03))
+    shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
+    pairs = (thin.centers, thick.centers), (thin.radii, blurred(thick, 2).radii)
+    shape = hanging(
+        Outlines(levels, *(a + (b - a) * shin for a, b in pairs)), 0.6
+    )  # the sole is as wide as what is above it
     below = ((-sole, 0.0), (-sole, 0.0), (-0.3 * sole, 0.004), (0.004, 0.004), (0.006, 0.0))
     rows = [(floor + y, 0, extra) for y, extra in below] + [(level, i + 1, 0.0) for i, level in enumerate(levels[1:])]
     rings = []
@@ -286,12 +274,3 @@ def _shoe(anatomy, side, height, sole, ease):
     weights = tailoring.smooth_weights(tailoring.nearest_weights(anatomy, vertices, own), faces, 3)
     local = vertices - np.where([True, False, True], anatomy.joints[LEFT_ANKLE + side], floor)
     return surfaces.turn_in_hems(Surface(vertices, faces, weights).painted(local, local, 0.06), 0.01)
-
-
-def _outlines(points, levels):
-    """Thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices."""
-    thin, thick = (surfaces.outlines(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03))
-    shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
-    smooth = blurred(thick, 2)
-    mixed = [a + (b - a) * shin for a, b in ((thin.centers, thick.centers), (thin.radii, smooth.radii))]
-    return Outlines(levels, *mixed)

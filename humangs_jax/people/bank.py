@@ -183,6 +183,8 @@ def _person(seed, body=None, *, texture_size, pose_count):
     identities = [id(material) for material in materials]
     generators = (np.random.default_rng([seed, POSE_STREAM, i]) for i in range(pose_count))
     rotations = np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(np.float32)
+    places = np.stack([joint_positions(subject.build, r.astype(np.float64))[1] for r in rotations])
+    away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(-1)  # of each pose from the others
     joint_ids, joint_weights = strongest_joints(surface.weights, JOINTS_PER_VERTEX)
     return {
         "seeds": np.int32(seed),
@@ -201,15 +203,8 @@ def _person(seed, body=None, *, texture_size, pose_count):
         "dyeable": pad([material.wrinkles > 0 for material in materials], np.float32),
         "texture": np.concatenate([baked.albedo, baked.slopes], axis=-1),
         "rotations": rotations,
-        "nearest": _nearest(subject.build, rotations),
+        "nearest": np.argmin(away + 1e9 * np.eye(pose_count), axis=1).astype(np.int32),
     }
-
-
-def _nearest(build, rotations):
-    """(q,) for each pose the other one whose joints are nearest to its own."""
-    places = np.stack([joint_positions(build, r.astype(np.float64))[1] for r in rotations])
-    away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(-1) + 1e9 * np.eye(len(places))
-    return np.argmin(away, axis=1).astype(np.int32)
 
 
 _BY_VERTEX, _BY_FACE = ("vertices", "normals", "joint_ids", "joint_weights"), ("faces", "uvs", "face_pieces")

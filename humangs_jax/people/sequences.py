@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.people import kinematics as kin
@@ -119,8 +120,7 @@ def _path(heading, stride, first, last):
     """A function from the phase to the body's position (3,) on its path: the integral of the heading."""
     grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
     direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)
-    steps = 0.5 * (direction[1:] + direction[:-1]) * np.diff(grid)[:, None]
-    along = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, 0)])
+    along = cumulative_trapezoid(direction, grid, axis=0, initial=0)
     at = lambda p: np.asarray([np.interp(p, grid, along[:, k]) for k in range(3)])
     origin = at(first)
     return lambda p: stride * (at(p) - origin)

@@ -205,8 +205,9 @@ def _drape(rng, anatomy, surface, fit):
             own = leg * (sign * points[:, 0] > 0)
             points = _push(points, (0, 2), points[:, 1], hanging(inner, fit.leg_hang), own, *wider)
     points = smooth(points, surface.faces, 3, keep_hems=True)
-    seat = _over_the_seat(surface.attributes["template"])
-    if seat.any():
+    x, y, _ = surface.attributes["template"].T
+    seat = np.exp(-((x / 0.045) ** 2)) * smoothstep(0.22, 0.28, -y) * (y > -0.5)
+    if seat.any():  # smoother between the buttocks and below the belly
         points = points + seat[:, None] * (smooth(points, surface.faces, 15, keep_hems=True) - points)
     outer = surfaces.vertex_normals(points, surface.faces)
     cloth = smooth(surface.attributes["cloth"], surface.faces, 10, keep_hems=True)  # as the points were
@@ -217,16 +218,9 @@ def _drape(rng, anatomy, surface, fit):
     points = points + np.maximum(least - distance, 0)[:, None] * surface.attributes["normals"]
     hems = np.unique(surfaces.boundary_edges(surface.faces))
     points[hems] = smooth(points, surface.faces, 4, keep_hems=True)[hems]
-    side = np.sign(surface.attributes["template"][:, 0])
-    thighs = leg > 0.6  # trouser legs do not cross the middle
+    side, thighs = np.sign(x), leg > 0.6  # trouser legs do not cross the middle
     points[:, 0] = np.where(thighs, side * np.maximum(side * points[:, 0], 0.004), points[:, 0])
     return surface.moved(points).with_attributes(cloth=cloth, template=template)
-
-
-def _over_the_seat(template):
-    """(n,) 1 between the buttocks and below the belly: cloth is smoothed more there than elsewhere."""
-    x, y, _ = template.T
-    return np.exp(-((x / 0.045) ** 2)) * smoothstep(0.22, 0.28, -y) * (y > -0.5)
 
 
 def _fold_heights(rng, cloth, arm, leg, fit):
