@@ -65,14 +65,13 @@ def _ribboned(fabric, s):
 
 def neck_ring(anatomy: Anatomy, lift: float) -> tuple[np.ndarray, np.ndarray]:
     """(RING, 3) rest points around the neck at a lift above the crew neckline, from front over left, and outward directions."""
-    template = anatomy.skin.attributes["template"]
-    return _ring(anatomy, np.abs(tailoring.neckline(template, "crew", 0.0) + lift) < 0.02, -0.005)
+    return _ring(anatomy, np.abs(tailoring.neckline(anatomy.skin.template, "crew", 0.0) + lift) < 0.02, -0.005)
 
 
 def _ring(anatomy, near, middle):
     """Means of the chosen skin vertices by azimuth around x = 0, z = middle, on a smooth closed line."""
-    template = anatomy.skin.attributes["template"]
-    points, azimuths = anatomy.skin.vertices[near], np.arctan2(template[:, 0], template[:, 2] - middle)[near]
+    x, _, z = anatomy.skin.template[near].T
+    points, azimuths = anatomy.skin.vertices[near], np.arctan2(x, z - middle)
     apart = np.abs((azimuths[None] - AZIMUTH[:, None] + np.pi) % (2 * np.pi) - np.pi)
     weights = np.exp(-((apart / 0.16) ** 2)) + 1e-9
     ring = weights @ points / weights.sum(1, keepdims=True)
@@ -83,9 +82,8 @@ def _ring(anatomy, near, middle):
 
 def _followed(anatomy, path, across, widths, columns, closed=True):
     """A swept tube that moves with the skin nearest to it; its template coordinates are its own, around its middle."""
-    template = anatomy.skin.attributes["template"]
-    vertices, faces = sweep(path, across, widths, columns, closed)
-    candidates = np.flatnonzero((np.abs(template[:, 0]) < 0.2) & (template[:, 1] > -0.35) & (template[:, 1] < 0.2))
+    (x, y, _), (vertices, faces) = anatomy.skin.template.T, sweep(path, across, widths, columns, closed)
+    candidates = np.flatnonzero((np.abs(x) < 0.2) & (y > -0.35) & (y < 0.2))
     weights = tailoring.smooth_weights(tailoring.nearest_weights(anatomy, vertices, candidates), faces, 6)
     around_middle = vertices - [0, anatomy.joints[NECK, 1] - 0.19, 0]
     return Surface(vertices, faces, weights).painted(around_middle, around_middle, 0.12)
@@ -147,7 +145,7 @@ def _on_head(anatomy, vertices, faces, template):
 
 def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Surface:
     """The brim of a hat, wider in front, or the peak of a cap: a sheet from the edge of the hat outwards."""
-    template, size, closed = anatomy.skin.attributes["template"], garment.sizes["brim"], garment.kind == "brim_hat"
+    template, size, closed = anatomy.skin.template, garment.sizes["brim"], garment.kind == "brim_hat"
     no_ear = (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
     ring, out = _ring(anatomy, no_ear & (np.abs(hair.above_line(template, hair.CAP_LINE)) < 0.012), hair.SKULL[2])
     if closed:
@@ -176,7 +174,7 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
     dark = garment.kind == "sunglasses"
     eyes = anatomy.joints[[LEFT_EYE, RIGHT_EYE]]
     middle, apart = eyes.mean(0), np.abs(eyes[0, 0])
-    template, vertices = anatomy.skin.attributes["template"], anatomy.skin.vertices
+    template, vertices = anatomy.skin.template, anatomy.skin.vertices
     x, y, z = template.T
     brow = (np.abs(x) < 0.055) & (np.abs(vertices[:, 1] - middle[1]) < 0.022) & (z > 0.05)
     front = np.quantile(vertices[brow, 2], 0.97) + 0.003
@@ -218,7 +216,7 @@ def necklace(anatomy: Anatomy, length: float) -> Surface:
 
 def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
     """A rounded box on the back, or a flat one at the hip, that moves as the skin near it does on average."""
-    x, y, z = anatomy.skin.attributes["template"].T
+    x, y, z = anatomy.skin.template.T
     size = garment.sizes["size"]
     if garment.kind == "backpack":
         near = (np.abs(x) < 0.1) & (y > -0.2) & (y < 0.08) & (z < -0.05)
@@ -248,8 +246,8 @@ def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> 
 
 
 def _shoe(anatomy, side, height, sole, ease):
-    template = anatomy.skin.attributes["template"]
-    own = np.flatnonzero((template[:, 0] * (1 - 2 * side) > 0) & (template[:, 1] < FLOOR + height + 0.06))
+    x, y, _ = anatomy.skin.template.T
+    own = np.flatnonzero((x * (1 - 2 * side) > 0) & (y < FLOOR + height + 0.06))
     points = anatomy.skin.vertices[own]
     floor = points[:, 1].min()
     shaft = np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1)) if height > 0.1 else [height]

@@ -83,16 +83,11 @@ def _placed(targets, distances, azimuths, elevations, K, size):
 
 
 def camera_from(
-    u: Float[Array, "5"],
-    vertices: Float[Array, "n 3"],
-    count: Int[Array, ""] | int,
-    azimuth: Number,
-    close: Number,
-    size: int,
+    u: Array, vertices: Float[Array, "n 3"], count: Int[Array, ""] | int, azimuth: Number, close: Number, size: int
 ) -> Camera:
     """A square camera of `size` pixels that looks at a posed person from an azimuth.
 
-    u: in [0, 1). count: vertices that are no padding. close: probability of a close camera; others see all of the person.
+    u: (5,) in [0, 1). count: vertices that are no padding. close: probability of a close camera; others see all of the person.
     """
     is_close, tilt, spread, outwards, place = u
     low, high = vertices.min(0), vertices.max(0)

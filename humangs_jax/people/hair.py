@@ -116,7 +116,7 @@ def style(rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: fl
     elif kind not in ("buzz", "bald"):
         bumps, size, parted = SHELLS.get(kind, (0.12, 0.035, 1))
         quiff = rng.uniform(0.012, 0.026) if kind == "quiff" else 0.0
-        look = {"bump_size": size, "quiff": quiff, "side": haircut.side * parted, "shift": haircut.receding}
+        look = {"size": size, "quiff": quiff, "side": haircut.side * parted, "shift": haircut.receding}
         parts.append(scalp_shell(rng, anatomy, haircut.thickness, bumps, **look))
     if kind in TAILS:
         length, knots = TAILS[kind]
@@ -159,33 +159,24 @@ def above_line(template: Points, line: tuple, shift: float = 0.0) -> Field:
 
 
 def scalp_shell(
-    rng,
-    anatomy: Anatomy,
-    thickness: float,
-    bumps: float,
-    hat=False,
-    shift=0.0,
-    crown=0.0,
-    bump_size=0.05,
-    quiff=0.0,
-    side=0.0,
+    rng, anatomy: Anatomy, thickness: float, bumps: float, size=0.05, hat=False, shift=0.0, crown=0.0, quiff=0.0, side=0
 ) -> Surface:
     """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the hairline.
 
-    bumps: share of the thickness, `bump_size` metres wide. crown, quiff: metres that the top and the front rise above that.
+    bumps: share of the thickness, `size` metres wide. crown, quiff: metres that the top and the front rise above that.
     side: +1 or -1 for a parting on that side of the head, 0 for none. hat: with a straight edge that stands off.
     """
-    template = anatomy.skin.attributes["template"]
+    template = anatomy.skin.template
     above, rim = above_line(template, CAP_LINE if hat else SHORT_LINE, shift), 0.011 if hat else 0.0025
     if not hat:
         above = above + 0.0035 * ripples(rng, template, 0.018) * (np.abs(template[:, 0]) < 0.07)
     surface = cut(anatomy.skin.with_attributes(above=above), above)
     normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 8))
     full = smoothstep(-0.002, 0.022, surface.attributes["above"])
-    grown = thickness * full * (1 + bumps * ripples(rng, surface.attributes["template"], bump_size))
+    grown = thickness * full * (1 + bumps * ripples(rng, surface.template, size))
     grown = np.maximum(grown, rim) + 0.3 * rim
     base = smooth(surface.vertices, surface.faces, 3, keep_hems=True)
-    x, y, z = surface.attributes["template"].T
+    x, y, z = surface.template.T
     top = smoothstep(0.385, 0.425, y)
     if side:
         parting = np.exp(-(((x - side * 0.035) / 0.009) ** 2)) * top * (z > -0.02)
@@ -193,26 +184,19 @@ def scalp_shell(
     points = base + grown[:, None] * normals
     raised = quiff * smoothstep(0.02, 0.085, z) * smoothstep(0.375, 0.41, y)
     points = points + raised[:, None] * np.asarray([0.0, 0.95, 0.35])
-    points[:, 1] += crown * smoothstep(0.39, 0.42, surface.attributes["template"][:, 1])
+    points[:, 1] += crown * smoothstep(0.39, 0.42, y)
     return finished(surface.moved(points), 2, 0.006)
 
 
 def falling_tube(
-    rng,
-    anatomy: Anatomy,
-    thickness: float,
-    bottom: float,
-    opening: Opening,
-    wave=0.004,
-    ends: float | None = None,
-    over=0.0,
+    rng, anatomy: Anatomy, thickness: float, bottom: float, opening: Opening, wave=0.004, ends=None, over=0.0
 ) -> Surface:
     """Long hair, a hood or a headscarf: the skull's outline scaled up, then falling to the height `bottom` at the back.
 
-    ends: height at which it ends in front; hair ends on the shoulders at the sides. over: metres between skin and what is worn
-    below it.
+    ends: height at which it ends in front; None: hair, which ends on the shoulders at the sides. over: metres between skin
+    and what is worn below it.
     """
-    skin, template = anatomy.skin, anatomy.skin.attributes["template"]
+    skin, template = anatomy.skin, anatomy.skin.template
     to_rest, center = _skull(anatomy)
     scale = 1 + thickness / 0.09
     ears = (np.abs(template[:, 0]) > 0.0735) & (template[:, 1] > 0.26) & (template[:, 1] < 0.36)
@@ -293,14 +277,14 @@ def beard_field(template: Points, kind: str) -> Field:
 
 def beard(rng, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
     """A beard that thins out towards the cheeks."""
-    template = anatomy.skin.attributes["template"]
+    template = anatomy.skin.template
     field = beard_field(template, kind)
     ragged = np.where(field > -0.5, field + 0.002 * ripples(rng, template, 0.012), -1.0)
     surface = cut(anatomy.skin.with_attributes(above=field), ragged)
     normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 4))
     full = smoothstep(0.0, 0.016, surface.attributes["above"])
-    chin = smoothstep(0.25, 0.225, surface.attributes["template"][:, 1])
-    bumps = 1 + 0.25 * ripples(rng, surface.attributes["template"], 0.02)
+    chin = smoothstep(0.25, 0.225, surface.template[:, 1])
+    bumps = 1 + 0.25 * ripples(rng, surface.template, 0.02)
     grown = thickness * full * (0.6 + 0.8 * chin) * bumps + 0.0010
     return finished(surface.moved(surface.vertices + grown[:, None] * normals), 2, 0.002)
 
@@ -333,8 +317,8 @@ def _skull(anatomy):
 
 def _falling_weights(anatomy, vertices, template_y):
     """Weights of the head above the jaw, blending into those of the nearest skin further down."""
-    template = anatomy.skin.attributes["template"]
-    near = np.flatnonzero((np.abs(template[:, 0]) < 0.15) & (template[:, 1] > -0.3) & (template[:, 1] < 0.26))[::2]
+    x, y, _ = anatomy.skin.template.T
+    near = np.flatnonzero((np.abs(x) < 0.15) & (y > -0.3) & (y < 0.26))[::2]
     head = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
     head[:, HEAD] = 1
     own = smoothstep(0.06, 0.25, template_y)[:, None]

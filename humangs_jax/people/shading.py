@@ -173,18 +173,12 @@ def seen_from_behind(
 
 
 def light_points(
-    lights: Lights,
-    corners: Array,
-    weights: Vectors,
-    behind: Bool[Array, "*p"],
-    albedo: Vectors,
-    slopes: Vectors,
-    sheen: Values,
+    lights: Lights, corners: Array, weights: Vectors, behind: Array, albedo: Vectors, slopes: Vectors, sheen: Values
 ) -> Vectors:
     """Colours (p, 3) of points on faces.
 
     corners: (p, 15) normal (3), openness and share of the key light of each corner of the point's face. weights: of the corners.
-    behind: whether the inner side is seen. albedo, slopes, sheen: of the material there.
+    behind: (p,) whether the inner side is seen. albedo, slopes, sheen: of the material there.
     """
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
     blended = wa * corners[:, :5] + wb * corners[:, 5:10] + wc * corners[:, 10:]

@@ -174,7 +174,7 @@ def _hair(rng, anatomy, person, over, hooded):
     pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, haircut, over)]
     hat = any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments)
     if hat and pieces and not hooded:  # the scalp's; tails, buns and beards hang out
-        hidden = hair.above_line(pieces[0].surface.attributes["template"], hair.CAP_LINE) > 0.008
+        hidden = hair.above_line(pieces[0].surface.template, hair.CAP_LINE) > 0.008
         pieces[0] = dataclasses.replace(pieces[0], hidden=hidden).visible()
     return pieces
 

@@ -28,6 +28,11 @@ class Surface:
     weights: Float[np.ndarray, "n j"]
     attributes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
+    @property
+    def template(self) -> Points:
+        """(n, 3) template coordinates, see `anatomy`."""
+        return self.attributes["template"]
+
     def moved(self, vertices: Points) -> "Surface":
         """The same surface with other vertex positions."""
         return dataclasses.replace(self, vertices=np.asarray(vertices, np.float32))

@@ -205,13 +205,13 @@ def _drape(rng, anatomy, surface, fit):
             own = leg * (sign * points[:, 0] > 0)
             points = _push(points, (0, 2), points[:, 1], hanging(inner, fit.leg_hang), own, *wider)
     points = smooth(points, surface.faces, 3, keep_hems=True)
-    x, y, _ = surface.attributes["template"].T
+    x, y, _ = surface.template.T
     seat = np.exp(-((x / 0.045) ** 2)) * smoothstep(0.22, 0.28, -y) * (y > -0.5)
     if seat.any():  # smoother between the buttocks and below the belly
         points = points + seat[:, None] * (smooth(points, surface.faces, 15, keep_hems=True) - points)
     outer = surfaces.vertex_normals(points, surface.faces)
     cloth = smooth(surface.attributes["cloth"], surface.faces, 10, keep_hems=True)  # as the points were
-    template = smooth(surface.attributes["template"], surface.faces, 8, keep_hems=True)
+    template = smooth(surface.template, surface.faces, 8, keep_hems=True)
     points = points + _fold_heights(rng, sewn_coordinates(cloth, template), arm, leg, fit)[:, None] * outer
     distance = np.sum((points - below) * surface.attributes["normals"], -1)
     least = max(0.55 * fit.ease, fit.inner)
@@ -286,7 +286,7 @@ def skirt(
 
 def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
     """Rest heights of the person's skin for template heights on trunk and legs."""
-    x, y, _ = anatomy.skin.attributes["template"].T
+    x, y, _ = anatomy.skin.template.T
     own = (np.abs(x) < 0.2) & (y < 0.14) & (y > ANKLE)
     bins = np.floor((y[own] - ANKLE) / 0.03).astype(int)
     counts = np.maximum(np.bincount(bins), 1)
@@ -300,8 +300,8 @@ def rest_height(anatomy: Anatomy, template_y: np.ndarray) -> np.ndarray:
 
 def _skirt_weights(anatomy, vertices, template_y):
     """Weights of the trunk at the waist, blending into those of thighs and shins of the vertex's side further down."""
-    template = anatomy.skin.attributes["template"]
-    near = np.flatnonzero((np.abs(template[:, 0]) < 0.2) & (template[:, 1] < 0.0) & (template[:, 1] > -0.4))[::2]
+    x, y, _ = anatomy.skin.template.T
+    near = np.flatnonzero((np.abs(x) < 0.2) & (y < 0.0) & (y > -0.4))[::2]
     trunk = nearest_weights(anatomy, vertices, near)
     left = smoothstep(-0.09, 0.09, vertices[:, 0])
     thigh = 0.96 * smoothstep(0.27, 0.47, -template_y)

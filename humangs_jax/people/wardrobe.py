@@ -55,12 +55,12 @@ class Outfit:
     @property
     def template(self) -> np.ndarray:
         """Template coordinates (n, 3) of the body's vertices."""
-        return self.anatomy.skin.attributes["template"]
+        return self.anatomy.skin.template
 
     @property
     def lowest(self) -> float:
         """Template height of the hem of the innermost piece."""
-        return float(self.pieces[0].surface.attributes["template"][:, 1].min())
+        return float(self.pieces[0].surface.template[:, 1].min())
 
     def add(self, surface: Surface, material: Material, layered: bool = True) -> None:
         """Put one more piece on. layered: whether later layers can hide parts of it."""
@@ -73,7 +73,7 @@ class Outfit:
         self.removed = self.removed | (field > margin)
         for i, piece in enumerate(self.pieces):
             if cloth and piece.hidden is not None:
-                below = cover(piece.surface.attributes["template"]) > max(margin, 0.03)
+                below = cover(piece.surface.template) > max(margin, 0.03)
                 self.pieces[i] = dataclasses.replace(piece, hidden=piece.hidden | below)
 
 
@@ -193,7 +193,7 @@ def _trousers(rng, outfit, garment):
         calm=9.0 if tucked else outfit.lowest + 0.02,
     )
     material = Material(sewn(garment, end + 0.018), wrinkles=0.15 + 0.4 * loose, sheen=0.03)
-    in_two_legs = lambda surface: surface.with_attributes(cloth=leg_coordinates(surface.attributes["template"]))
+    in_two_legs = lambda surface: surface.with_attributes(cloth=leg_coordinates(surface.template))
     margin = HEM_MARGIN + 0.03 * loose * (kind in ("wide", "shorts"))
     _put(rng, outfit, [(tailoring.trousers, top, end)], fit, material, margin, in_two_legs, tucked)
     x, y, _ = outfit.template.T  # skin between shirt and trousers, below both
@@ -207,7 +207,7 @@ def _trousers(rng, outfit, garment):
 def _let_hang_over(outfit, margin):
     """An untucked top hides the last piece below it, except for a margin inside of the top's hem."""
     lower = outfit.pieces[-1]
-    x, y, _ = lower.surface.attributes["template"].T
+    x, y, _ = lower.surface.template.T
     hidden = (y > outfit.lowest + margin) & (np.abs(x) < tailoring.TRUNK_HALF_WIDTH)
     outfit.pieces[-1] = dataclasses.replace(lower, hidden=lower.hidden | hidden)
 
@@ -272,9 +272,9 @@ def _shoes(rng, outfit, garment):
 
 def _unhidden_legs(piece):
     """Trouser legs hang over low shoes: the shoe hides nothing of them, only socks."""
-    if piece.hidden is None or piece.surface.attributes["template"][:, 1].min() < -1.2:
+    if piece.hidden is None or piece.surface.template[:, 1].min() < -1.2:
         return piece
-    low = piece.surface.attributes["template"][:, 1] < -0.9
+    low = piece.surface.template[:, 1] < -0.9
     return dataclasses.replace(piece, hidden=piece.hidden & ~low)
 
 
