@@ -126,10 +126,8 @@ def paint(subject: SyntheticSubject, face_ids: Ids, spots: Spots) -> tuple[Value
     """The materials at points on given faces: albedo (m, 3) and slope (m, 3) of the painted folds."""
     material_ids = subject.face_materials[face_ids]
     albedo, slope = np.empty((len(face_ids), 3), np.float32), np.zeros((len(face_ids), 3), np.float32)
-    order = np.argsort(material_ids, kind="stable")
-    bounds = np.searchsorted(material_ids[order], np.arange(len(subject.materials) + 1))
     for k in np.unique(material_ids):
-        material, chosen = subject.materials[k], order[bounds[k] : bounds[k + 1]]
+        material, chosen = subject.materials[k], np.flatnonzero(material_ids == k)
         own = Spots(spots.cloth[chosen], spots.template[chosen])
         albedo[chosen] = material.albedo(own)
         if material.wrinkles > 0:
