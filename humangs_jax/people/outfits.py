@@ -291,12 +291,12 @@ def _shoes(rng, style, male, worn):
     narrow = not covered or (lower.kind in ("slim", "leggings", "jeans") and lower.sizes["width"] <= 0.01)
     if kind == "boots" and (male or not narrow):
         kind = "ankle_boots"
-    height, sole = float(row(rng, SHAFTS, kind)), float(row(rng, SOLES, kind))
+    height, sole = row(rng, SHAFTS, kind), row(rng, SOLES, kind)
     result = []
     if kind in ("sneakers", "ankle_boots") and not covered and rng.random() < 0.75:
         tall = drawn(rng, OneOf(((0.1, 0.17), (0.2, 0.4)), (0.75, 0.25)))
         result.append(_made(rng, "socks", 0.7, height=max(float(tall), height + 0.02)))
-    return [*result, _made(rng, kind, 0.9, height=height, sole=sole, over=float(kind == "boots"))]
+    return [*result, _made(rng, kind, 0.9, height=float(height), sole=float(sole), over=float(kind == "boots"))]
 
 
 def _fastened(rng, style, male, worn):
