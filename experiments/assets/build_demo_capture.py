@@ -20,13 +20,11 @@ def main() -> None:
 
     from humangs_jax.body.library import load_body
     from humangs_jax.people.seeds import split_of
-    from humangs_jax.people.writer import write_subject
+    from humangs_jax.people.writer import Layout, write_person
 
     if split_of(arguments.seed) != "demo":
         parser.error(f"--seed {arguments.seed} belongs to the {split_of(arguments.seed)} people")
-    write_subject(
-        arguments.out, arguments.seed, body=load_body(), image_size=256, input_views=4, held_out_views=6, novel_poses=0
-    )
+    write_person(arguments.out, arguments.seed, load_body(), Layout(256, views=4, held_out_views=6))
     print(f"{arguments.out}: written")
 
 

@@ -2,7 +2,7 @@
 
 The ring has `RING` cameras of the published protocol around the person, evenly spaced but for the generator's jitter, number 0
 the most frontal one. N photos are every (RING / N)-th camera of the ring, so each person is rendered once for all numbers of
-photos. Held-out cameras and unseen poses are those of `humangs_jax.people.writer.write_subject` for the same seed, and images
+photos. Held-out cameras and unseen poses are those of `humangs_jax.people.writer.write_person` for the same seed, and images
 have 8 bits as they would have on disk.
 """
 

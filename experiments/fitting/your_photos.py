@@ -30,10 +30,10 @@ def main() -> None:
     from humangs_jax import cli
     from humangs_jax.body.library import load_body
     from humangs_jax.data.capture import load_capture
-    from humangs_jax.people.writer import write_subject
+    from humangs_jax.people.writer import Layout, write_person
 
     arguments.out.mkdir(parents=True)
-    write_subject(arguments.out / "truth", SEED, body=load_body(), image_size=SIZE, input_views=VIEWS)
+    write_person(arguments.out / "truth", SEED, load_body(), Layout(SIZE, views=VIEWS, held_out_views=8))
     truth, photos, me = load_capture(arguments.out / "truth"), arguments.out / "photos", arguments.out / "me"
     points = landmarks_in(truth)
     points = points + np.random.default_rng(0).normal(0, NOISE, points.shape)

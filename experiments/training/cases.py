@@ -86,14 +86,12 @@ def random_networks(config: Any) -> Any:
 
 def written_subject(folder: Path, config: Any, body: Any, seed: int = 0) -> Path:
     """The capture folder of a synthetic person with as many views as an example takes; made if it is not there."""
-    from humangs_jax.people.writer import write_training_subject
+    from humangs_jax.people.writer import Layout, write_person
 
     views = config.views.input_counts[0] + config.views.target_count
     path = folder / f"{config.model.conventions.image_size}_{views}"
     if not path.exists():
-        write_training_subject(
-            path, seed, body=body, image_size=config.model.conventions.image_size, poses=1, views=views
-        )
+        write_person(path, seed, body, Layout(config.model.conventions.image_size, views=views))
     return path
 
 

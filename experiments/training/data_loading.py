@@ -63,7 +63,7 @@ def measure_synth(out: Path, size: int, subjects: int, body: Any) -> dict[str, f
 def measure_read(out: Path, size: int, examples: int, body: Any) -> dict[str, dict[str, float]]:
     """Examples of written people through the loader: from disk every time, and from memory."""
     from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
-    from humangs_jax.people.manifest import find_people
+    from humangs_jax.people.writer import find_people
 
     sampling = ViewSampling(input_counts=(INPUTS,), target_count=TARGETS)
     results = {}
@@ -81,8 +81,7 @@ def measure_on_the_fly(size: int, people: int, examples: int, body: Any) -> dict
     import jax
 
     from humangs_jax.people.bank import build_bank
-    from humangs_jax.people.on_the_fly import OnTheFlyConfig
-    from humangs_jax.people.source import jitted_example
+    from humangs_jax.people.on_the_fly import OnTheFlyConfig, jitted_example
 
     texture = 1024 if size > 256 else 512
     build_bank([0, 1], body, "train", texture_size=texture)
@@ -110,10 +109,8 @@ def measure_training(folder: Path, body: Any) -> dict[str, Any]:
     from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling, Waiting
     from humangs_jax.data.views import gaussian_body
     from humangs_jax.people.bank import build_bank
-    from humangs_jax.people.manifest import find_people
-    from humangs_jax.people.on_the_fly import OnTheFlyConfig
-    from humangs_jax.people.source import on_the_fly_source
-    from humangs_jax.people.writer import Layout, write_set
+    from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_source
+    from humangs_jax.people.writer import Layout, find_people, write_set
     from humangs_jax.training.config import small
     from humangs_jax.training.state import init_state
     from humangs_jax.training.step import train_step

@@ -63,8 +63,7 @@ def train(arguments: argparse.Namespace) -> bool:
     """Make people, train until the end or an interruption; whether it is the end. Facts go to out/report.json."""
     from experiments.training.data_loading import machine
     from humangs_jax.body.library import load_body
-    from humangs_jax.people.manifest import find_people
-    from humangs_jax.people.writer import Layout, write_set
+    from humangs_jax.people.writer import Layout, find_people, write_set
     from humangs_jax.training.config import PRESETS
     from humangs_jax.training.loop import train as run
 

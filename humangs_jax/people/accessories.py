@@ -7,51 +7,33 @@ import functools
 
 import numpy as np
 
-from humangs_jax.people import hair, tailoring
+from humangs_jax.people import hair, surfaces, tailoring
 from humangs_jax.people.anatomy import FLOOR, Anatomy
 from humangs_jax.people.fabrics import Material, band, colour, mix
-from humangs_jax.people.garments import nearest_weights, rest_height, smooth_weights
 from humangs_jax.people.kinematics import HEAD, LEFT_ANKLE, LEFT_EYE, NECK, RIGHT_EYE
 from humangs_jax.people.noise import ripples
 from humangs_jax.people.outfits import Garment
-from humangs_jax.people.surfaces import (
-    Outlines,
-    Surface,
-    around,
-    ball,
-    blurred,
-    circle,
-    grid_faces,
-    hanging,
-    join,
-    outlines,
-    rigid,
-    sweep,
-    turn_in_hems,
-    unit,
-)
+from humangs_jax.people.surfaces import Outlines, Surface, blurred, circle, grid_faces, hanging, join, sweep, unit
 
-RING = 40
-"""Points of a ring around neck or head."""
+RING, COLUMNS = 40, 32
+"""Points of a ring around neck or head; of a ring of a shoe."""
 AZIMUTH = circle(RING)
-UP = np.asarray([0.0, 1.0, 0.0])
+SIDEWAYS, UP, FORWARD = np.eye(3)
 
 
 def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: float) -> list[tuple[Surface, Material]]:
     """Surfaces and materials of an accessory. ease: distance of the outermost layer from the trunk, metres."""
     kind, sizes, fabric = garment.kind, garment.sizes, garment.fabric
-    hat = functools.partial(hair.scalp_shell, rng, anatomy, line=hair.CAP_LINE, rim=0.011)
+    hat = functools.partial(hair.scalp_shell, rng, anatomy, hat=True)
     if kind in ("glasses", "sunglasses"):
-        return glasses(anatomy, sizes["size"], sizes["squareness"], sizes["wire"], kind == "sunglasses", fabric.base)
+        return glasses(anatomy, garment)
     if kind == "necklace":
         metal = colour(0.12, 0.5, 0.75) if fabric.rng(2).random() < 0.5 else colour(0.6, 0.04, 0.72)
         return [(necklace(anatomy, sizes["length"]), _painted(metal, 0.6))]
-    if kind == "cap":
-        parts = [hat(0.016, 0.0, crown=0.008), peak(anatomy, sizes["brim"], sizes["backwards"] > 0)]
-        return [(join(parts), Material(lambda s: _panelled(fabric.colours(s), s), wrinkles=0.05))]
-    if kind == "brim_hat":
-        parts = [hat(0.017, 0.0, crown=0.05), brim(rng, anatomy, sizes["brim"])]
-        return [(join(parts), Material(lambda s: _ribboned(fabric.colours(s), s, fabric.other), wrinkles=0.05))]
+    if kind in ("cap", "brim_hat"):
+        shell = hat(0.016, 0.0, crown=0.008) if kind == "cap" else hat(0.017, 0.0, crown=0.05)
+        albedo = functools.partial(_panelled if kind == "cap" else _ribboned, fabric)
+        return [(join([shell, hat_edge(rng, anatomy, garment)]), Material(albedo, wrinkles=0.05))]
     if kind == "scarf":
         surface = scarf(rng, anatomy, sizes["thickness"], sizes["tails"], ease)
     elif kind == "beanie":
@@ -67,25 +49,29 @@ def _painted(dye, sheen):
     return Material(lambda s: np.broadcast_to(np.asarray(dye, np.float32), (len(s.cloth), 3)), sheen=sheen)
 
 
+def _panelled(fabric, s):
+    """Six panels of a cap with a button on top."""
+    angle, colours = np.arctan2(s.template[:, 0], s.template[:, 2] - 0.02), fabric.colours(s)
+    seam = np.abs((angle / (np.pi / 3) + 0.5) % 1 - 0.5) * (np.pi / 3) * 0.08
+    return mix(colours, colours * 0.6, band(seam, -1, 0.0016) * (s.template[:, 1] > 0.34))
+
+
+def _ribboned(fabric, s):
+    """A hat with a ribbon above its brim."""
+    above = hair.above_line(s.template, hair.CAP_LINE)
+    on_crown = np.hypot(s.template[:, 0], s.template[:, 2] - 0.02) < 0.118
+    return mix(fabric.colours(s), fabric.other, band(above, 0.002, 0.026, 0.002) * on_crown)
+
+
 def neck_ring(anatomy: Anatomy, lift: float) -> tuple[np.ndarray, np.ndarray]:
     """(RING, 3) rest points around the neck at a lift above the crew neckline, from front over left, and outward directions."""
-    template = anatomy.skin.attributes["template"]
-    field = tailoring.neckline(template, "crew", 0.0) + lift
-    near = np.abs(field) < 0.02
-    return _ring(anatomy, near, np.arctan2(template[:, 0], template[:, 2] + 0.005))
+    return _ring(anatomy, np.abs(tailoring.neckline(anatomy.skin.template, "crew", 0.0) + lift) < 0.02, -0.005)
 
 
-def head_ring(anatomy: Anatomy, line: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """(RING, 3) rest points around the head at a hairline, from front over left, and outward directions."""
-    template = anatomy.skin.attributes["template"]
-    no_ear = (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
-    near = no_ear & (np.abs(hair.above_line(template, line)) < 0.012)
-    return _ring(anatomy, near, np.arctan2(template[:, 0], template[:, 2] - hair.SKULL[2]))
-
-
-def _ring(anatomy, near, azimuths):
-    """Means of the chosen skin vertices by azimuth, on a smooth closed line."""
-    points, azimuths = anatomy.skin.vertices[near], azimuths[near]
+def _ring(anatomy, near, middle):
+    """Means of the chosen skin vertices by azimuth around x = 0, z = middle, on a smooth closed line."""
+    x, _, z = anatomy.skin.template[near].T
+    points, azimuths = anatomy.skin.vertices[near], np.arctan2(x, z - middle)
     apart = np.abs((azimuths[None] - AZIMUTH[:, None] + np.pi) % (2 * np.pi) - np.pi)
     weights = np.exp(-((apart / 0.16) ** 2)) + 1e-9
     ring = weights @ points / weights.sum(1, keepdims=True)
@@ -94,11 +80,11 @@ def _ring(anatomy, near, azimuths):
     return ring, unit(outwards)
 
 
-def _followed(anatomy, vertices, faces):
-    """A surface that moves with the skin nearest to it; its template coordinates are its own, around its middle."""
-    template = anatomy.skin.attributes["template"]
-    candidates = np.flatnonzero((np.abs(template[:, 0]) < 0.2) & (template[:, 1] > -0.35) & (template[:, 1] < 0.2))
-    weights = smooth_weights(nearest_weights(anatomy, vertices, candidates), faces, 6)
+def _followed(anatomy, path, across, widths, columns, closed=True):
+    """A swept tube that moves with the skin nearest to it; its template coordinates are its own, around its middle."""
+    (x, y, _), (vertices, faces) = anatomy.skin.template.T, sweep(path, across, widths, columns, closed)
+    candidates = np.flatnonzero((np.abs(x) < 0.2) & (y > -0.35) & (y < 0.2))
+    weights = tailoring.smooth_weights(tailoring.nearest_weights(anatomy, vertices, candidates), faces, 6)
     around_middle = vertices - [0, anatomy.joints[NECK, 1] - 0.19, 0]
     return Surface(vertices, faces, weights).painted(around_middle, around_middle, 0.12)
 
@@ -114,7 +100,7 @@ def hood(rng: np.random.Generator, anatomy: Anatomy, up: bool) -> Surface:
     path = ring + outwards * (0.4 * thick + 0.022)[:, None]
     path[:, 1] += 0.012 - 0.030 * behind**4 + 0.004 * ripples(rng, 3 * ring, 0.3)
     rolls = np.stack([tall, thick], -1) * (1 + 0.1 * ripples(rng, 4 * ring, 0.2))[:, None]
-    return _followed(anatomy, *sweep(path, UP + 0.5 * outwards * behind[:, None] ** 3, rolls, 12, closed=True))
+    return _followed(anatomy, path, UP + 0.5 * outwards * behind[:, None] ** 3, rolls, 12)
 
 
 def _face_opening(middle, half_width, half_height):
@@ -131,7 +117,7 @@ def scarf(rng: np.random.Generator, anatomy: Anatomy, thickness: float, tails: f
         path = ring + outwards * (0.75 * thickness + min(ease, 0.015))
         path[:, 1] += 0.014 + 0.006 * np.sin(AZIMUTH + turn * 2.1)
         widths = np.stack([1.15 * thickness * lumps, 0.85 * thickness / lumps], -1)
-        parts.append(_followed(anatomy, *sweep(path, UP, widths, 12, closed=True)))
+        parts.append(_followed(anatomy, path, UP, widths, 12))
     if tails > 0:
         ring, _ = neck_ring(anatomy, -0.004)
         for side, length in ((1, tails), (-1, tails * rng.uniform(0.6, 1.0))):
@@ -150,68 +136,45 @@ def _tail(rng, anatomy, start, side, length, thickness, ease):
     widths = np.stack([np.full(rows, 0.045 + 0.3 * thickness), np.full(rows, 0.010)], -1)
     widths[0] *= 0.5
     widths[-1, 1] = 0.002
-    return _followed(anatomy, *sweep(path, np.asarray([1.0, 0.0, 0.0]), widths, 10))
+    return _followed(anatomy, path, SIDEWAYS, widths, 10, closed=False)
 
 
 def _on_head(anatomy, vertices, faces, template):
-    return rigid(vertices, faces, HEAD, len(anatomy.joints)).painted(template, template, 0.09)
+    return surfaces.rigid(vertices, faces, HEAD, len(anatomy.joints)).painted(template, template, 0.09)
 
 
-def _flange(anatomy, ring, outwards, widths, droop, closed):
-    """A sheet from a ring outwards: widths (m,) metres, droop (m,) metres down at its edge."""
-    steps = np.linspace(0, 1, 5)
-    out = ring[None] + (steps[:, None] * widths[None])[..., None] * outwards[None]
-    out[..., 1] -= steps[:, None] ** 2 * droop[None]
-    vertices, faces = out.reshape(-1, 3), grid_faces(len(steps), len(ring), closed=closed)
+def hat_edge(rng: np.random.Generator, anatomy: Anatomy, garment: Garment) -> Surface:
+    """The brim of a hat, wider in front, or the peak of a cap: a sheet from the edge of the hat outwards."""
+    template, size, closed = anatomy.skin.template, garment.sizes["brim"], garment.kind == "brim_hat"
+    no_ear = (np.abs(template[:, 0]) < 0.078) | (template[:, 1] > 0.357)
+    ring, out = _ring(anatomy, no_ear & (np.abs(hair.above_line(template, hair.CAP_LINE)) < 0.012), hair.SKULL[2])
+    if closed:
+        start, widths = ring + out * 0.012, size * (1 + 0.12 * np.cos(AZIMUTH))
+        droop = rng.uniform(-0.012, 0.02) - 0.016 * np.cos(2 * AZIMUTH) * rng.uniform(0.2, 1)
+    else:
+        backwards, across = garment.sizes["backwards"] > 0, np.linspace(-1, 1, 15)
+        chosen = ((RING // 2 if backwards else 0) + np.arange(-7, 8)) % RING
+        start = ring[chosen] + out[chosen] * 0.011
+        out = unit(np.tile(-FORWARD if backwards else FORWARD, (15, 1)) + 0.25 * out[chosen])
+        widths = (0.030 + size * 0.75) * np.sqrt(np.clip(1 - 0.92 * across**2, 0, 1))
+        droop = 0.010 + 0.016 * across**2
+    start[:, 1] += 0.004
+    steps = np.linspace(0, 1, 5)[:, None]
+    sheet = start[None] + (steps * widths[None])[..., None] * out[None]
+    sheet[..., 1] -= steps**2 * droop[None]
+    vertices, faces = sheet.reshape(-1, 3), grid_faces(len(steps), len(start), closed=closed)
     template = vertices - anatomy.joints[HEAD]
-    template[:, 1] = np.repeat(0.4 + 0.05 * steps, len(ring))
-    return turn_in_hems(_on_head(anatomy, vertices, faces, template), 0.004)
+    template[:, 1] = np.repeat(0.4 + 0.05 * steps, len(start))
+    return surfaces.turn_in_hems(_on_head(anatomy, vertices, faces, template), 0.004)
 
 
-def brim(rng: np.random.Generator, anatomy: Anatomy, width: float) -> Surface:
-    """The brim of a hat, wider in front."""
-    ring, outwards = head_ring(anatomy, hair.CAP_LINE)
-    shape = width * (1 + 0.12 * np.cos(AZIMUTH))
-    droop = rng.uniform(-0.012, 0.02) - 0.016 * np.cos(2 * AZIMUTH) * rng.uniform(0.2, 1)
-    start = ring + outwards * 0.012
-    start[:, 1] += 0.004
-    return _flange(anatomy, start, outwards, shape, droop, closed=True)
-
-
-def peak(anatomy: Anatomy, length: float, backwards: bool) -> Surface:
-    """The peak of a cap."""
-    ring, outwards = head_ring(anatomy, hair.CAP_LINE)
-    first = RING // 2 if backwards else 0
-    chosen = np.arange(first - 7, first + 8) % RING
-    across = np.linspace(-1, 1, len(chosen))
-    start = ring[chosen] + outwards[chosen] * 0.011
-    start[:, 1] += 0.004
-    forward = np.tile([0.0, 0.0, -1.0 if backwards else 1.0], (len(chosen), 1)) + 0.25 * outwards[chosen]
-    widths = (0.030 + length * 0.75) * np.sqrt(np.clip(1 - 0.92 * across**2, 0, 1))
-    return _flange(anatomy, start, unit(forward), widths, 0.010 + 0.016 * across**2, closed=False)
-
-
-def _panelled(colours, s):
-    """Six panels of a cap with a button on top."""
-    angle = np.arctan2(s.template[:, 0], s.template[:, 2] - 0.02)
-    seam = np.abs((angle / (np.pi / 3) + 0.5) % 1 - 0.5) * (np.pi / 3) * 0.08
-    return mix(colours, colours * 0.6, band(seam, -1, 0.0016) * (s.template[:, 1] > 0.34))
-
-
-def _ribboned(colours, s, ink):
-    """A hat with a ribbon above its brim."""
-    above = hair.above_line(s.template, hair.CAP_LINE)
-    on_crown = np.hypot(s.template[:, 0], s.template[:, 2] - 0.02) < 0.118
-    return mix(colours, ink, band(above, 0.002, 0.026, 0.002) * on_crown)
-
-
-def glasses(
-    anatomy: Anatomy, size: float, squareness: float, wire: float, dark: bool, ink: np.ndarray
-) -> list[tuple[Surface, Material]]:
+def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]]:
     """Two rims, a bridge and temples to the ears; dark lenses for the sun."""
+    size, squareness, wire = (garment.sizes[name] for name in ("size", "squareness", "wire"))
+    dark = garment.kind == "sunglasses"
     eyes = anatomy.joints[[LEFT_EYE, RIGHT_EYE]]
     middle, apart = eyes.mean(0), np.abs(eyes[0, 0])
-    template, vertices = anatomy.skin.attributes["template"], anatomy.skin.vertices
+    template, vertices = anatomy.skin.template, anatomy.skin.vertices
     x, y, z = template.T
     brow = (np.abs(x) < 0.055) & (np.abs(vertices[:, 1] - middle[1]) < 0.022) & (z > 0.05)
     front = np.quantile(vertices[brow, 2], 0.97) + 0.003
@@ -222,9 +185,8 @@ def glasses(
     parts, lenses = [], []
     for side in (1, -1):
         x, y = side * apart * 1.06 + half * radius * c, middle[1] - 0.004 + tall * radius * s
-        bow = 9.0 * np.abs(x) ** 2.0 * 0.6
-        path = np.stack([x, y, front - bow], -1)
-        parts.append(sweep(path, np.asarray([0.0, 0.0, 1.0]), wire, 6, closed=True))
+        path = np.stack([x, y, front - 9.0 * np.abs(x) ** 2.0 * 0.6], -1)
+        parts.append(sweep(path, FORWARD, wire, 6, closed=True))
         hinge = np.asarray([side * (apart * 1.06 + half), middle[1] + 0.006, front - 9.0 * (apart + half) ** 2 * 0.6])
         on_ear = vertices[ear & (template[:, 0] * side > 0)]
         hook = np.median(on_ear, 0) + np.asarray([side * 0.004, 0.006, 0]) if len(on_ear) else hinge - [0, 0, 0.09]
@@ -237,11 +199,9 @@ def glasses(
     across, flat = np.linspace(-1, 1, 7), np.full(7, front + 0.002)
     bridge = np.stack([(apart * 1.06 - half) * across, middle[1] + 0.004 + 0.003 * (1 - across**2), flat], -1)
     parts.append(sweep(bridge, UP, wire, 6))
-    result = [(join([_on_head(anatomy, v, f, v - middle) for v, f in parts]), _painted(ink, 0.4))]
-    if dark:
-        lens = join([_on_head(anatomy, v, f, v - middle) for v, f in lenses])
-        result.append((lens, _painted(colour(0.08, 0.3, 0.06), 0.7)))
-    return result
+    glass = (lenses, _painted(colour(0.08, 0.3, 0.06), 0.7))
+    made = [(parts, _painted(garment.fabric.base, 0.4)), *([glass] if dark else [])]
+    return [(join([_on_head(anatomy, v, f, v - middle) for v, f in pieces]), material) for pieces, material in made]
 
 
 def necklace(anatomy: Anatomy, length: float) -> Surface:
@@ -251,45 +211,33 @@ def necklace(anatomy: Anatomy, length: float) -> Surface:
     path = ring + outwards * 0.003
     path[:, 1] -= length * front
     path[:, 2] += 0.35 * length * front
-    return _followed(anatomy, *sweep(path, UP, 0.0022, 6, closed=True))
+    return _followed(anatomy, path, UP, 0.0022, 6)
 
 
-def _bag(anatomy, center, half, turn, near):
-    """A rounded box with half axes (3,), turned about the vertical, that moves as the skin near it does on average."""
-    d, faces = ball(14, 24)
-    unit_box = d / (np.sum(np.abs(d) ** 4.0, -1, keepdims=True) ** (1 / 4.0))
-    points = unit_box * np.asarray(half)
-    c, s = np.cos(turn), np.sin(turn)
+def bag(anatomy: Anatomy, garment: Garment, ease: float) -> Surface:
+    """A rounded box on the back, or a flat one at the hip, that moves as the skin near it does on average."""
+    x, y, z = anatomy.skin.template.T
+    size = garment.sizes["size"]
+    if garment.kind == "backpack":
+        near = (np.abs(x) < 0.1) & (y > -0.2) & (y < 0.08) & (z < -0.05)
+        half, turn = np.asarray([0.145, 0.21, 0.075]) * size, np.pi
+        height = float(tailoring.rest_height(anatomy, np.asarray([0.10]))[0]) - half[1]
+        behind = anatomy.trunk.radius(height + np.linspace(-0.6, 0.8, 9) * half[1], np.full(9, np.pi)).max()
+        center = np.asarray([0, height, -behind - ease - half[2] - 0.004])
+    else:
+        side = garment.sizes["side"]
+        near = (x * side > 0.1) & (x * side < 0.24) & (np.abs(y + 0.22) < 0.05)
+        half, turn = np.asarray([0.15, 0.11, 0.05]) * size, side * 1.75
+        height = float(tailoring.rest_height(anatomy, np.asarray([-0.29]))[0]) - 0.75 * half[1]
+        around = anatomy.hips_and_legs.radius(height + np.linspace(-0.3, 1, 7) * half[1], np.full(7, turn))
+        reach = around.mean() + ease + half[2] + 0.008
+        center = np.asarray([reach * np.sin(turn), height, reach * np.cos(turn)])
+    directions, faces = surfaces.ball(14, 24)
+    unit_box = directions / (np.sum(np.abs(directions) ** 4.0, -1, keepdims=True) ** (1 / 4.0))
+    points, c, s = unit_box * half, np.cos(turn), np.sin(turn)
     vertices = (points @ np.asarray([[c, 0, -s], [0, 1, 0], [s, 0, c]]) + center).astype(np.float32)
     weights = np.repeat(anatomy.skin.weights[near].mean(0, keepdims=True), len(vertices), 0)
     return Surface(vertices, faces, weights).painted(unit_box, points, 0.15)
-
-
-def backpack(anatomy: Anatomy, size: float, ease: float) -> Surface:
-    """A rounded box on the back."""
-    template = anatomy.skin.attributes["template"]
-    near = (np.abs(template[:, 0]) < 0.1) & (template[:, 1] > -0.2) & (template[:, 1] < 0.08) & (template[:, 2] < -0.05)
-    half = np.asarray([0.145, 0.21, 0.075]) * size
-    y = float(rest_height(anatomy, np.asarray([0.10]))[0]) - half[1]
-    levels = y + np.linspace(-0.6, 0.8, 9) * half[1]
-    behind = anatomy.trunk.radius(levels, np.full(9, np.pi)).max()
-    return _bag(anatomy, np.asarray([0, y, -behind - ease - half[2] - 0.004]), half, np.pi, np.flatnonzero(near))
-
-
-def shoulder_bag(anatomy: Anatomy, size: float, side: float, ease: float) -> Surface:
-    """A flat rounded box at the hip."""
-    template = anatomy.skin.attributes["template"]
-    near = (template[:, 0] * side > 0.1) & (template[:, 0] * side < 0.24) & (np.abs(template[:, 1] + 0.22) < 0.05)
-    half = np.asarray([0.15, 0.11, 0.05]) * size
-    y = float(rest_height(anatomy, np.asarray([-0.29]))[0]) - 0.75 * half[1]
-    angle = side * 1.75
-    levels = y + np.linspace(-0.3, 1, 7) * half[1]
-    reach = anatomy.hips_and_legs.radius(levels, np.full(7, angle)).mean() + ease + half[2] + 0.008
-    center = np.asarray([reach * np.sin(angle), y, reach * np.cos(angle)])
-    return _bag(anatomy, center, half, angle, np.flatnonzero(near))
-
-
-COLUMNS = 32
 
 
 def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> Surface:
@@ -298,33 +246,29 @@ def pair_of_shoes(anatomy: Anatomy, height: float, sole: float, ease: float) -> 
 
 
 def _shoe(anatomy, side, height, sole, ease):
-    template = anatomy.skin.attributes["template"]
-    sign = 1 if side == 0 else -1
-    own = np.flatnonzero((template[:, 0] * sign > 0) & (template[:, 1] < FLOOR + height + 0.06))
+    x, y, _ = anatomy.skin.template.T
+    own = np.flatnonzero((x * (1 - 2 * side) > 0) & (y < FLOOR + height + 0.06))
     points = anatomy.skin.vertices[own]
     floor = points[:, 1].min()
     shaft = np.linspace(0.085, height, max(3, int((height - 0.085) / 0.03) + 1)) if height > 0.1 else [height]
     low = np.asarray([0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072])
     levels = floor + np.concatenate([low[low < height - 0.004], shaft])
-    shape = hanging(_outlines(points, levels), 0.6)  # the sole is as wide as what is above it
+    # thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices
+    thin, thick = (surfaces.outlines(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03))
+    shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
+    pairs = (thin.centers, thick.centers), (thin.radii, blurred(thick, 2).radii)
+    shape = hanging(
+        Outlines(levels, *(a + (b - a) * shin for a, b in pairs)), 0.6
+    )  # the sole is as wide as what is above it
     below = ((-sole, 0.0), (-sole, 0.0), (-0.3 * sole, 0.004), (0.004, 0.004), (0.006, 0.0))
     rows = [(floor + y, 0, extra) for y, extra in below] + [(level, i + 1, 0.0) for i, level in enumerate(levels[1:])]
     rings = []
     for y, i, extra in rows:
         radius = shape.radius(np.full(COLUMNS, levels[i]), circle(COLUMNS)) + ease + extra
         radius = radius if rings else 0 * radius
-        rings.append(around(radius, circle(COLUMNS), np.full(COLUMNS, y), shape.centers[i]))
+        rings.append(surfaces.around(radius, circle(COLUMNS), np.full(COLUMNS, y), shape.centers[i]))
     vertices = np.concatenate(rings).astype(np.float32)
     faces = np.ascontiguousarray(grid_faces(len(rows), COLUMNS, closed=True)[:, ::-1])
-    weights = smooth_weights(nearest_weights(anatomy, vertices, own), faces, 3)
+    weights = tailoring.smooth_weights(tailoring.nearest_weights(anatomy, vertices, own), faces, 3)
     local = vertices - np.where([True, False, True], anatomy.joints[LEFT_ANKLE + side], floor)
-    return turn_in_hems(Surface(vertices, faces, weights).painted(local, local, 0.06), 0.01)
-
-
-def _outlines(points, levels):
-    """Thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices."""
-    thin, thick = (outlines(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03))
-    shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
-    smooth = blurred(thick, 2)
-    mixed = [a + (b - a) * shin for a, b in ((thin.centers, thick.centers), (thin.radii, smooth.radii))]
-    return Outlines(levels, *mixed)
+    return surfaces.turn_in_hems(Surface(vertices, faces, weights).painted(local, local, 0.06), 0.01)

@@ -10,11 +10,10 @@ import functools
 import numpy as np
 
 from humangs_jax.people.kinematics import LEFT_ANKLE, LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER, LEFT_WRIST
-from humangs_jax.people.surfaces import Outlines, Surface, blurred, outlines, vertex_normals
+from humangs_jax.people.surfaces import Faces, Outlines, Points, Surface, blurred, outlines, vertex_normals
 
 BODY_NAME, BODY_VERTICES = "makehuman", 13380
 """The body that the cuts below were measured on."""
-
 WAIST, CROTCH, ANKLE, FLOOR = -0.2, -0.425, -1.159, -1.2285
 ARM_HEIGHT, SHOULDER, WRIST = 0.096, 0.171, 0.651
 """Heights (y) of the trunk and legs, and distances from the middle (|x|) of the arms, in template coordinates."""
@@ -49,11 +48,6 @@ def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
     """0 at `low`, 1 at `high`, smooth between, constant beyond (either may be the larger one)."""
     t = np.clip((x - low) / (high - low), 0, 1)
     return t * t * (3 - 2 * t)
-
-
-def arm_membership(template: np.ndarray) -> np.ndarray:
-    """(n,) 1 on the arms, 0 on the trunk, smooth across the shoulder seam."""
-    return smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])
 
 
 def leg_membership(template: np.ndarray) -> np.ndarray:
@@ -100,18 +94,20 @@ def sewn_coordinates(cloth: np.ndarray, template: np.ndarray) -> np.ndarray:
 @functools.lru_cache(maxsize=1)
 def _fixed(template_bytes: bytes):
     template = np.frombuffer(template_bytes, np.float32).reshape(-1, 3)
-    return template, cloth_coordinates(template), arm_membership(template), leg_membership(template)
+    # 1 on the arms, 0 on the trunk, smooth across the shoulder seam
+    arm = smoothstep(0.165, 0.23, np.abs(template[:, 0])) * smoothstep(-0.15, -0.05, template[:, 1])
+    return template, cloth_coordinates(template), arm, leg_membership(template)
 
 
 def measure(
-    vertices: np.ndarray, joints: np.ndarray, template: np.ndarray, faces: np.ndarray, weights: np.ndarray, parents
-):
+    vertices: Points, joints: np.ndarray, template: Points, faces: Faces, weights: np.ndarray, parents: tuple
+) -> Anatomy:
     """The `Anatomy` of a shaped body from its rest vertices (n, 3) and joints (j, 3)."""
     template, cloth, arm, leg = _fixed(np.ascontiguousarray(template, np.float32).tobytes())
     vertices = np.asarray(vertices, np.float32)
     attributes = {"template": template, "normals": vertex_normals(vertices, faces), "cloth": cloth}
     skin = Surface(vertices, faces, weights, attributes)
-    levels = np.arange(-1.3, 0.5, 0.02) * 1.0
+    levels, along = np.arange(-1.3, 0.5, 0.02), np.arange(0.05, 0.8, 0.02)
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)
     trunk_points = vertices[body & (template[:, 1] > -0.6)]
     spine = np.zeros((len(levels), 2))
@@ -119,12 +115,11 @@ def measure(
     lower = vertices[body & (template[:, 1] < WAIST + 0.03)]
     hips = outlines(lower[:, 1], lower[:, [0, 2]], levels, spine, 0.025)
     legs, arms = [], []
-    for side, offset in ((1, 0), (-1, 1)):
+    for offset, side in enumerate((1, -1)):
         line = joints[[LEFT_ANKLE + offset, LEFT_KNEE + offset, LEFT_HIP + offset]]
         centers = np.stack([np.interp(levels, line[:, 1], line[:, i]) for i in (0, 2)], -1)
         own = vertices[(template[:, 0] * side > 0.004) & (template[:, 1] < CROTCH + 0.1) & (template[:, 1] > -1.15)]
         legs.append(blurred(outlines(own[:, 1], own[:, [0, 2]], levels, centers, 0.025)))
-        along = np.arange(0.05, 0.8, 0.02)
         line = joints[[LEFT_SHOULDER + offset, LEFT_WRIST + offset]]
         centers = np.stack([np.interp(along, np.abs(line[:, 0]), line[:, i]) for i in (1, 2)], -1)
         own = vertices[(template[:, 0] * side > 0.2) & (template[:, 1] > -0.05) & (np.abs(template[:, 0]) < 0.68)]

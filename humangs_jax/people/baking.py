@@ -25,16 +25,12 @@ from humangs_jax.rendering.mesh.atlas import Atlas, fill_gaps, texels, unwrap
 
 JOINTS_PER_VERTEX = 6
 """Bodies have up to 7, smoothed garments up to 12; six lose at most 0.4 % of the weight, under a millimetre in any pose."""
-SLOPE_STEP = 1 / 100
-"""One step of the slope texture's bytes: slopes up to 1.27."""
-SLOPE_ZERO = 128
-"""Byte of no slope."""
+SLOPE_STEP, SLOPE_ZERO = 1 / 100, 128
+"""One step of the slope texture's bytes: slopes up to 1.27; byte of no slope."""
 FACE_DENSITY = 2.0
 """Texels per metre of skin and eyes of the head, relative to everything else."""
-HEAD_JOINTS = (HEAD, 22, 23, 24)
-"""Head, jaw and eyes."""
-SKIN, EYES = 0, 1
-"""Materials of a subject that `make_subject` puts first."""
+HEAD_JOINTS, SKIN_AND_EYES = (HEAD, 22, 23, 24), (0, 1)
+"""Head, jaw and eyes; the materials of a subject that `make_subject` puts first."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,9 +49,14 @@ class BakedSubject:
 def bake_subject(subject: SyntheticSubject, texture_size: int = 1024, samples: int = 1) -> BakedSubject:
     """The textures of a subject, texture_size texels a side, each the mean of samples x samples points.
 
+    No chart of the atlas is across two materials; faces (of people) are in finer detail.
     Raises: ValueError if the size is no multiple of the packing's `atlas.CELLS`.
     """
-    atlas = unwrap_subject(subject, texture_size)
+    surface, pieces = subject.surface, subject.face_materials
+    strongest = np.argmax(surface.weights[surface.faces[:, 0]], axis=1)
+    face = np.isin(strongest, HEAD_JOINTS) & np.isin(pieces, SKIN_AND_EYES)
+    density = np.where(face, FACE_DENSITY, 1.0).astype(np.float32)
+    atlas = unwrap(surface.vertices, surface.faces, 2 * pieces + face, texture_size, density)
     ids, weights = texels(dataclasses.replace(atlas, size=texture_size * samples))
     covered = ids >= 0
     albedo, slopes = paint(subject, ids[covered], spots_at(subject, ids[covered], weights[covered]))
@@ -67,19 +68,8 @@ def bake_subject(subject: SyntheticSubject, texture_size: int = 1024, samples: i
     return BakedSubject(atlas, np.round(albedo).astype(np.uint8), np.round(SLOPE_ZERO + slopes).astype(np.uint8))
 
 
-def unwrap_subject(subject: SyntheticSubject, size: int) -> Atlas:
-    """The atlas of a subject: no chart across two materials; faces (of people) in finer detail."""
-    surface = subject.surface
-    strongest = np.argmax(surface.weights[surface.faces[:, 0]], axis=1)
-    face = np.isin(strongest, HEAD_JOINTS) & np.isin(subject.face_materials, (SKIN, EYES))
-    density = np.where(face, FACE_DENSITY, 1.0).astype(np.float32)
-    return unwrap(surface.vertices, surface.faces, 2 * subject.face_materials + face, size, density)
-
-
-def strongest_joints(
-    weights: Float[np.ndarray, "n j"], count: int
-) -> tuple[UInt8[np.ndarray, "n k"], Float[np.ndarray, "n k"]]:
-    """The `count` joints of most weight of each vertex, strongest first, and their weights scaled to sum 1."""
+def strongest_joints(weights: Float[np.ndarray, "n j"], count: int) -> tuple[np.ndarray, np.ndarray]:
+    """The `count` joints (n, k) of most weight of each vertex, strongest first, and their weights (n, k) scaled to sum 1."""
     ids = np.argsort(-weights, axis=1, kind="stable")[:, :count]
     kept = np.take_along_axis(weights, ids, axis=1)
     return ids.astype(np.uint8), (kept / kept.sum(1, keepdims=True)).astype(np.float32)

@@ -4,9 +4,7 @@ A bank holds people of ONE range of seeds (see `seeds`), so no key of a training
 3 MB a person at 512 texels a side.
 """
 
-import concurrent.futures
 import functools
-import multiprocessing
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, UInt, UInt8
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.core.signals import started_deaf
-from humangs_jax.core.workers import end_with_parent
+from humangs_jax.core.workers import in_processes
 from humangs_jax.io.arrays import check_array, check_indices, check_joints
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import Refused, reading
@@ -27,7 +25,7 @@ from humangs_jax.people.baking import JOINTS_PER_VERTEX, bake_subject, strongest
 from humangs_jax.people.kinematics import joint_positions
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.seeds import GENERATOR_VERSION, split_of
-from humangs_jax.people.subject import SyntheticSubject, make_subject
+from humangs_jax.people.subject import make_subject
 from humangs_jax.people.surfaces import vertex_normals
 
 FORMAT, VERSION = "humangs-people", 1
@@ -100,7 +98,7 @@ def build_bank(
     """The people of some seeds, which must all lie in the range `split` of `seeds.SPLITS`.
 
     texture_size: texels a side, a multiple of 128; 512 suits images up to 256 pixels, 1024 those of 512.
-    processes: how many work at once; with more than one, each loads the shipped body itself.
+    processes: how many work at once; more than one use the CPU and load the shipped body themselves.
     Raises: ValueError if there are no seeds, a seed lies in another range, or the body is not the package's own.
     """
     seeds = list(seeds)
@@ -108,16 +106,12 @@ def build_bank(
         raise ValueError("no seeds")
     _check_range(seeds, split)
     make = functools.partial(_person, texture_size=texture_size, pose_count=pose_count)
-    shown = functools.partial(bar, total=len(seeds), desc="bank", shown=progress)
     if processes == 1:
-        people = list(shown(make(seed, body) for seed in seeds))
+        made = ((i, make(seed, body)) for i, seed in enumerate(seeds))
     else:
-        context = multiprocessing.get_context("spawn")  # a forked process may hang in jax's threads
-        with concurrent.futures.ProcessPoolExecutor(processes, context, end_with_parent) as pool:
-            with started_deaf():
-                made = pool.map(make, seeds)
-            people = list(shown(made))
-    return _stacked(people, body, split)
+        made = in_processes(make, {i: (seed,) for i, seed in enumerate(seeds)}, processes, _shipped_body)
+    people = dict(bar(made, total=len(seeds), desc="bank", shown=progress))
+    return _stacked([people[i] for i in range(len(seeds))], body, split)
 
 
 def save_bank(path: str | Path, bank: PeopleBank) -> None:
@@ -129,27 +123,19 @@ def save_bank(path: str | Path, bank: PeopleBank) -> None:
 def load_bank(path: str | Path) -> PeopleBank:
     """Read a bank. Raises: FileNotFoundError; FileError if it holds no bank."""
     with reading(path, "bank of people"):
-        return _load_bank(path)
-
-
-def _load_bank(path):
-    arrays, _ = read_npz(path)
-    if str(arrays.get("format")) != FORMAT:
-        raise ValueError(f"{path}: not a bank of people")
-    if int(arrays["version"]) != VERSION:
-        raise ValueError(f"{path}: a bank of version {int(arrays['version'])}; this program reads version {VERSION}")
-    if missing := {*_ARRAYS, *_STATIC} - set(arrays):
-        raise ValueError(f"{path}: a bank without {sorted(missing)}")
-    _check_arrays(arrays)
-    split = str(arrays["split"])
-    _check_range(arrays["seeds"].tolist(), split, f"{path}: ")
-    return PeopleBank(
-        **{name: jnp.asarray(arrays[name]) for name in _ARRAYS},
-        parents=tuple(arrays["parents"].tolist()),
-        mirrored_joints=tuple(arrays["mirrored_joints"].tolist()),
-        split=split,
-        generator=int(arrays["generator"]),
-    )
+        arrays, _ = read_npz(path)
+        if str(arrays.get("format")) != FORMAT:
+            raise ValueError(f"{path}: not a bank of people")
+        if (version := int(arrays["version"])) != VERSION:
+            raise ValueError(f"{path}: a bank of version {version}; this program reads version {VERSION}")
+        if missing := {*_ARRAYS, *_STATIC} - set(arrays):
+            raise ValueError(f"{path}: a bank without {sorted(missing)}")
+        _check_arrays(arrays)
+        _check_range(arrays["seeds"].tolist(), str(arrays["split"]), f"{path}: ")
+        fields: dict[str, Any] = {name: jnp.asarray(arrays[name]) for name in _ARRAYS}
+        for name in ("parents", "mirrored_joints"):
+            fields[name] = tuple(arrays[name].tolist())
+        return PeopleBank(**fields, split=str(arrays["split"]), generator=int(arrays["generator"]))
 
 
 _STATIC = ("parents", "mirrored_joints", "split", "generator")
@@ -182,9 +168,6 @@ def _check_range(seeds, split, where=""):
 
 @functools.cache
 def _shipped_body():
-    """For processes of their own."""
-    from humangs_jax.body.library import load_body
-
     return load_body()
 
 
@@ -195,11 +178,13 @@ def _person(seed, body=None, *, texture_size, pose_count):
     surface, atlas, materials = subject.surface, baked.atlas, subject.materials
     if len(materials) > MOST_MATERIALS or len(surface.vertices) > np.iinfo(np.uint16).max:
         raise ValueError(f"seed {seed}: {len(materials)} pieces, {len(surface.vertices)} vertices: too many")
-    uvs = atlas.uvs[atlas.faces]
-    uvs = np.round(UV_STEPS * np.stack([uvs[..., 0], 1 - uvs[..., 1]], -1)).astype(np.uint16)
+    u, v = np.moveaxis(atlas.uvs[atlas.faces], -1, 0)
     pad = lambda values, kind: np.pad(np.asarray(values), (0, MOST_MATERIALS - len(materials))).astype(kind)
     identities = [id(material) for material in materials]
-    rotations = sample_poses(subject, pose_count)
+    generators = (np.random.default_rng([seed, POSE_STREAM, i]) for i in range(pose_count))
+    rotations = np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(np.float32)
+    places = np.stack([joint_positions(subject.build, r.astype(np.float64))[1] for r in rotations])
+    away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(-1)  # of each pose from the others
     joint_ids, joint_weights = strongest_joints(surface.weights, JOINTS_PER_VERTEX)
     return {
         "seeds": np.int32(seed),
@@ -211,28 +196,15 @@ def _person(seed, body=None, *, texture_size, pose_count):
         "joint_ids": joint_ids,
         "joint_weights": joint_weights.astype(np.float16),
         "faces": surface.faces.astype(np.uint16),
-        "uvs": uvs,
+        "uvs": np.round(UV_STEPS * np.stack([u, 1 - v], -1)).astype(np.uint16),
         "face_pieces": subject.face_materials.astype(np.uint8),
         "sheen": pad([material.sheen for material in materials], np.float32),
         "groups": pad([identities.index(i) for i in identities], np.uint8),
         "dyeable": pad([material.wrinkles > 0 for material in materials], np.float32),
         "texture": np.concatenate([baked.albedo, baked.slopes], axis=-1),
         "rotations": rotations,
-        "nearest": _nearest(subject.build, rotations),
+        "nearest": np.argmin(away + 1e9 * np.eye(pose_count), axis=1).astype(np.int32),
     }
-
-
-def sample_poses(subject: SyntheticSubject, count: int) -> Float[np.ndarray, "q j 3"]:
-    """(q, j, 3) poses of a subject by the prior."""
-    generators = (np.random.default_rng([subject.seed, POSE_STREAM, i]) for i in range(count))
-    return np.stack([sample_rotations(rng, subject.build) for rng in generators]).astype(np.float32)
-
-
-def _nearest(build, rotations):
-    """(q,) for each pose the other one whose joints are nearest to its own."""
-    places = np.stack([joint_positions(build, r.astype(np.float64))[1] for r in rotations])
-    away = np.linalg.norm(places[:, None] - places[None], axis=-1).mean(-1) + 1e9 * np.eye(len(places))
-    return np.argmin(away, axis=1).astype(np.int32)
 
 
 _BY_VERTEX, _BY_FACE = ("vertices", "normals", "joint_ids", "joint_weights"), ("faces", "uvs", "face_pieces")

@@ -15,22 +15,20 @@ from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, look_at, or
 from humangs_jax.people.kinematics import Vector
 from humangs_jax.people.surfaces import Points
 
-VERTICAL_FOV = np.deg2rad(60.0)
-DISTANCE_FACTOR = (1.8, 2.2)
-"""Distance in bounding radii: nearer than 1.7 the frame cuts heads and feet."""
-ELEVATION = np.deg2rad(np.asarray([-5.0, 15.0]))
-CLOSE_FACTOR = (0.8, 1.7)
-"""The same of close views, which show parts of the person."""
-CLOSE_SPREAD = 0.85
-"""Close cameras look at points up to this share of the way from the middle of the person to its surface."""
-CLEARANCE = 0.3
-"""Metres: no close camera is nearer to a point of the surface."""
+VERTICAL_FOV, ELEVATION = np.deg2rad(60.0), np.deg2rad(np.asarray([-5.0, 15.0]))
+DISTANCE_FACTOR, CLOSE_FACTOR = (1.8, 2.2), (0.8, 1.7)
+"""Distance in bounding radii: nearer than 1.7 the frame cuts heads and feet. Close views show parts of the person."""
+CLOSE_SPREAD, CLEARANCE = 0.85, 0.3
+"""Close cameras look at points up to this share of the way from the middle of the person to its surface, and come no nearer to a
+point of it than this (metres)."""
 FRAME = 0.98
 """Share of the half frame that the person may reach; a camera that is too near for it steps back."""
 POINT_STEP = 4096
 """Points are padded to a multiple of this: few shapes are compiled."""
 CAMERA_NUMBERS = 5
 UP = (0.0, 1.0, 0.0)
+Angles = Float[np.ndarray, " v"]
+Number = Float[Array, ""] | float
 
 
 def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
@@ -39,15 +37,13 @@ def bounding_sphere(vertices: Points) -> tuple[Vector, float]:
     return center, float(np.linalg.norm(vertices - center, axis=1).max())
 
 
-def spread_azimuths(rng: np.random.Generator, count: int, jitter: float = 0.3) -> Float[np.ndarray, " count"]:
+def spread_azimuths(rng: np.random.Generator, count: int, jitter: float = 0.3) -> Angles:
     """(count,) sorted azimuths, evenly spread from a random start, each moved by up to `jitter` of the spacing."""
     spacing = 2 * np.pi / count
     return rng.uniform(0, spacing) + spacing * (np.arange(count) + rng.uniform(-jitter, jitter, count))
 
 
-def cameras_around(
-    rng: np.random.Generator, vertices: Points, azimuths: Float[np.ndarray, " v"], image_size: int
-) -> Camera:
+def cameras_around(rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int) -> Camera:
     """A batch of cameras at the azimuths, distances and elevations drawn from the protocol's ranges."""
     center, radius = bounding_sphere(vertices)
     distances = radius * rng.uniform(*DISTANCE_FACTOR, len(azimuths))
@@ -58,9 +54,7 @@ def cameras_around(
     return _orbits(targets, np.maximum(distances, np.asarray(near)), azimuths, elevations, image_size)
 
 
-def close_cameras(
-    rng: np.random.Generator, vertices: Points, azimuths: Float[np.ndarray, " v"], image_size: int
-) -> Camera:
+def close_cameras(rng: np.random.Generator, vertices: Points, azimuths: Angles, image_size: int) -> Camera:
     """A batch of cameras that see parts: `CLOSE_FACTOR` bounding radii away from points between middle and surface."""
     center, radius = bounding_sphere(vertices)
     count = len(azimuths)
@@ -68,8 +62,8 @@ def close_cameras(
     targets = center + rng.uniform(0, CLOSE_SPREAD, (count, 1)) * (towards - center)
     distances = radius * rng.uniform(*CLOSE_FACTOR, count)
     elevations = rng.uniform(*ELEVATION, count)
-    ce = np.cos(elevations)
-    directions = np.stack([ce * np.sin(azimuths), np.sin(elevations), ce * np.cos(azimuths)], -1)
+    flat = np.cos(elevations)
+    directions = np.stack([flat * np.sin(azimuths), np.sin(elevations), flat * np.cos(azimuths)], -1)
     for i in range(count):
         while np.linalg.norm(vertices - targets[i] - distances[i] * directions[i], axis=1).min() < CLEARANCE:
             distances[i] += 0.05 * radius
@@ -89,31 +83,26 @@ def _placed(targets, distances, azimuths, elevations, K, size):
 
 
 def camera_from(
-    u: Float[Array, "5"],
-    vertices: Float[Array, "n 3"],
-    count: Int[Array, ""] | int,
-    azimuth: Float[Array, ""],
-    close_share: Float[Array, ""] | float,
-    size: int,
+    u: Array, vertices: Float[Array, "n 3"], count: Int[Array, ""] | int, azimuth: Number, close: Number, size: int
 ) -> Camera:
     """A square camera of `size` pixels that looks at a posed person from an azimuth.
 
-    u: in [0, 1). count: vertices that are no padding. close_share: probability of a close camera; others see all of the person.
+    u: (5,) in [0, 1). count: vertices that are no padding. close: probability of a close camera; others see all of the person.
     """
     is_close, tilt, spread, outwards, place = u
     low, high = vertices.min(0), vertices.max(0)
     center = 0.5 * (low + high)
     radius = jnp.sqrt(jnp.max(jnp.sum((vertices - center) ** 2, -1)))
-    close = is_close < close_share
+    near = is_close < close
     elevation = _within(ELEVATION, tilt)
-    factor = jnp.where(close, _within(CLOSE_FACTOR, spread), _within(DISTANCE_FACTOR, spread))
+    factor = jnp.where(near, _within(CLOSE_FACTOR, spread), _within(DISTANCE_FACTOR, spread))
     towards_vertex = vertices[pick(place, count)] - center
-    target = center + jnp.where(close, CLOSE_SPREAD * outwards, 0.0) * towards_vertex
+    target = center + jnp.where(near, CLOSE_SPREAD * outwards, 0.0) * towards_vertex
     along = _along_axes(vertices - target, azimuth, elevation)
     ahead, above, aside = along
     beside = CLEARANCE**2 - (above * above + aside * aside)  # a camera on its axis comes no nearer than that to a point
     clear = jnp.max(jnp.where(beside > 0, ahead + jnp.sqrt(jnp.maximum(beside, 0)), -jnp.inf))
-    distance = jnp.maximum(factor * radius, jnp.where(close, clear, _nearest_distance(*along)))
+    distance = jnp.maximum(factor * radius, jnp.where(near, clear, _nearest_distance(*along)))
     K = intrinsics_from_fov(VERTICAL_FOV, size, size).astype(vertices.dtype)
     eye = target + distance * _axes(azimuth, elevation)[0]
     return look_at(eye, target, jnp.asarray(UP, vertices.dtype), K, size, size)

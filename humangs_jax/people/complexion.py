@@ -9,19 +9,13 @@ from humangs_jax.people.hair import LONG_CUTS, SHORT_LINE, Haircut, above_line, 
 from humangs_jax.people.noise import Ripples, lattice
 from humangs_jax.people.outfits import drawn
 
-EYE_X, EYE_Y, MOUTH_Y = 0.029, 0.330, 0.2629
-HAND_Y = 0.085
-"""Template height that parts the backs of the hands from the palms."""
-
-
+EYE_X, EYE_Y, MOUTH_Y, HAND_Y = 0.029, 0.330, 0.2629, 0.085
+"""Places in template coordinates; the last parts the backs of the hands from the palms."""
 HAIR = {
-    "black": (0.07, 0.3, (0.05, 0.12)),
-    "brown": ((0.05, 0.09), (0.5, 0.7), (0.15, 0.4)),
-    "blond": ((0.09, 0.13), (0.35, 0.6), (0.5, 0.76)),
-    "red": ((0.03, 0.06), (0.6, 0.8), (0.35, 0.6)),
-    "grey": (0.1, 0.05, (0.3, 0.66)),
-    "dyed": ((0, 1), 0.55, 0.55),
-}
+    "black": (0.07, 0.3, (0.05, 0.12)), "brown": ((0.05, 0.09), (0.5, 0.7), (0.15, 0.4)),
+    "blond": ((0.09, 0.13), (0.35, 0.6), (0.5, 0.76)), "red": ((0.03, 0.06), (0.6, 0.8), (0.35, 0.6)),
+    "grey": (0.1, 0.05, (0.3, 0.66)), "dyed": ((0, 1), 0.55, 0.55),
+}  # fmt: skip
 """Hue, saturation and value of hair, or their ranges."""
 FAIR_ODDS, DARK_ODDS = np.asarray([[0.2, 0.35, 0.22, 0.08, 0.06, 0.05], [0.80, 0.12, 0.01, 0.0, 0.03, 0.03]])
 """Odds of the colours of hair above, of fair and of dark skin."""
@@ -107,16 +101,14 @@ def skin_material(rng: np.random.Generator, tones: Complexion, haircut: Haircut)
         result = tones.skin * (1 + 0.035 * cloud(s.template) + 0.03 * blotches(s.template))[:, None]
         result = result * (1 - tones.tan * np.clip((x - 0.2) / 0.3, 0, 1) * (y > -0.1))[:, None]
         i = np.flatnonzero((x > 0.6) & (y > -0.1))
-        if len(i):
-            result[i] = _hand(tones, result[i], x[i], y[i])
+        result[i] = _hand(tones, result[i], x[i], y[i])
         knees, elbows = _bell((y, -0.764, 0.05)) * (y < -0.5), _bell((x, 0.411, 0.03)) * (y > 0) * (z < 0)
         result = _tinted(result, (0.96, 0.82, 0.8), 0.5 * (knees + elbows))
         i = np.flatnonzero((y > 0.19) & (z > -0.14) & (x < 0.2))
-        if len(i):
-            front = np.clip((z[i] - 0.07) / 0.02, 0, 1)
-            result[i] = _cheeks_and_eyes(tones, features, result[i], x[i], y[i], front, s.template[i], seed)
-            result[i] = _aged(tones, result[i], x[i], y[i], front)
-            result[i] = _mouth_and_brows(tones, haircut, features, result[i], x[i], y[i], front, s.template[i], seed)
+        face = x[i], y[i], np.clip((z[i] - 0.07) / 0.02, 0, 1), s.template[i]
+        result[i] = _cheeks_and_eyes(tones, features, result[i], *face, seed)
+        result[i] = _aged(tones, result[i], *face[:3])
+        result[i] = _mouth_and_brows(tones, haircut, features, result[i], *face, seed)
         return result
 
     return Material(albedo, wrinkles=0.0, sheen=0.25)
@@ -156,9 +148,8 @@ def _cheeks_and_eyes(tones, features, result, x, y, front, template, seed):
     rim = np.sqrt(((x - EYE_X) / 0.0155) ** 2 + ((y - EYE_Y - 0.001) / (0.0075 * features["eye_opening"])) ** 2)
     lashes = band(rim, 0.75, 1.08 + 0.18 * tones.liner, 0.15)
     result = mix(result, result * 0.22, 0.8 * lashes * (y > EYE_Y - 0.002) * front)
-    wing = (
-        band(np.abs(y - EYE_Y - 0.25 * (x - 0.042)), -1, 0.0016) * band(x, 0.041, 0.041 + 0.008 * tones.liner) * front
-    )
+    wing = band(np.abs(y - EYE_Y - 0.25 * (x - 0.042)), -1, 0.0016)
+    wing = wing * band(x, 0.041, 0.041 + 0.008 * tones.liner) * front
     return mix(result, result * 0.2, np.clip(tones.liner * (0.7 * lashes * (y < EYE_Y) + wing), 0, 1))
 
 
@@ -214,15 +205,16 @@ def _mouth_and_brows(tones, haircut, features, result, x, y, front, template, se
 
 def eye_material(tones: Complexion) -> Material:
     """White, iris, pupil and a highlight painted on the surface."""
+    white, black, bright = (np.asarray(dye, np.float32) for dye in ([0.84, 0.82, 0.80], [0.02] * 3, [0.85] * 3))
 
     def albedo(s: Spots):
         d = s.template
         angle = np.arccos(np.clip(d[:, 2] / np.maximum(np.linalg.norm(d, axis=1), 1e-6), -1, 1))
-        result = mix(np.asarray([0.84, 0.82, 0.80], np.float32), tones.iris, band(angle, -1, 0.47, 0.05))
+        result = mix(white, tones.iris, band(angle, -1, 0.47, 0.05))
         result = mix(result, tones.iris * 0.4, band(angle, 0.40, 0.48, 0.05))
-        result = mix(result, np.asarray([0.02, 0.02, 0.02], np.float32), band(angle, -1, 0.21, 0.05))
+        result = mix(result, black, band(angle, -1, 0.21, 0.05))
         glint = np.sqrt((d[:, 0] - 0.15) ** 2 + (d[:, 1] - 0.2) ** 2)
-        return mix(result, np.asarray([0.85, 0.85, 0.85], np.float32), band(glint, -1, 0.08, 0.05) * (d[:, 2] > 0))
+        return mix(result, bright, band(glint, -1, 0.08, 0.05) * (d[:, 2] > 0))
 
     return Material(albedo)
 
@@ -238,16 +230,18 @@ def hair_material(rng: np.random.Generator, base: np.ndarray, haircut: Haircut) 
         x, y, z = s.template[:, 0], s.template[:, 1], s.template[:, 2] - 0.02
         angle, radial = np.arctan2(x, z), np.sqrt(x * x + z * z)
         if curls:
-            fine = lattice(s.template / 0.006, seed)
-            coarse = lattice(s.template / 0.02, seed + 1)
+            fine, coarse, shine = (
+                lattice(s.template / 0.006, seed),
+                lattice(s.template / 0.02, seed + 1),
+                np.zeros(1, np.float32),
+            )
         else:
             strand, run = angle / 0.04, (y - 0.6 * radial) / 0.09
             fine = lattice(np.stack([strand + 0.8 * np.sin(run), run, radial / 0.05], -1), seed)
             coarse = lattice(np.stack([strand / 5, run / 2], -1), seed + 1)
-        shine = 0.0 if curls else np.exp(-(((y - ring + 0.012 * (coarse - 0.5)) / 0.016) ** 2)) * (0.4 + fine)
+            shine = np.exp(-(((y - ring + 0.012 * (coarse - 0.5)) / 0.016) ** 2)) * (0.4 + fine)
         bright = 1 + haircut.grain * (1.2 * (fine - 0.5) + 0.9 * (coarse - 0.5)) + 0.5 * shine
         down = np.clip((0.3 - y) / 0.35, 0, 1)
-        sheen = 0.035 * shine if not curls else 0.0
-        return mix(base, tips, down) * np.clip(bright, 0.25, 2.2)[:, None] + np.asarray(sheen)[..., None]
+        return mix(base, tips, down) * np.clip(bright, 0.25, 2.2)[:, None] + (0.035 * shine)[..., None]
 
     return Material(albedo, wrinkles=0.0, sheen=0.15 if curls else 0.45)

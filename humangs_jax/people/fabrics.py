@@ -15,7 +15,7 @@ import numpy as np
 from humangs_jax.core.array_types import Float
 from humangs_jax.people.anatomy import ARMHOLE, SAME_GIRTH, TRUNK_GIRTH, sewn_coordinates
 from humangs_jax.people.kinematics import Vector
-from humangs_jax.people.noise import Ripples, hashed, lattice
+from humangs_jax.people.noise import Ripples, choice, hashed, lattice
 from humangs_jax.people.surfaces import Field, Points
 
 SHOULDER_RIDGE = -0.02
@@ -61,19 +61,12 @@ class Spots:
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """albedo: Spots -> (n, 3). wrinkles: strength of the creases painted into the normals. sheen: soft highlight in [0, 1].
-
-    draped: creases run down (skirts).
-    """
+    """albedo: Spots -> (n, 3). wrinkles: of the normals, strength; draped: they run down. sheen: soft highlight in [0, 1]."""
 
     albedo: Callable[[Spots], np.ndarray]
     wrinkles: float = 0.0
     sheen: float = 0.0
     draped: bool = False
-
-
-def _rgb(*values):
-    return np.asarray(values, np.float32)
 
 
 def colour(hue: float, saturation: float, value: float) -> Vector:
@@ -139,11 +132,9 @@ class Fabric:
 
 LEATHER_SHOES = ("flats", "sandals", "ankle_boots", "boots")
 USUAL = {
-    "denim": ((0.57, 0.63), (0.3, 0.75), (0.12, 0.6)),
-    "cotton": ((0.06, 0.13), (0.15, 0.5), (0.2, 0.75)),
-    "leather": ((0.05, 0.09), (0.2, 0.7), (0.06, 0.4)),
-    "suit": ((0.58, 0.68), (0.05, 0.35), (0.06, 0.4)),
-}
+    "denim": ((0.57, 0.63), (0.3, 0.75), (0.12, 0.6)), "cotton": ((0.06, 0.13), (0.15, 0.5), (0.2, 0.75)),
+    "leather": ((0.05, 0.09), (0.2, 0.7), (0.06, 0.4)), "suit": ((0.58, 0.68), (0.05, 0.35), (0.06, 0.4)),
+}  # fmt: skip
 """Hue, saturation and value of usual cloths."""
 CLOTHS = {
     "jeans": ("denim", 0.85), "denim_jacket": ("denim", 0.9), "chinos": ("cotton", 0.6), "cargo": ("cotton", 0.65),
@@ -171,12 +162,9 @@ PATTERN_RULES = (
 
 def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabric:
     """A fabric that suits a kind of garment; with probability `plainness` in one dye or nearly so."""
-    if rng.random() < plainness:
-        pattern = str(rng.choice(["plain", "melange", "tweed"], p=[0.66, 0.2, 0.14]))
-    else:
-        names = [n for n in PATTERNS if PATTERNS[n][0] > 0]
-        odds = np.asarray([PATTERNS[n][0] for n in names])
-        pattern = str(rng.choice(names, p=odds / odds.sum()))
+    plain_ones = {"plain": 0.66, "melange": 0.2, "tweed": 0.14}
+    odds = plain_ones if rng.random() < plainness else {name: share for name, (share, _) in PATTERNS.items() if share}
+    pattern = choice(rng, odds)
     base = _dye(rng, kind)
     for kinds, usual, odds, kept in PATTERN_RULES:
         if kind in kinds and pattern not in kept and (odds == 1 or rng.random() < odds):
@@ -191,9 +179,6 @@ def _dye(rng, kind):
         if kind in kinds and rng.random() < share:
             return _colour_of(rng, ranges)
     return random_colour(rng)
-
-
-# Patterns: (points, random numbers, two dyes) -> colours (n, 3). ---------------------------------------------------------
 
 
 def _lines(x, period, width, shift=0.0):
@@ -222,15 +207,11 @@ def stripes(s, rng, base, other, upright=False):
 
 
 def checks(s, rng, base, other):
-    """Gingham or tartan."""
-    period = rng.choice([0.03, 0.05, 0.08])
-    third, thin = accent(rng, base), rng.random() < 0.6
-    across, along = (_lines(x, period, period / 2) for x in (s.around, s.along))
-    result = mix(base, other, 0.5 * (across + along))
-    if not thin:
-        return result
-    lines = np.maximum(*(_lines(x, period, 0.004, 0.25) for x in (s.around, s.along)))
-    return mix(result, third, 0.7 * lines)
+    """Gingham, or tartan with thin lines of a third dye."""
+    period, third, tartan = rng.choice([0.03, 0.05, 0.08]), accent(rng, base), rng.random() < 0.6
+    result = mix(base, other, 0.5 * (_lines(s.around, period, period / 2) + _lines(s.along, period, period / 2)))
+    lines = np.maximum(_lines(s.around, period, 0.004, 0.25), _lines(s.along, period, 0.004, 0.25))
+    return mix(result, third, 0.7 * lines) if tartan else result
 
 
 def dots(s, rng, base, other):
@@ -252,7 +233,7 @@ def flowers(s, rng, base, other):
     r, a = np.sqrt(np.sum(d * d, -1)), np.arctan2(d[:, 1], d[:, 0]) + 6 * hashed(cell, seed + 2)
     petals = band(r, -1, period * (0.2 + 0.08 * np.cos(5 * a)), 0.002)
     dye = mix(other, third, (hashed(cell, seed + 3) > 0.5).astype(np.float32))
-    return mix(mix(base, dye, petals), _rgb(0.85, 0.75, 0.3), band(r, -1, period * 0.07, 0.002))
+    return mix(mix(base, dye, petals), np.asarray([0.85, 0.75, 0.3], np.float32), band(r, -1, period * 0.07, 0.002))
 
 
 def mottled(s, rng, base, other):
@@ -267,7 +248,7 @@ def mottled(s, rng, base, other):
 
 
 def melange(s, rng, base, other):
-    """Knit or tweed: fine grain."""
+    """Knit: fine grain."""
     seed, share = _seed(rng), rng.uniform(0.2, 0.5)
     return mix(base, other, share * _grain(s, 0.006, 0.009, seed))
 
@@ -285,7 +266,7 @@ def denim(s, rng, base, _other):
         return result
     at = ((s.along + 0.72) / 0.03) ** 2 + (s.around / 0.05) ** 2
     frayed = band(at + 0.6 * _grain(s, 0.02, 0.004, seed + 2), -1, 0.8, 0.2)
-    return mix(result, _rgb(0.75, 0.74, 0.72), 0.8 * frayed * (s.cloth[:, 2] > 0))
+    return mix(result, np.asarray([0.75, 0.74, 0.72], np.float32), 0.8 * frayed * (s.cloth[:, 2] > 0))
 
 
 CAMOUFLAGES = np.asarray([
@@ -301,7 +282,7 @@ def camouflage(s, rng, _base, _other):
     """Torn blots of four colours, larger ones below smaller ones."""
     dyes = CAMOUFLAGES[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])]
     scale, seed = rng.uniform(0.045, 0.09), _seed(rng)
-    p = s.cloth[:, :3] / scale * _rgb(0.8, 1.4, 0.8)
+    p = s.cloth[:, :3] / scale * np.asarray([0.8, 1.4, 0.8], np.float32)
     warp = np.stack([lattice(2.3 * p + k, seed + k) for k in range(3)], -1) - 0.5
     result = np.broadcast_to(dyes[0], (len(p), 3))
     for k, level in ((1, 0.56), (2, 0.6), (3, 0.66)):

@@ -8,46 +8,28 @@ from collections.abc import Callable
 
 import numpy as np
 
+from humangs_jax.people import surfaces
 from humangs_jax.people.anatomy import Anatomy, smoothstep
-from humangs_jax.people.garments import finished, nearest_weights
 from humangs_jax.people.kinematics import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3
 from humangs_jax.people.noise import ripples
 from humangs_jax.people.outfits import HEADWEAR, drawn, row
-from humangs_jax.people.surfaces import (
-    Surface,
-    around,
-    ball,
-    blurred,
-    circle,
-    cut,
-    hanging,
-    join,
-    outlines,
-    rigid,
-    smooth,
-    sweep,
-    tube,
-    unit,
-)
+from humangs_jax.people.surfaces import Field, Points, Surface, around, blurred, cut, outlines, rigid, smooth
+from humangs_jax.people.tailoring import finished, nearest_weights
 
 CUTS = {
-    "cropped": (0.22, 0.03, (0.005, 0.010)),
-    "short": (0.26, 0.10, (0.012, 0.022)),
-    "quiff": (0.10, 0.01, (0.010, 0.016)),
-    "curly": (0.08, 0.12, (0.024, 0.045)),
-    "afro": (0.05, 0.05, (0.045, 0.085)),
-    "buzz": (0.09, 0.01, 0.008),
-    "bald": (0.07, 0.004, 0.008),
-    "bob": (0.012, 0.17, (0.012, 0.024)),
-    "long": (0.025, 0.25, (0.010, 0.022)),
-    "ponytail": (0.02, 0.11, 0.008),
-    "bun": (0.03, 0.08, 0.008),
-    "braid": (0.01, 0.05, 0.008),
-}
+    "cropped": (0.22, 0.03, (0.005, 0.010)), "short": (0.26, 0.10, (0.012, 0.022)), "quiff": (0.10, 0.01, (0.010, 0.016)),
+    "curly": (0.08, 0.12, (0.024, 0.045)), "afro": (0.05, 0.05, (0.045, 0.085)), "buzz": (0.09, 0.01, 0.008),
+    "bald": (0.07, 0.004, 0.008), "bob": (0.012, 0.17, (0.012, 0.024)), "long": (0.025, 0.25, (0.010, 0.022)),
+    "ponytail": (0.02, 0.11, 0.008), "bun": (0.03, 0.08, 0.008), "braid": (0.01, 0.05, 0.008),
+}  # fmt: skip
 """Odds for men and women, thickness (metres, or their range)."""
 NOT_UNDER_HEADWEAR = ("curly", "afro", "quiff", "bun")
 """Cuts that no headwear fits over."""
 LONG_CUTS = ("bob", "long")
+SHELLS = {"curly": (0.3, 0.035, 0), "afro": (0.1, 0.05, 0), "quiff": (0.2, 0.05, 1), "short": (0.22, 0.035, 1)}
+"""Of hair on the scalp: height of its bumps as a share of the thickness, their width in metres, 1 if it is parted."""
+TAILS = {"ponytail": ((0.2, 0.38), 0.0), "braid": ((0.28, 0.42), 0.028)}
+"""Range of their lengths; distance of the knots, metres."""
 FRINGES = {"straight": 0.28, "parted": 0.34, "side": 0.38}
 """Odds of a fringe of longer hair."""
 BEARDS = {"none": 0.5, "stubble": 0.2, "moustache": 0.05, "goatee": 0.09, "full": 0.16}
@@ -114,7 +96,6 @@ SHORT_LINE = (
 CAP_LINE = ([0.0, 0.8, 1.5, 2.2, 3.15], [0.375, 0.37, 0.345, 0.325, 0.315])
 TUBE_COLUMNS = 60
 
-
 FRINGE_LINES = {
     "straight": ([-3.15, -1.2, -1.12, -0.9, -0.5, 0.0, 0.5, 0.9, 1.12, 1.2, 3.15],
                  [-9.0, -9.0, 0.30, 0.362, 0.384, 0.388, 0.384, 0.362, 0.30, -9.0, -9.0]),
@@ -128,33 +109,31 @@ FRINGE_LINES = {
 
 def style(rng: np.random.Generator, anatomy: Anatomy, haircut: Haircut, over: float = 0.0) -> list[Surface]:
     """The surfaces of a haircut, beard included, over clothes that are `over` metres from the skin."""
-    cut_name, thick, shift = haircut.cut, haircut.thickness, haircut.receding
-    parts = []
-    if cut_name in LONG_CUTS:
-        opening = fringe(rng, haircut)
-        parts.append(falling_tube(rng, anatomy, thick, haircut.bottom, opening, wave=haircut.wave, over=over))
-    elif cut_name in ("curly", "afro"):
-        bumps, size = (0.3, 0.035) if cut_name == "curly" else (0.1, 0.05)
-        parts.append(scalp_shell(rng, anatomy, thick, bumps, shift=shift, bump_size=size))
-    elif cut_name == "quiff":
-        up = rng.uniform(0.012, 0.026)
-        parts.append(scalp_shell(rng, anatomy, thick, 0.2, shift=shift, quiff=up, side=haircut.side))
-    elif cut_name not in ("buzz", "bald"):
-        bumps = 0.22 if cut_name == "short" else 0.12
-        parts.append(scalp_shell(rng, anatomy, thick, bumps, shift=shift, bump_size=0.035, side=haircut.side))
-    if cut_name == "ponytail":
-        parts.append(ponytail(rng, anatomy, rng.uniform(0.2, 0.38)))
-    if cut_name == "braid":
-        parts.append(ponytail(rng, anatomy, rng.uniform(0.28, 0.42), knots=0.028))
-    if cut_name == "bun":
-        parts.append(bun(rng, anatomy, rng.uniform(0.032, 0.05), rng.uniform(0.0, 1.1)))
+    kind, parts = haircut.cut, []
+    if kind in LONG_CUTS:
+        opening, wave = fringe(rng, haircut), haircut.wave
+        parts.append(falling_tube(rng, anatomy, haircut.thickness, haircut.bottom, opening, wave=wave, over=over))
+    elif kind not in ("buzz", "bald"):
+        bumps, size, parted = SHELLS.get(kind, (0.12, 0.035, 1))
+        quiff = rng.uniform(0.012, 0.026) if kind == "quiff" else 0.0
+        look = {"size": size, "quiff": quiff, "side": haircut.side * parted, "shift": haircut.receding}
+        parts.append(scalp_shell(rng, anatomy, haircut.thickness, bumps, **look))
+    if kind in TAILS:
+        length, knots = TAILS[kind]
+        parts.append(tail(rng, anatomy, rng.uniform(*length), knots))
+    if kind == "bun":
+        parts.append(bun(anatomy, rng.uniform(0.032, 0.05), rng.uniform(0.0, 1.1)))
     if haircut.beard in ("moustache", "goatee", "full"):
         parts.append(beard(rng, anatomy, haircut.beard_length, haircut.beard))
     return parts
 
 
-def fringe(rng: np.random.Generator, haircut: Haircut) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """(azimuths, heights) -> metres above the ragged edge of hair around the face."""
+Opening = Callable[[Field, Field], Field]
+"""Azimuths in (-pi, pi] and template heights -> positive where hair or cloth leaves the face free."""
+
+
+def fringe(rng: np.random.Generator, haircut: Haircut) -> Opening:
+    """Metres above the ragged edge of hair around the face."""
     angles, heights = (np.asarray(x) for x in FRINGE_LINES[haircut.fringe])
     phase = rng.uniform(0, 6.28, 3)
 
@@ -166,52 +145,38 @@ def fringe(rng: np.random.Generator, haircut: Haircut) -> Callable[[np.ndarray, 
     return above
 
 
-def ears(template: np.ndarray) -> np.ndarray:
+def ears(template: Points) -> np.ndarray:
     """(n,) whether a vertex is on the outer part of an ear."""
     x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
     return (x > 0.0765) & (y > 0.265) & (y < 0.36) & (z < 0.03)
 
 
-def azimuth(template: np.ndarray) -> np.ndarray:
-    """(n,) angle around the skull in [0, pi]: 0 in front, pi at the nape."""
-    return np.abs(np.arctan2(np.abs(template[:, 0]), template[:, 2] - SKULL[2]))
-
-
-def above_line(template: np.ndarray, line: tuple, shift: float = 0.0) -> np.ndarray:
+def above_line(template: Points, line: tuple, shift: float = 0.0) -> Field:
     """(n,) height above a hairline; strongly negative away from the head."""
-    above = template[:, 1] - np.interp(azimuth(template), *line) - shift
+    azimuths = np.abs(np.arctan2(np.abs(template[:, 0]), template[:, 2] - SKULL[2]))  # 0 in front, pi at the nape
+    above = template[:, 1] - np.interp(azimuths, *line) - shift
     return np.where((template[:, 1] > 0.2) & (np.abs(template[:, 0]) < 0.12), above, -1.0)
 
 
 def scalp_shell(
-    rng,
-    anatomy: Anatomy,
-    thickness: float,
-    bumps: float,
-    line: tuple = SHORT_LINE,
-    shift: float = 0.0,
-    crown: float = 0.0,
-    bump_size: float = 0.05,
-    quiff: float = 0.0,
-    side: float = 0.0,
-    rim: float = 0.0025,
+    rng, anatomy: Anatomy, thickness: float, bumps: float, size=0.05, hat=False, shift=0.0, crown=0.0, quiff=0.0, side=0
 ) -> Surface:
     """Short hair (or a hat): the scalp moved out by a thickness (metres) that runs out at the hairline.
 
-    bumps: share of the thickness, `bump_size` metres wide. crown, quiff: metres that the top and the front rise above that.
-    side: +1 or -1 for a parting on that side of the head, 0 for none. rim: metres that its edge stands off.
+    bumps: share of the thickness, `size` metres wide. crown, quiff: metres that the top and the front rise above that.
+    side: +1 or -1 for a parting on that side of the head, 0 for none. hat: with a straight edge that stands off.
     """
-    template = anatomy.skin.attributes["template"]
-    above = above_line(template, line, shift)
-    if line is SHORT_LINE:
+    template = anatomy.skin.template
+    above, rim = above_line(template, CAP_LINE if hat else SHORT_LINE, shift), 0.011 if hat else 0.0025
+    if not hat:
         above = above + 0.0035 * ripples(rng, template, 0.018) * (np.abs(template[:, 0]) < 0.07)
     surface = cut(anatomy.skin.with_attributes(above=above), above)
-    normals = unit(smooth(surface.attributes["normals"], surface.faces, 8))
+    normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 8))
     full = smoothstep(-0.002, 0.022, surface.attributes["above"])
-    grown = thickness * full * (1 + bumps * ripples(rng, surface.attributes["template"], bump_size))
+    grown = thickness * full * (1 + bumps * ripples(rng, surface.template, size))
     grown = np.maximum(grown, rim) + 0.3 * rim
     base = smooth(surface.vertices, surface.faces, 3, keep_hems=True)
-    x, y, z = surface.attributes["template"].T
+    x, y, z = surface.template.T
     top = smoothstep(0.385, 0.425, y)
     if side:
         parting = np.exp(-(((x - side * 0.035) / 0.009) ** 2)) * top * (z > -0.02)
@@ -219,28 +184,20 @@ def scalp_shell(
     points = base + grown[:, None] * normals
     raised = quiff * smoothstep(0.02, 0.085, z) * smoothstep(0.375, 0.41, y)
     points = points + raised[:, None] * np.asarray([0.0, 0.95, 0.35])
-    points[:, 1] += crown * smoothstep(0.39, 0.42, surface.attributes["template"][:, 1])
+    points[:, 1] += crown * smoothstep(0.39, 0.42, y)
     return finished(surface.moved(points), 2, 0.006)
 
 
 def falling_tube(
-    rng,
-    anatomy: Anatomy,
-    thickness: float,
-    bottom: float,
-    opening: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    wave: float = 0.004,
-    ends: float | None = None,
-    over: float = 0.0,
+    rng, anatomy: Anatomy, thickness: float, bottom: float, opening: Opening, wave=0.004, ends=None, over=0.0
 ) -> Surface:
     """Long hair, a hood or a headscarf: the skull's outline scaled up, then falling to the height `bottom` at the back.
 
-    opening(azimuths in (-pi, pi], template heights): positive outside of the face. ends: height at which it ends in front;
-    hair ends on the shoulders at the sides. over: metres between skin and what is worn below it.
+    ends: height at which it ends in front; None: hair, which ends on the shoulders at the sides. over: metres between skin
+    and what is worn below it.
     """
-    skin, template = anatomy.skin, anatomy.skin.attributes["template"]
-    to_rest = _rest_heights(anatomy)
-    center = np.asarray([0.0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01])
+    skin, template = anatomy.skin, anatomy.skin.template
+    to_rest, center = _skull(anatomy)
     scale = 1 + thickness / 0.09
     ears = (np.abs(template[:, 0]) > 0.0735) & (template[:, 1] > 0.26) & (template[:, 1] < 0.36)
     head = (template[:, 1] > 0.24) & (np.abs(template[:, 0]) < 0.1) & ~ears & (template[:, 2] < 0.125)
@@ -248,7 +205,7 @@ def falling_tube(
     spine = np.repeat(center[None, [0, 2]], len(levels), 0)
     points = skin.vertices[head]
     skull = blurred(outlines(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.012))
-    falling = hanging(skull, 0.25)
+    falling = surfaces.hanging(skull, 0.25)
     trunk = (np.abs(template[:, 0]) < 0.12) & (template[:, 1] < 0.24) & (template[:, 1] > -0.35)
     points = skin.vertices[trunk]
     back = blurred(outlines(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.02), 2)
@@ -256,7 +213,7 @@ def falling_tube(
     top = CROWN + (CROWN - SKULL[1]) * (scale - 1)
     dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))
     rows = np.concatenate([dome, np.arange(SKULL[1] - 0.02, min(bottom, 0.3), -0.022)])
-    row_height, angle, faces = tube(rows, circle(TUBE_COLUMNS))
+    row_height, angle, faces = surfaces.tube(rows, surfaces.circle(TUBE_COLUMNS))
     height = to_rest(row_height)
     inner = center[1] + (height - center[1]) / scale
     brim, summit = to_rest(0.385), center[1] + (to_rest(top) - center[1]) / scale
@@ -279,36 +236,33 @@ def falling_tube(
     return finished(surface.moved(smooth(surface.vertices, surface.faces, 1, keep_hems=True)), 2, 0.008)
 
 
-def bun(rng, anatomy: Anatomy, radius: float, elevation: float) -> Surface:
+def bun(anatomy: Anatomy, radius: float, elevation: float) -> Surface:
     """A ball of hair on the back of the head."""
-    to_rest = _rest_heights(anatomy)
     direction = np.asarray([0, np.sin(elevation), -np.cos(elevation)])
-    center = np.asarray([0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01]) + direction * (0.095 + 0.55 * radius)
-    directions, faces = ball(12, 20)
+    center = _skull(anatomy)[1] + direction * (0.095 + 0.55 * radius)
+    directions, faces = surfaces.ball(12, 20)
     vertices = center + directions * (radius * np.asarray([1.0, 0.9, 0.85]))
     return _painted(rigid(vertices, faces, HEAD, len(anatomy.joints)))
 
 
-def ponytail(rng, anatomy: Anatomy, length: float, knots: float = 0.0) -> Surface:
+def tail(rng, anatomy: Anatomy, length: float, knots: float) -> Surface:
     """A tapering tail from the back of the head down the back; a braid has knots, `knots` metres apart."""
-    to_rest = _rest_heights(anatomy)
-    start = np.asarray([0, to_rest(0.36), anatomy.joints[HEAD, 2] - 0.105])
-    rows = 40 if knots else 16
+    start = np.asarray([0, _skull(anatomy)[0](0.36), anatomy.joints[HEAD, 2] - 0.105])
+    rows, columns = 40 if knots else 16, 14
     t = np.linspace(0, 1, rows)
     sway = 0.012 * np.sin(3 * t + rng.uniform(0, 6)) * t
     line = start + np.stack([sway, -length * t**1.3, -0.05 * np.sin(np.pi * np.minimum(t * 1.6, 1) / 1.3) - 0.01], -1)
     radius = np.interp(t, [0, 0.12, 0.4, 0.8, 1], [0.016, 0.026, 0.030, 0.020, 0.004])
     if knots:
         radius = 0.85 * radius * (1 + 0.22 * np.cos(2 * np.pi * length * t / knots))
-    columns = 14
-    vertices, faces = sweep(line, np.asarray([1.0, 0.0, 0.0]), radius[:, None], columns)
+    vertices, faces = surfaces.sweep(line, np.asarray([1.0, 0.0, 0.0]), radius[:, None], columns)
     weights = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
     follow = smoothstep(0.1, 1.0, np.repeat(t, columns)) * 0.8
     weights[:, HEAD], weights[:, SPINE3] = 1 - follow, follow
     return _painted(Surface(vertices, faces, weights))
 
 
-def beard_field(template: np.ndarray, kind: str) -> np.ndarray:
+def beard_field(template: Points, kind: str) -> Field:
     """Positive where a beard grows: full, goatee or moustache."""
     x, y, z = np.abs(template[:, 0]), template[:, 1], template[:, 2]
     lips = 1 - (x / 0.027) ** 2 - ((y - 0.262) / 0.0115) ** 2
@@ -323,14 +277,14 @@ def beard_field(template: np.ndarray, kind: str) -> np.ndarray:
 
 def beard(rng, anatomy: Anatomy, thickness: float, kind: str) -> Surface:
     """A beard that thins out towards the cheeks."""
-    template = anatomy.skin.attributes["template"]
+    template = anatomy.skin.template
     field = beard_field(template, kind)
     ragged = np.where(field > -0.5, field + 0.002 * ripples(rng, template, 0.012), -1.0)
     surface = cut(anatomy.skin.with_attributes(above=field), ragged)
-    normals = unit(smooth(surface.attributes["normals"], surface.faces, 4))
+    normals = surfaces.unit(smooth(surface.attributes["normals"], surface.faces, 4))
     full = smoothstep(0.0, 0.016, surface.attributes["above"])
-    chin = smoothstep(0.25, 0.225, surface.attributes["template"][:, 1])
-    bumps = 1 + 0.25 * ripples(rng, surface.attributes["template"], 0.02)
+    chin = smoothstep(0.25, 0.225, surface.template[:, 1])
+    bumps = 1 + 0.25 * ripples(rng, surface.template, 0.02)
     grown = thickness * full * (0.6 + 0.8 * chin) * bumps + 0.0010
     return finished(surface.moved(surface.vertices + grown[:, None] * normals), 2, 0.002)
 
@@ -343,28 +297,28 @@ def _painted(surface):
 
 def eyeballs(anatomy: Anatomy) -> Surface:
     """Two balls in the sockets; their `template` attribute is the unit direction from the ball's middle."""
-    parts = []
-    directions, faces = ball(14, 22)
+    parts, (directions, faces) = [], surfaces.ball(14, 22)
     directions = directions.astype(np.float32)
     for joint in (LEFT_EYE, RIGHT_EYE):
         center = anatomy.joints[joint]
         lids = np.sort(np.linalg.norm(anatomy.skin.vertices - center, axis=1))[:12]
         eye = rigid(center + directions * lids.mean() * 0.985, faces, joint, len(anatomy.joints))
         parts.append(eye.painted(directions, directions, 1.0))
-    return join(parts)
+    return surfaces.join(parts)
 
 
-def _rest_heights(anatomy):
-    """Template heights of head and neck -> rest heights of the person."""
+def _skull(anatomy):
+    """Template heights of head and neck -> rest heights of the person; the skull's middle (3,) at rest."""
     neck = anatomy.joints[NECK, 1]
     factor = (anatomy.skin.vertices[:, 1].max() - neck) / (CROWN - NECK_HEIGHT)
-    return lambda y: neck + (y - NECK_HEIGHT) * factor
+    to_rest = lambda y: neck + (y - NECK_HEIGHT) * factor
+    return to_rest, np.asarray([0.0, to_rest(SKULL[1]), anatomy.joints[HEAD, 2] - 0.01])
 
 
 def _falling_weights(anatomy, vertices, template_y):
     """Weights of the head above the jaw, blending into those of the nearest skin further down."""
-    template = anatomy.skin.attributes["template"]
-    near = np.flatnonzero((np.abs(template[:, 0]) < 0.15) & (template[:, 1] > -0.3) & (template[:, 1] < 0.26))[::2]
+    x, y, _ = anatomy.skin.template.T
+    near = np.flatnonzero((np.abs(x) < 0.15) & (y > -0.3) & (y < 0.26))[::2]
     head = np.zeros((len(vertices), anatomy.skin.weights.shape[1]), np.float32)
     head[:, HEAD] = 1
     own = smoothstep(0.06, 0.25, template_y)[:, None]

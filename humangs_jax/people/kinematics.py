@@ -7,6 +7,7 @@ parent joint at rest.
 import dataclasses
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from humangs_jax.core.array_types import Float
 
@@ -62,34 +63,13 @@ class Build:
 
 
 def rotation_matrix(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
-    """Rodrigues' formula for rotation vectors (..., 3)."""
-    angle = np.sqrt(np.sum(vectors * vectors, axis=-1))[..., None, None]
-    x, y, z = np.moveaxis(vectors / np.maximum(angle[..., 0], 1e-9), -1, 0)
-    zero = np.zeros_like(x)
-    skew = np.stack([np.stack([zero, -z, y], -1), np.stack([z, zero, -x], -1), np.stack([-y, x, zero], -1)], -2)
-    return np.eye(3) + np.sin(angle) * skew + (1 - np.cos(angle)) * skew @ skew
+    """The rotations of rotation vectors (..., 3)."""
+    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
 
 
 def rotation_vector(matrix: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 3"]:
     """The rotation vector, no longer than pi, of (..., 3, 3) rotations."""
-    m = matrix
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    x, y, z = (m[..., i, j] - m[..., j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
-    xy, xz, yz = (m[..., i, j] + m[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
-    # rows of 4 q q^T: each is the quaternion (wxyz) times one of its entries; the one of the largest entry is the most exact
-    rows = np.stack([
-        np.stack([1 + xx + yy + zz, x, y, z], -1),
-        np.stack([x, 1 + xx - yy - zz, xy, xz], -1),
-        np.stack([y, xy, 1 - xx + yy - zz, yz], -1),
-        np.stack([z, xz, yz, 1 - xx - yy + zz], -1),
-    ], -2)  # fmt: skip
-    best = np.argmax(np.einsum("...ii->...i", rows), axis=-1)
-    q = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    q = np.where(q[..., :1] < 0, -q, q)
-    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(sine, q[..., :1])
-    return q[..., 1:] * np.where(sine < 1e-9, 2.0, angle / np.maximum(sine, 1e-9))
+    return Rotation.from_matrix(matrix.reshape(-1, 3, 3)).as_rotvec().reshape(matrix.shape[:-1])
 
 
 def between(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"], t: float) -> Float[np.ndarray, "*n 3"]:
@@ -128,9 +108,6 @@ def excess(rotations: Rotations, joints: tuple[int, ...]) -> float:
     return float(np.max(np.linalg.norm(rotations[list(joints)], axis=1) - LIMITS[list(joints)]))
 
 
-# Legs ----------------------------------------------------------------------------------------------------------------
-
-
 @dataclasses.dataclass(frozen=True)
 class Foot:
     """Position of a foot, given by the point that a flat sole would touch.
@@ -146,6 +123,8 @@ class Foot:
     lift: float = 0.0
 
 
+Feet = tuple[Foot, Foot]
+"""The left and the right one."""
 LEGS = ((LEFT_HIP, LEFT_KNEE, LEFT_ANKLE, LEFT_FOOT), (RIGHT_HIP, RIGHT_KNEE, RIGHT_ANKLE, RIGHT_FOOT))
 
 
@@ -162,9 +141,7 @@ def ankle_of(build: Build, side: int, foot: Foot) -> tuple[Vector, Matrix]:
     return np.asarray([foot.x, foot.lift, foot.z]) + pivot + orientation @ offset, orientation
 
 
-def highest_pelvis(
-    build: Build, turn: Matrix, x: float, z: float, feet: tuple[Foot, Foot], reach: float = REACH
-) -> float:
+def highest_pelvis(build: Build, turn: Matrix, x: float, z: float, feet: Feet, reach: float = REACH) -> float:
     """The greatest height of the pelvis, turned by `turn`, above x, z, at which both legs reach their feet."""
     heights = []
     for side, foot in enumerate(feet):
@@ -175,7 +152,7 @@ def highest_pelvis(
     return min(heights)
 
 
-def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: tuple[Foot, Foot]) -> float:
+def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: Feet) -> float:
     """Set hips, knees, ankles and toes (in place) so that the feet are at their targets; the pelvis's rotation stays.
 
     pelvis: where the pelvis joint is, the ground at y = 0. Returns how far (metres) the worse ankle is from its place,
@@ -189,8 +166,7 @@ def place_feet(build: Build, rotations: Rotations, pelvis: Vector, feet: tuple[F
         start = pelvis + turn @ (build.joints[hip] - build.joints[PELVIS])
         thigh, shin = build.joints[knee] - build.joints[hip], build.joints[ankle] - build.joints[knee]
         bend = _knee_angle(thigh, shin, np.linalg.norm(target - start))
-        # knees point between where the pelvis and where the foot looks
-        across = turn[:, 0] + orientation[:, 0]
+        across = turn[:, 0] + orientation[:, 0]  # knees point between where the pelvis and where the foot looks
         chain = thigh + turned(x=bend) @ shin
         upper = _frame(target - start, across) @ _frame(chain, np.asarray([1.0, 0.0, 0.0])).T
         lower = upper @ turned(x=bend)

@@ -11,19 +11,14 @@ def choice(rng: np.random.Generator, odds: Mapping[str, float | int]) -> str:
     return str(rng.choice(list(odds), p=shares / shares.sum()))
 
 
-def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float, waves: int = 6) -> np.ndarray:
-    """(n,) a random band-limited function of points (n, 3), of unit amplitude or so, with features of a wavelength."""
-    return Ripples(rng, wavelength, waves)(points)
-
-
 class Ripples:
-    """A random sum of plane waves; the same object is the same function for every view."""
+    """A random band-limited function of points with features of a wavelength: a sum of plane waves, of unit amplitude or so."""
 
-    def __init__(self, rng: np.random.Generator, wavelength: float, waves: int = 6, stretch=(1.0, 1.0, 1.0)):
+    def __init__(self, rng: np.random.Generator, wavelength: float, waves: int = 6):
         direction = rng.normal(size=(3, waves))
         direction /= np.linalg.norm(direction, axis=0)
         scale = 2 * np.pi / wavelength * rng.uniform(0.6, 1.5, waves)
-        self.k = (direction * scale * np.asarray(stretch)[:, None]).astype(np.float32)
+        self.k = (direction * scale).astype(np.float32)
         self.phase = rng.uniform(0, 2 * np.pi, waves).astype(np.float32)
         self.amplitude = np.float32(np.sqrt(2 / waves) * 0.7)
 
@@ -31,9 +26,10 @@ class Ripples:
         """(n,) values at (n, 3) points."""
         return self.amplitude * np.sin(points.astype(np.float32) @ self.k + self.phase).sum(-1)
 
-    def gradient(self, points: np.ndarray) -> np.ndarray:
-        """(n, 3) derivatives at (n, 3) points."""
-        return self.amplitude * np.cos(points.astype(np.float32) @ self.k + self.phase) @ self.k.T
+
+def ripples(rng: np.random.Generator, points: np.ndarray, wavelength: float) -> np.ndarray:
+    """(n,) values of new `Ripples` at points (n, 3)."""
+    return Ripples(rng, wavelength)(points)
 
 
 class Folds:

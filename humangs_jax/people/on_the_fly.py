@@ -1,4 +1,4 @@
-"""People on the fly: a pure, jittable function of a key, from a bank of dressed people to views to learn from.
+"""People on the fly: a pure, jittable function of a key, from a bank of dressed people to views to learn from; its `Source`.
 
 A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two similar poses of the
 person's own), light and cameras. The same key gives the same bits on the same platform. Differences from
@@ -10,7 +10,9 @@ person's own), light and cameras. The same key gives the same bits on the same p
 """
 
 import dataclasses
+import functools
 import math
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -18,63 +20,27 @@ import numpy as np
 from jax import lax
 
 from humangs_jax.body.skinning import joint_transforms
-from humangs_jax.core.array_types import Array, Float, Int, Key, UInt8
+from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.configuration import knob
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.loading.examples import Example
+from humangs_jax.data.loading.order import SUBJECT_STREAM
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.people import cameras, shading
 from humangs_jax.people.baking import SLOPE_STEP, SLOPE_ZERO
 from humangs_jax.people.bank import UV_STEPS, PeopleBank
-from humangs_jax.people.cameras import CAMERA_NUMBERS, azimuths_from, camera_from, pick
+from humangs_jax.people.cameras import pick
 from humangs_jax.people.kinematics import MIRROR
-from humangs_jax.people.shading import (
-    LIGHT_NUMBERS,
-    Lights,
-    dyes_from,
-    light_points,
-    lights_from,
-    seen_from_behind,
-    shaded_vertices,
-)
+from humangs_jax.people.seeds import SPLITS, subject_key
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
+from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
 from humangs_jax.rendering.tiling import cumsum
 
 MIXING = 0.5
 """Largest share of the way to the nearest pose; the other half of the way is reached from that pose."""
-
-
-def rotations_from(u: Float[Array, "2"], bank: PeopleBank, person: Int[Array, ""]) -> Float[Array, "j 3"]:
-    """(j, 3) rotation vectors of a pose of a person; u in [0, 1) says which and how far on the way to the next."""
-    pose = pick(u[0], bank.rotations.shape[1])
-    other = bank.nearest[person, pose]
-    return quaternion.interpolate(bank.rotations[person, pose], bank.rotations[person, other], MIXING * u[1])
-
-
-def pose_person(
-    bank: PeopleBank, person: Int[Array, ""], rotations: Float[Array, "j 3"]
-) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "3"]]:
-    """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the translation (3,)."""
-    nowhere = jnp.zeros(3, rotations.dtype)
-    transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[:, :3].reshape(-1, 12)
-    blended = _blend(transforms, bank.joint_ids[person], bank.joint_weights[person].astype(rotations.dtype))
-    x, y, z = jnp.split(bank.vertices[person], 3, axis=-1)
-    nx, ny, nz = jnp.split(bank.normals[person].astype(rotations.dtype), 3, axis=-1)
-    # written out: matrix products are of low precision on GPU and TPU
-    vertices = blended[:, 0::4] * x + blended[:, 1::4] * y + blended[:, 2::4] * z + blended[:, 3::4]
-    normals = blended[:, 0::4] * nx + blended[:, 1::4] * ny + blended[:, 2::4] * nz
-    translation = nowhere.at[1].set(-vertices[:, 1].min())
-    return vertices + translation, normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9), translation
-
-
-def _blend(transforms: Float[Array, "j 12"], ids: UInt8[Array, "n k"], weights: Float[Array, "n k"]):
-    """(n, 12) rows of the vertices' blended transforms. Weights are stored in few bits: their sum is made 1 again."""
-    weights = weights / weights.sum(-1, keepdims=True)
-    return sum(weights[:, i : i + 1] * transforms[ids[:, i].astype(jnp.int32)] for i in range(ids.shape[1]))
-
-
 BACKGROUND, DARKEST_ALBEDO = 1.0, 0.01
 
 
@@ -129,7 +95,7 @@ class Scene:
     vertices: Float[Array, "o n 3"]
     corners: Float[Array, "o f 15"]
     dyes: Float[Array, "m 3 3"]
-    lights: Lights
+    lights: shading.Lights
 
 
 def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
@@ -151,11 +117,11 @@ def on_the_fly_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_T
 
 def _draw_numbers(bank, key, config):
     """All random numbers of an example, in [0, 1), by name. One draw: each costs compile time."""
-    shapes = {"person": (), "poses": (config.poses, 2), "lights": (LIGHT_NUMBERS,), "dyed": ()}
+    shapes = {"person": (), "poses": (config.poses, 2), "lights": (shading.LIGHT_NUMBERS,), "dyed": ()}
     shapes |= {"dyes": (4, bank.groups.shape[1]), "mirrored": (), "mixed": ()}
     for name, count in (("input", config.input_views), ("target", config.target_views)):
         shapes |= {f"{name}_azimuths": (2 + 2 * count,), f"{name}_poses": (count,)}
-        shapes |= {f"{name}_cameras": (count, CAMERA_NUMBERS)}
+        shapes |= {f"{name}_cameras": (count, cameras.CAMERA_NUMBERS)}
     ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
     parts = jnp.split(jax.random.uniform(key, (ends[-1],)), ends[:-1])
     return {name: part.reshape(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
@@ -164,41 +130,49 @@ def _draw_numbers(bank, key, config):
 def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: OnTheFlyConfig) -> Scene:
     """Who, in which poses, colours and light; numbers in [0, 1) by name."""
     person = pick(numbers["person"], bank.people)
-    rotations = jax.vmap(lambda u: rotations_from(u, bank, person))(numbers["poses"])
-    dyes = dyes_from(numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
-    dyes = jnp.where(numbers["dyed"] < config.dyed_share, dyes, jnp.eye(3))
-    return make_scene(bank, person, rotations, lights_from(numbers["lights"]), dyes)
-
-
-def make_scene(
-    bank: PeopleBank,
-    person: Int[Array, ""],
-    rotations: Float[Array, "o j 3"],
-    lights: Lights,
-    dye: Float[Array, "m 3 3"],
-) -> Scene:
-    """A person of the bank in given poses, light and dyes."""
     faces = bank.faces[person].astype(jnp.int32)
+    which = pick(numbers["poses"][:, 0], bank.rotations.shape[1])
+    poses, nearest = bank.rotations[person, which], bank.rotations[person, bank.nearest[person, which]]
+    rotations = quaternion.interpolate(poses, nearest, MIXING * numbers["poses"][:, 1:])
+    dyes = shading.dyes_from(numbers["dyes"], bank.groups[person].astype(jnp.int32), bank.dyeable[person])
+    dyes = jnp.where(numbers["dyed"] < config.dyed_share, dyes, jnp.eye(3))
+    lights = shading.lights_from(numbers["lights"])
 
     def pose(rotations):
         vertices, normals, translation = pose_person(bank, person, rotations)
-        openness, lit = shaded_vertices(vertices, normals, lights.directions[0], faces)
+        openness, lit = shading.shaded_vertices(vertices, normals, lights.directions[0], faces)
         values = jnp.concatenate([normals, openness[:, None], lit[:, None]], axis=-1)
         return vertices, translation, values[faces].reshape(faces.shape[0], 15)
 
     vertices, translations, corners = lax.map(pose, rotations)
-    return Scene(person, rotations, translations, vertices, corners, dye, lights)
+    return Scene(person, rotations, translations, vertices, corners, dyes, lights)
+
+
+def pose_person(
+    bank: PeopleBank, person: Int[Array, ""], rotations: Float[Array, "j 3"]
+) -> tuple[Float[Array, "n 3"], Float[Array, "n 3"], Float[Array, "3"]]:
+    """Vertices (n, 3) of a person who stands on y = 0 in a pose, unit normals (n, 3), and the translation (3,)."""
+    nowhere = jnp.zeros(3, rotations.dtype)
+    transforms = joint_transforms(bank.joints[person], bank.parents, rotations, nowhere)[:, :3].reshape(-1, 12)
+    ids, weights = bank.joint_ids[person].astype(jnp.int32), bank.joint_weights[person].astype(rotations.dtype)
+    weights = weights / weights.sum(-1, keepdims=True)  # they are stored in few bits
+    blended = jnp.asarray(sum(weights[:, i : i + 1] * transforms[ids[:, i]] for i in range(ids.shape[1])))
+    x, y, z = jnp.split(bank.vertices[person], 3, axis=-1)
+    nx, ny, nz = jnp.split(bank.normals[person].astype(rotations.dtype), 3, axis=-1)
+    # written out: matrix products are of low precision on GPU and TPU
+    vertices = blended[:, 0::4] * x + blended[:, 1::4] * y + blended[:, 2::4] * z + blended[:, 3::4]
+    normals = blended[:, 0::4] * nx + blended[:, 1::4] * ny + blended[:, 2::4] * nz
+    translation = nowhere.at[1].set(-vertices[:, 1].min())
+    return vertices + translation, normals / (jnp.linalg.norm(normals, axis=-1, keepdims=True) + 1e-9), translation
 
 
 def _plans(numbers, config):
     """Of the inputs and the targets: numbers for cameras (v, c), azimuths (v,), poses (v,), shares of close cameras (v,)."""
-    azimuths = azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share)
+    azimuths = cameras.azimuths_from(numbers["input_azimuths"], config.jitter, config.scattered_share)
     own, other = (pick(numbers[name], config.poses) for name in ("input_poses", "target_poses"))
     own = jnp.where(numbers["mixed"] < config.mixed_pose_share, own, 0)
-    anywhere, close = (
-        azimuths_from(numbers["target_azimuths"], 0.0, 1.0),
-        jnp.full(config.target_views, config.close_share),
-    )
+    anywhere = cameras.azimuths_from(numbers["target_azimuths"], 0.0, 1.0)
+    close = jnp.full(config.target_views, config.close_share)
     inputs = numbers["input_cameras"], azimuths, own, jnp.zeros(config.input_views)
     return inputs, (numbers["target_cameras"], anywhere, other, close)
 
@@ -208,22 +182,17 @@ def _views(bank, scene, plan, config, size):
 
     def view(plan):
         u, azimuth, pose, close_share = plan
-        camera = camera_from(u, scene.vertices[pose], bank.vertex_counts[scene.person], azimuth, close_share, size)
+        camera = cameras.camera_from(
+            u, scene.vertices[pose], bank.vertex_counts[scene.person], azimuth, close_share, size
+        )
         return *draw_view(bank, scene, pose, camera, config), camera
 
     poses = plan[2]
     batch = None if config.views_at_once == 1 else min(config.views_at_once, len(poses))
-    images, masks, depths, cameras = lax.map(view, plan, batch_size=batch)
-    betas = bank.betas[scene.person]
-    return SubjectViews(
-        images,
-        masks,
-        cameras,
-        scene.rotations[poses],
-        scene.translations[poses],
-        betas,
-        depths=depths if config.depths else None,
-    )
+    images, masks, depths, found = lax.map(view, plan, batch_size=batch)
+    rotations, translations, betas = scene.rotations[poses], scene.translations[poses], bank.betas[scene.person]
+    depths = depths if config.depths else None
+    return SubjectViews(images, masks, found, rotations, translations, betas, depths=depths)
 
 
 def _some(views, part):
@@ -241,7 +210,7 @@ def draw_view(
     fine = camera.resized(camera.width * s, camera.height * s)
     vertices, faces = scene.vertices[pose], bank.faces[scene.person].astype(jnp.int32)
     fragments = rasterize_mesh(vertices, faces, fine)
-    behind = seen_from_behind(vertices, faces, camera.center)
+    behind = shading.seen_from_behind(vertices, faces, camera.center)
     colors = _light_pixels(bank, scene, scene.corners[pose], behind, fragments, config.pixels_per_step)
     covered = (fragments.face_ids >= 0).reshape(-1, 1).astype(colors.dtype)
     z = _box_average(fragments.depth.reshape(-1, 1) * covered, camera, s)[..., 0]
@@ -288,7 +257,7 @@ def _color_points(bank, scene, corners, faces, weights, behind):
     albedo = sum(painted[:, i : i + 1] * dye[:, :, i] for i in range(3)) / 255
     slopes = (painted[:, 3:] - SLOPE_ZERO) * SLOPE_STEP
     albedo, sheen = jnp.clip(albedo, DARKEST_ALBEDO, None), bank.sheen[person, pieces]
-    return light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
+    return shading.light_points(scene.lights, corners, weights, behind, albedo, slopes, sheen)
 
 
 def _sample(texture, person, at):
@@ -322,3 +291,77 @@ def mirrored(views: SubjectViews, joints: tuple[int, ...]) -> SubjectViews:
         rotations=views.rotations[..., jnp.asarray(joints), :] * flip,
         translations=views.translations * side,
     )
+
+
+MakeExample = Callable[[Key, int], Example]
+"""(key, number of input views) -> Example; pure, usually jitted with the number static."""
+
+
+@dataclasses.dataclass(frozen=True)
+class GeneratedSource:
+    """Examples that `make` computes from keys; all keys are of people of one split (`seeds.SPLITS`).
+
+    make: called as make(key, input_count); runs wherever it is jitted to run. input_counts: see `ViewSampling`.
+    on_host: bring the arrays to the host, where they mix with those of files and are divided among devices.
+
+    Raises: ValueError if there is no such split.
+    """
+
+    make: MakeExample
+    split: str = "train"
+    input_counts: tuple[int, ...] = (4,)
+    on_host: bool = False
+
+    def __post_init__(self):
+        if self.split not in SPLITS:
+            raise ValueError(f"no split {self.split!r}: expected one of {', '.join(SPLITS)}")
+
+    @property
+    def broken(self) -> Mapping[str, str]:
+        """Empty: there are no files."""
+        return {}
+
+    def __len__(self) -> int:
+        return len(SPLITS[self.split])
+
+    def drawn_key(self, seed: int, index: int) -> Key:
+        """The key of the index-th example of a run: a random subject of the split, in its index-th appearance."""
+        return subject_key(self._person(seed, index), index)
+
+    def _person(self, seed, index):
+        people = SPLITS[self.split]
+        return people[int(np.random.default_rng([SUBJECT_STREAM, seed, index]).integers(len(people)))]
+
+    def describe(self, seed: int, index: int, input_count: int) -> str:
+        """See `Source`."""
+        return f"synthetic person {self._person(seed, index)} in appearance {index}"
+
+    def example(self, seed: int, index: int, input_count: int) -> Example:
+        """See `Source`."""
+        example = self.make(self.drawn_key(seed, index), input_count)
+        return jax.tree.map(np.asarray if self.on_host else jnp.asarray, example)
+
+
+def jitted_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_FLY) -> Example:
+    """`on_the_fly_example`, compiled once per configuration and shape of the bank; with `CPU_COMPILER_OPTIONS` on a CPU."""
+    return _compiled()(bank, key, config=config)
+
+
+@functools.cache
+def _compiled():
+    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    return jax.jit(on_the_fly_example, static_argnames="config", compiler_options=options)
+
+
+def on_the_fly_source(
+    bank: PeopleBank, config: OnTheFlyConfig, input_counts: tuple[int, ...] = (4,), on_host: bool = False
+) -> GeneratedSource:
+    """Examples of a bank for `loader.Loader` and `loader.Mixture`: all of people of the bank's split.
+
+    input_counts replace `config.input_views`; each is compiled once. on_host: see `GeneratedSource`.
+    """
+
+    def make(key: Key, input_count: int) -> Example:
+        return jitted_example(bank, key, config=dataclasses.replace(config, input_views=input_count))
+
+    return GeneratedSource(make=make, split=bank.split, input_counts=input_counts, on_host=on_host)

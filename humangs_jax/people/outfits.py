@@ -138,14 +138,10 @@ MENS_NECKS = NECKS | {"other": {"crew": 6, "vee": 2, "scoop": 0}}
 PLAIN_TOPS = {"tee": 0.5, "sweater": 0.4, "turtleneck": 0.65, "hoodie": 0.65, "shirt": 0.35, "tank": 0.55}
 """How often tops are in one dye; the others: 0.35."""
 TOP_DETAILS = (
-    ("print", ("tee", "hoodie", "longsleeve", "tank"), 0.5),
-    ("number", ("jersey",), 1),
-    ("zip", ("hoodie",), 0.4),
-    ("hood_up", ("hoodie",), 0.18),
-    ("ribbed", ("sweater", "turtleneck", "hoodie", "longsleeve"), 1),
-    ("pocket", ("shirt", "polo", "blouse"), 0.5),
-    ("open", ("shirt",), 0.2),
-)
+    ("print", ("tee", "hoodie", "longsleeve", "tank"), 0.5), ("number", ("jersey",), 1), ("zip", ("hoodie",), 0.4),
+    ("hood_up", ("hoodie",), 0.18), ("ribbed", ("sweater", "turtleneck", "hoodie", "longsleeve"), 1),
+    ("pocket", ("shirt", "polo", "blouse"), 0.5), ("open", ("shirt",), 0.2),
+)  # fmt: skip
 """Feature, kinds that can have it, how often they do."""
 LEG_ENDS = {"shorts": (-0.77, -0.56), "cropped": (-1.1, -0.93), "other": (-1.172, -1.14)}
 LEG_WIDTHS = {
@@ -158,6 +154,10 @@ COAT_OPEN = {"puffer": 0.4, "coat": 0.5, "cardigan": 0.85, "vest": 0.5}
 COAT_ENDS = {
     "coat": (-0.9, -0.6), "blazer": (-0.43, -0.38), "denim_jacket": (-0.34, -0.28), "puffer": (-0.42, -0.3),
     "vest": (-0.34, -0.27), "other": (-0.42, -0.31),
+}  # fmt: skip
+COAT_DETAILS = {
+    "jacket": {"collar", "pockets"}, "denim_jacket": {"collar", "pockets"}, "coat": {"pockets"}, "vest": {"pockets"},
+    "puffer": {"pockets"}, "hooded_jacket": {"hood"}, "blazer": {"lapels"},
 }  # fmt: skip
 SHAFTS = {
     "sneakers": OneOf((0.09, (0.11, 0.14)), (0.8, 0.2)), "flats": (0.068, 0.085), "sandals": 0.07,
@@ -180,6 +180,11 @@ def sample_outfit(rng: np.random.Generator, male: bool, years: float) -> tuple[G
     return tuple(worn)
 
 
+def _made(rng, kind, plainness, details=(), **sizes):
+    """A garment in a random fabric."""
+    return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
+
+
 def _separates(rng, name, male, outer):
     style = STYLES[name]
     kind = drawn(rng, style.tops)
@@ -191,7 +196,7 @@ def _separates(rng, name, male, outer):
     lower = _skirt(rng, waist, tucked) if skirted else _trousers(rng, style, male, waist, tucked, top)
     if "open" in top.details:
         below = {"sleeve": rng.uniform(0.14, 0.36), "bottom": top.sizes["bottom"] + 0.012, "loose": 0.0, "depth": 0.05}
-        return [Garment("tee", sample_fabric(rng, "tee", 0.7), below, frozenset({"crew"})), lower, top]
+        return [_made(rng, "tee", 0.7, {"crew"}, **below), lower, top]
     return [top, lower]
 
 
@@ -214,9 +219,9 @@ def _top(rng, style, kind, male, waist, tucked, outer):
     if tucked:
         details.add("tucked")
     sleeve, loose = float(min(sleeve, WRIST - 0.01) if outer else sleeve), min(loose, 0.2) if outer or tucked else loose
-    sizes = {"sleeve": sleeve, "bottom": bottom, "loose": loose, "depth": rng.uniform(0.04, 0.095)}
     plainness = 0.55 if style == "formal" else PLAIN_TOPS.get(kind, 0.35)
-    return Garment(kind, sample_fabric(rng, kind, plainness), sizes, frozenset(details))
+    depth = rng.uniform(0.04, 0.095)
+    return _made(rng, kind, plainness, details, sleeve=sleeve, bottom=bottom, loose=loose, depth=depth)
 
 
 def _trousers(rng, style, male, waist, tucked, top):
@@ -232,7 +237,7 @@ def _trousers(rng, style, male, waist, tucked, top):
     if kind == "jeans" and rng.random() < 0.25:
         details.add("turn_up")
     sizes = {"top": upper, "end": end, "width": float(width), "loose": loose, "waist": waist, "tucked": float(tucked)}
-    return Garment(kind, sample_fabric(rng, kind, 0.75), sizes, frozenset(details))
+    return _made(rng, kind, 0.75, details, **sizes)
 
 
 def _skirt(rng, waist, tucked):
@@ -240,55 +245,43 @@ def _skirt(rng, waist, tucked):
     end = rng.uniform(-1.1, -0.84) if kind == "long_skirt" else rng.uniform(-0.76, -0.57)
     flare = rng.uniform(0.0, 0.05) if rng.random() < 0.35 and kind != "pleated_skirt" else rng.uniform(0.05, 0.16)
     sizes = {"top": waist, "end": end, "flare": flare, "waist": waist, "tucked": float(tucked), **_pleats(rng, kind)}
-    return Garment(kind, sample_fabric(rng, kind, 0.35), sizes)
+    return _made(rng, kind, 0.35, **sizes)
 
 
 def _pleats(rng, kind):
-    if kind == "pleated_skirt":
-        return {"pleats": float(rng.integers(14, 24)), "depth": rng.uniform(0.008, 0.014)}
-    return {"pleats": float(rng.integers(4, 10)), "depth": rng.uniform(0.004, 0.016)}
+    count, depth = ((14, 24), (0.008, 0.014)) if kind == "pleated_skirt" else ((4, 10), (0.004, 0.016))
+    return {"pleats": float(rng.integers(*count)), "depth": rng.uniform(*depth)}
 
 
 def _dress(rng, outer):
     kind = drawn(rng, {"short_dress": 4, "long_dress": 3, "shirt_dress": 1.5})
     end = rng.uniform(-1.14, -0.85) if kind == "long_dress" else rng.uniform(-0.78, -0.56)
-    sleeve = drawn(rng, OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25)))
+    sleeve = float(drawn(rng, OneOf(((0.118, 0.15), (0.25, 0.4), WRIST - 0.02), (0.42, 0.33, 0.25))))
     neck = "collar" if kind == "shirt_dress" else drawn(rng, {"crew": 1, "vee": 1.3, "scoop": 1.3})
-    sizes = {
-        "sleeve": float(sleeve),
-        "waist": rng.uniform(-0.235, -0.165),
-        "end": end,
-        "flare": rng.uniform(0.015, 0.17),
-    }
+    sizes = {"sleeve": sleeve, "waist": rng.uniform(-0.235, -0.165), "end": end, "flare": rng.uniform(0.015, 0.17)}
     sizes |= {"depth": rng.uniform(0.04, 0.1), "loose": 0.1 if outer else rng.uniform(0.0, 0.4), **_pleats(rng, kind)}
-    details = {neck} | ({"sash"} if rng.random() < 0.35 else set())
-    return [Garment(kind, sample_fabric(rng, kind, 0.3), sizes, frozenset(details))]
+    return [_made(rng, kind, 0.3, [neck, "sash"] if rng.random() < 0.35 else [neck], **sizes)]
 
 
 def _outer(rng, style, worn):
     kind = drawn(rng, style.coats)
     is_open = rng.random() < COAT_OPEN.get(kind, 0.75)
     bottom = row(rng, COAT_ENDS, kind)
-    details = {"open" if is_open else "closed"}
-    if kind in ("jacket", "denim_jacket", "coat", "vest", "puffer"):
-        details.add("pockets")
-    if (kind == "puffer" and rng.random() < 0.4) or kind == "hooded_jacket":
+    details = {"open" if is_open else "closed"} | COAT_DETAILS.get(kind, set())
+    if kind == "puffer" and rng.random() < 0.4:
         details.add("hood")
     if kind == "coat":
         details.add(drawn(rng, {"lapels": 2, "hood": 0.6, "collar": 1}))
         if not is_open and rng.random() < 0.4:
             details.add("sash")
-    details |= {"blazer": {"lapels"}, "jacket": {"collar"}, "denim_jacket": {"collar"}}.get(kind, set())
     sizes = {"sleeve": 0.2 if kind == "vest" else WRIST - rng.uniform(0.0, 0.035), "bottom": bottom}
     sizes |= {"gap": rng.uniform(0.012, 0.05) if is_open else -1.0, "spread": rng.uniform(0.05, 0.35)}
     sizes |= {"flare": rng.uniform(0.02, 0.1), "loose": rng.uniform(0.2, 1.0)}
     if kind == "vest":
         sizes["sleeve"] = rng.uniform(0.145, 0.165)
-    fabric = sample_fabric(rng, kind, 0.9 if kind in ("blazer", "coat", "puffer") else 0.72)
-    trousers = next((g for g in worn if g.kind in ("chinos", "slim", "wide")), None)
-    if kind == "blazer" and trousers is not None and rng.random() < 0.55:
-        fabric = trousers.fabric  # a suit
-    return Garment(kind, fabric, sizes, frozenset(details))
+    coat = _made(rng, kind, 0.9 if kind in ("blazer", "coat", "puffer") else 0.72, details, **sizes)
+    suited = [g.fabric for g in worn if g.kind in ("chinos", "slim", "wide")] if kind == "blazer" else []
+    return dataclasses.replace(coat, fabric=suited[0]) if suited and rng.random() < 0.55 else coat
 
 
 def _shoes(rng, style, male, worn):
@@ -302,10 +295,8 @@ def _shoes(rng, style, male, worn):
     result = []
     if kind in ("sneakers", "ankle_boots") and not covered and rng.random() < 0.75:
         tall = drawn(rng, OneOf(((0.1, 0.17), (0.2, 0.4)), (0.75, 0.25)))
-        result.append(Garment("socks", sample_fabric(rng, "socks", 0.7), {"height": max(float(tall), height + 0.02)}))
-    fabric = sample_fabric(rng, kind, 0.9)
-    sizes = {"height": float(height), "sole": float(sole), "over": float(kind == "boots")}
-    return [*result, Garment(kind, fabric, sizes)]
+        result.append(_made(rng, "socks", 0.7, height=max(float(tall), height + 0.02)))
+    return [*result, _made(rng, kind, 0.9, height=float(height), sole=float(sole), over=float(kind == "boots"))]
 
 
 def _fastened(rng, style, male, worn):
@@ -314,12 +305,11 @@ def _fastened(rng, style, male, worn):
     trousers = next((g for g in worn if g.kind in BOTTOMS), None)
     belted = trousers is not None and trousers.sizes["tucked"] and trousers.kind not in ("track", "leggings")
     if belted and rng.random() < 0.7:
-        sizes = {"top": trousers.sizes["waist"] - 0.004, "width": rng.uniform(0.028, 0.042)}
-        result.append(Garment("belt", sample_fabric(rng, "belt", 1.0), sizes))
+        top = trousers.sizes["waist"] - 0.004
+        result.append(_made(rng, "belt", 1.0, top=top, width=rng.uniform(0.028, 0.042)))
     collared = any("collar" in g.details and g.kind == "shirt" and "open" not in g.details for g in worn)
     if style == "formal" and male and collared and rng.random() < 0.55:
-        sizes = {"length": rng.uniform(0.3, 0.36), "width": rng.uniform(0.018, 0.032)}
-        result.append(Garment("tie", sample_fabric(rng, "tie", 0.3), sizes))
+        result.append(_made(rng, "tie", 0.3, length=rng.uniform(0.3, 0.36), width=rng.uniform(0.018, 0.032)))
     return result
 
 
@@ -329,7 +319,7 @@ def _extras(rng, style, male, years, worn):
     result: list[Garment] = []
 
     def put(kind, plainness, **sizes):
-        result.append(Garment(kind, sample_fabric(rng, kind, plainness), sizes))
+        result.append(_made(rng, kind, plainness, **sizes))
         kinds.add(kind)
 
     if not hooded and rng.random() < style.scarf:
@@ -344,8 +334,9 @@ def _extras(rng, style, male, years, worn):
     if eyes < 0.2 + 0.15 * (years > 50):
         put("glasses", 1.0, size=rng.uniform(0.85, 1.2), squareness=rng.uniform(2, 6), wire=rng.uniform(0.0011, 0.0028))
     elif eyes > style.no_sunglasses:
-        size, squareness, wire = rng.uniform(1.0, 1.3), rng.uniform(2, 5), rng.uniform(0.0015, 0.003)
-        put("sunglasses", 1.0, size=size, squareness=squareness, wire=wire)
+        put(
+            "sunglasses", 1.0, size=rng.uniform(1.0, 1.3), squareness=rng.uniform(2, 5), wire=rng.uniform(0.0015, 0.003)
+        )
     carried = rng.random()
     if carried < 0.09 and "headscarf" not in kinds:
         put("backpack", 0.7, size=rng.uniform(0.8, 1.15))

@@ -1,6 +1,8 @@
 """A pose prior: plausible standing, striding, crouching and reaching people, within joint limits, their soles on the ground.
 
-Stances place the feet and the pelvis; `arms` has arms and hands; `kinematics` has the joints, their limits and the conventions.
+Stances place the feet and the pelvis. An arm draws many candidates within its limits and keeps the one whose wrist comes nearest
+to a goal, among those whose forearm and hand stay out of the trunk, the head, the legs and the other arm. Hands blend a few
+gestures. `kinematics` has the joints, their limits and the conventions.
 """
 
 import dataclasses
@@ -9,11 +11,18 @@ from collections.abc import Callable
 import numpy as np
 
 from humangs_jax.people import kinematics as kin
-from humangs_jax.people.arms import bend_arm, draw_goal, pose_hand
 from humangs_jax.people.noise import choice
 
 TRIES = 20
 """Stances tried until one is within the limits of the joints; after that the person stands upright."""
+BOTH_ARMS, ATTEMPTS = 0.45, 3
+"""Share of people whose arms have the same goal; how many goals are tried for an arm that cannot keep clear of the body."""
+CANDIDATES = 400
+HAND_LENGTH = 0.6
+"""From the wrist to the knuckles and a little beyond, in lengths of the forearm."""
+HEAD_RADIUS = 0.14
+MARGIN = 0.015
+"""Metres that forearm and hand keep away from the body."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,7 +33,7 @@ class Stance:
     pelvis, left side up. lean: how far forward the trunk bends to keep the balance.
     """
 
-    feet: tuple[kin.Foot, kin.Foot]
+    feet: kin.Feet
     sink: float = 0.0
     tilt: float = 0.0
     roll: float = 0.0
@@ -49,12 +58,11 @@ def take_stance(build: kin.Build, rotations: kin.Rotations, heading: float, stan
     turn = kin.turned(y=heading) @ kin.turned(x=stance.tilt, z=stance.roll)
     rotations[kin.PELVIS] = kin.rotation_vector(turn)
     feet = in_world(stance.feet, build.leg, heading)
-    height = kin.highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg
-    pelvis = np.asarray([0.0, height, 0.0])
+    pelvis = np.asarray([0.0, kin.highest_pelvis(build, turn, 0.0, 0.0, feet) - stance.sink * build.leg, 0.0])
     return pelvis, kin.place_feet(build, rotations, pelvis, feet)
 
 
-def in_world(feet: tuple[kin.Foot, kin.Foot], leg: float, heading: float) -> tuple[kin.Foot, kin.Foot]:
+def in_world(feet: kin.Feet, leg: float, heading: float) -> kin.Feet:
     """The feet of a stance (lengths in legs, unturned) in metres, turned by the heading."""
     placed = []
     for foot in feet:
@@ -89,8 +97,7 @@ def _contrapposto(rng, width):
 
 def _stride(rng, width):
     feet, front = _pair(rng, 0.75 * width, spread=(-0.02, 0.03), turn_out=(-0.05, 0.2)), int(rng.integers(2))
-    length = rng.uniform(0.25, 0.85)
-    share = rng.uniform(0.35, 0.6)
+    length, share = rng.uniform(0.25, 0.85), rng.uniform(0.35, 0.6)
     feet[front] = dataclasses.replace(feet[front], z=0.08 + share * length, pitch=-rng.uniform(0, 0.3) * (length > 0.4))
     rear = rng.uniform(0.3, 0.7) * min(1.0, length / 0.5)
     feet[1 - front] = dataclasses.replace(feet[1 - front], z=0.08 - (1 - share) * length, pitch=rear)
@@ -157,12 +164,173 @@ STANCES: dict[str, tuple[float, Callable[[np.random.Generator, float], Stance]]]
 """Name -> probability, and a function of a generator and the distance of a hip from the middle in legs."""
 
 
-BOTH_ARMS = 0.45
-"""Share of people whose arms have the same goal."""
-ATTEMPTS = 3
-"""How many goals are tried for an arm that cannot keep clear of the body."""
-CLEAR = 0.0
-"""Least clearance of an accepted arm, metres."""
+@dataclasses.dataclass(frozen=True)
+class Goal:
+    """Target of a wrist. odds: of being drawn.
+
+    place: of the left wrist relative to the shoulder in arm lengths, in axes of the chest.
+    raised: range of the upper arm's elevation, 0 is horizontal. forward: of its turn towards the front. flexed: of the elbow.
+    collar: how much the collar is raised.
+    """
+
+    odds: float
+    place: tuple[float, float, float]
+    raised: tuple[float, float] = (-1.45, -0.1)
+    forward: tuple[float, float] = (-0.5, 1.4)
+    flexed: tuple[float, float] = (0.05, 2.2)
+    collar: float = -0.08
+
+
+GOALS = {
+    "hang": Goal(0.36, (0.28, -1.0, 0.1), (-1.5, -1.05), (-0.25, 0.35), (0.05, 0.6)),
+    "away": Goal(0.14, (0.6, -0.85, 0.08), (-1.3, -0.7), flexed=(0.05, 0.6)),
+    "hip": Goal(0.09, (0.35, -0.82, 0.12)),
+    "front": Goal(0.09, (0.2, -0.3, 0.8)),
+    "low": Goal(0.06, (0.15, -0.75, 0.5)),
+    "chest": Goal(0.05, (-0.2, -0.4, 0.45)),
+    "wave": Goal(0.05, (0.55, 0.45, 0.25), (-1.45, 1.25), collar=0.15),
+    "side": Goal(0.04, (1.0, -0.1, 0.1), (-0.4, 0.4), collar=0.05),
+    "up": Goal(0.03, (0.25, 1.0, 0.1), (-0.5, 1.25), collar=0.3),
+    "reach": Goal(0.03, (0.15, 0.1, 0.95), (-0.6, 0.5), (0.6, 1.5), (0.05, 0.9), 0.02),
+    "back": Goal(0.02, (0.3, -0.85, -0.45), (-1.45, -0.7), (-0.9, 0.0), (0.05, 0.9)),
+    "face": Goal(0.02, (-0.2, 0.2, 0.5), (-1.3, 0.4), (0.0, 1.5), (1.2, 2.35), 0.05),
+    "diagonal": Goal(0.02, (0.75, 0.65, 0.1), (0.0, 1.1), (-0.2, 0.9), (0.05, 0.7), 0.2),
+}
+ARMS = (
+    (kin.LEFT_COLLAR, kin.LEFT_SHOULDER, kin.LEFT_ELBOW, kin.LEFT_WRIST),
+    (kin.RIGHT_COLLAR, kin.RIGHT_SHOULDER, kin.RIGHT_ELBOW, kin.RIGHT_WRIST),
+)
+
+
+def draw_goal(rng: np.random.Generator) -> str:
+    """The name of a goal."""
+    return choice(rng, {name: goal.odds for name, goal in GOALS.items()})
+
+
+def bend_arm(rng, build: kin.Build, rotations: kin.Rotations, goal: str, side: int, other_arm: bool = False) -> float:
+    """Set collar, shoulder, elbow and wrist of one side (0 left, 1 right) in `rotations`; trunk, head and legs must be set.
+
+    other_arm: keep clear of the other arm, too. Returns how clear the arm is (metres, negative: it is not).
+    """
+    matrix, vector = kin.rotation_matrix, kin.rotation_vector
+    collar, shoulder, elbow, wrist = ARMS[side]
+    mirror, n, wanted = np.ones(3) if side == 0 else kin.MIRROR, CANDIDATES, GOALS[goal]
+    rotations[collar] = np.asarray([0, rng.normal(-0.03, 0.03), wanted.collar + rng.normal(0, 0.03)]) * mirror
+    down, forward, twist, flex, pronation = np.zeros((5, n, 3))
+    down[:, 2] = rng.uniform(*wanted.raised, n)
+    forward[:, 1] = -rng.uniform(*wanted.forward, n)
+    twist[:, 0] = rng.uniform(-1.0, 0.8, n)
+    flex[:, 1] = -rng.uniform(*wanted.flexed, n)
+    pronation[:, 0] = rng.uniform(-0.4, 0.5)
+    about_both = np.stack(
+        [forward[:, 1], down[:, 1], down[:, 2]], 1
+    )  # a hanging arm swings about the axis of both shoulders
+    swing = matrix(about_both) if goal == "hang" else matrix(forward) @ matrix(down)
+    upper = vector(swing @ matrix(twist)) * mirror
+    lower = vector(matrix(flex) @ matrix(pronation)) * mirror
+
+    world, positions = kin.joint_positions(build, rotations)
+    rest = build.joints
+    upper_world = world[collar] @ matrix(upper)
+    elbows = positions[shoulder] + upper_world @ (rest[elbow] - rest[shoulder])
+    wrists = elbows + upper_world @ matrix(lower) @ (rest[wrist] - rest[elbow])
+    reach = np.linalg.norm(rest[elbow] - rest[shoulder]) + np.linalg.norm(rest[wrist] - rest[elbow])
+    offset = np.asarray(wanted.place) * [1 - 2 * side, 1, 1] + rng.normal(0, 0.08, 3)
+    target = positions[shoulder] + reach * world[kin.SPINE3] @ offset
+    capsules = _body_capsules(build, world, positions)
+    if other_arm:
+        capsules += _arm_capsules(build, positions, 1 - side)
+    clear = np.min([_clearance(build, capsules, points) for points in _along(elbows, wrists)], axis=0)
+    beyond = np.maximum(np.linalg.norm(upper, axis=1) - kin.LIMITS[shoulder], 0)
+    cost = np.linalg.norm(wrists - target, axis=1) + 20 * np.maximum(MARGIN - clear, 0) + 5 * beyond
+    best = int(np.argmin(cost))
+    rotations[shoulder], rotations[elbow] = upper[best], lower[best]
+    rotations[wrist] = rng.normal(0, 1, 3) * [0.08, 0.12, 0.2]
+    return float(clear[best])
+
+
+def arm_clearance(build: kin.Build, rotations: kin.Rotations) -> float:
+    """How far (metres) both forearms and hands are from the body and each other; negative if one is inside."""
+    world, positions = kin.joint_positions(build, rotations)
+    body, worst = _body_capsules(build, world, positions), np.inf
+    for side, (_, _, elbow, wrist) in enumerate(ARMS):
+        points = np.stack(_along(positions[elbow], positions[wrist]))
+        worst = min(worst, _clearance(build, body + _arm_capsules(build, positions, 1 - side), points).min())
+    return float(worst)
+
+
+def _body_capsules(build, world, positions):
+    """Trunk, legs and head of a posed body: two ends (3,) and a radius each, metres."""
+    sideways = 0.25 * (positions[kin.LEFT_HIP] - positions[kin.RIGHT_HIP])
+    top = positions[kin.NECK] + world[kin.SPINE3] @ np.asarray([0, -0.06, 0])
+    head = positions[kin.HEAD] + world[kin.HEAD] @ np.asarray([0, 0.09, 0.03])
+    capsules = [(head, head, HEAD_RADIUS)]
+    for s in (-1.0, 0.0, 1.0):
+        capsules.append((positions[kin.PELVIS] + s * sideways, top + s * 0.8 * sideways, build.torso_radius))
+    for hip, knee, ankle, _ in kin.LEGS:
+        capsules.append((positions[hip], positions[knee], build.thigh_radius))
+        capsules.append((positions[knee], positions[ankle], build.shin_radius))
+    return capsules
+
+
+def _arm_capsules(build, positions, side):
+    """Upper arm, forearm and hand of one side."""
+    _, shoulder, elbow, wrist = (positions[joint] for joint in ARMS[side])
+    radius = build.arm_radius + 0.01
+    return [(shoulder, elbow, radius), (elbow, wrist + HAND_LENGTH * (wrist - elbow), radius)]
+
+
+def _clearance(build, capsules, points):
+    """Distance of an arm's points (n, 3) from the capsules, less all radii (metres)."""
+    distances = []
+    for a, b, radius in capsules:
+        axis = b - a
+        t = np.clip((points - a) @ axis / max(axis @ axis, 1e-9), 0, 1)
+        distances.append(np.linalg.norm(points - a - t[:, None] * axis, axis=1) - radius)
+    return np.min(distances, axis=0) - build.arm_radius
+
+
+def _along(elbows, wrists):
+    """Points of the forearm and the hand that must not touch the body."""
+    tips = wrists + HAND_LENGTH * (wrists - elbows)
+    return [elbows, 0.5 * (elbows + wrists), wrists, 0.5 * (wrists + tips), tips]
+
+
+FINGERS = ((0, 1.0), (1, 0.15), (3, -1.2), (2, -0.6))
+"""Index, middle, pinky, ring, in the order of SMPL-X's joints: place among a gesture's curls, share of its spread."""
+BONE_SHARE = (0.85, 1.0, 0.7)
+"""Share of a finger's curl at each knuckle, from the palm outwards."""
+
+
+GESTURES = {
+    "relaxed": (0.4, (0.25, 0.32, 0.38, 0.42), 0.03, 0.25), "flat": (0.15, (0.03, 0.03, 0.04, 0.05), 0.0, 0.05),
+    "spread": (0.1, (0.0, 0.0, 0.0, 0.0), 0.16, -0.3), "fist": (0.12, (1.3, 1.35, 1.35, 1.35), 0.0, 1.0),
+    "point": (0.06, (0.02, 1.2, 1.3, 1.3), 0.0, 0.8), "two": (0.03, (0.02, 0.02, 1.3, 1.3), 0.12, 0.9),
+    "thumb up": (0.03, (1.2, 1.3, 1.3, 1.3), 0.0, -0.4), "hold": (0.11, (0.65, 0.7, 0.75, 0.8), 0.05, 0.6),
+}  # fmt: skip
+"""Odds; curl of index, middle, ring and pinky, radians a knuckle; angle between fingers; how far the thumb lies across the palm,
+0 beside it, 1 across."""
+
+
+def pose_hand(rng: np.random.Generator, rotations: kin.Rotations, side: int) -> None:
+    """Set the 15 joints of one hand (0 left, 1 right) in `rotations`: a blend of relaxed and a random gesture."""
+    first, mirror = (kin.LEFT_HAND, np.ones(3)) if side == 0 else (kin.RIGHT_HAND, kin.MIRROR)
+    goal, t = choice(rng, {name: odds for name, (odds, *_) in GESTURES.items()}), rng.beta(2.5, 1.0)
+    blends = (
+        (1 - t) * np.asarray(a) + t * np.asarray(b) for a, b in zip(GESTURES["relaxed"], GESTURES[goal], strict=True)
+    )
+    _, curls, spread, thumb = blends
+    thumb = thumb + rng.normal(0, 0.08)
+    for finger, (place, splay) in enumerate(FINGERS):
+        curl = curls[place] * rng.uniform(0.85, 1.15) + rng.normal(0, 0.03)
+        for bone, share in enumerate(BONE_SHARE):
+            # fingers do not bend backwards, and spread at the palm only
+            bend = np.clip(curl * share * rng.uniform(0.9, 1.1), -0.1, kin.FINGER_LIMIT - 0.1)
+            aside = splay * spread if bone == 0 else 0.0
+            rotations[first + 3 * finger + bone] = np.asarray([0, -aside, -bend]) * mirror
+    rotations[first + 12] = np.asarray([0.25 * thumb, 0.45 * thumb, -0.35 * thumb]) * mirror
+    rotations[first + 13] = np.asarray([0.0, 0.35 * thumb, -0.1 * thumb]) * mirror
+    rotations[first + 14] = np.asarray([0.0, 0.5 * max(thumb, 0.0), 0.0]) * mirror
 
 
 def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotations:
@@ -175,7 +343,7 @@ def sample_rotations(rng: np.random.Generator, build: kin.Build) -> kin.Rotation
     for side in (0, 1):
         wanted = goal if both or side == 0 else draw_goal(rng)
         for _ in range(ATTEMPTS):
-            if bend_arm(rng, build, rotations, wanted, side, other_arm=side == 1) >= CLEAR:
+            if bend_arm(rng, build, rotations, wanted, side, other_arm=side == 1) >= 0:
                 break
             wanted = draw_goal(rng)
         pose_hand(rng, rotations, side)

@@ -6,10 +6,12 @@ where that point is on the person in T-pose, metres: on bare skin a point of the
 
 import dataclasses
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import PIL.Image
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.geometry.camera import Camera
@@ -33,12 +35,17 @@ DEPTH_UNIT = 1e-4
 
 _shaded_vertices, _seen_from_behind = jax.jit(shading.shaded_vertices), jax.jit(shading.seen_from_behind)
 _light_points = jax.jit(shading.light_points)
+Image = Float[np.ndarray, "h w 3"]
+Map = Float[np.ndarray, "h w"]
+Ids = Int[np.ndarray, " m"]
+Values = Float[np.ndarray, "m 3"]
 
 
 @dataclasses.dataclass(frozen=True)
 class PosedSubject:
-    """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n, 3), openness (n,), share of
-    the key light that arrives (n,).
+    """A person in one pose: rotations (j, 3), translation (3,); vertices (n, 3), unit normals (n, 3), openness (n,).
+
+    lit: (n,) share of the key light that arrives.
     """
 
     subject: SyntheticSubject
@@ -66,9 +73,7 @@ def padded(vertices: Points, faces: Faces) -> tuple[Float[Array, "n_padded 3"], 
     return jnp.asarray(vertices), jnp.asarray(np.pad(faces, ((0, spare_faces), (0, 0))))
 
 
-def render_view(
-    posed: PosedSubject, camera: Camera, background: float = 1.0
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+def render_view(posed: PosedSubject, camera: Camera, background: float = 1.0) -> tuple[Image, Map]:
     """(h, w, 3) image on the background and (h, w) coverage of one camera, both in [0, 1]."""
     s, subject = SUPERSAMPLING, posed.subject
     fine = camera.resized(camera.width * s, camera.height * s)
@@ -86,16 +91,11 @@ def render_view(
 
 
 def light_points(
-    posed: PosedSubject,
-    face_ids: Int[np.ndarray, " m"],
-    weights: Float[np.ndarray, "m 3"],
-    albedo: Float[np.ndarray, "m 3"],
-    slopes: Float[np.ndarray, "m 3"],
-    eye: Float[Array, "3"] | None = None,
-) -> Float[np.ndarray, "m 3"]:
+    posed: PosedSubject, face_ids: Ids, weights: Values, albedo: Values, slopes: Values, eye: Array | None = None
+) -> Values:
     """Colours (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the weights of the corners.
 
-    eye: camera centre, which decides whether the inner side of cloth is seen; None: everything is seen from outside.
+    eye: camera centre (3,), which decides whether the inner side of cloth is seen; None: everything is seen from outside.
     """
     subject, faces = posed.subject, posed.subject.surface.faces
     values = np.concatenate([posed.normals, posed.openness[:, None], posed.lit[:, None]], axis=1)
@@ -113,7 +113,7 @@ def light_points(
     return np.concatenate(colors)
 
 
-def spots_at(subject: SyntheticSubject, face_ids: Int[np.ndarray, " m"], weights: Float[np.ndarray, "m 3"]) -> Spots:
+def spots_at(subject: SyntheticSubject, face_ids: Ids, weights: Values) -> Spots:
     """Points on faces, given by the weights of their corners, as materials see them."""
     attributes = subject.surface.attributes
     values = np.concatenate([attributes["cloth"], attributes["template"]], axis=1)
@@ -122,14 +122,12 @@ def spots_at(subject: SyntheticSubject, face_ids: Int[np.ndarray, " m"], weights
     return Spots(blended[:, :4], blended[:, 4:])
 
 
-def paint(subject: SyntheticSubject, face_ids: Int[np.ndarray, " n"], spots: Spots) -> tuple[Points, Points]:
-    """The materials at points on given faces: albedo (n, 3) and slope (n, 3) of the painted folds."""
+def paint(subject: SyntheticSubject, face_ids: Ids, spots: Spots) -> tuple[Values, Values]:
+    """The materials at points on given faces: albedo (m, 3) and slope (m, 3) of the painted folds."""
     material_ids = subject.face_materials[face_ids]
     albedo, slope = np.empty((len(face_ids), 3), np.float32), np.zeros((len(face_ids), 3), np.float32)
-    order = np.argsort(material_ids, kind="stable")
-    bounds = np.searchsorted(material_ids[order], np.arange(len(subject.materials) + 1))
     for k in np.unique(material_ids):
-        material, chosen = subject.materials[k], order[bounds[k] : bounds[k + 1]]
+        material, chosen = subject.materials[k], np.flatnonzero(material_ids == k)
         own = Spots(spots.cloth[chosen], spots.template[chosen])
         albedo[chosen] = material.albedo(own)
         if material.wrinkles > 0:
@@ -138,12 +136,11 @@ def paint(subject: SyntheticSubject, face_ids: Int[np.ndarray, " n"], spots: Spo
     return np.clip(albedo, 0.01, None), slope
 
 
-@dataclasses.dataclass(frozen=True)
-class SurfaceMaps:
+class SurfaceMaps(NamedTuple):
     """See the module."""
 
-    depth: Float[np.ndarray, "h w"]
-    position: Float[np.ndarray, "h w 3"]
+    depth: Map
+    position: Image
 
 
 def render_maps(posed: PosedSubject, camera: Camera) -> SurfaceMaps:
@@ -156,17 +153,15 @@ def render_maps(posed: PosedSubject, camera: Camera) -> SurfaceMaps:
     return SurfaceMaps(np.maximum(np.asarray(fragments.depth), 0), position)
 
 
-def write_depth(path: str | Path, depth: Float[np.ndarray, "h w"]) -> None:
+def write_depth(path: str | Path, depth: Map) -> None:
     """A 16-bit PNG in steps of `DEPTH_UNIT`. Raises: ValueError if a depth does not fit."""
-    from PIL import Image
-
     levels = np.rint(depth / DEPTH_UNIT)
     if not 0 <= levels.min() <= levels.max() <= 65535:
         raise ValueError(f"{path}: depths of {depth.min():.3g} to {depth.max():.3g} m do not fit into 16 bits")
-    Image.fromarray(levels.astype(np.uint16)).save(path, format="PNG")
+    PIL.Image.fromarray(levels.astype(np.uint16)).save(path, format="PNG")
 
 
-def read_depth(path: str | Path) -> Float[np.ndarray, "h w"]:
+def read_depth(path: str | Path) -> Map:
     """Metres, 0 where nothing is hit. Raises: OSError if the file cannot be read; ValueError if it is no 16-bit grey PNG."""
     with open_image(path) as (image, _):
         if not image.mode.startswith("I"):
@@ -174,13 +169,7 @@ def read_depth(path: str | Path) -> Float[np.ndarray, "h w"]:
         return (np.asarray(image).astype(np.float64) * DEPTH_UNIT).astype(np.float32)
 
 
-def write_maps(
-    path: str | Path,
-    image: Float[np.ndarray, "h w 3"],
-    mask: Float[np.ndarray, "h w"],
-    maps: SurfaceMaps,
-    camera: Camera,
-) -> None:
+def write_maps(path: str | Path, image: Image, mask: Map, maps: SurfaceMaps, camera: Camera) -> None:
     """An OpenEXR file: R, G, B (image: on white) premultiplied by A, depth Z, position.X/Y/Z, the camera in the header."""
     rgba = np.concatenate([image - (1 - mask[..., None]), mask[..., None]], axis=-1)
     channels = {f"position.{axis}": maps.position[..., i] for i, axis in enumerate("XYZ")}

@@ -26,13 +26,8 @@ TRADEOFF = range(5_000_000, 5_001_000)
 """People that the presets of speed and accuracy are chosen on."""
 
 SPLITS = {
-    "train": TRAIN,
-    "validation": VALIDATION,
-    "test": TEST,
-    "demo": DEMO,
-    "fitting": FITTING,
-    "tradeoff": TRADEOFF,
-}
+    "train": TRAIN, "validation": VALIDATION, "test": TEST, "demo": DEMO, "fitting": FITTING, "tradeoff": TRADEOFF,
+}  # fmt: skip
 
 KEY_KIND = "threefry2x32"
 """Implementation of all keys of people: the words of such a key are its seed."""
@@ -44,18 +39,16 @@ def split_of(seed: int) -> str:
     for name, seeds in SPLITS.items():
         if seed in seeds:
             return name
-    raise ValueError(
-        f"seed {seed} lies in no range: {', '.join(f'{n} {r.start}..{r.stop - 1}' for n, r in SPLITS.items())}"
-    )
+    ranges = ", ".join(f"{name} {seeds.start}..{seeds.stop - 1}" for name, seeds in SPLITS.items())
+    raise ValueError(f"seed {seed} lies in no range: {ranges}")
 
 
 def seeds_of(split: str, first: int, count: int) -> range:
     """`count` seeds of a split from its `first`-th on. Raises ValueError if they reach beyond the split."""
     people = SPLITS[split]
     if first < 0 or count < 1 or first + count > len(people):
-        raise ValueError(
-            f"subjects {first}..{first + count - 1} reach beyond the split '{split}', which has {len(people)}"
-        )
+        asked = f"subjects {first}..{first + count - 1}"
+        raise ValueError(f"{asked} reach beyond the split '{split}', which has {len(people)}")
     return people[first : first + count]
 
 

@@ -9,26 +9,21 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.people import kinematics as kin
-from humangs_jax.people.arms import ARMS, arm_clearance, bend_arm, draw_goal, pose_hand
 from humangs_jax.people.noise import choice
-from humangs_jax.people.poses import STANCES, bend_trunk, in_world
+from humangs_jax.people.poses import ARMS, STANCES, arm_clearance, bend_arm, bend_trunk, draw_goal, in_world, pose_hand
 
-FPS = 30.0
-STANCE_SHARE = 0.62
-"""Share of a stride during which a foot is on the ground."""
+FPS, LONG_STEP = 30.0, 0.75
+"""Frames a second; a long step in lengths of a leg."""
+STANCE_SHARE, FLAT_FROM, FLAT_UNTIL = 0.62, 0.15, 0.55
+"""Share of a stride during which a foot is on the ground; shares of that between which the sole is flat."""
 HEEL_STRIKE, TOE_OFF = 0.28, 0.85
 """Pitch of the foot, radians, when it comes down on the heel and leaves from the toes, at a long stride."""
-FLAT_FROM, FLAT_UNTIL = 0.15, 0.55
-"""Shares of the stance between which the sole is flat."""
-LONG_STEP = 0.75
-"""Lengths of a leg."""
-SMOOTHING = 4
-"""Frames to both sides over which the pelvis's height is smoothed, below what the legs allow."""
-SPARE = 0.995
-"""Share of the legs' reach that the pelvis's height uses."""
+SMOOTHING, SPARE = 4, 0.995
+"""Frames to both sides over which the pelvis's height is smoothed; share of the legs' reach that it uses."""
 TRIES = 12
 """Goals tried for an arm until the way to one is clear."""
 
@@ -59,9 +54,6 @@ def sample_sequence(rng: np.random.Generator, build: kin.Build, frames: int = 60
     return Sequence(kind, rotations, pelvis - build.joints[kin.PELVIS], planted)
 
 
-# Walking and turning -------------------------------------------------------------------------------------------------
-
-
 @dataclasses.dataclass(frozen=True)
 class Gait:
     """cadence: strides a second. step: metres forward per step. bend: radians turned per step. width: metres of a foot from the
@@ -78,38 +70,24 @@ class Gait:
 
 
 def _walk(rng, build, frames):
-    step = rng.uniform(0.3, LONG_STEP) * build.leg
-    curved = rng.random() < 0.6
-    gait = Gait(
-        cadence=rng.uniform(0.75, 1.05),
-        step=step,
-        bend=rng.normal(0, 0.16) if curved else 0.0,
-        width=build.hip_width * rng.uniform(0.5, 0.9),
-        lift=rng.uniform(0.04, 0.09),
-        turn_out=rng.uniform(0.0, 0.18),
-        swing=rng.uniform(0.25, 0.5) * min(1.0, step / build.leg / 0.6),
-    )
-    return _step_along(rng, build, frames, gait)
+    step, curved = rng.uniform(0.3, LONG_STEP) * build.leg, rng.random() < 0.6
+    cadence, bend = rng.uniform(0.75, 1.05), rng.normal(0, 0.16) if curved else 0.0
+    width, lift, turn_out = build.hip_width * rng.uniform(0.5, 0.9), rng.uniform(0.04, 0.09), rng.uniform(0.0, 0.18)
+    swing = rng.uniform(0.25, 0.5) * min(1.0, step / build.leg / 0.6)
+    return _step_along(rng, build, frames, Gait(cadence, step, bend, width, lift, turn_out, swing))
 
 
 def _turn(rng, build, frames):
-    gait = Gait(
-        cadence=rng.uniform(0.6, 0.9),
-        step=rng.uniform(-0.02, 0.06),
-        bend=rng.choice([-1, 1]) * rng.uniform(0.25, 0.5),
-        width=build.hip_width * rng.uniform(0.95, 1.3),
-        lift=rng.uniform(0.05, 0.09),
-        turn_out=rng.uniform(0.05, 0.2),
-        swing=rng.uniform(0.03, 0.15),
-    )
-    return _step_along(rng, build, frames, gait)
+    cadence, step = rng.uniform(0.6, 0.9), rng.uniform(-0.02, 0.06)
+    bend, width = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5), build.hip_width * rng.uniform(0.95, 1.3)
+    lift, turn_out, swing = rng.uniform(0.05, 0.09), rng.uniform(0.05, 0.2), rng.uniform(0.03, 0.15)
+    return _step_along(rng, build, frames, Gait(cadence, step, bend, width, lift, turn_out, swing))
 
 
 def _step_along(rng, build, frames, gait):
-    time = np.arange(frames) / FPS
     start = rng.uniform(0, 1)
     begin_heading = rng.uniform(-np.pi, np.pi) if abs(gait.step) < 0.1 * build.leg else rng.uniform(-0.7, 0.7)
-    phase = start + gait.cadence * time  # strides; two steps each
+    phase = start + gait.cadence * (np.arange(frames) / FPS)  # strides; two steps each
     heading = lambda p: begin_heading + 2 * gait.bend * (p - start)
     track = _path(heading, 2 * gait.step, start, phase[-1])
     feet = [tuple(_foot_at(build, gait, heading, track, side, p) for side in (0, 1)) for p in phase]
@@ -142,8 +120,7 @@ def _path(heading, stride, first, last):
     """A function from the phase to the body's position (3,) on its path: the integral of the heading."""
     grid = np.linspace(first - 1.5, last + 1.5, int(64 * (last - first + 3)) + 2)
     direction = np.stack([np.sin(heading(grid)), np.zeros_like(grid), np.cos(heading(grid))], -1)
-    steps = 0.5 * (direction[1:] + direction[:-1]) * np.diff(grid)[:, None]
-    along = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, 0)])
+    along = cumulative_trapezoid(direction, grid, axis=0, initial=0)
     at = lambda p: np.asarray([np.interp(p, grid, along[:, k]) for k in range(3)])
     origin = at(first)
     return lambda p: stride * (at(p) - origin)
@@ -158,7 +135,8 @@ def _foot_at(build, gait, heading, track, side, phase):
     strike, off = HEEL_STRIKE * long if gait.step > 0.2 * build.leg else 0.0, TOE_OFF * (0.35 + 0.65 * long)
     if share < STANCE_SHARE:
         u = share / STANCE_SHARE
-        late = off * _rise((u - FLAT_UNTIL) / (1 - FLAT_UNTIL))
+        rise = np.clip((u - FLAT_UNTIL) / (1 - FLAT_UNTIL), 0.0, 1.0)  # from rest to full motion
+        late = off * (rise**2 * (3 - rise) / 2)
         return dataclasses.replace(here, pitch=float(-strike * (1 - _ease(u / FLAT_FROM)) if u < FLAT_FROM else late))
     u = (share - STANCE_SHARE) / (1 - STANCE_SHARE)
     s = _ease(u)
@@ -171,8 +149,7 @@ def _footprint(build, gait, heading, track, side, down):
     """Position of the foot that comes down at a phase: beside the path, ahead of the pelvis in mid-stance."""
     middle = down + 0.5 * STANCE_SHARE
     yaw, sign = heading(middle), 1 - 2 * side
-    # of the ball before the pelvis, standing
-    ahead = build.joints[kin.LEFT_FOOT, 2] - build.joints[kin.PELVIS, 2] - 0.04 * build.leg
+    ahead = build.joints[kin.LEFT_FOOT, 2] - build.joints[kin.PELVIS, 2] - 0.04 * build.leg  # of the ball, standing
     x, _, z = track(middle) + kin.turned(y=yaw) @ np.asarray([sign * gait.width, 0.0, ahead])
     return kin.Foot(float(x), float(z), float(yaw + sign * gait.turn_out))
 
@@ -186,8 +163,7 @@ def _swing_arms(rng, build, rotations, phase, gait):
             if bend_arm(rng, build, stood, "hang", side) > 0.01:
                 break
         pose_hand(rng, stood, side)
-    hand_of = (slice(kin.LEFT_HAND, kin.RIGHT_HAND), slice(kin.RIGHT_HAND, kin.JOINTS))
-    for side in (0, 1):
+    for side, hand in ((0, slice(kin.LEFT_HAND, kin.RIGHT_HAND)), (1, slice(kin.RIGHT_HAND, kin.JOINTS))):
         collar, shoulder, elbow, wrist = ARMS[side]
         sign = 1 - 2 * side
         forward = -sign * np.cos(2 * np.pi * (phase - 0.04))  # the left arm is back when the left heel comes down
@@ -196,29 +172,20 @@ def _swing_arms(rng, build, rotations, phase, gait):
             rotations[i, shoulder] = kin.rotation_vector(kin.turned(x=-gait.swing * f) @ base)
             rotations[i, elbow] = stood[elbow] + np.asarray([0, -sign * 0.35 * gait.swing * (1 + f), 0])
             rotations[i, collar] = stood[collar] + np.asarray([0, -sign * 0.05 * f * min(1.0, gait.swing / 0.4), 0])
-        rotations[:, wrist] = stood[wrist]
-        rotations[:, hand_of[side]] = stood[hand_of[side]]
-
-
-# Reaching ------------------------------------------------------------------------------------------------------------
+        rotations[:, wrist], rotations[:, hand] = stood[wrist], stood[hand]
 
 
 def _reach(rng, build, frames):
     """From pose to pose on planted feet: the hands reach for targets, trunk and knees follow."""
-    width = build.hip_width / build.leg
     name = rng.choice(["stand", "contrapposto", "wide", "stride"], p=[0.4, 0.2, 0.2, 0.2])
     heading = rng.uniform(-0.7, 0.7)
-    stance = STANCES[name][1](rng, width)
+    stance = STANCES[name][1](rng, build.hip_width / build.leg)
     feet = in_world(stance.feet, build.leg, heading)
-    keys, times, t = [], [], 0.0
-    while True:
-        keys.append(_key_pose(rng, build, heading, stance, feet, keys[-1] if keys else None))
-        times.append(t)
-        if t > frames / FPS:
-            break
-        t += rng.uniform(0.7, 1.4)
-    rotations, centers, turns = np.zeros((frames, kin.JOINTS, 3)), np.zeros((frames, 3)), np.zeros((frames, 3, 3))
-    sinks = np.zeros(frames)
+    keys, times = [_key_pose(rng, build, heading, stance, feet, None)], [0.0]
+    while times[-1] <= frames / FPS:
+        times.append(times[-1] + rng.uniform(0.7, 1.4))
+        keys.append(_key_pose(rng, build, heading, stance, feet, keys[-1]))
+    rotations, centers, sinks = np.zeros((frames, kin.JOINTS, 3)), np.zeros((frames, 3)), np.zeros(frames)
     for i in range(frames):
         k = int(np.searchsorted(times, i / FPS, side="right")) - 1
         a, b = keys[k], keys[k + 1]
@@ -226,8 +193,7 @@ def _reach(rng, build, frames):
         s = _ease((i / FPS - times[k]) / (0.8 * (times[k + 1] - times[k])))
         rotations[i] = kin.between(a[0], b[0], s)
         centers[i], sinks[i] = (1 - s) * a[1] + s * b[1], (1 - s) * a[2] + s * b[2]
-        turns[i] = kin.rotation_matrix(rotations[i, kin.PELVIS])
-    pelvis = _ride(build, turns, centers, [feet] * frames, sinks)
+    pelvis = _ride(build, kin.rotation_matrix(rotations[:, kin.PELVIS]), centers, [feet] * frames, sinks)
     for i in range(frames):
         kin.place_feet(build, rotations[i], pelvis[i], feet)
     return rotations, pelvis, np.ones((frames, 2), bool)
@@ -238,12 +204,11 @@ def _key_pose(rng, build, heading, stance, feet, before):
     rotations = np.zeros((kin.JOINTS, 3))
     sink = stance.sink * build.leg + (rng.uniform(0.05, 0.3) * build.leg if rng.random() < 0.3 else 0.0)
     stooped = sink / build.leg
-    tilt, turned = 0.5 * stooped + rng.uniform(0, 0.05), rng.normal(0, 0.15)
-    turn = kin.turned(y=heading + turned) @ kin.turned(x=tilt, z=stance.roll)
+    tilt, aside = 0.5 * stooped + rng.uniform(0, 0.05), rng.normal(0, 0.15)
+    turn = kin.turned(y=heading + aside) @ kin.turned(x=tilt, z=stance.roll)
     rotations[kin.PELVIS] = kin.rotation_vector(turn)
-    middle = 0.5 * (feet[0].x + feet[1].x), 0.5 * (feet[0].z + feet[1].z)
     back = kin.turned(y=heading) @ np.asarray([rng.normal(0, 0.02), 0, rng.normal(-0.08, 0.02)]) * build.leg
-    center = np.asarray([middle[0] + back[0], 0.0, middle[1] + back[2]])
+    center = np.asarray([0.5 * (feet[0].x + feet[1].x) + back[0], 0.0, 0.5 * (feet[0].z + feet[1].z) + back[2]])
     height = kin.highest_pelvis(build, turn, center[0], center[2], feet, SPARE) - sink
     kin.place_feet(build, rotations, np.asarray([center[0], height, center[2]]), feet)
     bend_trunk(rng, rotations, stance.lean + 1.2 * stooped, stance.roll)
@@ -274,9 +239,6 @@ def _clear_of(build, rotations, side):
     return arm_clearance(build, rotations)
 
 
-# Shared --------------------------------------------------------------------------------------------------------------
-
-
 def _ride(build, turns, centers, feet, sinks=None):
     """Positions of the pelvis (m, 3) above the centers: smooth heights that the legs allow, minus `sinks`."""
     heights = np.asarray([
@@ -296,12 +258,6 @@ def _ease(t):
     """From 0 to 1 with rest at both ends (speed and acceleration)."""
     t = np.clip(t, 0.0, 1.0)
     return t**3 * (10 - 15 * t + 6 * t**2)
-
-
-def _rise(t):
-    """From 0 with rest, to 1 in full motion."""
-    t = np.clip(t, 0.0, 1.0)
-    return t**2 * (3 - t) / 2
 
 
 KINDS: dict[str, tuple[float, Callable]] = {"walk": (0.5, _walk), "turn": (0.2, _turn), "reach": (0.3, _reach)}

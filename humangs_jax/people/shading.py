@@ -1,8 +1,7 @@
 """Soft light on posed surfaces, in JAX: sky and ground, three wide lights, occlusion and soft shadows, painted folds.
 
 Everything is diffuse or nearly so and fixed in the world: a point has one colour from wherever it is seen. Occlusion and the
-shadow of the key light are per vertex, from a voxel grid that holds the posed person: how empty it is in front of a point, and
-what it holds on the way towards the light. Exposure and white balance differ from person to person.
+shadow of the key light are per vertex, from a voxel grid that holds the posed person. Exposure and white balance differ.
 """
 
 import math
@@ -17,26 +16,20 @@ from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.people.fabrics import ALBEDO_LIMIT
 from humangs_jax.people.noise import choice
 
-CELL = 0.025
-"""Edge of a voxel of the occupancy grid, metres."""
-GRID = (112, 104, 80)
-"""Voxels along x, y and z: 2.8 m x 2.6 m x 2 m, more than any pose takes; what lies outside casts no shadow."""
-MARGIN = 6
-"""Empty voxels around the person."""
-REACH = (0.045, 0.11)
-"""Distances from the surface at which the grid is sampled for openness, metres."""
+CELL, GRID, MARGIN = 0.025, (112, 104, 80), 6
+"""Edge of a voxel of the occupancy grid, metres; voxels along x, y and z, more than any pose takes (what lies outside casts no
+shadow); empty voxels around the person."""
+REACH, LIFT = (0.045, 0.11), 0.03
+"""Distances from the surface at which the grid is sampled for openness; height above it at which the way to the light begins."""
 STRIDES = (0.06, 0.085, 0.115, 0.155, 0.205, 0.27, 0.36, 0.47, 0.6)
 """Distances towards the key light at which the grid is sampled for shadows, metres."""
-LIFT = 0.03
-"""Metres above the surface at which the way to the light begins."""
 SHADOW_DENSITY, DARKEST = 2.2, 0.4
 """Extinction per unit of what the samples find, and the least share of the key light that arrives."""
 SHOULDER, WHITEST = 0.72, 0.97
 """Brightness from which highlights are compressed, and the one that they approach."""
-WRAP, GLOSS = 0.25, 0.12
-"""Cosine by which a wide light reaches beyond the terminator; strength of highlights on the glossiest material."""
-INSIDE_SHADE = 0.45
-"""Brightness of the inner side of cloth."""
+WRAP, GLOSS, INSIDE_SHADE = 0.25, 0.12, 0.45
+"""Cosine by which a wide light reaches beyond the terminator; strength of highlights on the glossiest material; brightness of the
+inner side of cloth."""
 LIGHT_NUMBERS = 28
 WARM = np.asarray([1.0, 0.0, -1.0])
 
@@ -50,6 +43,10 @@ SCENES = {
 """Kinds of light: odds; azimuth and elevation of the key light (radians), its strength, that of the fill, the sky's; how much
 warmer the key is than the sky; and the ground's brightness against the sky's."""
 _SCENES = np.asarray([np.hstack(row) for row in SCENES.values()], np.float32)
+
+
+Vectors = Float[Array, "*p 3"]
+Values = Float[Array, "*p"]
 
 
 @pytree_dataclass
@@ -111,11 +108,8 @@ def _lights(numpy, angles, elevations, power, tint, warmth, sky, ground, gain):
 
 
 def shaded_vertices(
-    vertices: Float[Array, "n 3"],
-    normals: Float[Array, "n 3"],
-    direction: Float[Array, "3"],
-    faces: Int[Array, "f 3"] | None = None,
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    vertices: Vectors, normals: Vectors, direction: Float[Array, "3"], faces: Int[Array, "f 3"] | None = None
+) -> tuple[Values, Values]:
     """(n,) openness in [0.35, 1] and (n,) share of the light from `direction` that arrives, in [DARKEST, 1].
 
     faces: where they are given, as for training on the fly, their middles fill the grid as well (meshes may have edges longer
@@ -126,19 +120,15 @@ def shaded_vertices(
     if faces is not None:
         middles = (vertices[faces[:, 0]] + vertices[faces[:, 1]] + vertices[faces[:, 2]]) / 3
         points, towards_light = jnp.concatenate([vertices, middles]), _nearest
-    grid = _blurred(_occupancy(points, low))
+    x, y, z = ((points - low) / CELL).astype(jnp.int32).T
+    # duplicates all write the same number: the order does not matter
+    grid = _blurred(jnp.zeros(GRID, points.dtype).at[x, y, z].set(1.0, mode="drop"))
     place = lambda points: (points - low) / CELL - 0.5
     dark = sum(_trilinear(grid, place(vertices + reach * normals)) for reach in REACH) / len(REACH)
     openness = jnp.clip(1.08 - 2.6 * dark, 0.35, 1.0)
     start = vertices + LIFT * normals
     found = sum(towards_light(grid, place(start + stride * direction)) for stride in STRIDES)
     return openness, jnp.maximum(jnp.exp(-SHADOW_DENSITY * found), DARKEST)
-
-
-def _occupancy(points, low):
-    """Grid with 1 in the voxels that hold a point. Duplicates all write the same number: the order does not matter."""
-    cells = ((points - low) / CELL).astype(jnp.int32)
-    return jnp.zeros(GRID, points.dtype).at[cells[:, 0], cells[:, 1], cells[:, 2]].set(1.0, mode="drop")
 
 
 def _blurred(grid):
@@ -183,35 +173,24 @@ def seen_from_behind(
 
 
 def light_points(
-    lights: Lights,
-    corners: Float[Array, "p 15"],
-    weights: Float[Array, "p 3"],
-    behind: Bool[Array, " p"],
-    albedo: Float[Array, "p 3"],
-    slopes: Float[Array, "p 3"],
-    sheen: Float[Array, " p"],
-) -> Float[Array, "p 3"]:
+    lights: Lights, corners: Array, weights: Vectors, behind: Array, albedo: Vectors, slopes: Vectors, sheen: Values
+) -> Vectors:
     """Colours (p, 3) of points on faces.
 
-    corners: normal (3), openness and share of the key light of each corner of the point's face. weights: of the corners.
-    behind: whether the inner side is seen. albedo, slopes, sheen: of the material there.
+    corners: (p, 15) normal (3), openness and share of the key light of each corner of the point's face. weights: of the corners.
+    behind: (p,) whether the inner side is seen. albedo, slopes, sheen: of the material there.
     """
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
     blended = wa * corners[:, :5] + wb * corners[:, 5:10] + wc * corners[:, 10:]
     normals, openness, lit = _unit(blended[:, :3]), blended[:, 3], blended[:, 4]
     normals = jnp.where(behind[:, None], -normals, normals)
     openness = jnp.where(behind, INSIDE_SHADE, 1.0) * openness
-    return shade(lights, albedo, bend_normals(normals, slopes), openness, lit, sheen)
+    # tilted against the gradient of a height field on the surface
+    normals = _unit(normals - (slopes - jnp.sum(slopes * normals, -1, keepdims=True) * normals))
+    return shade(lights, albedo, normals, openness, lit, sheen)
 
 
-def shade(
-    lights: Lights,
-    albedo: Float[Array, "*p 3"],
-    normals: Float[Array, "*p 3"],
-    openness: Float[Array, "*p"],
-    lit: Float[Array, "*p"],
-    sheen: Float[Array, "*p"],
-) -> Float[Array, "*p 3"]:
+def shade(lights: Lights, albedo: Vectors, normals: Vectors, openness: Values, lit: Values, sheen: Values) -> Vectors:
     """Colours in [0, 1] of points; normals are unit, `lit` is the share of the key light that arrives."""
     up = 0.5 + 0.5 * normals[..., 1:2]
     light = (lights.ground + (lights.sky - lights.ground) * up) * openness[..., None]
@@ -227,16 +206,11 @@ def shade(
     return rolled_off(jnp.minimum(albedo, ALBEDO_LIMIT) * light * lights.gain)
 
 
-def rolled_off(colors: Float[Array, "*p 3"]) -> Float[Array, "*p 3"]:
+def rolled_off(colors: Vectors) -> Vectors:
     """Colours from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns out at once."""
     reach = WHITEST - SHOULDER
     colors = jnp.maximum(colors, 0)
     return jnp.minimum(colors, SHOULDER) + reach * (1 - jnp.exp(-jnp.maximum(colors - SHOULDER, 0) / reach))
-
-
-def bend_normals(normals: Float[Array, "*p 3"], slopes: Float[Array, "*p 3"]) -> Float[Array, "*p 3"]:
-    """Normals tilted against the gradient of a height field on the surface."""
-    return _unit(normals - (slopes - jnp.sum(slopes * normals, -1, keepdims=True) * normals))
 
 
 def _unit(vectors):

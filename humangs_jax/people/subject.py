@@ -11,9 +11,8 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Float, Int
-from humangs_jax.people import anatomy as anatomy_module
 from humangs_jax.people import complexion, hair, wardrobe
-from humangs_jax.people.anatomy import Anatomy
+from humangs_jax.people.anatomy import BODY_NAME, BODY_VERTICES, measure
 from humangs_jax.people.complexion import Complexion, sample_complexion
 from humangs_jax.people.fabrics import Material
 from humangs_jax.people.hair import Haircut, sample_haircut
@@ -26,11 +25,9 @@ SHAPE_STD = 0.55
 """Standard deviation of the shape coefficients without a rule of their own; values are clipped at twice that."""
 HEIGHTS = {True: (1.765, 0.085), False: (1.645, 0.08)}
 """Mean and standard deviation of the stature in metres of men (True) and women."""
-HEIGHT_RANGE = (1.42, 2.08)
-TALLEST_WOMAN = 1.95
-YEARS = (15.0, 85.0)
-YOUNG, OLD = 25.0, 90.0
-"""Years at which the body's age coefficient is 0 and 1."""
+HEIGHT_RANGE, TALLEST_WOMAN = (1.42, 2.08), 1.95
+YEARS, YOUNG, OLD = (15.0, 85.0), 25.0, 90.0
+"""Range of ages; years at which the body's age coefficient is 0 and 1."""
 LENGTHS = ("height", "leg_length", "torso_length")
 """Coefficients that share what is missing to the wanted stature."""
 
@@ -66,13 +63,10 @@ def describe(seed: int, body: BodyModel) -> Person:
     return Person(seed, betas, male, years, stature, complexion, haircut, garments, lights)
 
 
-def sample_shape(
-    rng: np.random.Generator, body: BodyModel, male: bool, years: float
-) -> tuple[Float[np.ndarray, " s"], float]:
+def sample_shape(rng: np.random.Generator, body: BodyModel, male: bool, years: float) -> tuple[np.ndarray, float]:
     """(s,) shape coefficients and the stature in metres that they give."""
-    names = body.shape_names
-    at = {name: i for i, name in enumerate(names)}
-    betas = np.clip(rng.normal(0, 1, len(names)), -2, 2) * SHAPE_STD
+    at = {name: i for i, name in enumerate(body.shape_names)}
+    betas = np.clip(rng.normal(0, 1, len(at)), -2, 2) * SHAPE_STD
     betas[at["sex_male"]] = (1 if male else -1) * rng.uniform(0.55, 1.0)
     betas[at["age"]] = (years - YOUNG) / (OLD - YOUNG) if years > YOUNG else 0.03 * (years - YOUNG)
     heavier = 0.25 * np.clip((years - 20) / 30, 0, 1)
@@ -83,9 +77,8 @@ def sample_shape(
     tall = rng.standard_t(5) if rng.random() < 0.85 else rng.uniform(-2.6, 3.4)
     wanted = np.clip(mean - youth + std * tall, HEIGHT_RANGE[0], HEIGHT_RANGE[1] if male else TALLEST_WOMAN)
     *_, stature, gains = _host_arrays(body)
-    share = np.asarray([gains[at[name]] for name in LENGTHS])
-    missing = wanted - (stature + gains @ betas)
-    betas[[at[name] for name in LENGTHS]] += missing * share / (share @ share)
+    lengths = [at[name] for name in LENGTHS]
+    betas[lengths] += (wanted - (stature + gains @ betas)) * gains[lengths] / (gains[lengths] @ gains[lengths])
     return betas.astype(np.float32), float(wanted)
 
 
@@ -94,9 +87,8 @@ class SyntheticSubject:
     """A dressed person.
 
     seed. betas: (s,) shape of the body. surface: the mesh at rest with attributes `template`, `cloth`. face_materials: (f,)
-    indices into materials. lights. build: what the pose prior knows.
+    indices into materials. lights. build: what the pose prior knows. person: what all of this was built from.
     cover: (n,) metres that a vertex of the skin lies inside of a hem, negative on bare skin and on everything else.
-    person: what all of this was built from.
     """
 
     seed: int
@@ -127,28 +119,26 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
 
     Raises: ValueError if the body is not the package's own: cuts and paint are given in its coordinates.
     """
-    if body.name != anatomy_module.BODY_NAME or body.template.shape[0] != anatomy_module.BODY_VERTICES:
-        raise ValueError(f"synthetic people need the shipped body '{anatomy_module.BODY_NAME}', got '{body.name}'")
+    if body.name != BODY_NAME or body.template.shape[0] != BODY_VERTICES:
+        raise ValueError(f"synthetic people need the shipped body '{BODY_NAME}', got '{body.name}'")
     person = describe(seed, body) if person is None else person
     rest = _shape(body, jnp.asarray(person.betas))
     template, faces, weights, *_ = _host_arrays(body)
     vertices, joints = np.asarray(rest.vertices), np.asarray(rest.joints)
-    anatomy = anatomy_module.measure(vertices, joints, template, faces, weights, body.parents)
-    rng = np.random.default_rng([seed, 20])
-    outfit = wardrobe.dress_up(rng, anatomy, person.garments)
-    if person.haircut.cut in hair.LONG_CUTS or _hooded(person):
-        outfit.removed = outfit.removed | hair.ears(template)
-    hairs = _hair(np.random.default_rng([seed, 21]), anatomy, person, outfit.trunk)
-    skin, cover = _visible_skin(anatomy, outfit)
-    tones = person.complexion
-    pieces = [
-        wardrobe.Piece(skin, complexion.skin_material(np.random.default_rng([seed, 22]), tones, person.haircut)),
-        wardrobe.Piece(hair.eyeballs(anatomy), complexion.eye_material(tones)),
-        *outfit.pieces,
-        *hairs,
-    ]
+    anatomy = measure(vertices, joints, template, faces, weights, body.parents)
+    outfit = wardrobe.dress_up(np.random.default_rng([seed, 20]), anatomy, person.garments)
+    hooded = any(g.kind == "headscarf" or "hood_up" in g.details for g in person.garments)
+    removed = outfit.removed
+    if person.haircut.cut in hair.LONG_CUTS or hooded:
+        removed = removed | hair.ears(template)
+    hairs = _hair(np.random.default_rng([seed, 21]), anatomy, person, outfit.trunk, hooded)
+    skin = anatomy.skin.with_attributes(cover=outfit.cover.astype(np.float32))
+    skin = compact(skin, ~removed[skin.faces].all(1))
+    skin_material = complexion.skin_material(np.random.default_rng([seed, 22]), person.complexion, person.haircut)
+    eyes = wardrobe.Piece(hair.eyeballs(anatomy), complexion.eye_material(person.complexion))
+    pieces = [wardrobe.Piece(skin, skin_material), eyes, *outfit.pieces, *hairs]
     surface = join([piece.surface for piece in pieces])
-    cover = np.pad(cover, (0, len(surface.vertices) - len(cover)), constant_values=-1.0)
+    cover = skin.attributes["cover"]
     return SyntheticSubject(
         seed=seed,
         betas=person.betas,
@@ -157,7 +147,7 @@ def make_subject(seed: int, body: BodyModel, person: Person | None = None) -> Sy
         materials=tuple(piece.material for piece in pieces),
         lights=person.lights,
         build=_build(anatomy, surface),
-        cover=cover,
+        cover=np.pad(cover, (0, len(surface.vertices) - len(cover)), constant_values=-1.0),
         person=person,
     )
 
@@ -177,27 +167,14 @@ def _host_arrays(body):
     return _HOST[id(body)][1:]
 
 
-def _visible_skin(anatomy: Anatomy, outfit: wardrobe.Outfit) -> tuple[Surface, np.ndarray]:
-    """Skin without hidden faces, and how far inside of a hem its vertices (n,) lie, metres."""
-    skin = anatomy.skin.with_attributes(cover=outfit.cover.astype(np.float32))
-    bare = compact(skin, ~outfit.removed[skin.faces].all(1))
-    kept = {name: bare.attributes[name] for name in ("template", "cloth")}
-    return dataclasses.replace(bare, attributes=kept), bare.attributes["cover"]
-
-
-def _hooded(person):
-    return any(g.kind == "headscarf" or "hood_up" in g.details for g in person.garments)
-
-
-def _hair(rng, anatomy, person, over):
+def _hair(rng, anatomy, person, over, hooded):
     """The pieces of hair; what a hat or hood covers is left out."""
     material = complexion.hair_material(rng, person.complexion.hair, person.haircut)
-    hooded = _hooded(person)
     haircut = dataclasses.replace(person.haircut, cut="buzz") if hooded else person.haircut
     pieces = [wardrobe.Piece(surface, material) for surface in hair.style(rng, anatomy, haircut, over)]
     hat = any(g.kind in ("cap", "beanie", "brim_hat") for g in person.garments)
     if hat and pieces and not hooded:  # the scalp's; tails, buns and beards hang out
-        hidden = hair.above_line(pieces[0].surface.attributes["template"], hair.CAP_LINE) > 0.008
+        hidden = hair.above_line(pieces[0].surface.template, hair.CAP_LINE) > 0.008
         pieces[0] = dataclasses.replace(pieces[0], hidden=hidden).visible()
     return pieces
 

@@ -16,6 +16,7 @@ from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.rendering.mesh.atlas import Faces, Points, edges_of, unit
 
 Field = Float[np.ndarray, " n"]
+Values = Float[np.ndarray, "n c"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,6 +27,11 @@ class Surface:
     faces: Faces
     weights: Float[np.ndarray, "n j"]
     attributes: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
+
+    @property
+    def template(self) -> Points:
+        """(n, 3) template coordinates, see `anatomy`."""
+        return self.attributes["template"]
 
     def moved(self, vertices: Points) -> "Surface":
         """The same surface with other vertex positions."""
@@ -59,9 +65,7 @@ def vertex_normals(vertices: Points, faces: Faces) -> Points:
     return unit(scatter_add(faces.T.reshape(-1), np.tile(np.cross(b - a, c - a), (3, 1)), len(vertices)))
 
 
-def scatter_add(
-    indices: Int[np.ndarray, " m"], values: Float[np.ndarray, "m c"], count: int
-) -> Float[np.ndarray, "count c"]:
+def scatter_add(indices: Int[np.ndarray, " m"], values: Float[np.ndarray, "m c"], count: int) -> np.ndarray:
     """Sums of the rows of `values` (m, c) that share an index, (count, c) float32."""
     columns = [np.bincount(indices, weights=values[:, c], minlength=count) for c in range(values.shape[1])]
     return np.stack(columns, axis=1).astype(np.float32)
@@ -76,9 +80,7 @@ def boundary_edges(faces: Faces) -> Int[np.ndarray, "e 2"]:
     return edges[uses[inverse] == 1].astype(np.int32)
 
 
-def smooth(
-    values: Float[np.ndarray, "n c"], faces: Faces, iterations: int, keep_hems: bool = False
-) -> Float[np.ndarray, "n c"]:
+def smooth(values: Values, faces: Faces, iterations: int, keep_hems: bool = False) -> Values:
     """Laplacian smoothing of vertex values (n, c): each step moves a vertex halfway towards the mean of its neighbours.
 
     keep_hems: vertices on the boundary only feel their neighbours on the boundary, so that hems stay crisp and do not shrink.
@@ -88,13 +90,12 @@ def smooth(
     source, target = np.concatenate([edges[:, 0], edges[:, 1]]), np.concatenate([edges[:, 1], edges[:, 0]])
     if keep_hems:
         hems = boundary_edges(faces)
-        on_hem = np.zeros(count, bool)
-        on_hem[hems] = True
-        inner = ~on_hem[target]
+        inner = ~np.isin(target, hems)
         source = np.concatenate([source[inner], hems[:, 0], hems[:, 1]])
         target = np.concatenate([target[inner], hems[:, 1], hems[:, 0]])
-    neighbours = np.maximum(np.bincount(target, minlength=count), 1).astype(np.float32)[:, None]
-    lonely = np.bincount(target, minlength=count) == 0
+    neighbours = np.bincount(target, minlength=count)
+    lonely = neighbours == 0
+    neighbours = np.maximum(neighbours, 1).astype(np.float32)[:, None]
     for _ in range(iterations):
         mean = scatter_add(target, values[source], count) / neighbours
         mean[lonely] = values[lonely]
@@ -120,17 +121,13 @@ def cut(surface: Surface, field: Field) -> Surface:
         return compact(surface, count == 3)
     # turn each mixed face so that its odd corner (alone on its side) comes first
     sides = inside[mixed]
-    odd_side = sides.sum(1) == 1
-    odd = np.argmax(sides == odd_side[:, None], axis=1)
-    corners = mixed[np.arange(len(mixed))[:, None], (odd[:, None] + np.arange(3)) % 3]
-    a, b, c = corners.T
-    keys = np.stack([np.stack([a, b], 1), np.stack([a, c], 1)]).reshape(-1, 2)
-    keys = np.sort(keys, axis=1)
-    pairs, inverse = np.unique(keys, axis=0, return_inverse=True)
-    new = (inverse.reshape(-1) + len(surface.vertices)).astype(np.int32)
-    on_ab, on_ac = new[: len(mixed)], new[len(mixed) :]
-    kept_tip = np.stack([a, on_ab, on_ac], 1)[odd_side]
-    base = ~odd_side
+    base = sides.sum(1) != 1
+    odd = np.argmax(sides != base[:, None], axis=1)
+    a, b, c = mixed[np.arange(len(mixed))[:, None], (odd[:, None] + np.arange(3)) % 3].T
+    cuts = np.sort(np.concatenate([np.stack([a, b], 1), np.stack([a, c], 1)]), axis=1)
+    pairs, inverse = np.unique(cuts, axis=0, return_inverse=True)
+    on_ab, on_ac = np.split((inverse.reshape(-1) + len(surface.vertices)).astype(np.int32), 2)
+    kept_tip = np.stack([a, on_ab, on_ac], 1)[~base]
     kept_base = np.concatenate([np.stack([on_ab, b, c], 1)[base], np.stack([on_ab, c, on_ac], 1)[base]])
     f0, f1 = field[pairs[:, 0]], field[pairs[:, 1]]
     t = (f0 / (f0 - f1)).astype(np.float32)
@@ -195,15 +192,11 @@ def tube(levels: Float[np.ndarray, " r"], angles: Float[np.ndarray, " c"]) -> tu
 
 
 def sweep(
-    path: Float[np.ndarray, "m 3"],
-    across: Float[np.ndarray, "*m 3"],
-    widths: Float[np.ndarray, "m _"] | float,
-    columns: int = 10,
-    closed: bool = False,
+    path: np.ndarray, across: np.ndarray, widths: np.ndarray | float, columns: int = 10, closed: bool = False
 ) -> tuple[Points, Faces]:
     """Vertices (m columns, 3) and faces of a tube of elliptic sections along a path (m, 3).
 
-    across: direction(s) of the first half axis, made normal to the path. widths: half axes, metres; one, or (m, 1 or 2).
+    across: (3,) or (m, 3) along the first half axis, made normal to the path. widths: half axes, metres; one, or (m, 1 or 2).
     closed: the path's end joins its start; otherwise the ends are open (let the widths run out to close them).
     """
     tangent = unit(np.roll(path, -1, 0) - np.roll(path, 1, 0)) if closed else unit(np.gradient(path, axis=0))
@@ -222,17 +215,13 @@ def circle(count: int) -> Field:
     return np.arange(count) * (2 * np.pi / count)
 
 
-def around(
-    radius: Field | float | int, angle: Field, height: Field, center: Float[np.ndarray, "2"] | tuple = (0, 0)
-) -> Points:
+def around(radius: Field | float | int, angle: Field, height: Field, center: np.ndarray | tuple = (0, 0)) -> Points:
     """(n, 3) points at radii (n,) and angles (n,) around the vertical axis through center (x, z)."""
     return np.stack([center[0] + radius * np.sin(angle), height, center[1] + radius * np.cos(angle)], -1)
 
 
-ANGLES = 48
-EMPTY = 1e-3
-"""Radius (metres) of a slice without points."""
-
+ANGLES, EMPTY = 48, 1e-3
+"""Of an outline; radius (metres) of a slice without points."""
 _GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
 _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
@@ -256,15 +245,9 @@ class Outlines:
         t = np.clip(np.interp(level, self.levels, np.arange(len(self.levels))), 0, len(self.levels) - 1.001)
         a = (angle / (2 * np.pi) * ANGLES) % ANGLES
         i, k = t.astype(int), a.astype(int) % ANGLES
-        u, w = t - i, a - np.floor(a)
-        k1 = (k + 1) % ANGLES
-        low = self.radii[i, k] * (1 - w) + self.radii[i, k1] * w
-        high = self.radii[i + 1, k] * (1 - w) + self.radii[i + 1, k1] * w
+        u, w, k1 = t - i, a - np.floor(a), (k + 1) % ANGLES
+        low, high = (self.radii[row, k] * (1 - w) + self.radii[row, k1] * w for row in (i, i + 1))
         return (low * (1 - u) + high * u).astype(np.float32)
-
-    def with_radii(self, radii: np.ndarray) -> "Outlines":
-        """The same slices with other radii."""
-        return dataclasses.replace(self, radii=radii)
 
 
 def polar(across: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -274,7 +257,7 @@ def polar(across: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def outlines(
-    along: np.ndarray, across: np.ndarray, levels: np.ndarray, centers: np.ndarray | None, window: float
+    along: Field, across: np.ndarray, levels: np.ndarray, centers: np.ndarray | None, window: float
 ) -> Outlines:
     """Outlines of the points with position `along` (n,) on the axis and (n, 2) across it.
 
@@ -306,7 +289,7 @@ def blurred(shape: Outlines, times: int = 1) -> Outlines:
         padded = np.concatenate([radii[:1], radii, radii[-1:]])
         radii = 0.25 * padded[:-2] + 0.5 * padded[1:-1] + 0.25 * padded[2:]
         radii = 0.25 * np.roll(radii, 1, 1) + 0.5 * radii + 0.25 * np.roll(radii, -1, 1)
-    return shape.with_radii(radii)
+    return dataclasses.replace(shape, radii=radii)
 
 
 def hanging(shape: Outlines, slope: float) -> Outlines:
@@ -314,4 +297,4 @@ def hanging(shape: Outlines, slope: float) -> Outlines:
     radii = shape.radii.copy()
     for i in range(len(radii) - 2, -1, -1):
         radii[i] = np.maximum(radii[i], radii[i + 1] - slope * abs(shape.levels[i] - shape.levels[i + 1]))
-    return shape.with_radii(radii)
+    return dataclasses.replace(shape, radii=radii)

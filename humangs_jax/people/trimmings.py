@@ -1,16 +1,24 @@
 """What is sewn on or printed on a fabric: prints, buttons, zips, seams, pockets, ribs, bands, stripes, laces.
 
-Each function takes colours (n, 3) at points and returns other ones. Words are set in a 5 x 7 alphabet of the package's own;
-emblems are closed shapes.
+`sewn` is the fabric of a garment with all of that, by the table `SEWN_ON`. Its trimmings take colours (n, 3) at points, the
+points, random numbers and the garment, and return other colours. Words are set in a 5 x 7 alphabet of the package's own.
 """
+
+from collections.abc import Callable
 
 import numpy as np
 
 from humangs_jax.core.array_types import Bool
-from humangs_jax.people.anatomy import ARMHOLE
+from humangs_jax.people.anatomy import ARMHOLE, WAIST
 from humangs_jax.people.fabrics import Spots, accent, band, colour, mix
 from humangs_jax.people.noise import lattice
+from humangs_jax.people.outfits import BOTTOMS, DRESSES, OUTER, TOPS, Garment
 from humangs_jax.people.surfaces import Field, Points
+
+QUILT = 0.075
+"""Period of quilted cloth, metres."""
+PADDED = ("puffer", "vest")
+"""Kinds of garments that are quilted."""
 
 ROWS, ADVANCE = 7, 6
 """Cells of a letter: rows, and columns from one letter to the next."""
@@ -95,17 +103,39 @@ def emblem(kind: str, x: Field, y: Field, points: int = 5) -> Field:
     return np.minimum(0.28 - np.abs(slant), 1 - np.abs(y))  # bolt
 
 
-def _trunk(s: Spots):
+def _trunk(s):
     """(n,) 1 on the trunk, 0 on limbs."""
     return band(s.cloth[:, 3], 0.13, 1.0, 0.01)
+
+
+def _from_the_side(s):
+    """(n,) metres around the trunk or limb from its sides."""
+    return np.abs(np.abs(s.around) - 0.5 * np.pi * s.cloth[:, 3])
 
 
 def _darker(colours, share, where):
     return mix(colours, colours * share, where)
 
 
-def printed(colours: Points, s: Spots, rng: np.random.Generator, base: np.ndarray, number: bool = False) -> Points:
+def seamed(colours: Points, s: Spots) -> Points:
+    """Seams down the sides of trunk and limbs and around the armholes."""
+    armhole = np.where(s.template[:, 1] > -0.02, np.abs(np.abs(s.template[:, 0]) - ARMHOLE), 1.0)
+    return _darker(colours, 0.8, np.maximum(band(_from_the_side(s), -1, 0.0022), band(armhole, -1, 0.0024)))
+
+
+def hemmed(colours: Points, s: Spots, hem: float, sleeve: float | None) -> Points:
+    """Stitching beside the hem at height y of trunk or legs, and at |x| = sleeve of the arms."""
+    x, y, _ = s.template.T
+    on_arm = np.abs(x) > 0.2
+    line = band(np.abs(y - hem), 0.0, 0.002) * ~on_arm
+    if sleeve is not None:
+        line = np.maximum(line, band(np.abs(np.abs(x) - sleeve), 0.0, 0.002) * on_arm)
+    return _darker(colours, 0.8, line)
+
+
+def printed(colours: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a scene."""
+    number, base = "number" in garment.details, garment.fabric.base
     ink = accent(rng, base)
     ink2 = accent(rng, ink)
     kind = "number" if number else str(rng.choice(list(PRINTS), p=list(PRINTS.values())))
@@ -143,9 +173,39 @@ def printed(colours: Points, s: Spots, rng: np.random.Generator, base: np.ndarra
     return motif(result, -x, y - 0.02, trunk * (s.cloth[:, 2] < 0)) if on_back else result
 
 
-def buttoned(colours: Points, s: Spots, rng: np.random.Generator, base: np.ndarray, low: float, high: float) -> Points:
+def side_striped(colours: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+    """One to three stripes down the outside of arms and legs."""
+    ink, count = accent(rng, garment.fabric.base), int(rng.integers(1, 4))
+    girth, wide = s.cloth[:, 3], 0.022 / count
+    turned = np.where(s.template[:, 0] > 0, s.around, -s.around)
+    outside = np.where(girth > 0.1, _from_the_side(s), 0)
+    outside = np.where(girth < 0.12, turned - 0.5 * np.pi * girth, outside)
+    phase = (outside + 0.011) / wide
+    stripes = band((phase % 1) * wide, 0.0, 0.6 * wide) * (np.floor(phase) >= 0) * (np.floor(phase) < count)
+    return mix(colours, ink, stripes * band(girth, 0.0, 0.12, 0.01))
+
+
+def ribbed(colours: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
+    """Knitted bands at the hem and the cuffs: upright ribs, a little darker."""
+    x, width = np.abs(s.template[:, 0]), 0.04
+    at_hem = s.template[:, 1] < garment.sizes["bottom"] + 1.3 * width
+    inside = np.where(x > 0.2, x > garment.sizes["sleeve"] - width, at_hem)
+    ribs = 0.86 + 0.1 * np.cos(2 * np.pi * s.around / 0.009)
+    return _darker(colours, ribs[:, None], inside.astype(np.float32))
+
+
+def quilted(colours: Points, s: Spots, _rng: np.random.Generator, _garment: Garment) -> Points:
+    """Dark stitched lines around the garment, between which it bulges."""
+    phase = (s.along / QUILT) % 1
+    return _darker(colours, 0.55, np.exp(-((np.minimum(phase, 1 - phase) * QUILT / 0.006) ** 2)))
+
+
+def buttoned(colours: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A placket with buttons down the front."""
-    ink = accent(rng, base) if rng.random() < 0.3 else colour(0.1, 0.1, rng.choice([0.12, 0.8]))
+    sizes, high = garment.sizes, 0.2
+    low = 0.02 if garment.kind == "polo" else sizes["end" if garment.kind in DRESSES else "bottom"]
+    dyed = rng.random() < 0.3
+    ink = accent(rng, garment.fabric.base) if dyed else colour(0.1, 0.1, rng.choice([0.12, 0.8]))
     pitch, size = rng.uniform(0.07, 0.1), rng.uniform(0.005, 0.0075)
     x, y = s.cloth[:, 0], s.cloth[:, 1]
     front = (s.cloth[:, 2] > 0) * _trunk(s) * band(y, low, high)
@@ -153,49 +213,19 @@ def buttoned(colours: Points, s: Spots, rng: np.random.Generator, base: np.ndarr
     return mix(_darker(colours, 0.6, band(np.abs(x - 0.002), 0.0135, 0.016) * front), ink, button)
 
 
-def zipped(colours: Points, s: Spots, rng: np.random.Generator, low: float, high: float, edge: float = 0.0) -> Points:
-    """A zip down the front (edge 0), or its halves along the edges of an open front at |x| = edge."""
-    ink = colour(0.1, 0.05, rng.choice([0.15, 0.6, 0.75]))
-    front = (s.cloth[:, 2] > 0) * _trunk(s) * band(s.cloth[:, 1], low, high)
+def zipped(colours: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+    """A zip down the front, or its halves along the edges of an open front."""
+    ink, edge = colour(0.1, 0.05, rng.choice([0.15, 0.6, 0.75])), max(garment.sizes.get("gap", 0.0), 0.0)
+    front = (s.cloth[:, 2] > 0) * _trunk(s) * band(s.cloth[:, 1], garment.sizes["bottom"], 0.2)
     away = np.abs(np.abs(s.cloth[:, 0]) - edge)
     return mix(_darker(colours, 0.55, band(away, 0.004, 0.011) * front), ink, band(away, -1, 0.0035) * front)
-
-
-def _from_the_side(s):
-    """(n,) metres around the trunk or limb from its sides."""
-    return np.abs(np.abs(s.around) - 0.5 * np.pi * s.cloth[:, 3])
-
-
-def seamed(colours: Points, s: Spots) -> Points:
-    """Seams down the sides of trunk and limbs and around the armholes."""
-    armhole = np.where(s.template[:, 1] > -0.02, np.abs(np.abs(s.template[:, 0]) - ARMHOLE), 1.0)
-    return _darker(colours, 0.8, np.maximum(band(_from_the_side(s), -1, 0.0022), band(armhole, -1, 0.0024)))
-
-
-def hemmed(colours: Points, s: Spots, heights: tuple[float, ...] = (), sleeve: float | None = None) -> Points:
-    """Stitching beside hems at heights y of trunk and legs, and at |x| = sleeve of the arms."""
-    x, y, _ = s.template.T
-    on_arm, line = np.abs(x) > 0.2, np.zeros(len(x), np.float32)
-    for height in heights:
-        line = np.maximum(line, band(np.abs(y - height), 0.0, 0.002) * ~on_arm)
-    if sleeve is not None:
-        line = np.maximum(line, band(np.abs(np.abs(x) - sleeve), 0.0, 0.002) * on_arm)
-    return _darker(colours, 0.8, line)
-
-
-def ribbed(colours: Points, s: Spots, bottom: float, sleeve: float, width: float = 0.04) -> Points:
-    """Knitted bands at the hem and the cuffs: upright ribs, a little darker."""
-    x = np.abs(s.template[:, 0])
-    inside = np.where(x > 0.2, x > sleeve - width, s.template[:, 1] < bottom + 1.3 * width)
-    ribs = 0.86 + 0.1 * np.cos(2 * np.pi * s.around / 0.009)
-    return _darker(colours, ribs[:, None], inside.astype(np.float32))
 
 
 def _outline(x, y, half_width, half_height):
     return band(np.abs(np.maximum(np.abs(x) - half_width, np.abs(y) - half_height)), -1, 0.0018)
 
 
-def pocketed(colours: Points, s: Spots, rng: np.random.Generator, kind: str) -> Points:
+def pocketed(colours: Points, s: Spots, rng: np.random.Generator, _garment: Garment, kind: str) -> Points:
     """Pockets as stitched outlines: on the chest, in a jacket's front, on jeans (front and back) or on the thighs (cargo)."""
     sides = rng.choice([1, 2]) if kind == "chest" else 2
     bright = 1.6 if kind == "jeans" and rng.random() < 0.5 else 0.6
@@ -222,26 +252,64 @@ def banded(colours: Points, s: Spots, ink: np.ndarray, low: float, high: float) 
     return mix(colours, ink, band(s.cloth[:, 1], low, high) * band(s.cloth[:, 3], 0.1, 1.0, 0.01))
 
 
-def side_striped(colours: Points, s: Spots, rng: np.random.Generator, base: np.ndarray) -> Points:
-    """One to three stripes down the outside of arms and legs."""
-    ink, count = accent(rng, base), int(rng.integers(1, 4))
-    girth, wide = s.cloth[:, 3], 0.022 / count
-    turned = np.where(s.template[:, 0] > 0, s.around, -s.around)
-    outside = np.where(girth > 0.1, _from_the_side(s), 0)
-    outside = np.where(girth < 0.12, turned - 0.5 * np.pi * girth, outside)
-    phase = (outside + 0.011) / wide
-    stripes = band((phase % 1) * wide, 0.0, 0.6 * wide) * (np.floor(phase) >= 0) * (np.floor(phase) < count)
-    return mix(colours, ink, stripes * band(girth, 0.0, 0.12, 0.01))
+def sashed(colours: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+    """A sash around the waist of a coat or a dress."""
+    if garment.kind == "coat":
+        return banded(colours, s, garment.fabric.base * 0.6, WAIST - 0.02, WAIST + 0.02)
+    waist = garment.sizes["waist"]
+    return banded(colours, s, garment.fabric.other, waist - 0.01, waist + rng.uniform(0.02, 0.05))
 
 
-def quilted(colours: Points, s: Spots, period: float) -> Points:
-    """Dark stitched lines around the garment, between which it bulges."""
-    phase = (s.along / period) % 1
-    return _darker(colours, 0.55, np.exp(-((np.minimum(phase, 1 - phase) * period / 0.006) ** 2)))
+def turned_up(colours: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
+    """The paler inner side of trouser legs above their hems."""
+    pale = (0.5 * garment.fabric.base + 0.35).astype(np.float32)
+    return mix(colours, pale, band(s.template[:, 1], -9.0, garment.sizes["end"] + 0.045))
 
 
-def leather(s: Spots, rng: np.random.Generator, kind: str, base: np.ndarray) -> Points:
+SEWN_ON = (
+    (PADDED, None, quilted),
+    (TOPS, "pocket", pocketed, "chest"),
+    (("denim_jacket",), "pockets", pocketed, "chest"),
+    ({*OUTER} - {"denim_jacket"}, "pockets", pocketed, "jacket"),
+    (BOTTOMS, "pockets", pocketed, "jeans"),
+    (("cargo",), None, pocketed, "cargo"),
+    (("shirt", "blouse"), "closed collar", buttoned),
+    (("denim_jacket", "blazer", "cardigan", "coat"), "closed", buttoned),
+    (("polo", "shirt_dress"), None, buttoned),
+    (("hoodie",), "zip", zipped),
+    (("jacket", "puffer", "hooded_jacket", "vest"), None, zipped),
+    (("coat", *DRESSES), "sash", sashed),
+    (("jeans",), "turn_up", turned_up),
+)
+"""Kinds of garments, the detail that they need for it, None: all have it; a trimming, and its further arguments. In this order:
+they share the fabric's random numbers."""
+
+
+def sewn(garment: Garment, hem: float, sleeve: float | None = None, seams: bool = True) -> Callable[[Spots], Points]:
+    """The garment's fabric with stitches at the hem (height y) and the sleeves' ends, seams, prints and what is sewn on."""
+    details = garment.details
+    if "collar" in details and "open" not in details:
+        details = details | {"closed collar"}
+
+    def colours(s):
+        rng = garment.fabric.rng(1)
+        result = hemmed(garment.fabric.colours(s), s, hem, sleeve)
+        result = seamed(result, s) if seams else result
+        result = ribbed(result, s, rng, garment) if "ribbed" in details and sleeve is not None else result
+        result = printed(result, s, rng, garment) if details & {"print", "number"} else result
+        result = side_striped(result, s, rng, garment) if "side_stripe" in details else result
+        rng = garment.fabric.rng(2)
+        for kinds, detail, trimming, *arguments in SEWN_ON:
+            if garment.kind in kinds and (detail is None or detail in details):
+                result = trimming(result, s, rng, garment, *arguments)
+        return result
+
+    return colours
+
+
+def leather(s: Spots, garment: Garment) -> Points:
     """Shoes: upper, a sole of another colour, laces on the instep, and what marks the kind."""
+    rng, kind, base = garment.fabric.rng(2), garment.kind, garment.fabric.base
     white, sneakers = rng.random() < 0.75, kind == "sneakers"
     dark = base * rng.uniform(0.35, 0.6)
     trim = colour(0.1, 0.05, 0.82 if white else 0.1) if sneakers else dark
@@ -266,22 +334,24 @@ def leather(s: Spots, rng: np.random.Generator, kind: str, base: np.ndarray) -> 
     return mix(result, base * 0.3 if kind == "flats" else trim, band(y, -1, 0.004, 0.002))
 
 
-def buckled(colours: Points, s: Spots, middle: float, width: float) -> Points:
+def buckled(s: Spots, garment: Garment) -> Points:
     """A belt with stitched edges, holes and a buckle in front."""
-    x, y, front = s.template[:, 0], s.template[:, 1] - middle, s.cloth[:, 2] > 0
+    width = garment.sizes["width"]
+    x, y, front = s.template[:, 0], s.template[:, 1] - (garment.sizes["top"] - 0.5 * width), s.cloth[:, 2] > 0
     metal = colour(0.12, 0.3, 0.62) if width > 0.035 else colour(0.6, 0.05, 0.6)
-    result = _darker(colours, 0.6, band(np.abs(np.abs(y) - 0.38 * width), -1, 0.0012))
+    result = _darker(garment.fabric.colours(s), 0.6, band(np.abs(np.abs(y) - 0.38 * width), -1, 0.0012))
     frame = np.maximum(np.abs(x) / 0.026, np.abs(y) / (0.56 * width))
     holes = band(np.abs(x - 0.06) % 0.03, -1, 0.003) * band(np.abs(y), -1, 0.003) * (x > 0.03)
     return _darker(mix(result, metal, band(frame, 0.68, 1.02, 0.06) * front), 0.3, holes * front)
 
 
-def zipped_bag(colours: Points, s: Spots, rng: np.random.Generator, base: np.ndarray) -> Points:
+def bagged(s: Spots, garment: Garment) -> Points:
     """A bag with a zip around the top, a front pocket and darker edges. Template: the bag's own unit box."""
+    rng, base = garment.fabric.rng(2), garment.fabric.base
     ink = colour(0.1, 0.05, rng.choice([0.1, 0.7]))
     second = accent(rng, base) if rng.random() < 0.3 else base * 0.8
     x, y, z = s.template.T
     pocket = band(np.abs(x), -1, 0.72, 0.02) * (z > 0.3)
-    result = mix(colours, second, band(y, -0.8, 0.05, 0.02) * pocket)
+    result = mix(garment.fabric.colours(s), second, band(y, -0.8, 0.05, 0.02) * pocket)
     result = mix(result, ink, band(np.abs(y - 0.05), -1, 0.025, 0.02) * pocket)
     return mix(result, ink, band(np.abs(y - 0.72), -1, 0.025, 0.02) * (z > -0.2))

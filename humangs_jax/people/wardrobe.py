@@ -7,18 +7,17 @@ import numpy as np
 
 from humangs_jax.people import accessories, tailoring, trimmings
 from humangs_jax.people.anatomy import CROTCH, WAIST, Anatomy, leg_coordinates
-from humangs_jax.people.fabrics import Material, Spots, band, mix
-from humangs_jax.people.garments import HEM_MARGIN, Fit, Skirt, shell, skirt
+from humangs_jax.people.fabrics import Material
 from humangs_jax.people.outfits import BOTTOMS, DRESSES, OUTER, SHOES, SKIRTS, TOPS, Garment
 from humangs_jax.people.surfaces import Surface, compact
+from humangs_jax.people.tailoring import HEM_MARGIN, Fit, shell, skirt
+from humangs_jax.people.trimmings import PADDED, QUILT, sewn
 
 Cover = Callable[[np.ndarray], np.ndarray]
 """Template points (n, 3) -> (n,) metres inside of a garment's hems, negative outside."""
 
 LAYER = 0.006
 """What one layer is further out than the one below it, metres."""
-QUILT = 0.075
-"""Period of quilted cloth, metres."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,12 +55,12 @@ class Outfit:
     @property
     def template(self) -> np.ndarray:
         """Template coordinates (n, 3) of the body's vertices."""
-        return self.anatomy.skin.attributes["template"]
+        return self.anatomy.skin.template
 
     @property
     def lowest(self) -> float:
         """Template height of the hem of the innermost piece."""
-        return float(self.pieces[0].surface.attributes["template"][:, 1].min())
+        return float(self.pieces[0].surface.template[:, 1].min())
 
     def add(self, surface: Surface, material: Material, layered: bool = True) -> None:
         """Put one more piece on. layered: whether later layers can hide parts of it."""
@@ -74,7 +73,7 @@ class Outfit:
         self.removed = self.removed | (field > margin)
         for i, piece in enumerate(self.pieces):
             if cloth and piece.hidden is not None:
-                below = cover(piece.surface.attributes["template"]) > max(margin, 0.03)
+                below = cover(piece.surface.template) > max(margin, 0.03)
                 self.pieces[i] = dataclasses.replace(piece, hidden=piece.hidden | below)
 
 
@@ -101,76 +100,25 @@ def _strip(rng, outfit, field, fit, material, layered=False):
     outfit.add(shell(rng, outfit.anatomy, [field], fit), material, layered)
 
 
-Colouring = Callable[[Spots], np.ndarray]
-
-PADDED = ("puffer", "vest")
-SEWN_ON = (
-    (PADDED, None, lambda c, s, rng, g: trimmings.quilted(c, s, QUILT)),
-    (TOPS, "pocket", lambda c, s, rng, g: trimmings.pocketed(c, s, rng, "chest")),
-    (("denim_jacket",), "pockets", lambda c, s, rng, g: trimmings.pocketed(c, s, rng, "chest")),
-    ({*OUTER} - {"denim_jacket"}, "pockets", lambda c, s, rng, g: trimmings.pocketed(c, s, rng, "jacket")),
-    (BOTTOMS, "pockets", lambda c, s, rng, g: trimmings.pocketed(c, s, rng, "jeans")),
-    (("cargo",), None, lambda c, s, rng, g: trimmings.pocketed(c, s, rng, "cargo")),
-    (("shirt", "blouse"), "closed collar", lambda c, s, rng, g: _buttoned(c, s, rng, g, g.sizes["bottom"])),
-    (("denim_jacket", "blazer", "cardigan", "coat"), "closed",
-     lambda c, s, rng, g: _buttoned(c, s, rng, g, g.sizes["bottom"])),
-    (("polo",), None, lambda c, s, rng, g: _buttoned(c, s, rng, g, 0.02)),
-    (("shirt_dress",), None, lambda c, s, rng, g: _buttoned(c, s, rng, g, g.sizes["end"])),
-    (("hoodie",), "zip", lambda c, s, rng, g: _zipped(c, s, rng, g.sizes)),
-    (("jacket", "puffer", "hooded_jacket", "vest"), None, lambda c, s, rng, g: _zipped(c, s, rng, g.sizes)),
-    (("coat",), "sash", lambda c, s, rng, g: trimmings.banded(c, s, g.fabric.base * 0.6, WAIST - 0.02, WAIST + 0.02)),
-    (DRESSES, "sash", lambda c, s, rng, g: trimmings.banded(
-        c, s, g.fabric.other, g.sizes["waist"] - 0.01, g.sizes["waist"] + rng.uniform(0.02, 0.05))),
-    (("jeans",), "turn_up", lambda c, s, rng, g: mix(
-        c, (0.5 * g.fabric.base + 0.35).astype(np.float32), band(s.template[:, 1], -9.0, g.sizes["end"] + 0.045))),
-)  # fmt: skip
-"""What is sewn on: kinds of garments that have it; the detail that they need for it, None: all have it; and a function of
-colours, points, random numbers and the garment. In this order: they share the fabric's random numbers."""
-
-
-def _buttoned(colours, s, rng, garment, low):
-    return trimmings.buttoned(colours, s, rng, garment.fabric.base, low, 0.2)
-
-
-def _zipped(colours, s, rng, sizes):
-    return trimmings.zipped(colours, s, rng, sizes["bottom"], 0.2, max(sizes.get("gap", 0.0), 0.0))
-
-
-def _sewn(garment: Garment, hems=(), sleeve=None, seams=True) -> Colouring:
-    """The garment's fabric with hems, seams, prints and what is sewn on."""
-    details, base = garment.details, garment.fabric.base
-    if "collar" in details and "open" not in details:
-        details = details | {"closed collar"}
-
-    def colours(s):
-        rng = garment.fabric.rng(1)
-        result = trimmings.hemmed(garment.fabric.colours(s), s, hems, sleeve)
-        result = trimmings.seamed(result, s) if seams else result
-        if "ribbed" in details and sleeve is not None:
-            result = trimmings.ribbed(result, s, garment.sizes["bottom"], garment.sizes["sleeve"])
-        if details & {"print", "number"}:
-            result = trimmings.printed(result, s, rng, base, "number" in details)
-        if "side_stripe" in details:
-            result = trimmings.side_striped(result, s, rng, base)
-        rng = garment.fabric.rng(2)
-        for kinds, detail, sew in SEWN_ON:
-            if garment.kind in kinds and (detail is None or detail in details):
-                result = sew(result, s, rng, garment)
-        return result
-
-    return colours
+def _bodice(rng, outfit, garment, neck, depth, bottom, fit, material, margin, opening=()):
+    """Cloth on trunk and arms from a neckline down to a height, the outermost so far. opening: further cuts."""
+    cuts = [(tailoring.neckline, neck, depth), (tailoring.sleeves, garment.sizes["sleeve"]), (tailoring.above, bottom)]
+    _put(rng, outfit, [*cuts, *opening], fit, material, margin)
+    outfit.trunk, outfit.fit = fit.ease, fit
 
 
 def _neck(garment):
     return next(neck for neck in tailoring.NECKLINES if neck in garment.details)
 
 
+def _collar(rng, outfit, material, fit, extra=0.004, low=0.125, high=0.178, gap=0.012):
+    cut_of = dataclasses.replace(fit, ease=fit.ease + extra, fold=0.0, hem=0.01, quilt=0.0)
+    _strip(rng, outfit, tailoring.collar(outfit.template, low, high, gap), cut_of, material)
+
+
 def _top(rng, outfit, garment):
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     sleeve, bottom, loose = sizes["sleeve"], sizes["bottom"], sizes["loose"]
-    cuts: list[tuple] = [(tailoring.neckline, _neck(garment), sizes["depth"])]
-    cuts += [(tailoring.sleeves, sleeve), (tailoring.above, bottom)]
-    cuts += [(tailoring.front_opening, 0.03, 0.12)] if "open" in details else []
     fit = Fit(
         ease=max((0.008 if "tucked" in details else 0.012) + 0.016 * loose, outfit.trunk + LAYER),
         hang=rng.choice([0.05, 0.2, 0.5]) if loose > 0.3 else 2.0,
@@ -179,55 +127,47 @@ def _top(rng, outfit, garment):
         inner=outfit.trunk + 0.5 * LAYER if outfit.trunk else 0.0,
         skirted=True,
     )
-    colours = _sewn(garment, (bottom + 0.018,), sleeve - 0.016 if sleeve > 0.2 else None)
-    material = Material(colours, 0.25 + 0.45 * loose, sheen=0.04)
-    _put(rng, outfit, cuts, fit, material, HEM_MARGIN + 0.03 * loose)
-    outfit.trunk, outfit.fit = fit.ease, fit
+    stitches = sewn(garment, bottom + 0.018, sleeve - 0.016 if sleeve > 0.2 else None)
+    material = Material(stitches, 0.25 + 0.45 * loose, sheen=0.04)
+    opening = [(tailoring.front_opening, 0.03, 0.12)] if "open" in details else []
+    margin = HEM_MARGIN + 0.03 * loose
+    _bodice(rng, outfit, garment, _neck(garment), sizes["depth"], bottom, fit, material, margin, opening)
     if kind in ("shirt", "polo", "blouse") and "collar" in details:
         _collar(rng, outfit, material, fit)
     if kind == "hoodie":
         outfit.add(accessories.hood(rng, outfit.anatomy, "hood_up" in details), material, layered=False)
 
 
-def _collar(rng, outfit, material, fit, extra=0.004, low=0.125, high=0.178, gap=0.012):
-    cut_of = dataclasses.replace(fit, ease=fit.ease + extra, fold=0.0, hem=0.01, quilt=0.0)
-    _strip(rng, outfit, tailoring.collar(outfit.template, low, high, gap), cut_of, material)
-
-
 def _outer(rng, outfit, garment):
     sizes, kind, details = garment.sizes, garment.kind, garment.details
     gap, spread, bottom, loose = sizes["gap"], sizes["spread"], sizes["bottom"], sizes["loose"]
-    long, padded = kind == "coat", kind in PADDED
-    cuts: list[tuple] = [(tailoring.neckline, "vee" if "lapels" in details else "crew", 0.09)]
-    cuts += [(tailoring.sleeves, sizes["sleeve"]), (tailoring.above, WAIST - 0.045 if long else bottom)]
-    cuts += [(tailoring.front_opening, gap, spread)] if gap > 0 else []
+    long, padded, blazer = kind == "coat", kind in PADDED, kind == "blazer"
     ease = max(outfit.trunk + 0.009 + 0.008 * loose, 0.022 if padded else 0.0)
     fit = Fit(
         ease=ease,
-        hang=1.5 if long else rng.choice([0.05, 0.3]) if kind != "blazer" else 0.8,
+        hang=1.5 if long else 0.8 if blazer else rng.choice([0.05, 0.3]),
         sleeve=0.01 + 0.012 * loose,
-        fold=0.002 if padded or kind == "blazer" else 0.002 + 0.003 * loose,
+        fold=0.002 if padded or blazer else 0.002 + 0.003 * loose,
         hem=0.014,
         quilt=QUILT if padded else 0.0,
         skirted=True,
         inner=outfit.trunk + 0.5 * LAYER,
     )
-    colours = _sewn(garment, (bottom + 0.018,), sizes["sleeve"] - 0.016 if kind != "vest" else None)
-    wrinkles = 0.15 if kind == "blazer" else 0.3 + 0.2 * loose
-    material = Material(colours, wrinkles, sheen=0.12 if padded else 0.05)
-    _put(rng, outfit, cuts, fit, material, 0.03)
-    outfit.trunk, outfit.fit = ease, fit
+    stitches = sewn(garment, bottom + 0.018, sizes["sleeve"] - 0.016 if kind != "vest" else None)
+    material = Material(stitches, 0.15 if blazer else 0.3 + 0.2 * loose, sheen=0.12 if padded else 0.05)
+    opening = [(tailoring.front_opening, gap, spread)] if gap > 0 else []
+    neck, low = "vee" if "lapels" in details else "crew", WAIST - 0.045 if long else bottom
+    _bodice(rng, outfit, garment, neck, 0.09, low, fit, material, 0.03, opening)
     if long:
-        width = max(outfit.legs, ease) + 0.002
-        cut_of = Skirt(WAIST + 0.02, bottom, width, sizes["flare"], 5, 0.008, gap, 0.5 * spread)
-        tube = skirt(rng, outfit.anatomy, cut_of)
+        width, flare = max(outfit.legs, ease) + 0.002, sizes["flare"]
+        tube = skirt(rng, outfit.anatomy, (WAIST + 0.02, bottom), width, flare, (5, 0.008), gap, 0.5 * spread)
         if gap < 0:
             outfit.hide(lambda t: tailoring.hips_and_legs(t, WAIST, bottom), 0.02)
         outfit.add(tube, dataclasses.replace(material, draped=True))
     if "lapels" in details:
         edge, low = max(gap, 0.004), rng.uniform(-0.16, -0.08)
         strip = dataclasses.replace(fit, ease=ease + 0.006, fold=0.0, hem=0.005, inner=ease + 0.003)
-        dark = Material(lambda s: 0.88 * colours(s), sheen=0.06)  # seen against its pile
+        dark = Material(lambda s: 0.88 * stitches(s), sheen=0.06)  # seen against its pile
         _strip(rng, outfit, tailoring.lapel(outfit.template, edge, spread if gap > 0 else 0.0, low), strip, dark)
         _collar(rng, outfit, dark, strip, 0.001, 0.12, 0.17, max(edge, 0.03))
     elif "hood" in details or kind == "hooded_jacket":
@@ -252,8 +192,8 @@ def _trousers(rng, outfit, garment):
         fold=0.0012 if kind in ("leggings", "slim") else 0.0025 + 0.0035 * loose,
         calm=9.0 if tucked else outfit.lowest + 0.02,
     )
-    material = Material(_sewn(garment, (end + 0.018,)), wrinkles=0.15 + 0.4 * loose, sheen=0.03)
-    in_two_legs = lambda surface: surface.with_attributes(cloth=leg_coordinates(surface.attributes["template"]))
+    material = Material(sewn(garment, end + 0.018), wrinkles=0.15 + 0.4 * loose, sheen=0.03)
+    in_two_legs = lambda surface: surface.with_attributes(cloth=leg_coordinates(surface.template))
     margin = HEM_MARGIN + 0.03 * loose * (kind in ("wide", "shorts"))
     _put(rng, outfit, [(tailoring.trousers, top, end)], fit, material, margin, in_two_legs, tucked)
     x, y, _ = outfit.template.T  # skin between shirt and trousers, below both
@@ -266,10 +206,10 @@ def _trousers(rng, outfit, garment):
 
 def _let_hang_over(outfit, margin):
     """An untucked top hides the last piece below it, except for a margin inside of the top's hem."""
-    trousers = outfit.pieces[-1]
-    template = trousers.surface.attributes["template"]
-    hidden = (template[:, 1] > outfit.lowest + margin) & (np.abs(template[:, 0]) < tailoring.TRUNK_HALF_WIDTH)
-    outfit.pieces[-1] = dataclasses.replace(trousers, hidden=trousers.hidden | hidden)
+    lower = outfit.pieces[-1]
+    x, y, _ = lower.surface.template.T
+    hidden = (y > outfit.lowest + margin) & (np.abs(x) < tailoring.TRUNK_HALF_WIDTH)
+    outfit.pieces[-1] = dataclasses.replace(lower, hidden=lower.hidden | hidden)
 
 
 def _skirt(rng, outfit, garment):
@@ -277,10 +217,9 @@ def _skirt(rng, outfit, garment):
     top, end = sizes["top"], sizes["end"]
     ease = outfit.trunk + 0.004 if tucked else 0.004
     cling = 0.0 if tucked else max(0.0, top - outfit.lowest + 0.02)  # as far as the top reaches
-    colours = _sewn(garment, (end + 0.02,), seams=False)
-    waistband = lambda s: trimmings.banded(colours(s), s, garment.fabric.base * 0.8, top - 0.035, top)
-    tube = Skirt(top, end, ease, _flare(sizes), int(sizes["pleats"]), sizes["depth"], cling=cling)
-    surface = skirt(rng, outfit.anatomy, tube)
+    stitches = sewn(garment, end + 0.02, seams=False)
+    waistband = lambda s: trimmings.banded(stitches(s), s, garment.fabric.base * 0.8, top - 0.035, top)
+    surface = skirt(rng, outfit.anatomy, (top, end), ease, *_hem_of(sizes), cling=cling)
     outfit.hide(lambda t: tailoring.hips_and_legs(t, top, end), 0.0, tucked)
     outfit.add(surface, Material(waistband, wrinkles=0.35, sheen=0.05, draped=True))
     outfit.legs = ease + 0.02
@@ -288,22 +227,19 @@ def _skirt(rng, outfit, garment):
         _let_hang_over(outfit, 0.055)
 
 
-def _flare(sizes):
-    """Metres wider per metre down, so that the hem of a short skirt stands off as far as a long one's."""
-    return sizes["flare"] / max(0.3, -0.2 - sizes["end"])
+def _hem_of(sizes):
+    """Of a skirt: metres wider per metre down, so that the hem of a short one stands off as far as a long one's; pleats."""
+    return sizes["flare"] / max(0.3, -0.2 - sizes["end"]), (int(sizes["pleats"]), sizes["depth"])
 
 
 def _dress(rng, outfit, garment):
-    sizes = garment.sizes
+    sizes, anatomy = garment.sizes, outfit.anatomy
     waist, end = sizes["waist"], sizes["end"]
-    neckline = tailoring.neckline, _neck(garment), sizes["depth"]
-    cuts = [neckline, (tailoring.sleeves, sizes["sleeve"]), (tailoring.above, waist - 0.02)]
     fit = Fit(ease=0.008, hang=1.0, sleeve=0.004 + 0.03 * sizes["loose"], fold=0.002)
-    material = Material(_sewn(garment, (end + 0.02,), seams=False), wrinkles=0.3, sheen=0.05)
-    _put(rng, outfit, cuts, fit, material, HEM_MARGIN + 0.02 * sizes["loose"])
-    outfit.trunk, outfit.fit = fit.ease, fit
-    tube = Skirt(waist, end, 0.010, _flare(sizes), int(sizes["pleats"]), sizes["depth"])
-    surface = skirt(rng, outfit.anatomy, tube)
+    material = Material(sewn(garment, end + 0.02, seams=False), wrinkles=0.3, sheen=0.05)
+    margin = HEM_MARGIN + 0.02 * sizes["loose"]
+    _bodice(rng, outfit, garment, _neck(garment), sizes["depth"], waist - 0.02, fit, material, margin)
+    surface = skirt(rng, anatomy, (waist, end), 0.010, *_hem_of(sizes))
     outfit.hide(lambda t: tailoring.hips_and_legs(t, waist + 0.03, end), 0.0)
     outfit.add(surface, dataclasses.replace(material, draped=True))
     outfit.legs = 0.03
@@ -319,37 +255,34 @@ def _socks(rng, outfit, garment):
 
 
 def _shoes(rng, outfit, garment):
-    sizes, anatomy = garment.sizes, outfit.anatomy
-    height, sole = sizes["height"], sizes["sole"]
-    fabric, kind = garment.fabric, garment.kind
-    colours = lambda s: trimmings.leather(s, fabric.rng(2), kind, fabric.base)
-    material = Material(colours, sheen=0.2 if kind != "sneakers" else 0.08)
+    height, sole, over = (garment.sizes[name] for name in ("height", "sole", "over"))
+    leather = lambda s: trimmings.leather(s, garment)
+    material = Material(leather, sheen=0.2 if garment.kind != "sneakers" else 0.08)
     if garment.kind == "sandals":
-        outfit.add(accessories.pair_of_shoes(anatomy, 0.024, sole, 0.004), material, layered=False)
+        outfit.add(accessories.pair_of_shoes(outfit.anatomy, 0.024, sole, 0.004), material, layered=False)
         for field in tailoring.sandal_straps(outfit.template):
             _strip(rng, outfit, field, Fit(ease=0.005, fold=0.0, hem=0.004), material)
         return
-    surface = accessories.pair_of_shoes(anatomy, height, sole, 0.017 if sizes["over"] else 0.006)
+    surface = accessories.pair_of_shoes(outfit.anatomy, height, sole, 0.017 if over else 0.006)
     outfit.hide(lambda t: tailoring.shaft(t, height), 0.012)
-    if not sizes["over"]:
+    if not over:
         outfit.pieces = [_unhidden_legs(piece) for piece in outfit.pieces]
     outfit.add(surface, material, layered=False)
 
 
 def _unhidden_legs(piece):
     """Trouser legs hang over low shoes: the shoe hides nothing of them, only socks."""
-    if piece.hidden is None or piece.surface.attributes["template"][:, 1].min() < -1.2:
+    if piece.hidden is None or piece.surface.template[:, 1].min() < -1.2:
         return piece
-    low = piece.surface.attributes["template"][:, 1] < -0.9
+    low = piece.surface.template[:, 1] < -0.9
     return dataclasses.replace(piece, hidden=piece.hidden & ~low)
 
 
 def _belt(rng, outfit, garment):
     top, width = garment.sizes["top"], garment.sizes["width"]
     fit = Fit(ease=outfit.trunk + 0.009, hang=0.6, fold=0.0, hem=0.006, inner=outfit.trunk + 0.007)
-    colours = lambda s: trimmings.buckled(garment.fabric.colours(s), s, top - 0.5 * width, width)
-    field = tailoring.trousers(outfit.template, top, top - width)
-    _strip(rng, outfit, field, fit, Material(colours, sheen=0.15), layered=True)
+    material = Material(lambda s: trimmings.buckled(s, garment), sheen=0.15)
+    _strip(rng, outfit, tailoring.trousers(outfit.template, top, top - width), fit, material, layered=True)
 
 
 def _tie(rng, outfit, garment):
@@ -366,20 +299,19 @@ def _watch(rng, outfit, garment):
 
 def _bag(rng, outfit, garment):
     """A backpack or a shoulder bag, and its straps, which lie on what is worn."""
-    fabric, size, on_back = garment.fabric, garment.sizes["size"], garment.kind == "backpack"
-    bag = lambda s: trimmings.zipped_bag(fabric.colours(s), s, fabric.rng(2), fabric.base)
+    on_back, colours = garment.kind == "backpack", lambda s: trimmings.bagged(s, garment)
     if on_back:
-        surface, material, sheen = accessories.backpack(outfit.anatomy, size, outfit.trunk), Material(bag, 0.1), 0.0
-        straps = tailoring.straps(outfit.template, -0.16, -0.03)
+        ease, material, straps = outfit.trunk, Material(colours, 0.1), tailoring.straps(outfit.template, -0.16, -0.03)
     else:
-        side, outer = garment.sizes["side"], max(outfit.trunk, min(outfit.legs, 0.02))
-        surface = accessories.shoulder_bag(outfit.anatomy, size, side, outer)
-        material, sheen = Material(bag, 0.0, 0.12), 0.12
+        side, ease = garment.sizes["side"], max(outfit.trunk, min(outfit.legs, 0.02))
+        material = Material(colours, 0.0, 0.12)
         straps = tailoring.sash(outfit.template, -side * 0.105, side * 0.165, 0.014)
+    surface = accessories.bag(outfit.anatomy, garment, ease)
     outfit.add(surface, material, layered=False)
     raised = outfit.trunk + 0.009 + 1.5 * outfit.fit.fold
     flat = {"ease": raised, "inner": raised - 0.002, "fold": 0.0, "hem": 0.006, "quilt": 0.0, "skirted": True}
-    _strip(rng, outfit, straps, dataclasses.replace(outfit.fit, **flat), Material(fabric.colours, sheen=sheen))
+    strap = Material(garment.fabric.colours, sheen=material.sheen)
+    _strip(rng, outfit, straps, dataclasses.replace(outfit.fit, **flat), strap)
 
 
 def _accessory(rng, outfit, garment):

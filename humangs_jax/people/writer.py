@@ -1,16 +1,15 @@
 """Synthetic people as capture folders: images, masks, cameras and body poses on disk, made from seeds.
 
-out/manifest.json                    settings of the set and finished subjects, see `manifest`
+out/manifest.json                    settings of the set and finished subjects, see `write_manifest`
 out/SEED/                            a capture (docs/capture_format.md): views of one person in one or several poses
 out/SEED/held_out/                   a capture of its own with the views that reconstruction may not see
 out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
 out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see `baking`
-out/SEED/depth/NAME.png, maps/NAME.exr    where asked for, see `maps`; also in held_out/
+out/SEED/depth/NAME.png, maps/NAME.exr    where asked for, see `rendering`; also in held_out/
 """
 
 import dataclasses
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +17,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.workers import in_processes
 from humangs_jax.data.capture import Capture, save_capture
+from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.motion import Motion, save_motion
-from humangs_jax.geometry.camera import Camera
+from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
+from humangs_jax.io.text import read_json, write_json
 from humangs_jax.people.baking import export_scan
 from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
-from humangs_jax.people.manifest import begin_set, write_manifest
 from humangs_jax.people.poses import sample_rotations
 from humangs_jax.people.rendering import PosedSubject, pose_subject, render_maps, render_view, write_depth, write_maps
-from humangs_jax.people.seeds import seeds_of
+from humangs_jax.people.seeds import GENERATOR_VERSION, seeds_of, split_of
 from humangs_jax.people.sequences import sample_sequence
 from humangs_jax.people.subject import SyntheticSubject, make_subject
 
 HELD_OUT = "held_out"
-"""Sub-folder of a subject's folder: a capture of its own with the views that reconstruction may not see."""
+"""Sub-folder of a subject's folder."""
 POSE_STREAM, CAMERA_STREAM, HELD_OUT_STREAM, CLOSE_STREAM, MOTION_STREAM = 1, 2, 3, 4, 5
 """Independent random streams of a seed; stream 0 makes the person."""
 GROUNDED_EVERY = 5
 """Every how many frames the height of a motion above the ground is measured."""
+MANIFEST, FORMAT, VERSION = "manifest.json", "humangs-synthetic", 2
 MANIFEST_EVERY = 30.0
 """Seconds between two updates of the manifest."""
 
@@ -99,9 +101,7 @@ def sample_motion(subject: SyntheticSubject, frames: int, kind: str | None = Non
     return Motion(jnp.asarray(rotations), jnp.asarray(translations), sequence.fps)
 
 
-def capture_views(
-    subject: SyntheticSubject, body: BodyModel, poses: list[PosedSubject], views: Sequence[View]
-) -> Capture:
+def capture_views(subject: SyntheticSubject, body: BodyModel, poses: list[PosedSubject], views: list[View]) -> Capture:
     """A capture of these views."""
     rendered = [render_view(poses[view.frame], view.camera) for view in views]
     images, masks = (np.stack(x) for x in zip(*rendered, strict=True))
@@ -109,7 +109,7 @@ def capture_views(
     return Capture(
         images=images,
         masks=masks,
-        cameras=jax.tree.map(lambda *leaves: jnp.stack(leaves), *[view.camera for view in views]),
+        cameras=stack_cameras([view.camera for view in views]),
         frames=np.asarray([view.frame for view in views], np.int32),
         body=body,
         betas=subject.betas,
@@ -121,22 +121,18 @@ def capture_views(
 def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout) -> None:
     """One person as `layout` says. Written whole or not at all; an existing folder is replaced."""
     subject = make_subject(seed, body)
-    rngs = {stream: np.random.default_rng([seed, stream]) for stream in (CAMERA_STREAM, HELD_OUT_STREAM, CLOSE_STREAM)}
     motion = sample_motion(subject, layout.frames) if layout.frames else None
     if motion is None:
         posed = [sample_pose(subject, i) for i in range(layout.poses)]
     else:
         shown = np.linspace(0, layout.frames - 1, layout.poses).round().astype(int)
-        rotations, translations = np.asarray(motion.rotations), np.asarray(motion.translations)
-        posed = [pose_subject(subject, rotations[i], translations[i]) for i in shown]
-    size = layout.image_size
-    around = lambda stream, place, count, poses: [
-        place(rngs[stream], p.vertices, spread_azimuths(rngs[stream], count), size) for p in poses if count
-    ]
-    views = _views(around(CAMERA_STREAM, cameras_around, layout.views, posed))
-    views += _views(around(CLOSE_STREAM, close_cameras, layout.close_views, posed), mark="c")
+        moments = zip(np.asarray(motion.rotations)[shown], np.asarray(motion.translations)[shown], strict=True)
+        posed = [pose_subject(subject, *moment) for moment in moments]
     others = [posed[0], *(sample_pose(subject, layout.poses + i) for i in range(layout.novel_poses))]
-    held_out = _views(around(HELD_OUT_STREAM, cameras_around, layout.held_out_views, others))
+    size = layout.image_size
+    views = _views([seed, CAMERA_STREAM], cameras_around, layout.views, posed, size)
+    views += _views([seed, CLOSE_STREAM], close_cameras, layout.close_views, posed, size, mark="c")
+    held_out = _views([seed, HELD_OUT_STREAM], cameras_around, layout.held_out_views, others, size)
 
     def write(temporary: Path):
         _write_views(temporary, subject, body, posed, views, layout)
@@ -149,32 +145,6 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
             export_scan(subject, temporary / "scan", pose, lit=True, texture_size=layout.scan_texture)
 
     replace_folder(folder, write, mark="capture.json")
-
-
-def write_subject(
-    folder: str | Path,
-    seed: int,
-    *,
-    body: BodyModel,
-    image_size: int = 512,
-    input_views: int = 4,
-    held_out_views: int = 8,
-    novel_poses: int = 0,
-) -> None:
-    """A capture of `input_views` evenly spread photos of a standing person, and `held_out/` with other views.
-
-    The held-out capture shows the same pose (frame 0) from `held_out_views` other cameras, then each of `novel_poses` other
-    poses (frames 1, 2, ...) from as many.
-    """
-    layout = Layout(image_size, views=input_views, held_out_views=held_out_views, novel_poses=novel_poses)
-    write_person(folder, seed, body, layout)
-
-
-def write_training_subject(
-    folder: str | Path, seed: int, *, body: BodyModel, image_size: int = 256, poses: int = 2, views: int = 12
-) -> None:
-    """ONE capture of `poses` frames with `views` views each, azimuths evenly spread with jitter."""
-    write_person(folder, seed, body, Layout(image_size, poses=poses, views=views))
 
 
 def write_set(
@@ -190,11 +160,11 @@ def write_set(
 ) -> list[Path]:
     """Write people `first` .. `first + subjects - 1` of a split into `out`/SEED; folders that are there already are kept.
 
-    workers: processes that make people; more than one use the CPU, write the same files, and need the calling script to be
-    guarded by `if __name__ == "__main__"`. body: default: the body that comes with the package. progress: show a bar.
-    Returns the folders. Raises: ValueError if the people reach beyond the split, `out` was written with other settings or by
-    another version of the generator, or (at the end, the others being written) some could not be made; OSError if nothing can be
-    written there.
+    workers: processes; more than one use the CPU, write the same files, and need the calling script to be guarded by
+    `if __name__ == "__main__"`. body: default: the body that comes with the package. progress: show a bar. Returns the folders.
+
+    Raises: ValueError if the people reach beyond the split, `out` was written with other settings or by another version of the
+    generator, or (at the end) some could not be made; OSError if nothing can be written there.
     """
     out, seeds, settings = Path(out), seeds_of(split, first, subjects), dataclasses.asdict(layout)
     check_writable(out)
@@ -217,65 +187,115 @@ def write_set(
         write_manifest(out, split, settings)
     if failed:
         seed, error = next(iter(failed.items()))
-        raise ValueError(
-            f"{out}: {len(failed)} of {subjects} people could not be made, the first of them {seed}: {error}"
-        )
+        found = f"{len(failed)} of {subjects} people could not be made, the first of them {seed}: {error}"
+        raise ValueError(f"{out}: {found}")
     return list(folders.values())
 
 
 def _make(seeds, folders, layout, body, workers):
     """Yields (seed, None or the error) as people are finished."""
-    if workers <= 1 or len(seeds) <= 1:
-        if body is None and seeds:
-            from humangs_jax.body.library import load_body
-
-            body = load_body()
-        for seed in seeds:
-            yield seed, _attempt(folders[seed], seed, body, layout)
-        return
-    tasks = {seed: (folders[seed], seed, layout) for seed in seeds}
-    yield from in_processes(_work, tasks, workers, _load_body, body)
+    if workers > 1 and len(seeds) > 1:
+        tasks = {seed: (folders[seed], seed, layout) for seed in seeds}
+        yield from in_processes(_work, tasks, workers, _load_body, body)
+    elif seeds:
+        _load_body(body)
+        yield from ((seed, _work(folders[seed], seed, layout)) for seed in seeds)
 
 
-def _attempt(folder, seed, body, layout):
-    try:
-        write_person(folder, seed, body, layout)
-    except (ValueError, ArithmeticError, IndexError, KeyError) as error:  # not OSError: a full disk ends everything
-        return error
-    return None
-
-
-_worker: dict[str, Any] = {}
+_worker: dict[str, BodyModel] = {}
 
 
 def _load_body(body):
-    from humangs_jax.body.library import load_body
-
     _worker["body"] = load_body() if body is None else body
 
 
 def _work(folder, seed, layout):
-    return _attempt(folder, seed, _worker["body"], layout)
+    """None or the error. An OSError ends everything: the disk may be full."""
+    try:
+        write_person(folder, seed, _worker["body"], layout)
+    except (ValueError, ArithmeticError, IndexError, KeyError) as error:
+        return error
+    return None
 
 
-def _views(batches: list[Camera], mark: str = "") -> list[View]:
-    """The views of batches[frame]."""
-    numbered = [(frame, batch, i) for frame, batch in enumerate(batches) for i in range(batch.K.shape[0])]
-    return [View(frame, f"{frame}_{mark}{i:02d}", batch[i]) for frame, batch, i in numbered]
+def _views(stream, place, count, poses, size, mark=""):
+    """`count` views of each pose, from cameras that `place` finds."""
+    rng, views = np.random.default_rng(stream), []
+    for frame, posed in enumerate(poses if count else ()):
+        cameras = place(rng, posed.vertices, spread_azimuths(rng, count), size)
+        views += [View(frame, f"{frame}_{mark}{i:02d}", cameras[i]) for i in range(count)]
+    return views
 
 
 def _write_views(folder, subject, body, posed, views, layout):
     capture = capture_views(subject, body, posed, views)
     save_capture(folder, capture)
+    images, masks = capture.images, np.asarray(capture.masks)
     for name in ("depth", "maps"):
         if getattr(layout, name):
             (folder / name).mkdir()
-    if not (layout.depth or layout.maps):
-        return
-    assert capture.masks is not None
-    for i, view in enumerate(views):
+    for i, view in enumerate(views if layout.depth or layout.maps else ()):
         maps = render_maps(posed[view.frame], view.camera)
         if layout.depth:
             write_depth(folder / "depth" / f"{view.name}.png", maps.depth)
         if layout.maps:
-            write_maps(folder / "maps" / f"{view.name}.exr", capture.images[i], capture.masks[i], maps, view.camera)
+            write_maps(folder / "maps" / f"{view.name}.exr", images[i], masks[i], maps, view.camera)
+
+
+def read_manifest(folder: str | Path) -> dict[str, Any]:
+    """What a set was made with. Raises: ValueError, one line naming the file, if it is no manifest of this format."""
+    file = Path(folder) / MANIFEST
+    content = read_json(file)
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise ValueError(f"{file}: format: expected a manifest of {FORMAT!r}")
+    if content.get("version") not in (1, VERSION):
+        raise ValueError(f"{file}: version: expected {VERSION}, got {content.get('version')!r}")
+    return {"generator_version": 1, "split": None} | content
+
+
+def begin_set(folder: str | Path, split: str, settings: dict[str, Any]) -> None:
+    """Start a set in a folder, or check that the one that is there can be continued.
+
+    Raises: ValueError if it was made by another version of the generator, of another split, or with other settings.
+    """
+    folder = Path(folder)
+    if not (folder / MANIFEST).is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        write_manifest(folder, split, settings)
+        return
+    earlier, file = read_manifest(folder), folder / MANIFEST
+    pairs = {name: (earlier["settings"].get(name), settings.get(name)) for name in {**settings, **earlier["settings"]}}
+    changed = [f"{name} {old} -> {new}" for name, (old, new) in sorted(pairs.items()) if old != new]
+    version, problem = earlier["generator_version"], ""
+    if version != GENERATOR_VERSION:
+        problem = f"written by version {version} of the generator, this is version {GENERATOR_VERSION}"
+    elif earlier["split"] != split:
+        problem = f"people of the split '{earlier['split']}', now asked for '{split}'"
+    elif changed:
+        problem = f"written with settings other than asked for now ({', '.join(changed)})"
+    if problem:
+        raise ValueError(f"{file}: {problem}: choose another folder")
+
+
+def write_manifest(folder: str | Path, split: str, settings: dict[str, Any]) -> None:
+    """List the finished subjects; written aside, then renamed, so that it is never half there."""
+    folder = Path(folder)
+    content = {"format": FORMAT, "version": VERSION, "generator_version": GENERATOR_VERSION, "split": split}
+    finished = sorted(file.parent.name for file in folder.glob("[0-9]*/capture.json"))
+    write_json(folder / MANIFEST, content | {"settings": settings, "subjects": finished})
+
+
+def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
+    """The capture folders in `root`, sorted by name; where a manifest says that they are synthetic, only of one split.
+
+    Folders without a manifest (real captures) are taken as they are. split None: any.
+    Raises: ValueError if a written set holds a subject of another split, or there is no capture.
+    """
+    root = Path(root)
+    folders = find_captures(root)
+    if split is not None and (root / MANIFEST).is_file():
+        read_manifest(root)
+        for folder in folders:
+            if folder.name.isdigit() and (other := split_of(int(folder.name))) != split:
+                raise ValueError(f"{folder}: a subject of the split '{other}', where '{split}' was expected")
+    return folders

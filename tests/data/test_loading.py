@@ -20,9 +20,9 @@ from humangs_jax.data.loading.order import MIX_BLOCK, block_counts, source_at
 from humangs_jax.data.loading.threads import read_in_order
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.people.manifest import begin_set, find_people
+from humangs_jax.people.on_the_fly import GeneratedSource
 from humangs_jax.people.seeds import SPLITS, TRAIN, seed_of_key, split_of, subject_key
-from humangs_jax.people.source import GeneratedSource
+from humangs_jax.people.writer import begin_set, find_people
 
 SIZE = 4
 

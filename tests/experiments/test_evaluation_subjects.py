@@ -8,7 +8,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
 from humangs_jax.people.seeds import DEMO
-from humangs_jax.people.writer import write_subject
+from humangs_jax.people.writer import Layout, write_person
 
 SIZE = 48
 
@@ -49,7 +49,7 @@ def test_the_first_photo_is_the_frontal_one(person):
 
 
 def test_held_out_views_are_those_of_written_captures(person, body, tmp_path):
-    write_subject(tmp_path / "a", DEMO[0], body=body, image_size=SIZE, held_out_views=2, input_views=1)
+    write_person(tmp_path / "a", DEMO[0], body, Layout(SIZE, views=1, held_out_views=2))
     written = load_capture(tmp_path / "a" / "held_out", body=body)
     novel = person.held_out.select([0, 1])
     assert np.array_equal(written.images, novel.images) and np.array_equal(written.masks, novel.masks)

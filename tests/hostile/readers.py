@@ -55,8 +55,8 @@ from humangs_jax.network.conversion import load_checkpoint
 from humangs_jax.network.weights import expected_variables, load_weights, save_weights
 from humangs_jax.objectives.loss_networks import load_vgg19
 from humangs_jax.people.bank import load_bank
-from humangs_jax.people.manifest import read_manifest
 from humangs_jax.people.rendering import read_depth
+from humangs_jax.people.writer import read_manifest
 from humangs_jax.training.config import read_config, tiny
 from humangs_jax.training.diagnose import first_failed_step
 

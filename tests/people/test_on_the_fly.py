@@ -19,8 +19,8 @@ from humangs_jax.network.presets import tiny
 from humangs_jax.people import cameras, on_the_fly, rendering, shading
 from humangs_jax.people.bank import build_bank, load_bank, save_bank
 from humangs_jax.people.kinematics import joint_positions
+from humangs_jax.people.on_the_fly import jitted_example, on_the_fly_source
 from humangs_jax.people.seeds import DEMO, TEST
-from humangs_jax.people.source import jitted_example, on_the_fly_source
 from humangs_jax.people.subject import make_subject
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 

@@ -220,7 +220,7 @@ def test_patterns_stay_in_range_and_differ():
 
 def test_a_written_subject_loads_back(tmp_path, body, people):
     folder = tmp_path / "person"
-    writer.write_subject(folder, SEEDS[0], body=body, image_size=48, input_views=2, held_out_views=2, novel_poses=1)
+    writer.write_person(folder, SEEDS[0], body, writer.Layout(48, views=2, held_out_views=2, novel_poses=1))
     inputs, held_out = load_capture(folder, body=body), load_capture(folder / writer.HELD_OUT, body=body)
     assert inputs.images.shape == (2, 48, 48, 3) and held_out.images.shape == (4, 48, 48, 3)
     np.testing.assert_array_equal(inputs.frames, [0, 0])

@@ -12,10 +12,8 @@ from hypothesis import strategies as st
 from experiments.people.overlap import OverlapMeter, winding_numbers
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, rest_pose, shape_body
-from humangs_jax.people import arms
 from humangs_jax.people import kinematics as kin
-from humangs_jax.people.arms import pose_hand
-from humangs_jax.people.poses import STANCES, sample_rotations, take_stance
+from humangs_jax.people.poses import STANCES, arm_clearance, pose_hand, sample_rotations, take_stance
 
 CLOSE = 1e-4
 """Metres or radians after 10 chained float32 rotations against float64."""
@@ -147,7 +145,7 @@ def test_both_soles_are_on_the_ground(body, build, posed):
 
 def test_hands_stay_clear_of_the_body(build, drawn):
     """Forearms and hands lie outside of trunk, legs, head and the other arm in nearly all poses."""
-    clear = np.asarray([arms.arm_clearance(build, rotations) for rotations in drawn])
+    clear = np.asarray([arm_clearance(build, rotations) for rotations in drawn])
     assert (clear < -0.01).mean() < 0.06
 
 

@@ -22,10 +22,10 @@ from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.exr import read_exr
 from humangs_jax.people import cameras, seeds, writer
 from humangs_jax.people.bank import build_bank
-from humangs_jax.people.manifest import find_people
 from humangs_jax.people.rendering import DEPTH_UNIT, padded, read_depth, render_maps, write_depth
 from humangs_jax.people.seeds import DEMO, SPLITS, seeds_of, split_of
 from humangs_jax.people.subject import make_subject
+from humangs_jax.people.writer import find_people
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 SIZE = 32
@@ -182,7 +182,7 @@ def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):
         write(4, layout=writer.Layout(64, views=2))
     with pytest.raises(ValueError, match="of the split 'demo', now asked for 'train'"):
         write(4, split="train")
-    monkeypatch.setattr("humangs_jax.people.manifest.GENERATOR_VERSION", seeds.GENERATOR_VERSION + 1)
+    monkeypatch.setattr("humangs_jax.people.writer.GENERATOR_VERSION", seeds.GENERATOR_VERSION + 1)
     with pytest.raises(ValueError, match=f"version {seeds.GENERATOR_VERSION} of the generator, this is version"):
         write(4)
 
@@ -279,7 +279,7 @@ def test_written_training_people_are_training_people(first, count):
     """Every person written lies in the split that was asked for, or nothing is written."""
     written = []
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory() as folder:
-        patch.setattr(writer, "_attempt", lambda folder, seed, body, layout: written.append(seed))
+        patch.setattr(writer, "_work", lambda folder, seed, layout: written.append(seed))
         for split in ("train", "test"):
             written.clear()
             start = first % len(SPLITS[split])

@@ -20,7 +20,7 @@ from humangs_jax.network import presets
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
-from humangs_jax.people.writer import write_subject
+from humangs_jax.people.writer import Layout, write_person
 from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.optimizer import OptimizerConfig
 from humangs_jax.training.state import init_state
@@ -58,7 +58,7 @@ def configuration(free: int, longest_edge: float) -> TrainConfig:
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
     folder = tmp_path_factory.mktemp("people") / "person"
-    write_subject(folder, 0, body=load_body(), image_size=SIZE, input_views=4, held_out_views=0)
+    write_person(folder, 0, load_body(), Layout(SIZE, views=4))
     return jax.tree.map(jnp.asarray, standardize(load_capture(folder), SIZE))
 
 
