@@ -45,10 +45,12 @@ def main() -> None:
 
 def measure(quick: bool = False) -> dict[str, Any]:
     """{run: {"error"} or its numbers and curves}. Raises: AssertionError: something is not finite at the end of a run."""
+    import jax
     from tqdm import tqdm
 
     from humangs_jax.body.library import load_body
 
+    jax.config.update("jax_disable_most_optimizations", True)  # most of the time of such short runs is compilation
     body, results = load_body(), {}
     with tempfile.TemporaryDirectory() as folder:
         base = base_config(4 if quick else STEPS)
