@@ -5,7 +5,8 @@
 Short runs of the smallest network on three synthetic people, each as `humangs train` makes it, that differ in one thing. "loss":
 mean of the last five steps, over the scale of the loss. "PSNR": of the training targets, the same five steps. "gradient": the
 largest norm before clipping. "clipped", "skipped": steps by the guard of `training.optimizer`. "log": what the log reports beside
-numbers. All parameters, moments and batch statistics have to be finite at the end. --quick: 4 steps of three of the runs.
+numbers. All parameters, moments and batch statistics have to be finite at the end. Runs that are in OUT are not made again.
+--quick: 4 steps of three of the runs.
 """
 
 import argparse
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import add_outputs, check_section, markdown_table, write_outputs
+from experiments.common.results import add_outputs, check_section, markdown_table, write_json, write_outputs
 
 TABLE = "training_extremes"
 PLAIN = "as it is"
@@ -37,29 +38,38 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.page:
         check_section(arguments.page, TABLE)
-    results = measure(arguments.quick)
+    results = measure(arguments.quick, arguments.json)
     write_outputs(arguments, TABLE, section(results), results)
     if arguments.image:
         draw(results, arguments.image)
 
 
-def measure(quick: bool = False) -> dict[str, Any]:
-    """{run: {"error"} or its numbers and curves}. Raises: AssertionError: something is not finite at the end of a run."""
+def measure(quick: bool = False, path: Path | None = None) -> dict[str, Any]:
+    """{run: {"error"} or its numbers and curves}; those in a file are not made again, and each is added to it.
+
+    Raises: AssertionError: something is not finite at the end of a run.
+    """
     import jax
     from tqdm import tqdm
 
     from humangs_jax.body.library import load_body
+    from humangs_jax.network.humangs import init_humangs
 
     jax.config.update("jax_disable_most_optimizations", True)  # most of the time of such short runs is compilation
     body, results = load_body(), {}
+    if path is not None and path.is_file():
+        results = json.loads(path.read_text())
     with tempfile.TemporaryDirectory() as folder:
         base = base_config(4 if quick else STEPS)
+        variables = init_humangs(jax.random.key(base.seed), base.model)
         people = written_people(Path(folder), body)
         for name, (change, start, of) in tqdm(runs().items(), desc="runs"):
-            if not quick or name in QUICK:
+            if name not in results and (not quick or name in QUICK):
                 out = Path(folder) / name.replace(" ", "_").replace(",", "")
-                results[name] = outcome(base, change, start, of(people, body), body, out)
-    return results
+                results[name] = outcome(base, change, start, variables, of(people, body), body, out)
+                if path is not None:
+                    write_json(path, results)
+    return {name: results[name] for name in runs() if name in results}
 
 
 def base_config(steps: int) -> Any:
@@ -169,17 +179,17 @@ def changed(change: Any = lambda example: example, index: Any = lambda i: i) -> 
     return lambda folders, body: lambda config: Changed(captured_people(folders, body)(config))
 
 
-def outcome(base: Any, change: Any, start: Any, make_source: Any, body: Any, out: Path) -> dict[str, Any]:
+def outcome(
+    base: Any, change: Any, start: Any, variables: Any, make_source: Any, body: Any, out: Path
+) -> dict[str, Any]:
     """What becomes of one run. start None: parameters of another type are handed to the training step itself."""
     import jax
     import numpy as np
 
-    from humangs_jax.network.humangs import init_humangs
     from humangs_jax.training.loop import train
 
     try:
         config = change(base)
-        variables = init_humangs(jax.random.key(config.seed), config.model)
         if start is None:
             step_with_bfloat16(config, variables, make_source, body)
             return {"error": None}
