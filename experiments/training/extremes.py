@@ -60,28 +60,29 @@ def measure(quick: bool = False, path: Path | None = None) -> dict[str, Any]:
     if path is not None and path.is_file():
         results = json.loads(path.read_text())
     with tempfile.TemporaryDirectory() as folder:
-        base = base_config(4 if quick else STEPS)
+        base = base_config()
         variables = init_humangs(jax.random.key(base.seed), base.model)
         people = written_people(Path(folder), body)
         for name, (change, start, of) in tqdm(runs().items(), desc="runs"):
             if name not in results and (not quick or name in QUICK):
                 out = Path(folder) / name.replace(" ", "_").replace(",", "")
-                results[name] = outcome(base, change, start, variables, of(people, body), body, out)
+                results[name] = outcome(
+                    base, change, start, variables, of(people, body), body, out, 4 if quick else STEPS
+                )
                 if path is not None:
                     write_json(path, results)
     return {name: results[name] for name in runs() if name in results}
 
 
-def base_config(steps: int) -> Any:
+def base_config() -> Any:
     """The preset `tiny`, for photos of `SIZE` pixels."""
     from experiments.training.cases import settings
 
     config = settings("tiny", SIZE, 2, 2)
     model = config.model.with_conventions(body_vertices=VERTICES).with_execution(token_capacity=0)
     loss = dataclasses.replace(config.loss, structural_scales=2)
-    return dataclasses.replace(
-        config, model=model, loss=loss, steps=steps, validate_every=steps, checkpoint_every=steps
-    )
+    every = {"steps": STEPS, "validate_every": STEPS, "checkpoint_every": STEPS}
+    return dataclasses.replace(config, model=model, loss=loss, **every)
 
 
 def written_people(folder: Path, body: Any) -> list[Path]:
@@ -180,7 +181,7 @@ def changed(change: Any = lambda example: example, index: Any = lambda i: i) -> 
 
 
 def outcome(
-    base: Any, change: Any, start: Any, variables: Any, make_source: Any, body: Any, out: Path
+    base: Any, change: Any, start: Any, variables: Any, make_source: Any, body: Any, out: Path, stop_at: int
 ) -> dict[str, Any]:
     """What becomes of one run. start None: parameters of another type are handed to the training step itself."""
     import jax
@@ -193,7 +194,7 @@ def outcome(
         if start is None:
             step_with_bfloat16(config, variables, make_source, body)
             return {"error": None}
-        state = train(config, body, make_source, out, variables=start(variables), progress=False)
+        state = train(config, body, make_source, out, variables=start(variables), stop_at=stop_at, progress=False)
     except ValueError as error:
         return {"error": str(error)}
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((state.params, state.opt_state, state.batch_stats)))

@@ -194,6 +194,7 @@ def _check(capture, name):
         raise ValueError(f"reconstruct: {name}: frames: expected 0 to {capture.frame_count - 1}, got {capture.frames}")
     arrays = {
         "body.template": (capture.body.template, FINITE),
+        "body.skinning_weights": (capture.body.skinning_weights, FINITE),
         "images": (capture.images, UNIT),
         "masks": (capture.masks, UNIT),
         "betas": (capture.betas, FINITE),
