@@ -1,6 +1,6 @@
 """For each quantity of a capture, the range in which avatars stay good, and where a capture lies in it.
 
-The ranges are measured by experiments/check_extremes.py --limits on synthetic people, with the shipped weights, each quantity
+The ranges are measured by experiments/check_limits.py on synthetic people, with the shipped weights, each quantity
 alone; assets/limits.json holds them.
 """
 

@@ -2,7 +2,7 @@
 
 The front (assets/front.json, written by experiments/tradeoff/sweep.py) says which settings are worth trying, how good they
 are, and how their times compare. A few of them are measured, the cheapest first; times of the others are extrapolated from
-those. What is chosen has been measured itself. Times are without compilation.
+those. What is chosen has been measured itself, twice: other programs come and go. Times are without compilation.
 """
 
 import dataclasses
@@ -74,6 +74,14 @@ class Cost:
         """With refinement."""
         return self.make_ms + self.refine_ms
 
+    def worst(self, other: "Cost") -> "Cost":
+        """The larger one of each."""
+        memory = (
+            None if None in (self.memory_mb, other.memory_mb) else max(self.memory_mb or 0.0, other.memory_mb or 0.0)
+        )
+        make, refine = max(self.make_ms, other.make_ms), max(self.refine_ms, other.refine_ms)
+        return Cost(make, refine, max(self.frame_ms, other.frame_ms), memory)
+
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
@@ -95,7 +103,9 @@ class Budget:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Tuned:
-    """What `tune` found. cost: of the point, as measured. measured: all costs that were measured, by the name of the point."""
+    """What `tune` found. cost: of the point, the worse of two measurements. measured: all costs that were measured, by the name
+    of the point.
+    """
 
     point: FrontPoint
     cost: Cost
@@ -171,12 +181,17 @@ def tune(
     if capture.masks is None:  # which refinement needs
         front = [point for point in front if point.settings.refinement is None]
     measured: dict[str, Cost] = {}
+    confirmed = set()
     with bar(total=len(front), desc="tune", unit="setting", shown=progress) as shown:
         while (point := choose(front, measured, budget)) is not None:
-            if point.name in measured:
+            if point.name in confirmed:
                 return Tuned(point, measured[point.name], measured)
             shown.set_postfix_str(point.name)
-            measured[point.name] = measure(point.settings, variables, config, capture, size)
+            cost = measure(point.settings, variables, config, capture, size)
+            if point.name in measured:
+                cost = cost.worst(measured[point.name])
+                confirmed.add(point.name)
+            measured[point.name] = cost
             if budget.memory_mb is not None and measured[point.name].memory_mb is None:
                 raise ValueError("memory_mb: how much memory is used cannot be measured on this system")
             shown.update()

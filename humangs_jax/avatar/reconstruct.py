@@ -51,6 +51,7 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     if bucket > capture.view_count:
         views = pad_views(views, bucket)
     inputs = _prepare(body, views, config)
+    _check_posed(inputs, "capture")
     return _assemble_compiled(variables, fit_buffers(inputs, config), body, views, inputs)[0]
 
 
@@ -81,6 +82,7 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
         subjects.append(replace(views, betas=betas))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
     inputs = _prepare_batch(body, batch, config)
+    _check_posed(inputs, "captures")
     avatars, _ = _assemble_batch(variables, fit_buffers(inputs, config), body, batch, inputs)
     return [jax.tree.map(lambda leaf, i=index: leaf[i], avatars) for index in range(len(captures))]
 
@@ -191,6 +193,8 @@ def _check(capture, name):
     if not 0 <= np.min(capture.frames) <= np.max(capture.frames) < capture.frame_count:
         raise ValueError(f"reconstruct: {name}: frames: expected 0 to {capture.frame_count - 1}, got {capture.frames}")
     arrays = {
+        "body.template": (capture.body.template, FINITE),
+        "body.skinning_weights": (capture.body.skinning_weights, FINITE),
         "images": (capture.images, UNIT),
         "masks": (capture.masks, UNIT),
         "betas": (capture.betas, FINITE),
@@ -198,6 +202,14 @@ def _check(capture, name):
         "poses.translation": (capture.poses.translation, FINITE),
     }
     check_values(f"reconstruct: {name}", arrays | camera_values(capture.cameras))
+
+
+def _check_posed(inputs, name):
+    """The other arrays of a body are large, and each of them moves vertices."""
+    try:
+        check_values(f"reconstruct: {name}", {"the posed vertices": (inputs.posed_vertices, FINITE)})
+    except ValueError as error:
+        raise ValueError(f"{error}; are the arrays of its body finite?") from error
 
 
 def _equal(body, other):

@@ -1,7 +1,7 @@
 """How the network runs: settings of time and memory. Weights files do not record them."""
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax.numpy as jnp
 
@@ -12,6 +12,7 @@ MEASURED, TRADE = "performance_reconstruction.md", "tradeoff.md"
 
 TokenSelection = Literal["all", "foreground"]
 AttentionKernel = Literal["xla", "cudnn", "chunked"]
+ComputeType = Literal["float32", "bfloat16", "float16"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +35,8 @@ class Execution:
     image_size: side of the photos in pixels, a multiple of the patch size; None: as the weights were trained.
     crop: photos are cut to the square around the person's mask before they are brought to that size.
     raster: buffers of the mesh rasterizer.
+
+    Raises: ValueError for another dtype.
     """
 
     tokens: TokenSelection | None = knob(
@@ -45,7 +48,7 @@ class Execution:
     token_capacity: int = knob(
         0, cost="tokens beyond it are dropped and counted", gain="time and memory", measured=MEASURED
     )
-    dtype: Literal["float32", "bfloat16", "float16"] = knob(
+    dtype: ComputeType = knob(
         "float32",
         cost="bfloat16: 1e-2 of relative error; float16: 1e-3, not for training",
         gain="time on accelerators; none on CPUs",
@@ -76,6 +79,10 @@ class Execution:
     image_size: int | None = knob(None, cost="detail of the photos", gain="tokens grow with its square", measured=TRADE)
     crop: bool = knob(False, cost="none", gain="pixels of the person in place of background", measured=TRADE)
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
+
+    def __post_init__(self):
+        if self.dtype not in get_args(ComputeType):
+            raise ValueError(f"execution.dtype: expected one of {', '.join(get_args(ComputeType))}, got {self.dtype!r}")
 
     @staticmethod
     def preset(name: str) -> "Execution":

@@ -27,7 +27,7 @@ from humangs_jax.training.state import TrainState
 logger = logging.getLogger("humangs_jax.training")
 FLUSH_SECONDS = 10
 MANY_SKIPPED = 20
-"""Number of consecutive skipped steps that is reported."""
+"""Number of consecutive steps that is reported if all were skipped, or all had a gradient of 0."""
 
 
 class RunLog:
@@ -109,7 +109,7 @@ class Watch:
     def __init__(self, log: RunLog, state: TrainState):
         self._log, self._pending = log, None
         self._skipped, self._nonfinite = int(state.opt_state.skipped), int(state.opt_state.nonfinite)
-        self._in_a_row = 0
+        self._in_a_row = self._without_gradient = 0
 
     def __call__(self, done: int, metrics: dict[str, Any], bad_samples: Callable[[], list[str]] = list) -> None:
         """The metrics of the step that was just begun; done: steps with it. bad_samples: asked if it failed, see `sources`."""
@@ -129,6 +129,10 @@ class Watch:
         was_skipped, was_nonfinite = skipped > self._skipped, nonfinite > self._nonfinite
         self._skipped, self._nonfinite = skipped, nonfinite
         self._in_a_row = self._in_a_row + 1 if was_skipped else 0
+        self._without_gradient = self._without_gradient + 1 if numbers["grad_norm"] == 0 else 0
+        if self._without_gradient == MANY_SKIPPED:
+            advice = "no loss depends on a parameter any more; a learning rate that is too high does that"
+            self._log.event(done, "stuck", f"{MANY_SKIPPED} steps in a row had a gradient of 0: {advice}")
         if not (was_skipped or was_nonfinite):
             return
         text = f"loss {numbers['loss']:.4g}, gradient norm {numbers['grad_norm']:.4g}"

@@ -15,7 +15,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.network.parts import HumanGSOutputs
-from humangs_jax.network.stages import StageCaller, call
+from humangs_jax.network.stages import StageCaller, call, inexact_leaves
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.losses import squared_error, surface_distance, tightness, translucency
 from humangs_jax.objectives.lpips import lpips
@@ -257,6 +257,7 @@ def train_step(
     Arguments: state is given away (donated). batch: an `Example` with a leading axis of subjects. body: decimated
     already. config: static, of one stage. networks: of the losses that need them. mesh: static; where there is one, state,
     batch, body and networks lie on it, see `sharding`.
+    Raises: ValueError for parameters of fewer than 32 bits.
     """
     return jitted_train_step()(state, batch, body, networks, config=config, mesh=mesh)
 
@@ -270,6 +271,12 @@ def jitted_train_step() -> Any:
 
 
 def _train_step(state, batch, body, networks, config, mesh):
+    for name, leaf in inexact_leaves(state.params):
+        if jnp.finfo(leaf.dtype).bits < 32:
+            raise ValueError(
+                f"train_step: params.{name}: expected float32, got {leaf.dtype}: small updates would be rounded away; to "
+                'compute in bfloat16, keep the parameters and set model.execution.dtype to "bfloat16"'
+            )
     keys = subject_keys(config.seed, state.step, batch.inputs.betas.shape[0])
     loss, gradients, batch_stats, metrics = batch_gradients(
         state.params, state.batch_stats, body, batch, keys, config, networks, mesh

@@ -16,7 +16,7 @@ from humangs_jax.apps.tune import MARGIN, Budget, Cost, FrontPoint, choose, in_w
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.cli.options import Preset
-from humangs_jax.data.capture import load_capture, save_capture
+from humangs_jax.data.capture import Capture, load_capture, save_capture
 from humangs_jax.network import presets
 from humangs_jax.network.execution import EXECUTIONS, Execution
 from humangs_jax.network.humangs import init_humangs
@@ -126,6 +126,21 @@ def test_what_is_chosen_has_been_measured_within_the_budget_on_any_machine(front
     found, measured = searched(front, machine, budget)
     assert len(measured) <= len(front)
     assert found is None or MARGIN * measured[found.name].reconstruct_ms <= most
+
+
+def test_a_choice_that_is_slower_the_second_time_is_not_taken(monkeypatch):
+    fast, good = (
+        FrontPoint(n, Settings(views=v), float(v), 0.0, 1.0, 100.0, q, q)
+        for n, v, q in (("a", 1, 20.0), ("b", 2, 25.0))
+    )
+    times = {1: [30.0, 31.0], 2: [70.0, 90.0]}
+    measure = lambda settings, *_: Cost(times[settings.views].pop(0), 0.0, 10.0, None)
+    monkeypatch.setattr(tuning, "measure", measure)
+    capture = object.__new__(Capture)  # nothing of it is measured
+    object.__setattr__(capture, "masks", ())
+    tuned = tune({}, presets.tiny(), capture, Budget(100.0), 32, [fast, good])
+    assert tuned.point is fast and tuned.cost == Cost(31.0, 0.0, 10.0) and not any(times.values())
+    assert tuned.measured["b"].reconstruct_ms == 90
 
 
 def test_costs_are_extrapolated_from_the_nearest_measured_point():

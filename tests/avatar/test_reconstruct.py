@@ -218,6 +218,11 @@ def test_the_size_of_the_photos_is_a_choice_of_execution():
         (lambda c: {"images": c.images * np.nan}, "images: expected numbers in"),
         (lambda c: {"images": c.images * 255}, "images: expected numbers in"),
         (lambda c: {"betas": np.full(3, np.inf, np.float32)}, "betas: expected finite numbers"),
+        (lambda c: {"body": replace(c.body, template=np.nan * c.body.template)}, r"body\.template: expected finite"),
+        (
+            lambda c: {"body": replace(c.body, skinning_weights=np.nan * c.body.skinning_weights)},
+            r"body\.skinning_weights: expected finite",
+        ),
     ],
 )
 def test_captures_made_by_hand_are_checked(body, change, message):
@@ -254,6 +259,16 @@ def test_photos_that_are_not_numbers_are_an_error(body, network):
     bytes_ = dataclasses.replace(capture(body, SIZE, SIZE), images=np.full((2, SIZE, SIZE, 3), 255.0, np.float32))
     with pytest.raises(ValueError, match=r"images: expected numbers in \[0, 1\]"):
         reconstruct(variables, config, bytes_)
+
+
+@pytest.mark.slow
+def test_a_body_that_is_not_finite_is_an_error(body, network):
+    photos = capture(replace(body, joint_regressor=body.joint_regressor.at[0, 0].set(np.nan)), SIZE, SIZE)
+    message = "the posed vertices: expected finite numbers.*nan; are the arrays of its body finite"
+    with pytest.raises(ValueError, match=f"reconstruct: capture: {message}"):
+        reconstruct(*network, photos)
+    with pytest.raises(ValueError, match=f"reconstruct: captures: {message}"):
+        reconstruct_batch(*network, [photos])
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import pytest
 
 from experiments.accelerator import training_cost
 from experiments.common.results import publish
-from experiments.training import checkpoints, convolution
+from experiments.training import checkpoints, convolution, extremes
 
 REPOSITORY = Path(__file__).parents[2]
 EXPERIMENTS = REPOSITORY / "experiments"
@@ -129,3 +129,14 @@ def test_the_page_is_made_of_what_the_benchmark_writes(tmp_path, page):
 
     subprocess.run([*command, "--page", str(path)], check=True, cwd=tmp_path)
     assert "tiny 32, 2 + 2 views" in path.read_text()
+
+
+@pytest.mark.slow
+def test_training_at_the_extremes():
+    results = extremes.measure(quick=True)
+    assert tuple(results) == tuple(name for name in extremes.runs() if name in extremes.QUICK)
+    assert "float16: gradients underflow" in results["float16 compute"]["error"]
+    for name in (extremes.PLAIN, "an all-white photo in every batch"):
+        row = results[name]
+        assert row["steps"] == 4 and row["skipped"] == row["nonfinite"] == 0 and 0 < row["loss"] < 1
+    assert extremes.section(results).count("\n") == 1 + len(results)

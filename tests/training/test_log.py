@@ -160,3 +160,16 @@ def test_steps_that_went_wrong_are_told_by_number(tmp_path, capsys):
     skipped = [(3 + i, "skipped") for i in range(MANY_SKIPPED)]
     assert events == [(2, "nonfinite"), *skipped, (2 + MANY_SKIPPED, "stuck")]
     assert "--diagnose" in capsys.readouterr().out
+
+
+def test_a_gradient_that_stays_0_is_reported_once(tmp_path, capsys):
+    state = TrainState(jnp.asarray(0), {}, {}, GuardState(jnp.asarray(0), jnp.asarray(0), jnp.zeros(()), ()), None)
+    metrics = {name: np.zeros(()) for name in ("skipped", "nonfinite", "loss", "grad_norm")}
+    with RunLog(tmp_path, 0, 100, progress=False) as log:
+        watch = Watch(log, state)
+        for i in range(2 * MANY_SKIPPED):
+            watch(1 + i, metrics | {"grad_norm": np.asarray(float(i == 0))})
+        watch.look()
+    events = [(line["step"], line["event"]) for line in read(tmp_path / "log.jsonl")]
+    assert events == [(1 + MANY_SKIPPED, "stuck")]
+    assert "had a gradient of 0" in capsys.readouterr().out

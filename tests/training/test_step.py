@@ -20,7 +20,7 @@ from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.objectives.perceptual import VGG19, Vgg19
 from humangs_jax.training.config import tiny
 from humangs_jax.training.forward import token_share
-from humangs_jax.training.state import init_state
+from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import (
     batch_gradients,
     change_background,
@@ -100,6 +100,13 @@ def test_it_learns_a_batch(body, source, variables):
     first, last = ({name: float(value) for name, value in metrics.items()} for metrics in (history[0], history[-1]))
     assert last["silhouette"] < 0.6 * first["silhouette"] and last["squared"] < 0.8 * first["squared"]
     assert last["skipped"] == 0
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16])
+def test_parameters_of_fewer_bits_are_refused(body, source, dtype):
+    state = TrainState(jnp.zeros((), jnp.int32), {"reader": {"bias": jnp.zeros(3, dtype)}}, {}, (), None)
+    with pytest.raises(ValueError, match=f"params.reader.bias: expected float32, got {jnp.dtype(dtype).name}"):
+        train_step(state, source.batch_at(0), body, CONFIG)
 
 
 def test_a_fresh_state_has_the_shapes_of_a_given_one(variables):
