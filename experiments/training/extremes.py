@@ -87,11 +87,11 @@ def base_config() -> Any:
 
 def written_people(folder: Path, body: Any) -> list[Path]:
     """Capture folders."""
-    from humangs_jax.people.writer import write_training_subject
+    from humangs_jax.people.writer import Layout, write_person
 
     folders = [folder / f"person{seed}" for seed in range(PEOPLE)]
     for seed, path in enumerate(folders):
-        write_training_subject(path, seed, body=body, image_size=SIZE, poses=1, views=6)
+        write_person(path, seed, body, Layout(SIZE, views=6))
     return folders
 
 
