@@ -20,8 +20,8 @@ from pathlib import Path
 # before JAX is imported; the programs that tests start inherit it
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 if os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] == "1" and importlib.metadata.version("jaxlib").startswith("0.10."):
-    # the emitters make faster programs, but take 40 % of the time of a cold run. XLA aborts at flags that it does not know:
-    # other versions of jaxlib may have none of this name
+    # the emitters make faster programs, but took more than a third of the CPU time of a run with an empty cache. XLA aborts at
+    # flags that it does not know, and other versions of jaxlib may not have this one
     os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}".strip()
 
 import jax

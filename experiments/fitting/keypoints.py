@@ -6,11 +6,12 @@
 
 Writes mean_joint_error_mm and p95_joint_error_mm over all 55 joints (raw, in the world), of the body's 22 and of the hands', and
 seconds_per_frame of all people and frames in one batch, compilation apart; the same without outliers. --curves adds errors over
-views and over noise beside plain and robust triangulation of the same keypoints, and other keypoint sets. About 1 minute, with
---curves 8, on two cores. --plot needs matplotlib (the `notebooks` extra).
+views and over noise beside plain and robust triangulation of the same keypoints, and other keypoint sets. --resume keeps what an
+interrupted run has measured. About 1 minute, with --curves 8, on two cores. --plot needs matplotlib (the `notebooks` extra).
 """
 
 import argparse
+import itertools
 import json
 import sys
 import time
@@ -35,6 +36,7 @@ def main() -> None:
     parser.add_argument("--set", default=ALL, choices=("coco17", ALL, "openpose67"), help="which keypoints")
     parser.add_argument("--curves", action="store_true", help="also over views, noise and keypoint sets")
     parser.add_argument("--json", type=Path, required=True, help="numbers")
+    parser.add_argument("--resume", action="store_true", help="keep the settings that the file at --json has")
     parser.add_argument("--plot", type=Path, help="picture of the curves (.png)")
     parser.add_argument("--docs", action="store_true", help="write the tables into docs/fitting.md")
     arguments = parser.parse_args()
@@ -52,22 +54,24 @@ def main() -> None:
 
 
 def run(arguments) -> None:
-    """Everything that was asked for; numbers are written after each part."""
-    bench = Bench(arguments.people, arguments.frames)
+    """Everything that was asked for; numbers are written after each setting."""
+    bench = Bench(arguments.people, arguments.frames, measured(arguments.json) if arguments.resume else [])
     asked = (arguments.set, arguments.views, arguments.noise_px)
-    results = bench.measure(*asked, arguments.outliers)
+    results = dict(bench.measure(*asked, arguments.outliers))
     results["without_outliers"] = bench.measure(*asked, 0.0)
     write(arguments.json, results)
     if not arguments.curves:
         return
-    over_views = [bench.measure(ALL, views, 2.0, share) for views in VIEWS for share in (0.0, 0.2)]
-    results["over_views"] = over_views
-    write(arguments.json, results)
-    results["over_noise"] = [bench.measure(ALL, 4, noise, 0.0) for noise in NOISES]
-    results["over_sets"] = [
-        bench.measure(kind, 4, 2.0, share) for kind in ("coco17", "openpose67") for share in (0.0, 0.2)
-    ]
-    write(arguments.json, results)
+    parts = {
+        "over_views": [(ALL, views, 2.0, share) for views in VIEWS for share in (0.0, 0.2)],
+        "over_noise": [(ALL, 4, noise, 0.0) for noise in NOISES],
+        "over_sets": [(kind, 4, 2.0, share) for kind in ("coco17", "openpose67") for share in (0.0, 0.2)],
+    }
+    for name, settings in parts.items():
+        results[name] = []
+        for setting in settings:
+            results[name].append(bench.measure(*setting))
+            write(arguments.json, results)
     if arguments.plot:
         plot(results, arguments.plot)
     if arguments.docs:
@@ -76,23 +80,30 @@ def run(arguments) -> None:
         publish(PAGE, "fit_keypoints", table(results), results)
 
 
+def measured(path: Path) -> list[dict]:
+    """What an earlier run left in its file, one record a setting."""
+    if not path.exists():
+        return []
+    results = json.loads(path.read_text())
+    lists = [results.pop(name, []) for name in ("over_views", "over_noise", "over_sets")]
+    return [results.pop("without_outliers", {}), results, *itertools.chain(*lists)]
+
+
 def write(path: Path, results: dict) -> None:
     """Whole or not at all."""
     from experiments.common.results import write_json
 
     write_json(path, results)
-    short = {name: value for name, value in results.items() if not isinstance(value, dict | list)}
-    print(json.dumps(short), flush=True)
 
 
 class Bench:
     """People and their fits; what was made or measured once is kept."""
 
-    def __init__(self, people: int, frames: int) -> None:
+    def __init__(self, people: int, frames: int, measured: list[dict]) -> None:
         from humangs_jax.body.library import load_body
 
         self.people, self.frames, self.body = people, frames, load_body()
-        self.kept: dict = {}
+        self.measured, self.kept = measured, {}
 
     def cases(self, kind, views):
         """The keypoint model of a set and people seen by that number of views."""
@@ -108,6 +119,17 @@ class Bench:
 
     def measure(self, kind: str, views: int, noise: float, outliers: float) -> dict:
         """Errors and times of one setting."""
+        setting = {"keypoints": kind, "views": views, "noise_px": noise, "outliers": outliers}
+        setting |= {"people": self.people, "frames": self.frames}
+        record = next((record for record in self.measured if setting.items() <= record.items()), None)
+        if record is None:
+            record = setting | self.errors(kind, views, noise, outliers)
+            self.measured.append(record)
+        print(json.dumps(record), flush=True)
+        return record
+
+    def errors(self, kind: str, views: int, noise: float, outliers: float) -> dict:
+        """Millimetres, and seconds."""
         import jax
         import numpy as np
 
@@ -123,15 +145,11 @@ class Bench:
         start = time.perf_counter()
         fit = jax.block_until_ready(fit_all(seen))
         seconds = time.perf_counter() - start
-        setting = {"keypoints": kind, "views": views, "noise_px": noise, "outliers": outliers}
-        setting |= {"people": self.people, "frames": self.frames}
         truth = np.stack([case.joints for case in people])
         errors = 1000 * np.linalg.norm(np.asarray(fit.joints) - truth, axis=-1)
-        found = setting | joint_errors(errors) | landmark_errors(model, people, seen, fit)
+        found = joint_errors(errors) | landmark_errors(model, people, seen, fit)
         found["root_aligned_mean_joint_error_mm"] = root_aligned(np.asarray(fit.joints), truth)
-        found |= {"seconds_per_frame": seconds / truth[..., 0, 0].size, "first_call_s": first}
-        print(json.dumps(found), flush=True)
-        return found
+        return found | {"seconds_per_frame": seconds / truth[..., 0, 0].size, "first_call_s": first}
 
 
 def joint_errors(errors) -> dict:

@@ -34,7 +34,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--load", type=int, default=cores(), help="processes beside; as many as there are cores if not given"
+        "--load", type=int, default=cores(), help="busy processes beside it (default: one for each core)"
     )
     parser.add_argument("--runs", type=int, default=10, help="measurements of each choice")
     parser.add_argument("--size", type=int, default=256, help="side of the frames, pixels")
@@ -50,7 +50,7 @@ def main() -> None:
 
 @contextlib.contextmanager
 def busy(count: int) -> Any:
-    """So many processes that keep a core busy each, until the end."""
+    """`count` processes, each of which keeps one core busy until the block ends."""
     one_thread = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
     processes = [subprocess.Popen([sys.executable, "-c", BUSY], env=os.environ | one_thread) for _ in range(count)]
     try:
