@@ -146,7 +146,8 @@ def compiled(
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, render
+    from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+    from humangs_jax.rendering.splatting import render
 
     gaussians, camera = scene.gaussians(dtype), scene.camera(dtype)
     goal, black = jnp.asarray(target, dtype), jnp.zeros(3, dtype)
@@ -157,7 +158,7 @@ def compiled(
     def loss(gaussians):
         return jnp.mean((forward(gaussians).rgb - goal) ** 2)
 
-    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    options = cpu_options(CPU_COMPILER_OPTIONS)
     programs, facts = {}, {}
     for name, function in zip(DIRECTIONS, (forward, jax.value_and_grad(loss)), strict=True):
         started = time.perf_counter()

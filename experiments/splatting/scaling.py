@@ -98,7 +98,8 @@ def compiled_views(scene: Scene, views: int, at_once: bool) -> tuple[dict[str, C
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, plan_buffers, render, render_views
+    from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+    from humangs_jax.rendering.splatting import plan_buffers, render, render_views
 
     gaussians, cameras = scene.gaussians(), orbiting(scene, VIEW_ANGLE * np.arange(views))
     config, black = plan_buffers(gaussians, cameras, margin=1.0), jnp.zeros(3)
@@ -112,7 +113,7 @@ def compiled_views(scene: Scene, views: int, at_once: bool) -> tuple[dict[str, C
     def loss(gaussians):
         return jnp.mean((forward(gaussians).rgb - goal) ** 2)
 
-    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    options = cpu_options(CPU_COMPILER_OPTIONS)
     programs, facts = {}, {}
     for name, function in zip(DIRECTIONS, (forward, jax.value_and_grad(loss)), strict=True):
         program = jax.jit(function, compiler_options=options).lower(gaussians).compile()

@@ -53,18 +53,18 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
+    from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
     from humangs_jax.rendering import binning
     from humangs_jax.rendering.compositing import pack_splats
     from humangs_jax.rendering.projection import project, squared_reach
     from humangs_jax.rendering.schedules import fat_chunks, small_blocks
-    from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
     from humangs_jax.rendering.tiling import TileGrid, image_to_tiles, sort_into_tiles, tiles_to_image
 
     on_cpu = jax.default_backend() == "cpu"
     schedule, runs = small_blocks if on_cpu else fat_chunks, {}
 
     def stage(name, function, *arguments):
-        program = jax.jit(function, compiler_options=CPU_COMPILER_OPTIONS if on_cpu else None)
+        program = jax.jit(function, compiler_options=cpu_options(CPU_COMPILER_OPTIONS))
         program = program.lower(*arguments).compile()
         runs[name] = lambda: jax.block_until_ready(program(*arguments))
         return program(*arguments)

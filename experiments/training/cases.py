@@ -202,8 +202,6 @@ def first(batch: Any) -> Any:
 
 def compiler_options() -> dict[str, Any] | None:
     """Those of a training step here."""
-    import jax
+    from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
 
-    from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
-
-    return CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    return cpu_options(CPU_COMPILER_OPTIONS)

@@ -21,6 +21,7 @@ from jax import lax
 
 from humangs_jax.body.skinning import joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
 from humangs_jax.core.configuration import knob
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace
@@ -36,7 +37,6 @@ from humangs_jax.people.cameras import pick
 from humangs_jax.people.kinematics import MIRROR
 from humangs_jax.people.seeds import SPLITS, subject_key
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
-from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
 from humangs_jax.rendering.tiling import cumsum
 
 MIXING = 0.5
@@ -349,7 +349,7 @@ def jitted_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_F
 
 @functools.cache
 def _compiled():
-    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    options = cpu_options(CPU_COMPILER_OPTIONS)
     return jax.jit(on_the_fly_example, static_argnames="config", compiler_options=options)
 
 

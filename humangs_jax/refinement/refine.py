@@ -21,6 +21,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
+from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
 from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
@@ -32,7 +33,7 @@ from humangs_jax.refinement.density import photo_errors, split, with_room, witho
 from humangs_jax.refinement.objective import Photos, photos_gradient, photos_loss, photos_of, posed_gaussians
 from humangs_jax.refinement.parameters import RefineState, gaussians_of, init_state, parameters_of, update
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS, plan_buffers, render
+from humangs_jax.rendering.splatting import plan_buffers, render
 
 HELD_OUT_PHOTOS = 8
 """With this number of photos or more, one photo is held out, not pixels of each: a test of views that no step sees."""
@@ -285,9 +286,8 @@ def _planned(avatar: Avatar, photos: SubjectViews | Photos) -> SplatConfig:
 
 @functools.cache
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
     static = [name for name in ("config", "splat", "mesh", "count") if name in inspect.signature(function).parameters]
-    return jax.jit(function, static_argnames=static, compiler_options=options)
+    return jax.jit(function, static_argnames=static, compiler_options=cpu_options(CPU_COMPILER_OPTIONS))
 
 
 def _check(avatar, capture, config, mesh):

@@ -17,6 +17,7 @@ from jax.sharding import Mesh
 
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.checks import FINITE, check_values
+from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.rendering import constants
 from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers, raise_on_overflow, with_default_buffers
@@ -25,16 +26,6 @@ from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
 
 __all__ = ["BufferOverflowError", "Rendering", "SplatConfig", "plan_buffers", "render", "render_views", "seen_from"]
-
-CPU_COMPILER_OPTIONS = {
-    "xla_cpu_prefer_vector_width": 512,
-    "xla_disable_hlo_passes": "cpu-parallel-task-assigner,cse_barrier_expander,small-while-loop-hoisting",
-}
-"""`jax.jit(..., compiler_options=CPU_COMPILER_OPTIONS)` of a program that draws on a CPU: wide vectors make the loops over
-pixels up to a third faster where there is AVX-512; XLA no longer divides its small kernels, tens of microseconds each,
-among several threads, which took twice the CPU time and gained nothing; and it keeps barriers, so that tables are stored
-before they are gathered from (the loops of tiny images must then not become single kernels, which know no barriers).
-Eager calls use it; options do not reach a jit inside a jit, so your own needs them itself. Works from jax 0.10 to 0.12."""
 
 
 def render(
@@ -125,8 +116,7 @@ def _render(
 
 @functools.cache
 def _jitted(draw, more):
-    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
-    return jax.jit(draw, static_argnums=range(3, 5 + more), compiler_options=options)
+    return jax.jit(draw, static_argnums=range(3, 5 + more), compiler_options=cpu_options(CPU_COMPILER_OPTIONS))
 
 
 def _draw_image(gaussians, camera, background, config, mesh):

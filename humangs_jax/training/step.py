@@ -11,6 +11,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, Key, PyTree, Scalar, Shaped
+from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
@@ -22,7 +23,6 @@ from humangs_jax.objectives.lpips import lpips
 from humangs_jax.objectives.metrics import psnr
 from humangs_jax.objectives.perceptual import perceptual_loss
 from humangs_jax.objectives.ssim import multiscale_structural_dissimilarity
-from humangs_jax.rendering.splatting import CPU_COMPILER_OPTIONS
 from humangs_jax.training import sharding
 from humangs_jax.training.config import LossConfig, TrainConfig
 from humangs_jax.training.disturbances import disturb
@@ -265,8 +265,7 @@ def train_step(
 @functools.cache
 def jitted_train_step() -> Any:
     """The jitted function behind `train_step`, called as f(state, batch, body, networks, config=, mesh=)."""
-    # chosen when first used: asking for the backend would start it
-    options = CPU_COMPILER_OPTIONS if jax.default_backend() == "cpu" else None
+    options = cpu_options(CPU_COMPILER_OPTIONS)
     return jax.jit(_train_step, static_argnames=("config", "mesh"), donate_argnames="state", compiler_options=options)
 
 
