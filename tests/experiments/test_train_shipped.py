@@ -1,12 +1,21 @@
 """The command that trains the shipped weights."""
 
+import functools
 import typing
 from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
 import tyro
 
 from experiments.training import train_shipped
+from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.presets import tiny
+from humangs_jax.network.weights import load_weights, save_weights
+
+HALF_PRECISION = 2**-11
+"""Relative: the file has float16."""
 
 
 @pytest.mark.parametrize(("given", "expected"), [("shipped", "shipped"), ("old.safetensors", Path("old.safetensors"))])
@@ -17,3 +26,21 @@ def test_the_shipped_weights_have_a_name(given, expected):
         return init_weights
 
     assert tyro.cli(command, args=["--init-weights", given]) == expected
+
+
+def test_the_mean_of_the_first_and_the_trained_weights(tmp_path):
+    shapes = jax.eval_shape(functools.partial(init_humangs, config=tiny()), jax.random.key(0))
+    random = np.random.default_rng(0)
+    made = lambda leaf: random.normal(size=leaf.shape).astype(leaf.dtype)
+    first, last = jax.tree.map(made, shapes), jax.tree.map(made, shapes)
+    save_weights(tmp_path / "weights.safetensors", last, tiny())
+    train_shipped.write_mean(tmp_path, first, 0.25)
+    mean, model = load_weights(tmp_path / "mean.safetensors")
+    assert model.conventions == tiny().conventions
+    expected = jax.tree.map(lambda a, b: 0.25 * np.asarray(a) + 0.75 * np.asarray(b), first, last)
+    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, HALF_PRECISION), mean, expected)
+
+
+def test_a_share_of_no_first_weights_is_an_error(tmp_path):
+    with pytest.raises(ValueError, match=r"start_share 0.5: expected .* init_weights"):
+        train_shipped.main(tmp_path, start_share=0.5)
