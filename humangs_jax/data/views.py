@@ -1,6 +1,7 @@
 """Photos of one subject with the body parameters of each, and the inputs that the network computes from them."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,7 @@ from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.arrays import checksum
 from humangs_jax.io.images import resized
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
@@ -68,19 +70,42 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     of its surface where the network works on one.
 
     Its `spacing` is relative to the mesh that the weights were trained with: 1 unless `execution.longest_edge` asks for more
-    vertices or `execution.body_vertices` for fewer. Raises: ValueError for both.
+    vertices or `execution.body_vertices` for fewer. Takes as long as a small network on a CPU, so the last few are kept.
+    Raises: ValueError for both.
     """
-    vertices, edge = config.conventions.body_vertices, config.conventions.longest_edge
-    if None not in (config.execution.body_vertices, config.execution.longest_edge):
+    trained, asked = config.conventions, config.execution
+    if None not in (asked.body_vertices, asked.longest_edge):
         raise ValueError(
             "execution: body_vertices asks for fewer vertices, longest_edge for more: expected one of them"
         )
+    wanted = config.architecture.surface_map
+    settings = (trained.body_vertices, trained.longest_edge, asked.body_vertices, asked.longest_edge, wanted)
+    return body if settings == (None,) * 5 else _remeshed(_ByContent(body), *settings)
+
+
+class _ByContent:
+    """A key of caches: bodies that were read twice are equal."""
+
+    def __init__(self, body: BodyModel) -> None:
+        leaves, structure = jax.tree.flatten(body)
+        self.body = body
+        self.checksum = checksum({str(i): leaf for i, leaf in enumerate(leaves)}, str(structure))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByContent) and self.checksum == other.checksum
+
+    def __hash__(self) -> int:
+        return hash(self.checksum)
+
+
+@functools.lru_cache(maxsize=4)
+def _remeshed(key, vertices, edge, fewer, longest, wanted):
+    body = key.body
     if vertices is not None and vertices < len(body.template):
         body = decimate(body, vertices)
     whole = body
     if edge is not None:
         body = replace(split_long_edges(body, edge), spacing=None)
-    fewer, longest = config.execution.body_vertices, config.execution.longest_edge
     if fewer is not None and fewer < len(whole.template):
         coarse = decimate(whole, fewer)
         if edge is not None:  # edges as much longer as the body has fewer vertices on the same area
@@ -89,7 +114,6 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
         body = replace(coarse, spacing=jnp.full(len(coarse.template), wider, body.template.dtype))
     if longest is not None:
         body = split_long_edges(body, longest)
-    wanted = config.architecture.surface_map
     return body if wanted is None else replace(body, texels=surface_texels(body, wanted))
 
 

@@ -197,6 +197,16 @@ def test_bodies_of_fewer_vertices_have_wider_gaussians(body):
         gaussian_body(body, config.with_execution(body_vertices=200, longest_edge=0.1))
 
 
+def test_a_body_that_was_read_twice_is_remeshed_once(body):
+    config = tiny().with_conventions(body_vertices=300)
+    again = jax.tree.map(lambda leaf: jnp.array(leaf, copy=True), body)
+    made = gaussian_body(body, config)
+    assert gaussian_body(again, config) is made and len(made.template) == 300
+    moved = gaussian_body(replace(body, template=body.template + 0.1), config)
+    np.testing.assert_allclose(moved.template, made.template + 0.1, atol=1e-6)
+    assert gaussian_body(replace(body, name="another"), config).name == "another"
+
+
 def test_the_size_of_the_photos_is_a_choice_of_execution():
     config = tiny().with_execution(image_size=64)
     assert (tiny().image_size, config.image_size, config.conventions.image_size) == (32, 64, 32)

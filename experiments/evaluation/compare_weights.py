@@ -1,0 +1,84 @@
+"""Weights side by side: feed-forward and refined, of the same people.
+
+    python experiments/evaluation/refinement.py --split validation --seconds 5 --sizes 256 --weights A --json a.json     # each
+    python experiments/evaluation/compare_weights.py first=a.json trained=b.json --page docs/evaluation.md
+
+The scores are those of `refinement.py`, means over its people, from four photos of 256 pixels.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import add_outputs, check_section, markdown_table, write_outputs
+
+TABLE = "weights_choice"
+CELL = "256 4 network"
+SCORES = {"psnr": ("PSNR", 2), "psnr_foreground": ("on the person", 2), "ssim": ("SSIM", 4), "fog": ("fog", 3)}
+TASKS = {"novel": "same pose", "animation": "unseen poses"}
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("results", nargs="+", metavar="NAME=JSON", help="results of refinement.py")
+    add_outputs(parser, TABLE)
+    arguments = parser.parse_args()
+    if arguments.page:
+        check_section(arguments.page, TABLE)
+    named = dict(pair.split("=", 1) for pair in arguments.results)
+    means = compare({name: json.loads(Path(path).read_text()) for name, path in named.items()})
+    write_outputs(arguments, TABLE, section(means), means)
+
+
+def compare(results: dict[str, Any]) -> dict[str, Any]:
+    """{name: {seconds: {task: {score: mean}}}}.
+
+    Raises: ValueError if two results are not of the same people and settings.
+    """
+    common = [
+        ({name: value for name, value in result["settings"].items() if name != "weights"}, seeds(result))
+        for result in results.values()
+    ]
+    for name, found in zip(results, common, strict=True):
+        if found != common[0]:
+            raise ValueError(
+                f"{name}: expected the people and settings of {next(iter(results))}: {common[0]}, got {found}"
+            )
+    return {
+        name: {
+            run: {task: {score: mean(result, run, task, score) for score in SCORES} for task in TASKS}
+            for run in result["subjects"][0]["cells"][CELL]
+            if run.isdigit()
+        }
+        for name, result in results.items()
+    }
+
+
+def seeds(result: dict[str, Any]) -> list[int]:
+    """Of its people."""
+    return [subject["seed"] for subject in result["subjects"]]
+
+
+def mean(result: dict[str, Any], run: str, task: str, score: str) -> float:
+    """Over its people."""
+    values = [subject["cells"][CELL][run][task][score] for subject in result["subjects"]]
+    return sum(values) / len(values)
+
+
+def section(means: dict[str, Any]) -> str:
+    """The table."""
+    header = ["weights", "refined, s", *(f"{task}: {name}" for task in TASKS.values() for name, _ in SCORES.values())]
+    rows = [
+        [name, run, *(f"{scores[task][score]:.{digits}f}" for task in TASKS for score, (_, digits) in SCORES.items())]
+        for name, runs in means.items()
+        for run, scores in runs.items()
+    ]
+    return markdown_table(header, rows)
+
+
+if __name__ == "__main__":
+    main()
