@@ -115,14 +115,15 @@ def write_outputs(arguments: argparse.Namespace, name: str, text: str, numbers: 
 
 
 def publish(page: Path, name: str, text: str, numbers: object = None, row: str | None = None) -> None:
-    """Writes results/NAME.json beside a page, and the page's section of that name.
+    """Writes results/NAME.json beside a page (for a README.md in its docs/), and the page's section of that name.
 
     row: the first cell of the rows of this run. They replace those of the same name, other rows and their numbers stay.
 
     Raises: FileNotFoundError; ValueError if the page lacks the section.
     """
     check_section(page, name)
-    path, blocks = page.parent / "results" / f"{name}.json", blocks_of(text)
+    folder = page.parent / "docs" if page.name == "README.md" else page.parent
+    path, blocks = folder / "results" / f"{name}.json", blocks_of(text)
     record = run_record()
     if row is not None and path.exists():
         old = json.loads(path.read_text())

@@ -1,0 +1,73 @@
+"""README's tables of quality and of the demo's times, from what other programs have written.
+
+HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --refine 15s --out b
+python experiments/evaluation/synthetic.py --subjects 32 --views 1 2 4 6 --json evaluation.json
+python experiments/evaluation/readme.py --timed a/report.json --refined b/report.json --people evaluation.json
+
+Times are those of an idle machine, from an empty compile cache.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import REPOSITORY, markdown_table, publish, significant
+
+VIEWS = "4"
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--timed", type=Path, required=True, help="report of the unrefined demo, nothing compiled before"
+    )
+    parser.add_argument("--refined", type=Path, required=True, help="report of the refined demo")
+    parser.add_argument("--people", type=Path, required=True, help="result of synthetic.py")
+    arguments = parser.parse_args()
+    timed, refined, people = (
+        json.loads(path.read_text()) for path in (arguments.timed, arguments.refined, arguments.people)
+    )
+    for name, text in {"readme_quality": quality(refined, people), "readme_demo": times(timed)}.items():
+        print(text)
+        publish(REPOSITORY / "README.md", name, text)
+
+
+def quality(demo: dict[str, Any], people: dict[str, Any]) -> str:
+    """The demo person and the test people. Raises: ValueError if the demo was not refined."""
+    if "refined" not in demo:
+        raise ValueError("the report of the refined demo has no refined scores: expected `humangs demo --refine 15s`")
+    dashes = {"baseline_psnr": None, "baseline_psnr_foreground": None}
+    rows = {
+        f"the shipped person ({demo['views']['held_out']} views)": demo,
+        f"the same, refined for {demo['refined']['seconds']:.0f} s": demo["refined"] | dashes,
+        f"{len(people['subjects'])} people of the test seeds, other cameras": people["by_views"][VIEWS]["novel"],
+        f"these {len(people['subjects'])}, in poses that no photo shows": people["by_views"][VIEWS]["animation"],
+    }
+    columns = {"psnr": 1, "ssim": 3, "psnr_foreground": 1, "baseline_psnr": 1, "baseline_psnr_foreground": 1}
+    cells = lambda scores: ["" if scores[key] is None else f"{scores[key]:.{n}f}" for key, n in columns.items()]
+    header = ["", "PSNR", "SSIM", "PSNR on the person", "painted body mesh: PSNR", "on the person"]
+    return markdown_table(header, [[name, *cells(scores)] for name, scores in rows.items()])
+
+
+def times(demo: dict[str, Any]) -> str:
+    """Of the demo's stages."""
+    spent, views = demo["timings"], demo["views"]
+    stages = {
+        f"reconstruct: {views['input']} photos of {demo['image_size'][0]} px -> {demo['gaussians']:,} Gaussians": "reconstruct",
+        "animate: one pose": "animate",
+        f"render {views['held_out']} views": "render_held_out",
+    }
+    rows = [
+        [name, f"{spent[stage]['compile']:.1f} s", f"{significant(1000 * spent[stage]['run'])} ms"]
+        for name, stage in stages.items()
+    ]
+    whole = ["everything, files included, without refinement (`--refine 0`)", "", f"{demo['total_seconds']:.0f} s"]
+    return markdown_table(["stage", "compile", "run"], [*rows, whole], "lll")
+
+
+if __name__ == "__main__":
+    main()
