@@ -64,6 +64,7 @@ def main() -> None:
 
 def sweep(arguments: argparse.Namespace) -> dict[str, Any]:
     """Measures what the file does not have."""
+    import jax
     from tqdm import tqdm
 
     from experiments.tradeoff.points import points
@@ -82,7 +83,10 @@ def sweep(arguments: argparse.Namespace) -> dict[str, Any]:
     if not missing and result["growth"]:
         return result
     bench = Bench(subjects, arguments.people, arguments.rounds)
-    for i, each in tqdm(missing, desc="points"):  # all of one person, then the next: times are of the first
+    # all of one person, then the next: times are of the first
+    for done, (i, each) in enumerate(tqdm(missing, desc="points")):
+        if done % 20 == 19:
+            jax.clear_caches()  # compiled programs hold memory maps, of which Linux gives a process 65,530
         bench.measure(each, i, rows[each.name])
         write_json(path, result)
     if not result["growth"]:

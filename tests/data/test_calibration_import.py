@@ -9,6 +9,7 @@ from PIL import Image
 from humangs_jax.data.calibration.calibration import (
     CONVENTIONS,
     WORLD_FROM_CAM_OPENGL,
+    _squared_reach,
     distort,
     undistort,
     undistort_person,
@@ -477,3 +478,13 @@ def test_a_bare_photo_of_16_bits_stays_what_it_is(rig):
     Image.fromarray(deep).save(rig[1] / "a.png")
     import_rig(rig)
     np.testing.assert_allclose(read_image(rig[2] / "images" / "a.png")[0][..., 0], deep / 65535, rtol=1e-6)
+
+
+@pytest.mark.parametrize("k3", [0.0, 1e-310, -1e-310, 1e90, -1e90, 0.02])
+def test_where_a_lens_folds(k3):
+    """At the first root of d/dr (r + k1 r^3 + k2 r^5 + k3 r^7), whatever the size of the coefficients."""
+    reach = _squared_reach(np.array([-0.3, 0.05, 0.0, 0.0, k3]))
+    slope = lambda squared: 1 - 0.9 * squared + 0.25 * squared**2 + 7 * k3 * squared**3
+    assert np.isinf(reach) or abs(slope(reach)) < 1e-6 or reach < 1e-30
+    assert all(slope(0.999 * share * reach) > 0 for share in (0.1, 0.5, 1.0)) or reach > 1e30
+    assert np.isinf(_squared_reach(np.zeros(5))) and 0 <= _squared_reach(np.full(5, -1e308)) < 1e-30

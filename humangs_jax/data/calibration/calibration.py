@@ -16,6 +16,8 @@ from humangs_jax.io.reading import limits
 
 ROUNDED_ROTATION = 5e-3
 """R R^T of matrices written with three decimals (EasyMocap) is this far from 1; they are replaced by the nearest rotation."""
+LARGEST_COEFFICIENT = 1e100
+"""Of a lens: products of larger ones are not finite."""
 ROTATION_TO_Y_UP = {
     "+x": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
     "-x": ((0, 1, 0), (-1, 0, 0), (0, 0, 1)),
@@ -254,7 +256,7 @@ def _in_photo(pixels, K, coefficients):
 
 def _squared_reach(coefficients):
     """r^2 up to which r (1 + k1 r^2 + ..) grows. Beyond it the formula folds the image back over itself."""
-    k1, k2, _, _, k3 = coefficients
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1])
-    real = roots[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)].real
-    return real.min() if len(real) else np.inf
+    k1, k2, _, _, k3 = np.clip(coefficients, -LARGEST_COEFFICIENT, LARGEST_COEFFICIENT)
+    roots = np.roots([1, 3 * k1, 5 * k2, 7 * k3])  # 1 / r^2, so that tiny coefficients are not divided by
+    real = roots[(np.abs(roots.imag) <= 1e-9 * np.abs(roots.real)) & (roots.real > 0)].real
+    return 1 / real.max() if len(real) else np.inf
