@@ -1,6 +1,6 @@
 """README's tables of quality and of the demo's times, from what other programs have written.
 
-HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --refine 15s --out b
+HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --refine 15 --out b
 python experiments/evaluation/synthetic.py --subjects 32 --views 1 2 4 6 --json evaluation.json
 python experiments/evaluation/readme.py --timed a/report.json --refined b/report.json --people evaluation.json
 
@@ -39,7 +39,7 @@ def main() -> None:
 def quality(demo: dict[str, Any], people: dict[str, Any]) -> str:
     """The demo person and the test people. Raises: ValueError if the demo was not refined."""
     if "refined" not in demo:
-        raise ValueError("the report of the refined demo has no refined scores: expected `humangs demo --refine 15s`")
+        raise ValueError("the report of the refined demo has no refined scores: expected `humangs demo --refine 15`")
     dashes = {"baseline_psnr": None, "baseline_psnr_foreground": None}
     rows = {
         f"the shipped person ({demo['views']['held_out']} views)": demo,
