@@ -80,8 +80,8 @@ def main(
         validation = out / "validation"
         write_set(validation, VALIDATION_SUBJECTS, Layout(256, poses=2, views=12), "validation")
     training = training_people(None, people, out, body) if bank is None else on_the_fly_people(load_bank(bank))
-    train(config, body, training, out, validation=find_captures(validation), variables=variables)
-    if start_share:
+    state = train(config, body, training, out, validation=find_captures(validation), variables=variables)
+    if start_share and int(state.step) == config.steps:
         write_mean(out, variables, start_share)
 
 
