@@ -37,6 +37,8 @@ from hypothesis import strategies as st  # noqa: E402
 
 CHUNK = 500
 """Inputs that hypothesis draws from one seed: its number among those of the reader."""
+LARGEST = 1 << 26
+"""Bytes of a mutated file: reading what is honestly large takes memory within the limits of docs/security.md."""
 MOST_MAPPINGS = 20_000
 """Every compiled program maps memory, of which Linux allows 65,530 pieces: with more than this the fuzzer starts itself again."""
 
@@ -449,6 +451,8 @@ def fuzz(name, folder, inputs, number, watch):
         try:
             content = mutate(honest, draw)
         except (OverflowError, TypeError, ValueError):  # values that the format itself cannot hold
+            content = mutated_bytes(honest, draw)
+        if len(content) > LARGEST:
             content = mutated_bytes(honest, draw)
         file.write_bytes(content)
         try:
