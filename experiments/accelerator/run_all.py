@@ -307,7 +307,8 @@ def batch_sizes(arguments: argparse.Namespace) -> Iterator[Measurement]:
         import jax
 
         from experiments.common.interleaved import medians
-        from experiments.training.cases import Case, compiler_options
+        from experiments.training.cases import Case
+        from humangs_jax.core.compiler_options import compiler_options
 
         with tempfile.TemporaryDirectory() as folder:
             case = Case(preset, size, 4 if preset == "small" else 2, 3 if preset == "small" else 2, "float32", batch)

@@ -49,24 +49,14 @@ def compare(results: dict[str, Any]) -> dict[str, Any]:
                 f"{name}: expected the people and settings of {next(iter(results))}: {common[0]}, got {found}"
             )
     return {
-        name: {
-            run: {task: {score: mean(result, run, task, score) for score in SCORES} for task in TASKS}
-            for run in result["subjects"][0]["cells"][CELL]
-            if run.isdigit()
-        }
-        for name, result in results.items()
+        name: {run: {task: {key: tasks[task][key] for key in SCORES} for task in TASKS} for run, tasks in runs.items()}
+        for name, runs in ((name, result["means"][CELL]) for name, result in results.items())
     }
 
 
 def seeds(result: dict[str, Any]) -> list[int]:
     """Of its people."""
     return [subject["seed"] for subject in result["subjects"]]
-
-
-def mean(result: dict[str, Any], run: str, task: str, score: str) -> float:
-    """Over its people."""
-    values = [subject["cells"][CELL][run][task][score] for subject in result["subjects"]]
-    return sum(values) / len(values)
 
 
 def section(means: dict[str, Any]) -> str:

@@ -119,9 +119,9 @@ def compiled_step():
     """The jitted `lm_step`."""
     import jax
 
-    from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+    from humangs_jax.core.compiler_options import compiler_options
 
-    return jax.jit(lm_step, static_argnames=("config", "splat"), compiler_options=cpu_options(CPU_COMPILER_OPTIONS))
+    return jax.jit(lm_step, static_argnames=("config", "splat"), compiler_options=compiler_options())
 
 
 def lm_step(parameters, trust, damping, avatar, photos, config, splat):

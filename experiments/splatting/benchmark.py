@@ -146,7 +146,7 @@ def compiled(
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+    from humangs_jax.core.compiler_options import compiler_options
     from humangs_jax.rendering.splatting import render
 
     gaussians, camera = scene.gaussians(dtype), scene.camera(dtype)
@@ -158,7 +158,7 @@ def compiled(
     def loss(gaussians):
         return jnp.mean((forward(gaussians).rgb - goal) ** 2)
 
-    options = cpu_options(CPU_COMPILER_OPTIONS)
+    options = compiler_options()
     programs, facts = {}, {}
     for name, function in zip(DIRECTIONS, (forward, jax.value_and_grad(loss)), strict=True):
         started = time.perf_counter()

@@ -29,7 +29,7 @@ def benchmark(source: str, size: int, repeats: int) -> dict[str, Any]:
 
     from humangs_jax.body.library import load_body
     from humangs_jax.body.model import shape_body
-    from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+    from humangs_jax.core.compiler_options import compiler_options
     from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
     from humangs_jax.rendering.splatting import plan_buffers, render
 
@@ -38,7 +38,7 @@ def benchmark(source: str, size: int, repeats: int) -> dict[str, Any]:
     vertices = shape_body(body, jnp.zeros(body.shape_directions.shape[-1])).vertices
     vertices = vertices + jnp.mean(gaussians.means, axis=0) - jnp.mean(vertices, axis=0)
     config = plan_buffers(gaussians, camera, margin=1.0)
-    options = cpu_options(CPU_COMPILER_OPTIONS)
+    options = compiler_options()
     splat = jax.jit(lambda g: render(g, camera, config).rgb, compiler_options=options)
     mesh = jax.jit(lambda v: rasterize_mesh(v, body.faces, camera), compiler_options=options)
     covered = float((mesh(vertices).face_ids >= 0).mean())

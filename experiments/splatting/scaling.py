@@ -98,7 +98,7 @@ def compiled_views(scene: Scene, views: int, at_once: bool) -> tuple[dict[str, C
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+    from humangs_jax.core.compiler_options import compiler_options
     from humangs_jax.rendering.splatting import plan_buffers, render, render_views
 
     gaussians, cameras = scene.gaussians(), orbiting(scene, VIEW_ANGLE * np.arange(views))
@@ -113,7 +113,7 @@ def compiled_views(scene: Scene, views: int, at_once: bool) -> tuple[dict[str, C
     def loss(gaussians):
         return jnp.mean((forward(gaussians).rgb - goal) ** 2)
 
-    options = cpu_options(CPU_COMPILER_OPTIONS)
+    options = compiler_options()
     programs, facts = {}, {}
     for name, function in zip(DIRECTIONS, (forward, jax.value_and_grad(loss)), strict=True):
         program = jax.jit(function, compiler_options=options).lower(gaussians).compile()

@@ -53,7 +53,7 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+    from humangs_jax.core.compiler_options import compiler_options
     from humangs_jax.rendering import binning
     from humangs_jax.rendering.compositing import pack_splats
     from humangs_jax.rendering.projection import project, squared_reach
@@ -64,7 +64,7 @@ def stages(scene: Scene, config: Any) -> dict[str, Any]:
     schedule, runs = small_blocks if on_cpu else fat_chunks, {}
 
     def stage(name, function, *arguments):
-        program = jax.jit(function, compiler_options=cpu_options(CPU_COMPILER_OPTIONS))
+        program = jax.jit(function, compiler_options=compiler_options())
         program = program.lower(*arguments).compile()
         runs[name] = lambda: jax.block_until_ready(program(*arguments))
         return program(*arguments)

@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.compiled_costs import compiled_costs
 from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
 from experiments.common.results import markdown_table, publish, write_json
-from experiments.training.cases import CASES, Case, compiler_options
+from experiments.training.cases import CASES, Case
 from experiments.training.variants import stage_numbers, variant_numbers
 
 MEBI = 1 / 2**20
@@ -93,6 +93,7 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
     import jax
 
     from experiments.reconstruction.cases import matmul_program
+    from humangs_jax.core.compiler_options import compiler_options
 
     program, compile_s = case.compiled(compiler_options())
     case.program = program

@@ -198,10 +198,3 @@ def first(batch: Any) -> Any:
     import jax
 
     return jax.tree.map(lambda x: x[0], batch)
-
-
-def compiler_options() -> dict[str, Any] | None:
-    """Those of a training step here."""
-    from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
-
-    return cpu_options(CPU_COMPILER_OPTIONS)

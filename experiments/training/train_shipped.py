@@ -5,8 +5,8 @@
 
 The run is the preset `small` of training/config.py. Every setting is an option: `--steps 4000 --optimizer.learning-rate 2e-4`.
 Makes the people first: `--people` of the training seeds, rendered anew for every step, and 8 of the validation seeds. The same
-command continues the run in `--out`; Ctrl-C, SIGTERM and the end of `--hours` save. Weights that continue others are often
-worse than the mean of both (Wortsman et al. 2022, https://arxiv.org/abs/2109.01903): `--start-share` writes it.
+command continues the run in `--out`; Ctrl-C, SIGTERM and the end of `--hours` save. The mean of the first and
+the trained weights is often better than both (Wortsman et al. 2022, https://arxiv.org/abs/2109.01903): `--start-share` writes it.
 
 On 2 CPU cores: 2.6 s a person, then 1.2 s a step on an otherwise quiet machine. How the shipped weights came about is in
 humangs_jax/assets/weights.md.

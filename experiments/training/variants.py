@@ -11,13 +11,15 @@ from typing import Any
 
 from experiments.common.compiled_costs import compiled_costs
 from experiments.common.interleaved import medians
-from experiments.training.cases import Case, compiler_options, first, fresh_state
+from experiments.training.cases import Case, first, fresh_state
 
 MEBI = 1 / 2**20
 
 
 def variants(case: Case) -> dict[str, tuple[dict[str, Any], dict[str, Any] | None, bool]]:
     """Changes to the settings, compiler options, and whether convolutions are differentiated by XLA alone."""
+    from humangs_jax.core.compiler_options import compiler_options
+
     options = compiler_options()
     model = case.config.model
     return {
@@ -79,6 +81,8 @@ def stage_numbers(case: Case, repeats: int, warm_up: int) -> dict[str, list[floa
     """(wall, CPU ms) of parts of a step, each a program; of reading a batch from kept images and from disk."""
     import jax
 
+    from humangs_jax.core.compiler_options import compiler_options
+
     programs = {}
     for name, (function, inputs) in stages(case).items():
         program = jax.jit(function, compiler_options=compiler_options()).lower(*inputs).compile()
@@ -96,6 +100,7 @@ def stages(case: Case) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
     import jax.numpy as jnp
     import optax
 
+    from humangs_jax.core.compiler_options import compiler_options
     from humangs_jax.core.pytree import replace
     from humangs_jax.data.views import prepare_inputs
     from humangs_jax.network.humangs import decode, part_variables

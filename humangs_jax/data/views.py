@@ -70,8 +70,10 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     of its surface where the network works on one.
 
     Its `spacing` is relative to the mesh that the weights were trained with: 1 unless `execution.longest_edge` asks for more
-    vertices or `execution.body_vertices` for fewer. Takes as long as a small network on a CPU, so the last few are kept.
-    Raises: ValueError for both.
+    vertices or `execution.body_vertices` for fewer. The last four results are kept: making one takes as long as
+    a small network does on a CPU.
+
+    Raises: ValueError if `execution` has both.
     """
     trained, asked = config.conventions, config.execution
     if None not in (asked.body_vertices, asked.longest_edge):

@@ -21,7 +21,7 @@ from jax import lax
 
 from humangs_jax.body.skinning import joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.core.configuration import knob
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace
@@ -349,8 +349,7 @@ def jitted_example(bank: PeopleBank, key: Key, config: OnTheFlyConfig = ON_THE_F
 
 @functools.cache
 def _compiled():
-    options = cpu_options(CPU_COMPILER_OPTIONS)
-    return jax.jit(on_the_fly_example, static_argnames="config", compiler_options=options)
+    return jax.jit(on_the_fly_example, static_argnames="config", compiler_options=compiler_options())
 
 
 def on_the_fly_source(

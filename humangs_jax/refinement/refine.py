@@ -21,7 +21,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
-from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
@@ -287,7 +287,7 @@ def _planned(avatar: Avatar, photos: SubjectViews | Photos) -> SplatConfig:
 @functools.cache
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     static = [name for name in ("config", "splat", "mesh", "count") if name in inspect.signature(function).parameters]
-    return jax.jit(function, static_argnames=static, compiler_options=cpu_options(CPU_COMPILER_OPTIONS))
+    return jax.jit(function, static_argnames=static, compiler_options=compiler_options())
 
 
 def _check(avatar, capture, config, mesh):

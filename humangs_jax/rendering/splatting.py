@@ -17,7 +17,7 @@ from jax.sharding import Mesh
 
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.checks import FINITE, check_values
-from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.rendering import constants
 from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers, raise_on_overflow, with_default_buffers
@@ -40,7 +40,7 @@ def render(
         rendering = render(gaussians, camera)             # eager: inputs are checked, buffers sized to the scene
         config = plan_buffers(gaussians, cameras)         # for calls inside jit, vmap and grad: sized once
         loss = lambda gaussians: jnp.mean((render(gaussians, camera, config).rgb - photo) ** 2)
-        gradient = jax.jit(jax.grad(loss), compiler_options=CPU_COMPILER_OPTIONS)(gaussians)   # options: on a CPU
+        gradient = jax.jit(jax.grad(loss), compiler_options=compiler_options())(gaussians)
 
     Arguments: gaussians: (g, ...) one set, metres. camera: one camera; its size is the image's. config: what is drawn, and
     the buffers. background: (3,) RGB; None: white. mesh: of one axis, whose devices share the image's rows of tiles; None:
@@ -116,7 +116,7 @@ def _render(
 
 @functools.cache
 def _jitted(draw, more):
-    return jax.jit(draw, static_argnums=range(3, 5 + more), compiler_options=cpu_options(CPU_COMPILER_OPTIONS))
+    return jax.jit(draw, static_argnums=range(3, 5 + more), compiler_options=compiler_options())
 
 
 def _draw_image(gaussians, camera, background, config, mesh):

@@ -11,7 +11,7 @@ from jax.sharding import Mesh, PartitionSpec
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float, Int, Key, PyTree, Scalar, Shaped
-from humangs_jax.core.compiler_options import CPU_COMPILER_OPTIONS, cpu_options
+from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
@@ -265,8 +265,9 @@ def train_step(
 @functools.cache
 def jitted_train_step() -> Any:
     """The jitted function behind `train_step`, called as f(state, batch, body, networks, config=, mesh=)."""
-    options = cpu_options(CPU_COMPILER_OPTIONS)
-    return jax.jit(_train_step, static_argnames=("config", "mesh"), donate_argnames="state", compiler_options=options)
+    return jax.jit(
+        _train_step, static_argnames=("config", "mesh"), donate_argnames="state", compiler_options=compiler_options()
+    )
 
 
 def _train_step(state, batch, body, networks, config, mesh):

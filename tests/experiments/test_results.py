@@ -62,6 +62,13 @@ def test_a_result_is_written_beside_its_page(page, monkeypatch):
         publish(page, "z", TABLE)
 
 
+def test_results_of_a_readme_are_in_its_docs(page):
+    readme = page.parents[1] / "README.md"
+    readme.write_text(page.read_text())
+    publish(readme, "x", TABLE, 1)
+    assert TABLE in readme.read_text() and (page.parent / "results" / "x.json").exists()
+
+
 def test_rows_of_other_runs_stay(page):
     publish(page, "x", TABLE, 1, row="a")
     publish(page, "x", "| run | PSNR | name |\n|---|---:|---|\n| b | 3.0 | z |", 2, row="b")

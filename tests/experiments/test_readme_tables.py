@@ -1,0 +1,34 @@
+"""README's tables from what the demo and the evaluation have written."""
+
+import pytest
+
+from experiments.evaluation.readme import quality, times
+
+SCORES = {"psnr": 27.44, "ssim": 0.9464, "psnr_foreground": 18.75}
+BASELINE = {"baseline_psnr": 20.67, "baseline_psnr_foreground": 11.28}
+STAGES = {"reconstruct": (11.63, 0.291), "animate": (2.07, 0.0341), "render_held_out": (6.87, 0.1236)}
+DEMO = {
+    **SCORES,
+    **BASELINE,
+    "views": {"input": 4, "held_out": 6},
+    "image_size": [256, 256],
+    "gaussians": 20376,
+    "timings": {name: {"compile": first, "run": run} for name, (first, run) in STAGES.items()},
+    "total_seconds": 39.5,
+}
+
+
+def test_quality():
+    people = {"subjects": [{}] * 3, "by_views": {"4": {task: SCORES | BASELINE for task in ("novel", "animation")}}}
+    rows = quality(DEMO | {"refined": SCORES | {"psnr": 29.16, "seconds": 15.2}}, people).splitlines()[2:]
+    assert rows[0] == "| the shipped person (6 views) | 27.4 | 0.946 | 18.8 | 20.7 | 11.3 |"
+    assert rows[1] == "| the same, refined for 15 s | 29.2 | 0.946 | 18.8 |  |  |"
+    assert rows[2].startswith("| 3 people of the test seeds, other cameras | 27.4 |") and len(rows) == 4
+    with pytest.raises(ValueError, match="expected `humangs demo --refine 15`"):
+        quality(DEMO, people)
+
+
+def test_times():
+    rows = times(DEMO).splitlines()[2:]
+    assert rows[0] == "| reconstruct: 4 photos of 256 px -> 20,376 Gaussians | 11.6 s | 291 ms |"
+    assert rows[1] == "| animate: one pose | 2.1 s | 34 ms |" and rows[3].endswith("|  | 40 s |")
