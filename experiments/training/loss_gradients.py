@@ -20,8 +20,8 @@ from experiments.common.results import add_outputs, markdown_table, write_output
 TABLE = "loss_gradients"
 DIRECTIONS = 3
 STEPS = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9)
-"""Of central differences, relative to the size of what is varied. Thousands of Gaussians move: within the longer steps some of them
-exchange places in the depth order, and the colours jump."""
+"""Of central differences, relative to the size of what is varied. Thousands of Gaussians move: within the longer steps some
+exchange places in the depth order, and colours jump."""
 NETWORKS = ("perceptual", "lpips")
 """Terms that need a network of their own."""
 SIDE, TARGETS, VERTICES = 32, 2, 800

@@ -53,6 +53,17 @@ class Start:
         require_at_least(0, person=self.person)
         if limits is not None and self.without_masks:
             raise UsageError("--refine needs masks: leave out --without-masks")
+        with stage("starting"):
+            from humangs_jax.apps.start import look
+            from humangs_jax.io.atomic import only_maker
+
+        material = look(self.photos, cameras=self.cameras, masks=self.masks, keypoints=self.keypoints)
+        tell(material)
+        with only_maker(self.out):
+            self._go_on(material, limits)
+
+    def _go_on(self, material: "Material", limits: dict[str, Any] | None) -> None:
+        """From where an earlier run came to an end, if there was one."""
         # by an earlier run that missed something, or was interrupted: nothing is lost
         begun = not (self.out / "body.npz").exists()
         fitted = (self.out / "fit.json").exists() and not (
@@ -60,11 +71,6 @@ class Start:
         )
         inputs = (self.photos, self.cameras, self.masks, self.keypoints)
         require_replaceable(self.out, self.overwrite or begun or fitted, "capture.json", inputs)
-        with stage("starting"):
-            from humangs_jax.apps.start import look, missing
-
-        material = look(self.photos, cameras=self.cameras, masks=self.masks, keypoints=self.keypoints)
-        tell(material)
         if fitted:
             with stage("reading the fit of an earlier run"):
                 from humangs_jax.data.capture import load_capture
@@ -75,6 +81,8 @@ class Start:
             return
         if self.overwrite:
             tell_deleted(self.out)
+        from humangs_jax.apps.start import missing
+
         undistorted = self._import(material) if material.cameras is not None else None
         needed = [each for each in missing(material, undistorted) if not (self.without_masks and each.name == "masks")]
         if needed:

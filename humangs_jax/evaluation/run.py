@@ -32,8 +32,8 @@ from humangs_jax.evaluation.tables import (
     shown,
     shown_mean,
 )
-from humangs_jax.io.atomic import write_text
-from humangs_jax.io.text import write_json
+from humangs_jax.io.atomic import write_texts
+from humangs_jax.io.text import json_text
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.objectives.lpips import Lpips
@@ -133,17 +133,15 @@ class Evaluation:
         markdown: str | os.PathLike | None = None,
         latex: str | os.PathLike | None = None,
     ) -> None:
-        """Write what is named: all numbers; the page; a line an image; tables of people. Raises: OSError."""
-        if json is not None:
-            write_json(json, self.to_json())
-        if csv is not None:
-            write_text(csv, csv_text(self.rows))
-        if markdown is not None:
-            write_text(markdown, markdown_table(*self.tables()))
-        if latex is not None:
-            write_text(latex, latex_table(*self.tables()))
-        if html is not None:
-            write_text(html, page_html(self.to_json(), self.notes(), self.gallery))
+        """Write all that is named, or nothing: all numbers; the page; a line an image; tables of people. Raises: OSError."""
+        texts = {
+            json: lambda: json_text(self.to_json()),
+            csv: lambda: csv_text(self.rows),
+            markdown: lambda: markdown_table(*self.tables()),
+            latex: lambda: latex_table(*self.tables()),
+            html: lambda: page_html(self.to_json(), self.notes(), self.gallery),
+        }
+        write_texts({path: text() for path, text in texts.items() if path is not None})
 
 
 def evaluate(

@@ -14,7 +14,7 @@ import shutil
 import time
 import uuid
 import zlib
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from pathlib import Path
 
 from humangs_jax.core.signals import undisturbed
@@ -41,23 +41,41 @@ def write_text(path: str | os.PathLike, text: str) -> None:
     write_bytes(path, text.encode())
 
 
-def replace_file(path: str | os.PathLike, write: Callable[[Path], object]) -> None:
-    """Calls write(temporary), which makes that file, and renames it to `path`. The temporary name has the same suffix.
+def write_texts(texts: Mapping[str | os.PathLike, str]) -> None:
+    """Write files in UTF-8, all of them or none. Raises: OSError."""
+    replace_files({path: functools.partial(Path.write_bytes, data=text.encode()) for path, text in texts.items()})
 
-    Raises: FileNotFoundError if the folder does not exist; OSError, naming `path`, if it cannot be written; what `write` raises.
+
+def replace_file(path: str | os.PathLike, write: Callable[[Path], object]) -> None:
+    """`replace_files` of one file."""
+    replace_files({path: write})
+
+
+def replace_files(writers: Mapping[str | os.PathLike, Callable[[Path], object]]) -> None:
+    """Calls write(temporary) for each path, which makes that file; then all are renamed to their paths at once.
+
+    If one of them cannot be written, none appears. Temporary names have the same suffix.
+
+    Raises: FileNotFoundError if a folder does not exist; OSError, naming the path, if it cannot be written; what `write` raises.
     """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"{path.parent}: no such folder")
-    _sweep(path.parent.resolve())
-    temporary = path.with_name(f".{path.stem}.new-{_tag()}{path.suffix}")
+    temporaries: dict[Path, Path] = {}
     try:
-        with _naming(path, temporary):
-            with _unfinished(temporary):
+        for path, write in ((Path(path), write) for path, write in writers.items()):
+            if not path.parent.is_dir():
+                raise FileNotFoundError(f"{path.parent}: no such folder")
+            _sweep(path.parent.resolve())
+            temporaries[path] = temporary = path.with_name(f".{path.stem}.new-{_tag()}{path.suffix}")
+            _being_written.add(temporary.absolute())
+            with _naming(path, temporary):
                 write(temporary)
-            temporary.replace(path)
+        with undisturbed():
+            for path, temporary in temporaries.items():
+                with _naming(path, temporary):
+                    temporary.replace(path)
     finally:
-        _delete(temporary)
+        for temporary in temporaries.values():
+            _being_written.discard(temporary.absolute())
+            _delete(temporary)
 
 
 def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *, mark: str) -> None:
@@ -229,13 +247,32 @@ def only_writer(folder: str | os.PathLike) -> Generator[None]:
 
 
 @contextlib.contextmanager
-def _locked(folder, wait):
+def only_maker(folder: str | os.PathLike) -> Generator[None]:
+    """`only_writer` of a folder that the work makes or replaces: what is locked is a file beside it, there until the work ends.
+
+    Raises: as `only_writer`; OSError, naming the folder, if nothing can be written beside it.
+    """
+    folder = Path(folder)
+    lock = folder.absolute().with_name(f".{folder.name}.lock")
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with _locked(lock, wait=False, folder=folder), _unfinished(lock):
+        try:
+            yield
+        finally:
+            _delete(lock)
+
+
+@contextlib.contextmanager
+def _locked(place, wait, folder=None):
+    """place: a folder, or a file that is made for this and stands for `folder`."""
     try:
         import fcntl
     except ImportError:  # Windows
         yield
         return
-    descriptor = os.open(folder, os.O_RDONLY)
+    folder = folder or place
+    with _naming(folder, place):
+        descriptor = os.open(place, os.O_RDONLY | (0 if folder == place else os.O_CREAT))
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))

@@ -9,7 +9,16 @@ from humangs_jax.io.atomic import write_text
 from humangs_jax.io.reading import FileError, Refused, limits, read_bytes, reading
 
 T = TypeVar("T")
-__all__ = ["FileError", "check_nesting", "parse_json", "read_configuration", "read_json", "read_text", "write_json"]
+__all__ = [
+    "FileError",
+    "check_nesting",
+    "json_text",
+    "parse_json",
+    "read_configuration",
+    "read_json",
+    "read_text",
+    "write_json",
+]
 
 
 def read_text(path: str | os.PathLike, limit: str = "text_bytes") -> str:
@@ -64,7 +73,12 @@ def read_configuration(cls: type[T], path: str | os.PathLike) -> T:
 
 def write_json(path: str | os.PathLike, value: Any, indent: int | None = 1) -> None:
     """Write a JSON file, whole or not at all. Raises: TypeError for what JSON cannot hold; OSError."""
-    write_text(path, json.dumps(value, indent=indent) + "\n")
+    write_text(path, json_text(value, indent))
+
+
+def json_text(value: Any, indent: int | None = 1) -> str:
+    """What `write_json` writes. Raises: TypeError for what JSON cannot hold."""
+    return json.dumps(value, indent=indent) + "\n"
 
 
 def read_json(path: str | os.PathLike) -> Any:

@@ -156,22 +156,34 @@ def test_a_full_disk_names_what_was_to_be_written(tmp_path):
         atomic.replace_file(tmp_path / "file", lambda temporary: temporary.write_bytes(source.read_bytes()))
 
 
-def test_a_folder_has_one_writer_at_a_time(tmp_path):
+def test_if_one_of_several_files_fails_none_appears(tmp_path):
+    (tmp_path / "a.csv").write_text("old")
+
+    def full(temporary):
+        raise OSError(errno.ENOSPC, "No space left", str(temporary))
+
+    with pytest.raises(OSError, match=r"No space left: '.*b\.html'"):
+        atomic.replace_files({tmp_path / "a.csv": lambda path: path.write_text("new"), tmp_path / "b.html": full})
+    assert names(tmp_path) == ["a.csv"] and (tmp_path / "a.csv").read_text() == "old"
+    atomic.write_texts({tmp_path / "a.csv": "new", tmp_path / "b.html": "whole"})
+    assert names(tmp_path) == ["a.csv", "b.html"] and (tmp_path / "a.csv").read_text() == "new"
+
+
+@pytest.mark.parametrize("lock", ["only_writer", "only_maker"])
+def test_a_folder_has_one_writer_at_a_time(tmp_path, lock):
+    place, held = tmp_path / "place", getattr(atomic, lock)
+    if lock == "only_writer":
+        place.mkdir()
     code = "import sys; from humangs_jax.io import atomic\n"
-    code += "with atomic.only_writer(sys.argv[1]): print('held', flush=True); input()"
-    with subprocess.Popen(
-        [sys.executable, "-c", code, tmp_path], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    ) as other:
+    code += f"with atomic.{lock}(sys.argv[1]): print('held', flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", code, place], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         other.stdout.readline()
-        with (
-            pytest.raises(BlockingIOError, match=f"{tmp_path}: another process is writing here"),
-            atomic.only_writer(tmp_path),
-        ):
+        with pytest.raises(BlockingIOError, match=f"{place}: another process is writing here"), held(place):
             pass
         other.kill()
-    with atomic.only_writer(tmp_path):
-        atomic.add_files(tmp_path / "folder", writes_into("whole"))
-    assert names(tmp_path) == ["folder"]
+    with held(place):
+        atomic.replace_folder(tmp_path / "place", writes("whole"), mark=MARK)
+    assert names(tmp_path) == ["place"]
 
 
 def test_places_are_checked_before_the_work(tmp_path, monkeypatch):

@@ -8,8 +8,8 @@ from experiments.training.loss_gradients import NETWORKS, agreement, network_cas
 OWN = 1e-7
 """Central differences of step h: h^2 of truncation and 1e-16 / h of rounding; terms with corners have some within a step."""
 WHOLE = 1e-4
-"""Of thousands of pixels some cross a corner (an absolute value, a ReLU, a Gaussian's least alpha) within a step, and some Gaussians
-exchange places in the depth order."""
+"""Of thousands of pixels some cross a corner (an absolute value, a ReLU, a Gaussian's least alpha) within a step, and some
+Gaussians exchange places in the depth order."""
 PLAIN = [name for name in term_names() if name not in NETWORKS]
 
 
