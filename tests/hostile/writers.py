@@ -661,7 +661,8 @@ def temporary(part: str) -> bool:
     """Whether a name in a path is one that `atomic` or Orbax gives what is not finished."""
     from humangs_jax.io.atomic import _TEMPORARY
 
-    return _TEMPORARY.fullmatch(part) is not None or ".orbax-checkpoint-tmp" in part
+    lock = part.startswith(".") and part.endswith(".lock")
+    return lock or _TEMPORARY.fullmatch(part) is not None or ".orbax-checkpoint-tmp" in part
 
 
 def snapshot(place: Path) -> tuple[dict[str, str], dict[str, str]]:
