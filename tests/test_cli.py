@@ -329,7 +329,7 @@ def test_another_error_because_of_an_interrupt_is_an_interrupt(sample, monkeypat
         raise ImportError("while initializing the extension")
 
     monkeypatch.setattr(Sample, "run", run)
-    assert cli.execute(["sample"]) == cli.INTERRUPTED and capsys.readouterr().err == "humangs: interrupted\n"
+    assert cli.execute(["sample"]) == cli.INTERRUPTED and capsys.readouterr().err == "\nhumangs: interrupted\n"
     monkeypatch.setattr(Sample, "run", lambda self: 1 / 0)  # a mistake of ours is not hidden
     with pytest.raises(ZeroDivisionError):
         cli.execute(["sample"])

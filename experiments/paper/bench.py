@@ -18,6 +18,8 @@ PHOTOS, TARGETS = 4, 6
 VIEW_COUNTS = (1, 2, 4, 6, 8)
 PER_PERSON = ("animatable",)
 """Systems that are fitted to one person, and so have no place in a training on many."""
+ABLATIONS = (", another seed", "tightness", "Gaussian", "no ", "features", "pooling", "all tokens", "canonical")
+"""Marks of names that are no system of tables 1 to 3."""
 NOISE = "noise"
 """The claim of variants that differ from another one in the seed alone."""
 
@@ -288,31 +290,20 @@ def measured(
     None if the system takes no such number of photos. The first person is run twice, and only the second run is timed: the first
     one compiles.
     """
-    import jax
-
-    from humangs_jax.avatar.reconstruct import reconstruct
-    from humangs_jax.avatar.targets import show_targets
-    from humangs_jax.evaluation.cases import Predicted, draw_views
     from humangs_jax.evaluation.run import evaluate
     from humangs_jax.evaluation.tables import mean_scores
 
-    variables, config = weights
+    config = weights[1]
     if takes_one(config) and photos > 1:
         return None
     seconds: dict[str, list[float]] = {"model": [], "frame": []}
 
     def method(case: Any, background: float) -> Any:
-        views, again = case.truth.view_count, not seconds["frame"]
-        for _ in range(1 + again):
-            start = time.perf_counter()
-            if config.architecture.runs_per_target:
-                images, alpha = show_targets(variables, config, case.inputs, case.truth, background)
-                modelled, predicted = start, Predicted(images, alpha, tuple(range(views)))
-            else:
-                avatar = jax.block_until_ready(reconstruct(variables, config, case.inputs))
-                modelled, predicted = time.perf_counter(), draw_views(avatar, case.truth, background)
-        seconds["model"].append(modelled - start)
-        seconds["frame"].append((time.perf_counter() - modelled) / views)
+        if not seconds["frame"]:
+            shown(weights, case, background)
+        predicted, modelled, drawn = shown(weights, case, background)
+        seconds["model"].append(modelled)
+        seconds["frame"].append(drawn / case.truth.view_count)
         return predicted
 
     found = evaluate(
@@ -328,6 +319,24 @@ def measured(
     means["model_s"] = None if per_target else sum(seconds["model"]) / len(seconds["model"])
     means["frame_s"] = sum(seconds["frame"]) / len(seconds["frame"])
     return means
+
+
+def shown(weights: tuple[Any, Any], case: Any, background: float = 1.0) -> tuple[Any, float, float]:
+    """What a system shows of a `Case`, as `Predicted`; seconds to model, 0 if it runs for each target, and to draw all views."""
+    import jax
+
+    from humangs_jax.avatar.reconstruct import reconstruct
+    from humangs_jax.avatar.targets import show_targets
+    from humangs_jax.evaluation.cases import Predicted, draw_views
+
+    start = modelled = time.perf_counter()
+    if weights[1].architecture.runs_per_target:
+        images, alpha = show_targets(*weights, case.inputs, case.truth, background)
+        predicted = Predicted(images, alpha, tuple(range(case.truth.view_count)))
+    else:
+        avatar = jax.block_until_ready(reconstruct(*weights, case.inputs))
+        modelled, predicted = time.perf_counter(), draw_views(avatar, case.truth, background)
+    return predicted, modelled - start, time.perf_counter() - modelled
 
 
 def takes_one(config: Any) -> bool:

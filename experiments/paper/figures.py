@@ -8,6 +8,7 @@ token     PSNR with and without the global token over 1, 2, 4, 6 and 8 photos; t
 features  histogram of what the features of four depths change in a patch of 64 x 64 pixels (at 512; in proportion otherwise) more
           than half of which is the person: LPIPS where --lpips is given, squared error otherwise; the paper: a positive skew
 driven    people of --people in the poses of other people (--motions; of each other without)
+systems   the first person by every system: a view in the pose of the photos, and one in a pose that no photo shows
 
 Variants that are not trained are left out, with a line that says so.
 """
@@ -24,12 +25,15 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import write_json
 from experiments.paper.bench import (
+    ABLATIONS,
     PHOTOS,
     VIEW_COUNTS,
     add_people_options,
     load_networks,
     measured,
     quick_people,
+    shown,
+    takes_one,
     trained,
 )
 
@@ -96,8 +100,8 @@ def varied(people: Path, count: int) -> dict[str, dict[str, list[int]]] | None:
         if (folder / "held_out").is_dir():
             return None
         frames = np.asarray(load_capture(folder).frames)
-        shown = sorted(set(frames.tolist()))[:-1] or [0]  # the last pose is unseen
-        context = [int(np.flatnonzero(frames == shown[i % len(shown)])[i // len(shown)]) for i in range(count)]
+        seen = sorted(set(frames.tolist()))[:-1] or [0]  # the last pose is unseen
+        context = [int(np.flatnonzero(frames == seen[i % len(seen)])[i // len(seen)]) for i in range(count)]
         chosen[folder.name] = {"context": context, "target": np.flatnonzero(frames == frames.max()).tolist()}
     return chosen or None
 
@@ -210,6 +214,38 @@ def driven(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace
     return {"people": list(people.names[:SHOWN])}
 
 
+def systems_shown(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, list[str]]:
+    """A column a system, the truth first."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from humangs_jax.evaluation.cases import find_people
+
+    names = [name for name in systems if not any(mark in name for mark in ABLATIONS)]
+    columns: dict[str, Any] = {}
+    for name in names:
+        photos = 1 if takes_one(systems[name][1]) else PHOTOS
+        case = find_people(arguments.people, photos, None, arguments.body).load(0)
+        frames = np.asarray(case.truth.frames)
+        views = sorted({int(np.argmax(frames == frame)) for frame in (frames.min(), frames.max())})
+        columns["truth"] = [case.truth.images[view] for view in views]
+        predicted = shown(systems[name], case)[0]
+        columns[f"{name}\n{photos} photo{'s' * (photos > 1)}"] = [predicted.images[view] for view in views]
+    rows = len(columns["truth"])
+    figure, axes = plt.subplots(
+        rows, len(columns), figsize=(1.3 * len(columns), 1.6 * rows), layout="constrained", squeeze=False
+    )
+    for (title, images), column in zip(columns.items(), axes.T, strict=True):
+        column[0].set_title(title, fontsize=7)
+        for axis, image in zip(column, images, strict=True):
+            axis.imshow(np.clip(image, 0, 1))
+            axis.set_axis_off()
+    figure.savefig(arguments.out / "systems.png", dpi=130)
+    return {"systems": names}
+
+
 def draw_curves(curves: dict[str, dict[int, float]], path: Path, label: str) -> None:
     """PSNR over numbers of photos."""
     import matplotlib
@@ -232,6 +268,7 @@ FIGURES: dict[str, Callable[[dict[str, Any], Any, argparse.Namespace], Any]] = {
     "token": token,
     "features": features,
     "driven": driven,
+    "systems": systems_shown,
 }
 
 if __name__ == "__main__":

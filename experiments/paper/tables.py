@@ -26,6 +26,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import markdown_table, significant, write_json
 from experiments.paper.bench import (
+    ABLATIONS,
     ANIMATION,
     DOMAINS,
     GAUSSIANS,
@@ -44,8 +45,6 @@ from experiments.paper.bench import (
 
 COUNTS = (1, 2, 4, 6)
 K_VARIANTS = ("1 Gaussian a vertex", "humangs", "1 + 4 Gaussians a vertex", "1 + 8 Gaussians a vertex")
-ABLATIONS = (", another seed", "tightness", "Gaussian", "no ", "features", "pooling", "all tokens", "canonical")
-"""Marks of names that are no system of tables 1 to 3."""
 Measure = Callable[[str, Path | None, int], dict[str, Any] | None]
 """(system, people, photos) -> what `bench.measured` gives; each is measured once."""
 

@@ -143,5 +143,5 @@ def _failed(error: Exception, verbose: bool) -> int:
 
 
 def _interrupted() -> int:
-    print("humangs: interrupted", file=sys.stderr, flush=True)
+    print("\nhumangs: interrupted", file=sys.stderr, flush=True)  # after the terminal's ^C, or a bar
     return INTERRUPTED
