@@ -38,7 +38,7 @@ PHOTOS = (1, 2, 3, 4, 6)
 TRUE_SIZE = 512
 FRAMES = 10
 """Timed rounds of drawing a frame."""
-SHORT_RUNS = (5, 15)
+SHORT_RUNS = (5, 25)
 """Steps of the refinements that are timed."""
 QUALITY = ("psnr", "ssim", "psnr_foreground")
 
@@ -262,23 +262,30 @@ class Bench:
             self.make(settings)
         refined, memory = 0.0, peak[0]
         if settings.refinement is not None:
-            refined_ms, more = self.refining(settings)
-            refined, memory = refined_ms / self.default_make_ms(), max(memory or 0.0, more or 0.0)
+            refined, more = self.refining(settings)
+            memory = max(memory or 0.0, more or 0.0)
         times = {"reconstruct": ratio + refined, "refine_share": refined, "memory_mb": memory}
         return times | ({"reconstruct_ms": float(own)} if point is self.default else {})
 
     def refining(self, settings) -> tuple[float, float | None]:
-        """CPU ms of a refinement, from two short ones without compilation, and its MiB, which do not grow with the steps."""
+        """Time of a refinement over the default's reconstruction, without compilation, and its MiB.
+
+        From short runs: neither the time of a step nor the memory changes with the number of steps.
+        """
         from humangs_jax.core.allocator import peak_memory
         from humangs_jax.refinement.refine import refine_with_report
 
         photos, avatar = self.person(0).inputs(settings.views or 4), self.make(settings)
         run = lambda n: refine_with_report(avatar, photos, dataclasses.replace(settings, refine_steps=n).refinement)
         few, many = SHORT_RUNS
-        first = timed(lambda: run(few))[1]
         with peak_memory() as peak:
-            second = timed(lambda: run(many))[1]
-        return first + (settings.refine_steps - few) * max(0.0, second - first) / (many - few), peak[0]
+            run(few)
+        turns = [
+            (timed(lambda: run(few))[1], timed(lambda: run(many))[1], self.default_make_ms())
+            for _ in range(self.rounds)
+        ]
+        first, second, default = np.median(turns, axis=0)
+        return (first + (settings.refine_steps - few) * max(0.0, second - first) / (many - few)) / default, peak[0]
 
     def frame_times(self, point, drawn) -> dict[str, Any]:
         """Time of a frame over the default's, and the default's ms."""
