@@ -38,8 +38,6 @@ PHOTOS = (1, 2, 3, 4, 6)
 TRUE_SIZE = 512
 FRAMES = 10
 """Timed rounds of drawing a frame."""
-SHORT_RUNS = (5, 25)
-"""Steps of the refinements that are timed."""
 QUALITY = ("psnr", "ssim", "psnr_foreground")
 
 
@@ -268,24 +266,18 @@ class Bench:
         return times | ({"reconstruct_ms": float(own)} if point is self.default else {})
 
     def refining(self, settings) -> tuple[float, float | None]:
-        """Time of a refinement over the default's reconstruction, without compilation, and its MiB.
-
-        From short runs: neither the time of a step nor the memory changes with the number of steps.
-        """
+        """Time of a refinement over the default's reconstruction, without compilation, and its MiB."""
         from humangs_jax.core.allocator import peak_memory
         from humangs_jax.refinement.refine import refine_with_report
 
         photos, avatar = self.person(0).inputs(settings.views or 4), self.make(settings)
-        run = lambda n: refine_with_report(avatar, photos, dataclasses.replace(settings, refine_steps=n).refinement)
-        few, many = SHORT_RUNS
+        run = lambda config: refine_with_report(avatar, photos, config)
+        run(dataclasses.replace(settings, refine_steps=1).refinement)  # compiles
+        default = [self.default_make_ms() for _ in range(self.rounds)]
         with peak_memory() as peak:
-            run(few)
-        turns = [
-            (timed(lambda: run(few))[1], timed(lambda: run(many))[1], self.default_make_ms())
-            for _ in range(self.rounds)
-        ]
-        first, second, default = np.median(turns, axis=0)
-        return (first + (settings.refine_steps - few) * max(0.0, second - first) / (many - few)) / default, peak[0]
+            own = timed(lambda: run(settings.refinement))[1]
+        default += [self.default_make_ms() for _ in range(self.rounds)]
+        return own / float(np.median(default)), peak[0]
 
     def frame_times(self, point, drawn) -> dict[str, Any]:
         """Time of a frame over the default's, and the default's ms."""
