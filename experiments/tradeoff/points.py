@@ -81,6 +81,7 @@ COMBINED: tuple[dict[str, Any], ...] = (
     {"crop": True, "refine_steps": 200, "refine_size": 256},
     {"views": 6, "crop": True, "refine_steps": 100, "refine_size": 256},
     {"views": 6, "crop": True, "refine_steps": 200, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_steps": 100, "refine_size": 512},
     {"crop": True, "body_vertices": 2000, "refine_steps": 100, "refine_size": 256},
     {"crop": True, "body_vertices": 2000, "refine_steps": 100, "refine_size": 256, "splat": "fast"},
     {"crop": True, "longest_edge": 0.02, "refine_steps": 200, "refine_size": 256},
