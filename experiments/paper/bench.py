@@ -218,11 +218,19 @@ def headline(row: Mapping[str, Any]) -> dict[str, float]:
     return row["by_views"][str(row["photos"])]
 
 
-def noise(rows: Mapping[str, Any], score: str) -> float | None:
-    """The largest difference between two runs that differ in their seed alone; None without such a pair."""
+def noise(rows: Mapping[str, Any]) -> float | None:
+    """The largest difference in dB between two runs that differ in their seed alone; None without such a pair.
+
+    Of either PSNR: two pairs are few, and one number of a pair may be equal by chance.
+    """
     pairs = [(name, name.removesuffix(", another seed")) for name in rows if name.endswith(", another seed")]
-    found = [abs(headline(rows[a])[score] - headline(rows[b])[score]) for a, b in pairs if b in rows]
-    return max(found) if found else None
+    found = [
+        abs(headline(rows[a])[score] - headline(rows[b])[score])
+        for a, b in pairs
+        if b in rows
+        for score in ("psnr", "psnr_mask")
+    ]
+    return max(found, default=None)
 
 
 def verdict(difference: float, noise: float | None) -> str:

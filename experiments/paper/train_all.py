@@ -171,7 +171,7 @@ def table(rows: Mapping[str, Any], queue: Mapping[str, Any], settings: Mapping[s
         cells += [f"{scores[key]:.{digits}f}" for key, (_, digits) in SCORES.items()]
         if against in rows:
             change = scores["psnr_mask"] - headline(rows[against])["psnr_mask"]
-            said = NOISE if queue[name].claim == NOISE else verdict(change, noise(rows, "psnr_mask"))
+            said = NOISE if queue[name].claim == NOISE else verdict(change, noise(rows))
             cells += [against, f"{change:+.2f}", said]
         else:
             cells += ["", "", ""]

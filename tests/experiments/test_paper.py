@@ -44,8 +44,8 @@ def test_variants_are_compared_with_variants_and_differ_from_them(queue):
 
 def test_a_difference_no_larger_than_that_of_another_seed_is_noise(queue):
     rows = {"humangs": run(20.0), "humangs, another seed": run(20.3), "no shells": run(19.8)}
-    assert bench.noise(rows, "psnr_mask") == pytest.approx(0.3)
-    assert bench.noise({"humangs": run(20.0)}, "psnr_mask") is None
+    assert bench.noise(rows) == pytest.approx(0.3)
+    assert bench.noise({"humangs": run(20.0)}) is None
     words = [bench.verdict(difference, 0.3) for difference in (0.2, -0.3, 0.4, -0.4)]
     assert words == ["within noise", "within noise", "better", "worse"] and bench.verdict(1.0, None) == "noise unknown"
     rows["pooling over all views"] = run(19.0)
