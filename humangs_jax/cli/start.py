@@ -64,6 +64,8 @@ class Start:
 
     def _go_on(self, material: "Material", limits: dict[str, Any] | None) -> None:
         """From where an earlier run came to an end, if there was one."""
+        from humangs_jax.apps.start import missing
+
         # by an earlier run that missed something, or was interrupted: nothing is lost
         begun = not (self.out / "body.npz").exists()
         fitted = (self.out / "fit.json").exists() and not (
@@ -81,8 +83,6 @@ class Start:
             return
         if self.overwrite:
             tell_deleted(self.out)
-        from humangs_jax.apps.start import missing
-
         undistorted = self._import(material) if material.cameras is not None else None
         needed = [each for each in missing(material, undistorted) if not (self.without_masks and each.name == "masks")]
         if needed:

@@ -253,7 +253,7 @@ def only_maker(folder: str | os.PathLike) -> Generator[None]:
     Raises: as `only_writer`; OSError, naming the folder, if nothing can be written beside it.
     """
     folder = Path(folder)
-    lock = folder.absolute().with_name(f".{folder.name}.lock")
+    lock = folder.absolute().with_name(f".{folder.absolute().name}.lock")
     lock.parent.mkdir(parents=True, exist_ok=True)
     with _locked(lock, wait=False, folder=folder), _unfinished(lock):
         try:
