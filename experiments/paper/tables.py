@@ -24,12 +24,13 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import markdown_table, significant, write_json
+from experiments.common.results import check_section, markdown_table, publish, significant, write_json
 from experiments.paper.bench import (
     ABLATIONS,
     ANIMATION,
     DOMAINS,
     GAUSSIANS,
+    PAGE,
     PAPER,
     PHOTOS,
     RECONSTRUCTION,
@@ -44,6 +45,7 @@ from experiments.paper.bench import (
 )
 
 COUNTS = (1, 2, 4, 6)
+PAGE_TABLE = "paper_tables"
 K_VARIANTS = ("1 Gaussian a vertex", "humangs", "1 + 4 Gaussians a vertex", "1 + 8 Gaussians a vertex")
 Measure = Callable[[str, Path | None, int], dict[str, Any] | None]
 """(system, people, photos) -> what `bench.measured` gives; each is measured once."""
@@ -55,11 +57,14 @@ def main() -> None:
     add_people_options(parser)
     parser.add_argument("--other", type=Path, help="people of another kind")
     parser.add_argument("--near", type=Path, help="people seen by nearer cameras")
+    parser.add_argument("--page", type=Path, nargs="?", const=PAGE, help=f"write the table {PAGE_TABLE} of this page")
     parser.add_argument("--table", nargs="+", default=["all"], choices=(*TABLES, "all"), help="which ones")
     arguments = parser.parse_args()
     if not (arguments.people or arguments.quick):
         parser.error("--people is needed, or --quick")
     try:
+        if arguments.page:
+            check_section(arguments.page, PAGE_TABLE)
         with tempfile.TemporaryDirectory() as folder:
             if arguments.people is None:
                 arguments.people = quick_people(Path(folder) / "people")
@@ -77,16 +82,20 @@ def write(arguments: argparse.Namespace) -> None:
         if people is None or name not in systems:
             return None
         photos = 1 if takes_one(systems[name][1]) and photos == PHOTOS else photos
-        key = f"{name}, {people}, {photos}"
+        key = f"{name}, {people.name}, {photos}"
         if key not in numbers:
             numbers[key] = measured(systems[name], people, photos, arguments.body, networks)
         return numbers[key]
 
     names = [name for name in systems if not any(mark in name for mark in ABLATIONS)]
+    texts = []
     for table in TABLES if "all" in arguments.table else arguments.table:
-        print(f"## {table}\n\n{TABLES[table](names, measure, arguments)}\n", flush=True)
+        texts.append(f"**{table}**\n\n{TABLES[table](names, measure, arguments)}")
+        print(f"{texts[-1]}\n", flush=True)
     if arguments.json:
         write_json(arguments.json, numbers)
+    if arguments.page:
+        publish(arguments.page, PAGE_TABLE, "\n\n".join(texts), numbers)
 
 
 def of(found: Mapping[str, Any] | None, task: str) -> str:

@@ -29,6 +29,7 @@ from humangs_jax.rendering.splatting import SplatConfig, render
 
 SIZE = 32
 VMAP_TOLERANCE = 2e-5  # batched matrix products round differently
+DEPTH_TOLERANCE = 2e-6  # another program rounds the some ten operations of a depth differently: 16 ulps
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +79,9 @@ def test_pixels_outside_the_masks_are_seen_by_no_vertex(body, network):
     assert outside.any()
     assert (masked.depth_maps[outside] == -1).all() and (masked.position_maps[outside] == 1).all()
     kept = ~np.asarray(outside)
-    np.testing.assert_array_equal(masked.depth_maps[kept], whole.depth_maps[kept])
+    np.testing.assert_allclose(masked.depth_maps[kept], whole.depth_maps[kept], rtol=DEPTH_TOLERANCE)
     # photos without masks are not empty: the body is all that is known of the person
-    np.testing.assert_array_equal(unmasked.depth_maps, whole.depth_maps)
+    np.testing.assert_allclose(unmasked.depth_maps, whole.depth_maps, rtol=DEPTH_TOLERANCE)
     np.testing.assert_array_equal(unmasked.foreground, whole.depth_maps >= 0)
 
 
