@@ -11,6 +11,7 @@ LPIPS) have random weights. --quick: without the network.
 import argparse
 import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,9 @@ def loss_of(names: list[str]) -> Any:
     return LossConfig(**weights, structural_scales=1, random_background=0.0)
 
 
-def agreement(values: Any, point: Any, names: list[str]) -> dict[str, float]:
+def agreement(
+    values: Any, point: Any, names: list[str], directions: int = DIRECTIONS, steps: Sequence[float] = STEPS
+) -> dict[str, float]:
     """{term: relative error of its derivatives}. values: point -> {term: number}; differentiable. point: a tree of float64."""
     import jax
     import jax.numpy as jnp
@@ -71,16 +74,14 @@ def agreement(values: Any, point: Any, names: list[str]) -> dict[str, float]:
     gradient = jax.jit(jax.grad(lambda point, weights: jnp.dot(weights, vector(point))))
     rng = np.random.default_rng(0)
     size = lambda x: np.sqrt(np.mean(np.square(x)))
-    directions = [
-        jax.tree.map(lambda x: rng.normal(size=x.shape) * size(np.asarray(x)), point) for _ in range(DIRECTIONS)
-    ]
+    ways = [jax.tree.map(lambda x: rng.normal(size=x.shape) * size(np.asarray(x)), point) for _ in range(directions)]
     inner = lambda a, b: sum(np.vdot(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
     gradients = [jax.device_get(gradient(point, weights)) for weights in np.eye(len(names))]
-    derivatives = np.asarray([[inner(g, direction) for direction in directions] for g in gradients])
-    best = np.full((len(names), DIRECTIONS), np.inf)
-    along = lambda direction, step: vector(jax.tree.map(lambda x, d: x + step * d, point, direction))
-    for step in STEPS:
-        found = [np.asarray(along(d, step) - along(d, -step)) / (2 * step) for d in directions]
+    derivatives = np.asarray([[inner(g, way) for way in ways] for g in gradients])
+    best = np.full((len(names), directions), np.inf)
+    along = lambda way, step: vector(jax.tree.map(lambda x, d: x + step * d, point, way))
+    for step in steps:
+        found = [np.asarray(along(way, step) - along(way, -step)) / (2 * step) for way in ways]
         best = np.fmin(best, np.abs(np.stack(found, axis=1) - derivatives))
     errors = np.linalg.norm(best, axis=1) / np.linalg.norm(derivatives, axis=1)
     return dict(zip(names, errors.tolist(), strict=True))
