@@ -53,6 +53,7 @@ class Start:
         require_at_least(0, person=self.person)
         if limits is not None and self.without_masks:
             raise UsageError("--refine needs masks: leave out --without-masks")
+        self._resumes()  # what is wrong with --out is said before the work
         with stage("starting"):
             from humangs_jax.apps.start import look
             from humangs_jax.io.atomic import only_maker
@@ -66,14 +67,7 @@ class Start:
         """From where an earlier run came to an end, if there was one."""
         from humangs_jax.apps.start import missing
 
-        # by an earlier run that missed something, or was interrupted: nothing is lost
-        begun = not (self.out / "body.npz").exists()
-        fitted = (self.out / "fit.json").exists() and not (
-            begun or (self.out / "avatar.html").exists() or self.overwrite
-        )
-        inputs = (self.photos, self.cameras, self.masks, self.keypoints)
-        require_replaceable(self.out, self.overwrite or begun or fitted, "capture.json", inputs)
-        if fitted:
+        if self._resumes():
             with stage("reading the fit of an earlier run"):
                 from humangs_jax.data.capture import load_capture
 
@@ -91,6 +85,17 @@ class Start:
             names = " and ".join(", ".join(each.name for each in needed).rsplit(", ", 1))
             raise ValueError(f"{self.photos}: {names} missing: make them as above and run the same command again")
         self._finish(self._fit(material), limits)
+
+    def _resumes(self) -> bool:
+        """Whether an earlier run left a body to go on from. Raises: UsageError if --out may not be replaced."""
+        # by an earlier run that missed something, or was interrupted: nothing is lost
+        begun = not (self.out / "body.npz").exists()
+        fitted = (self.out / "fit.json").exists() and not (
+            begun or (self.out / "avatar.html").exists() or self.overwrite
+        )
+        inputs = (self.photos, self.cameras, self.masks, self.keypoints)
+        require_replaceable(self.out, self.overwrite or begun or fitted, "capture.json", inputs)
+        return fitted
 
     def _finish(self, capture: "Capture", limits: dict[str, Any] | None) -> None:
         """The steps after the fit."""
