@@ -42,9 +42,11 @@ def quality(demo: dict[str, Any], people: dict[str, Any]) -> str:
         raise ValueError("the report of the refined demo has no refined scores: expected `humangs demo --refine 15`")
     dashes = {"baseline_psnr": None, "baseline_psnr_foreground": None}
     rows = {
-        f"the shipped person ({demo['views']['held_out']} views)": demo,
+        f"the shipped person, {demo['image_size'][0]} px ({demo['views']['held_out']} views)": demo,
         f"the same, refined for {demo['refined']['seconds']:.0f} s": demo["refined"] | dashes,
-        f"{len(people['subjects'])} people of the test seeds, other cameras": people["by_views"][VIEWS]["novel"],
+        f"{len(people['subjects'])} people of the test seeds, 256 px, other cameras": people["by_views"][VIEWS][
+            "novel"
+        ],
         f"these {len(people['subjects'])}, in poses that no photo shows": people["by_views"][VIEWS]["animation"],
     }
     columns = {"psnr": 1, "ssim": 3, "psnr_foreground": 1, "baseline_psnr": 1, "baseline_psnr_foreground": 1}

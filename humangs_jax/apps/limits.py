@@ -55,7 +55,7 @@ def limits_table(capture: Capture) -> str:
             least, most = own[name]
             outside = (low is not None and least < low) or (high is not None and most > high)
             has = f"here {_range(least, most, row['unit'])}{'  !' * outside}"
-        lines.append(f"{name:<{width}}  {wanted:<24}{has}".rstrip())
+        lines.append(f"{name:<{width}}  {wanted:<27}{has}".rstrip())
     return "\n".join(lines)
 
 

@@ -22,7 +22,7 @@ def test_every_quantity_has_its_range_and_what_a_capture_shows_is_compared(captu
     assert set(ranges) == set(LIMITS)
     text = limits.limits_table(capture)
     assert all(name in text for name in ranges) and text.count("here") == 3 and "!" not in text
-    assert "here 4\n" in text and "here 1.68 to 1.87 m" in text and "here 205 to 240 pixels of 256" in text
+    assert "here 4\n" in text and "here 1.74 to 1.88 m" in text and "here 216 to 234 pixels of 256" in text
 
 
 def test_a_capture_outside_of_a_range_is_marked(capture):

@@ -55,7 +55,7 @@ CHANGES = {
     ),
     "poses in degrees": (
         lambda c: {"poses": replace(c.poses, rotations=jnp.degrees(c.poses.rotations))},
-        "the poses seem to be in degrees: rotations up to 77, expected radians",
+        "the poses seem to be in degrees: rotations up to 81, expected radians",
     ),
     "camera to world": (
         lambda c: {"cameras": replace(c.cameras, cam_from_world=jnp.linalg.inv(c.cameras.cam_from_world))},

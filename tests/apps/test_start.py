@@ -37,7 +37,7 @@ def mine(photos, tmp_path, monkeypatch):
 
 def test_everything_is_found(mine):
     found = look(mine)
-    assert (found.images, found.photos, found.size) == (mine / "images", 4, (256, 256))
+    assert (found.images, found.photos, found.size) == (mine / "images", 4, (512, 512))
     assert (found.cameras, found.masks, found.keypoints) == (mine, mine / "masks", mine / "keypoints")
     assert missing(found) == () and str(found).count("\n") == 3
 
@@ -62,7 +62,7 @@ def test_other_layouts_are_found(mine):
 def test_alpha_is_a_mask(mine):
     shutil.rmtree(mine / "masks")
     for path in (mine / "images").iterdir():
-        write_png(path, np.concatenate([np.ones((256, 256, 3)), np.zeros((256, 256, 1))], axis=-1))
+        write_png(path, np.concatenate([np.ones((512, 512, 3)), np.zeros((512, 512, 1))], axis=-1))
     found = look(mine)
     assert found.alpha and missing(found) == () and "in the photos' alpha channel" in str(found)
 
@@ -93,7 +93,7 @@ def test_what_is_missing_comes_with_its_tools(name, mine, capsys):
     if name == "cameras":
         assert not Path("me").exists()
     else:  # what is there was imported
-        assert load_photos("me").images.shape == (4, 256, 256, 3) and not Path("me/body.npz").exists()
+        assert load_photos("me").images.shape == (4, 512, 512, 3) and not Path("me/body.npz").exists()
 
 
 def test_all_that_is_missing_is_told_at_once(mine, capsys):
