@@ -1,8 +1,8 @@
 """What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colours.
 
     python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 2 5 15] [--sizes 256 512]
-        [--views 4] [--growth 1 1.5] [--longest-edge 0.017] [--page docs/refinement.md] [--table NAME] [--plot PLOT]
-        [--sheet SHEET]
+        [--views 4] [--rounds 0 2] [--growth 1 1.5] [--longest-edge 0.017] [--page docs/refinement.md] [--table NAME]
+        [--plot PLOT] [--sheet SHEET]
 
 People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random colours" from
 as many round Gaussians of random colours on the vertices of the body. Scores: docs/evaluation.md.
@@ -12,6 +12,7 @@ Seconds do not count compilation. One device: one core of a CPU.
 """
 
 import argparse
+import dataclasses
 import itertools
 import sys
 from pathlib import Path
@@ -22,6 +23,7 @@ from experiments.common.results import markdown_table, publish, write_json
 from experiments.evaluation.options import add_people_options, check_people_options, load_network, settings_of
 from experiments.evaluation.results import TASK_NAMES, kept_rows
 from humangs_jax.evaluation.tables import mean_scores
+from humangs_jax.refinement.config import ROUNDS, RefineConfig
 
 STARTS = ("network", "random colours")
 SHOWN = {
@@ -40,6 +42,9 @@ def main() -> None:
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="sides of the photos in pixels")
     parser.add_argument("--views", type=int, nargs="+", default=[4], help="numbers of photos")
     parser.add_argument("--starts", nargs="+", choices=STARTS, default=["network"], help="what is refined")
+    parser.add_argument(
+        "--rounds", type=int, nargs="+", default=[0, ROUNDS], help="of the learned update; 0: Adam alone"
+    )
     parser.add_argument("--growth", type=float, nargs="+", default=[1.0], help="of the number of Gaussians")
     parser.add_argument("--longest-edge", type=float, help="split the body's edges to this, metres")
     parser.add_argument("--table", default="refinement", help="name of the table on the page")
@@ -70,7 +75,8 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     config = config.with_execution(longest_edge=arguments.longest_edge)
     settings = settings_of(arguments, digest, config.tokens, None)
     settings |= {
-        name: getattr(arguments, name) for name in ("seconds", "sizes", "views", "starts", "growth", "longest_edge")
+        name: getattr(arguments, name)
+        for name in ("seconds", "sizes", "views", "starts", "rounds", "growth", "longest_edge")
     }
     rows, images = kept_rows(arguments.json, settings, "cells"), {}
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
@@ -82,10 +88,12 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         for size in arguments.sizes:
             subject = make_evaluation_subject(seed, body, arguments.views, size, held_out)
             for count in arguments.views:
-                for start, growth in itertools.product(arguments.starts, arguments.growth):
-                    cell, drawn = measure(variables, config, subject, count, start, growth, arguments.seconds)
-                    grown = "" if growth == 1 else f", {growth:g} x Gaussians"
-                    row[f"{size} {count} {start}{grown}"] = cell
+                for start, rounds, growth in itertools.product(arguments.starts, arguments.rounds, arguments.growth):
+                    how = RefineConfig(rounds=rounds, growth=growth)
+                    cell, drawn = measure(variables, config, subject, count, start, how, arguments.seconds)
+                    also = f", {rounds} rounds" if rounds else ""
+                    also += "" if growth == 1 else f", {growth:g} x Gaussians"
+                    row[f"{size} {count} {start}{also}"] = cell
                     if start == "network" and count == max(arguments.views):
                         images[seed] = drawn
         rows[seed] = row
@@ -96,10 +104,9 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     return report_of(rows, settings, seeds)
 
 
-def measure(variables, config, subject, count, start, growth, seconds):
+def measure(variables, config, subject, count, start, how, seconds):
     """Scores by seconds and task, and (truth, feed-forward, refined) of the first held-out view."""
     from humangs_jax.avatar.reconstruct import reconstruct
-    from humangs_jax.refinement.config import RefineConfig
     from humangs_jax.refinement.refine import refine_with_report
 
     inputs = subject.inputs(count)
@@ -109,7 +116,7 @@ def measure(variables, config, subject, count, start, growth, seconds):
     scores, first = score_all(avatar, subject.held_out)
     cell, last = {"0": scores}, first
     for length in seconds:
-        refined = refine_with_report(avatar, inputs, RefineConfig(seconds=length, growth=growth))
+        refined = refine_with_report(avatar, inputs, dataclasses.replace(how, seconds=length))
         scores, last = score_all(refined.avatar, subject.held_out)
         about = {"steps": refined.steps, "compile_seconds": round(refined.compile_seconds, 1), "kept": refined.kept}
         cell[f"{length:g}"] = scores | {"run": about | {"photos_psnr": refined.psnr[1]}}

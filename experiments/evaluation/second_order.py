@@ -73,7 +73,9 @@ def measure_people(arguments):
     body, (variables, config, _) = load_body(), load_network(arguments)
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
     methods = {
-        "Adam": lambda avatar, inputs, length: refine(avatar, inputs, RefineConfig(seconds=length, held_out=0.0)),
+        "Adam": lambda avatar, inputs, length: refine(
+            avatar, inputs, RefineConfig(rounds=0, seconds=length, held_out=0.0)
+        ),
         "Levenberg-Marquardt": levenberg_marquardt,
     }
     found = {name: [[] for _ in arguments.seconds] for name in methods}

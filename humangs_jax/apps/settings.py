@@ -61,7 +61,8 @@ class Settings:
         """What `refine` is given; None for no refinement."""
         if not self.refine_steps:
             return None
-        return RefineConfig(steps=self.refine_steps, seconds=None, image_size=self.refine_size)
+        # without rounds of the learned update: the front was measured before they existed
+        return RefineConfig(rounds=0, steps=self.refine_steps, seconds=None, image_size=self.refine_size)
 
     def network(self, config: HumanGSConfig) -> HumanGSConfig:
         """A network of these weights, run in this way."""

@@ -117,11 +117,11 @@ def require_between(least: float | int, most: float | int, **values: float | int
 
 
 def refine_limits(text: str, option: str) -> dict[str, Any]:
-    """Fields of `RefineConfig` for "15s", "15" (seconds) or "100steps". Raises: UsageError."""
+    """Fields of `RefineConfig` for "15s", "15" (seconds), "100steps", or "0steps" (rounds only). Raises: UsageError."""
     match = re.fullmatch(r"(?P<number>\d+(\.\d*)?)(?P<unit>s|steps)?", text.strip())
     number = float(match["number"]) if match else 0.0
     in_steps = match is not None and match["unit"] == "steps"
-    if not number > 0 or (in_steps and number != int(number)):
+    if not (number > 0 or in_steps) or (in_steps and number != int(number)):
         raise UsageError(f'{option} {text!r}: expected how long to refine, as in "15s" or "100steps"')
     return {"steps": int(number), "seconds": None} if in_steps else {"steps": None, "seconds": number}
 

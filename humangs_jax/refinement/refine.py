@@ -1,6 +1,6 @@
-"""Refinement: the Gaussians of an avatar are fitted to its photos by Adam through skinning and splatting.
+"""Refinement: the Gaussians of an avatar are fitted to its photos, by rounds of a learned update, then by Adam.
 
-The network's answer is the start, and stays where no photo sees the person. `refine` is the whole job on the host: it crops the
+The learned update moves what no photo shows, too; Adam leaves it where it is. `refine` is the whole job on the host: it crops the
 photos, sizes buffers, watches the clock and keeps the state with the highest PSNR on pixels that no step saw.
 `refine_views` is the same optimisation as one pure function of a fixed number of steps, for `jax.jit` and `jax.vmap`.
 """
@@ -30,6 +30,15 @@ from humangs_jax.objectives.metrics import decibels
 from humangs_jax.refinement.config import SPLITS, RefineConfig
 from humangs_jax.refinement.crops import crop_to_person, held_out_blocks
 from humangs_jax.refinement.density import photo_errors, split, with_room, without_clear
+from humangs_jax.refinement.learned import (
+    Refiner,
+    load_refiner,
+    neighbors_of,
+    photo_signals,
+    refiner_round,
+    stacked,
+    unstacked,
+)
 from humangs_jax.refinement.objective import Photos, photos_gradient, photos_loss, photos_of, posed_gaussians
 from humangs_jax.refinement.parameters import RefineState, gaussians_of, init_state, parameters_of, update
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
@@ -41,6 +50,7 @@ BUFFER_MARGIN = 1.5
 """Room in the renderer's buffers beyond the need of the start: Gaussians grow. What does not fit is counted, and the buffers
 are planned again."""
 HOST_SETTINGS = {
+    "rounds": 1,
     "steps": 1,
     "seconds": None,
     "image_size": None,
@@ -56,12 +66,13 @@ HOST_SETTINGS = {
 class Refinement:
     """What `refine_with_report` returns.
 
-    avatar: the best state of the run. steps: number of steps. seconds: of the run, without compilation (compile_seconds).
-    loss: before and after, over all photos. psnr: before and after, dB over the crops. kept: whether the loss has fallen; if
-    not, the avatar is unchanged. interrupted: whether Ctrl-C ended the run.
+    avatar: the best state of the run. rounds, steps: how many of the learned update and of Adam. seconds: of the run, without
+    compilation (compile_seconds). loss: before and after, over all photos. psnr: before and after, dB over the crops. kept:
+    whether the loss has fallen; if not, the avatar is unchanged. interrupted: whether Ctrl-C ended the run.
     """
 
     avatar: Avatar
+    rounds: int
     steps: int
     seconds: float
     compile_seconds: float
@@ -75,7 +86,7 @@ class Refinement:
         gain = f"{self.psnr[0]:.1f} -> {self.psnr[1]:.1f} dB on the photos"
         verdict = gain if self.kept else "no improvement on the photos: the avatar is unchanged"
         ended = ", interrupted" if self.interrupted else ""
-        took = f"{self.steps} steps in {self.seconds:.1f} s (compiled in {self.compile_seconds:.1f} s)"
+        took = f"{self.rounds} rounds and {self.steps} steps in {self.seconds:.1f} s (compiled in {self.compile_seconds:.1f} s)"
         return f"refined by {took}{ended}: {verdict}"
 
 
@@ -117,9 +128,9 @@ def refine_views(
 ) -> tuple[Avatar, Int[Array, ""]]:
     """The pure function behind `refine`: `steps` steps of one photo each, in turns, on all their pixels.
 
-    Static: config (its limits, held-out pixels and `growth` are not used), splat (with `max_pairs`, see `plan_buffers`), steps.
-    Returns the avatar and the (splat, tile) pairs that did not fit. Batch over people whose arrays have the same shapes with
-    `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
+    Static: config (its limits, rounds, held-out pixels and `growth` are not used), splat (with `max_pairs`, see
+    `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs that did not fit. Batch over people whose arrays have
+    the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
     """
     photos = photos_of(views, jnp.ones(views.masks.shape, bool))
     state = start(avatar, photos, config, splat)
@@ -183,22 +194,36 @@ class _Run:
                 (self.avatar, self.all, self.seen, self.held), everywhere
             )
         self.any_held = bool(np.asarray(held).any())  # a small crop may have no block to hold out
-        useful = np.flatnonzero(np.asarray(~held).any(axis=(1, 2)))
-        self.order = _order(useful, config.views_per_step, np.random.default_rng(config.seed))
+        self.useful = np.flatnonzero(np.asarray(~held).any(axis=(1, 2)))
+        self.order = _order(self.useful, config.views_per_step, np.random.default_rng(config.seed))
 
     def go(self, progress: bool, watch: Callable[[Avatar], None] | None) -> Refinement:
         config, began = self.config, time.perf_counter()
         state = _compiled(start)(self.avatar, self.all, self.compiled_for, self.splat)
         before = self.loss(state, self.all)
         best, highest = (state, self.avatar), self.loss(state, self.held)[1]
-        self.step(state, 0.0)  # compiles
+        if config.steps != 0:
+            self.step(state, 0.0)  # compiles
+        if config.rounds:
+            self.learned(state, 1)
         if config.growth > 1:
             self.denser(state)
         compile_seconds = time.perf_counter() - began
         began, done, interrupted = time.perf_counter(), 0, False
         bar = progress_bar(total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}")
         try:
-            passed, checked, splits = 0.0, 0, list(SPLITS) if config.growth > 1 else []
+            if config.rounds:
+                state = self.learned(state, config.rounds)
+                psnr = self.loss(state, self.held)[1]
+                if psnr > highest or not self.any_held:
+                    best, highest = (state, self.avatar), psnr
+                else:
+                    state = best[0]
+            passed, checked, splits = (
+                self.passed(0, time.perf_counter() - began),
+                0,
+                list(SPLITS) if config.growth > 1 else [],
+            )
             while passed < 1:
                 if splits and passed >= splits[0]:
                     state, self.avatar = self.denser(state)
@@ -231,7 +256,7 @@ class _Run:
             refined = jax.tree.map(jnp.asarray, jax.device_get(refined))
         after = after if kept else before
         pairs = tuple(zip(before, after, strict=True))
-        return Refinement(refined, done, seconds, compile_seconds, pairs[0], pairs[1], kept, interrupted)
+        return Refinement(refined, config.rounds, done, seconds, compile_seconds, pairs[0], pairs[1], kept, interrupted)
 
     def step(self, state: RefineState, passed: float) -> tuple[RefineState, bool]:
         """The state after one step, and whether something did not fit into the buffers."""
@@ -241,6 +266,30 @@ class _Run:
             state, self.avatar, photos, passed, self.compiled_for, self.splat, self.mesh
         )
         return state, int(overflow) > 0
+
+    def learned(self, state: RefineState, rounds: int) -> RefineState:
+        """The state after rounds of the learned update, which Adam's steps then start from and are drawn back to.
+
+        Slots without a Gaussian (`growth`) stay empty.
+        """
+        count = len(self.original.gaussians.means)
+        graph = neighbors_of(np.asarray(self.original.gaussians.means))
+        seen = dataclasses.replace(self.splat, visibility=True)
+        everything = stacked(state.parameters)
+        start = values = everything[:count]
+        hidden = jnp.zeros((count, Refiner.width))
+        for _ in range(rounds):
+            parameters = unstacked(everything.at[:count].set(values), state.parameters)
+            each = [
+                _compiled(photo_signals)(parameters, self.avatar, jax.tree.map(lambda x, i=i: x[i], self.seen), seen)
+                for i in self.useful
+            ]
+            signals = jax.tree.map(lambda *x: jnp.stack(x)[:, :count], *each)
+            values, hidden = _compiled(refiner_round)(
+                load_refiner(), values, start, hidden, signals, graph, self.original
+            )
+        parameters = unstacked(everything.at[:count].set(values), state.parameters)
+        return replace(state, parameters=parameters, start=parameters)
 
     def denser(self, state: RefineState) -> tuple[RefineState, Avatar]:
         """The state and the avatar after the Gaussians with the largest errors were split."""
@@ -256,7 +305,7 @@ class _Run:
     def passed(self, steps: int, seconds: float) -> float:
         """How much of the run is over, in [0, 1]."""
         limits = ((steps, self.config.steps), (seconds, self.config.seconds))
-        return min(1.0, max(done / limit for done, limit in limits if limit is not None))
+        return min(1.0, max(done / limit if limit else 1.0 for done, limit in limits if limit is not None))
 
 
 def _chosen(photos, views):

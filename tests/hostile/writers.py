@@ -378,7 +378,7 @@ def stand_ins(variant):
         (
             "refinement.refine",
             "refine_with_report",
-            lambda *_, **__: Refinement(avatar(), 1, 1.0, 0.0, (1.0, 0.5), (20.0, 21.0), True),
+            lambda *_, **__: Refinement(avatar(), 2, 1, 1.0, 0.0, (1.0, 0.5), (20.0, 21.0), True),
         ),
         ("avatar.frames", "images", frames),
         ("avatar.frames", "motion_views", lambda *_: (None, None)),

@@ -14,7 +14,7 @@ from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.rendering.gaussians import Gaussians
 
 WIDTH, HEIGHT = 48, 64
-STEPS = RefineConfig(steps=12, seconds=None, held_out=0.0)
+STEPS = RefineConfig(rounds=0, steps=12, seconds=None, held_out=0.0)
 
 
 def toy_avatar(body, shade):

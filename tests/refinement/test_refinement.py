@@ -129,7 +129,8 @@ def test_crops_show_the_same_pixels(person):
     ("settings", "named"),
     [
         ({"steps": None, "seconds": None}, "steps, seconds"),
-        ({"steps": 0}, "steps"),
+        ({"rounds": 0, "steps": 0}, "rounds 0, steps 0"),
+        ({"rounds": -1}, "rounds -1"),
         ({"seconds": 0.0}, "seconds"),
         ({"decay": 2.0}, "decay"),
         ({"visible": 0.0}, "visible"),

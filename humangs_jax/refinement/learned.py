@@ -1,0 +1,229 @@
+"""Learned refinement: a small recurrent network sees the errors of the photos at every Gaussian and moves it, a few rounds.
+
+After ReSplat (https://arxiv.org/abs/2510.08575): the input views are drawn, their errors are gathered at the Gaussians, and a
+network that knows the neighbours adds to their parameters; one set of weights for all rounds, no gradient through the errors.
+Ours: the errors arrive as the gradient of the squared error with respect to each Gaussian's parameters, a backward pass a photo,
+in place of features of a frozen network, and the neighbours are those in the T-pose.
+
+Trained (`experiments/training/train_refiner.py`) on views that are not among the photos. What no photo shows moves with its
+neighbours, which gradient descent on the photos cannot do.
+"""
+
+import functools
+import os
+from importlib import resources
+from typing import Any, cast
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial import KDTree
+
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.core.array_types import Array, Float, Int, PyTree
+from humangs_jax.core.pytree import pytree_dataclass, replace
+from humangs_jax.io.atomic import write_bytes
+from humangs_jax.io.tensor_file import read_safetensors
+from humangs_jax.refinement.objective import Photos, posed_gaussians
+from humangs_jax.refinement.parameters import Parameters
+from humangs_jax.rendering.splat_config import SplatConfig
+from humangs_jax.rendering.splatting import render
+
+SHIPPED = "assets/refiner.safetensors"
+FIELDS = ("means", "quats", "log_scales", "opacity_logits", "color_logits")
+COLUMNS = 14
+"""Of these parameters side by side."""
+LARGEST_MOVES = np.asarray([0.01] * 3 + [0.1] * 4 + [0.2] * 3 + [0.5] * 4, np.float32)
+"""What an output of 1 moves: metres, quaternions, log scales, logits of opacity and colours."""
+NEIGHBORS = 8
+PERSON = 8000.0
+"""Pixels of a person in the photos of training: sums over pixels are brought to it, whatever the size of the photos."""
+SEEN = 0.02
+"""A Gaussian of this largest weight on a pixel of a photo counts as seen there."""
+TYPICAL_LOG_SCALE = -4.5
+
+
+@pytree_dataclass
+class Signals:
+    """What photos say about g Gaussians; without the axis v: one photo.
+
+    gradients: of the sum of squared errors of colours and coverage. visibility: largest weight on a pixel. pixels: sum of the
+    weights.
+    """
+
+    gradients: Float[Array, "*v g 14"]
+    visibility: Float[Array, "*v g"]
+    pixels: Float[Array, "*v g"]
+
+
+@pytree_dataclass
+class Neighbors:
+    """A symmetric graph. index: the neighbours of each Gaussian, itself where it has fewer. share: 1 / how many, 0 there."""
+
+    index: Int[Array, "g k"]
+    share: Float[Array, "g k"]
+
+
+def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Neighbors:
+    """Pairs of Gaussians each of which is among the `count` nearest of the other. On the host."""
+    total = len(means)
+    own = np.arange(total)[:, None]
+    nearest = KDTree(means).query(means, min(count + 1, total))[1].reshape(total, -1)[:, 1:]
+    pairs = np.sort((own * total + nearest).ravel())
+    reverse = nearest * total + own
+    mutual = (
+        pairs[np.minimum(np.searchsorted(pairs, reverse), len(pairs) - 1)] == reverse if pairs.size else reverse > 0
+    )
+    share = mutual / np.maximum(mutual.sum(axis=1, keepdims=True), 1)
+    return Neighbors(jnp.asarray(np.where(mutual, nearest, own), jnp.int32), jnp.asarray(share, jnp.float32))
+
+
+@jax.custom_vjp
+def neighbor_mean(values: Float[Array, "g c"], neighbors: Neighbors) -> Float[Array, "g c"]:
+    """Mean over the neighbours. Its gradient reads, too: the graph is symmetric, and a CPU scatters slowly."""
+    return jnp.sum(values[neighbors.index] * neighbors.share[..., None], axis=1)
+
+
+def _mean_forward(values, neighbors):
+    return neighbor_mean(values, neighbors), neighbors
+
+
+def _mean_backward(neighbors, cotangent):
+    shared = cotangent * jnp.max(neighbors.share, axis=1, keepdims=True)
+    present = neighbors.share > 0
+    return jnp.sum(shared[neighbors.index] * present[..., None], axis=1), None
+
+
+neighbor_mean.defvjp(_mean_forward, _mean_backward)
+
+
+class Refiner(nn.Module):
+    """The network of a round. width: of its features. layers: of messages between neighbours."""
+
+    width: int = 48
+    layers: int = 2
+    per_photo: int = 32
+
+    @nn.compact
+    def __call__(
+        self,
+        values: Float[Array, "g 14"],
+        start: Float[Array, "g 14"],
+        hidden: Float[Array, "g w"],
+        signals: Signals,
+        neighbors: Neighbors,
+        center: Float[Array, "3"],
+    ) -> tuple[Float[Array, "g 14"], Float[Array, "g w"]]:
+        """(values, hidden) after a round; values: the parameters side by side, start: those before the first round."""
+        dense = lambda name, width: nn.Dense(width, name=name)
+        errors = _relative_errors(values, signals)
+        seen = jnp.minimum(signals.visibility / SEEN, 1.0)[..., None]
+        logs = jnp.log(signals.pixels[..., None] + 0.1)
+        photo = jnp.concatenate([errors, signals.visibility[..., None], logs], axis=-1)
+        photo = nn.relu(dense("photo_0", self.per_photo)(photo))
+        photo = dense("photo_1", self.per_photo)(photo) * seen
+        pooled = [
+            jnp.sum(photo, axis=0) / 2,
+            jnp.max(photo, axis=0),
+            jnp.sum(seen, axis=0) / 4,
+            jnp.max(seen, axis=0),
+            jnp.sum(errors * seen, axis=0) / jnp.maximum(jnp.sum(seen, axis=0), 1e-3),
+        ]
+        own = [
+            values[:, :3] - center,
+            values[:, 3:7],
+            values[:, 7:10] - TYPICAL_LOG_SCALE,
+            values[:, 10:11],
+            nn.sigmoid(values[:, 11:]),
+            (values - start) / LARGEST_MOVES,
+        ]
+        features = dense("enter", self.width)(jnp.concatenate([*pooled, *own, hidden], axis=-1))
+        for i in range(self.layers):
+            normed = nn.LayerNorm(name=f"norm_{i}")(features)
+            message = neighbor_mean(nn.relu(dense(f"message_{i}", self.width)(normed)), neighbors)
+            update = nn.relu(dense(f"update_{i}_0", self.width)(jnp.concatenate([normed, message], axis=-1)))
+            features = features + dense(f"update_{i}_1", self.width)(update)
+        normed = nn.LayerNorm(name="norm")(features)
+        moves = nn.Dense(COLUMNS, kernel_init=nn.initializers.zeros, name="moves")(normed)
+        return values + moves * LARGEST_MOVES, features
+
+
+def _relative_errors(values, signals):
+    """Gradients for a pixel of a Gaussian's weight, lengths relative to its longest axis, those of colours before the sigmoid."""
+    colors = nn.sigmoid(values[:, 11:])
+    longest = jnp.exp(jnp.max(values[:, 7:10], axis=-1, keepdims=True))
+    units = [jnp.tile(longest, 3), jnp.ones((len(values), 8), values.dtype), 1 / (colors * (1 - colors) + 0.01)]
+    errors = 30 * signals.gradients * jnp.concatenate(units, axis=-1) / (signals.pixels[..., None] + 1.0)
+    return 3 * errors / (1 + jnp.abs(errors))
+
+
+def stacked(parameters: Parameters) -> Float[Array, "g 14"]:
+    """The parameters of the Gaussians side by side."""
+    return jnp.concatenate([getattr(parameters, name).reshape(len(parameters.means), -1) for name in FIELDS], axis=-1)
+
+
+def unstacked(values: Float[Array, "g 14"], like: Parameters) -> Parameters:
+    """Inverse of `stacked`; the poses are those of `like`."""
+    shapes = {name: getattr(like, name) for name in FIELDS}
+    ends = np.cumsum([x[0].size for x in shapes.values()])
+    parts = jnp.split(values, ends[:-1], axis=-1)
+    return replace(like, **{name: part.reshape(x.shape) for (name, x), part in zip(shapes.items(), parts, strict=True)})
+
+
+def photo_signals(parameters: Parameters, avatar: Avatar, photo: Photos, splat: SplatConfig) -> Signals:
+    """Of one photo (without the axis v), over its pixels that count. splat: with `visibility`."""
+
+    def draw(parameters, shift):
+        gaussians = posed_gaussians(parameters, avatar, photo, poses=False)
+        colors = gaussians.colors + shift[:, None]
+        rendering = render(replace(gaussians, colors=colors), photo.cameras, splat)
+        return (rendering.rgb, rendering.alpha), rendering.visibility
+
+    (rgb, alpha), pull_back, visibility = jax.vjp(
+        draw, parameters, jnp.zeros_like(avatar.gaussians.opacities), has_aux=True
+    )
+    errors = (
+        jnp.where(photo.counted[..., None], rgb - photo.images, 0),
+        jnp.where(photo.counted, alpha - photo.masks, 0),
+    )
+    gradient, _ = pull_back(jax.tree.map(lambda x: 2 * x, errors))
+    # a change of all three colours of a Gaussian changes the sum of an image by three times its weights
+    _, pixels = pull_back((jnp.ones_like(rgb), jnp.zeros_like(alpha)))
+    scale = PERSON / jnp.maximum(jnp.sum(photo.masks), 1.0)
+    return Signals(scale * stacked(gradient), visibility, scale * pixels / 3)
+
+
+def refiner_round(
+    variables: PyTree,
+    values: Float[Array, "g 14"],
+    start: Float[Array, "g 14"],
+    hidden: Float[Array, "g w"],
+    signals: Signals,
+    neighbors: Neighbors,
+    avatar: Avatar,
+) -> tuple[Float[Array, "g 14"], Float[Array, "g w"]]:
+    """`Refiner` on an avatar: (values, hidden) after a round."""
+    center = jnp.mean(avatar.rest_joints, axis=0)
+    return cast(Any, Refiner().apply(variables, values, start, hidden, signals, neighbors, center))
+
+
+def save_refiner(path: str | os.PathLike, variables: PyTree) -> None:
+    """Write the variables of a `Refiner`; the file appears whole or not at all."""
+    from safetensors.numpy import save
+
+    tensors = {
+        f"{layer}/{name}": np.asarray(x) for layer, own in variables["params"].items() for name, x in own.items()
+    }
+    write_bytes(path, save(tensors))
+
+
+@functools.cache
+def load_refiner() -> PyTree:
+    """Variables of the `Refiner` that comes with the package."""
+    variables: dict[str, Any] = {}
+    with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as path:
+        for key, tensor in read_safetensors(path)[0].items():
+            layer, name = key.split("/")
+            variables.setdefault(layer, {})[name] = jnp.asarray(tensor, jnp.float32)
+    return {"params": variables}

@@ -1,0 +1,175 @@
+"""The learned update: what it sees, that it does nothing untrained, and what the shipped one gains."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from refinement_cases import STEPS, toy_avatar, toy_capture
+
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.library import load_body
+from humangs_jax.core.pytree import replace
+from humangs_jax.refinement import refine as refinement
+from humangs_jax.refinement.crops import crop_to_person
+from humangs_jax.refinement.learned import (
+    COLUMNS,
+    PERSON,
+    Refiner,
+    Signals,
+    load_refiner,
+    neighbor_mean,
+    neighbors_of,
+    photo_signals,
+    refiner_round,
+    save_refiner,
+    stacked,
+    unstacked,
+)
+from humangs_jax.refinement.objective import photos_of, posed_gaussians
+from humangs_jax.refinement.parameters import parameters_of
+from humangs_jax.rendering.splatting import plan_buffers, render
+
+DIFFERENCE, DIFFERENCES = 1e-3, 2e-2  # of a colour; float32 sums over some thousand pixels
+ROUNDING = 1e-5
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """Avatar, one photo of the same person in other colours, parameters, splatting."""
+    body = decimate(load_body(), 400)
+    avatar = toy_avatar(body, 0.0)
+    views = crop_to_person(toy_capture(body, toy_avatar(body, 0.15)))
+    photo = jax.tree.map(lambda x: x[0], photos_of(views, jnp.ones(views.masks.shape, bool)))
+    splat = dataclasses.replace(plan_buffers(avatar.gaussians, views.cameras, margin=2.0), visibility=True)
+    return avatar, photo, parameters_of(avatar.gaussians, 3, 55), splat
+
+
+def drawn(scene, parameters):
+    avatar, photo, _, splat = scene
+    return render(posed_gaussians(parameters, avatar, photo), photo.cameras, splat)
+
+
+def signals_of(scene, photo=None):
+    avatar, own, parameters, splat = scene
+    return jax.jit(photo_signals, static_argnames="splat")(parameters, avatar, photo or own, splat)
+
+
+def test_neighbors_are_mutual_and_near():
+    means = np.random.default_rng(0).normal(size=(200, 3))
+    graph = jax.tree.map(np.asarray, neighbors_of(means, 5))
+    present = graph.share > 0
+    pairs = {(i, int(j)) for i in range(200) for j in graph.index[i][present[i]]}
+    assert pairs == {(j, i) for i, j in pairs} and all(i != j for i, j in pairs)
+    distances = np.linalg.norm(means[:, None] - means[None], axis=-1)
+    nearest = np.argsort(distances, axis=1)[:, 1:6]
+    assert pairs == {(i, int(j)) for i in range(200) for j in nearest[i] if i in nearest[j]}
+    np.testing.assert_allclose(graph.share.sum(axis=1), present.any(axis=1), atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_few_gaussians_have_few_neighbors(count):
+    graph = neighbors_of(np.random.default_rng(1).normal(size=(count, 3)), 8)
+    assert (np.asarray(graph.share > 0).sum(axis=1) == count - 1).all()
+    values = jnp.arange(float(count))[:, None]
+    others = (values.sum() - values) / max(1, count - 1)
+    np.testing.assert_allclose(neighbor_mean(values, graph), others, atol=1e-6)
+
+
+def test_the_gradient_of_the_mean_is_its_transpose():
+    rng = np.random.default_rng(2)
+    graph = neighbors_of(rng.normal(size=(60, 3)), 6)
+    matrix = np.stack([np.asarray(neighbor_mean(column[:, None], graph))[:, 0] for column in jnp.eye(60)], axis=1)
+    values, cotangent = (jnp.asarray(rng.normal(size=(60, 2)), jnp.float32) for _ in range(2))
+    mean, pull_back = jax.vjp(lambda x: neighbor_mean(x, graph), values)
+    np.testing.assert_allclose(mean, matrix @ values, atol=ROUNDING)
+    np.testing.assert_allclose(pull_back(cotangent)[0], matrix.T @ cotangent, atol=ROUNDING)
+
+
+def test_parameters_side_by_side_and_back(scene):
+    parameters = scene[2]
+    values = stacked(parameters)
+    assert values.shape == (len(parameters.means), COLUMNS)
+    jax.tree.map(np.testing.assert_array_equal, unstacked(values, parameters), parameters)
+
+
+def test_pixels_are_the_sums_of_the_weights(scene):
+    signals, rendering = signals_of(scene), drawn(scene, scene[2])
+    per_person = PERSON / float(scene[1].masks.sum())
+    assert float(signals.pixels.sum()) == pytest.approx(per_person * float(rendering.alpha.sum()), rel=1e-4)
+    assert (np.asarray(signals.pixels) >= -ROUNDING).all()
+    np.testing.assert_allclose(signals.visibility, rendering.visibility, atol=ROUNDING)
+
+
+def test_gradients_are_those_of_the_squared_error(scene):
+    _, photo, parameters, _ = scene
+    most = int(np.argmax(signals_of(scene).pixels))
+
+    def error(shift):
+        moved = replace(parameters, color_logits=parameters.color_logits.at[most].add(shift))
+        rendering = drawn(scene, moved)
+        squared = np.square(rendering.rgb - photo.images, dtype=np.float64).sum()
+        return squared + np.square(rendering.alpha - photo.masks, dtype=np.float64).sum()
+
+    slope = (error(DIFFERENCE) - error(-DIFFERENCE)) / (2 * DIFFERENCE)
+    gradient = np.asarray(signals_of(scene).gradients)[most, 11:].sum() * float(photo.masks.sum()) / PERSON
+    assert gradient == pytest.approx(slope, rel=DIFFERENCES)
+
+
+def test_pixels_that_do_not_count_say_nothing(scene):
+    photo = scene[1]
+    signals = signals_of(scene, replace(photo, counted=jnp.zeros_like(photo.counted)))
+    assert not np.asarray(signals.gradients).any() and np.asarray(signals.pixels).any()
+
+
+def test_untrained_it_changes_nothing_and_trained_it_does(scene):
+    avatar, _, parameters, _ = scene
+    values, graph = stacked(parameters), neighbors_of(np.asarray(avatar.gaussians.means))
+    signals = jax.tree.map(lambda x: x[None], signals_of(scene))
+    hidden = jnp.zeros((len(values), Refiner.width))
+    fresh = Refiner().init(jax.random.key(0), values, values, hidden, signals, graph, jnp.zeros(3))
+    shipped = load_refiner()
+    assert jax.tree.map(jnp.shape, fresh) == jax.tree.map(jnp.shape, shipped)
+    same, carried = refiner_round(fresh, values, values, hidden, signals, graph, avatar)
+    np.testing.assert_array_equal(same, values)
+    assert np.asarray(carried).any()
+    moved, _ = refiner_round(shipped, values, values, hidden, signals, graph, avatar)
+    assert np.isfinite(moved).all() and (np.asarray(moved) != np.asarray(values)).any()
+
+
+def test_the_order_of_photos_does_not_matter(scene):
+    avatar, _, parameters, _ = scene
+    rng, values = np.random.default_rng(3), stacked(parameters)
+    graph, g = neighbors_of(np.asarray(avatar.gaussians.means)), len(values)
+    signals = Signals(*(jnp.asarray(rng.random(shape), jnp.float32) for shape in ((3, g, COLUMNS), (3, g), (3, g))))
+    run = lambda s: refiner_round(load_refiner(), values, values, jnp.zeros((g, Refiner.width)), s, graph, avatar)[0]
+    np.testing.assert_allclose(run(signals), run(jax.tree.map(lambda x: x[::-1], signals)), atol=ROUNDING)
+
+
+def test_weights_are_read_as_written(tmp_path, monkeypatch):
+    from humangs_jax.refinement import learned
+
+    changed = jax.tree.map(lambda x: x + 1, load_refiner())
+    save_refiner(tmp_path / "refiner.safetensors", changed)
+    monkeypatch.setattr(learned.resources, "files", lambda _: tmp_path)
+    monkeypatch.setattr(learned, "SHIPPED", "refiner.safetensors")
+    jax.tree.map(np.testing.assert_array_equal, learned.load_refiner.__wrapped__(), changed)
+
+
+def test_rounds_move_gaussians_and_leave_empty_slots_empty(scene):
+    avatar, _, _, splat = scene
+    views = crop_to_person(toy_capture(decimate(load_body(), 400), toy_avatar(decimate(load_body(), 400), 0.15)))
+    config = dataclasses.replace(STEPS, rounds=2, steps=0, growth=1.5)
+    run = refinement._Run(avatar, views, config, None, splat)
+    count = len(avatar.gaussians.means)
+    before = refinement.start(run.avatar, run.all, config, splat)
+    after = run.learned(before, 2)
+    was, now = stacked(before.parameters), stacked(after.parameters)
+    assert len(now) == round(1.5 * count)
+    np.testing.assert_array_equal(now[count:], was[count:])
+    assert (np.abs(now[:count] - was[:count]).max(axis=0) > 0).all()
+    jax.tree.map(np.testing.assert_array_equal, after.parameters, after.start)
+    report = run.go(progress=False, watch=None)
+    assert (report.rounds, report.steps) == (2, 0) and "2 rounds and 0 steps" in report.summary()
+    assert report.loss[1] <= report.loss[0]
