@@ -1,11 +1,13 @@
 """What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colours.
 
     python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 2 5 15] [--sizes 256 512]
-        [--views 4] [--rounds 0 2] [--growth 1 1.5] [--longest-edge 0.017] [--page docs/refinement.md] [--table NAME]
-        [--plot PLOT] [--sheet SHEET]
+        [--views 4] [--rounds 0 2] [--growth 1 1.5] [--off 0 2.5 5] [--longest-edge 0.017]
+        [--page docs/refinement.md] [--table NAME] [--plot PLOT] [--sheet SHEET]
 
 People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random colours" from
-as many round Gaussians of random colours on the vertices of the body. Scores: docs/evaluation.md.
+as many round Gaussians of random colours on the vertices of the body. --off: the body is moved by so many millimetres (standard
+deviation), each joint turned by 0.2 degrees and each shape coefficient changed by 0.02 a millimetre, before anything else;
+held-out views of the pose of the photos are then drawn with that body. Scores: docs/evaluation.md.
 0 seconds are the start. A later run continues: finished people in the JSON with the same settings are not computed again.
 
 Seconds do not count compilation. One device: one core of a CPU.
@@ -25,6 +27,8 @@ from experiments.evaluation.results import TASK_NAMES, kept_rows
 from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.refinement.config import ROUNDS, RefineConfig
 
+DEGREES, SHAPES = 0.2, 0.02
+"""Of --off: turn of a joint and change of a shape coefficient for each millimetre."""
 STARTS = ("network", "random colours")
 SHOWN = {
     "psnr": ("PSNR", 2),
@@ -46,6 +50,10 @@ def main() -> None:
         "--rounds", type=int, nargs="+", default=[0, ROUNDS], help="of the learned update; 0: Adam alone"
     )
     parser.add_argument("--growth", type=float, nargs="+", default=[1.0], help="of the number of Gaussians")
+    parser.add_argument(
+        "--off", type=float, nargs="+", default=[0.0], help="millimetres that the body is off, see above"
+    )
+    parser.add_argument("--refine-poses", action="store_true", help="the pose of each photo is refined, too")
     parser.add_argument("--longest-edge", type=float, help="split the body's edges to this, metres")
     parser.add_argument("--table", default="refinement", help="name of the table on the page")
     parser.add_argument("--plot", type=Path, help="draw PSNR against seconds here")
@@ -76,7 +84,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     settings = settings_of(arguments, digest, config.tokens, None)
     settings |= {
         name: getattr(arguments, name)
-        for name in ("seconds", "sizes", "views", "starts", "rounds", "growth", "longest_edge")
+        for name in ("seconds", "sizes", "views", "starts", "rounds", "growth", "off", "refine_poses", "longest_edge")
     }
     rows, images = kept_rows(arguments.json, settings, "cells"), {}
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
@@ -87,21 +95,49 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         row: dict[str, Any] = {}
         for size in arguments.sizes:
             subject = make_evaluation_subject(seed, body, arguments.views, size, held_out)
-            for count in arguments.views:
-                for start, rounds, growth in itertools.product(arguments.starts, arguments.rounds, arguments.growth):
-                    how = RefineConfig(rounds=rounds, growth=growth)
-                    cell, drawn = measure(variables, config, subject, count, start, how, arguments.seconds)
-                    also = f", {rounds} rounds" if rounds else ""
-                    also += "" if growth == 1 else f", {growth:g} x Gaussians"
-                    row[f"{size} {count} {start}{also}"] = cell
-                    if start == "network" and count == max(arguments.views):
-                        images[seed] = drawn
+            choices = (arguments.views, arguments.off, arguments.starts, arguments.rounds, arguments.growth)
+            for count, off, start, rounds, growth in itertools.product(*choices):
+                how = RefineConfig(rounds=rounds, growth=growth, poses=arguments.refine_poses)
+                moved = with_body_off(subject, off)
+                cell, drawn = measure(variables, config, moved, count, start, how, arguments.seconds)
+                also = f", {rounds} rounds" if rounds else ""
+                also += f", body {off:g} mm off" if off else ""
+                also += "" if growth == 1 else f", {growth:g} x Gaussians"
+                row[f"{size} {count} {start}{also}"] = cell
+                if start == "network" and count == max(arguments.views):
+                    images[seed] = drawn
         rows[seed] = row
         if arguments.json:
             write_json(arguments.json, report_of(rows, settings, seeds))
     if arguments.sheet:
         write_sheet(arguments.sheet, images)
     return report_of(rows, settings, seeds)
+
+
+def with_body_off(subject, millimetres):
+    """The person, whose photos and held-out views of the same pose come with a body that is off."""
+    import jax.numpy as jnp
+    import numpy as np
+
+    from experiments.evaluation.subjects import task_views
+    from humangs_jax.core.pytree import replace
+
+    if not millimetres:
+        return subject
+    rng = np.random.default_rng(subject.seed)
+    poses = subject.photos.poses
+    off = lambda array, std: jnp.asarray(
+        np.asarray(array) + millimetres * std * rng.normal(size=array.shape), jnp.float32
+    )
+    poses = replace(
+        poses,
+        rotations=off(poses.rotations[:1], np.radians(DEGREES)),
+        translation=off(poses.translation[:1], 1e-3),
+    )
+    betas = off(np.asarray(subject.photos.betas), SHAPES)
+    moved = lambda capture: dataclasses.replace(capture, poses=poses, betas=betas)
+    still = subject.held_out.select(task_views(subject.held_out)["novel"])
+    return dataclasses.replace(subject, photos=moved(subject.photos), held_out=moved(still))
 
 
 def measure(variables, config, subject, count, start, how, seconds):

@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
@@ -25,10 +25,12 @@ if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.data.capture import Capture
     from humangs_jax.data.motion import Motion
+    from humangs_jax.refinement.config import RefineConfig
 
 
 DEMO_SECONDS = 10.0
 """Of refinement."""
+ROUNDS_ALONE = "0steps"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,7 +84,8 @@ class Reconstruct:
     dtype: Literal["as_trained", "float32", "bfloat16", "float16"] = "as_trained"
     """Number type of the encoder's matrix products ("as_trained": float32). The short ones are faster on GPU and TPU."""
     refine: str | None = None
-    """Fit the avatar to the photos afterwards for so long: seconds ("15s") or steps ("100steps"); see `humangs refine`."""
+    """Fit the avatar to the photos afterwards: "0steps": rounds of a learned update, about a second (default, if there are
+    masks); for longer: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not at all."""
     preset: Preset | None = None
     """Speed against accuracy (docs/tradeoff.md): photos, network and refinement, where the options above do not say."""
     config: Path | None = None
@@ -91,13 +94,14 @@ class Reconstruct:
     """Look first whether photos, cameras and poses belong together, the quick part of `humangs check`; --no-check skips it."""
 
     def run(self) -> None:
-        limits: dict[str, Any] | None = None if self.refine is None else refine_limits(self.refine, "--refine")
+        limits = None if self.refine == "0" else refine_limits(self.refine or ROUNDS_ALONE, "--refine")
         require_at_least(1, views=None if self.views == "auto" else self.views)
         require_avatar(self.out)
         with stage("starting"):
             from humangs_jax.avatar.reconstruct import reconstruct
             from humangs_jax.data.view_selection import select_views
             from humangs_jax.network.weights import load_weights
+            from humangs_jax.refinement.config import RefineConfig
 
             settings = chosen_settings(self.preset, self.config)
         photos = _read_capture(self.capture, self.check)
@@ -114,17 +118,20 @@ class Reconstruct:
         with stage("reconstructing"):
             avatar = reconstruct(variables, config, photos)
             avatar.gaussians.means.block_until_ready()
-        if limits is None and settings is not None and settings.refinement is not None:
-            limits = {"steps": settings.refine_steps, "seconds": None, "image_size": settings.refine_size}
-        if limits is None:
+        if self.refine is None and photos.masks is None:
+            limits = None
+        how = None if limits is None else RefineConfig(**limits)
+        if self.refine is None and settings is not None:
+            how = settings.refinement
+        if how is None:
             _save(avatar, self.out, f"from {photos.view_count} photos")
         else:
-            _refine_and_save(avatar, photos, self.out, **limits)
+            _refine_and_save(avatar, photos, self.out, how)
 
 
 @dataclasses.dataclass(frozen=True)
 class Refine:
-    """Fit an avatar to the photos of a capture: sharper where photos show it, unchanged where none does.
+    """Fit an avatar to the photos of a capture: rounds of a learned update, then gradient descent.
 
     Ctrl-C ends it early; the best avatar until then is written.
     """
@@ -136,7 +143,7 @@ class Refine:
     out: Path = Path("refined.npz")
     """The avatar file to write; an avatar that is there is replaced."""
     limit: str = "15s"
-    """How long: seconds ("15s") or steps ("100steps"), after a compilation of some seconds."""
+    """How long: seconds ("15s"), steps ("100steps") or rounds alone ("0steps"), after a compilation of some seconds."""
     image_size: int | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     refine_poses: bool = False
@@ -155,11 +162,12 @@ class Refine:
         require_avatar(self.out, inputs=(self.avatar,))
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
+            from humangs_jax.refinement.config import RefineConfig
 
             avatar = Avatar.load(self.avatar)
         photos = _read_capture(self.capture, self.check)
-        settings = {"image_size": self.image_size, "poses": self.refine_poses, "growth": self.growth}
-        _refine_and_save(avatar, photos, self.out, self.live, **settings, **limits)
+        how = RefineConfig(image_size=self.image_size, poses=self.refine_poses, growth=self.growth, **limits)
+        _refine_and_save(avatar, photos, self.out, how, self.live)
 
 
 def _read_capture(path: Path, check: bool) -> "Capture":
@@ -180,17 +188,16 @@ def _read_capture(path: Path, check: bool) -> "Capture":
     return photos
 
 
-def _refine_and_save(avatar: "Avatar", photos: "Capture", out: Path, live: bool = False, **settings: Any) -> None:
+def _refine_and_save(avatar: "Avatar", photos: "Capture", out: Path, how: "RefineConfig", live: bool = False) -> None:
     """Refine with a progress bar, write the result (now and then, if live), say what it took.
 
     Raises: KeyboardInterrupt, after that, if one ended it.
     """
     with stage("refining"):
-        from humangs_jax.refinement.config import RefineConfig
         from humangs_jax.refinement.refine import refine_with_report
 
         watch = (lambda so_far: so_far.save(out)) if live else None
-        refinement = refine_with_report(avatar, photos, RefineConfig(**settings), progress=True, watch=watch)
+        refinement = refine_with_report(avatar, photos, how, progress=True, watch=watch)
     _save(refinement.avatar, out, f"from {photos.view_count} photos, {refinement.summary()}")
     if refinement.interrupted:
         raise KeyboardInterrupt

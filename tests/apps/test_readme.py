@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 README = Path(__file__).parents[2] / "README.md"
-LEAST_PSNR = 26.3
-"""dB of a photo that the network was given, drawn again: 26.6 where this was written."""
+LEAST_PSNR = 25.7
+"""dB of a photo that the network was given, drawn again: 26.0 where this was written."""
 
 
 def ten_lines():
@@ -20,7 +20,7 @@ def test_the_ten_lines_run_as_they_stand():
     names: dict = {}
     exec(compile(lines, str(README), "exec"), names)
     image, capture = np.asarray(names["image"]), names["capture"]
-    assert image.shape == (256, 256, 3) and image.dtype == np.float32
+    assert image.shape == (512, 512, 3) and image.dtype == np.float32
     error = image - np.asarray(capture.images[0])
     assert -10 * np.log10(np.mean(error**2)) > LEAST_PSNR
     assert len(names["gaussians"].means) == len(names["avatar"].gaussians.means)

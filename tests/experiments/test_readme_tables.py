@@ -21,9 +21,9 @@ DEMO = {
 def test_quality():
     people = {"subjects": [{}] * 3, "by_views": {"4": {task: SCORES | BASELINE for task in ("novel", "animation")}}}
     rows = quality(DEMO | {"refined": SCORES | {"psnr": 29.16, "seconds": 15.2}}, people).splitlines()[2:]
-    assert rows[0] == "| the shipped person (6 views) | 27.4 | 0.946 | 18.8 | 20.7 | 11.3 |"
+    assert rows[0] == "| the shipped person, 256 px (6 views) | 27.4 | 0.946 | 18.8 | 20.7 | 11.3 |"
     assert rows[1] == "| the same, refined for 15 s | 29.2 | 0.946 | 18.8 |  |  |"
-    assert rows[2].startswith("| 3 people of the test seeds, other cameras | 27.4 |") and len(rows) == 4
+    assert rows[2].startswith("| 3 people of the test seeds, 256 px, other cameras | 27.4 |") and len(rows) == 4
     with pytest.raises(ValueError, match="expected `humangs demo --refine 15`"):
         quality(DEMO, people)
 
