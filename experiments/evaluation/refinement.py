@@ -1,6 +1,6 @@
 """What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colours.
 
-    python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 2 5 15] [--sizes 256 512]
+    python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 1 2 5 15] [--sizes 256 512]
         [--views 4] [--rounds 0 2] [--growth 1 1.5] [--off 0 2.5 5] [--longest-edge 0.017]
         [--page docs/refinement.md] [--table NAME] [--plot PLOT] [--sheet SHEET]
 
@@ -42,7 +42,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_people_options(parser, subjects=8)
-    parser.add_argument("--seconds", type=float, nargs="+", default=[2, 5, 15], help="lengths of the runs")
+    parser.add_argument("--seconds", type=float, nargs="+", default=[1, 2, 5, 15], help="lengths of the runs")
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="sides of the photos in pixels")
     parser.add_argument("--views", type=int, nargs="+", default=[4], help="numbers of photos")
     parser.add_argument("--starts", nargs="+", choices=STARTS, default=["network"], help="what is refined")

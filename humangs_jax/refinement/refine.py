@@ -231,7 +231,11 @@ class _Run:
                 state, overflow = self.step(state, passed)
                 done += 1
                 if overflow:
+                    paused = time.perf_counter()
                     self.splat = _planned(replace(self.avatar, gaussians=gaussians_of(state.parameters)), self.all)
+                    self.step(state, passed)  # compiles for the new buffers
+                    took = time.perf_counter() - paused
+                    compile_seconds, began = compile_seconds + took, began + took
                 passed = self.passed(done, time.perf_counter() - began)
                 if passed >= (checked + 1) / config.checks:
                     checked = int(passed * config.checks)

@@ -239,6 +239,6 @@ def test_refined_poses_explain_photos_of_poses_that_are_off(person):
 def test_buffers_that_are_too_small_are_planned_again(person):
     run = run_of(person)
     run.splat = dataclasses.replace(run.splat, max_pairs=64, max_rows=64)
-    report = run.go(progress=False)
+    report = run.go(progress=False, watch=None)
     assert run.splat.max_pairs > 64
     assert report.steps == STEPS.steps
