@@ -1,8 +1,10 @@
-"""README's tables of quality and of the demo's times, from what other programs have written.
+r"""README's tables of quality and of the demo's times, from what other programs have written.
 
 HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --refine 15 --out b
 python experiments/evaluation/synthetic.py --subjects 32 --views 1 2 4 6 --json evaluation.json
-python experiments/evaluation/readme.py --timed a/report.json --refined b/report.json --people evaluation.json
+python experiments/evaluation/refinement.py --subjects 32 --seconds 1 15 --sizes 256 --rounds 2 --json refinement.json
+python experiments/evaluation/readme.py --timed a/report.json --refined b/report.json --people evaluation.json \
+    --refined-people refinement.json
 
 Times are those of an idle machine, from an empty compile cache.
 """
@@ -27,28 +29,35 @@ def main() -> None:
     )
     parser.add_argument("--refined", type=Path, required=True, help="report of the refined demo")
     parser.add_argument("--people", type=Path, required=True, help="result of synthetic.py")
-    arguments = parser.parse_args()
-    timed, refined, people = (
-        json.loads(path.read_text()) for path in (arguments.timed, arguments.refined, arguments.people)
+    parser.add_argument(
+        "--refined-people", type=Path, required=True, help="result of refinement.py for the same people"
     )
-    for name, text in {"readme_quality": quality(refined, people), "readme_demo": times(timed)}.items():
+    arguments = parser.parse_args()
+    paths = (arguments.timed, arguments.refined, arguments.people, arguments.refined_people)
+    timed, refined, *people = (json.loads(path.read_text()) for path in paths)
+    for name, text in {"readme_quality": quality(refined, *people), "readme_demo": times(timed)}.items():
         print(text)
         publish(REPOSITORY / "README.md", name, text)
 
 
-def quality(demo: dict[str, Any], people: dict[str, Any]) -> str:
-    """The demo person and the test people. Raises: ValueError if the demo was not refined."""
+def quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any]) -> str:
+    """The demo person and the test people. Raises: ValueError if the demo was not refined, or the people are not the same."""
     if "refined" not in demo:
         raise ValueError("the report of the refined demo has no refined scores: expected `humangs demo --refine 15`")
+    count = len(people["subjects"])
+    if len(refined["subjects"]) != count:
+        raise ValueError(f"{len(refined['subjects'])} people were refined: expected the same {count}")
     dashes = {"baseline_psnr": None, "baseline_psnr_foreground": None}
     rows = {
         f"the shipped person, {demo['image_size'][0]} px ({demo['views']['held_out']} views)": demo,
         f"the same, refined for {demo['refined']['seconds']:.0f} s": demo["refined"] | dashes,
-        f"{len(people['subjects'])} people of the test seeds, 256 px, other cameras": people["by_views"][VIEWS][
-            "novel"
-        ],
-        f"these {len(people['subjects'])}, in poses that no photo shows": people["by_views"][VIEWS]["animation"],
+        f"{count} people of the test seeds, 256 px, other cameras": people["by_views"][VIEWS]["novel"],
+        f"these {count}, in poses that no photo shows": people["by_views"][VIEWS]["animation"],
     }
+    (lengths,) = refined["means"].values()
+    for seconds in (x for x in lengths if x != "0"):
+        rows[f"these {count}, refined for {seconds} s, other cameras"] = lengths[seconds]["novel"] | dashes
+        rows[f"refined for {seconds} s, in poses that no photo shows"] = lengths[seconds]["animation"] | dashes
     columns = {"psnr": 1, "ssim": 3, "psnr_foreground": 1, "baseline_psnr": 1, "baseline_psnr_foreground": 1}
     cells = lambda scores: ["" if scores[key] is None else f"{scores[key]:.{n}f}" for key, n in columns.items()]
     header = ["", "PSNR", "SSIM", "PSNR on the person", "painted body mesh: PSNR", "on the person"]

@@ -20,12 +20,18 @@ DEMO = {
 
 def test_quality():
     people = {"subjects": [{}] * 3, "by_views": {"4": {task: SCORES | BASELINE for task in ("novel", "animation")}}}
-    rows = quality(DEMO | {"refined": SCORES | {"psnr": 29.16, "seconds": 15.2}}, people).splitlines()[2:]
+    lengths = {seconds: {task: SCORES for task in ("novel", "animation")} for seconds in ("0", "1")}
+    refined = {"subjects": [{}] * 3, "means": {"256 4 network, 2 rounds": lengths}}
+    demo = DEMO | {"refined": SCORES | {"psnr": 29.16, "seconds": 15.2}}
+    rows = quality(demo, people, refined).splitlines()[2:]
     assert rows[0] == "| the shipped person, 256 px (6 views) | 27.4 | 0.946 | 18.8 | 20.7 | 11.3 |"
     assert rows[1] == "| the same, refined for 15 s | 29.2 | 0.946 | 18.8 |  |  |"
-    assert rows[2].startswith("| 3 people of the test seeds, 256 px, other cameras | 27.4 |") and len(rows) == 4
+    assert rows[2].startswith("| 3 people of the test seeds, 256 px, other cameras | 27.4 |")
+    assert rows[4] == "| these 3, refined for 1 s, other cameras | 27.4 | 0.946 | 18.8 |  |  |" and len(rows) == 6
     with pytest.raises(ValueError, match="expected `humangs demo --refine 15`"):
-        quality(DEMO, people)
+        quality(DEMO, people, refined)
+    with pytest.raises(ValueError, match="2 people were refined: expected the same 3"):
+        quality(demo, people, refined | {"subjects": [{}] * 2})
 
 
 def test_times():
