@@ -322,7 +322,7 @@ def measured(
         ("reconstruction", [row.scores for row in found.rows if row.frame == 0]),
         ("animation", [row.scores for row in found.rows if row.frame != 0]),
     ):
-        means[task] = mean_scores(rows) if rows else None
+        means[task] = mean_scores(rows) if rows and (task == "reconstruction" or animatable(config)) else None
     per_target = config.architecture.runs_per_target
     means["model_s"] = None if per_target else sum(seconds["model"]) / len(seconds["model"])
     means["frame_s"] = sum(seconds["frame"]) / len(seconds["frame"])
@@ -353,6 +353,14 @@ def takes_one(config: Any) -> bool:
 
     reader = config.architecture.reader
     return isinstance(reader, GroupReader) or getattr(reader, "most_views", None) == 1
+
+
+def animatable(config: Any) -> bool:
+    """Whether a system can show a pose that no photo shows: LVSM knows no body."""
+    from humangs_jax.network.pixel_queries import QueryDecoder
+
+    decoder = config.architecture.decoder
+    return not (isinstance(decoder, QueryDecoder) and decoder.texture is None)
 
 
 def triple(scores: Any) -> str:

@@ -45,6 +45,8 @@ from experiments.paper.bench import (
 )
 
 COUNTS = (1, 2, 4, 6)
+ONE_PHOTO = ", 1 photo"
+"""End of the names of variants that were trained with one."""
 PAGE_TABLE = "paper_tables"
 K_VARIANTS = ("1 Gaussian a vertex", "humangs", "1 + 4 Gaussians a vertex", "1 + 8 Gaussians a vertex")
 Measure = Callable[[str, Path | None, int], dict[str, Any] | None]
@@ -81,7 +83,8 @@ def write(arguments: argparse.Namespace) -> None:
     def measure(name: str, people: Path | None, photos: int) -> dict[str, Any] | None:
         if people is None or name not in systems:
             return None
-        photos = 1 if takes_one(systems[name][1]) and photos == PHOTOS else photos
+        alone = takes_one(systems[name][1]) or name.endswith(ONE_PHOTO)
+        photos = 1 if alone and photos == PHOTOS else photos
         key = f"{name}, {people.name}, {photos}"
         if key not in numbers:
             numbers[key] = measured(systems[name], people, photos, arguments.body, networks)

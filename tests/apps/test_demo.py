@@ -24,8 +24,8 @@ PRODUCTS = {
     "refined.png",
     "report.json",
 }
-LEAST = {"psnr": 27.1, "ssim": 0.941, "psnr_foreground": 18.4, "baseline_psnr": 20.4}
-"""What the README claims of the held-out views (27.4 dB, 0.946, 18.7 dB, 20.7 dB), less 0.3 dB and 0.005: that is more than
+LEAST = {"psnr": 25.4, "ssim": 0.924, "psnr_foreground": 17.6, "baseline_psnr": 18.6}
+"""What the README claims of the held-out views (25.7 dB, 0.930, 18.0 dB, 18.9 dB), less 0.3 dB and 0.005: that is more than
 processors and XLA's versions differ by, and less than any change of the method that matters."""
 
 FRAME_SIZE = 64
@@ -67,7 +67,7 @@ def test_the_report_holds_what_is_promised(out):
     report = json.loads((out / "report.json").read_text())
     assert all(report[name] >= least for name, least in LEAST.items()), report
     assert report["psnr"] > report["baseline_psnr"]
-    assert report["refined"]["psnr"] > report["psnr"] + 0.5  # 1.7 dB after 50 steps
+    assert report["refined"]["psnr"] > report["psnr"] + 0.5  # 3.8 dB after 15 s
     assert report["refined"]["psnr_foreground"] > report["psnr_foreground"] + 0.5
     assert report["psnr_foreground"] > report["baseline_psnr_foreground"]
     assert {"reconstruct", "animate", "render_held_out"} <= set(report["timings"])
