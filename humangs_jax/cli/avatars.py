@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import Positional
 
@@ -30,7 +30,8 @@ if TYPE_CHECKING:
 
 DEMO_SECONDS = 10.0
 """Of refinement."""
-ROUNDS_ALONE = "0steps"
+ROUNDS_ALONE = {"steps": 0, "seconds": None, "image_size": 512}
+"""Of refinement, where nothing is asked for: about a second, however large the photos."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -84,8 +85,8 @@ class Reconstruct:
     dtype: Literal["as_trained", "float32", "bfloat16", "float16"] = "as_trained"
     """Number type of the encoder's matrix products ("as_trained": float32). The short ones are faster on GPU and TPU."""
     refine: str | None = None
-    """Fit the avatar to the photos afterwards: "0steps": rounds of a learned update, about a second (default, if there are
-    masks); for longer: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not at all."""
+    """Fit the avatar to the photos afterwards for so long: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not
+    at all. Default, if there are masks: rounds of a learned update alone, about a second, on photos of at most 512 pixels."""
     preset: Preset | None = None
     """Speed against accuracy (docs/tradeoff.md): photos, network and refinement, where the options above do not say."""
     config: Path | None = None
@@ -94,7 +95,9 @@ class Reconstruct:
     """Look first whether photos, cameras and poses belong together, the quick part of `humangs check`; --no-check skips it."""
 
     def run(self) -> None:
-        limits = None if self.refine == "0" else refine_limits(self.refine or ROUNDS_ALONE, "--refine")
+        limits: dict[str, Any] | None = ROUNDS_ALONE if self.refine is None else None
+        if self.refine not in (None, "0"):
+            limits = refine_limits(self.refine, "--refine")
         require_at_least(1, views=None if self.views == "auto" else self.views)
         require_avatar(self.out)
         with stage("starting"):
