@@ -1,6 +1,6 @@
 """Weights side by side: feed-forward and refined, of the same people.
 
-    python experiments/evaluation/refinement.py --split validation --seconds 5 --sizes 256 --weights A --json a.json     # each
+    python experiments/evaluation/refinement.py --split validation --seconds 5 --sizes 256 --rounds 0 --weights A --json a.json
     python experiments/evaluation/compare_weights.py first=a.json trained=b.json --page docs/evaluation.md
 
 The scores are those of `refinement.py`, means over its people, from four photos of 256 pixels.

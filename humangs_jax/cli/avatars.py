@@ -123,6 +123,7 @@ class Reconstruct:
             avatar.gaussians.means.block_until_ready()
         if self.refine is None and photos.masks is None:
             limits = None
+            tell("no masks: the avatar is not refined")
         how = None if limits is None else RefineConfig(**limits)
         if self.refine is None and settings is not None:
             how = settings.refinement
@@ -150,7 +151,7 @@ class Refine:
     image_size: int | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     refine_poses: bool = False
-    """Also refine the pose of each photo: for poses from `humangs fit`, which are millimetres off."""
+    """Also refine the pose of each photo. On bodies that are millimetres off it gained nothing (docs/refinement.md)."""
     growth: float = 1.0
     """The number of Gaussians may grow by this factor: those with the largest errors are split."""
     live: bool = False

@@ -34,8 +34,8 @@ class RefineConfig:
 
     rounds: of the learned update (see `learned.py`), before the first step. 0: none.
 
-    steps, seconds: limits of the run; it ends at the first that is reached. None: no limit. Compilation does not count. 0 steps:
-    only rounds.
+    steps, seconds: limits of the run; it ends at the first that is reached, but not before the rounds are done. None: no limit.
+    Compilation does not count. 0 steps: only rounds.
     image_size: photos whose longer side is larger are reduced to it, pixels; None: photos as they are. views_per_step: photos
     drawn in a step.
 
@@ -53,7 +53,7 @@ class RefineConfig:
     seed: of the order of the photos and of the blocks.
     """
 
-    rounds: int = knob(ROUNDS, cost="blur without them", gain="0.3 s each", measured=MEASURED)
+    rounds: int = knob(ROUNDS, cost="blur without them", gain="0.35 to 0.5 s each with 4 photos", measured=MEASURED)
     steps: int | None = knob(None, cost="blur at few", gain="time in proportion", measured=MEASURED)
     seconds: float | None = knob(5.0, cost="blur at few", gain="time", measured=MEASURED)
     image_size: int | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)

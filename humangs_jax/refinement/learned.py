@@ -99,7 +99,7 @@ neighbor_mean.defvjp(_mean_forward, _mean_backward)
 
 
 class Refiner(nn.Module):
-    """The network of a round. width: of its features. layers: of messages between neighbours."""
+    """The network of a round. width: of its features. layers: of messages between neighbours. per_photo: width for a photo."""
 
     width: int = 48
     layers: int = 2
@@ -172,7 +172,7 @@ def unstacked(values: Float[Array, "g 14"], like: Parameters) -> Parameters:
 
 
 def photo_signals(parameters: Parameters, avatar: Avatar, photo: Photos, splat: SplatConfig) -> Signals:
-    """Of one photo (without the axis v), over its pixels that count. splat: with `visibility`."""
+    """Of one photo (without the axis v); errors are those of the pixels that count. splat: with `visibility`."""
 
     def draw(parameters, shift):
         gaussians = posed_gaussians(parameters, avatar, photo, poses=False)

@@ -69,7 +69,7 @@ def gaussians_of(parameters: Parameters) -> Gaussians:
 
 @pytree_dataclass
 class RefineState:
-    """State of a run. start: parameters before it. trust: (g,) share of the rates at which a Gaussian moves."""
+    """State of a run. start: parameters before Adam's first step. trust: (g,) share of the rates at which a Gaussian moves."""
 
     parameters: Parameters
     start: Parameters

@@ -2,7 +2,7 @@
 
 The learned update moves what no photo shows, too; Adam leaves it where it is. `refine` is the whole job on the host: it crops the
 photos, sizes buffers, watches the clock and keeps the state with the highest PSNR on pixels that no step saw.
-`refine_views` is the same optimisation as one pure function of a fixed number of steps, for `jax.jit` and `jax.vmap`.
+`refine_views` is Adam's part as one pure function of a fixed number of steps, for `jax.jit` and `jax.vmap`.
 """
 
 import dataclasses
@@ -66,9 +66,10 @@ HOST_SETTINGS = {
 class Refinement:
     """What `refine_with_report` returns.
 
-    avatar: the best state of the run. rounds, steps: how many of the learned update and of Adam. seconds: of the run, without
-    compilation (compile_seconds). loss: before and after, over all photos. psnr: before and after, dB over the crops. kept:
-    whether the loss has fallen; if not, the avatar is unchanged. interrupted: whether Ctrl-C ended the run.
+    avatar: the best state of the run. rounds, steps: how many of the learned update (0 if they were not kept) and of Adam.
+    seconds: of the run, without compilation (compile_seconds). loss: before and after, over all photos. psnr: before and after,
+    dB over the crops. kept: whether the loss has fallen; if not, the avatar is unchanged. interrupted: whether Ctrl-C ended the
+    run.
     """
 
     avatar: Avatar
@@ -209,16 +210,18 @@ class _Run:
         if config.growth > 1:
             self.denser(state)
         compile_seconds = time.perf_counter() - began
-        began, done, interrupted = time.perf_counter(), 0, False
+        began, rounds, done, interrupted = time.perf_counter(), 0, 0, False
         bar = progress_bar(total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}")
         try:
             if config.rounds:
                 state = self.learned(state, config.rounds)
                 psnr = self.loss(state, self.held)[1]
                 if psnr > highest or not self.any_held:
-                    best, highest = (state, self.avatar), psnr
+                    best, highest, rounds = (state, self.avatar), psnr, config.rounds
                 else:
                     state = best[0]
+                if watch is not None:
+                    watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
             passed, checked, splits = (
                 self.passed(0, time.perf_counter() - began),
                 0,
@@ -260,7 +263,7 @@ class _Run:
             refined = jax.tree.map(jnp.asarray, jax.device_get(refined))
         after = after if kept else before
         pairs = tuple(zip(before, after, strict=True))
-        return Refinement(refined, config.rounds, done, seconds, compile_seconds, pairs[0], pairs[1], kept, interrupted)
+        return Refinement(refined, rounds, done, seconds, compile_seconds, pairs[0], pairs[1], kept, interrupted)
 
     def step(self, state: RefineState, passed: float) -> tuple[RefineState, bool]:
         """The state after one step, and whether something did not fit into the buffers."""
@@ -303,7 +306,11 @@ class _Run:
 
     def loss(self, state: RefineState, photos: Photos) -> tuple[float, float]:
         """Loss and PSNR over the pixels that count."""
-        loss, squared, _ = _compiled(photos_loss)(state.parameters, self.avatar, photos, self.compiled_for, self.splat)
+        run = lambda: _compiled(photos_loss)(state.parameters, self.avatar, photos, self.compiled_for, self.splat)
+        loss, squared, overflow = run()
+        if int(overflow) > 0:  # after rounds of the learned update
+            self.splat = _planned(replace(self.avatar, gaussians=gaussians_of(state.parameters)), self.all)
+            loss, squared, _ = run()
         return float(loss), float(decibels(squared))
 
     def passed(self, steps: int, seconds: float) -> float:

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -48,3 +49,14 @@ def toy_capture(body, avatar, views=3, moving=False):
     drawn = capture_renderings(avatar, capture)[1]
     images = np.stack([np.clip(np.asarray(r.rgb), 0, 1) for r in drawn])
     return dataclasses.replace(capture, images=images, masks=np.stack([np.asarray(r.alpha) for r in drawn]))
+
+
+FEW = 0.03
+"""Share of numbers that may differ: where a gradient is rounding alone, Adam makes whole steps of it."""
+
+
+def assert_nearly_all_close(got, expected, atol):
+    """Two pytrees of one structure."""
+    for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
+        differ = np.abs(np.asarray(a) - np.asarray(b)) > atol
+        assert differ.mean() < FEW, f"{differ.sum()} of {differ.size} numbers differ by more than {atol}"

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refinement_cases import HEIGHT, STEPS, WIDTH, toy_avatar, toy_capture
+from refinement_cases import HEIGHT, STEPS, WIDTH, assert_nearly_all_close, toy_avatar, toy_capture
 
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
@@ -96,8 +96,7 @@ def test_pure_function_maps_over_people(body, person):
     assert not overflow.any()
     for i, one in enumerate((avatar, other)):
         alone, _ = jax.jit(run)(one, views)
-        for got, expected in zip(jax.tree.leaves(batch), jax.tree.leaves(alone), strict=True):
-            np.testing.assert_allclose(got[i], expected, atol=VMAP_TOLERANCE)
+        assert_nearly_all_close(jax.tree.map(lambda x, i=i: x[i], batch), alone, VMAP_TOLERANCE)
 
 
 def test_parameters_invert(person):
@@ -163,7 +162,7 @@ import numpy as np
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
 from humangs_jax.refinement.refine import refine_with_report
-from refinement_cases import STEPS, toy_avatar, toy_capture
+from refinement_cases import STEPS, assert_nearly_all_close, toy_avatar, toy_capture
 body = decimate(load_body(), 400)
 avatar = toy_avatar(body, 0.0)
 capture = toy_capture(body, toy_avatar(body, 0.15), views=2)
@@ -172,8 +171,7 @@ alone = refine_with_report(avatar, capture, config)
 shared = refine_with_report(avatar, capture, config, mesh=jax.make_mesh((2,), ("photos",)))
 assert alone.kept and shared.kept
 assert shared.avatar.gaussians.means.devices() == alone.avatar.gaussians.means.devices()
-for a, b in zip(jax.tree.leaves(shared.avatar), jax.tree.leaves(alone.avatar), strict=True):
-    np.testing.assert_allclose(a, b, atol=float(sys.argv[2]))
+assert_nearly_all_close(shared.avatar, alone.avatar, float(sys.argv[2]))
 """
 
 
