@@ -5,9 +5,12 @@
         [--page docs/refinement.md] [--table NAME] [--plot PLOT] [--sheet SHEET]
 
 People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random colours" from
-as many round Gaussians of random colours on the vertices of the body. --off: the body is moved by so many millimetres (standard
-deviation), each joint turned by 0.2 degrees and each shape coefficient changed by 0.02 a millimetre, before anything else;
-held-out views of the pose of the photos are then drawn with that body. Scores: docs/evaluation.md.
+as many round Gaussians of random colours on the vertices of the body. Scores: docs/evaluation.md.
+
+--off gives the photos a wrong body. Its value is the standard deviation of the translation, in millimetres. For each millimetre,
+joints turn by 0.2 degrees about each axis, and shape coefficients change by 0.02 (standard deviations). Held-out views show the
+pose of the photos and are drawn with the same wrong body.
+
 0 seconds are the start. A later run continues: finished people in the JSON with the same settings are not computed again.
 
 Seconds do not count compilation. One device: one core of a CPU.

@@ -24,7 +24,7 @@ FIRST_SEED = 6000
 """Of the training range, after those of the shipped network."""
 SIZE, PHOTOS, TARGETS = 256, 4, 6
 COUNTS = (1, 2, 4, 4, 4, 4, 6)
-"""Numbers of photos that a step draws from; with 6, two are views of other poses."""
+"""Numbers of photos that a step draws from; with 6, the first two targets are photos, too."""
 ROUND_WEIGHT = 0.9
 """A round counts this much less than the next."""
 WEIGHTS = {"squared": 10.0, "absolute": 1.0, "structural": 0.2, "silhouette": 0.2}
@@ -38,7 +38,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the samples, the state and the weights")
     parser.add_argument("--people", type=int, default=200, help="people of the samples")
-    parser.add_argument("--samples", type=int, default=300, help=f"the first {VALIDATED} are for validation")
+    parser.add_argument(
+        "--samples", type=int, default=300, help=f"the first {VALIDATED} are for validation, of the same people"
+    )
     parser.add_argument("--steps", type=int, default=900)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--learning-rate", type=float, default=2e-3)

@@ -31,6 +31,7 @@ from humangs_jax.refinement.config import SPLITS, RefineConfig
 from humangs_jax.refinement.crops import crop_to_person, held_out_blocks
 from humangs_jax.refinement.density import photo_errors, split, with_room, without_clear
 from humangs_jax.refinement.learned import (
+    Neighbors,
     Refiner,
     load_refiner,
     neighbors_of,
@@ -203,16 +204,11 @@ class _Run:
         state = _compiled(start)(self.avatar, self.all, self.compiled_for, self.splat)
         before = self.loss(state, self.all)
         best, highest = (state, self.avatar), self.loss(state, self.held)[1]
-        if config.steps != 0:
-            self.step(state, 0.0)  # compiles
-        if config.rounds:
-            self.learned(state, 1)
-        if config.growth > 1:
-            self.denser(state)
-        compile_seconds = time.perf_counter() - began
-        began, rounds, done, interrupted = time.perf_counter(), 0, 0, False
+        compile_seconds, rounds, done, interrupted = 0.0, 0, 0, False
         bar = progress_bar(total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}")
         try:
+            self.compile(state)
+            compile_seconds, began = time.perf_counter() - began, time.perf_counter()
             if config.rounds:
                 state = self.learned(state, config.rounds)
                 psnr = self.loss(state, self.held)[1]
@@ -222,11 +218,8 @@ class _Run:
                     state = best[0]
                 if watch is not None:
                     watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
-            passed, checked, splits = (
-                self.passed(0, time.perf_counter() - began),
-                0,
-                list(SPLITS) if config.growth > 1 else [],
-            )
+            checked, splits = 0, list(SPLITS) if config.growth > 1 else []
+            passed = self.passed(0, time.perf_counter() - began)
             while passed < 1:
                 if splits and passed >= splits[0]:
                     state, self.avatar = self.denser(state)
@@ -248,6 +241,7 @@ class _Run:
                     if watch is not None:
                         watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
                 bar.update(int(100 * passed) - bar.n)
+            bar.update(100 - bar.n)
         except KeyboardInterrupt:
             interrupted = True
         bar.close()
@@ -265,6 +259,15 @@ class _Run:
         pairs = tuple(zip(before, after, strict=True))
         return Refinement(refined, rounds, done, seconds, compile_seconds, pairs[0], pairs[1], kept, interrupted)
 
+    def compile(self, state: RefineState) -> None:
+        """Run once what a run consists of."""
+        if self.config.steps != 0:
+            self.step(state, 0.0)
+        if self.config.rounds:
+            self.learned(state, 1)
+        if self.config.growth > 1:
+            self.denser(state)
+
     def step(self, state: RefineState, passed: float) -> tuple[RefineState, bool]:
         """The state after one step, and whether something did not fit into the buffers."""
         chosen = next(self.order)
@@ -274,13 +277,17 @@ class _Run:
         )
         return state, int(overflow) > 0
 
+    @functools.cached_property
+    def neighbors(self) -> Neighbors:
+        """Of the avatar's own Gaussians."""
+        return neighbors_of(np.asarray(self.original.gaussians.means))
+
     def learned(self, state: RefineState, rounds: int) -> RefineState:
         """The state after rounds of the learned update, which Adam's steps then start from and are drawn back to.
 
         Slots without a Gaussian (`growth`) stay empty.
         """
         count = len(self.original.gaussians.means)
-        graph = neighbors_of(np.asarray(self.original.gaussians.means))
         seen = dataclasses.replace(self.splat, visibility=True)
         everything = stacked(state.parameters)
         start = values = everything[:count]
@@ -293,7 +300,7 @@ class _Run:
             ]
             signals = jax.tree.map(lambda *x: jnp.stack(x)[:, :count], *each)
             values, hidden = _compiled(refiner_round)(
-                load_refiner(), values, start, hidden, signals, graph, self.original
+                load_refiner(), values, start, hidden, signals, self.neighbors, self.original
             )
         parameters = unstacked(everything.at[:count].set(values), state.parameters)
         return replace(state, parameters=parameters, start=parameters)

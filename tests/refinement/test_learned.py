@@ -173,3 +173,27 @@ def test_rounds_move_gaussians_and_leave_empty_slots_empty(scene):
     report = run.go(progress=False, watch=None)
     assert (report.rounds, report.steps) == (2, 0) and "2 rounds and 0 steps" in report.summary()
     assert report.loss[1] <= report.loss[0]
+
+
+def test_interrupted_in_the_rounds_the_start_is_returned(scene, monkeypatch):
+    def interrupted(self, state, rounds):
+        raise KeyboardInterrupt
+
+    body = decimate(load_body(), 400)
+    monkeypatch.setattr(refinement._Run, "learned", interrupted)
+    config = dataclasses.replace(STEPS, rounds=2, steps=0)
+    report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
+    assert report.interrupted and (report.rounds, report.steps) == (0, 0)
+    jax.tree.map(np.testing.assert_array_equal, report.avatar, scene[0])
+
+
+def test_rounds_that_held_out_pixels_refuse_are_not_kept(scene, monkeypatch):
+    def worse(self, state, rounds):
+        return replace(state, parameters=replace(state.parameters, means=state.parameters.means + 0.3))
+
+    body = decimate(load_body(), 400)
+    monkeypatch.setattr(refinement._Run, "learned", worse)
+    config = dataclasses.replace(STEPS, rounds=2, steps=0, held_out=0.3)
+    report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
+    assert report.rounds == 0 and not report.kept
+    jax.tree.map(np.testing.assert_array_equal, report.avatar, scene[0])
