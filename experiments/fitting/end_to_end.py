@@ -1,10 +1,11 @@
-"""What a fitted body costs in the end: photos and keypoints -> fit -> reconstruct, beside true body parameters.
+"""What a fitted body costs in the end: photos and keypoints -> fit -> reconstruct -> refine, beside true body parameters.
 
     python experiments/fitting/end_to_end.py --people 4 --json end_to_end.json --docs
 
 People of the fitting seeds, four photos of 256 pixels each. Keypoints are the true ones with noise and outliers, at the
 accuracy of a detector that sees 512 pixels; cameras are true. Each reconstruction is drawn with the parameters it was made
-from, fitted or true, and compared with held-out photos. About 20 seconds a person after a minute of compilation.
+from, fitted or true, and compared with held-out photos, before and after refinement. --captures keeps the fitted people, with
+their held-out photos. About a minute a person after a minute of compilation.
 """
 
 import argparse
@@ -26,9 +27,11 @@ def main() -> None:
         "--outliers", type=float, default=0.0, help="share of points displaced by up to 100 pixels of 512"
     )
     parser.add_argument("--set", default="wholebody133", help="coco17, wholebody133 or openpose67")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of refinement")
+    parser.add_argument("--captures", type=Path, help="folder for the fitted captures, PERSON/ and PERSON/held_out/")
     parser.add_argument("--json", type=Path, required=True, help="numbers")
     parser.add_argument(
-        "--images", type=Path, help="folder for PERSON.png: truth, with true and with fitted parameters"
+        "--images", type=Path, help="folder for PERSON.png: truth, true and fitted parameters, both refined"
     )
     parser.add_argument("--docs", action="store_true", help="write the table into docs/fitting.md")
     arguments = parser.parse_args()
@@ -54,7 +57,7 @@ def run(arguments) -> None:
     for seed in tqdm(range(FIRST, FIRST + arguments.people), desc="people"):
         subject = make_evaluation_subject(seed, body, [VIEWS], SIZE, HeldOut(views=6, poses=0))
         rows.append({"seed": seed} | compare(variables, config, body, subject, arguments))
-    options = {name: getattr(arguments, name) for name in ("noise_px", "outliers", "set")}
+    options = {name: getattr(arguments, name) for name in ("noise_px", "outliers", "set", "seconds")}
     result = {"people": rows, "settings": options}
     write_json(arguments.json, result)
     cells = [[row["seed"], *(f"{row[key]:.2f}" for key in COLUMNS)] for row in rows]
@@ -70,32 +73,45 @@ COLUMNS = {
     "fitted_psnr": "PSNR, fitted",
     "true_foreground": "on the person, true",
     "fitted_foreground": "on the person, fitted",
+    "true_refined_psnr": "PSNR, true, refined",
+    "fitted_refined_psnr": "PSNR, fitted, refined",
+    "true_refined_foreground": "on the person, true, refined",
+    "fitted_refined_foreground": "on the person, fitted, refined",
     "joints_mm": "joint error, mm",
 }
 
 
 def compare(variables, config, body, subject, arguments) -> dict:
-    """Scores of both reconstructions of one person."""
+    """Scores of the reconstructions of one person, before and after refinement."""
     import dataclasses
 
     import numpy as np
 
     from humangs_jax.avatar.reconstruct import reconstruct
+    from humangs_jax.data.capture import save_capture
     from humangs_jax.evaluation.cases import draw_views
     from humangs_jax.evaluation.scores import score
+    from humangs_jax.refinement.config import RefineConfig
+    from humangs_jax.refinement.refine import refine
 
     photos = subject.inputs(VIEWS)
     fitted, millimetres = fit_photos(photos, body, subject.seed, arguments)
     pictures = {}
     for name, inputs in (("true", photos), ("fitted", fitted)):
         views = dataclasses.replace(subject.held_out, poses=inputs.poses, betas=inputs.betas)
-        pictures[name] = draw_views(reconstruct(variables, config, inputs), views).images
+        avatar = reconstruct(variables, config, inputs)
+        pictures[name] = draw_views(avatar, views).images
+        avatar = refine(avatar, inputs, RefineConfig(seconds=arguments.seconds))
+        pictures[f"{name}_refined"] = draw_views(avatar, views).images
+        if arguments.captures and name == "fitted":
+            save_capture(arguments.captures / str(subject.seed), inputs)
+            save_capture(arguments.captures / str(subject.seed) / "held_out", views)
     scores = {name: score(drawn, subject.held_out) for name, drawn in pictures.items()}
     if arguments.images:
         from humangs_jax.avatar.sheets import contact_sheet
 
         arguments.images.mkdir(parents=True, exist_ok=True)
-        sheet = np.concatenate([subject.held_out.images[:3], pictures["true"][:3], pictures["fitted"][:3]])
+        sheet = np.concatenate([subject.held_out.images[:3], *(drawn[:3] for drawn in pictures.values())])
         contact_sheet(sheet, arguments.images / f"{subject.seed}.png")
     found = {f"{name}_psnr": s.psnr for name, s in scores.items()}
     return found | {f"{name}_foreground": s.psnr_foreground for name, s in scores.items()} | {"joints_mm": millimetres}

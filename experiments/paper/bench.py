@@ -23,6 +23,8 @@ ABLATIONS = (", another seed", "tightness", "Gaussian", "no ", "features", "pool
 NOISE = "noise"
 """The claim of variants that differ from another one in the seed alone."""
 
+SHIPPED = "HumanGS, shipped"
+"""Name of the weights that come with the package."""
 PAPER = "paper"
 """Marks a row of the printed paper in every table."""
 HUMANRAM, LVSM, GHG, OURS = "HumanRAM", "LVSM", "GHG", "HumanGS"
@@ -287,7 +289,7 @@ def trained(runs: Path | None, names: Any = None) -> dict[str, tuple[Any, Any]]:
         finished = json.loads((runs / "results.json").read_text())["runs"]
         for name in finished if names is None else [name for name in names if name in finished]:
             found[name] = load_weights(runs / folder_of(name) / "weights.safetensors")
-    return found | {"HumanGS, shipped": load_weights()}
+    return found | {SHIPPED: load_weights()}
 
 
 def measured(

@@ -27,6 +27,7 @@ from experiments.common.results import write_json
 from experiments.paper.bench import (
     ABLATIONS,
     PHOTOS,
+    SHIPPED,
     VIEW_COUNTS,
     add_people_options,
     load_networks,
@@ -37,7 +38,6 @@ from experiments.paper.bench import (
     trained,
 )
 
-SHIPPED = "HumanGS, shipped"
 TOKENS = ("humangs", "no global token")
 DEPTHS = ("features of the last layer", "features of four depths")
 PATCHES = 8

@@ -1,12 +1,13 @@
 """The paper's tables with our rows beside the printed ones.
 
     python experiments/paper/tables.py --quick                                                 # minutes, synthetic people
-    python experiments/paper/tables.py --runs runs/paper --people PEOPLE --other OTHER --near NEAR --table all
+    python experiments/paper/tables.py --runs runs/paper --people PEOPLE --other OTHER --near NEAR --split RUNS PEOPLE
     python experiments/paper/tables.py ... --table animation --json tables.json
 
 animation        table 1: unseen poses and views, with the seconds to model a person and to draw a frame
 reconstruction   table 2: views in the pose of the photos, and in others
-domains          table 3: reconstruction of people like those of training (--people), and of others (--other)
+domains          table 3: reconstruction of people like those of training (--people), and of other kinds (--other); systems that
+                 were trained on another division of the people (--split: their runs, and people that they have not seen)
 views            1, 2, 4 and 6 photos, cameras at the distance of training (--people) and nearer (--near)
 gaussians        1 against 1 + 4 and 1 + 8 Gaussians a vertex
 
@@ -34,6 +35,7 @@ from experiments.paper.bench import (
     PAPER,
     PHOTOS,
     RECONSTRUCTION,
+    SHIPPED,
     VIEWS,
     add_people_options,
     load_networks,
@@ -43,10 +45,14 @@ from experiments.paper.bench import (
     trained,
     triple,
 )
+from humangs_jax.evaluation.tables import mean_scores
+from humangs_jax.io.text import read_json
 
 COUNTS = (1, 2, 4, 6)
 ONE_PHOTO = ", 1 photo"
 """End of the names of variants that were trained with one."""
+SPLIT = ", on the other split"
+"""End of the names of systems that were trained on other people."""
 PAGE_TABLE = "paper_tables"
 K_VARIANTS = ("1 Gaussian a vertex", "humangs", "1 + 4 Gaussians a vertex", "1 + 8 Gaussians a vertex")
 Measure = Callable[[str, Path | None, int], dict[str, Any] | None]
@@ -57,8 +63,10 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_people_options(parser)
-    parser.add_argument("--other", type=Path, help="people of another kind")
+    parser.add_argument("--other", type=Path, nargs="+", default=[], help="folders of people of other kinds")
+    parser.add_argument("--split", type=Path, nargs=2, metavar=("RUNS", "PEOPLE"), help="another division, see above")
     parser.add_argument("--near", type=Path, help="people seen by nearer cameras")
+    parser.add_argument("--fits", type=Path, help="the JSON of fit_person.py, for table 1")
     parser.add_argument("--page", type=Path, nargs="?", const=PAGE, help=f"write the table {PAGE_TABLE} of this page")
     parser.add_argument("--table", nargs="+", default=["all"], choices=(*TABLES, "all"), help="which ones")
     arguments = parser.parse_args()
@@ -78,6 +86,9 @@ def main() -> None:
 def write(arguments: argparse.Namespace) -> None:
     """Measure and print what was asked for."""
     systems, networks = trained(arguments.runs), load_networks(arguments.lpips)
+    if arguments.split:
+        others = trained(arguments.split[0])
+        systems |= {f"{name}{SPLIT}": others[name] for name in others if name != SHIPPED}
     numbers: dict[str, Any] = {}
 
     def measure(name: str, people: Path | None, photos: int) -> dict[str, Any] | None:
@@ -90,7 +101,7 @@ def write(arguments: argparse.Namespace) -> None:
             numbers[key] = measured(systems[name], people, photos, arguments.body, networks)
         return numbers[key]
 
-    names = [name for name in systems if not any(mark in name for mark in ABLATIONS)]
+    names = [name for name in systems if not any(mark in name for mark in (*ABLATIONS, SPLIT))]
     texts = []
     for table in TABLES if "all" in arguments.table else arguments.table:
         texts.append(f"**{table}**\n\n{TABLES[table](names, measure, arguments)}")
@@ -119,6 +130,11 @@ def animation(names: list[str], measure: Measure, arguments: argparse.Namespace)
         if found is not None:
             times = (seconds(found["model_s"]), seconds(found["frame_s"]))
             rows.append([name, f"{found['photos']} photos", of(found, "animation"), *times])
+    if arguments.fits:
+        fits = list(read_json(arguments.fits).values())
+        times = [seconds(sum(fit[key] for fit in fits) / len(fits)) for key in ("fit_s", "frame_s")]
+        scores = triple(mean_scores(fit["animation"] for fit in fits))
+        rows.append(["animatable", f"fitted to each of {len(fits)} people", scores, *times])
     return markdown_table(["method", "", "PSNR / SSIM / LPIPS", "modelling s", "synthesis s"], rows, "llrrr")
 
 
@@ -134,12 +150,16 @@ def reconstruction(names: list[str], measure: Measure, arguments: argparse.Names
 
 def domains(names: list[str], measure: Measure, arguments: argparse.Namespace) -> str:
     """Table 3."""
-    rows = [[name, PAPER, *map(triple, x)] for name, x in DOMAINS.items()]
+    others = arguments.other or [None]
+    rows = [[name, PAPER, *map(triple, x), *[""] * (len(others) - 1)] for name, x in DOMAINS.items()]
     for name in names:
-        found = [measure(name, people, PHOTOS) for people in (arguments.people, arguments.other)]
+        found = [measure(name, people, PHOTOS) for people in (arguments.people, *others)]
         if found[0] is not None:
             rows.append([name, f"{found[0]['photos']} photos", *(of(x, "reconstruction") for x in found)])
-    return markdown_table(["method", "", "in domain", "cross-domain"], rows, "llrr")
+        if arguments.split and (x := measure(f"{name}{SPLIT}", arguments.split[1], PHOTOS)) is not None:
+            rows.append([f"{name}{SPLIT}", f"{x['photos']} photos", of(x, "reconstruction"), *["-" for _ in others]])
+    heads = [f"cross-domain: {people.name}" if people else "cross-domain" for people in others]
+    return markdown_table(["method", "", "in domain", *heads], rows, "llr" + "r" * len(heads))
 
 
 def views(names: list[str], measure: Measure, arguments: argparse.Namespace) -> str:

@@ -50,6 +50,7 @@ def main() -> None:
     parser.add_argument("--budget", type=float, help="hours that this call may take; default: no limit")
     parser.add_argument("--steps", type=int, default=3000, help="of each variant")
     parser.add_argument("--people", type=int, default=64, help="people of the bank that is made")
+    parser.add_argument("--first", type=int, default=0, help="number of the first of them among the training seeds")
     parser.add_argument("--bank", type=Path, help="the people.npz of another run instead")
     parser.add_argument("--data", type=Path, help="captures or a data set (docs/datasets.md) to train on instead")
     parser.add_argument("--body", type=Path, help="body model of --data and --validation")
@@ -135,11 +136,11 @@ def made_people(arguments: argparse.Namespace) -> tuple[Path | None, Path]:
     bank, folder = arguments.bank, arguments.validation
     if bank is None and arguments.data is None:
         from humangs_jax.people.bank import build_bank, save_bank
-        from humangs_jax.people.seeds import SPLITS
+        from humangs_jax.people.seeds import seeds_of
 
         bank = arguments.out / "people.npz"
         if not bank.is_file():
-            seeds = SPLITS["train"][: arguments.people]
+            seeds = seeds_of("train", arguments.first, arguments.people)
             save_bank(bank, build_bank(seeds, load_body(), "train", processes=os.cpu_count() or 1, progress=True))
     if folder is None:
         from humangs_jax.people.writer import Layout, write_set

@@ -75,14 +75,31 @@ def test_tables_have_the_printed_rows_and_ours_beside_them(tmp_path):
         found = {"photos": photos, "reconstruction": scores, "animation": scores, "model_s": 0.5, "frame_s": 0.01}
         return found if people and name == "humangs" else None
 
-    arguments = argparse.Namespace(people=tmp_path, other=None, near=None)
+    arguments = argparse.Namespace(people=tmp_path, other=[], near=None, split=None, fits=tmp_path / "fits.json")
+    fit = {"animation": {"psnr": 21.0, "ssim": 0.9, "lpips_vgg": None}, "fit_s": 300.0, "frame_s": 0.5}
+    arguments.fits.write_text(json.dumps({"a": fit, "b": fit | {"fit_s": 500.0}}))
     texts = {name: table(["humangs", "lhm"], measure, arguments) for name, table in tables.TABLES.items()}
     assert "| humangs | 4 photos | 24.00 / 0.900 / - | 0.50 | 0.010 |" in texts["animation"]
     assert "| HumanGS | paper | 25.24 / 0.960 / 0.040 | 0.29 | 0.048 |" in texts["animation"]
+    assert "| animatable | fitted to each of 2 people | 21.00 / 0.900 / - | 400 | 0.50 |" in texts["animation"]
     assert "| humangs | standard | 21.00 / 0.900 / - |" in texts["views"]
     assert "| LVSM | paper | 24.38 / 0.960 / 0.036 | - |" in texts["reconstruction"]
     assert "| humangs | 4 photos | 24.00 / 0.900 / - | - |" in texts["domains"]
     assert "| humangs | 4 photos |" in texts["gaussians"] and ("lhm", tmp_path, 4) in asked
+
+
+def test_other_kinds_of_people_are_columns_and_another_split_a_row(tmp_path):
+    def measure(name, people, photos):
+        scores = {"psnr": 20.0 + len(people.name), "ssim": 0.9, "lpips_vgg": None}
+        return {"photos": photos, "reconstruction": scores}
+
+    people, other, third, unseen = (tmp_path / name for name in ("p", "walking", "hats", "unseen"))
+    arguments = argparse.Namespace(people=people, other=[other, third], split=[tmp_path, unseen])
+    text = tables.domains(["humangs"], measure, arguments)
+    assert "in domain | cross-domain: walking | cross-domain: hats |" in text
+    assert "| humangs | 4 photos | 21.00 / 0.900 / - | 27.00 / 0.900 / - | 24.00 / 0.900 / - |" in text
+    assert "| humangs, on the other split | 4 photos | 26.00 / 0.900 / - | - | - |" in text
+    assert "| HumanGS | paper | 30.81 / 0.980 / 0.024 | 27.27 / 0.970 / 0.033 |  |" in text
 
 
 def test_a_cost_table_has_the_ratio_of_the_readers():
