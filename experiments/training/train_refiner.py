@@ -1,14 +1,15 @@
 """Train the learned update of refinement (`humangs_jax/refinement/learned.py`) on avatars of the shipped network.
 
     python experiments/training/train_refiner.py --out runs/refiner --people 200 --samples 300 --steps 900
+    python experiments/training/train_refiner.py --out runs/more --rounds 3 --start runs/refiner/refiner.safetensors
 
 Makes the samples first: people of training seeds that the shipped network has not seen, its avatar of each from four photos, and
 ten views, four of them those photos. A step draws a sample and a number of photos, runs the rounds, and compares the result of
 each round with views that are not among the photos. Gradients pass through the rounds, but not through the errors that a round
 sees.
-The same command continues the run in --out; Ctrl-C saves. Writes OUT/refiner.safetensors.
+The same command continues the run in --out; Ctrl-C saves. Writes OUT/refiner.safetensors. Validation is on other people.
 
-On one CPU core: 5 s a sample, people included, then 1.3 s a step.
+On one CPU core: 5 s a sample, people included, then 0.7 s a step for each round.
 """
 
 import argparse
@@ -38,26 +39,44 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the samples, the state and the weights")
     parser.add_argument("--people", type=int, default=200, help="people of the samples")
-    parser.add_argument(
-        "--samples", type=int, default=300, help=f"the first {VALIDATED} are for validation, of the same people"
-    )
+    parser.add_argument("--samples", type=int, default=300, help="to train on")
+    parser.add_argument("--start", type=Path, help="weights to start from; default: a network that changes nothing")
     parser.add_argument("--steps", type=int, default=900)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--learning-rate", type=float, default=2e-3)
     arguments = parser.parse_args()
-    if arguments.samples <= VALIDATED or min(arguments.people, arguments.steps, arguments.rounds) < 1:
-        parser.error(f"expected more than {VALIDATED} samples, and at least 1 of --people, --steps and --rounds")
+    if min(arguments.samples, arguments.people, arguments.steps, arguments.rounds) < 1:
+        parser.error("expected at least 1 of --samples, --people, --steps and --rounds")
     from humangs_jax.core.allocator import keep_freed_memory
 
     keep_freed_memory()
-    train(make_samples(arguments.out, arguments.people, arguments.samples), arguments)
+    try:
+        keep_settings(arguments)
+        folders = make_samples(arguments.out / "samples", FIRST_SEED, arguments.people, arguments.samples)
+        validation = make_samples(arguments.out / "validation", FIRST_SEED + arguments.people, VALIDATED, VALIDATED)
+        train(folders, validation, arguments)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+
+
+def keep_settings(arguments: argparse.Namespace) -> None:
+    """Write OUT/settings.json, or raise ValueError if the run there has others."""
+    from humangs_jax.io.text import read_json, write_json
+
+    path = arguments.out / "settings.json"
+    settings = {name: str(x) if isinstance(x, Path) else x for name, x in vars(arguments).items() if name != "out"}
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    if not path.is_file():
+        write_json(path, settings)
+    elif (known := read_json(path)) != settings:
+        raise ValueError(f"{path}: this run has other settings, {known}: give another --out")
 
 
 # Samples ------------------------------------------------------------------------------------------------------------------
 
 
-def make_samples(out: Path, people: int, count: int) -> list[Path]:
-    """Folders with avatar.npz and views.npz; those that are there are kept."""
+def make_samples(out: Path, first: int, people: int, count: int) -> list[Path]:
+    """Folders with avatar.npz and views.npz, of the training seeds from `first` on; those that are there are kept."""
     import os
 
     import jax
@@ -74,16 +93,16 @@ def make_samples(out: Path, people: int, count: int) -> list[Path]:
     from humangs_jax.network.weights import load_weights
     from humangs_jax.people.bank import build_bank, load_bank, save_bank
     from humangs_jax.people.on_the_fly import OnTheFlyConfig, on_the_fly_example
-    from humangs_jax.people.seeds import SPLITS
+    from humangs_jax.people.seeds import seeds_of
 
-    folders = [out / "samples" / f"{i:05d}" for i in range(count)]
+    folders = [out / f"{i:05d}" for i in range(count)]
     missing = [folder for folder in folders if not (folder / "views.npz").is_file()]
     if not missing:
         return folders
     body, weights, path = load_body(), load_weights(), out / "people.npz"
     if not path.is_file():
         out.mkdir(parents=True, exist_ok=True)
-        seeds = SPLITS["train"][FIRST_SEED : FIRST_SEED + people]
+        seeds = seeds_of("train", first, people)
         save_bank(path, build_bank(seeds, body, "train", processes=os.cpu_count() or 1, progress=True))
     bank, make = load_bank(path), jax.jit(on_the_fly_example, static_argnames="config")
     config = OnTheFlyConfig(input_views=PHOTOS, target_views=TARGETS, input_size=SIZE, target_size=SIZE)
@@ -273,7 +292,7 @@ def step_gradient(variables: Any, sample: Sample, photos: int, rounds: int, spla
     return compiled(through_rounds)(variables, stacked(sample.start), seen, sample.neighbors, sample.avatar, cotangents)
 
 
-def train(folders: list[Path], arguments: argparse.Namespace) -> None:
+def train(folders: list[Path], validation: list[Path], arguments: argparse.Namespace) -> None:
     """From the first step, or from OUT/state.msgpack, to OUT/refiner.safetensors."""
     import jax
     import jax.numpy as jnp
@@ -283,13 +302,17 @@ def train(folders: list[Path], arguments: argparse.Namespace) -> None:
     from tqdm import tqdm
 
     from humangs_jax.io.atomic import write_bytes
-    from humangs_jax.refinement.learned import Refiner, Signals, save_refiner, stacked
+    from humangs_jax.refinement.learned import Refiner, Signals, read_refiner, save_refiner, stacked
 
     sample = read_sample(folders[0])
-    splat, values = planned([read_sample(folder) for folder in folders[:VALIDATED]]), stacked(sample.start)
+    splat, values = planned([read_sample(folder) for folder in validation]), stacked(sample.start)
     nothing = Signals(jnp.zeros((1, *values.shape)), jnp.zeros((1, len(values))), jnp.zeros((1, len(values))))
     hidden = jnp.zeros((len(values), Refiner.width))
     variables = Refiner().init(jax.random.key(0), values, values, hidden, nothing, sample.neighbors, jnp.zeros(3))
+    if arguments.start:
+        new, variables = variables, read_refiner(arguments.start)
+        if jax.tree.map(jnp.shape, variables) != jax.tree.map(jnp.shape, new):
+            raise ValueError(f"{arguments.start}: these are not weights of the network of a round")
     rate = optax.warmup_cosine_decay_schedule(
         0.0, arguments.learning_rate, min(50, arguments.steps // 2), arguments.steps, 0.02 * arguments.learning_rate
     )
@@ -308,10 +331,10 @@ def train(folders: list[Path], arguments: argparse.Namespace) -> None:
         try:
             while (step := int(state["step"])) < arguments.steps:
                 if step % VALIDATE_EVERY == 0:
-                    dB = validate(state["variables"], folders[:VALIDATED], arguments.rounds, splat)
+                    dB = validate(state["variables"], validation, arguments.rounds, splat)
                     bar.write(f"step {step}: {dB} dB before and after each round")
                 rng = np.random.default_rng(step)
-                chosen = read_sample(folders[rng.integers(VALIDATED, len(folders))])
+                chosen = read_sample(folders[rng.integers(len(folders))])
                 photos = int(rng.choice(COUNTS))
                 gradient = step_gradient(state["variables"], chosen, photos, arguments.rounds, splat, rng)
                 variables, opt_state = updated(gradient, state["optimizer"], state["variables"])
@@ -323,7 +346,7 @@ def train(folders: list[Path], arguments: argparse.Namespace) -> None:
             bar.write("interrupted: the same command goes on")
     write_bytes(path, serialization.to_bytes(jax.device_get(state)))
     if int(state["step"]) == arguments.steps:
-        dB = validate(state["variables"], folders[:VALIDATED], arguments.rounds, splat)
+        dB = validate(state["variables"], validation, arguments.rounds, splat)
         print(f"step {arguments.steps}: {dB} dB before and after each round")
         save_refiner(arguments.out / "refiner.safetensors", state["variables"])
 

@@ -218,12 +218,17 @@ def save_refiner(path: str | os.PathLike, variables: PyTree) -> None:
     write_bytes(path, save(tensors))
 
 
+def read_refiner(path: str | os.PathLike) -> PyTree:
+    """What `save_refiner` wrote. Raises: FileNotFoundError; FileError if it is no safetensors file."""
+    variables: dict[str, Any] = {}
+    for key, tensor in read_safetensors(path)[0].items():
+        layer, name = key.split("/")
+        variables.setdefault(layer, {})[name] = jnp.asarray(tensor, jnp.float32)
+    return {"params": variables}
+
+
 @functools.cache
 def load_refiner() -> PyTree:
     """Variables of the `Refiner` that comes with the package."""
-    variables: dict[str, Any] = {}
     with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as path:
-        for key, tensor in read_safetensors(path)[0].items():
-            layer, name = key.split("/")
-            variables.setdefault(layer, {})[name] = jnp.asarray(tensor, jnp.float32)
-    return {"params": variables}
+        return read_refiner(path)
