@@ -14,7 +14,7 @@ gaussians        1 against 1 + 4 and 1 + 8 Gaussians a vertex
 PSNR / SSIM / LPIPS by the protocol of the paper; LPIPS needs weights (--lpips). Printed rows say so and are of the paper's data
 and training: they are no measure of ours. Systems are those whose training is finished in --runs, and the shipped weights;
 those that take one photo get the first. People of another kind are any other folder: captures of `humangs synth` with other
-settings, or a data set.
+settings, or a data set. --json is written after every measurement; the same command goes on there.
 """
 
 import argparse
@@ -26,6 +26,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import check_section, markdown_table, publish, significant, write_json
+from experiments.evaluation.results import file_digest
 from experiments.paper.bench import (
     ABLATIONS,
     ANIMATION,
@@ -89,7 +90,8 @@ def write(arguments: argparse.Namespace) -> None:
     if arguments.split:
         others = trained(arguments.split[0])
         systems |= {f"{name}{SPLIT}": others[name] for name in others if name != SHIPPED}
-    numbers: dict[str, Any] = {}
+    settings = settings_of(arguments)
+    numbers: dict[str, Any] = kept(arguments.json, settings)
 
     def measure(name: str, people: Path | None, photos: int) -> dict[str, Any] | None:
         if people is None or name not in systems:
@@ -98,7 +100,10 @@ def write(arguments: argparse.Namespace) -> None:
         photos = 1 if alone and photos == PHOTOS else photos
         key = f"{name}, {people.name}, {photos}"
         if key not in numbers:
+            print(key, file=sys.stderr, flush=True)
             numbers[key] = measured(systems[name], people, photos, arguments.body, networks)
+            if arguments.json:
+                write_json(arguments.json, {"settings": settings, "rows": numbers})
         return numbers[key]
 
     names = [name for name in systems if not any(mark in name for mark in (*ABLATIONS, SPLIT))]
@@ -106,10 +111,29 @@ def write(arguments: argparse.Namespace) -> None:
     for table in TABLES if "all" in arguments.table else arguments.table:
         texts.append(f"**{table}**\n\n{TABLES[table](names, measure, arguments)}")
         print(f"{texts[-1]}\n", flush=True)
-    if arguments.json:
-        write_json(arguments.json, numbers)
     if arguments.page:
-        publish(arguments.page, PAGE_TABLE, "\n\n".join(texts), numbers)
+        publish(arguments.page, PAGE_TABLE, "\n\n".join(texts), {"settings": settings, "rows": numbers})
+
+
+def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What decides the numbers: the weights and the people."""
+    runs = [path for path in (arguments.runs, arguments.split and arguments.split[0]) if path]
+    folders = [arguments.people, arguments.near, *arguments.other, arguments.split and arguments.split[1]]
+    return {
+        "runs": {path.name: file_digest(path / "results.json") for path in runs},
+        "people": [path.name for path in folders if path],
+        "lpips": bool(arguments.lpips),
+    }
+
+
+def kept(path: Path | None, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The rows in a file. Raises: ValueError if they were measured with other settings."""
+    if path is None or not path.is_file():
+        return {}
+    report = read_json(path)
+    if report["settings"] != settings:
+        raise ValueError(f"{path}: rows of other settings, {report['settings']}: give another --json")
+    return report["rows"]
 
 
 def of(found: Mapping[str, Any] | None, task: str) -> str:

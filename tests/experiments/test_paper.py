@@ -102,6 +102,15 @@ def test_other_kinds_of_people_are_columns_and_another_split_a_row(tmp_path):
     assert "| HumanGS | paper | 30.81 / 0.980 / 0.024 | 27.27 / 0.970 / 0.033 |  |" in text
 
 
+def test_rows_of_tables_are_kept_for_the_same_settings_alone(tmp_path):
+    path = tmp_path / "tables.json"
+    assert tables.kept(None, {}) == tables.kept(path, {}) == {}
+    path.write_text('{"settings": {"people": ["a"]}, "rows": {"humangs, a, 4": null}}')
+    assert tables.kept(path, {"people": ["a"]}) == {"humangs, a, 4": None}
+    with pytest.raises(ValueError, match="rows of other settings"):
+        tables.kept(path, {"people": ["b"]})
+
+
 def test_a_cost_table_has_the_ratio_of_the_readers():
     readers = {
         "back-projection": {"cpu_ms": 2.0, "operations": 1e7, "temporary_mb": 1.0},
