@@ -44,22 +44,27 @@ def main() -> None:
 
 
 def run(arguments) -> None:
-    """Every person; numbers are written at the end."""
+    """Every person; numbers are written after each, and those of the same settings are kept."""
     from tqdm import tqdm
 
     from experiments.common.results import markdown_table, publish, write_json
     from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
     from humangs_jax.body.library import load_body
+    from humangs_jax.io.text import read_json
     from humangs_jax.network.weights import load_weights
 
-    body, (variables, config) = load_body(), load_weights()
-    rows = []
-    for seed in tqdm(range(FIRST, FIRST + arguments.people), desc="people"):
-        subject = make_evaluation_subject(seed, body, [VIEWS], SIZE, HeldOut(views=6, poses=0))
-        rows.append({"seed": seed} | compare(variables, config, body, subject, arguments))
     options = {name: getattr(arguments, name) for name in ("noise_px", "outliers", "set", "seconds")}
-    result = {"people": rows, "settings": options}
-    write_json(arguments.json, result)
+    known = read_json(arguments.json) if arguments.json.exists() else {"settings": options, "people": []}
+    kept = {row["seed"]: row for row in known["people"] if known["settings"] == options}
+    body, (variables, config) = load_body(), load_weights()
+    rows, result = [], {}
+    for seed in tqdm(range(FIRST, FIRST + arguments.people), desc="people"):
+        if seed not in kept:
+            subject = make_evaluation_subject(seed, body, [VIEWS], SIZE, HeldOut(views=6, poses=0))
+            kept[seed] = {"seed": seed} | compare(variables, config, body, subject, arguments)
+        rows.append(kept[seed])
+        result = {"people": rows, "settings": options}
+        write_json(arguments.json, result)
     cells = [[row["seed"], *(f"{row[key]:.2f}" for key in COLUMNS)] for row in rows]
     cells.append(["mean", *(f"{sum(row[key] for row in rows) / len(rows):.2f}" for key in COLUMNS)])
     text = markdown_table(["person", *COLUMNS.values()], cells)
