@@ -11,6 +11,7 @@ their held-out photos. About a minute a person after a minute of compilation.
 import argparse
 import sys
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
@@ -54,8 +55,8 @@ def run(arguments) -> None:
     from humangs_jax.network.weights import load_weights
 
     options = {name: getattr(arguments, name) for name in ("noise_px", "outliers", "set", "seconds")}
-    known = read_json(arguments.json) if arguments.json.exists() else {"settings": options, "people": []}
-    kept = {row["seed"]: row for row in known["people"] if known["settings"] == options}
+    known: Any = read_json(arguments.json) if arguments.json.exists() else {}
+    kept = {row["seed"]: row for row in known["people"]} if known.get("settings") == options else {}
     body, (variables, config) = load_body(), load_weights()
     rows, result = [], {}
     for seed in tqdm(range(FIRST, FIRST + arguments.people), desc="people"):

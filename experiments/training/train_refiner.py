@@ -196,7 +196,9 @@ def run_rounds(variables: Any, sample: Sample, photos: int, rounds: int, splat: 
     hidden, after, seen = jnp.zeros((len(start), Refiner.width)), [], []
     for _ in range(rounds):
         parameters = unstacked(values, sample.start)
-        each = [compiled(photo_signals)(parameters, sample.avatar, view, splat=splat) for view in sample.views[:photos]]
+        each = [
+            compiled(photo_signals)(parameters, sample.avatar, view, splat=splat)[0] for view in sample.views[:photos]
+        ]
         seen.append(jax.tree.map(lambda *x: jnp.stack(x), *each))
         values, hidden = compiled(refiner_round)(
             variables, values, start, hidden, seen[-1], sample.neighbors, sample.avatar

@@ -42,6 +42,8 @@ PERSON = 8000.0
 SEEN = 0.02
 """A Gaussian of this largest weight on a pixel of a photo counts as seen there."""
 TYPICAL_LOG_SCALE = -4.5
+MOST_PHOTOS = 6
+"""Photos that a round looks at, as in training: sums over more are nothing that the network knows, and take longer."""
 
 
 @pytree_dataclass
@@ -171,16 +173,18 @@ def unstacked(values: Float[Array, "g 14"], like: Parameters) -> Parameters:
     return replace(like, **{name: part.reshape(x.shape) for (name, x), part in zip(shapes.items(), parts, strict=True)})
 
 
-def photo_signals(parameters: Parameters, avatar: Avatar, photo: Photos, splat: SplatConfig) -> Signals:
-    """Of one photo (without the axis v); errors are those of the pixels that count. splat: with `visibility`."""
+def photo_signals(
+    parameters: Parameters, avatar: Avatar, photo: Photos, splat: SplatConfig
+) -> tuple[Signals, Int[Array, ""]]:
+    """Of one photo (without the axis v), and the overflow. Errors: of the pixels that count. splat: with `visibility`."""
 
     def draw(parameters, shift):
         gaussians = posed_gaussians(parameters, avatar, photo, poses=False)
         colors = gaussians.colors + shift[:, None]
         rendering = render(replace(gaussians, colors=colors), photo.cameras, splat)
-        return (rendering.rgb, rendering.alpha), rendering.visibility
+        return (rendering.rgb, rendering.alpha), (rendering.visibility, rendering.overflow)
 
-    (rgb, alpha), pull_back, visibility = jax.vjp(
+    (rgb, alpha), pull_back, (visibility, overflow) = jax.vjp(
         draw, parameters, jnp.zeros_like(avatar.gaussians.opacities), has_aux=True
     )
     errors = (
@@ -191,7 +195,7 @@ def photo_signals(parameters: Parameters, avatar: Avatar, photo: Photos, splat: 
     # a change of all three colours of a Gaussian changes the sum of an image by three times its weights
     _, pixels = pull_back((jnp.ones_like(rgb), jnp.zeros_like(alpha)))
     scale = PERSON / jnp.maximum(jnp.sum(photo.masks), 1.0)
-    return Signals(scale * stacked(gradient), visibility, scale * pixels / 3)
+    return Signals(scale * stacked(gradient), visibility, scale * pixels / 3), overflow
 
 
 def refiner_round(

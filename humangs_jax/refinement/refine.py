@@ -31,8 +31,10 @@ from humangs_jax.refinement.config import SPLITS, RefineConfig
 from humangs_jax.refinement.crops import crop_to_person, held_out_blocks
 from humangs_jax.refinement.density import photo_errors, split, with_room, without_clear
 from humangs_jax.refinement.learned import (
+    MOST_PHOTOS,
     Neighbors,
     Refiner,
+    Signals,
     load_refiner,
     neighbors_of,
     photo_signals,
@@ -41,7 +43,7 @@ from humangs_jax.refinement.learned import (
     unstacked,
 )
 from humangs_jax.refinement.objective import Photos, photos_gradient, photos_loss, photos_of, posed_gaussians
-from humangs_jax.refinement.parameters import RefineState, gaussians_of, init_state, parameters_of, update
+from humangs_jax.refinement.parameters import Parameters, RefineState, gaussians_of, init_state, parameters_of, update
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.splatting import plan_buffers, render
 
@@ -228,7 +230,7 @@ class _Run:
                 done += 1
                 if overflow:
                     paused = time.perf_counter()
-                    self.splat = _planned(replace(self.avatar, gaussians=gaussians_of(state.parameters)), self.all)
+                    self.splat = self.replanned(state.parameters)
                     self.step(state, passed)  # compiles for the new buffers
                     took = time.perf_counter() - paused
                     compile_seconds, began = compile_seconds + took, began + took
@@ -288,22 +290,35 @@ class _Run:
         Slots without a Gaussian (`growth`) stay empty.
         """
         count = len(self.original.gaussians.means)
-        seen = dataclasses.replace(self.splat, visibility=True)
         everything = stacked(state.parameters)
         start = values = everything[:count]
         hidden = jnp.zeros((count, Refiner.width))
+        used = min(len(self.useful), MOST_PHOTOS)
+        chosen = self.useful[np.arange(used) * len(self.useful) // used]
         for _ in range(rounds):
             parameters = unstacked(everything.at[:count].set(values), state.parameters)
-            each = [
-                _compiled(photo_signals)(parameters, self.avatar, jax.tree.map(lambda x, i=i: x[i], self.seen), seen)
-                for i in self.useful
-            ]
+            each = [self.signals(parameters, int(i)) for i in chosen]
             signals = jax.tree.map(lambda *x: jnp.stack(x)[:, :count], *each)
             values, hidden = _compiled(refiner_round)(
                 load_refiner(), values, start, hidden, signals, self.neighbors, self.original
             )
         parameters = unstacked(everything.at[:count].set(values), state.parameters)
         return replace(state, parameters=parameters, start=parameters)
+
+    def signals(self, parameters: Parameters, view: int) -> Signals:
+        """What one photo says; the buffers grow if the Gaussians no longer fit."""
+        photo = jax.tree.map(lambda x: x[view], self.seen)
+        for _ in range(2):
+            seen = dataclasses.replace(self.splat, visibility=True)
+            found, overflow = _compiled(photo_signals)(parameters, self.avatar, photo, seen)
+            if not int(overflow):
+                break
+            self.splat = self.replanned(parameters)
+        return found
+
+    def replanned(self, parameters: Parameters) -> SplatConfig:
+        """Buffers for the Gaussians as they are now."""
+        return _planned(replace(self.avatar, gaussians=gaussians_of(parameters)), self.all)
 
     def denser(self, state: RefineState) -> tuple[RefineState, Avatar]:
         """The state and the avatar after the Gaussians with the largest errors were split."""
@@ -316,7 +331,7 @@ class _Run:
         run = lambda: _compiled(photos_loss)(state.parameters, self.avatar, photos, self.compiled_for, self.splat)
         loss, squared, overflow = run()
         if int(overflow) > 0:  # after rounds of the learned update
-            self.splat = _planned(replace(self.avatar, gaussians=gaussians_of(state.parameters)), self.all)
+            self.splat = self.replanned(state.parameters)
             loss, squared, _ = run()
         return float(loss), float(decibels(squared))
 

@@ -53,7 +53,7 @@ def drawn(scene, parameters):
 
 def signals_of(scene, photo=None):
     avatar, own, parameters, splat = scene
-    return jax.jit(photo_signals, static_argnames="splat")(parameters, avatar, photo or own, splat)
+    return jax.jit(photo_signals, static_argnames="splat")(parameters, avatar, photo or own, splat)[0]
 
 
 def test_neighbors_are_mutual_and_near():
@@ -173,6 +173,22 @@ def test_rounds_move_gaussians_and_leave_empty_slots_empty(scene):
     report = run.go(progress=False, watch=None)
     assert (report.rounds, report.steps) == (2, 0) and "2 rounds and 0 steps" in report.summary()
     assert report.loss[1] <= report.loss[0]
+
+
+def test_rounds_look_at_a_few_evenly_spaced_photos_and_buffers_grow(scene, monkeypatch):
+    avatar, _, _, splat = scene
+    capture = toy_capture(decimate(load_body(), 400), toy_avatar(decimate(load_body(), 400), 0.15), views=9)
+    config = dataclasses.replace(STEPS, rounds=1, steps=0)
+    small = dataclasses.replace(splat, max_pairs=64)
+    run = refinement._Run(avatar, crop_to_person(capture), config, None, small)
+    looked, signals = [], run.signals
+    monkeypatch.setattr(run, "signals", lambda parameters, view: looked.append(int(view)) or signals(parameters, view))
+    before = refinement.start(run.avatar, run.all, config, splat)
+    after = run.learned(before, 1)
+    assert looked == [0, 1, 3, 4, 6, 7] and run.splat.max_pairs > 64
+    monkeypatch.undo()
+    run.splat = dataclasses.replace(run.splat, max_pairs=2 * run.splat.max_pairs)
+    jax.tree.map(np.testing.assert_array_equal, run.learned(before, 1).parameters, after.parameters)
 
 
 def test_interrupted_in_the_rounds_the_start_is_returned(scene, monkeypatch):

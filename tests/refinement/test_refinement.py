@@ -166,7 +166,7 @@ from refinement_cases import STEPS, assert_nearly_all_close, toy_avatar, toy_cap
 body = decimate(load_body(), 400)
 avatar = toy_avatar(body, 0.0)
 capture = toy_capture(body, toy_avatar(body, 0.15), views=2)
-config = dataclasses.replace(STEPS, steps=3, views_per_step=2)
+config = dataclasses.replace(STEPS, rounds=1, steps=3, views_per_step=2)
 alone = refine_with_report(avatar, capture, config)
 shared = refine_with_report(avatar, capture, config, mesh=jax.make_mesh((2,), ("photos",)))
 assert alone.kept and shared.kept

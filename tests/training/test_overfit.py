@@ -64,7 +64,7 @@ def photos(tmp_path_factory):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("free", "longest_edge"), [(0, 0.02), (4, 0.03)], ids=["K = 1", "K = 5"])
-def test_a_subject_is_learnt_by_heart(photos, free, longest_edge):
+def test_the_network_overfits_to_one_subject(photos, free, longest_edge):
     start = time.process_time()
     config = configuration(free, longest_edge)
     body = gaussian_body(load_body(), config.model)
