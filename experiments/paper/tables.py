@@ -86,6 +86,8 @@ def main() -> None:
 
 def write(arguments: argparse.Namespace) -> None:
     """Measure and print what was asked for."""
+    import jax
+
     systems, networks = trained(arguments.runs), load_networks(arguments.lpips)
     if arguments.split:
         others = trained(arguments.split[0])
@@ -102,6 +104,7 @@ def write(arguments: argparse.Namespace) -> None:
         if key not in numbers:
             print(key, file=sys.stderr, flush=True)
             numbers[key] = measured(systems[name], people, photos, arguments.body, networks)
+            jax.clear_caches()  # programs map memory, and Linux ends a process with too many mappings
             if arguments.json:
                 write_json(arguments.json, {"settings": settings, "rows": numbers})
         return numbers[key]
