@@ -17,6 +17,10 @@ CROP = 0.75
 """Share of the image's width that is shown: cameras keep the whole height of a person in a square frame."""
 TITLE = 22
 """Height of the letters of titles, pixels."""
+DETAILS = {"face": (("left_eye_smplhf", "right_eye_smplhf"), 0.3), "hand": (("left_middle1", "left_index1"), 0.3),
+           "hem": (("left_hip", "left_knee"), 0.5), "shoe": (("left_ankle", "left_foot"), 0.36)}  # fmt: skip
+"""What is looked at closely: joints in whose middle it is, and the side of the square in metres."""
+DETAIL_PIXELS = 96
 Strip = dict[str, np.ndarray]
 """By task: truth, ours and the painted body of the first held-out view, (3, h, w, 3) of 8 bits."""
 
@@ -67,6 +71,34 @@ def cropped(image: np.ndarray) -> np.ndarray:
     width = image.shape[1]
     left = round(0.5 * (1 - CROP) * width)
     return image[:, left : width - left]
+
+
+def frontal_view(photos: Capture, held_out: Capture, views: Sequence[int]) -> int:
+    """Which of these views looks in the direction of the first photo."""
+    directions = np.asarray(held_out.cameras.cam_from_world)[list(views), 2, :3]
+    return views[int(np.argmax(directions @ np.asarray(photos.cameras.cam_from_world)[0, 2, :3]))]
+
+
+def details(image: np.ndarray, capture: Capture, view: int) -> np.ndarray:
+    """Squares of an image of this view, (details, `DETAIL_PIXELS`, `DETAIL_PIXELS`, 3); white beyond its border."""
+    import jax.numpy as jnp
+    from skimage.transform import resize
+
+    from humangs_jax.body.model import pose_body, shape_body
+    from humangs_jax.geometry.camera import project
+
+    body, camera = capture.body, capture.cameras[view]
+    pose = capture.pose(int(np.asarray(capture.frames)[view]))
+    joints = np.asarray(pose_body(body, shape_body(body, jnp.asarray(capture.betas)), pose).joints)
+    squares = []
+    for names, side in DETAILS.values():
+        (x, y), depth = project(camera, joints[[body.joint_names.index(name) for name in names]].mean(0))
+        half = max(2, round(0.5 * side * float(camera.K[0, 0]) / float(depth)))
+        padded = np.pad(image, ((half, half), (half, half), (0, 0)), constant_values=1.0)
+        top, left = (int(np.clip(round(float(value)), 0, image.shape[0])) for value in (y, x))
+        square = padded[top : top + 2 * half, left : left + 2 * half]
+        squares.append(resize(square, (DETAIL_PIXELS, DETAIL_PIXELS), order=1, anti_aliasing=True))
+    return np.stack(squares)
 
 
 def plot_views(path: Path, report: dict[str, Any]) -> None:

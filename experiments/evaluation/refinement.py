@@ -2,7 +2,7 @@
 
     python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 1 2 5 15] [--sizes 256 512]
         [--views 4] [--rounds 0 2] [--growth 1 1.5] [--off 0 2.5 5] [--longest-edge 0.017]
-        [--page docs/refinement.md] [--table NAME] [--plot PLOT] [--sheet SHEET]
+        [--page docs/refinement.md] [--table NAME] [--plot PLOT] [--sheet SHEET] [--details SHEET]
 
 People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random colours" from
 as many round Gaussians of random colours on the vertices of the body. Scores: docs/evaluation.md.
@@ -63,6 +63,7 @@ def main() -> None:
     parser.add_argument(
         "--sheet", type=Path, help="truth, feed-forward and the longest run of every person, largest size"
     )
+    parser.add_argument("--details", type=Path, help="the same of faces, hands, hems and shoes")
     arguments = parser.parse_args()
     check_people_options(parser, arguments)
     report = evaluate(arguments)
@@ -78,11 +79,13 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     """Rows of all people, written to the JSON after each."""
     from tqdm import tqdm
 
+    from experiments.evaluation.pictures import cropped
     from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
     from humangs_jax.body.library import load_body
     from humangs_jax.people.seeds import seeds_of
 
     body, (variables, config, digest) = load_body(), load_network(arguments)
+    drawing = arguments.sheet or arguments.details
     config = config.with_execution(longest_edge=arguments.longest_edge)
     settings = settings_of(arguments, digest, config.tokens, None)
     settings |= {
@@ -93,7 +96,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
     seeds = seeds_of(arguments.split, arguments.first, arguments.subjects)
     for seed in tqdm(seeds, desc="people"):
-        if seed in rows and not arguments.sheet:
+        if seed in rows and not drawing:
             continue
         row: dict[str, Any] = {}
         for size in arguments.sizes:
@@ -113,7 +116,9 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         if arguments.json:
             write_json(arguments.json, report_of(rows, settings, seeds))
     if arguments.sheet:
-        write_sheet(arguments.sheet, images)
+        write_sheet(arguments.sheet, {seed: [cropped(image) for image in drawn] for seed, (drawn, _) in images.items()})
+    if arguments.details:
+        write_sheet(arguments.details, {seed: close for seed, (_, close) in images.items()})
     return report_of(rows, settings, seeds)
 
 
@@ -144,7 +149,11 @@ def with_body_off(subject, millimetres):
 
 
 def measure(variables, config, subject, count, start, how, seconds):
-    """Scores by seconds and task, and (truth, feed-forward, refined) of the first held-out view."""
+    """Scores by seconds and task; truth, feed-forward and refined of a held-out view from the front, whole and in details."""
+    import numpy as np
+
+    from experiments.evaluation.pictures import details, frontal_view
+    from experiments.evaluation.subjects import task_views
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.refinement.refine import refine_with_report
 
@@ -152,14 +161,16 @@ def measure(variables, config, subject, count, start, how, seconds):
     avatar = reconstruct(variables, config, inputs)
     if start != "network":
         avatar = random_start(avatar, subject.seed)
-    scores, first = score_all(avatar, subject.held_out)
+    view = frontal_view(subject.photos, subject.held_out, task_views(subject.held_out)["novel"].tolist())
+    scores, first = score_all(avatar, subject.held_out, view)
     cell, last = {"0": scores}, first
     for length in seconds:
         refined = refine_with_report(avatar, inputs, dataclasses.replace(how, seconds=length))
-        scores, last = score_all(refined.avatar, subject.held_out)
+        scores, last = score_all(refined.avatar, subject.held_out, view)
         about = {"steps": refined.steps, "compile_seconds": round(refined.compile_seconds, 1), "kept": refined.kept}
         cell[f"{length:g}"] = scores | {"run": about | {"photos_psnr": refined.psnr[1]}}
-    return cell, (subject.held_out.images[0], first, last)
+    drawn = (subject.held_out.images[view], first, last)
+    return cell, (drawn, [np.concatenate(list(details(image, subject.held_out, view)), axis=1) for image in drawn])
 
 
 def random_start(avatar, seed):
@@ -183,13 +194,13 @@ def random_start(avatar, seed):
     return replace(avatar, gaussians=gaussians)
 
 
-def score_all(avatar, held_out):
-    """Scores by task, and the first image."""
+def score_all(avatar, held_out, view=0):
+    """Scores by task, and the image of a view."""
     from experiments.evaluation.subjects import score_tasks
     from humangs_jax.evaluation.cases import draw_views
 
     drawn = draw_views(avatar, held_out)
-    return score_tasks(drawn.images, held_out, alpha=drawn.alpha), drawn.images[0]
+    return score_tasks(drawn.images, held_out, alpha=drawn.alpha), drawn.images[view]
 
 
 def report_of(rows, settings, seeds):
@@ -257,10 +268,9 @@ def write_sheet(path, images):
     """Truth, feed-forward and refined, two people a row."""
     import numpy as np
 
-    from experiments.evaluation.pictures import cropped
     from humangs_jax.avatar.sheets import contact_sheet
 
-    tiles = np.stack([cropped(image) for seed in images for image in images[seed]])
+    tiles = np.stack([image for drawn in images.values() for image in drawn])
     headers = ("truth", "feed-forward", "refined") * min(2, len(images))
     contact_sheet(tiles, path, headers=headers, columns=len(headers))
 

@@ -24,8 +24,10 @@ from humangs_jax.training.state import init_state
 from humangs_jax.training.step import train_step
 
 STEPS, VIEWS, SIZE = 80, 4, 32
+MORE_STEPS = {"lca": 240}
+"""Points that attend to tokens learn slowly."""
 FALL = 2.0
-"""Least factor by which the squared error falls; measured: lvsm 4.9, humanram 4.2, giga 4.6, animatable 3.4, lca 2.8."""
+"""Least factor by which the squared error falls; measured: lvsm 4.9, humanram 4.2, giga 4.6, animatable 3.4, lca 2.9."""
 
 
 def configuration(name: str) -> TrainConfig:
@@ -40,7 +42,7 @@ def configuration(name: str) -> TrainConfig:
         loss=LossConfig(structural_scales=1, tightness=0.01),
         optimizer=OptimizerConfig(learning_rate=5e-3, warmup_steps=5, weight_decay=0.0),
         target_size=SIZE,
-        steps=STEPS,
+        steps=MORE_STEPS.get(name, STEPS),
     )
 
 
@@ -53,7 +55,7 @@ def test_one_person_is_learnt_and_shown_by_the_evaluator(name, body, captures):
     mapped = gaussian_body(body, config.model)
     batch = jax.tree.map(lambda x: x[None], Example(views, views))
     state, errors = init_state(config), []
-    for _ in range(STEPS):
+    for _ in range(config.steps):
         state, metrics = train_step(state, batch, mapped, config)
         errors.append(float(metrics["squared"]))
     assert int(metrics["skipped"]) == int(metrics["overflow"]) == 0
