@@ -16,16 +16,17 @@ Variants that are not trained are left out, with a line that says so.
 import argparse
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.results import write_json
+from experiments.common.results import check_section, markdown_table, publish, write_json
 from experiments.paper.bench import (
     ABLATIONS,
+    PAGE,
     PHOTOS,
     SHIPPED,
     VIEW_COUNTS,
@@ -44,6 +45,9 @@ PATCHES = 8
 """Patches along a side of an image: 64 of 512 pixels."""
 SHOWN = 4
 """People, and poses, on the sheet of driven people."""
+ACROSS = 8
+"""Systems side by side, before the next ones are below."""
+PAGE_TABLE = "paper_figures"
 
 
 def main() -> None:
@@ -52,11 +56,15 @@ def main() -> None:
     add_people_options(parser)
     parser.add_argument("--out", type=Path, required=True, help="folder of the images")
     parser.add_argument("--motions", type=Path, help="captures whose poses drive the others")
+    parser.add_argument("--varying", type=Path, help="captures of several poses, for `varying`; default: --people")
+    parser.add_argument("--page", type=Path, nargs="?", const=PAGE, help=f"write the table {PAGE_TABLE} of this page")
     parser.add_argument("--figure", nargs="+", default=list(FIGURES), choices=tuple(FIGURES), help="which ones")
     arguments = parser.parse_args()
     if not (arguments.people or arguments.quick):
         parser.error("--people is needed, or --quick")
     try:
+        if arguments.page:
+            check_section(arguments.page, PAGE_TABLE)
         with tempfile.TemporaryDirectory() as folder:
             if arguments.people is None:
                 arguments.people = quick_people(Path(folder) / "people")
@@ -65,8 +73,29 @@ def main() -> None:
             numbers = {name: FIGURES[name](systems, networks, arguments) for name in arguments.figure}
             if arguments.json:
                 write_json(arguments.json, numbers)
+            if arguments.page:
+                publish(arguments.page, PAGE_TABLE, text_of(numbers), numbers)
     except (ValueError, OSError) as error:
         parser.error(str(error))
+
+
+def text_of(numbers: Mapping[str, Any]) -> str:
+    """The curves over photos as a table, and what the histogram says."""
+    counts = [str(count) for count in VIEW_COUNTS]
+    rows = [
+        [
+            name,
+            kind,
+            *(f"{x:.2f}" if (x := {str(k): v for k, v in points.items()}.get(count)) else "" for count in counts),
+        ]
+        for figure, kind in (("token", "one pose, that of the target"), ("varying", "several poses, another one"))
+        for name, points in numbers.get(figure, {}).items()
+    ]
+    texts = [markdown_table(["PSNR, dB, by photos", "photos show", *counts], rows, "ll" + "r" * len(counts))]
+    if found := numbers.get("features"):
+        said = f"mean {found['mean']:.1e}, skewness {found['skewness']:+.2f}"
+        texts.append(f"Squared error without - with features of four depths, {found['patches']} patches: {said}.")
+    return "\n\n".join(texts)
 
 
 def present(systems: dict[str, Any], names: tuple[str, ...], figure: str) -> bool:
@@ -79,11 +108,12 @@ def present(systems: dict[str, Any], names: tuple[str, ...], figure: str) -> boo
 
 def varying(systems: dict[str, Any], networks: Any, arguments: argparse.Namespace) -> dict[str, dict[int, float]]:
     """Unseen poses from photos of varying poses."""
+    people = arguments.varying or arguments.people
     curves: dict[str, dict[int, float]] = {}
     for name in (name for name in ("humangs", "cross-attention", SHIPPED) if name in systems):
         for count in (1, 2, 4, 6):
-            indices = varied(arguments.people, count)
-            found = measured(systems[name], arguments.people, count, arguments.body, networks, indices)
+            indices = varied(people, count)
+            found = measured(systems[name], people, count, arguments.body, networks, indices)
             if found is not None and (scores := found["animation"] or found["reconstruction"]):
                 curves.setdefault(name, {})[count] = scores["psnr"]
     draw_curves(curves, arguments.out / "varying.png", "photos of varying poses")
@@ -233,15 +263,18 @@ def systems_shown(systems: dict[str, Any], networks: Any, arguments: argparse.Na
         columns["truth"] = [case.truth.images[view] for view in views]
         predicted = shown(systems[name], case)[0]
         columns[f"{name}\n{photos} photo{'s' * (photos > 1)}"] = [predicted.images[view] for view in views]
-    rows = len(columns["truth"])
+    rows, width = len(columns["truth"]), min(len(columns), ACROSS)
+    blocks = -(-len(columns) // width)
     figure, axes = plt.subplots(
-        rows, len(columns), figsize=(1.3 * len(columns), 1.6 * rows), layout="constrained", squeeze=False
+        blocks * rows, width, figsize=(1.3 * width, 1.6 * blocks * rows), layout="constrained", squeeze=False
     )
-    for (title, images), column in zip(columns.items(), axes.T, strict=True):
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for i, (title, images) in enumerate(columns.items()):
+        column = axes[i // width * rows :, i % width]
         column[0].set_title(title, fontsize=7)
-        for axis, image in zip(column, images, strict=True):
+        for axis, image in zip(column, images, strict=False):
             axis.imshow(np.clip(image, 0, 1))
-            axis.set_axis_off()
     figure.savefig(arguments.out / "systems.png", dpi=130)
     return {"systems": names}
 
