@@ -20,6 +20,8 @@ PER_PERSON = ("animatable",)
 """Systems that are fitted to one person, and so have no place in a training on many."""
 ABLATIONS = (", another seed", "tightness", "Gaussian", "no ", "features", "pooling", "all tokens", "canonical")
 """Marks of names that are no system of tables 1 to 3."""
+ONE_PHOTO = ", 1 photo"
+"""End of the names of variants that were trained with one."""
 NOISE = "noise"
 """The claim of variants that differ from another one in the seed alone."""
 

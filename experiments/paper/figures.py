@@ -26,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import check_section, markdown_table, publish, write_json
 from experiments.paper.bench import (
     ABLATIONS,
+    ONE_PHOTO,
     PAGE,
     PHOTOS,
     SHIPPED,
@@ -256,7 +257,7 @@ def systems_shown(systems: dict[str, Any], networks: Any, arguments: argparse.Na
     names = [name for name in systems if not any(mark in name for mark in ABLATIONS)]
     columns: dict[str, Any] = {}
     for name in names:
-        photos = 1 if takes_one(systems[name][1]) else PHOTOS
+        photos = 1 if takes_one(systems[name][1]) or name.endswith(ONE_PHOTO) else PHOTOS
         case = find_people(arguments.people, photos, None, arguments.body).load(0)
         frames = np.asarray(case.truth.frames)
         views = sorted({int(np.argmax(frames == frame)) for frame in (frames.min(), frames.max())})

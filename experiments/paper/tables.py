@@ -32,6 +32,7 @@ from experiments.paper.bench import (
     ANIMATION,
     DOMAINS,
     GAUSSIANS,
+    ONE_PHOTO,
     PAGE,
     PAPER,
     PHOTOS,
@@ -50,8 +51,6 @@ from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.io.text import read_json
 
 COUNTS = (1, 2, 4, 6)
-ONE_PHOTO = ", 1 photo"
-"""End of the names of variants that were trained with one."""
 SPLIT = ", on the other split"
 """End of the names of systems that were trained on other people."""
 PAGE_TABLE = "paper_tables"
@@ -115,7 +114,13 @@ def write(arguments: argparse.Namespace) -> None:
         texts.append(f"**{table}**\n\n{TABLES[table](names, measure, arguments)}")
         print(f"{texts[-1]}\n", flush=True)
     if arguments.page:
-        publish(arguments.page, PAGE_TABLE, "\n\n".join(texts), {"settings": settings, "rows": numbers})
+        rows = {key: row and {name: shown(x) for name, x in row.items()} for key, row in numbers.items()}
+        publish(arguments.page, PAGE_TABLE, "\n\n".join(texts), {"settings": settings, "rows": rows})
+
+
+def shown(value: Any) -> Any:
+    """Of the scores, those that the tables have."""
+    return [value[name] for name in ("psnr", "ssim", "lpips_vgg")] if isinstance(value, dict) else value
 
 
 def settings_of(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -144,6 +149,11 @@ def of(found: Mapping[str, Any] | None, task: str) -> str:
     return "-" if found is None else triple(found[task])
 
 
+def photos_of(found: Mapping[str, Any]) -> str:
+    """How many a system got."""
+    return "1 photo" if found["photos"] == 1 else f"{found['photos']} photos"
+
+
 def seconds(value: float | None) -> str:
     """A time, or a dash."""
     return "-" if value is None else significant(value)
@@ -156,7 +166,7 @@ def animation(names: list[str], measure: Measure, arguments: argparse.Namespace)
         found = measure(name, arguments.people, PHOTOS)
         if found is not None:
             times = (seconds(found["model_s"]), seconds(found["frame_s"]))
-            rows.append([name, f"{found['photos']} photos", of(found, "animation"), *times])
+            rows.append([name, photos_of(found), of(found, "animation"), *times])
     if arguments.fits:
         fits = list(read_json(arguments.fits).values())
         times = [seconds(sum(fit[key] for fit in fits) / len(fits)) for key in ("fit_s", "frame_s")]
@@ -171,7 +181,7 @@ def reconstruction(names: list[str], measure: Measure, arguments: argparse.Names
     for name in names:
         found = measure(name, arguments.people, PHOTOS)
         if found is not None:
-            rows.append([name, f"{found['photos']} photos", of(found, "reconstruction"), of(found, "animation")])
+            rows.append([name, photos_of(found), of(found, "reconstruction"), of(found, "animation")])
     return markdown_table(["method", "", "reconstruction", "reconstruction + animation"], rows, "llrr")
 
 
@@ -182,9 +192,9 @@ def domains(names: list[str], measure: Measure, arguments: argparse.Namespace) -
     for name in names:
         found = [measure(name, people, PHOTOS) for people in (arguments.people, *others)]
         if found[0] is not None:
-            rows.append([name, f"{found[0]['photos']} photos", *(of(x, "reconstruction") for x in found)])
+            rows.append([name, photos_of(found[0]), *(of(x, "reconstruction") for x in found)])
         if arguments.split and (x := measure(f"{name}{SPLIT}", arguments.split[1], PHOTOS)) is not None:
-            rows.append([f"{name}{SPLIT}", f"{x['photos']} photos", of(x, "reconstruction"), *["-" for _ in others]])
+            rows.append([f"{name}{SPLIT}", photos_of(x), of(x, "reconstruction"), *["-" for _ in others]])
     heads = [f"cross-domain: {people.name}" if people else "cross-domain" for people in others]
     return markdown_table(["method", "", "in domain", *heads], rows, "llr" + "r" * len(heads))
 
@@ -192,9 +202,15 @@ def domains(names: list[str], measure: Measure, arguments: argparse.Namespace) -
 def views(names: list[str], measure: Measure, arguments: argparse.Namespace) -> str:
     """Numbers of photos."""
     rows = [[name, f"{PAPER}, near", *map(triple, x)] for name, x in VIEWS.items()]
+    several = [name for name in names if not name.endswith(ONE_PHOTO)]
     for kind, people in (("standard", arguments.people), ("near", arguments.near)):
-        for name in names:
-            found = [of(measure(name, people, count), "reconstruction") for count in COUNTS]
+        for name in several:
+            each = [measure(name, people, count) for count in COUNTS]
+            # those that take one photo are measured with it, whatever is asked for
+            found = [
+                of(row if row and row["photos"] == count else None, "reconstruction")
+                for count, row in zip(COUNTS, each, strict=True)
+            ]
             if set(found) != {"-"}:
                 rows.append([name, kind, *found])
     return markdown_table(["method", "cameras", *map(str, COUNTS)], rows, "ll" + "r" * len(COUNTS))
@@ -207,7 +223,7 @@ def gaussians(names: list[str], measure: Measure, arguments: argparse.Namespace)
     for name in K_VARIANTS:
         found = measure(name, arguments.people, PHOTOS)
         if found is not None:
-            rows.append([name, f"{found['photos']} photos", of(found, "reconstruction")])
+            rows.append([name, photos_of(found), of(found, "reconstruction")])
     return markdown_table(["Gaussians a vertex", "", "PSNR / SSIM / LPIPS"], rows, "llr")
 
 
