@@ -17,7 +17,7 @@ CROP = 0.75
 """Share of the image's width that is shown: cameras keep the whole height of a person in a square frame."""
 TITLE = 22
 """Height of the letters of titles, pixels."""
-DETAILS = {"face": (("left_eye_smplhf", "right_eye_smplhf"), 0.3), "hand": (("left_middle1", "left_index1"), 0.3),
+DETAILS = {"face": (("left_eye", "right_eye"), 0.3), "hand": (("left_middle1", "left_index1"), 0.3),
            "hem": (("left_hip", "left_knee"), 0.5), "shoe": (("left_ankle", "left_foot"), 0.36)}  # fmt: skip
 """What is looked at closely: joints in whose middle it is, and the side of the square in metres."""
 DETAIL_PIXELS = 96
@@ -89,10 +89,10 @@ def details(image: np.ndarray, capture: Capture, view: int) -> np.ndarray:
 
     body, camera = capture.body, capture.cameras[view]
     pose = capture.pose(int(np.asarray(capture.frames)[view]))
-    joints = np.asarray(pose_body(body, shape_body(body, jnp.asarray(capture.betas)), pose).joints)
+    joints = pose_body(body, shape_body(body, jnp.asarray(capture.betas)), pose).joints
     squares = []
     for names, side in DETAILS.values():
-        (x, y), depth = project(camera, joints[[body.joint_names.index(name) for name in names]].mean(0))
+        (x, y), depth = project(camera, joints[np.asarray([body.joint_names.index(name) for name in names])].mean(0))
         half = max(2, round(0.5 * side * float(camera.K[0, 0]) / float(depth)))
         padded = np.pad(image, ((half, half), (half, half), (0, 0)), constant_values=1.0)
         top, left = (int(np.clip(round(float(value)), 0, image.shape[0])) for value in (y, x))

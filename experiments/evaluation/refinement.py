@@ -118,7 +118,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.sheet:
         write_sheet(arguments.sheet, {seed: [cropped(image) for image in drawn] for seed, (drawn, _) in images.items()})
     if arguments.details:
-        write_sheet(arguments.details, {seed: close for seed, (_, close) in images.items()})
+        write_sheet(arguments.details, {seed: close for seed, (_, close) in images.items()}, 1)
     return report_of(rows, settings, seeds)
 
 
@@ -264,14 +264,14 @@ def plot(path, report):
     plt.close(figure)
 
 
-def write_sheet(path, images):
-    """Truth, feed-forward and refined, two people a row."""
+def write_sheet(path, images, across=2):
+    """Truth, feed-forward and refined; `across` people a row."""
     import numpy as np
 
     from humangs_jax.avatar.sheets import contact_sheet
 
     tiles = np.stack([image for drawn in images.values() for image in drawn])
-    headers = ("truth", "feed-forward", "refined") * min(2, len(images))
+    headers = ("truth", "feed-forward", "refined") * min(across, len(images))
     contact_sheet(tiles, path, headers=headers, columns=len(headers))
 
 
