@@ -2,7 +2,7 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
@@ -11,6 +11,7 @@ from humangs_jax.cli.options import (
     Preset,
     UsageError,
     chosen_settings,
+    first_refinement,
     refine_limits,
     require_at_least,
     require_avatar,
@@ -30,8 +31,6 @@ if TYPE_CHECKING:
 
 DEMO_SECONDS = 10.0
 """Of refinement."""
-ROUNDS_ALONE = {"steps": 0, "seconds": None, "image_size": 512}
-"""Of refinement, where nothing is asked for: about a second, however large the photos."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,9 +94,7 @@ class Reconstruct:
     """Look first whether photos, cameras and poses belong together, the quick part of `humangs check`; --no-check skips it."""
 
     def run(self) -> None:
-        limits: dict[str, Any] | None = ROUNDS_ALONE if self.refine is None else None
-        if self.refine not in (None, "0"):
-            limits = refine_limits(self.refine, "--refine")
+        limits = first_refinement(self.refine)
         require_at_least(1, views=None if self.views == "auto" else self.views)
         require_avatar(self.out)
         with stage("starting"):

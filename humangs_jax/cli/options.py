@@ -116,6 +116,10 @@ def require_between(least: float | int, most: float | int, **values: float | int
             raise UsageError(f"--{name.replace('_', '-')} {value}: expected {bounds}")
 
 
+ROUNDS_ALONE = {"steps": 0, "seconds": None, "image_size": 512}
+"""Of refinement, where nothing is asked for: about a second, however large the photos."""
+
+
 def refine_limits(text: str, option: str) -> dict[str, Any]:
     """Fields of `RefineConfig` for "15s", "15" (seconds), "100steps", or "0steps" (rounds only). Raises: UsageError."""
     match = re.fullmatch(r"(?P<number>\d+(\.\d*)?)(?P<unit>s|steps)?", text.strip())
@@ -124,6 +128,13 @@ def refine_limits(text: str, option: str) -> dict[str, Any]:
     if not (number > 0 or in_steps) or (in_steps and number != int(number)):
         raise UsageError(f'{option} {text!r}: expected how long to refine, as in "15s" or "100steps"')
     return {"steps": int(number), "seconds": None} if in_steps else {"steps": None, "seconds": number}
+
+
+def first_refinement(text: str | None) -> dict[str, Any] | None:
+    """Fields of `RefineConfig` for --refine of a new avatar: `refine_limits`, "0" for None, by default `ROUNDS_ALONE`."""
+    if text is None:
+        return ROUNDS_ALONE
+    return None if text == "0" else refine_limits(text, "--refine")
 
 
 def chosen_settings(preset: "Preset | None", config: Path | None) -> "Settings | None":

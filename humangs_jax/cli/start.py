@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
-from humangs_jax.cli.options import UsageError, refine_limits, require_at_least, require_replaceable, tell_deleted
+from humangs_jax.cli.options import UsageError, first_refinement, require_at_least, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 
 if TYPE_CHECKING:
@@ -42,16 +42,17 @@ class Start:
     without_masks: bool = False
     """Do without masks: the photos have nothing but white behind the person."""
     refine: str | None = None
-    """Fit the avatar to the photos for so long: seconds ("15s") or steps ("100steps"); see `humangs refine`. Needs masks."""
+    """Fit the avatar to the photos for so long: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not at all.
+    Needs masks. Default, if there are masks: rounds of a learned update alone, about a second."""
     browser: bool = True
     """Open the page at the end."""
     overwrite: bool = False
     """Start again, also where --out already has a body or a finished avatar."""
 
     def run(self) -> None:
-        limits = None if self.refine is None else refine_limits(self.refine, "--refine")
+        limits = first_refinement(self.refine)
         require_at_least(0, person=self.person)
-        if limits is not None and self.without_masks:
+        if self.refine not in (None, "0") and self.without_masks:
             raise UsageError("--refine needs masks: leave out --without-masks")
         self._resumes()  # what is wrong with --out is said before the work
         with stage("starting"):
@@ -161,7 +162,7 @@ class Start:
             from humangs_jax.viewer.page import write_page
 
             avatar = reconstruct(*load_weights(), capture)
-        if limits is not None:
+        if limits is not None and capture.masks is not None:
             with stage("refining"):
                 from humangs_jax.refinement.config import RefineConfig
                 from humangs_jax.refinement.refine import refine_with_report
