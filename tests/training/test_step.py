@@ -29,6 +29,7 @@ from humangs_jax.training.step import (
     train_step,
 )
 
+FLOAT64 = 1e-6
 FLOAT32 = 1e-5
 CONFIG = tiny()
 
@@ -142,13 +143,17 @@ def test_subjects_worked_on_at_once_or_one_after_the_other_give_the_same_gradien
     # without batch statistics, which are meant to differ
     config = dataclasses.replace(CONFIG, model=without_upsampler(CONFIG.model))
     variables = init_humangs(jax.random.key(0), config.model)
-    results = [
-        batch_gradients(variables["params"], {}, body, batch, keys, dataclasses.replace(config, microbatch_size=size))
-        for size in (1, 2)
-    ]
-    assert float(results[1][0]) == pytest.approx(float(results[0][0]), rel=bound(FLOAT32))
+    # in float32 the last bit decides whether a Gaussian counts in a pixel, which is 0.3 % of the gradient of a bias here
+    double = lambda x: x.astype(jnp.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x
+    with jax.enable_x64(True):
+        params, body, batch = jax.tree.map(double, (variables["params"], body, batch))
+        results = [
+            batch_gradients(params, {}, body, batch, keys, dataclasses.replace(config, microbatch_size=size))
+            for size in (1, 2)
+        ]
+    assert float(results[1][0]) == pytest.approx(float(results[0][0]), rel=FLOAT64)
     for a, b in zip(*(jax.tree.leaves(result[1]) for result in results), strict=True):
-        assert np.linalg.norm(a - b) <= 1e-4 * np.linalg.norm(b) + 1e-9
+        assert np.linalg.norm(a - b) <= FLOAT64 * np.linalg.norm(b) + 1e-12
 
 
 WITH_NETWORKS = dataclasses.replace(CONFIG, loss=dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25))
