@@ -106,7 +106,7 @@ def stages(case: Case) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
     from humangs_jax.network.humangs import decode, part_variables
     from humangs_jax.network.humangs import read as read_features
     from humangs_jax.network.parts import Pass
-    from humangs_jax.training.forward import draw_targets, white_backgrounds
+    from humangs_jax.training.forward import DrawnTargets, draw_targets, white_backgrounds
     from humangs_jax.training.optimizer import make_optimizer
     from humangs_jax.training.step import loss_terms
 
@@ -130,7 +130,9 @@ def stages(case: Case) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
         return draw_targets(outputs, body, targets, white_backgrounds(targets), config).rendering
 
     def compare(outputs, drawn, rgb):
-        terms = loss_terms(replace(drawn, rgb=rgb), outputs, targets.images, targets, config.loss, networks)
+        terms = loss_terms(
+            DrawnTargets(replace(drawn, rgb=rgb)), outputs, targets.images, targets, config.loss, networks
+        )
         return sum(getattr(config.loss, name) * term for name, term in terms.items())
 
     def update(state):
@@ -143,7 +145,7 @@ def stages(case: Case) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
             leaves = [x for x in jax.tree.leaves(function(*arguments)) if jnp.issubdtype(x.dtype, jnp.inexact)]
             return sum(jnp.sum(jnp.square(x.astype(jnp.float32))) for x in leaves)
 
-        return jax.grad(total, position)
+        return jax.grad(total, position, allow_int=True)  # an encoding also counts dropped tokens
 
     params = variables["params"]
     encoding = jit(encode, params)
