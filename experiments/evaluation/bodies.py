@@ -32,6 +32,7 @@ from experiments.evaluation.options import (
     check_people_options,
     load_lpips,
     load_network,
+    seeds_asked_for,
     settings_of,
 )
 from experiments.evaluation.results import (
@@ -83,10 +84,9 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     from humangs_jax.body.library import load_body
     from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
     from humangs_jax.evaluation.cases import draw_views
-    from humangs_jax.people.seeds import seeds_of
 
-    seeds = seeds_of(arguments.split, arguments.first, arguments.subjects)
     body, (variables, config, digest) = load_body(), load_network(arguments)
+    seeds = seeds_asked_for(arguments, body)
     settings = settings_of(arguments, digest, config.tokens, lpips)
     settings |= {"views": arguments.views, "device": jax.devices()[0].device_kind}
     rows = kept_rows(arguments.json, settings, "bodies")

@@ -1,9 +1,9 @@
-"""Weights side by side: feed-forward and refined, of the same people.
+"""Weights, or two ways to use them, side by side: feed-forward and refined, of the same people.
 
     python experiments/evaluation/refinement.py --split validation --seconds 5 --sizes 256 --rounds 0 --weights A --json a.json
-    python experiments/evaluation/compare_weights.py first=a.json trained=b.json --page docs/evaluation.md
+    python experiments/evaluation/compare_weights.py first=a.json trained=b.json --page docs/evaluation.md [--table NAME]
 
-The scores are those of `refinement.py`, means over its people, from four photos of 256 pixels.
+The scores are those of `refinement.py`, means over its people. Results may differ in --weights, --tokens and --skinning-reach.
 """
 
 import argparse
@@ -15,8 +15,8 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import add_outputs, check_section, markdown_table, write_outputs
 
-TABLE = "weights_choice"
-CELL = "256 4 network"
+COMPARED = ("weights", "tokens", "skinning_reach")
+"""Settings that may differ."""
 SCORES = {"psnr": ("PSNR", 2), "psnr_foreground": ("on the person", 2), "ssim": ("SSIM", 4), "fog": ("fog", 3)}
 TASKS = {"novel": "same pose", "animation": "unseen poses"}
 
@@ -25,22 +25,23 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("results", nargs="+", metavar="NAME=JSON", help="results of refinement.py")
-    add_outputs(parser, TABLE)
+    parser.add_argument("--table", default="weights_choice", help="name of the table on the page")
+    add_outputs(parser, "TABLE")
     arguments = parser.parse_args()
     if arguments.page:
-        check_section(arguments.page, TABLE)
+        check_section(arguments.page, arguments.table)
     named = dict(pair.split("=", 1) for pair in arguments.results)
     means = compare({name: json.loads(Path(path).read_text()) for name, path in named.items()})
-    write_outputs(arguments, TABLE, section(means), means)
+    write_outputs(arguments, arguments.table, section(means), means)
 
 
 def compare(results: dict[str, Any]) -> dict[str, Any]:
     """{name: {seconds: {task: {score: mean}}}}.
 
-    Raises: ValueError if two results are not of the same people and settings.
+    Raises: ValueError if two results are not of the same people and settings, or a result is of several starts.
     """
     common = [
-        ({name: value for name, value in result["settings"].items() if name != "weights"}, seeds(result))
+        ({name: value for name, value in result["settings"].items() if name not in COMPARED}, seeds(result))
         for result in results.values()
     ]
     for name, found in zip(results, common, strict=True):
@@ -48,9 +49,13 @@ def compare(results: dict[str, Any]) -> dict[str, Any]:
             raise ValueError(
                 f"{name}: expected the people and settings of {next(iter(results))}: {common[0]}, got {found}"
             )
+    for name, result in results.items():
+        if len(result["means"]) != 1:
+            raise ValueError(f"{name}: expected one size, number of photos and start, got {list(result['means'])}")
     return {
         name: {run: {task: {key: tasks[task][key] for key in SCORES} for task in TASKS} for run, tasks in runs.items()}
-        for name, runs in ((name, result["means"][CELL]) for name, result in results.items())
+        for name, result in results.items()
+        for runs in result["means"].values()
     }
 
 

@@ -1,10 +1,12 @@
 """Where the error of reconstructions is: at the outline, in holes, in the colours of the person, or around the person.
 
-    python experiments/evaluation/error_shares.py PEOPLE [--weights FILE] [--views 4] [--targets 6] [--json OUT]
+    python experiments/evaluation/error_shares.py PEOPLE --weights before=OLD.safetensors now= [--views 4] [--targets 6]
+        [--json OUT] [--page docs/evaluation.md]
 
-PEOPLE is a folder of captures with masks, such as `humangs synth --for-training` writes them. Prints, over all people, the
-shares of the squared error and the PSNR, and the PSNR that the predicted colours would have under the true coverage. About 20 s
-and 2 s a person on 2 CPU cores.
+PEOPLE is a folder of captures with masks, such as `humangs synth --for-training` writes them; several are compared. NAME= without
+a file stands for the shipped weights. Numbers are means over all views of all people: PSNR, also that which the predicted colours
+would have under the true coverage; shares of the squared error; fog, and what the true images have of it. About 20 s and 2 s a
+person on 2 CPU cores.
 """
 
 import argparse
@@ -12,35 +14,48 @@ import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import add_outputs, markdown_table, write_outputs
 
 BAND = 3
 """Pixels to either side that count as the outline."""
 LEAST_COVERAGE = 0.05
 """Below this coverage the predicted colour is undefined; the true one is used."""
+TABLE = "evaluation_error_shares"
 
 
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("people", type=Path, help="folder of capture folders")
-    parser.add_argument("--weights", type=Path, help="weights file; the shipped ones if not given")
+    parser.add_argument("people", type=Path, nargs="+", help="folders of capture folders")
+    parser.add_argument("--weights", nargs="+", default=["shipped="], metavar="NAME=FILE", help="weights to compare")
     parser.add_argument("--views", type=int, default=4, help="photos that the network sees")
     parser.add_argument("--targets", type=int, default=6, help="other views of each person")
-    parser.add_argument("--json", type=Path, help="write the numbers here")
+    add_outputs(parser, TABLE)
     arguments = parser.parse_args()
     if arguments.views < 1 or arguments.targets < 1:
         parser.error("--views and --targets must be at least 1")
-    from experiments.common.results import write_json
+    if unnamed := [pair for pair in arguments.weights if "=" not in pair]:
+        parser.error(f"--weights: expected NAME=FILE, got {unnamed[0]}")
+    columns = {}
+    for people in arguments.people:
+        for name, file in (pair.split("=", 1) for pair in arguments.weights):
+            size, found = measure(people, Path(file) if file else None, arguments.views, arguments.targets)
+            columns[f"{name}, {size} px"] = found
+    write_outputs(arguments, TABLE, section(columns), columns)
 
-    result = measure(arguments)
-    for name, value in result.items():
-        print(f"{name:28} {value:.3f}")
-    if arguments.json:
-        write_json(arguments.json, result)
+
+def section(columns: dict[str, dict[str, float]]) -> str:
+    """The table: a column for each folder and weights."""
+    rows = [
+        [name, *(f"{column[name]:.{2 if name.startswith('PSNR') else 3}f}" for column in columns.values())]
+        for name in next(iter(columns.values()))
+        if name != "squared error"
+    ]
+    return markdown_table(["", *columns], rows)
 
 
-def measure(arguments: argparse.Namespace) -> dict[str, float]:
-    """Means over people and views; shares are of the squared error of all."""
+def measure(people: Path, weights: Path | None, view_count: int, target_count: int) -> tuple[int, dict[str, float]]:
+    """Side of the images in pixels; means over people and views, where shares are of the squared error of all."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -54,11 +69,11 @@ def measure(arguments: argparse.Namespace) -> dict[str, float]:
     from humangs_jax.training.sources import captured_people
     from humangs_jax.training.validation import validation_examples
 
-    variables, model = load_weights(arguments.weights)
-    views = ViewSampling(input_counts=(arguments.views,), target_count=arguments.targets)
+    variables, model = load_weights(weights)
+    views = ViewSampling(input_counts=(view_count,), target_count=target_count)
     config = TrainConfig(model=model, views=views)
     body = load_body()
-    folders = find_captures(arguments.people)
+    folders = find_captures(people)
     examples = validation_examples(captured_people(folders, body), config, len(folders))
     body = gaussian_body(body, model)
     draw = jax.jit(predict, static_argnames="config")
@@ -70,15 +85,22 @@ def measure(arguments: argparse.Namespace) -> dict[str, float]:
         same = jnp.max(jnp.abs(targets.rotations - example.inputs.rotations[:1]), axis=(1, 2)) < 1e-3
         for pose, picture in zip(np.asarray(same), pictures, strict=True):
             found = shares(*picture)
-            rows.append({"psnr, pose of the photos" if pose else "psnr, other poses": found["psnr"], **found})
-    names = sorted({name for row in rows for name in row}, reverse=True)
+            psnr = found.pop("PSNR")
+            rows.append({f"PSNR, {'pose of the photos' if pose else 'other poses'}, dB": psnr, **found})
+    names = dict.fromkeys(sorted({name for row in rows for name in row}, key=_order))
     means = {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
     total = means["squared error"]
-    return {name: value / total if name.startswith("share") else value for name, value in means.items()}
+    size = examples[0].targets.images.shape[1]
+    return size, {name: value / total if name.startswith("share") else value for name, value in means.items()}
+
+
+def _order(name):
+    """PSNR, then shares of the error, then fog."""
+    return not name.startswith("PSNR"), name.startswith("fog"), name
 
 
 def shares(rgb, alpha, image, mask) -> dict[str, float]:
-    """Squared error of one image by place, and its PSNR, also under the true coverage. (h, w, 3) and (h, w)."""
+    """Squared error of one image by place, its PSNR, also under the true coverage, and fog. (h, w, 3) and (h, w)."""
     import jax.numpy as jnp
     import numpy as np
     from scipy import ndimage
@@ -93,13 +115,15 @@ def shares(rgb, alpha, image, mask) -> dict[str, float]:
     color = np.where(alpha[..., None] > LEAST_COVERAGE, color, image)
     covered = color * mask[..., None] + 1 - mask[..., None]
     return {
-        "psnr": psnr(rgb),
-        "psnr under the true coverage": psnr(covered),
+        "PSNR": psnr(rgb),
+        "PSNR with the true outline and the predicted colours, dB": psnr(covered),
         "squared error": float(error.mean()),
         "share at the outline": float((error * ~(inner | outer)).mean()),
         "share in holes": float((error * (1 - alpha) * inner).mean()),
         "share in colours": float((error * alpha * inner).mean()),
         "share around the person": float((error * outer).mean()),
+        "fog": float(metrics.fog(jnp.asarray(alpha), jnp.asarray(mask))),
+        "fog of the true images": float(metrics.fog(jnp.asarray(mask), jnp.asarray(mask))),
     }
 
 

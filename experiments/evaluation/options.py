@@ -1,6 +1,7 @@
 """What evaluations share before they start: options, the network, and what their rows depend on."""
 
 import argparse
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,13 @@ def add_people_options(parser: argparse.ArgumentParser, subjects: int) -> None:
         choices=("all", "foreground"),
         help="patches that the network looks at; as it was trained if not given",
     )
+    parser.add_argument("--loosest-of", type=int, metavar="N", help="of N people, those in the loosest clothes")
+    parser.add_argument(
+        "--skinning-reach",
+        type=float,
+        metavar="METRES",
+        help="other reach of the skinning between the legs than the weights'; 0: each Gaussian by its own vertex alone",
+    )
     parser.add_argument("--json", type=Path, help="numbers are written here; rows already there are kept")
     parser.add_argument("--page", "--docs", type=Path, help="page whose table is written")
     parser.add_argument("--lpips-backbone", type=Path, help="weights of the network under LPIPS")
@@ -40,6 +48,25 @@ def check_people_options(parser: argparse.ArgumentParser, arguments: argparse.Na
         or min(arguments.first, arguments.poses) < 0
     ):
         parser.error("--subjects, --held-out and --pose-views must be at least 1, --first and --poses at least 0")
+    if arguments.loosest_of is not None and arguments.loosest_of < arguments.subjects:
+        parser.error(f"--loosest-of must be at least --subjects, {arguments.subjects}")
+    if arguments.skinning_reach is not None and arguments.skinning_reach < 0:
+        parser.error("--skinning-reach must be at least 0")
+
+
+def seeds_asked_for(arguments: argparse.Namespace, body: Any) -> list[int]:
+    """Seeds of the people, in the order of their numbers. body: the shipped one, on which their clothes are made."""
+    import numpy as np
+
+    from experiments.evaluation.subjects import looseness
+    from humangs_jax.people.seeds import seeds_of
+    from humangs_jax.people.subject import make_subject
+
+    seeds = list(seeds_of(arguments.split, arguments.first, arguments.loosest_of or arguments.subjects))
+    if arguments.loosest_of is None:
+        return seeds
+    loose = [looseness(make_subject(seed, body), body) for seed in seeds]
+    return [seeds[i] for i in sorted(np.argsort(loose)[-arguments.subjects :])]
 
 
 def load_lpips(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> Any:
@@ -61,6 +88,8 @@ def load_network(arguments: argparse.Namespace) -> tuple[Any, Any, str]:
         path = arguments.weights or shipped
         variables, config = load_weights(path)
         digest = file_digest(path)
+    if (reach := arguments.skinning_reach) is not None:
+        config = replace(config, conventions=replace(config.conventions, skinning_reach=reach or None))
     return variables, config.with_execution(tokens=arguments.tokens), digest
 
 
@@ -69,7 +98,8 @@ def settings_of(arguments: argparse.Namespace, digest: str, tokens: str, lpips: 
     from experiments.evaluation.subjects import RING
     from humangs_jax.people.seeds import GENERATOR_VERSION
 
-    return {
+    given = {name: getattr(arguments, name) for name in ("loosest_of", "skinning_reach")}
+    return {name: value for name, value in given.items() if value is not None} | {
         "weights": digest,
         "tokens": tokens,
         "split": arguments.split,

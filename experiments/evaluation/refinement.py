@@ -25,7 +25,13 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import markdown_table, publish, write_json
-from experiments.evaluation.options import add_people_options, check_people_options, load_network, settings_of
+from experiments.evaluation.options import (
+    add_people_options,
+    check_people_options,
+    load_network,
+    seeds_asked_for,
+    settings_of,
+)
 from experiments.evaluation.results import TASK_NAMES, kept_rows
 from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.refinement.config import ROUNDS, RefineConfig
@@ -45,7 +51,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_people_options(parser, subjects=8)
-    parser.add_argument("--seconds", type=float, nargs="+", default=[1, 2, 5, 15], help="lengths of the runs")
+    parser.add_argument("--seconds", type=float, nargs="*", default=[1, 2, 5, 15], help="lengths of the runs")
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="sides of the photos in pixels")
     parser.add_argument("--views", type=int, nargs="+", default=[4], help="numbers of photos")
     parser.add_argument("--starts", nargs="+", choices=STARTS, default=["network"], help="what is refined")
@@ -82,7 +88,6 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     from experiments.evaluation.pictures import cropped
     from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
     from humangs_jax.body.library import load_body
-    from humangs_jax.people.seeds import seeds_of
 
     body, (variables, config, digest) = load_body(), load_network(arguments)
     drawing = arguments.sheet or arguments.details
@@ -94,7 +99,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     }
     rows, images = kept_rows(arguments.json, settings, "cells"), {}
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
-    seeds = seeds_of(arguments.split, arguments.first, arguments.subjects)
+    seeds = seeds_asked_for(arguments, body)
     for seed in tqdm(seeds, desc="people"):
         if seed in rows and not drawing:
             continue

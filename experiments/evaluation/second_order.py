@@ -18,7 +18,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import markdown_table, publish, write_json
-from experiments.evaluation.options import add_people_options, check_people_options, load_network
+from experiments.evaluation.options import add_people_options, check_people_options, load_network, seeds_asked_for
 from experiments.evaluation.refinement import score_all
 
 ITERATIONS = 5
@@ -66,7 +66,6 @@ def measure_people(arguments):
     from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.body.library import load_body
-    from humangs_jax.people.seeds import seeds_of
     from humangs_jax.refinement.config import RefineConfig
     from humangs_jax.refinement.refine import refine
 
@@ -79,7 +78,7 @@ def measure_people(arguments):
         "Levenberg-Marquardt": levenberg_marquardt,
     }
     found = {name: [[] for _ in arguments.seconds] for name in methods}
-    for seed in tqdm(seeds_of(arguments.split, arguments.first, arguments.subjects), desc="people"):
+    for seed in tqdm(seeds_asked_for(arguments, body), desc="people"):
         subject = make_evaluation_subject(seed, body, [4], 256, held_out)
         inputs = subject.inputs(4)
         avatar = reconstruct(variables, config, inputs)

@@ -15,7 +15,7 @@ import numpy as np
 
 from experiments.evaluation.results import TASKS, Scores
 from humangs_jax.avatar.reconstruct import reconstruct
-from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.body.model import BodyModel, BodyPose, shape_body
 from humangs_jax.data.capture import Capture
 from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
 from humangs_jax.evaluation.cases import draw_views
@@ -30,7 +30,7 @@ from humangs_jax.network.parts import Variables
 from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.rendering import PosedSubject
-from humangs_jax.people.subject import make_subject
+from humangs_jax.people.subject import SyntheticSubject, make_subject
 from humangs_jax.people.writer import CAMERA_STREAM, HELD_OUT_STREAM, View, capture_views, sample_pose
 
 RING = 12
@@ -80,6 +80,20 @@ def with_body(capture: Capture, body: BodyModel) -> Capture:
             carried[:, joint] = rotations[:, names.index(name)]
     poses = jax.vmap(BodyPose)(jnp.asarray(carried), capture.poses.translation)
     return dataclasses.replace(capture, body=body, poses=poses)
+
+
+def looseness(subject: SyntheticSubject, body: BodyModel) -> float:
+    """How far clothes, hair and bags are from the body at rest: the distance in metres that a tenth of the surface exceeds."""
+    from scipy.spatial import cKDTree
+
+    triangles = subject.surface.vertices[subject.surface.faces]
+    edges = triangles[:, 1:] - triangles[:, :1]
+    areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
+    skin = shape_body(body, jnp.asarray(subject.betas)).vertices
+    distances, _ = cKDTree(np.asarray(skin)).query(triangles.mean(1))
+    order = np.argsort(distances)
+    share = np.cumsum(areas[order]) / areas.sum()
+    return float(distances[order][np.searchsorted(share, 0.9)])
 
 
 def ring_positions(count: int) -> tuple[int, ...]:

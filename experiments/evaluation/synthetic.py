@@ -37,6 +37,7 @@ from experiments.evaluation.options import (
     check_people_options,
     load_lpips,
     load_network,
+    seeds_asked_for,
     settings_of,
 )
 from experiments.evaluation.results import (
@@ -84,10 +85,9 @@ def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]
     from experiments.evaluation.pictures import plot_views, strip_of, write_sheet
     from experiments.evaluation.subjects import HeldOut, draw_person, make_evaluation_subject, score_person
     from humangs_jax.body.library import load_body
-    from humangs_jax.people.seeds import seeds_of
 
-    seeds = seeds_of(arguments.split, arguments.first, arguments.subjects)
     body, (variables, config, digest) = load_body(), load_network(arguments)
+    seeds = seeds_asked_for(arguments, body)
     settings = settings_of(arguments, digest, config.tokens, lpips)
     rows = kept_rows(arguments.json, settings, "by_views")
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)

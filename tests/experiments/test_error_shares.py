@@ -38,4 +38,18 @@ def test_under_the_true_coverage_only_the_colours_count():
     rgb, alpha = person(half=11)
     rgb[24, 24] = 0.5  # so that the PSNR is finite
     found = error_shares.shares(rgb, alpha, image, mask)
-    assert found["psnr under the true coverage"] > found["psnr"] + 20
+    assert found["PSNR with the true outline and the predicted colours, dB"] > found["PSNR"] + 20
+
+
+def test_fog_of_the_prediction_stands_beside_that_of_the_truth():
+    image, mask = person()
+    alpha = mask.copy()
+    alpha[24:26, 24] = 0.5
+    found = error_shares.shares(image, alpha, image, mask)
+    assert np.isclose(found["fog"], 2 / mask.sum()) and found["fog of the true images"] == 0
+
+
+def test_the_table_has_a_column_for_each_weights_and_size():
+    rows = {"PSNR, other poses, dB": 25.0, "squared error": 0.003, "share in holes": 0.25}
+    table = error_shares.section({"before, 256 px": rows, "now, 256 px": rows | {"share in holes": 0.125}})
+    assert "| share in holes | 0.250 | 0.125 |" in table and "25.00" in table and "squared error" not in table
