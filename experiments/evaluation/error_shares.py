@@ -1,12 +1,12 @@
 """Where the error of reconstructions is: at the outline, in holes, in the colours of the person, or around the person.
 
-    python experiments/evaluation/error_shares.py PEOPLE --weights before=OLD.safetensors now= [--views 4] [--targets 6]
-        [--json OUT] [--page docs/evaluation.md]
+    python experiments/evaluation/error_shares.py PEOPLE --weights before=OLD.safetensors now= [--sizes 256 512]
+        [--views 4] [--targets 6] [--json OUT] [--page docs/evaluation.md]
 
-PEOPLE is a folder of captures with masks, such as `humangs synth --for-training` writes them; several are compared. NAME= without
-a file stands for the shipped weights. Numbers are means over all views of all people: PSNR, also that which the predicted colours
-would have under the true coverage; shares of the squared error; fog, and what the true images have of it. About 20 s and 2 s a
-person on 2 CPU cores.
+PEOPLE is a folder of captures with masks, such as `humangs synth --poses 2 --views 12 --close-views 0` writes them. NAME=
+without a file stands for the shipped weights. Numbers are means over all views of all people: PSNR, also that which the
+predicted colours would have under the true coverage; shares of the squared error; fog, and what the true images have of it.
+About 20 s and 2 s a person on 2 CPU cores.
 """
 
 import argparse
@@ -26,8 +26,9 @@ TABLE = "evaluation_error_shares"
 def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("people", type=Path, nargs="+", help="folders of capture folders")
+    parser.add_argument("people", type=Path, help="folder of capture folders")
     parser.add_argument("--weights", nargs="+", default=["shipped="], metavar="NAME=FILE", help="weights to compare")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[256], help="sides of photos and targets, pixels")
     parser.add_argument("--views", type=int, default=4, help="photos that the network sees")
     parser.add_argument("--targets", type=int, default=6, help="other views of each person")
     add_outputs(parser, TABLE)
@@ -37,15 +38,14 @@ def main() -> None:
     if unnamed := [pair for pair in arguments.weights if "=" not in pair]:
         parser.error(f"--weights: expected NAME=FILE, got {unnamed[0]}")
     columns = {}
-    for people in arguments.people:
+    for size in arguments.sizes:
         for name, file in (pair.split("=", 1) for pair in arguments.weights):
-            size, found = measure(people, Path(file) if file else None, arguments.views, arguments.targets)
-            columns[f"{name}, {size} px"] = found
+            columns[f"{name}, {size} px"] = measure(arguments, Path(file) if file else None, size)
     write_outputs(arguments, TABLE, section(columns), columns)
 
 
 def section(columns: dict[str, dict[str, float]]) -> str:
-    """The table: a column for each folder and weights."""
+    """The table: a column for each size and weights."""
     rows = [
         [name, *(f"{column[name]:.{2 if name.startswith('PSNR') else 3}f}" for column in columns.values())]
         for name in next(iter(columns.values()))
@@ -54,8 +54,8 @@ def section(columns: dict[str, dict[str, float]]) -> str:
     return markdown_table(["", *columns], rows)
 
 
-def measure(people: Path, weights: Path | None, view_count: int, target_count: int) -> tuple[int, dict[str, float]]:
-    """Side of the images in pixels; means over people and views, where shares are of the squared error of all."""
+def measure(arguments: argparse.Namespace, weights: Path | None, size: int) -> dict[str, float]:
+    """Means over people and views; shares are of the squared error of all."""
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -70,10 +70,11 @@ def measure(people: Path, weights: Path | None, view_count: int, target_count: i
     from humangs_jax.training.validation import validation_examples
 
     variables, model = load_weights(weights)
-    views = ViewSampling(input_counts=(view_count,), target_count=target_count)
+    model = model.with_conventions(image_size=size)
+    views = ViewSampling(input_counts=(arguments.views,), target_count=arguments.targets)
     config = TrainConfig(model=model, views=views)
     body = load_body()
-    folders = find_captures(people)
+    folders = find_captures(arguments.people)
     examples = validation_examples(captured_people(folders, body), config, len(folders))
     body = gaussian_body(body, model)
     draw = jax.jit(predict, static_argnames="config")
@@ -90,8 +91,7 @@ def measure(people: Path, weights: Path | None, view_count: int, target_count: i
     names = dict.fromkeys(sorted({name for row in rows for name in row}, key=_order))
     means = {name: float(np.mean([row[name] for row in rows if name in row])) for name in names}
     total = means["squared error"]
-    size = examples[0].targets.images.shape[1]
-    return size, {name: value / total if name.startswith("share") else value for name, value in means.items()}
+    return {name: value / total if name.startswith("share") else value for name, value in means.items()}
 
 
 def _order(name):

@@ -84,13 +84,13 @@ def with_body(capture: Capture, body: BodyModel) -> Capture:
 
 def looseness(subject: SyntheticSubject, body: BodyModel) -> float:
     """How far clothes, hair and bags are from the body at rest: the distance in metres that a tenth of the surface exceeds."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     triangles = subject.surface.vertices[subject.surface.faces]
     edges = triangles[:, 1:] - triangles[:, :1]
     areas = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
     skin = shape_body(body, jnp.asarray(subject.betas)).vertices
-    distances, _ = cKDTree(np.asarray(skin)).query(triangles.mean(1))
+    distances, _ = KDTree(np.asarray(skin)).query(triangles.mean(1))
     order = np.argsort(distances)
     share = np.cumsum(areas[order]) / areas.sum()
     return float(distances[order][np.searchsorted(share, 0.9)])

@@ -55,11 +55,23 @@ def points() -> list[Point]:
     found += [point(f"body of {n}", "Gaussians", body_vertices=n) for n in (1000, 2000, 3000)]
     found += [point(f"edges of {edge * 1e3:g} mm", "Gaussians", longest_edge=edge) for edge in (0.024, 0.02, 0.017)]
     found += [point("100 steps at 512", "refinement", refine_steps=100, refine_size=512)]
+    found += [refined(*limits) for limits in ROUNDS]
     found += [combined(**fields) for fields in COMBINED]
     found += [
         point(f"published, {t} tokens", "published", start="published network", tokens=t) for t in ("foreground", "all")
     ]
     return found
+
+
+ROUNDS = ((1, 0, 256), (2, 0, 256), (2, 25, 256), (2, 50, 256), (2, 100, 256), (2, 0, 512), (2, 100, 512))
+"""Of the learned update, steps of Adam after them, and the size of the photos."""
+
+
+def refined(rounds: int, steps: int, size: int) -> Point:
+    """A point with rounds, named by what it does."""
+    parts = [f"{rounds} round{'s' * (rounds > 1)}", *([f"{steps} steps"] if steps else [])]
+    name = ", ".join(parts) + (f" at {size}" if size != 256 else "")
+    return point(name, "refinement", refine_rounds=rounds, refine_steps=steps, refine_size=size)
 
 
 COMBINED: tuple[dict[str, Any], ...] = (
@@ -75,17 +87,21 @@ COMBINED: tuple[dict[str, Any], ...] = (
     {"body_vertices": 2000, "splat": "fast"},
     {"body_vertices": 2000, "splat": "near_exact"},
     {"views": 1, "crop": True, "image_size": 128, "body_vertices": 2000, "splat": "fast"},
-    {"views": 2, "crop": True, "refine_steps": 50, "refine_size": 256},
-    {"crop": True, "image_size": 128, "refine_steps": 50, "refine_size": 256},
-    {"crop": True, "refine_steps": 25, "refine_size": 256, "splat": "near_exact"},
+    {"crop": True, "refine_rounds": 2, "refine_size": 128},
+    {"crop": True, "refine_rounds": 2, "refine_size": 256},
+    {"crop": True, "refine_rounds": 2, "refine_size": 256, "splat": "near_exact"},
+    {"views": 2, "crop": True, "refine_rounds": 2, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_rounds": 2, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_rounds": 2, "refine_steps": 100, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_rounds": 2, "refine_size": 512},
+    {"views": 6, "crop": True, "refine_rounds": 2, "refine_steps": 100, "refine_size": 512},
+    {"body_vertices": 2000, "crop": True, "refine_rounds": 2, "refine_size": 256, "splat": "near_exact"},
+    {"body_vertices": 1000, "crop": True, "refine_rounds": 2, "refine_size": 256, "splat": "fast"},
+    {"crop": True, "image_size": 128, "refine_rounds": 2, "refine_size": 128},
+    {"crop": True, "image_size": 384, "refine_rounds": 2, "refine_size": 512},
+    {"crop": True, "longest_edge": 0.02, "refine_rounds": 2, "refine_size": 256},
+    {"crop": True, "longest_edge": 0.02, "refine_rounds": 2, "refine_steps": 100, "refine_size": 512},
     {"crop": True, "refine_steps": 200, "refine_size": 256},
-    {"views": 6, "crop": True, "refine_steps": 100, "refine_size": 256},
-    {"views": 6, "crop": True, "refine_steps": 200, "refine_size": 256},
-    {"views": 6, "crop": True, "refine_steps": 100, "refine_size": 512},
-    {"crop": True, "body_vertices": 2000, "refine_steps": 100, "refine_size": 256},
-    {"crop": True, "body_vertices": 2000, "refine_steps": 100, "refine_size": 256, "splat": "fast"},
-    {"crop": True, "longest_edge": 0.02, "refine_steps": 200, "refine_size": 256},
-    {"crop": True, "refine_steps": 200, "refine_size": 128},
 )
 """Several knobs at once."""
 
@@ -95,6 +111,7 @@ SHORT = {
     "crop": "cropped",
     "body_vertices": "body of {}",
     "longest_edge": "edges of {} m",
+    "refine_rounds": "{} rounds",
     "refine_steps": "{} steps",
     "refine_size": "at {}",
     "splat": "{}",

@@ -78,7 +78,7 @@ def kind(row: Row) -> str:
     """Of `KINDS`."""
     if row["start"] in NAIVE:
         return "naive"
-    return "refined" if row["settings"]["refine_steps"] else "feed-forward"
+    return "refined" if row["settings"]["refine_steps"] or row["settings"]["refine_rounds"] else "feed-forward"
 
 
 def compared(rows: list[Row]) -> list[Row]:
@@ -228,7 +228,7 @@ def growth_table(rows: list[Row], result: dict[str, Any]) -> str:
         "steps of refinement": [
             (r["settings"]["refine_steps"], r["refine_share"])
             for r in of("refinement")
-            if r["settings"]["refine_size"] == trained
+            if r["settings"]["refine_size"] == trained and not r["settings"]["refine_rounds"]
         ],
         "background pixels of a frame": [(int(n) ** 2, share) for n, share in result["growth"].get("box", {}).items()],
     }

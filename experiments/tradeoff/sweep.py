@@ -186,8 +186,7 @@ class Bench:
             if point.start == "painted body":
                 avatar = painted_body(photos)
             else:
-                plain = dataclasses.replace(settings, refine_steps=0)
-                avatar = reconstruct_with(plain, self.variables, self.config, photos)
+                avatar = reconstruct_with(settings.unrefined, self.variables, self.config, photos)
                 if point.start == "random colours":
                     avatar = random_start(avatar, self.person(i).seed)
                 if settings.refinement is not None:
@@ -238,8 +237,9 @@ class Bench:
         """One reconstruction of the first person, without refinement."""
         from humangs_jax.apps.settings import reconstruct_with
 
-        plain = dataclasses.replace(settings, refine_steps=0)
-        return reconstruct_with(plain, self.variables, self.config, self.person(0).inputs(settings.views or 4))
+        return reconstruct_with(
+            settings.unrefined, self.variables, self.config, self.person(0).inputs(settings.views or 4)
+        )
 
     def default_make_ms(self) -> float:
         """Of the default point, now."""
@@ -272,7 +272,7 @@ class Bench:
 
         photos, avatar = self.person(0).inputs(settings.views or 4), self.make(settings)
         run = lambda config: refine_with_report(avatar, photos, config)
-        run(dataclasses.replace(settings, refine_steps=1).refinement)  # compiles
+        run(dataclasses.replace(settings, refine_steps=min(settings.refine_steps, 1)).refinement)  # compiles
         default = [self.default_make_ms() for _ in range(self.rounds)]
         with peak_memory() as peak:
             own = timed(lambda: run(settings.refinement))[1]

@@ -34,13 +34,14 @@ KIND = "humangs_jax settings"
 class Settings:
     """How an avatar is made and drawn. The size of the frames is not in it: it belongs to the screen.
 
-    views: photos that are used at most, chosen by `select_views`; None: all. execution: of the network. refine_steps: of
-    refinement, 0 for none; refine_size: photos whose longer side is larger are reduced to it for refinement, pixels. splat:
-    as `Shot.splat`. prune: as `Shot.prune`.
+    views: photos that are used at most, chosen by `select_views`; None: all. execution: of the network. refine_rounds,
+    refine_steps: of refinement, see `RefineConfig`, 0 and 0 for none; refine_size: photos whose longer side is larger are reduced
+    to it for refinement, pixels. splat: as `Shot.splat`. prune: as `Shot.prune`.
     """
 
     views: int | None = knob(None, cost="what the other photos show", gain="time in proportion", measured=MEASURED)
     execution: Execution = dataclasses.field(default_factory=Execution)
+    refine_rounds: int = knob(0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED)
     refine_steps: int = knob(0, cost="time in proportion", gain="detail of the photos", measured=MEASURED)
     refine_size: int | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
@@ -53,16 +54,23 @@ class Settings:
         counts = {"views": self.views, "refine_size": self.refine_size}
         if wrong := [name for name, value in counts.items() if value is not None and value < 1]:
             raise ValueError(f"Settings: {', '.join(wrong)} must be at least 1")
-        if self.refine_steps < 0:
-            raise ValueError(f"Settings: refine_steps must not be negative, got {self.refine_steps}")
+        limits = {"refine_rounds": self.refine_rounds, "refine_steps": self.refine_steps}
+        if wrong := [f"{name} {value}" for name, value in limits.items() if value < 0]:
+            raise ValueError(f"Settings: {', '.join(wrong)}: must not be negative")
 
     @property
     def refinement(self) -> RefineConfig | None:
         """What `refine` is given; None for no refinement."""
-        if not self.refine_steps:
+        if not self.refine_rounds and not self.refine_steps:
             return None
-        # without rounds of the learned update: the front was measured before they existed
-        return RefineConfig(rounds=0, steps=self.refine_steps, seconds=None, image_size=self.refine_size)
+        return RefineConfig(
+            rounds=self.refine_rounds, steps=self.refine_steps, seconds=None, image_size=self.refine_size
+        )
+
+    @property
+    def unrefined(self) -> "Settings":
+        """The same without refinement."""
+        return dataclasses.replace(self, refine_rounds=0, refine_steps=0)
 
     def network(self, config: HumanGSConfig) -> HumanGSConfig:
         """A network of these weights, run in this way."""

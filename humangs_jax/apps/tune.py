@@ -30,6 +30,7 @@ from humangs_jax.io.images import write_png
 from humangs_jax.io.text import parse_json
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
+from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
 
 MARGIN = 1.25
@@ -41,7 +42,7 @@ MAKES, FRAMES, STEPS = 3, 16, 6
 @dataclasses.dataclass(frozen=True)
 class FrontPoint:
     """A point of the front. `make`, `refine` and `frame`: times over those of the sweep's default point, of making the avatar
-    without refinement, of all steps of refinement, and of a frame. memory_mb as in `Cost`. psnr, psnr_poses: dB, of new views
+    without refinement, of refinement, and of a frame. memory_mb as in `Cost`. psnr, psnr_poses: dB, of new views
     in the pose of the photos and in unseen poses.
     """
 
@@ -210,24 +211,32 @@ def measure(settings: Settings, variables: Variables, config: HumanGSConfig, cap
 
     Compiling and choosing photos, which happen once for a set of cameras, do not count.
     """
-    photos, plain = settings.photos(capture), dataclasses.replace(settings, refine_steps=0)
-    make = lambda: reconstruct_with(plain, variables, config, photos)
+    photos = settings.photos(capture)
+    make = lambda: reconstruct_with(settings.unrefined, variables, config, photos)
     avatar = make()  # compiles
     make_ms = max(_milliseconds(make) for _ in range(MAKES))
-    refine_ms, refine = 0.0, lambda: None
-    if settings.refinement is not None:
-        few = dataclasses.replace(settings, refine_steps=STEPS).refinement
-        refine = lambda: _uninterrupted(refine_with_report(avatar, photos, few))
-        refine_ms = settings.refine_steps / STEPS * 1e3 * max(refine().seconds for _ in range(2))
+    refine = lambda how: _uninterrupted(refine_with_report(avatar, photos, how)).seconds
+    refine_ms, parts = 0.0, refinement_parts(settings)
+    for how, times in parts:
+        refine_ms += 1e3 * times * max(refine(how) for _ in range(2))
     frames = frames_of(avatar, settings, size)
     next(frames)
     frame_ms = float(np.quantile([_milliseconds(lambda: next(frames)) for _ in range(FRAMES)], 0.9))
     with peak_memory() as peak:
         make()
-        refine()
+        for how, _ in parts:
+            refine(how)
         next(frames)
     on_host = jax.default_backend() == "cpu"  # what the process takes is known, what a device takes is not
     return Cost(make_ms, refine_ms, frame_ms, peak[0] if on_host else None)
+
+
+def refinement_parts(settings: Settings) -> list[tuple[RefineConfig, float]]:
+    """Short runs of refinement, and how often each has to be counted: the rounds, and a few steps for all."""
+    few = min(settings.refine_steps, STEPS)
+    rounds = dataclasses.replace(settings, refine_steps=0).refinement
+    steps = dataclasses.replace(settings, refine_rounds=0, refine_steps=few).refinement
+    return [(c, times) for c, times in ((rounds, 1.0), (steps, settings.refine_steps / max(few, 1))) if c is not None]
 
 
 def frames_of(avatar: Avatar, settings: Settings, size: int):
@@ -259,7 +268,8 @@ def in_words(tuned: Tuned, best: FrontPoint) -> str:
     parts = ["all photos" if views is None else f"{views} photo{'s' * (views > 1)}"]
     parts += [f"of {size} pixels"] if size else []
     parts += ["cut to the person"] if settings.execution.crop else []
-    parts += [f"{settings.refine_steps} steps of refinement" if settings.refine_steps else "no refinement"]
+    refined = [f"{n} {name}" for n, name in ((settings.refine_rounds, "rounds"), (settings.refine_steps, "steps")) if n]
+    parts += [f"{' and '.join(refined)} of refinement" if refined else "no refinement"]
     parts += [f"drawn {settings.splat}"]
     takes = f"{cost.reconstruct_ms:.0f} ms a reconstruction, {cost.frame_ms:.1f} ms a frame"
     takes += "" if cost.memory_mb is None else f", {cost.memory_mb:.0f} MiB"

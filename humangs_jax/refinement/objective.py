@@ -3,6 +3,8 @@
 The Gaussians are skinned to the pose of each photo, so the photos may show different poses.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jax.sharding import Mesh, PartitionSpec
@@ -80,21 +82,37 @@ def photo_loss(
     return loss, rendering
 
 
-def photos_loss(
+@pytree_dataclass
+class Comparison:
+    """Of an avatar with photos. loss: mean over them. squared: mean squared error of the pixels that count.
+
+    visibility: (g,) the largest weight of each Gaussian on any pixel of the photos. overflow: what the buffers had no room for.
+    """
+
+    loss: Scalar
+    squared: Scalar
+    visibility: Float[Array, " g"]
+    overflow: Int[Array, ""]
+
+
+def compare_photos(
     parameters: Parameters, avatar: Avatar, photos: Photos, config: RefineConfig, splat: SplatConfig
-) -> tuple[Scalar, Scalar, Int[Array, ""]]:
-    """Of the photos, one after the other: mean loss, mean squared error of the pixels that count, and overflow."""
+) -> Comparison:
+    """With the photos, one after the other."""
+    splat = dataclasses.replace(splat, visibility=True)
 
     def one(photo):
         loss, rendering = photo_loss(parameters, avatar, photo, config, splat)
         squared = jnp.mean(jnp.square(jnp.clip(rendering.rgb, 0, 1) - photo.images), axis=-1)
-        return loss, jnp.sum(squared * photo.counted), rendering.overflow
+        assert rendering.visibility is not None
+        return Comparison(loss, jnp.sum(squared * photo.counted), rendering.visibility, rendering.overflow)
 
-    losses, squared, overflow = jax.lax.map(one, photos)
-    return (
-        jnp.mean(losses),
-        safe_divide(jnp.sum(squared), jnp.sum(photos.counted, dtype=squared.dtype)),
-        jnp.sum(overflow),
+    each = jax.lax.map(one, photos)
+    return Comparison(
+        jnp.mean(each.loss),
+        safe_divide(jnp.sum(each.squared), jnp.sum(photos.counted, dtype=each.squared.dtype)),
+        jnp.max(each.visibility, axis=0),
+        jnp.sum(each.overflow),
     )
 
 

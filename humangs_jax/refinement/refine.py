@@ -42,10 +42,10 @@ from humangs_jax.refinement.learned import (
     stacked,
     unstacked,
 )
-from humangs_jax.refinement.objective import Photos, photos_gradient, photos_loss, photos_of, posed_gaussians
+from humangs_jax.refinement.objective import Comparison, Photos, compare_photos, photos_gradient, photos_of
 from humangs_jax.refinement.parameters import Parameters, RefineState, gaussians_of, init_state, parameters_of, update
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import plan_buffers, render
+from humangs_jax.rendering.splatting import plan_buffers
 
 HELD_OUT_PHOTOS = 8
 """With this number of photos or more, one photo is held out, not pixels of each: a test of views that no step sees."""
@@ -152,12 +152,7 @@ def refine_views(
 def start(avatar: Avatar, photos: Photos, config: RefineConfig, splat: SplatConfig) -> RefineState:
     """The state before the first step. Gaussians that no photo shows get no trust."""
     parameters = parameters_of(avatar.gaussians, len(photos.images), len(avatar.parents))
-    seen = dataclasses.replace(splat, visibility=True)
-
-    def visibility(photo):
-        return render(posed_gaussians(parameters, avatar, photo), photo.cameras, seen).visibility
-
-    return init_state(parameters, jnp.max(jax.lax.map(visibility, photos), axis=0), config)
+    return init_state(parameters, compare_photos(parameters, avatar, photos, config, splat).visibility, config)
 
 
 def refine_step(
@@ -203,21 +198,22 @@ class _Run:
 
     def go(self, progress: bool, watch: Callable[[Avatar], None] | None) -> Refinement:
         config, began = self.config, time.perf_counter()
-        state = _compiled(start)(self.avatar, self.all, self.compiled_for, self.splat)
-        before = self.loss(state, self.all)
-        best, highest = (state, self.avatar), self.loss(state, self.held)[1]
+        views, joints = len(self.all.images), len(self.avatar.parents)
+        parameters = jax.jit(parameters_of, static_argnums=(1, 2))(self.avatar.gaussians, views, joints)
+        before = self.compared(parameters, self.all)
+        state = self.state(parameters, before)
+        best, highest = (state, self.avatar), self.held_psnr(state)
         compile_seconds, rounds, done, interrupted = 0.0, 0, 0, False
         bar = progress_bar(total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}")
         try:
             self.compile(state)
             compile_seconds, began = time.perf_counter() - began, time.perf_counter()
             if config.rounds:
-                state = self.learned(state, config.rounds)
-                psnr = self.loss(state, self.held)[1]
-                if psnr > highest or not self.any_held:
-                    best, highest, rounds = (state, self.avatar), psnr, config.rounds
-                else:
-                    state = best[0]
+                parameters = self.learned(state.parameters, config.rounds)
+                found = self.compared(parameters, self.held)
+                if (psnr := float(decibels(found.squared))) > highest or not self.any_held:
+                    state, rounds = self.state(parameters, found), config.rounds
+                    best, highest = (state, self.avatar), psnr
                 if watch is not None:
                     watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
             checked, splits = 0, list(SPLITS) if config.growth > 1 else []
@@ -237,7 +233,7 @@ class _Run:
                 passed = self.passed(done, time.perf_counter() - began)
                 if passed >= (checked + 1) / config.checks:
                     checked = int(passed * config.checks)
-                    psnr = self.loss(state, self.held)[1]
+                    psnr = self.held_psnr(state)
                     if psnr > highest or not self.any_held:
                         best, highest = (state, self.avatar), psnr
                     if watch is not None:
@@ -249,24 +245,33 @@ class _Run:
         bar.close()
         seconds = time.perf_counter() - began
         state, self.avatar = best
-        after = self.loss(state, self.all)
-        kept = after[0] < before[0]
+        after = self.compared(state.parameters, self.all)
+        kept = float(after.loss) < float(before.loss)
         refined = self.original
         if kept:
             refined = replace(self.avatar, gaussians=gaussians_of(state.parameters))
             refined = refined if config.growth == 1 else without_clear(refined, self.splat.alpha_min)
         if self.mesh is not None:  # back from all devices to the default one
             refined = jax.tree.map(jnp.asarray, jax.device_get(refined))
-        after = after if kept else before
-        pairs = tuple(zip(before, after, strict=True))
-        return Refinement(refined, rounds, done, seconds, compile_seconds, pairs[0], pairs[1], kept, interrupted)
+        pair = (before, after if kept else before)
+        return Refinement(
+            refined,
+            rounds,
+            done,
+            seconds,
+            compile_seconds,
+            loss=(float(pair[0].loss), float(pair[1].loss)),
+            psnr=(float(decibels(pair[0].squared)), float(decibels(pair[1].squared))),
+            kept=kept,
+            interrupted=interrupted,
+        )
 
     def compile(self, state: RefineState) -> None:
         """Run once what a run consists of."""
         if self.config.steps != 0:
             self.step(state, 0.0)
         if self.config.rounds:
-            self.learned(state, 1)
+            self.learned(state.parameters, 1)
         if self.config.growth > 1:
             self.denser(state)
 
@@ -284,26 +289,22 @@ class _Run:
         """Of the avatar's own Gaussians."""
         return neighbors_of(np.asarray(self.original.gaussians.means))
 
-    def learned(self, state: RefineState, rounds: int) -> RefineState:
-        """The state after rounds of the learned update, which Adam's steps then start from and are drawn back to.
-
-        Slots without a Gaussian (`growth`) stay empty.
-        """
+    def learned(self, parameters: Parameters, rounds: int) -> Parameters:
+        """The parameters after rounds of the learned update. Slots without a Gaussian (`growth`) stay empty."""
         count = len(self.original.gaussians.means)
-        everything = stacked(state.parameters)
+        everything = stacked(parameters)
         start = values = everything[:count]
         hidden = jnp.zeros((count, Refiner.width))
         used = min(len(self.useful), MOST_PHOTOS)
         chosen = self.useful[np.arange(used) * len(self.useful) // used]
         for _ in range(rounds):
-            parameters = unstacked(everything.at[:count].set(values), state.parameters)
             each = [self.signals(parameters, int(i)) for i in chosen]
             signals = jax.tree.map(lambda *x: jnp.stack(x)[:, :count], *each)
             values, hidden = _compiled(refiner_round)(
                 load_refiner(), values, start, hidden, signals, self.neighbors, self.original
             )
-        parameters = unstacked(everything.at[:count].set(values), state.parameters)
-        return replace(state, parameters=parameters, start=parameters)
+            parameters = unstacked(everything.at[:count].set(values), parameters)
+        return parameters
 
     def signals(self, parameters: Parameters, view: int) -> Signals:
         """What one photo says; the buffers grow if the Gaussians no longer fit."""
@@ -326,14 +327,22 @@ class _Run:
         count = round((self.config.growth - 1) * len(self.original.gaussians.means) / len(SPLITS))
         return _compiled(split)(state, self.avatar, errors, count)
 
-    def loss(self, state: RefineState, photos: Photos) -> tuple[float, float]:
-        """Loss and PSNR over the pixels that count."""
-        run = lambda: _compiled(photos_loss)(state.parameters, self.avatar, photos, self.compiled_for, self.splat)
-        loss, squared, overflow = run()
-        if int(overflow) > 0:  # after rounds of the learned update
-            self.splat = self.replanned(state.parameters)
-            loss, squared, _ = run()
-        return float(loss), float(decibels(squared))
+    def state(self, parameters: Parameters, found: Comparison) -> RefineState:
+        """That Adam's steps start from, and are drawn back to."""
+        return _compiled(init_state)(parameters, found.visibility, self.compiled_for)
+
+    def compared(self, parameters: Parameters, photos: Photos) -> Comparison:
+        """With the photos; the buffers grow if the Gaussians no longer fit."""
+        run = lambda: _compiled(compare_photos)(parameters, self.avatar, photos, self.compiled_for, self.splat)
+        found = run()
+        if int(found.overflow) > 0:
+            self.splat = self.replanned(parameters)
+            found = run()
+        return found
+
+    def held_psnr(self, state: RefineState) -> float:
+        """PSNR over the pixels that no step sees, dB."""
+        return float(decibels(self.compared(state.parameters, self.held).squared))
 
     def passed(self, steps: int, seconds: float) -> float:
         """How much of the run is over, in [0, 1]."""

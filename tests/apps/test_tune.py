@@ -203,7 +203,9 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     small = Execution(image_size=32)
     front = [
         FrontPoint("one photo", Settings(views=1, execution=small, splat="fast"), 0.5, 0.0, 0.8, 100.0, 20.0, 19.0),
-        FrontPoint("refined", Settings(execution=small, refine_steps=3), 1.0, 2.0, 1.0, 150.0, 24.0, 21.0),
+        FrontPoint(
+            "refined", Settings(execution=small, refine_rounds=1, refine_steps=3), 1.0, 2.0, 1.0, 150.0, 24.0, 21.0
+        ),
     ]
     assert tune(variables, config, capture, Budget(1e8, 1e8), 32, front).point.name == "refined"
     monkeypatch.setattr(tuning, "load_front", lambda: front)

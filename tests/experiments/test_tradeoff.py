@@ -9,7 +9,7 @@ from experiments.tradeoff.points import points
 
 def row(name, reconstruct, frame, psnr, start="network", steps=0):
     scores = {task: {"psnr": psnr, "ssim": 0.9, "psnr_foreground": psnr - 6} for task in report.TASKS}
-    settings = {"refine_steps": steps}
+    settings = {"refine_rounds": 0, "refine_steps": steps}
     return {
         "name": name,
         "reconstruct": reconstruct,

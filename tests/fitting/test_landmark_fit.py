@@ -134,7 +134,7 @@ def test_smoothness_shrinks_the_jitter_of_a_motion_that_stands_still(still):
 
 
 STOPPED_SHORT = 0.015
-"""Metres between joints of two fits of the same keypoints: both stop short of the minimum, not in the same place (5.1 mm here)."""
+"""Metres between joints of two fits of the same keypoints: both stop short of the minimum, in two places (5.1 mm here)."""
 
 
 @pytest.mark.slow
