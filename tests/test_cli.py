@@ -449,6 +449,23 @@ def test_an_interrupt_that_python_drops_is_repeated():
     assert "Traceback" not in program.stderr
 
 
+@pytest.mark.parametrize("code", [0, 2])
+def test_an_interrupt_after_the_work_is_done_changes_nothing(code):
+    """While Python ends. `synth` was ended by the signal, 1 of 72 real runs."""
+    program = (
+        "import os, signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "class Late:\n"
+        "    def __del__(self, kill=os.kill, own=os.getpid(), number=signal.SIGINT):\n"
+        "        kill(own, number)\n"
+        "sys.late = Late()\n"
+        "from humangs_jax import cli\n"
+        f"cli.execute = lambda arguments: {code}\n"
+        "cli.main()"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=250)
+    assert (done.returncode, done.stderr) == (code, "")
+
+
 @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs Linux's or macOS's signals")
 def test_an_interrupt_during_an_import_waits_for_it(tmp_path):
     """Extensions crash or raise ImportError: `view` and `fit` were ended by SIGSEGV, 2 of 42 real runs."""

@@ -5,6 +5,7 @@ garbage collector (JAX has one) and destructors, Python drops the KeyboardInterr
 extensions crash where it comes while they are imported.
 """
 
+import atexit
 import os
 import signal
 import sys
@@ -43,6 +44,8 @@ def end_within_seconds() -> None:
     os.set_blocking(writer, False)
     signal.signal(signal.SIGINT, interrupt)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+    # when Python ends it gives signals back to the system, whose handler kills: a command that was done had no exit code
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
 
     def watch():
         while number := os.read(reader, 1):
