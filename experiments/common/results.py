@@ -176,10 +176,12 @@ def rendered(page: str, results: Path, names: Sequence[str] | None = None) -> st
 
 
 def run_record() -> dict[str, Any]:
-    """What made a result: the script and its arguments (absolute paths without their folders), date, machine, versions."""
+    """What made a result: the script and its arguments (absolute paths without their folders, also after NAME=), date, machine,
+    versions.
+    """
     script = Path(sys.argv[0]).resolve()
     inside = script.is_relative_to(REPOSITORY)
-    arguments = [Path(a).name if os.path.isabs(a) else a for a in sys.argv[1:]]
+    arguments = [re.sub(r"(^|=)/.*/", r"\1", a) for a in sys.argv[1:]]
     return {
         "script": script.relative_to(REPOSITORY).as_posix() if inside else script.name,
         "arguments": shlex.join(arguments),

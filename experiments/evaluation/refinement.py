@@ -4,8 +4,9 @@
         [--views 4] [--rounds 0 2] [--growth 1 1.5] [--off 0 2.5 5] [--longest-edge 0.017]
         [--page docs/refinement.md] [--table NAME] [--plot PLOT] [--sheet SHEET] [--details SHEET]
 
-People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random colours" from
-as many round Gaussians of random colours on the vertices of the body. Scores: docs/evaluation.md.
+People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "after rounds"
+from what `humangs reconstruct` writes, "random colours" from as many round Gaussians of random colours on the vertices of the
+body. Scores: docs/evaluation.md.
 
 --off gives the photos a wrong body. Its value is the standard deviation of the translation, in millimetres. For each millimetre,
 joints turn by 0.2 degrees about each axis, and shape coefficients change by 0.02 (standard deviations). Held-out views show the
@@ -38,7 +39,7 @@ from humangs_jax.refinement.config import ROUNDS, RefineConfig
 
 DEGREES, SHAPES = 0.2, 0.02
 """Of --off: turn of a joint and change of a shape coefficient for each millimetre."""
-STARTS = ("network", "random colours")
+STARTS = ("network", "after rounds", "random colours")
 SHOWN = {
     "psnr": ("PSNR", 2),
     "psnr_foreground": ("on the person", 2),
@@ -164,7 +165,9 @@ def measure(variables, config, subject, count, start, how, seconds):
 
     inputs = subject.inputs(count)
     avatar = reconstruct(variables, config, inputs)
-    if start != "network":
+    if start == "after rounds":
+        avatar = refine_with_report(avatar, inputs, RefineConfig(steps=0, seconds=None)).avatar
+    if start == "random colours":
         avatar = random_start(avatar, subject.seed)
     view = frontal_view(subject.photos, subject.held_out, task_views(subject.held_out)["novel"].tolist())
     scores, first = score_all(avatar, subject.held_out, view)
@@ -200,12 +203,18 @@ def random_start(avatar, seed):
 
 
 def score_all(avatar, held_out, view=0):
-    """Scores by task, and the image of a view."""
-    from experiments.evaluation.subjects import score_tasks
+    """Scores by task, also the fog of the true images, and the image of a view."""
+    from experiments.evaluation.subjects import score_tasks, task_views
     from humangs_jax.evaluation.cases import draw_views
+    from humangs_jax.objectives.metrics import fog
 
     drawn = draw_views(avatar, held_out)
-    return score_tasks(drawn.images, held_out, alpha=drawn.alpha), drawn.images[view]
+    scores = score_tasks(drawn.images, held_out, alpha=drawn.alpha)
+    for task, views in task_views(held_out).items():
+        if task in scores:
+            masks = held_out.masks[views]
+            scores[task]["fog_of_truth"] = sum(float(fog(mask, mask)) for mask in masks) / len(masks)
+    return scores, drawn.images[view]
 
 
 def report_of(rows, settings, seeds):
@@ -241,6 +250,13 @@ def section(report):
                     rows.append([f"{count} of {size} px", start, seconds, title, *numbers, least])
     settings, people = report["settings"], len(report["subjects"])
     about = f"Means over {people} people of the {settings['split']} seeds; PSNR in dB; least gain: of any person."
+    true = {
+        name.split()[0]: lengths["0"]["novel"]["fog_of_truth"]
+        for name, lengths in report["means"].items()
+        if "fog_of_truth" in lengths["0"]["novel"]
+    }
+    if true:
+        about += " Fog of the true images: " + ", ".join(f"{fog:.3f} at {size} px" for size, fog in true.items()) + "."
     return f"{about}\n\n{markdown_table(header, rows, 'llll' + 'r' * (len(SHOWN) + 1))}"
 
 

@@ -145,6 +145,8 @@ class Refine:
     """The avatar file to write; an avatar that is there is replaced."""
     limit: str = "15s"
     """How long: seconds ("15s"), steps ("100steps") or rounds alone ("0steps"), after a compilation of some seconds."""
+    rounds: int = 2
+    """Rounds of the learned update before the steps; 0: steps alone."""
     image_size: int | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     refine_poses: bool = False
@@ -160,6 +162,7 @@ class Refine:
         limits = refine_limits(self.limit, "--limit")
         require_between(16, LARGEST_IMAGE, image_size=self.image_size)
         require_between(1, 100, growth=self.growth)
+        require_between(0 if limits["steps"] != 0 else 1, 16, rounds=self.rounds)
         require_avatar(self.out, inputs=(self.avatar,))
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
@@ -167,7 +170,9 @@ class Refine:
 
             avatar = Avatar.load(self.avatar)
         photos = _read_capture(self.capture, self.check)
-        how = RefineConfig(image_size=self.image_size, poses=self.refine_poses, growth=self.growth, **limits)
+        how = RefineConfig(
+            rounds=self.rounds, image_size=self.image_size, poses=self.refine_poses, growth=self.growth, **limits
+        )
         _refine_and_save(avatar, photos, self.out, how, self.live)
 
 

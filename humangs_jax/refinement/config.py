@@ -49,7 +49,8 @@ class RefineConfig:
     growth: the number of Gaussians may grow by this factor: at `SPLITS` of the run those with the largest errors are split.
 
     held_out: share of the pixels, in square blocks, that no step sees; with `HELD_OUT_PHOTOS` photos or more, one whole photo
-    instead; 0: nothing. The state of the run with the highest PSNR there is returned. checks: how often it is measured.
+    instead; 0: nothing. Of the states after the rounds and after steps, the one with the highest PSNR there is returned. Rounds
+    alone use all pixels. checks: how often it is measured.
     seed: of the order of the photos and of the blocks.
     """
 

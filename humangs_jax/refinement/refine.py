@@ -180,11 +180,14 @@ class _Run:
         self.compiled_for = dataclasses.replace(config, **HOST_SETTINGS)  # the same for runs of 5 s and of 15 s
         everything = jnp.ones(views.masks.shape, bool)
         count = len(views.images)
-        if count >= HELD_OUT_PHOTOS and config.held_out:
+        share = (
+            config.held_out if config.steps != 0 else 0.0
+        )  # rounds were trained on views that are not among the photos
+        if count >= HELD_OUT_PHOTOS and share:
             checked = jnp.zeros(count, bool).at[np.random.default_rng(config.seed).integers(count)].set(True)
             held = everything & checked[:, None, None]
         else:
-            held = held_out_blocks(views, config.held_out, config.seed)
+            held = held_out_blocks(views, share, config.seed)
         self.all = photos_of(views, everything)
         self.seen, self.held = photos_of(views, ~held), photos_of(views, held)
         if mesh is not None:  # where each step leaves its results: other places would compile the step twice
@@ -210,10 +213,10 @@ class _Run:
             compile_seconds, began = time.perf_counter() - began, time.perf_counter()
             if config.rounds:
                 parameters = self.learned(state.parameters, config.rounds)
-                found = self.compared(parameters, self.held)
-                if (psnr := float(decibels(found.squared))) > highest or not self.any_held:
+                found = self.compared(parameters, self.all)
+                if float(found.loss) < float(before.loss):
                     state, rounds = self.state(parameters, found), config.rounds
-                    best, highest = (state, self.avatar), psnr
+                    best, highest = (state, self.avatar), self.held_psnr(state)
                 if watch is not None:
                     watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
             checked, splits = 0, list(SPLITS) if config.growth > 1 else []

@@ -50,13 +50,15 @@ def test_sections_are_data_and_text_again():
 
 
 def test_a_result_is_written_beside_its_page(page, monkeypatch):
-    monkeypatch.setattr(sys, "argv", [str(REPOSITORY / "experiments" / "a.py"), "--size", "2", "/some/where/file.npz"])
+    monkeypatch.setattr(
+        sys, "argv", [str(REPOSITORY / "experiments" / "a.py"), "--size", "2", "/some/where/file.npz", "a=/b c/d.npz"]
+    )
     publish(page, "x", TABLE, {"psnr": 1.0})
     assert page.read_text() == (
         f"before\n<!-- table: x -->\n{TABLE}\n<!-- end -->\nbetween\n<!-- table: y -->\nkept\n<!-- end -->\nafter\n"
     )
     result = json.loads((page.parent / "results" / "x.json").read_text())
-    assert (result["script"], result["arguments"]) == ("experiments/a.py", "--size 2 file.npz")
+    assert (result["script"], result["arguments"]) == ("experiments/a.py", "--size 2 file.npz a=d.npz")
     assert result["numbers"] == {"psnr": 1.0} and result["machine"]["cores"] > 0 and result["versions"]["jax"]
     with pytest.raises(ValueError, match="<!-- table: z -->"):
         publish(page, "z", TABLE)
