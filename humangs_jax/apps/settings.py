@@ -90,9 +90,9 @@ class Settings:
 
 PRESETS: dict[str, Settings] = {
     "realtime": Settings(views=4, execution=EXECUTIONS["realtime"], splat="fast"),
-    "balanced": Settings(views=4, execution=EXECUTIONS["balanced"], splat="near_exact"),
-    "quality": Settings(views=4, execution=EXECUTIONS["quality"], refine_steps=50, refine_size=256, splat="near_exact"),
-    "best": Settings(execution=EXECUTIONS["best"], refine_steps=100, refine_size=512),
+    "balanced": Settings(views=4, execution=EXECUTIONS["balanced"], refine_rounds=2, refine_size=256, splat="near_exact"),
+    "quality": Settings(views=4, execution=EXECUTIONS["quality"], refine_rounds=2, refine_size=512, splat="near_exact"),
+    "best": Settings(execution=EXECUTIONS["best"], refine_rounds=2, refine_steps=100, refine_size=512),
 }
 """From the fastest to the best; docs/tradeoff.md has what each takes and gains."""
 

@@ -118,12 +118,12 @@ class Reconstruct:
         with stage("reconstructing"):
             avatar = reconstruct(variables, config, photos)
             avatar.gaussians.means.block_until_ready()
-        if self.refine is None and photos.masks is None:
-            limits = None
-            tell("no masks: the avatar is not refined")
         how = None if limits is None else RefineConfig(**limits)
         if self.refine is None and settings is not None:
             how = settings.refinement
+        if self.refine is None and how is not None and photos.masks is None:
+            how = None
+            tell("no masks: the avatar is not refined")
         if how is None:
             _save(avatar, self.out, f"from {photos.view_count} photos")
         else:
