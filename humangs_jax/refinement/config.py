@@ -50,7 +50,7 @@ class RefineConfig:
 
     held_out: share of the pixels, in square blocks, that no step sees; with `HELD_OUT_PHOTOS` photos or more, one whole photo
     instead; 0: nothing. Of the states after the rounds and after steps, the one with the highest PSNR there is returned. Rounds
-    alone use all pixels. checks: how often it is measured.
+    alone hold them out, too, so that a later run can go on from them. checks: how often it is measured.
     seed: of the order of the photos and of the blocks.
     """
 

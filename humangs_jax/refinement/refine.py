@@ -180,14 +180,11 @@ class _Run:
         self.compiled_for = dataclasses.replace(config, **HOST_SETTINGS)  # the same for runs of 5 s and of 15 s
         everything = jnp.ones(views.masks.shape, bool)
         count = len(views.images)
-        share = (
-            config.held_out if config.steps != 0 else 0.0
-        )  # rounds were trained on views that are not among the photos
-        if count >= HELD_OUT_PHOTOS and share:
+        if count >= HELD_OUT_PHOTOS and config.held_out:
             checked = jnp.zeros(count, bool).at[np.random.default_rng(config.seed).integers(count)].set(True)
             held = everything & checked[:, None, None]
         else:
-            held = held_out_blocks(views, share, config.seed)
+            held = held_out_blocks(views, config.held_out, config.seed)
         self.all = photos_of(views, everything)
         self.seen, self.held = photos_of(views, ~held), photos_of(views, held)
         if mesh is not None:  # where each step leaves its results: other places would compile the step twice

@@ -223,5 +223,9 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     run_with = lambda *words: run(monkeypatch, capsys, *words, "--config", "tuned.json")
     code, _, err = run_with("reconstruct", "someone", "--weights", "tiny.safetensors", "--no-check")
     assert code == 0 and len(Avatar.load("avatar.npz").gaussians.means), err
+    save_capture(tmp_path / "unmasked", dataclasses.replace(capture, masks=None))
+    words = ("reconstruct", "unmasked", "--weights", "tiny.safetensors", "--no-check", "--out", "plain.npz")
+    code, out, err = run(monkeypatch, capsys, *words, "--preset", "quality")
+    assert code == 0 and "no masks: the avatar is not refined" in out + err, err
     code, _, err = run_with("render", "avatar.npz", "--size", "32", "--views", "2")
     assert code == 0 and len(list((tmp_path / "views").glob("*.png"))) == 2, err

@@ -236,11 +236,3 @@ def test_rounds_that_make_the_photos_worse_are_not_kept(steps, scene, monkeypatc
     report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
     assert report.rounds == 0
     assert np.abs(np.asarray(report.avatar.gaussians.means) - np.asarray(scene[0].gaussians.means)).max() < 0.01
-
-
-def test_nothing_is_held_out_without_steps(scene):
-    body = decimate(load_body(), 400)
-    views = crop_to_person(toy_capture(body, toy_avatar(body, 0.15)))
-    how = lambda steps: dataclasses.replace(STEPS, rounds=2, steps=steps, held_out=0.3)
-    assert refinement._Run(scene[0], views, how(0), None, scene[3]).seen.counted.all()
-    assert not refinement._Run(scene[0], views, how(1), None, scene[3]).seen.counted.all()
