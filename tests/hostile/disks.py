@@ -19,7 +19,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import writers
 from writers import COMMANDS, Command
 
-SIZE = 64 << 20
+SIZE = 256 << 20
+"""Bytes of a disk; what `demo` writes has to fit twice."""
 SHARES = (0.0, 0.3, 0.6)
 """Of the bytes of what a command writes: so much is free."""
 LEAST = 1 << 10
