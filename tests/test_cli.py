@@ -501,6 +501,18 @@ def test_the_logs_of_libraries_stay_off_the_screen():
     assert done.stderr == "humangs: ours\n"
 
 
+@pytest.mark.parametrize("verbose", [False, True])
+def test_errors_in_threads_of_libraries_stay_off_the_screen(verbose):
+    """TensorStore's print a traceback through `sys.excepthook`, as `train` did on a full disk; our own errors are shown."""
+    code = (
+        f"from humangs_jax.cli.screen import silence; import sys, threading; silence({verbose})\n"
+        "report = lambda name: sys.excepthook(RuntimeError, RuntimeError(name), None)\n"
+        "thread = threading.Thread(target=report, args=('theirs',)); thread.start(); thread.join(); report('ours')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "RuntimeError: theirs\n" * verbose + "RuntimeError: ours\n"
+
+
 # Places that cannot be written to -------------------------------------------------------------------------------------
 
 

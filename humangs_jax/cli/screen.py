@@ -9,6 +9,7 @@ import logging
 import os
 import shlex
 import sys
+import threading
 import time
 import warnings
 from pathlib import Path
@@ -36,11 +37,22 @@ _screen = _Screen()
 
 
 def silence(verbose: bool) -> None:
-    """Keep the logs of libraries off the screen, for a program of its own (not a test). Before JAX is imported."""
+    """Keep what libraries log off the screen, and errors in threads of their own, for a program of its own (not a test). Before
+    JAX is imported.
+    """
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", XLA_LEVELS[verbose])
     if not verbose and not sys.warnoptions:
         warnings.simplefilter("ignore")
         os.environ.setdefault("PYTHONWARNINGS", "ignore")  # of processes that this one starts
+    shown = sys.excepthook
+
+    def in_the_main_thread(
+        *what,
+    ):  # TensorStore's threads print what they cannot report when a disk is full; the command fails
+        if verbose or threading.current_thread() is threading.main_thread():
+            shown(*what)
+
+    sys.excepthook = in_the_main_thread
     root = logging.getLogger()
     if not root.handlers:  # else Python prints the warnings of all loggers, Orbax's among them
         handler = logging.StreamHandler()
