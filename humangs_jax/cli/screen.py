@@ -44,15 +44,14 @@ def silence(verbose: bool) -> None:
     if not verbose and not sys.warnoptions:
         warnings.simplefilter("ignore")
         os.environ.setdefault("PYTHONWARNINGS", "ignore")  # of processes that this one starts
-    shown = sys.excepthook
+    shown = sys.unraisablehook
 
-    def in_the_main_thread(
-        *what,
-    ):  # TensorStore's threads print what they cannot report when a disk is full; the command fails
+    def unraisable(what):
+        # TensorStore's threads have nobody to report to when a disk is full; the command itself says that it is
         if verbose or threading.current_thread() is threading.main_thread():
-            shown(*what)
+            shown(what)
 
-    sys.excepthook = in_the_main_thread
+    sys.unraisablehook = unraisable
     root = logging.getLogger()
     if not root.handlers:  # else Python prints the warnings of all loggers, Orbax's among them
         handler = logging.StreamHandler()
