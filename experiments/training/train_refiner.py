@@ -40,13 +40,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the samples, the state and the weights")
     parser.add_argument("--people", type=int, default=200, help="people of the samples")
     parser.add_argument("--samples", type=int, default=300, help="to train on")
-    parser.add_argument("--start", type=Path, help="weights to start from; default: a network that changes nothing")
+    parser.add_argument(
+        "--start",
+        type=Path,
+        help="weights to start from, of all layers or some; default: a network that changes nothing",
+    )
     parser.add_argument("--steps", type=int, default=900)
-    parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--batch", type=int, default=2, help="samples in a step, a thread each")
     parser.add_argument("--learning-rate", type=float, default=2e-3)
     arguments = parser.parse_args()
-    if min(arguments.samples, arguments.people, arguments.steps, arguments.rounds) < 1:
-        parser.error("expected at least 1 of --samples, --people, --steps and --rounds")
+    counts = ("samples", "people", "steps", "rounds", "batch")
+    if min(getattr(arguments, name) for name in counts) < 1:
+        parser.error(f"expected at least 1 of {', '.join(f'--{name}' for name in counts)}")
     from humangs_jax.core.allocator import keep_freed_memory
 
     keep_freed_memory()
@@ -136,7 +142,7 @@ class Sample:
     avatar: Any
     start: Any
     views: list[Any]
-    neighbors: Any
+    graph: Any
 
 
 def read_sample(folder: Path) -> Sample:
@@ -148,7 +154,7 @@ def read_sample(folder: Path) -> Sample:
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.geometry.camera import Camera
     from humangs_jax.io.npz import read_npz
-    from humangs_jax.refinement.learned import neighbors_of
+    from humangs_jax.refinement.learned import graph_of
     from humangs_jax.refinement.objective import Photos
     from humangs_jax.refinement.parameters import parameters_of
 
@@ -166,7 +172,7 @@ def read_sample(folder: Path) -> Sample:
     )
     views = [jax.tree.map(lambda x, i=i: x[i], photos) for i in range(count)]
     start = parameters_of(avatar.gaussians, 1, len(avatar.parents))
-    return Sample(avatar, start, views, neighbors_of(np.asarray(avatar.gaussians.means)))
+    return Sample(avatar, start, views, graph_of(np.asarray(avatar.gaussians.means)))
 
 
 # Training -----------------------------------------------------------------------------------------------------------------
@@ -201,13 +207,13 @@ def run_rounds(variables: Any, sample: Sample, photos: int, rounds: int, splat: 
         ]
         seen.append(jax.tree.map(lambda *x: jnp.stack(x), *each))
         values, hidden = compiled(refiner_round)(
-            variables, values, start, hidden, seen[-1], sample.neighbors, sample.avatar
+            variables, values, start, hidden, seen[-1], sample.graph, sample.avatar
         )
         after.append(values)
     return after, seen
 
 
-def through_rounds(variables: Any, start: Any, seen: list[Any], neighbors: Any, avatar: Any, cotangents: Any) -> Any:
+def through_rounds(variables: Any, start: Any, seen: list[Any], graph: Any, avatar: Any, cotangents: Any) -> Any:
     """Gradient with respect to the variables, from those with respect to the parameters after each round."""
     import jax
     import jax.numpy as jnp
@@ -217,7 +223,7 @@ def through_rounds(variables: Any, start: Any, seen: list[Any], neighbors: Any, 
     def rounds(variables):
         values, hidden, after = start, jnp.zeros((len(start), Refiner.width)), []
         for signals in seen:
-            values, hidden = refiner_round(variables, values, start, hidden, signals, neighbors, avatar)
+            values, hidden = refiner_round(variables, values, start, hidden, signals, graph, avatar)
             after.append(values)
         return after
 
@@ -274,10 +280,15 @@ def validate(variables: Any, folders: list[Path], rounds: int, splat: Any) -> li
     return np.mean(rows, axis=0).round(3).tolist()
 
 
-def step_gradient(variables: Any, sample: Sample, photos: int, rounds: int, splat: Any, rng: Any) -> Any:
-    """Gradient of one sample: a new view for each round, two for the last one."""
+def step_gradient(variables: Any, folders: list[Path], rounds: int, splat: Any, seed: tuple[int, int]) -> Any:
+    """Gradient of one sample, which the seed chooses: a new view for each round, two for the last one."""
+    import numpy as np
+
     from humangs_jax.refinement.learned import stacked
 
+    rng = np.random.default_rng(seed)
+    sample = read_sample(folders[rng.integers(len(folders))])
+    photos = int(rng.choice(COUNTS))
     after, seen = run_rounds(variables, sample, photos, rounds, splat)
     first = max(photos, PHOTOS)
     targets = list(first + rng.permutation(len(sample.views) - first))
@@ -291,14 +302,15 @@ def step_gradient(variables: Any, sample: Sample, photos: int, rounds: int, spla
             for j in range(count)
         ]
         cotangents.append(ROUND_WEIGHT ** (rounds - 1 - i) * sum(each) / count)
-    return compiled(through_rounds)(variables, stacked(sample.start), seen, sample.neighbors, sample.avatar, cotangents)
+    return compiled(through_rounds)(variables, stacked(sample.start), seen, sample.graph, sample.avatar, cotangents)
 
 
 def train(folders: list[Path], validation: list[Path], arguments: argparse.Namespace) -> None:
     """From the first step, or from OUT/state.msgpack, to OUT/refiner.safetensors."""
+    from concurrent.futures import ThreadPoolExecutor
+
     import jax
     import jax.numpy as jnp
-    import numpy as np
     import optax
     from flax import serialization
     from tqdm import tqdm
@@ -310,11 +322,15 @@ def train(folders: list[Path], validation: list[Path], arguments: argparse.Names
     splat, values = planned([read_sample(folder) for folder in validation]), stacked(sample.start)
     nothing = Signals(jnp.zeros((1, *values.shape)), jnp.zeros((1, len(values))), jnp.zeros((1, len(values))))
     hidden = jnp.zeros((len(values), Refiner.width))
-    variables = Refiner().init(jax.random.key(0), values, values, hidden, nothing, sample.neighbors, jnp.zeros(3))
+    variables = Refiner().init(jax.random.key(0), values, values, hidden, nothing, sample.graph, jnp.zeros(3))
     if arguments.start:
-        new, variables = variables, read_refiner(arguments.start)
-        if jax.tree.map(jnp.shape, variables) != jax.tree.map(jnp.shape, new):
+        new, given = variables["params"], read_refiner(arguments.start)["params"]
+        if any(
+            layer not in new or jax.tree.map(jnp.shape, new[layer]) != jax.tree.map(jnp.shape, own)
+            for layer, own in given.items()
+        ):
             raise ValueError(f"{arguments.start}: these are not weights of the network of a round")
+        variables = {"params": new | given}
     rate = optax.warmup_cosine_decay_schedule(
         0.0, arguments.learning_rate, min(50, arguments.steps // 2), arguments.steps, 0.02 * arguments.learning_rate
     )
@@ -329,16 +345,16 @@ def train(folders: list[Path], validation: list[Path], arguments: argparse.Names
         change, optimizer_state = optimizer.update(gradient, optimizer_state, variables)
         return optax.apply_updates(variables, change), optimizer_state
 
-    with tqdm(initial=int(state["step"]), total=arguments.steps, desc="steps") as bar:
+    bar = tqdm(initial=int(state["step"]), total=arguments.steps, desc="steps")
+    with bar, ThreadPoolExecutor(arguments.batch) as threads:
         try:
             while (step := int(state["step"])) < arguments.steps:
                 if step % VALIDATE_EVERY == 0:
                     dB = validate(state["variables"], validation, arguments.rounds, splat)
                     bar.write(f"step {step}: {dB} dB before and after each round")
-                rng = np.random.default_rng(step)
-                chosen = read_sample(folders[rng.integers(len(folders))])
-                photos = int(rng.choice(COUNTS))
-                gradient = step_gradient(state["variables"], chosen, photos, arguments.rounds, splat, rng)
+                one = functools.partial(step_gradient, state["variables"], folders, arguments.rounds, splat)
+                gradients = list(threads.map(one, [(step, i) for i in range(arguments.batch)]))
+                gradient = jax.tree.map(lambda *x: sum(x) / len(x), *gradients)
                 variables, opt_state = updated(gradient, state["optimizer"], state["variables"])
                 state = {"variables": variables, "optimizer": opt_state, "step": step + 1}
                 bar.update()

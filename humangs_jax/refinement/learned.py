@@ -3,7 +3,8 @@
 After ReSplat (https://arxiv.org/abs/2510.08575): the input views are drawn, their errors are gathered at the Gaussians, and a
 network that knows the neighbours adds to their parameters; one set of weights for all rounds, no gradient through the errors.
 Ours: the errors arrive as the gradient of the squared error with respect to each Gaussian's parameters, a backward pass a photo,
-in place of features of a frozen network, and the neighbours are those in the T-pose.
+in place of features of a frozen network, and the neighbours are those in the T-pose, at two levels: of Gaussians, and of clusters
+of them. The outline between two photos lies 20 cm from where either photo shows one; neighbours of Gaussians reach 5 cm.
 
 Trained (`experiments/training/train_refiner.py`) on views that are not among the photos. What no photo shows moves with its
 neighbours, which gradient descent on the photos cannot do.
@@ -37,6 +38,9 @@ COLUMNS = 14
 LARGEST_MOVES = np.asarray([0.01] * 3 + [0.1] * 4 + [0.2] * 3 + [0.5] * 4, np.float32)
 """What an output of 1 moves: metres, quaternions, log scales, logits of opacity and colours."""
 NEIGHBORS = 8
+CLUSTER_LEVELS, NEAREST_CLUSTERS = 9, 4
+CLUSTER_BLUR = 0.01
+"""Metres: what lies this close to the centre of a cluster reads mostly that cluster."""
 PERSON = 8000.0
 """Pixels of a person in the photos of training: sums over pixels are brought to it, whatever the size of the photos."""
 SEEN = 0.02
@@ -61,14 +65,55 @@ class Signals:
 
 @pytree_dataclass
 class Neighbors:
-    """A symmetric graph. index: the neighbours of each Gaussian, itself where it has fewer. share: 1 / how many, 0 there."""
+    """A symmetric graph. index: the neighbours of each point, itself where it has fewer. share: 1 / how many, 0 there."""
 
     index: Int[Array, "g k"]
     share: Float[Array, "g k"]
 
 
+@pytree_dataclass
+class Graph:
+    """Of g Gaussians at two levels.
+
+    gaussians, clusters: the neighbours at each. members: the Gaussians of each cluster. nearest: the clusters around each
+    Gaussian. weights: of those, by distance; they sum to 1.
+    """
+
+    gaussians: Neighbors
+    clusters: Neighbors
+    members: Int[Array, "c m"]
+    nearest: Int[Array, "g n"]
+    weights: Float[Array, "g n"]
+
+
+def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
+    """Of Gaussians at these places. On the host."""
+    members = clusters_of(means)
+    centers = means[members].mean(axis=1)
+    distances, nearest = KDTree(centers).query(means, NEAREST_CLUSTERS)
+    weights = 1 / (distances + CLUSTER_BLUR)
+    weights /= weights.sum(axis=1, keepdims=True)
+    indices = jnp.asarray(members, jnp.int32), jnp.asarray(nearest, jnp.int32)
+    return Graph(neighbors_of(means), neighbors_of(centers), *indices, jnp.asarray(weights, jnp.float32))
+
+
+def clusters_of(means: Float[np.ndarray, "g 3"]) -> Int[np.ndarray, "c m"]:
+    """The Gaussians of 2**CLUSTER_LEVELS clusters of equal size: halved along their longest side, again and again.
+
+    Some are in twice, where the number of Gaussians cannot be divided.
+    """
+    count = 2**CLUSTER_LEVELS
+    members = np.resize(np.arange(len(means)), (1, count * -(-len(means) // count)))
+    for _ in range(CLUSTER_LEVELS):
+        points = means[members]
+        axis = np.ptp(points, axis=1).argmax(axis=-1)[:, None, None]
+        order = np.argsort(np.take_along_axis(points, axis, axis=-1)[..., 0], axis=1, kind="stable")
+        members = np.take_along_axis(members, order, axis=1).reshape(2 * len(members), -1)
+    return members
+
+
 def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Neighbors:
-    """Pairs of Gaussians each of which is among the `count` nearest of the other. On the host."""
+    """Pairs of points each of which is among the `count` nearest of the other. On the host."""
     total = len(means)
     own = np.arange(total)[:, None]
     nearest = KDTree(means).query(means, min(count + 1, total))[1].reshape(total, -1)[:, 1:]
@@ -101,10 +146,14 @@ neighbor_mean.defvjp(_mean_forward, _mean_backward)
 
 
 class Refiner(nn.Module):
-    """The network of a round. width: of its features. layers: of messages between neighbours. per_photo: width for a photo."""
+    """The network of a round.
+
+    width: of its features. layers, cluster_layers: of messages between neighbours. per_photo: width for a photo.
+    """
 
     width: int = 48
     layers: int = 2
+    cluster_layers: int = 3
     per_photo: int = 32
 
     @nn.compact
@@ -114,7 +163,7 @@ class Refiner(nn.Module):
         start: Float[Array, "g 14"],
         hidden: Float[Array, "g w"],
         signals: Signals,
-        neighbors: Neighbors,
+        graph: Graph,
         center: Float[Array, "3"],
     ) -> tuple[Float[Array, "g 14"], Float[Array, "g w"]]:
         """(values, hidden) after a round; values: the parameters side by side, start: those before the first round."""
@@ -141,14 +190,29 @@ class Refiner(nn.Module):
             (values - start) / LARGEST_MOVES,
         ]
         features = dense("enter", self.width)(jnp.concatenate([*pooled, *own, hidden], axis=-1))
+        features = features + self.from_clusters(features, graph)
         for i in range(self.layers):
             normed = nn.LayerNorm(name=f"norm_{i}")(features)
-            message = neighbor_mean(nn.relu(dense(f"message_{i}", self.width)(normed)), neighbors)
+            message = neighbor_mean(nn.relu(dense(f"message_{i}", self.width)(normed)), graph.gaussians)
             update = nn.relu(dense(f"update_{i}_0", self.width)(jnp.concatenate([normed, message], axis=-1)))
             features = features + dense(f"update_{i}_1", self.width)(update)
         normed = nn.LayerNorm(name="norm")(features)
         moves = nn.Dense(COLUMNS, kernel_init=nn.initializers.zeros, name="moves")(normed)
         return values + moves * LARGEST_MOVES, features
+
+    def from_clusters(self, features: Float[Array, "g w"], graph: Graph) -> Float[Array, "g w"]:
+        """What the clusters around each Gaussian say, after messages between clusters and a mean over all of them."""
+        dense = lambda name: nn.Dense(self.width, name=f"cluster_{name}")
+        norm = lambda name: nn.LayerNorm(name=f"cluster_{name}")
+        clusters = dense("enter")(norm("norm")(jnp.mean(features[graph.members], axis=1)))
+        for i in range(self.cluster_layers):
+            normed = norm(f"norm_{i}")(clusters)
+            said = nn.relu(dense(f"message_{i}")(normed))
+            everywhere = jnp.broadcast_to(jnp.mean(said, axis=0), said.shape)
+            heard = jnp.concatenate([normed, neighbor_mean(said, graph.clusters), everywhere], axis=-1)
+            clusters = clusters + dense(f"update_{i}_1")(nn.relu(dense(f"update_{i}_0")(heard)))
+        around = jnp.sum(norm("norm_out")(clusters)[graph.nearest] * graph.weights[..., None], axis=1)
+        return nn.Dense(self.width, kernel_init=nn.initializers.zeros, name="cluster_out")(around)
 
 
 def _relative_errors(values, signals):
@@ -204,12 +268,12 @@ def refiner_round(
     start: Float[Array, "g 14"],
     hidden: Float[Array, "g w"],
     signals: Signals,
-    neighbors: Neighbors,
+    graph: Graph,
     avatar: Avatar,
 ) -> tuple[Float[Array, "g 14"], Float[Array, "g w"]]:
     """`Refiner` on an avatar: (values, hidden) after a round."""
     center = jnp.mean(avatar.rest_joints, axis=0)
-    return cast(Any, Refiner().apply(variables, values, start, hidden, signals, neighbors, center))
+    return cast(Any, Refiner().apply(variables, values, start, hidden, signals, graph, center))
 
 
 def save_refiner(path: str | os.PathLike, variables: PyTree) -> None:

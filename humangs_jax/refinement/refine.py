@@ -32,11 +32,11 @@ from humangs_jax.refinement.crops import crop_to_person, held_out_blocks
 from humangs_jax.refinement.density import photo_errors, split, with_room, without_clear
 from humangs_jax.refinement.learned import (
     MOST_PHOTOS,
-    Neighbors,
+    Graph,
     Refiner,
     Signals,
+    graph_of,
     load_refiner,
-    neighbors_of,
     photo_signals,
     refiner_round,
     stacked,
@@ -287,9 +287,9 @@ class _Run:
         return state, int(overflow) > 0
 
     @functools.cached_property
-    def neighbors(self) -> Neighbors:
+    def graph(self) -> Graph:
         """Of the avatar's own Gaussians."""
-        return neighbors_of(np.asarray(self.original.gaussians.means))
+        return graph_of(np.asarray(self.original.gaussians.means))
 
     def learned(self, parameters: Parameters, rounds: int) -> Parameters:
         """The parameters after rounds of the learned update. Slots without a Gaussian (`growth`) stay empty."""
@@ -303,7 +303,7 @@ class _Run:
             each = [self.signals(parameters, int(i)) for i in chosen]
             signals = jax.tree.map(lambda *x: jnp.stack(x)[:, :count], *each)
             values, hidden = _compiled(refiner_round)(
-                load_refiner(), values, start, hidden, signals, self.neighbors, self.original
+                load_refiner(), values, start, hidden, signals, self.graph, self.original
             )
             parameters = unstacked(everything.at[:count].set(values), parameters)
         return parameters

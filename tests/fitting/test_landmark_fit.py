@@ -1,3 +1,5 @@
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -133,16 +135,17 @@ def test_smoothness_shrinks_the_jitter_of_a_motion_that_stands_still(still):
     assert jitter(smooth) < 0.5 * jitter(still[2])
 
 
-STOPPED_SHORT = 0.015
-"""Metres between joints of two fits of the same keypoints: both stop short of the minimum, in two places (5.1 mm here)."""
+FEW_STEPS, SAME_PATH = 10, 1e-4
+"""Steps before rounding decides which step is accepted; metres. After 30 steps the two are 4 to 36 mm apart."""
 
 
 @pytest.mark.slow
 def test_vmap_over_people_is_a_loop():
+    config = dataclasses.replace(CONFIG, steps=FEW_STEPS, person_steps=FEW_STEPS)
     several = [observe(NAMES[:2], seed=seed, noise=2.0)[2] for seed in range(2)]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *several)
-    together = jax.vmap(lambda seen: fit_landmarks(model_of(), seen, CONFIG))(batch)
+    together = jax.vmap(lambda seen: fit_landmarks(model_of(), seen, config))(batch)
     for i, seen in enumerate(several):
-        alone = fit_landmarks(model_of(), seen, CONFIG)
+        alone = fit_landmarks(model_of(), seen, config)
         difference = np.linalg.norm(np.asarray(together.joints[i]) - np.asarray(alone.joints), axis=-1)
-        assert difference.max() < STOPPED_SHORT
+        assert difference.max() < SAME_PATH

@@ -18,6 +18,8 @@ from humangs_jax.refinement.learned import (
     PERSON,
     Refiner,
     Signals,
+    clusters_of,
+    graph_of,
     load_refiner,
     neighbor_mean,
     neighbors_of,
@@ -33,6 +35,7 @@ from humangs_jax.rendering.splatting import plan_buffers, render
 
 DIFFERENCE, DIFFERENCES = 1e-3, 2e-2  # of a colour; float32 sums over some thousand pixels
 ROUNDING = 1e-5
+ONE_STEP = 1e-3  # metres: five times the rate of the means
 
 
 @pytest.fixture(scope="module")
@@ -87,6 +90,36 @@ def test_the_gradient_of_the_mean_is_its_transpose():
     np.testing.assert_allclose(pull_back(cotangent)[0], matrix.T @ cotangent, atol=ROUNDING)
 
 
+def test_clusters_are_of_equal_size_and_near():
+    means = np.random.default_rng(4).normal(size=(1024, 3))
+    members = clusters_of(means)
+    assert members.shape == (512, 2) and (np.sort(members.ravel()) == np.arange(1024)).all()
+    within = np.linalg.norm(means[members[:, 0]] - means[members[:, 1]], axis=-1).mean()
+    assert within < 0.5 * np.linalg.norm(means[:512] - means[512:], axis=-1).mean()
+    assert clusters_of(2 * means).tolist() == members.tolist()
+
+
+@pytest.mark.parametrize("count", [1, 3, 700])
+def test_every_gaussian_is_in_a_cluster_whatever_their_number(count):
+    means = np.random.default_rng(5).normal(size=(count, 3))
+    graph = jax.tree.map(np.asarray, graph_of(means))
+    assert set(graph.members.ravel()) == set(range(count)) and graph.members.shape == (512, -(-count // 512))
+    assert graph.nearest.shape == graph.weights.shape == (count, 4)
+    np.testing.assert_allclose(graph.weights.sum(axis=1), 1, atol=ROUNDING)
+    assert (np.diff(graph.weights, axis=1) <= 0).all()
+
+
+def test_clusters_carry_what_one_end_knows_to_the_other(scene):
+    avatar, _, parameters, _ = scene
+    values, graph = stacked(parameters), graph_of(np.asarray(avatar.gaussians.means))
+    signals = jax.tree.map(lambda x: x[None], signals_of(scene))
+    hidden = jnp.zeros((len(values), Refiner.width))
+    moves = lambda hidden: refiner_round(load_refiner(), values, values, hidden, signals, graph, avatar)[0] - values
+    lowest, highest = np.argsort(np.asarray(values[:, 1]))[[0, -1]]
+    changed = moves(hidden.at[lowest].set(10.0)) - moves(hidden)
+    assert np.abs(changed[highest]).max() > 0
+
+
 def test_parameters_side_by_side_and_back(scene):
     parameters = scene[2]
     values = stacked(parameters)
@@ -125,7 +158,7 @@ def test_pixels_that_do_not_count_say_nothing(scene):
 
 def test_untrained_it_changes_nothing_and_trained_it_does(scene):
     avatar, _, parameters, _ = scene
-    values, graph = stacked(parameters), neighbors_of(np.asarray(avatar.gaussians.means))
+    values, graph = stacked(parameters), graph_of(np.asarray(avatar.gaussians.means))
     signals = jax.tree.map(lambda x: x[None], signals_of(scene))
     hidden = jnp.zeros((len(values), Refiner.width))
     fresh = Refiner().init(jax.random.key(0), values, values, hidden, signals, graph, jnp.zeros(3))
@@ -141,7 +174,7 @@ def test_untrained_it_changes_nothing_and_trained_it_does(scene):
 def test_the_order_of_photos_does_not_matter(scene):
     avatar, _, parameters, _ = scene
     rng, values = np.random.default_rng(3), stacked(parameters)
-    graph, g = neighbors_of(np.asarray(avatar.gaussians.means)), len(values)
+    graph, g = graph_of(np.asarray(avatar.gaussians.means)), len(values)
     signals = Signals(*(jnp.asarray(rng.random(shape), jnp.float32) for shape in ((3, g, COLUMNS), (3, g), (3, g))))
     run = lambda s: refiner_round(load_refiner(), values, values, jnp.zeros((g, Refiner.width)), s, graph, avatar)[0]
     np.testing.assert_allclose(run(signals), run(jax.tree.map(lambda x: x[::-1], signals)), atol=ROUNDING)
@@ -235,4 +268,7 @@ def test_rounds_that_make_the_photos_worse_are_not_kept(steps, scene, monkeypatc
     config = dataclasses.replace(STEPS, rounds=2, steps=steps, held_out=0.3)
     report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
     assert report.rounds == 0
-    assert np.abs(np.asarray(report.avatar.gaussians.means) - np.asarray(scene[0].gaussians.means)).max() < 0.01
+    if not steps:
+        assert not report.kept
+        jax.tree.map(np.testing.assert_array_equal, report.avatar, scene[0])
+    assert np.abs(np.asarray(report.avatar.gaussians.means) - np.asarray(scene[0].gaussians.means)).max() < ONE_STEP
