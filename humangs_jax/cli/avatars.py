@@ -21,12 +21,12 @@ from humangs_jax.cli.options import (
     require_suffix,
 )
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+from humangs_jax.refinement.config import ROUNDS, RefineConfig
 
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
     from humangs_jax.data.capture import Capture
     from humangs_jax.data.motion import Motion
-    from humangs_jax.refinement.config import RefineConfig
 
 
 DEMO_SECONDS = 10.0
@@ -145,7 +145,7 @@ class Refine:
     """The avatar file to write; an avatar that is there is replaced."""
     limit: str = "15s"
     """How long: seconds ("15s"), steps ("100steps") or rounds alone ("0steps"), after a compilation of some seconds."""
-    rounds: int = 2
+    rounds: int = ROUNDS
     """Rounds of the learned update before the steps; 0: steps alone."""
     image_size: int | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
