@@ -239,7 +239,7 @@ def view_loss(values: Any, like: Any, avatar: Any, view: Any, splat: Any) -> tup
     from humangs_jax.refinement.objective import posed_gaussians
     from humangs_jax.rendering.splatting import render
 
-    drawn = render(posed_gaussians(unstacked(values, like), avatar, view), view.cameras, splat)
+    drawn = render(posed_gaussians(unstacked(values, like), avatar, view, poses=False), view.cameras, splat)
     terms = {
         "squared": jnp.square(drawn.rgb - view.images),
         "absolute": jnp.abs(drawn.rgb - view.images),
@@ -377,7 +377,7 @@ def planned(samples: list[Sample]) -> Any:
 
     like = SPLAT_PRESETS[samples[0].avatar.rendering]
     plans = [
-        plan_buffers(posed_gaussians(sample.start, sample.avatar, view), view.cameras, like, MARGIN)
+        plan_buffers(posed_gaussians(sample.start, sample.avatar, view, poses=False), view.cameras, like, MARGIN)
         for sample in samples
         for view in sample.views
     ]

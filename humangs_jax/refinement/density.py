@@ -13,11 +13,8 @@ from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.objectives.metrics import OUTLINE
-from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.refinement.objective import Photos, posed_gaussians
+from humangs_jax.refinement.objective import Image, Photos
 from humangs_jax.refinement.parameters import Parameters, RefineState
-from humangs_jax.rendering.splat_config import SplatConfig
-from humangs_jax.rendering.splatting import render
 
 CLEAR = 0.02
 """A Gaussian of less opacity gives its slot away."""
@@ -44,25 +41,14 @@ def without_clear(avatar: Avatar, smallest: float) -> Avatar:
     return replace(avatar, gaussians=gaussians, skinning_weights=avatar.skinning_weights[kept])
 
 
-def photo_errors(
-    parameters: Parameters, avatar: Avatar, photos: Photos, config: RefineConfig, splat: SplatConfig
-) -> Float[Array, " g"]:
-    """Each Gaussian's share of the absolute errors of all photos: the sum over pixels of its weight there times the error.
+def inner_errors(image: Image, photo: Photos) -> Image:
+    """Absolute errors of the colours of one photo. Their pull-back to the brightness of each Gaussian is its share of them.
 
     Pixels near the outline do not count: more Gaussians there fit the masks of the photos, and are fur in other views.
-    The weights are the gradient of the image with respect to the colours, after Rota Bulo et al. 2024
-    (https://arxiv.org/abs/2404.06109).
+    After Rota Bulo et al. 2024 (https://arxiv.org/abs/2404.06109).
     """
-
-    def one(photo):
-        gaussians = posed_gaussians(parameters, avatar, photo)
-        image = lambda colors: render(replace(gaussians, colors=colors), photo.cameras, splat).rgb
-        rgb, pull_back = jax.vjp(image, gaussians.colors)
-        inside = photo.counted & (eroded(photo.masks, round(OUTLINE * max(photo.masks.shape))) > 0.5)
-        error = jnp.abs(rgb - photo.images) * inside[..., None]
-        return jnp.sum(pull_back(error)[0], axis=-1)
-
-    return jnp.sum(jax.lax.map(one, photos), axis=0)
+    inside = photo.counted & (eroded(photo.masks, round(OUTLINE * max(photo.masks.shape))) > 0.5)
+    return jnp.abs(image[0] - photo.images) * inside[..., None], jnp.zeros_like(image[1])
 
 
 def eroded(mask: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:

@@ -26,10 +26,10 @@ from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.tensor_file import read_safetensors
-from humangs_jax.refinement.objective import Photos, posed_gaussians
+from humangs_jax.refinement.objective import Image, Photos, drawn_photo
 from humangs_jax.refinement.parameters import Parameters
 from humangs_jax.rendering.splat_config import SplatConfig
-from humangs_jax.rendering.splatting import render
+from humangs_jax.rendering.splatting import Rendering
 
 SHIPPED = "assets/refiner.safetensors"
 FIELDS = ("means", "quats", "log_scales", "opacity_logits", "color_logits")
@@ -241,25 +241,29 @@ def photo_signals(
     parameters: Parameters, avatar: Avatar, photo: Photos, splat: SplatConfig
 ) -> tuple[Signals, Int[Array, ""]]:
     """Of one photo (without the axis v), and the overflow. Errors: of the pixels that count. splat: with `visibility`."""
+    image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat, poses=False)
+    gradient, _ = pull_back(squared_errors(image, photo))
+    _, pixels = pull_back(colors_alone(image))
+    return signals_from(gradient, pixels, rendering, photo), rendering.overflow
 
-    def draw(parameters, shift):
-        gaussians = posed_gaussians(parameters, avatar, photo, poses=False)
-        colors = gaussians.colors + shift[:, None]
-        rendering = render(replace(gaussians, colors=colors), photo.cameras, splat)
-        return (rendering.rgb, rendering.alpha), (rendering.visibility, rendering.overflow)
 
-    (rgb, alpha), pull_back, (visibility, overflow) = jax.vjp(
-        draw, parameters, jnp.zeros_like(avatar.gaussians.opacities), has_aux=True
-    )
-    errors = (
-        jnp.where(photo.counted[..., None], rgb - photo.images, 0),
-        jnp.where(photo.counted, alpha - photo.masks, 0),
-    )
-    gradient, _ = pull_back(jax.tree.map(lambda x: 2 * x, errors))
-    # a change of all three colours of a Gaussian changes the sum of an image by three times its weights
-    _, pixels = pull_back((jnp.ones_like(rgb), jnp.zeros_like(alpha)))
+def squared_errors(image: Image, photo: Photos) -> Image:
+    """Gradient of the sum of squared errors with respect to the image."""
+    rgb = jnp.where(photo.counted[..., None], image[0] - photo.images, 0)
+    return 2 * rgb, 2 * jnp.where(photo.counted, image[1] - photo.masks, 0)
+
+
+def colors_alone(image: Image) -> Image:
+    """Gradient of the sum of all colours with respect to the image."""
+    return jnp.ones_like(image[0]), jnp.zeros_like(image[1])
+
+
+def signals_from(gradient: Parameters, colors: Float[Array, " g"], rendering: Rendering, photo: Photos) -> Signals:
+    """From what `squared_errors` and `colors_alone` mean for the Gaussians."""
+    assert rendering.visibility is not None
     scale = PERSON / jnp.maximum(jnp.sum(photo.masks), 1.0)
-    return Signals(scale * stacked(gradient), visibility, scale * pixels / 3), overflow
+    # a change of all three colours of a Gaussian changes the sum of an image by three times its weights
+    return Signals(scale * stacked(gradient), rendering.visibility, scale * colors / 3)
 
 
 def refiner_round(

@@ -4,6 +4,7 @@ The Gaussians are skinned to the pose of each photo, so the photos may show diff
 """
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,11 @@ from humangs_jax.refinement.parameters import Parameters, gaussians_of
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import Rendering, render
+
+Image = tuple[Float[Array, "h w 3"], Float[Array, "h w"]]
+"""Colours and alpha."""
+PullBack = Callable[[Image], tuple[Parameters, Float[Array, " g"]]]
+"""From the gradient with respect to an image to those with respect to the parameters, and to the brightness of each Gaussian."""
 
 
 @pytree_dataclass
@@ -47,7 +53,7 @@ def photos_of(views: SubjectViews, counted: Bool[Array, "v h w"]) -> Photos:
     return Photos(views.images, views.masks, counted, views.cameras, views.rotations, views.translations, index)
 
 
-def posed_gaussians(parameters: Parameters, avatar: Avatar, photo: Photos, poses: bool = True) -> Gaussians:
+def posed_gaussians(parameters: Parameters, avatar: Avatar, photo: Photos, poses: bool) -> Gaussians:
     """The Gaussians in the pose of one photo (without the axis v), corrected as far as it has been refined.
 
     poses: whether gradients reach the pose; they pass through the transforms of all Gaussians, which takes time.
@@ -64,22 +70,31 @@ def posed_gaussians(parameters: Parameters, avatar: Avatar, photo: Photos, poses
     return skin(replace(avatar, gaussians=gaussians_of(parameters)), pose)
 
 
-def photo_loss(
-    parameters: Parameters, avatar: Avatar, photo: Photos, config: RefineConfig, splat: SplatConfig
-) -> tuple[Scalar, Rendering]:
+def drawn_photo(
+    parameters: Parameters, avatar: Avatar, photo: Photos, splat: SplatConfig, poses: bool
+) -> tuple[Image, PullBack, Rendering]:
+    """The image of one photo (without the axis v), its pull-back, and all that was rendered. poses: see `posed_gaussians`."""
+
+    def draw(parameters, brightness):
+        gaussians = posed_gaussians(parameters, avatar, photo, poses)
+        rendering = render(replace(gaussians, colors=gaussians.colors + brightness[:, None]), photo.cameras, splat)
+        return (rendering.rgb, rendering.alpha), rendering
+
+    return jax.vjp(draw, parameters, jnp.zeros_like(avatar.gaussians.opacities), has_aux=True)
+
+
+def image_loss(image: Image, photo: Photos, config: RefineConfig) -> Scalar:
     """Of one photo (without the axis v): L1 of colours, structural dissimilarity and L1 of coverage, means over the crop.
 
     A pixel that does not count takes the photo's value, so that it contributes nothing anywhere.
     """
-    rendering = render(posed_gaussians(parameters, avatar, photo, config.poses), photo.cameras, splat)
-    rgb = jnp.where(photo.counted[..., None], rendering.rgb, photo.images)
-    alpha = jnp.where(photo.counted, rendering.alpha, photo.masks)
-    loss = (
+    rgb = jnp.where(photo.counted[..., None], image[0], photo.images)
+    alpha = jnp.where(photo.counted, image[1], photo.masks)
+    return (
         jnp.mean(jnp.abs(rgb - photo.images))
         + config.structural * jnp.mean(structural_dissimilarity(rgb, photo.images))
         + config.silhouette * jnp.mean(jnp.abs(alpha - photo.masks))
     )
-    return loss, rendering
 
 
 @pytree_dataclass
@@ -102,12 +117,22 @@ def compare_photos(
     splat = dataclasses.replace(splat, visibility=True)
 
     def one(photo):
-        loss, rendering = photo_loss(parameters, avatar, photo, config, splat)
-        squared = jnp.mean(jnp.square(jnp.clip(rendering.rgb, 0, 1) - photo.images), axis=-1)
-        assert rendering.visibility is not None
-        return Comparison(loss, jnp.sum(squared * photo.counted), rendering.visibility, rendering.overflow)
+        image, _, rendering = drawn_photo(parameters, avatar, photo, splat, config.poses)
+        return compared(image, rendering, photo, config)
 
-    each = jax.lax.map(one, photos)
+    return comparison_of(jax.lax.map(one, photos), photos)
+
+
+def compared(image: Image, rendering: Rendering, photo: Photos, config: RefineConfig) -> Comparison:
+    """One photo. squared: sum over its pixels."""
+    squared = jnp.mean(jnp.square(jnp.clip(image[0], 0, 1) - photo.images), axis=-1)
+    assert rendering.visibility is not None
+    loss = image_loss(image, photo, config)
+    return Comparison(loss, jnp.sum(squared * photo.counted), rendering.visibility, rendering.overflow)
+
+
+def comparison_of(each: Comparison, photos: Photos) -> Comparison:
+    """Of all photos, from that of each (leading axis v)."""
     return Comparison(
         jnp.mean(each.loss),
         safe_divide(jnp.sum(each.squared), jnp.sum(photos.counted, dtype=each.squared.dtype)),
@@ -128,9 +153,9 @@ def photos_gradient(
 
     def total(parameters, avatar, photos):
         def one(photo):
-            loss = lambda parameters: photo_loss(parameters, avatar, photo, config, splat)
-            (value, rendering), gradient = jax.value_and_grad(loss, has_aux=True)(parameters)
-            return gradient, value, rendering.overflow
+            image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat, config.poses)
+            value, error = jax.value_and_grad(image_loss)(image, photo, config)
+            return pull_back(error)[0], value, rendering.overflow
 
         # unrolled: a CPU runs the loops of the renderer more slowly inside of another loop
         each = [one(jax.tree.map(lambda x, i=i: x[i], photos)) for i in range(len(photos.images))]

@@ -29,23 +29,37 @@ from humangs_jax.data.views import SubjectViews
 from humangs_jax.objectives.metrics import decibels
 from humangs_jax.refinement.config import SPLITS, RefineConfig
 from humangs_jax.refinement.crops import crop_to_person, held_out_blocks
-from humangs_jax.refinement.density import photo_errors, split, with_room, without_clear
+from humangs_jax.refinement.density import inner_errors, split, with_room, without_clear
 from humangs_jax.refinement.learned import (
     MOST_PHOTOS,
     Graph,
     Refiner,
     Signals,
+    colors_alone,
     graph_of,
     load_refiner,
-    photo_signals,
     refiner_round,
+    signals_from,
+    squared_errors,
     stacked,
     unstacked,
 )
-from humangs_jax.refinement.objective import Comparison, Photos, compare_photos, photos_gradient, photos_of
+from humangs_jax.refinement.objective import (
+    Comparison,
+    Image,
+    Photos,
+    PullBack,
+    compare_photos,
+    compared,
+    comparison_of,
+    drawn_photo,
+    image_loss,
+    photos_gradient,
+    photos_of,
+)
 from humangs_jax.refinement.parameters import Parameters, RefineState, gaussians_of, init_state, parameters_of, update
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.rendering.splatting import plan_buffers
+from humangs_jax.rendering.splatting import Rendering, plan_buffers
 
 HELD_OUT_PHOTOS = 8
 """With this number of photos or more, one photo is held out, not pixels of each: a test of views that no step sees."""
@@ -164,10 +178,9 @@ def refine_step(
     progress: Float[Array, ""] | float,
     config: RefineConfig,
     splat: SplatConfig,
-    mesh: Mesh | None = None,
 ) -> tuple[RefineState, Scalar, Int[Array, ""]]:
     """One step on some photos: state, loss before it, overflow. progress: how much of the run is over, in [0, 1]."""
-    gradient, loss, overflow = photos_gradient(state.parameters, avatar, photos, config, splat, mesh)
+    gradient, loss, overflow = photos_gradient(state.parameters, avatar, photos, config, splat)
     return update(state, gradient, progress, config), loss, overflow
 
 
@@ -224,12 +237,10 @@ class _Run:
                 if splits and passed >= splits[0]:
                     state, self.avatar = self.denser(state)
                     splits.pop(0)
-                state, overflow = self.step(state, passed)
+                buffers, paused = self.splat, time.perf_counter()
+                state = self.step(state, passed)
                 done += 1
-                if overflow:
-                    paused = time.perf_counter()
-                    self.splat = self.replanned(state.parameters)
-                    self.step(state, passed)  # compiles for the new buffers
+                if self.splat != buffers:  # what a step compiled for larger ones
                     took = time.perf_counter() - paused
                     compile_seconds, began = compile_seconds + took, began + took
                 passed = self.passed(done, time.perf_counter() - began)
@@ -277,14 +288,45 @@ class _Run:
         if self.config.growth > 1:
             self.denser(state)
 
-    def step(self, state: RefineState, passed: float) -> tuple[RefineState, bool]:
-        """The state after one step, and whether something did not fit into the buffers."""
+    def step(self, state: RefineState, passed: float) -> RefineState:
+        """The state after one step."""
         chosen = next(self.order)
+        find = self.gradient if self.mesh is None else self.shared_gradient
+        return _compiled(update)(state, find(state.parameters, chosen), passed, self.compiled_for)
+
+    def gradient(self, parameters: Parameters, chosen: np.ndarray) -> Parameters:
+        """Of the mean loss over some photos."""
+        each = []
+        for i in chosen:
+            photo = _compiled(_chosen)(self.seen, i)
+            image, pull_back, _ = self.drawn(parameters, photo)
+            each.append(_compiled(_pulled)(pull_back, _compiled(_loss_gradient)(image, photo, self.compiled_for))[0])
+        return each[0] if len(each) == 1 else jax.tree.map(lambda *x: sum(x) / len(x), *each)
+
+    def shared_gradient(self, parameters: Parameters, chosen: np.ndarray) -> Parameters:
+        """The same, each device some of the photos."""
         photos = _compiled(_chosen)(self.seen, chosen)
-        state, _, overflow = _compiled(refine_step)(
-            state, self.avatar, photos, passed, self.compiled_for, self.splat, self.mesh
-        )
-        return state, int(overflow) > 0
+        for _ in range(2):
+            gradient, _, overflow = _compiled(photos_gradient)(
+                parameters, self.avatar, photos, self.compiled_for, self.splat, self.mesh
+            )
+            if not int(overflow):
+                break
+            self.splat = self.replanned(parameters)
+        return gradient
+
+    def drawn(self, parameters: Parameters, photo: Photos) -> tuple[Image, PullBack, Rendering]:
+        """One photo; the buffers grow if the Gaussians no longer fit.
+
+        All that a run does consists of this and `_pulled`, so that it compiles one renderer and its transpose.
+        """
+        for _ in range(2):
+            splat = dataclasses.replace(self.splat, visibility=True)
+            found = _compiled(drawn_photo)(parameters, self.avatar, photo, splat, self.config.poses)
+            if not int(found[2].overflow):
+                break
+            self.splat = self.replanned(parameters)
+        return found
 
     @functools.cached_property
     def graph(self) -> Graph:
@@ -309,15 +351,12 @@ class _Run:
         return parameters
 
     def signals(self, parameters: Parameters, view: int) -> Signals:
-        """What one photo says; the buffers grow if the Gaussians no longer fit."""
-        photo = jax.tree.map(lambda x: x[view], self.seen)
-        for _ in range(2):
-            seen = dataclasses.replace(self.splat, visibility=True)
-            found, overflow = _compiled(photo_signals)(parameters, self.avatar, photo, seen)
-            if not int(overflow):
-                break
-            self.splat = self.replanned(parameters)
-        return found
+        """What one photo says."""
+        photo = _compiled(_chosen)(self.seen, view)
+        image, pull_back, rendering = self.drawn(parameters, photo)
+        gradient, _ = _compiled(_pulled)(pull_back, _compiled(squared_errors)(image, photo))
+        _, colors = _compiled(_pulled)(pull_back, _compiled(colors_alone)(image))
+        return _compiled(signals_from)(gradient, colors, rendering, photo)
 
     def replanned(self, parameters: Parameters) -> SplatConfig:
         """Buffers for the Gaussians as they are now."""
@@ -325,7 +364,11 @@ class _Run:
 
     def denser(self, state: RefineState) -> tuple[RefineState, Avatar]:
         """The state and the avatar after the Gaussians with the largest errors were split."""
-        errors = _compiled(photo_errors)(state.parameters, self.avatar, self.seen, self.compiled_for, self.splat)
+        errors = jnp.zeros(len(state.trust))
+        for i in range(len(self.seen.images)):
+            photo = _compiled(_chosen)(self.seen, i)
+            image, pull_back, _ = self.drawn(state.parameters, photo)
+            errors += _compiled(_pulled)(pull_back, _compiled(inner_errors)(image, photo))[1]
         count = round((self.config.growth - 1) * len(self.original.gaussians.means) / len(SPLITS))
         return _compiled(split)(state, self.avatar, errors, count)
 
@@ -334,13 +377,13 @@ class _Run:
         return _compiled(init_state)(parameters, found.visibility, self.compiled_for)
 
     def compared(self, parameters: Parameters, photos: Photos) -> Comparison:
-        """With the photos; the buffers grow if the Gaussians no longer fit."""
-        run = lambda: _compiled(compare_photos)(parameters, self.avatar, photos, self.compiled_for, self.splat)
-        found = run()
-        if int(found.overflow) > 0:
-            self.splat = self.replanned(parameters)
-            found = run()
-        return found
+        """With the photos."""
+        each = []
+        for i in range(len(photos.images)):
+            photo = _compiled(_chosen)(photos, i)
+            image, _, rendering = self.drawn(parameters, photo)
+            each.append(_compiled(compared)(image, rendering, photo, self.compiled_for))
+        return _compiled(comparison_of)(jax.tree.map(lambda *x: jnp.stack(x), *each), photos)
 
     def held_psnr(self, state: RefineState) -> float:
         """PSNR over the pixels that no step sees, dB."""
@@ -354,6 +397,14 @@ class _Run:
 
 def _chosen(photos, views):
     return jax.tree.map(lambda x: x[views], photos)
+
+
+def _loss_gradient(image, photo, config):
+    return jax.grad(image_loss)(image, photo, config)
+
+
+def _pulled(pull_back, image):
+    return pull_back(image)
 
 
 def _order(views: np.ndarray, size: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
@@ -379,7 +430,9 @@ def _planned(avatar: Avatar, photos: SubjectViews | Photos) -> SplatConfig:
 
 @functools.cache
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    static = [name for name in ("config", "splat", "mesh", "count") if name in inspect.signature(function).parameters]
+    static = [
+        name for name in ("config", "splat", "mesh", "count", "poses") if name in inspect.signature(function).parameters
+    ]
     options = compiler_options()
     return jax.jit(function, static_argnames=static, compiler_options=options and options | FASTER_COMPILATION)
 

@@ -51,7 +51,7 @@ def scene():
 
 def drawn(scene, parameters):
     avatar, photo, _, splat = scene
-    return render(posed_gaussians(parameters, avatar, photo), photo.cameras, splat)
+    return render(posed_gaussians(parameters, avatar, photo, poses=False), photo.cameras, splat)
 
 
 def signals_of(scene, photo=None):
