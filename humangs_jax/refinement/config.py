@@ -40,7 +40,8 @@ class RefineConfig:
     drawn in a step.
 
     structural, silhouette: weights of the structural dissimilarity, and of |alpha - mask|, beside the L1 distance of colours.
-    rates: see `LearningRates`. final_rate: share of the rates that is left at the end.
+    rates: see `LearningRates`. final_rate: share of the rates that is left at the end. full_steps: after rounds, a run of more
+    steps than this takes smaller ones in proportion; Gaussians that move further overfit to the photos.
 
     decay: each step moves means and log scales back towards the start by this share of the distance. visible: a Gaussian whose
     largest weight on a pixel of the photos is at least this moves at the full rate, others more slowly; what no photo shows
@@ -65,6 +66,7 @@ class RefineConfig:
     silhouette: float = 0.1
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
     final_rate: float = 0.1
+    full_steps: int = 100
     decay: float = 2e-3
     visible: float = 0.02
     poses: bool = False
@@ -89,5 +91,5 @@ class RefineConfig:
             raise ValueError(f"RefineConfig: {', '.join(wrong)} must be in [0, 1]")
         if not 1 <= self.growth <= 16:
             raise ValueError(f"RefineConfig: growth must be between 1 and 16, got {self.growth}")
-        if not self.held_out < 1 or not self.visible > 0 or self.checks < 1:
-            raise ValueError("RefineConfig: need held_out < 1, visible > 0 and checks >= 1")
+        if not self.held_out < 1 or not self.visible > 0 or min(self.checks, self.full_steps) < 1:
+            raise ValueError("RefineConfig: need held_out < 1, visible > 0, checks >= 1 and full_steps >= 1")

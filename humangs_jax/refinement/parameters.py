@@ -84,9 +84,13 @@ def init_state(parameters: Parameters, visibility: Float[Array, " g"], config: R
 
 
 def update(
-    state: RefineState, gradient: Parameters, progress: Float[Array, ""] | float, config: RefineConfig
+    state: RefineState,
+    gradient: Parameters,
+    progress: Float[Array, ""] | float,
+    config: RefineConfig,
+    share: Float[Array, ""] | float = 1.0,
 ) -> RefineState:
-    """One step of Adam with a rate for each parameter. progress: how much of the run is over, in [0, 1].
+    """One step of Adam with a rate for each parameter. progress: how much of the run is over, in [0, 1]. share: of the rates.
 
     Adam's steps do not shrink with the gradient, so the trust multiplies the step and not the loss.
     """
@@ -95,7 +99,7 @@ def update(
 
     def moved(name):
         value, step = getattr(state.parameters, name), getattr(steps, name)
-        rate = cosine * getattr(config.rates, name)
+        rate = share * cosine * getattr(config.rates, name)
         if name in ("rotations", "translations"):
             return value - rate * step if config.poses else value
         trust = state.trust.reshape(-1, *[1] * (value.ndim - 1))

@@ -75,6 +75,7 @@ HOST_SETTINGS = {
     "image_size": None,
     "views_per_step": 1,
     "held_out": 0.0,
+    "full_steps": 1,
     "checks": 1,
     "seed": 0,
 }
@@ -238,7 +239,7 @@ class _Run:
                     state, self.avatar = self.denser(state)
                     splits.pop(0)
                 buffers, paused = self.splat, time.perf_counter()
-                state = self.step(state, passed)
+                state = self.step(state, passed, self.share(passed, done) if rounds else 1.0)
                 done += 1
                 if self.splat != buffers:  # what a step compiled for larger ones
                     took = time.perf_counter() - paused
@@ -288,11 +289,11 @@ class _Run:
         if self.config.growth > 1:
             self.denser(state)
 
-    def step(self, state: RefineState, passed: float) -> RefineState:
-        """The state after one step."""
+    def step(self, state: RefineState, passed: float, share: float = 1.0) -> RefineState:
+        """The state after one step, at a share of the rates."""
         chosen = next(self.order)
         find = self.gradient if self.mesh is None else self.shared_gradient
-        return _compiled(update)(state, find(state.parameters, chosen), passed, self.compiled_for)
+        return _compiled(update)(state, find(state.parameters, chosen), passed, self.compiled_for, share)
 
     def gradient(self, parameters: Parameters, chosen: np.ndarray) -> Parameters:
         """Of the mean loss over some photos."""
@@ -388,6 +389,11 @@ class _Run:
     def held_psnr(self, state: RefineState) -> float:
         """PSNR over the pixels that no step sees, dB."""
         return float(decibels(self.compared(state.parameters, self.held).squared))
+
+    def share(self, passed: float, done: int) -> float:
+        """Of the rates, from how many steps the run will have. Before the first step of a run that a clock ends: 0."""
+        steps = done / passed if passed else self.config.steps or np.inf
+        return min(1.0, self.config.full_steps / steps)
 
     def passed(self, steps: int, seconds: float) -> float:
         """How much of the run is over, in [0, 1]."""

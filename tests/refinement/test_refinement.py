@@ -73,11 +73,11 @@ def test_interruption_returns_the_best_state(person, monkeypatch):
     avatar, capture = person
     step, calls = refinement._Run.step, []
 
-    def interrupted(self, state, passed):
-        calls.append(passed)
+    def interrupted(self, state, *when):
+        calls.append(when)
         if len(calls) > 9:
             raise KeyboardInterrupt
-        return step(self, state, passed)
+        return step(self, state, *when)
 
     monkeypatch.setattr(refinement._Run, "step", interrupted)
     report = refinement.refine_with_report(avatar, capture, STEPS)
@@ -192,6 +192,14 @@ def run_of(person, config=STEPS, views=3):
     avatar, capture = person
     crops = crop_to_person(capture.select(range(views)))
     return refinement._Run(avatar, crops, config, None, plan_buffers(avatar.gaussians, crops.cameras, margin=3.0))
+
+
+def test_long_runs_after_rounds_take_smaller_steps(person):
+    by_clock = run_of(person, dataclasses.replace(STEPS, rounds=2, steps=None, seconds=10.0, full_steps=50))
+    assert by_clock.share(0.0, 0) == 0
+    assert by_clock.share(0.1, 20) == pytest.approx(0.25) and by_clock.share(0.5, 20) == 1
+    by_steps = run_of(person, dataclasses.replace(STEPS, rounds=2, steps=12, full_steps=6))
+    assert by_steps.share(0.0, 0) == by_steps.share(0.25, 3) == 0.5
 
 
 def test_of_many_photos_one_is_held_out_whole_and_never_drawn(person, monkeypatch):
