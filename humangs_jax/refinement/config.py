@@ -7,7 +7,7 @@ from humangs_jax.core.configuration import knob
 MEASURED = "refinement.md"
 SPLITS = (0.0, 0.2, 0.4)
 """Shares of a run after which Gaussians are split."""
-ROUNDS = 2
+ROUNDS = 3
 """As many as the learned update was trained with."""
 
 

@@ -5,11 +5,12 @@ photos, sizes buffers, watches the clock and keeps the state with the highest PS
 `refine_views` is Adam's part as one pure function of a fixed number of steps, for `jax.jit` and `jax.vmap`.
 """
 
+import contextlib
 import dataclasses
 import functools
 import inspect
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import jax
@@ -193,6 +194,7 @@ class _Run:
     ):
         self.avatar, self.config, self.mesh, self.splat = with_room(avatar, config.growth), config, mesh, splat
         self.original = avatar
+        self.growing = 0.0  # seconds that compiling for larger buffers took
         self.compiled_for = dataclasses.replace(config, **HOST_SETTINGS)  # the same for runs of 5 s and of 15 s
         everything = jnp.ones(views.masks.shape, bool)
         count = len(views.images)
@@ -223,7 +225,8 @@ class _Run:
         bar = progress_bar(total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}")
         try:
             self.compile(state)
-            compile_seconds, began = time.perf_counter() - began, time.perf_counter()
+            compile_seconds, began, self.growing = time.perf_counter() - began, time.perf_counter(), 0.0
+            elapsed = lambda: time.perf_counter() - began - self.growing
             if config.rounds:
                 parameters = self.learned(state.parameters, config.rounds)
                 found = self.compared(parameters, self.all)
@@ -233,18 +236,14 @@ class _Run:
                 if watch is not None:
                     watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
             checked, splits = 0, list(SPLITS) if config.growth > 1 else []
-            passed = self.passed(0, time.perf_counter() - began)
+            passed = self.passed(0, elapsed())
             while passed < 1:
                 if splits and passed >= splits[0]:
                     state, self.avatar = self.denser(state)
                     splits.pop(0)
-                buffers, paused = self.splat, time.perf_counter()
                 state = self.step(state, passed, self.share(passed, done) if rounds else 1.0)
                 done += 1
-                if self.splat != buffers:  # what a step compiled for larger ones
-                    took = time.perf_counter() - paused
-                    compile_seconds, began = compile_seconds + took, began + took
-                passed = self.passed(done, time.perf_counter() - began)
+                passed = self.passed(done, elapsed())
                 if passed >= (checked + 1) / config.checks:
                     checked = int(passed * config.checks)
                     psnr = self.held_psnr(state)
@@ -257,7 +256,7 @@ class _Run:
         except KeyboardInterrupt:
             interrupted = True
         bar.close()
-        seconds = time.perf_counter() - began
+        seconds = time.perf_counter() - began - self.growing
         state, self.avatar = best
         after = self.compared(state.parameters, self.all)
         kept = float(after.loss) < float(before.loss)
@@ -273,7 +272,7 @@ class _Run:
             rounds,
             done,
             seconds,
-            compile_seconds,
+            compile_seconds + self.growing,
             loss=(float(pair[0].loss), float(pair[1].loss)),
             psnr=(float(decibels(pair[0].squared)), float(decibels(pair[1].squared))),
             kept=kept,
@@ -307,13 +306,13 @@ class _Run:
     def shared_gradient(self, parameters: Parameters, chosen: np.ndarray) -> Parameters:
         """The same, each device some of the photos."""
         photos = _compiled(_chosen)(self.seen, chosen)
-        for _ in range(2):
-            gradient, _, overflow = _compiled(photos_gradient)(
-                parameters, self.avatar, photos, self.compiled_for, self.splat, self.mesh
-            )
-            if not int(overflow):
-                break
-            self.splat = self.replanned(parameters)
+        find = lambda: _compiled(photos_gradient)(
+            parameters, self.avatar, photos, self.compiled_for, self.splat, self.mesh
+        )
+        gradient, _, overflow = find()
+        if int(overflow):
+            with self.larger_buffers(parameters):
+                gradient, _, _ = find()
         return gradient
 
     def drawn(self, parameters: Parameters, photo: Photos) -> tuple[Image, PullBack, Rendering]:
@@ -321,13 +320,23 @@ class _Run:
 
         All that a run does consists of this and `_pulled`, so that it compiles one renderer and its transpose.
         """
-        for _ in range(2):
-            splat = dataclasses.replace(self.splat, visibility=True)
-            found = _compiled(drawn_photo)(parameters, self.avatar, photo, splat, self.config.poses)
-            if not int(found[2].overflow):
-                break
-            self.splat = self.replanned(parameters)
-        return found
+        draw = lambda: _compiled(drawn_photo)(
+            parameters, self.avatar, photo, dataclasses.replace(self.splat, visibility=True), self.config.poses
+        )
+        image, pull_back, rendering = draw()
+        if int(rendering.overflow):
+            with self.larger_buffers(parameters):
+                image, pull_back, rendering = draw()
+                _compiled(_pulled)(pull_back, image)
+        return image, pull_back, rendering
+
+    @contextlib.contextmanager
+    def larger_buffers(self, parameters: Parameters) -> Generator[None]:
+        """Room for the Gaussians as they are now. What is compiled for it within the block does not count as refinement."""
+        paused = time.perf_counter()
+        self.splat = _planned(replace(self.avatar, gaussians=gaussians_of(parameters)), self.all)
+        yield
+        self.growing += time.perf_counter() - paused
 
     @functools.cached_property
     def graph(self) -> Graph:
@@ -358,10 +367,6 @@ class _Run:
         gradient, _ = _compiled(_pulled)(pull_back, _compiled(squared_errors)(image, photo))
         _, colors = _compiled(_pulled)(pull_back, _compiled(colors_alone)(image))
         return _compiled(signals_from)(gradient, colors, rendering, photo)
-
-    def replanned(self, parameters: Parameters) -> SplatConfig:
-        """Buffers for the Gaussians as they are now."""
-        return _planned(replace(self.avatar, gaussians=gaussians_of(parameters)), self.all)
 
     def denser(self, state: RefineState) -> tuple[RefineState, Avatar]:
         """The state and the avatar after the Gaussians with the largest errors were split."""
