@@ -2,7 +2,7 @@ r"""README's tables of quality and of the demo's times, from what other programs
 
 HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --refine 15 --out b
 python experiments/evaluation/synthetic.py --subjects 32 --views 1 2 4 6 --json evaluation.json
-python experiments/evaluation/refinement.py --subjects 32 --seconds 1 15 --sizes 256 --rounds 3 --json refinement.json
+python experiments/evaluation/refinement.py --subjects 32 --seconds 1 15 --sizes 256 --rounds 4 --json refinement.json
 python experiments/evaluation/readme.py --timed a/report.json --refined b/report.json --people evaluation.json \
     --refined-people refinement.json
 

@@ -1,7 +1,7 @@
 """What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colours.
 
     python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 1 2 5 15] [--sizes 256 512]
-        [--views 4] [--rounds 0 3] [--growth 1 1.5] [--off 0 2.5 5] [--longest-edge 0.017]
+        [--views 4] [--rounds 0 4] [--growth 1 1.5] [--off 0 2.5 5] [--longest-edge 0.017]
         [--page docs/refinement.md] [--table NAME] [--plot PLOT] [--sheet SHEET] [--details SHEET]
 
 People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "after rounds"

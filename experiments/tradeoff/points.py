@@ -63,7 +63,7 @@ def points() -> list[Point]:
     return found
 
 
-ROUNDS = tuple((n, 0, 256) for n in (1, 2, 3)) + ((3, 25, 256), (3, 50, 256), (3, 100, 256), (3, 0, 512), (3, 100, 512))
+ROUNDS = tuple((n, 0, 256) for n in (1, 2, 4)) + ((4, 25, 256), (4, 50, 256), (4, 100, 256), (4, 0, 512), (4, 100, 512))
 """Of the learned update, steps of Adam after them, and the size of the photos."""
 
 
@@ -87,20 +87,20 @@ COMBINED: tuple[dict[str, Any], ...] = (
     {"body_vertices": 2000, "splat": "fast"},
     {"body_vertices": 2000, "splat": "near_exact"},
     {"views": 1, "crop": True, "image_size": 128, "body_vertices": 2000, "splat": "fast"},
-    {"crop": True, "refine_rounds": 3, "refine_size": 128},
-    {"crop": True, "refine_rounds": 3, "refine_size": 256},
-    {"crop": True, "refine_rounds": 3, "refine_size": 256, "splat": "near_exact"},
-    {"views": 2, "crop": True, "refine_rounds": 3, "refine_size": 256},
-    {"views": 6, "crop": True, "refine_rounds": 3, "refine_size": 256},
-    {"views": 6, "crop": True, "refine_rounds": 3, "refine_steps": 100, "refine_size": 256},
-    {"views": 6, "crop": True, "refine_rounds": 3, "refine_size": 512},
-    {"views": 6, "crop": True, "refine_rounds": 3, "refine_steps": 100, "refine_size": 512},
-    {"body_vertices": 2000, "crop": True, "refine_rounds": 3, "refine_size": 256, "splat": "near_exact"},
-    {"body_vertices": 1000, "crop": True, "refine_rounds": 3, "refine_size": 256, "splat": "fast"},
-    {"crop": True, "image_size": 128, "refine_rounds": 3, "refine_size": 128},
-    {"crop": True, "image_size": 384, "refine_rounds": 3, "refine_size": 512},
-    {"crop": True, "longest_edge": 0.02, "refine_rounds": 3, "refine_size": 256},
-    {"crop": True, "longest_edge": 0.02, "refine_rounds": 3, "refine_steps": 100, "refine_size": 512},
+    {"crop": True, "refine_rounds": 4, "refine_size": 128},
+    {"crop": True, "refine_rounds": 4, "refine_size": 256},
+    {"crop": True, "refine_rounds": 4, "refine_size": 256, "splat": "near_exact"},
+    {"views": 2, "crop": True, "refine_rounds": 4, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_rounds": 4, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_rounds": 4, "refine_steps": 100, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_rounds": 4, "refine_size": 512},
+    {"views": 6, "crop": True, "refine_rounds": 4, "refine_steps": 100, "refine_size": 512},
+    {"body_vertices": 2000, "crop": True, "refine_rounds": 4, "refine_size": 256, "splat": "near_exact"},
+    {"body_vertices": 1000, "crop": True, "refine_rounds": 4, "refine_size": 256, "splat": "fast"},
+    {"crop": True, "image_size": 128, "refine_rounds": 4, "refine_size": 128},
+    {"crop": True, "image_size": 384, "refine_rounds": 4, "refine_size": 512},
+    {"crop": True, "longest_edge": 0.02, "refine_rounds": 4, "refine_size": 256},
+    {"crop": True, "longest_edge": 0.02, "refine_rounds": 4, "refine_steps": 100, "refine_size": 512},
     {"crop": True, "refine_steps": 200, "refine_size": 256},
 )
 """Several knobs at once."""

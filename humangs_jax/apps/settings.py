@@ -91,10 +91,10 @@ class Settings:
 PRESETS: dict[str, Settings] = {
     "realtime": Settings(views=4, execution=EXECUTIONS["realtime"], splat="fast"),
     "balanced": Settings(
-        views=4, execution=EXECUTIONS["balanced"], refine_rounds=3, refine_size=256, splat="near_exact"
+        views=4, execution=EXECUTIONS["balanced"], refine_rounds=4, refine_size=256, splat="near_exact"
     ),
-    "quality": Settings(views=4, execution=EXECUTIONS["quality"], refine_rounds=3, refine_size=512, splat="near_exact"),
-    "best": Settings(execution=EXECUTIONS["best"], refine_rounds=3, refine_steps=100, refine_size=512),
+    "quality": Settings(views=4, execution=EXECUTIONS["quality"], refine_rounds=4, refine_size=512, splat="near_exact"),
+    "best": Settings(execution=EXECUTIONS["best"], refine_rounds=4, refine_steps=100, refine_size=512),
 }
 """From the fastest to the best; docs/tradeoff.md has what each takes and gains."""
 

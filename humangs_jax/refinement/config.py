@@ -7,8 +7,9 @@ from humangs_jax.core.configuration import knob
 MEASURED = "refinement.md"
 SPLITS = (0.0, 0.2, 0.4)
 """Shares of a run after which Gaussians are split."""
-ROUNDS = 3
-"""As many as the learned update was trained with."""
+ROUNDS = 4
+"""One more than the learned update was trained with: on people of the validation seeds it gains 0.5 dB on the person, the fifth
+nothing."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,7 +21,7 @@ DEMO = {
 def test_quality():
     people = {"subjects": [{}] * 3, "by_views": {"4": {task: SCORES | BASELINE for task in ("novel", "animation")}}}
     lengths = {seconds: {task: SCORES for task in ("novel", "animation")} for seconds in ("0", "1")}
-    refined = {"subjects": [{}] * 3, "means": {"256 4 network, 3 rounds": lengths}}
+    refined = {"subjects": [{}] * 3, "means": {"256 4 network, 4 rounds": lengths}}
     demo = DEMO | {"refined": SCORES | {"psnr": 29.16, "seconds": 15.2}}
     rows = quality(demo, people, refined).splitlines()[2:]
     assert rows[0] == "| the shipped person, 256 px (6 views) | 27.4 | 0.946 | 18.8 | 20.7 | 11.3 |"
