@@ -63,7 +63,11 @@ def points() -> list[Point]:
     return found
 
 
-ROUNDS = tuple((n, 0, 256) for n in (1, 2, 4)) + ((4, 25, 256), (4, 50, 256), (4, 100, 256), (4, 0, 512), (4, 100, 512))
+ROUNDS = (
+    *((n, 0, 256) for n in (1, 2, 3, 4, 6)),
+    *((4, steps, 256) for steps in (25, 50, 100)),
+    *((4, steps, 512) for steps in (0, 100)),
+)
 """Of the learned update, steps of Adam after them, and the size of the photos."""
 
 

@@ -8,8 +8,7 @@ MEASURED = "refinement.md"
 SPLITS = (0.0, 0.2, 0.4)
 """Shares of a run after which Gaussians are split."""
 ROUNDS = 4
-"""One more than the learned update was trained with: on people of the validation seeds it gains 0.5 dB on the person, the fifth
-nothing."""
+"""One more than the learned update was trained with; docs/tradeoff.md has what each gains."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,7 +55,7 @@ class RefineConfig:
     seed: of the order of the photos and of the blocks.
     """
 
-    rounds: int = knob(ROUNDS, cost="blur without them", gain="0.35 to 0.5 s each with 4 photos", measured=MEASURED)
+    rounds: int = knob(ROUNDS, cost="blur without them", gain="0.2 to 0.35 s each with 4 photos", measured=MEASURED)
     steps: int | None = knob(None, cost="blur at few", gain="time in proportion", measured=MEASURED)
     seconds: float | None = knob(5.0, cost="blur at few", gain="time", measured=MEASURED)
     image_size: int | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)

@@ -236,12 +236,12 @@ class _Run:
                 if watch is not None:
                     watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
             checked, splits = 0, list(SPLITS) if config.growth > 1 else []
-            passed = self.passed(0, elapsed())
+            passed = first = self.passed(0, elapsed())
             while passed < 1:
                 if splits and passed >= splits[0]:
                     state, self.avatar = self.denser(state)
                     splits.pop(0)
-                state = self.step(state, passed, self.share(passed, done) if rounds else 1.0)
+                state = self.step(state, passed, self.share(passed, first, done) if rounds else 1.0)
                 done += 1
                 passed = self.passed(done, elapsed())
                 if passed >= (checked + 1) / config.checks:
@@ -395,9 +395,12 @@ class _Run:
         """PSNR over the pixels that no step sees, dB."""
         return float(decibels(self.compared(state.parameters, self.held).squared))
 
-    def share(self, passed: float, done: int) -> float:
-        """Of the rates, from how many steps the run will have. Before the first step of a run that a clock ends: 0."""
-        steps = done / passed if passed else self.config.steps or np.inf
+    def share(self, passed: float, first: float, done: int) -> float:
+        """Of the rates, from how many steps the run will have. Before the first step of a run that a clock ends: 0.
+
+        first: how much of the run was over before the first step.
+        """
+        steps = done * (1 - first) / (passed - first) if done else self.config.steps or np.inf
         return min(1.0, self.config.full_steps / steps)
 
     def passed(self, steps: int, seconds: float) -> float:

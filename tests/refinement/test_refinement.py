@@ -196,10 +196,15 @@ def run_of(person, config=STEPS, views=3):
 
 def test_long_runs_after_rounds_take_smaller_steps(person):
     by_clock = run_of(person, dataclasses.replace(STEPS, rounds=2, steps=None, seconds=10.0, full_steps=50))
-    assert by_clock.share(0.0, 0) == 0
-    assert by_clock.share(0.1, 20) == pytest.approx(0.25) and by_clock.share(0.5, 20) == 1
+    assert by_clock.share(0.1, 0.1, 0) == 0
+    assert by_clock.share(0.2, 0.1, 20) == pytest.approx(50 / 180) and by_clock.share(0.55, 0.1, 20) == 1
     by_steps = run_of(person, dataclasses.replace(STEPS, rounds=2, steps=12, full_steps=6))
-    assert by_steps.share(0.0, 0) == by_steps.share(0.25, 3) == 0.5
+    assert by_steps.share(0.0, 0.0, 0) == by_steps.share(0.25, 0.0, 3) == 0.5
+
+
+def test_a_clock_ends_the_steps_after_the_rounds(person):
+    report = refinement.refine_with_report(*person, dataclasses.replace(STEPS, rounds=1, steps=None, seconds=1.0))
+    assert report.rounds == 1 and report.steps > 1 and report.seconds < 10
 
 
 def test_of_many_photos_one_is_held_out_whole_and_never_drawn(person, monkeypatch):
