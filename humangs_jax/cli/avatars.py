@@ -85,7 +85,7 @@ class Reconstruct:
     """Number type of the encoder's matrix products ("as_trained": float32). The short ones are faster on GPU and TPU."""
     refine: str | None = None
     """Fit the avatar to the photos afterwards for so long: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not
-    at all. Default, if there are masks: rounds of a learned update alone, about a second, on photos of at most 512 pixels."""
+    at all. Default, if there are masks: rounds of a learned update alone, one to two seconds, on photos of at most 512 pixels."""
     preset: Preset | None = None
     """Speed against accuracy (docs/tradeoff.md): photos, network and refinement, where the options above do not say."""
     config: Path | None = None

@@ -117,7 +117,7 @@ def require_between(least: float | int, most: float | int, **values: float | int
 
 
 ROUNDS_ALONE = {"steps": 0, "seconds": None, "image_size": 512}
-"""Of refinement, where nothing is asked for: about a second, however large the photos."""
+"""Of refinement, where nothing is asked for: one to two seconds, however large the photos."""
 
 
 def refine_limits(text: str, option: str) -> dict[str, Any]:

@@ -43,7 +43,7 @@ class Start:
     """Do without masks: the photos have nothing but white behind the person."""
     refine: str | None = None
     """Fit the avatar to the photos for so long: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not at all.
-    Needs masks. Default, if there are masks: rounds of a learned update alone, about a second."""
+    Needs masks. Default, if there are masks: rounds of a learned update alone, one to two seconds."""
     browser: bool = True
     """Open the page at the end."""
     overwrite: bool = False
