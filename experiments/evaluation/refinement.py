@@ -286,14 +286,17 @@ def plot(path, report):
 
 
 def write_sheet(path, images, across=2):
-    """Truth, feed-forward and refined; `across` people a row."""
+    """Truth, feed-forward and refined, as a JPEG; `across` people a row."""
     import numpy as np
+    from PIL import Image
 
-    from humangs_jax.avatar.sheets import contact_sheet
+    from humangs_jax.avatar.sheets import tile
+    from humangs_jax.io.images import to_uint8
 
     tiles = np.stack([image for drawn in images.values() for image in drawn])
     headers = ("truth", "feed-forward", "refined") * min(across, len(images))
-    contact_sheet(tiles, path, headers=headers, columns=len(headers))
+    sheet = Image.fromarray(to_uint8(tile(tiles, headers=headers, columns=len(headers))))
+    sheet.save(path, format="JPEG", quality=85)
 
 
 if __name__ == "__main__":

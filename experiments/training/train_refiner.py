@@ -4,9 +4,9 @@
     python experiments/training/train_refiner.py --out runs/more --start runs/refiner/refiner.safetensors
 
 Makes the samples first: people of training seeds that the shipped network has not seen, its avatar of each from four photos, and
-ten views, four of them those photos. A step draws a sample and a number of photos, runs the rounds, and compares the result of
-each round with views that are not among the photos. Gradients pass through the rounds, but not through the errors that a round
-sees.
+ten views, four of them those photos. A step draws --batch samples and a number of photos for each, runs the rounds, and compares
+the result of each round with views that are not among the photos. Gradients pass through the rounds, but not through the errors
+that a round sees.
 The same command continues the run in --out; Ctrl-C saves. Writes OUT/refiner.safetensors. Validation is on other people.
 
 On two cores of a CPU: 1.7 s a sample, people included, then 2.4 s for a step of two samples and three rounds.

@@ -96,7 +96,7 @@ PRESETS: dict[str, Settings] = {
     "quality": Settings(views=4, execution=EXECUTIONS["quality"], refine_rounds=4, refine_size=512, splat="near_exact"),
     "best": Settings(execution=EXECUTIONS["best"], refine_rounds=4, refine_steps=100, refine_size=512),
 }
-"""From the fastest to the best; docs/tradeoff.md has what each takes and gains."""
+"""From the fastest to the slowest; docs/tradeoff.md has what each takes and gains."""
 
 
 def reconstruct_with(

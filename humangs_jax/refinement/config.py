@@ -13,7 +13,8 @@ ROUNDS = 4
 
 @dataclasses.dataclass(frozen=True)
 class LearningRates:
-    """Change of each parameter in a step of Adam, in the space in which it is optimised; `refine` lowers all by a cosine.
+    """Change of each parameter in a step of Adam, in the space in which it is optimised; `refine` lowers all by a cosine
+    and, after rounds, in long runs (`RefineConfig.full_steps`).
 
     means: metres, in the T-pose. quats: of quaternions that start at unit length. log_scales, opacity_logits, color_logits: no
     unit. rotations: radians of the pose's axis-angles, translations: metres; both only with `RefineConfig.poses`.
@@ -55,7 +56,7 @@ class RefineConfig:
     seed: of the order of the photos and of the blocks.
     """
 
-    rounds: int = knob(ROUNDS, cost="blur without them", gain="0.2 to 0.35 s each with 4 photos", measured=MEASURED)
+    rounds: int = knob(ROUNDS, cost="blur without them", gain="0.25 to 0.5 s each with 4 photos", measured=MEASURED)
     steps: int | None = knob(None, cost="blur at few", gain="time in proportion", measured=MEASURED)
     seconds: float | None = knob(5.0, cost="blur at few", gain="time", measured=MEASURED)
     image_size: int | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)

@@ -2,9 +2,9 @@
 
 After ReSplat (https://arxiv.org/abs/2510.08575): the input views are drawn, their errors are gathered at the Gaussians, and a
 network that knows the neighbours adds to their parameters; one set of weights for all rounds, no gradient through the errors.
-Ours: the errors arrive as the gradient of the squared error with respect to each Gaussian's parameters, a backward pass a photo,
-in place of features of a frozen network, and the neighbours are those in the T-pose, at two levels: of Gaussians, and of clusters
-of them. The outline between two photos lies 20 cm from where either photo shows one; neighbours of Gaussians reach 5 cm.
+Ours: the errors arrive as the gradient of the squared error with respect to each Gaussian's parameters, in place of features of
+a frozen network, and the neighbours are those in the T-pose, at two levels: of Gaussians, and of clusters of them. Between two
+photos, the nearest outline that a photo shows can be 20 cm away. Messages between Gaussians reach 5 cm; clusters carry them on.
 
 Trained (`experiments/training/train_refiner.py`) on views that are not among the photos. What no photo shows moves with its
 neighbours, which gradient descent on the photos cannot do.
@@ -100,7 +100,7 @@ def graph_of(means: Float[np.ndarray, "g 3"]) -> Graph:
 def clusters_of(means: Float[np.ndarray, "g 3"]) -> Int[np.ndarray, "c m"]:
     """The Gaussians of 2**CLUSTER_LEVELS clusters of equal size: halved along their longest side, again and again.
 
-    Some are in twice, where the number of Gaussians cannot be divided.
+    Some are in more than once, where the number of Gaussians is not a multiple of the number of clusters.
     """
     count = 2**CLUSTER_LEVELS
     members = np.resize(np.arange(len(means)), (1, count * -(-len(means) // count)))

@@ -150,7 +150,7 @@ def refine_views(
 ) -> tuple[Avatar, Int[Array, ""]]:
     """The pure function behind `refine`: `steps` steps of one photo each, in turns, on all their pixels.
 
-    Static: config (its limits, rounds, held-out pixels and `growth` are not used), splat (with `max_pairs`, see
+    Static: config (its limits, rounds, `full_steps`, held-out pixels and `growth` are not used), splat (with `max_pairs`, see
     `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs that did not fit. Batch over people whose arrays have
     the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
     """
@@ -194,7 +194,7 @@ class _Run:
     ):
         self.avatar, self.config, self.mesh, self.splat = with_room(avatar, config.growth), config, mesh, splat
         self.original = avatar
-        self.growing = 0.0  # seconds that compiling for larger buffers took
+        self.compile_seconds = 0.0
         self.compiled_for = dataclasses.replace(config, **HOST_SETTINGS)  # the same for runs of 5 s and of 15 s
         everything = jnp.ones(views.masks.shape, bool)
         count = len(views.images)
@@ -216,17 +216,18 @@ class _Run:
 
     def go(self, progress: bool, watch: Callable[[Avatar], None] | None) -> Refinement:
         config, began = self.config, time.perf_counter()
+        elapsed = lambda: time.perf_counter() - began - self.compile_seconds
         views, joints = len(self.all.images), len(self.avatar.parents)
-        parameters = jax.jit(parameters_of, static_argnums=(1, 2))(self.avatar.gaussians, views, joints)
-        before = self.compared(parameters, self.all)
-        state = self.state(parameters, before)
-        best, highest = (state, self.avatar), self.held_psnr(state)
-        compile_seconds, rounds, done, interrupted = 0.0, 0, 0, False
+        with self.compiling():
+            parameters = jax.jit(parameters_of, static_argnums=(1, 2))(self.avatar.gaussians, views, joints)
+            before = self.compared(parameters, self.all)
+            state = self.state(parameters, before)
+            best, highest = (state, self.avatar), self.held_psnr(state)
+        rounds, done, interrupted = 0, 0, False
         bar = progress_bar(total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}")
         try:
-            self.compile(state)
-            compile_seconds, began, self.growing = time.perf_counter() - began, time.perf_counter(), 0.0
-            elapsed = lambda: time.perf_counter() - began - self.growing
+            with self.compiling():
+                self.compile(state)
             if config.rounds:
                 parameters = self.learned(state.parameters, config.rounds)
                 found = self.compared(parameters, self.all)
@@ -236,14 +237,15 @@ class _Run:
                 if watch is not None:
                     watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
             checked, splits = 0, list(SPLITS) if config.growth > 1 else []
-            passed = first = self.passed(0, elapsed())
+            now = first = elapsed()
+            passed = self.passed(0, now)
             while passed < 1:
                 if splits and passed >= splits[0]:
                     state, self.avatar = self.denser(state)
                     splits.pop(0)
-                state = self.step(state, passed, self.share(passed, first, done) if rounds else 1.0)
-                done += 1
-                passed = self.passed(done, elapsed())
+                state = self.step(state, passed, self.share(done, now - first, first) if rounds else 1.0)
+                done, now = done + 1, elapsed()
+                passed = self.passed(done, now)
                 if passed >= (checked + 1) / config.checks:
                     checked = int(passed * config.checks)
                     psnr = self.held_psnr(state)
@@ -256,7 +258,7 @@ class _Run:
         except KeyboardInterrupt:
             interrupted = True
         bar.close()
-        seconds = time.perf_counter() - began - self.growing
+        seconds = elapsed()
         state, self.avatar = best
         after = self.compared(state.parameters, self.all)
         kept = float(after.loss) < float(before.loss)
@@ -272,7 +274,7 @@ class _Run:
             rounds,
             done,
             seconds,
-            compile_seconds + self.growing,
+            self.compile_seconds,
             loss=(float(pair[0].loss), float(pair[1].loss)),
             psnr=(float(decibels(pair[0].squared)), float(decibels(pair[1].squared))),
             kept=kept,
@@ -305,38 +307,53 @@ class _Run:
 
     def shared_gradient(self, parameters: Parameters, chosen: np.ndarray) -> Parameters:
         """The same, each device some of the photos."""
-        photos = _compiled(_chosen)(self.seen, chosen)
-        find = lambda: _compiled(photos_gradient)(
-            parameters, self.avatar, photos, self.compiled_for, self.splat, self.mesh
-        )
-        gradient, _, overflow = find()
+        gradient, overflow = self.drawn_by_all(parameters, chosen)
         if int(overflow):
-            with self.larger_buffers(parameters):
-                gradient, _, _ = find()
+            self.enlarge_buffers(parameters)
+            gradient, _ = self.drawn_by_all(parameters, chosen)
         return gradient
 
     def drawn(self, parameters: Parameters, photo: Photos) -> tuple[Image, PullBack, Rendering]:
-        """One photo; the buffers grow if the Gaussians no longer fit.
-
-        All that a run does consists of this and `_pulled`, so that it compiles one renderer and its transpose.
-        """
-        draw = lambda: _compiled(drawn_photo)(
-            parameters, self.avatar, photo, dataclasses.replace(self.splat, visibility=True), self.config.poses
-        )
-        image, pull_back, rendering = draw()
+        """One photo; the buffers grow if the Gaussians no longer fit."""
+        image, pull_back, rendering = self.drawn_once(parameters, photo)
         if int(rendering.overflow):
-            with self.larger_buffers(parameters):
-                image, pull_back, rendering = draw()
-                _compiled(_pulled)(pull_back, image)
+            self.enlarge_buffers(parameters)
+            image, pull_back, rendering = self.drawn_once(parameters, photo)
         return image, pull_back, rendering
 
+    def drawn_once(self, parameters: Parameters, photo: Photos) -> tuple[Image, PullBack, Rendering]:
+        """One photo with the buffers as they are.
+
+        Everything but steps on a mesh consists of this and `_pulled`, so that a run compiles one renderer and its transpose.
+        """
+        splat = dataclasses.replace(self.splat, visibility=True)
+        return _compiled(drawn_photo)(parameters, self.avatar, photo, splat, self.config.poses)
+
+    def drawn_by_all(self, parameters: Parameters, chosen: np.ndarray) -> tuple[Parameters, Int[Array, ""]]:
+        """Gradient and overflow of some photos, shared by the devices of the mesh."""
+        photos = _compiled(_chosen)(self.seen, chosen)
+        gradient, _, overflow = _compiled(photos_gradient)(
+            parameters, self.avatar, photos, self.compiled_for, self.splat, self.mesh
+        )
+        return gradient, overflow
+
+    def enlarge_buffers(self, parameters: Parameters) -> None:
+        """Room for the Gaussians as they are now."""
+        with self.compiling():
+            self.splat = _planned(replace(self.avatar, gaussians=gaussians_of(parameters)), self.all)
+            image, pull_back, _ = self.drawn_once(parameters, _compiled(_chosen)(self.seen, 0))
+            _compiled(_pulled)(pull_back, image)
+            if self.mesh is not None:
+                self.drawn_by_all(parameters, np.resize(self.useful, self.config.views_per_step))
+
     @contextlib.contextmanager
-    def larger_buffers(self, parameters: Parameters) -> Generator[None]:
-        """Room for the Gaussians as they are now. What is compiled for it within the block does not count as refinement."""
-        paused = time.perf_counter()
-        self.splat = _planned(replace(self.avatar, gaussians=gaussians_of(parameters)), self.all)
-        yield
-        self.growing += time.perf_counter() - paused
+    def compiling(self) -> Generator[None]:
+        """The time within counts as compilation, and not as refinement. May be nested."""
+        before, began = self.compile_seconds, time.perf_counter()
+        try:
+            yield
+        finally:
+            self.compile_seconds = before + time.perf_counter() - began
 
     @functools.cached_property
     def graph(self) -> Graph:
@@ -395,13 +412,15 @@ class _Run:
         """PSNR over the pixels that no step sees, dB."""
         return float(decibels(self.compared(state.parameters, self.held).squared))
 
-    def share(self, passed: float, first: float, done: int) -> float:
-        """Of the rates, from how many steps the run will have. Before the first step of a run that a clock ends: 0.
+    def share(self, done: int, seconds: float, first: float) -> float:
+        """Factor on the rates: `full_steps` over the number of steps that the run is expected to have, at most 1.
 
-        first: how much of the run was over before the first step.
+        Before the first step of a run that only a clock ends: 0. seconds: that the `done` steps took. first: before them.
         """
-        steps = done * (1 - first) / (passed - first) if done else self.config.steps or np.inf
-        return min(1.0, self.config.full_steps / steps)
+        ends: list[float] = [] if self.config.steps is None else [self.config.steps]
+        if self.config.seconds is not None and done:
+            ends.append(done * (self.config.seconds - first) / max(seconds, 1e-9))
+        return min(1.0, self.config.full_steps / min(ends, default=np.inf))
 
     def passed(self, steps: int, seconds: float) -> float:
         """How much of the run is over, in [0, 1]."""

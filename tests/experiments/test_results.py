@@ -38,6 +38,12 @@ def test_every_result_says_what_made_it(path):
     assert result["blocks"] and json_text(result) + "\n" == path.read_text()
 
 
+@pytest.mark.parametrize(("pattern", "begins"), [("*.jpg", b"\xff\xd8\xff"), ("*.png", b"\x89PNG"), ("*.gif", b"GIF8")])
+def test_images_are_what_their_names_say(pattern, begins):
+    images = list((REPOSITORY / "docs/images").glob(pattern))
+    assert images and not [image.name for image in images if not image.read_bytes().startswith(begins)]
+
+
 def test_sections_are_data_and_text_again():
     text = f"One line,\nanother.\n\n{TABLE}\n\nMore."
     blocks = blocks_of(text)

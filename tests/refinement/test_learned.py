@@ -99,6 +99,17 @@ def test_clusters_are_of_equal_size_and_near():
     assert clusters_of(2 * means).tolist() == members.tolist()
 
 
+def test_clusters_do_not_mix_what_lies_apart():
+    means = np.random.default_rng(6).normal(size=(1024, 3)) + 100 * (np.arange(1024)[:, None] < 512)
+    graph = jax.tree.map(np.asarray, graph_of(means))
+    near = graph.members < 512
+    assert (near.all(axis=1) | ~near.any(axis=1)).all() and near.any(axis=1).sum() == 256
+    np.testing.assert_array_equal(near[graph.nearest].all(axis=(1, 2)), np.arange(1024) < 512)
+    np.testing.assert_array_equal(near[graph.nearest].any(axis=(1, 2)), np.arange(1024) < 512)
+    between = near[graph.clusters.index].any(axis=-1)
+    np.testing.assert_array_equal(between, near.any(axis=1)[:, None] & np.ones_like(between))
+
+
 @pytest.mark.parametrize("count", [1, 3, 700])
 def test_every_gaussian_is_in_a_cluster_whatever_their_number(count):
     means = np.random.default_rng(5).normal(size=(count, 3))
@@ -148,6 +159,15 @@ def test_gradients_are_those_of_the_squared_error(scene):
     slope = (error(DIFFERENCE) - error(-DIFFERENCE)) / (2 * DIFFERENCE)
     gradient = np.asarray(signals_of(scene).gradients)[most, 11:].sum() * float(photo.masks.sum()) / PERSON
     assert gradient == pytest.approx(slope, rel=DIFFERENCES)
+
+
+def test_a_run_sees_the_signals_of_training(scene):
+    avatar, _, parameters, splat = scene
+    body = decimate(load_body(), 400)
+    run = refinement._Run(avatar, crop_to_person(toy_capture(body, toy_avatar(body, 0.15))), STEPS, None, splat)
+    expected = signals_of(scene, jax.tree.map(lambda x: x[1], run.seen))
+    for got, wanted in zip(jax.tree.leaves(run.signals(parameters, 1)), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(got, wanted, atol=ROUNDING * np.abs(wanted).max())
 
 
 def test_pixels_that_do_not_count_say_nothing(scene):

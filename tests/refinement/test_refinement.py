@@ -135,6 +135,7 @@ def test_crops_show_the_same_pixels(person):
         ({"seconds": 0.0}, "seconds"),
         ({"decay": 2.0}, "decay"),
         ({"visible": 0.0}, "visible"),
+        ({"full_steps": 0}, "full_steps"),
     ],
 )
 def test_wrong_settings_are_named(settings, named):
@@ -198,10 +199,12 @@ def run_of(person, config=STEPS, views=3):
 
 def test_long_runs_after_rounds_take_smaller_steps(person):
     by_clock = run_of(person, dataclasses.replace(STEPS, rounds=2, steps=None, seconds=10.0, full_steps=50))
-    assert by_clock.share(0.1, 0.1, 0) == 0
-    assert by_clock.share(0.2, 0.1, 20) == pytest.approx(50 / 180) and by_clock.share(0.55, 0.1, 20) == 1
+    assert by_clock.share(0, 0.0, 1.0) == 0  # 1 s of rounds, then 9 s of steps
+    assert by_clock.share(20, 1.0, 1.0) == pytest.approx(50 / 180) and by_clock.share(20, 4.5, 1.0) == 1
     by_steps = run_of(person, dataclasses.replace(STEPS, rounds=2, steps=12, full_steps=6))
-    assert by_steps.share(0.0, 0.0, 0) == by_steps.share(0.25, 0.0, 3) == 0.5
+    assert by_steps.share(0, 0.0, 1.0) == by_steps.share(3, 1.0, 1.0) == 0.5
+    both = run_of(person, dataclasses.replace(STEPS, rounds=2, steps=100, seconds=10.0, full_steps=50))
+    assert both.share(0, 0.0, 1.0) == both.share(20, 1.0, 1.0) == 0.5 and both.share(20, 3.0, 1.0) == 50 / 60
 
 
 def test_a_clock_ends_the_steps_after_the_rounds(person, monkeypatch):
@@ -210,6 +213,25 @@ def test_a_clock_ends_the_steps_after_the_rounds(person, monkeypatch):
     report = refinement.refine_with_report(*person, dataclasses.replace(STEPS, rounds=1, steps=None, seconds=1.0))
     assert report.rounds == 1 and 5 < report.steps < 10
     assert report.seconds == pytest.approx(1.1, abs=0.15)
+
+
+def test_compiling_for_larger_buffers_does_not_count(person, monkeypatch):
+    clock, compile, planned = SimpleNamespace(now=0.0), refinement._Run.compile, refinement._planned
+
+    def then_small(self, state):
+        compile(self, state)
+        self.splat = dataclasses.replace(self.splat, max_pairs=64)
+
+    def slowly(avatar, photos):
+        clock.now += 100
+        return planned(avatar, photos)
+
+    monkeypatch.setattr(refinement, "time", SimpleNamespace(perf_counter=lambda: clock.now))
+    monkeypatch.setattr(refinement._Run, "compile", then_small)
+    monkeypatch.setattr(refinement, "_planned", slowly)
+    report = refinement.refine_with_report(*person, dataclasses.replace(STEPS, steps=2))
+    assert clock.now == 200  # once before the run, once within
+    assert (report.seconds, report.compile_seconds) == (0, 100)
 
 
 def test_of_many_photos_one_is_held_out_whole_and_never_drawn(person, monkeypatch):
