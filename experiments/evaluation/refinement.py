@@ -54,6 +54,7 @@ def main() -> None:
     add_people_options(parser, subjects=8)
     parser.add_argument("--seconds", type=float, nargs="*", default=[1, 2, 5, 15], help="lengths of the runs")
     parser.add_argument("--sizes", type=int, nargs="+", default=[256, 512], help="sides of the photos in pixels")
+    parser.add_argument("--scored-at", type=int, help="side of the held-out views in pixels; default: as the photos")
     parser.add_argument("--views", type=int, nargs="+", default=[4], help="numbers of photos")
     parser.add_argument("--starts", nargs="+", choices=STARTS, default=["network"], help="what is refined")
     parser.add_argument(
@@ -98,6 +99,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         name: getattr(arguments, name)
         for name in ("seconds", "sizes", "views", "starts", "rounds", "growth", "off", "refine_poses", "longest_edge")
     }
+    settings |= {"scored_at": arguments.scored_at} if arguments.scored_at else {}
     rows, images = kept_rows(arguments.json, settings, "cells"), {}
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
     seeds = seeds_asked_for(arguments, body)
@@ -107,6 +109,9 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         row: dict[str, Any] = {}
         for size in arguments.sizes:
             subject = make_evaluation_subject(seed, body, arguments.views, size, held_out)
+            if arguments.scored_at:
+                scored = make_evaluation_subject(seed, body, arguments.views, arguments.scored_at, held_out)
+                subject = dataclasses.replace(subject, held_out=scored.held_out)
             choices = (arguments.views, arguments.off, arguments.starts, arguments.rounds, arguments.growth)
             for count, off, start, rounds, growth in itertools.product(*choices):
                 how = RefineConfig(rounds=rounds, growth=growth, poses=arguments.refine_poses)
@@ -250,8 +255,11 @@ def section(report):
                     rows.append([f"{count} of {size} px", start, seconds, title, *numbers, least])
     settings, people = report["settings"], len(report["subjects"])
     about = f"Means over {people} people of the {settings['split']} seeds; PSNR in dB; least gain: of any person."
+    scored_at = settings.get("scored_at")
+    if scored_at:
+        about += f" Views of {scored_at} px."
     true = {
-        name.split()[0]: lengths["0"]["novel"]["fog_of_truth"]
+        scored_at or name.split()[0]: lengths["0"]["novel"]["fog_of_truth"]
         for name, lengths in report["means"].items()
         if "fog_of_truth" in lengths["0"]["novel"]
     }
