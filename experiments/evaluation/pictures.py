@@ -124,3 +124,18 @@ def plot_views(path: Path, report: dict[str, Any]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
+
+
+def write_triples(
+    path: Path,
+    images: Mapping[int, Sequence[np.ndarray]],
+    across: int = 2,
+    headers: tuple[str, ...] = ("truth", "feed-forward", "refined"),
+) -> None:
+    """The same images of every person, as a JPEG; `across` people a row."""
+    from PIL import Image
+
+    tiles = np.stack([image for drawn in images.values() for image in drawn])
+    headers *= min(across, len(images))
+    sheet = Image.fromarray(to_uint8(tile(tiles, headers=headers, columns=len(headers))))
+    sheet.save(path, format="JPEG", quality=85)

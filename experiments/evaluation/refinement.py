@@ -87,7 +87,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     """Rows of all people, written to the JSON after each."""
     from tqdm import tqdm
 
-    from experiments.evaluation.pictures import cropped
+    from experiments.evaluation.pictures import cropped, write_triples
     from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
     from humangs_jax.body.library import load_body
 
@@ -127,9 +127,11 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         if arguments.json:
             write_json(arguments.json, report_of(rows, settings, seeds))
     if arguments.sheet:
-        write_sheet(arguments.sheet, {seed: [cropped(image) for image in drawn] for seed, (drawn, _) in images.items()})
+        write_triples(
+            arguments.sheet, {seed: [cropped(image) for image in drawn] for seed, (drawn, _) in images.items()}
+        )
     if arguments.details:
-        write_sheet(arguments.details, {seed: close for seed, (_, close) in images.items()}, 1)
+        write_triples(arguments.details, {seed: close for seed, (_, close) in images.items()}, 1)
     return report_of(rows, settings, seeds)
 
 
@@ -291,20 +293,6 @@ def plot(path, report):
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
     plt.close(figure)
-
-
-def write_sheet(path, images, across=2):
-    """Truth, feed-forward and refined, as a JPEG; `across` people a row."""
-    import numpy as np
-    from PIL import Image
-
-    from humangs_jax.avatar.sheets import tile
-    from humangs_jax.io.images import to_uint8
-
-    tiles = np.stack([image for drawn in images.values() for image in drawn])
-    headers = ("truth", "feed-forward", "refined") * min(across, len(images))
-    sheet = Image.fromarray(to_uint8(tile(tiles, headers=headers, columns=len(headers))))
-    sheet.save(path, format="JPEG", quality=85)
 
 
 if __name__ == "__main__":

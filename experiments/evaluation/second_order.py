@@ -94,6 +94,7 @@ def levenberg_marquardt(avatar, capture, seconds):
     """The avatar after that many seconds of damped Gauss-Newton steps on all photos."""
     import jax.numpy as jnp
 
+    from humangs_jax.avatar.low_pass import without_low_pass
     from humangs_jax.core.pytree import replace
     from humangs_jax.refinement import refine as refinement
     from humangs_jax.refinement.config import RefineConfig
@@ -101,7 +102,7 @@ def levenberg_marquardt(avatar, capture, seconds):
     from humangs_jax.refinement.objective import photos_of
     from humangs_jax.refinement.parameters import gaussians_of
 
-    views, config = crop_to_person(capture), RefineConfig()
+    avatar, views, config = without_low_pass(avatar), crop_to_person(capture), RefineConfig()
     photos, splat = photos_of(views, jnp.ones(views.masks.shape, bool)), refinement._planned(avatar, views)
     state = refinement._compiled(refinement.start)(avatar, photos, config, splat)
     step = compiled_step()

@@ -90,6 +90,7 @@ def make_samples(out: Path, first: int, people: int, count: int) -> list[Path]:
     import numpy as np
     from tqdm import tqdm
 
+    from humangs_jax.avatar.low_pass import without_low_pass
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.body.library import load_body
     from humangs_jax.body.model import BodyPose
@@ -126,7 +127,7 @@ def make_samples(out: Path, first: int, people: int, count: int) -> list[Path]:
             names=tuple(map(str, range(PHOTOS))),
         )
         folder.mkdir(parents=True, exist_ok=True)
-        reconstruct(*weights, capture).save(folder / "avatar.npz")
+        without_low_pass(reconstruct(*weights, capture)).save(folder / "avatar.npz")
         both = jax.tree.map(lambda *x: jnp.concatenate(x), photos, jax.tree.map(jnp.asarray, example.targets))
         arrays = {name: to_uint8(getattr(both, name)) for name in ("images", "masks")}
         arrays |= {name: getattr(both, name) for name in ("rotations", "translations")}

@@ -3,16 +3,24 @@
 import jax
 
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.light import relit
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
 from humangs_jax.core.checks import FINITE, check_values
+from humangs_jax.core.pytree import replace
 from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values, skin_gaussians
 
 
 def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
-    """Posed Gaussians, differentiable in avatar and pose; affine skinning leaves its linear part in `deformations`."""
-    transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
-    return skin_gaussians(avatar.gaussians, blend_transforms(avatar.skinning_weights, transforms), avatar.skinning)
+    """Posed Gaussians, differentiable in avatar and pose; affine skinning leaves its linear part in `deformations`.
+
+    Colours stay, or are those of the avatar's light.
+    """
+    joints = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
+    gaussians, transforms = avatar.gaussians, blend_transforms(avatar.skinning_weights, joints)
+    if avatar.light is not None:
+        gaussians = replace(gaussians, colors=relit(gaussians.colors, avatar.light, transforms[:, :3, :3]))
+    return skin_gaussians(gaussians, transforms, avatar.skinning)
 
 
 def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:

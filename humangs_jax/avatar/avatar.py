@@ -4,12 +4,14 @@ import json
 import os
 from typing import Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.avatar.light import TERMS, Light
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import ROUNDING
-from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.io.arrays import check_array, check_checksum, check_indices, check_joints, checksum
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import FileError, Refused, reading
@@ -29,6 +31,7 @@ _ARRAYS = (
     "rest_joints",
     "faces",
 )
+_LIGHT = ("coefficients", "normals", "shading")
 
 
 @pytree_dataclass
@@ -38,7 +41,7 @@ class Avatar:
     gaussians: canonical, metres; vertex-major, the k Gaussians of a vertex together, unless refinement has added some.
     skinning_weights: (g, j), rows sum to 1. rest_vertices: (n, 3) and rest_joints: (j, 3), the shaped body in the T-pose. faces:
     (f, 3). parents: joint tree, root -1. skinning: "affine" or "rotation". rendering: the splatting that the Gaussians were
-    trained for, a name in `SPLAT_PRESETS`.
+    trained for, a name in `SPLAT_PRESETS`. light: of the photos, where it has been estimated; other poses are drawn in it.
     """
 
     gaussians: Gaussians
@@ -50,6 +53,15 @@ class Avatar:
     joint_names: tuple[str, ...] = static_field()
     skinning: Literal["affine", "rotation"] = static_field(default="affine")
     rendering: Literal["exact", "inria"] = static_field(default="exact")
+    light: Light | None = None
+
+    def select(self, index: Array | np.ndarray) -> "Avatar":
+        """The avatar with these of its Gaussians."""
+        light = self.light
+        if light is not None:
+            light = replace(light, normals=light.normals[index], shading=light.shading[index])
+        gaussians = jax.tree.map(lambda x: x[index], self.gaussians)
+        return replace(self, gaussians=gaussians, skinning_weights=self.skinning_weights[index], light=light)
 
     def save(self, path: str | os.PathLike) -> None:
         """Write one compressed `.npz` (no pickle); it appears whole or not at all."""
@@ -63,6 +75,10 @@ class Avatar:
         }
         values = {name: np.asarray(getattr(self.gaussians, name)) for name in _ARRAYS[:5]}
         values |= {name: np.asarray(getattr(self, name)) for name in _ARRAYS[5:]}
+        if self.light is not None:
+            values |= {f"light_{name}": np.asarray(getattr(self.light, name)) for name in _LIGHT}
+        if self.gaussians.low_pass is not None:
+            values["low_pass"] = np.asarray(self.gaussians.low_pass)
         write_npz(path, {"header": json.dumps(header | {"checksum": checksum(values)})} | values)
 
     @classmethod
@@ -86,7 +102,10 @@ def _load(cls, path):
     if not isinstance(header, dict) or header.get("format") != FORMAT or header.get("version") != VERSION:
         found = header if isinstance(header, dict) else {}
         raise Refused(f"expected {FORMAT} version {VERSION}, got {found.get('format')} version {found.get('version')}")
-    if missing := [name for name in _ARRAYS if name not in arrays]:
+    with_light = any(f"light_{name}" in arrays for name in _LIGHT)
+    wanted = _ARRAYS + tuple(f"light_{name}" for name in _LIGHT if with_light)
+    wanted += ("low_pass",) if "low_pass" in arrays else ()
+    if missing := [name for name in wanted if name not in arrays]:
         raise Refused(f"missing keys {missing}")
     check_joints(header["parents"], header["joint_names"])
     skinning, rendering = header["skinning"], header.get("rendering", "exact")  # the first files do not say
@@ -98,7 +117,7 @@ def _load(cls, path):
     if j != len(header["parents"]):
         raise Refused(f"rest_joints: expected shape ({len(header['parents'])}, 3), got {arrays['rest_joints'].shape}")
     unit = (-ROUNDING, 1 + ROUNDING)
-    ranges = {"scales": (0.0,), "opacities": unit, "skinning_weights": unit}
+    ranges = {"scales": (0.0,), "low_pass": (0.0,), "opacities": unit, "skinning_weights": unit}
     shapes = {
         "means": (g, 3),
         "quats": (g, 4),
@@ -109,17 +128,20 @@ def _load(cls, path):
         "rest_vertices": (n, 3),
         "rest_joints": (j, 3),
     }
-    for name, shape in shapes.items():
-        check_array(name, arrays[name], shape, *ranges.get(name, ()))
+    shapes |= {"light_coefficients": (TERMS,), "light_normals": (g, 3), "light_shading": (g,), "low_pass": (g,)}
+    for name in wanted:
+        if name in shapes:
+            check_array(name, arrays[name], shapes[name], *ranges.get(name, ()))
     check_indices("faces", arrays["faces"], (None, 3), n)
-    arrays = {name: arrays[name] for name in _ARRAYS}
+    arrays = {name: arrays[name] for name in wanted}
     check_checksum(header.get("checksum"), checksum(arrays))
     loaded = {name: jnp.asarray(value) for name, value in arrays.items()}
     return cls(
-        Gaussians(*(loaded[name] for name in _ARRAYS[:5])),
+        Gaussians(*(loaded[name] for name in _ARRAYS[:5]), low_pass=loaded.get("low_pass")),
         *(loaded[name] for name in _ARRAYS[5:]),
         parents=tuple(header["parents"]),
         joint_names=tuple(header["joint_names"]),
         skinning=skinning,
         rendering=rendering,
+        light=Light(*(loaded[f"light_{name}"] for name in _LIGHT)) if with_light else None,
     )

@@ -310,6 +310,4 @@ def without_unseen(
     drawn = draw(avatar, poses, cameras, how=dataclasses.replace(how, visibility=True))
     for rendering in bar(drawn, total=len(poses), desc=progress, unit="frame", shown=progress is not None):
         most = np.maximum(most, rendering.visibility)
-    kept = np.flatnonzero(most >= threshold)
-    gaussians = jax.tree.map(lambda x: x[kept], avatar.gaussians)
-    return replace(avatar, gaussians=gaussians, skinning_weights=avatar.skinning_weights[kept])
+    return avatar.select(np.flatnonzero(most >= threshold))

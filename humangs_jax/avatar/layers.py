@@ -22,6 +22,7 @@ import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import draw, draw_gaussians, image_of, posed, splatting_of
+from humangs_jax.avatar.light import surface_normals, turned_normals
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
@@ -179,27 +180,11 @@ def gaussian_parts(avatar: Avatar) -> Int[np.ndarray, " g"]:
 
 def gaussian_normals(avatar: Avatar, pose: BodyPose) -> Float[Array, "g 3"]:
     """Unit normals of the posed body's surface: of the nearest vertex, turned by the Gaussian's own transform."""
-    return _turned_normals(jnp.asarray(_rest_normals(avatar)), avatar, pose)
+    normals = surface_normals(avatar.rest_vertices, avatar.faces, avatar.gaussians.means)
+    return _posed_normals(normals, avatar, pose)
 
 
 @jax.jit
-def _turned_normals(normals, avatar, pose):
+def _posed_normals(normals, avatar, pose):
     transforms = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
-    linear = blend_transforms(avatar.skinning_weights, transforms)[:, :3, :3]
-    # the inverse transpose, up to a positive factor: rows of cofactors
-    rows = [jnp.cross(linear[:, (i + 1) % 3], linear[:, (i + 2) % 3]) for i in range(3)]
-    turned = jnp.einsum("gij,gj->gi", jnp.stack(rows, axis=1), normals)
-    return turned / jnp.maximum(jnp.linalg.norm(turned, axis=-1, keepdims=True), 1e-12)
-
-
-def _rest_normals(avatar) -> np.ndarray:
-    """(g, 3) normals in the T-pose; a vertex's is the mean of its faces', by their areas."""
-    from scipy.spatial import KDTree
-
-    vertices, faces = np.asarray(avatar.rest_vertices, np.float64), np.asarray(avatar.faces)
-    a, b, c = (vertices[faces[:, i]] for i in range(3))
-    normals = np.zeros_like(vertices)
-    for i in range(3):
-        np.add.at(normals, faces[:, i], np.cross(b - a, c - a))
-    normals /= np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
-    return normals[KDTree(vertices).query(np.asarray(avatar.gaussians.means))[1]].astype(np.float32)
+    return turned_normals(normals, blend_transforms(avatar.skinning_weights, transforms)[:, :3, :3])

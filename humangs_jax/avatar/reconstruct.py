@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.light import Light, light_coefficients, light_terms, log_brightness, turned_normals
+from humangs_jax.avatar.low_pass import with_low_pass
 from humangs_jax.body.model import BodyModel, BodyPose, shape_body
 from humangs_jax.body.skinning import blend_transforms, joint_transforms, spread_weights
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
@@ -27,6 +29,7 @@ from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.buffers import round_up
+from humangs_jax.rendering.mesh.position_map import vertex_normals
 
 LEGS = tuple(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
 SMALLEST_VOLUME = 0.2
@@ -136,7 +139,32 @@ def _assemble(variables, config, body, views, inputs):
         avatar = with_spread_weights(
             avatar, BodyPose(views.rotations[0], views.translations[0]), config.conventions.skinning_reach
         )
+    if config.conventions.light and outputs.skinning_weights is None:
+        avatar = with_light(avatar, views)
+    if config.conventions.low_pass is not None:
+        avatar = with_low_pass(avatar, config.conventions.low_pass)
     return avatar, outputs.dropped_tokens
+
+
+def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
+    """The avatar with the light of its photos (`avatar.light`). Gradients do not pass through the light."""
+    fixed = jax.lax.stop_gradient(avatar)
+    vertices, gaussians = fixed.rest_vertices, fixed.gaussians
+    per_vertex = len(gaussians.means) // len(vertices)
+    normals = jnp.repeat(vertex_normals(vertices, fixed.faces), per_vertex, axis=0)
+
+    def terms_in(rotations, translation):
+        joints = joint_transforms(fixed.rest_joints, fixed.parents, rotations, translation)
+        return light_terms(turned_normals(normals, blend_transforms(fixed.skinning_weights, joints)[:, :3, :3]))
+
+    count = len(views.images) if views.view_count is None else views.view_count
+    share = (jnp.arange(len(views.images)) < count) / count
+    terms = jnp.sum(share[:, None, None] * jax.vmap(terms_in)(views.rotations, views.translations), axis=0)
+    pooled = lambda values: jnp.sum(values.reshape(len(vertices), per_vertex, -1), axis=1)
+    weights = pooled(gaussians.opacities)
+    mean = lambda values: pooled(values * gaussians.opacities[:, None]) / jnp.maximum(weights, 1e-6)
+    coefficients = light_coefficients(vertices, mean(gaussians.colors), weights[:, 0], mean(terms))
+    return replace(avatar, light=Light(coefficients, normals, log_brightness(terms, coefficients)))
 
 
 def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:

@@ -94,8 +94,10 @@ class Conventions:
     its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex (paper) or over all (release).
     pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn. skinning_reach: Gaussians
     between the legs farther than this from their vertex, metres, move with both (`body.skinning.spread_weights`); None: all with
-    their vertex, as in training. body_vertices, longest_edge: number of vertices to which bodies are decimated, and metres to
-    which their edges are split afterwards; None for neither.
+    their vertex, as in training. light: other poses are drawn in the light of the photos (`avatar.light`). low_pass: metres that
+    a pixel of the training images shows of the person, if their low-pass is to be part of the scales (`avatar.low_pass`); None:
+    it stays with the renderer. body_vertices, longest_edge: number of vertices to which bodies are decimated, and metres to which
+    their edges are split afterwards; None for neither.
     """
 
     image_size: int = knob(
@@ -113,6 +115,8 @@ class Conventions:
     skinning: Literal["affine", "rotation"] = "affine"
     rendering: Literal["exact", "inria"] = "exact"
     skinning_reach: float | None = None
+    light: bool = False
+    low_pass: float | None = None
     body_vertices: int | None = knob(
         None, cost="detail of the body", gain="Gaussians, reads and decoding in proportion", measured=EVALUATION
     )
@@ -121,9 +125,11 @@ class Conventions:
     )
 
     def __post_init__(self):
-        """Raises ValueError for a reach that is none."""
-        if self.skinning_reach is not None and not 0 < self.skinning_reach < math.inf:
-            raise ValueError(f"skinning_reach {self.skinning_reach}: expected a positive number of metres, or None")
+        """Raises ValueError for metres that are none."""
+        for name in ("skinning_reach", "low_pass"):
+            metres = getattr(self, name)
+            if metres is not None and not 0 < metres < math.inf:
+                raise ValueError(f"{name} {metres}: expected a positive number of metres, or None")
 
 
 @dataclasses.dataclass(frozen=True)

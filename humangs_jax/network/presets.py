@@ -63,6 +63,7 @@ def small() -> HumanGSConfig:
             tokens="foreground",
             pixels="person",
             skinning_reach=0.04,
+            light=True,
             body_vertices=4000,
             longest_edge=0.03,
         ),

@@ -45,7 +45,12 @@ def bench() -> HumanGSConfig:
     )
     decoder = dataclasses.replace(decoder, hidden=BENCH_WIDTH)
     conventions = dataclasses.replace(
-        presets.small().conventions, image_size=128, skinning_reach=None, body_vertices=1500, longest_edge=0.05
+        presets.small().conventions,
+        image_size=128,
+        skinning_reach=None,
+        light=False,
+        body_vertices=1500,
+        longest_edge=0.05,
     )
     return HumanGSConfig(Architecture(encoder, reader, decoder), conventions, Execution(token_capacity=BENCH_TOKENS))
 

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.geometry.curve import along_curve
 from humangs_jax.network.attention import NORM_EPSILON, attention
 from humangs_jax.network.cross_attention import INIT, check_layers, image_tokens
 from humangs_jax.network.execution import Execution
@@ -28,10 +29,8 @@ from humangs_jax.network.reader import VertexFeatures
 from humangs_jax.network.transformer import layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
 
-CURVE_BITS = 10
-"""Cells along each axis of the Morton curve: 2^10, over a cube of side 2 * `CURVE_REACH`."""
 CURVE_REACH = 1.2
-"""Normalised units: canonical bodies are 1.8 high and less than 2 wide."""
+"""Normalised units: half the side of the curve's cube; canonical bodies are 1.8 high and less than 2 wide."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,17 +76,6 @@ def check_views(inputs: HumanGSInputs, most: int | None) -> None:
         raise ValueError(f"{len(inputs.images)} photos: this system takes {most}")
 
 
-def along_curve(positions: Float[Array, "n 3"]) -> Int[Array, " n"]:
-    """Rank of each position (normalised units) along a Morton curve: those of similar rank are near each other."""
-    cells = 2**CURVE_BITS
-    at = jnp.floor((positions / (2 * CURVE_REACH) + 0.5) * cells).astype(jnp.int32)
-    at, bits = jnp.clip(at, 0, cells - 1), jnp.arange(CURVE_BITS)
-    digits = (at[:, :, None] >> bits) & 1
-    codes = jnp.sum(digits << (3 * bits + jnp.arange(3)[:, None]), axis=(1, 2))
-    order = jnp.argsort(codes, stable=True)
-    return jnp.zeros_like(order).at[order].set(jnp.arange(len(order), dtype=order.dtype))
-
-
 class TwoStreams(nn.Module):
     """Canonical positions (n, 3) and tokens (l, e) -> features (n, d)."""
 
@@ -103,7 +91,10 @@ class TwoStreams(nn.Module):
         embedded = dense("position_out")(jax.nn.silu(dense("position_in")(positional_encoding(positions))))
         points, cluster = embedded, None
         if config.pooling > 1:
-            cluster, clusters = along_curve(positions) // config.pooling, -(-len(positions) // config.pooling)
+            cluster, clusters = (
+                along_curve(positions, CURVE_REACH) // config.pooling,
+                -(-len(positions) // config.pooling),
+            )
             members = jax.ops.segment_sum(jnp.ones(len(positions)), cluster, clusters)
             points = jax.ops.segment_sum(embedded, cluster, clusters) / members[:, None]
         tokens = layer_norm(None, "token_norm")(dense("tokens")(tokens))

@@ -29,16 +29,14 @@ def with_room(avatar: Avatar, growth: float) -> Avatar:
     count = len(avatar.gaussians.means)
     slots = jnp.arange(round(growth * count))
     index = jnp.where(slots < count, slots, 0)
-    gaussians = jax.tree.map(lambda x: x[index], avatar.gaussians)
-    gaussians = replace(gaussians, opacities=gaussians.opacities.at[count:].set(0.0))
-    return replace(avatar, gaussians=gaussians, skinning_weights=avatar.skinning_weights[index])
+    avatar = avatar.select(index)
+    gaussians = replace(avatar.gaussians, opacities=avatar.gaussians.opacities.at[count:].set(0.0))
+    return replace(avatar, gaussians=gaussians)
 
 
 def without_clear(avatar: Avatar, smallest: float) -> Avatar:
     """The avatar without the Gaussians too clear to be drawn. On the host."""
-    kept = jnp.flatnonzero(avatar.gaussians.opacities >= smallest)
-    gaussians = jax.tree.map(lambda x: x[kept], avatar.gaussians)
-    return replace(avatar, gaussians=gaussians, skinning_weights=avatar.skinning_weights[kept])
+    return avatar.select(jnp.flatnonzero(avatar.gaussians.opacities >= smallest))
 
 
 def inner_errors(image: Image, photo: Photos) -> Image:
@@ -94,4 +92,4 @@ def split(state: RefineState, avatar: Avatar, errors: Float[Array, " g"], count:
     gathered = lambda x: x[index] if x.ndim and len(x) == total else x
     adam = jax.tree.map(gathered, state.adam)
     state = replace(state, parameters=halves(p), start=halves(state.start), trust=state.trust[index], adam=adam)
-    return state, replace(avatar, skinning_weights=avatar.skinning_weights[index])
+    return state, avatar.select(index)

@@ -20,6 +20,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
+from humangs_jax.avatar.low_pass import with_low_pass, without_low_pass
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.core.compiler_options import compiler_options
@@ -27,6 +28,7 @@ from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry.camera import project
 from humangs_jax.objectives.metrics import decibels
 from humangs_jax.refinement.config import SPLITS, RefineConfig
 from humangs_jax.refinement.crops import crop_to_person, held_out_blocks
@@ -141,8 +143,17 @@ def refine_with_report(
     config = config or RefineConfig()
     _check(avatar, capture, config, mesh)
     views = crop_to_person(capture, config.image_size)
-    run = _Run(avatar, views, config, mesh, splat=_planned(avatar, views))
-    return run.go(progress, watch)
+    pixel = pixel_size(avatar, views)
+    start = without_low_pass(avatar, pixel)
+    report = _Run(start, views, config, mesh, _planned(start, views), without_low_pass(avatar)).go(progress, watch)
+    return dataclasses.replace(report, avatar=with_low_pass(report.avatar, pixel) if report.kept else avatar)
+
+
+def pixel_size(avatar: Avatar, views: SubjectViews) -> Float[Array, ""]:
+    """Metres that a pixel of the photos shows at the person's pelvis, mean over the photos."""
+    places = views.translations + avatar.rest_joints[0]
+    depths = jax.vmap(lambda camera, place: project(camera, place)[1])(views.cameras, places)
+    return jnp.mean(depths / views.cameras.K[:, 0, 0])
 
 
 def refine_views(
@@ -187,13 +198,22 @@ def refine_step(
 
 
 class _Run:
-    """What one call of `refine` works with."""
+    """What one call of `refine` works with.
+
+    avatar: that is refined. fresh: the same as the network made it, with the scales that the rounds were trained with.
+    """
 
     def __init__(
-        self, avatar: Avatar, views: SubjectViews, config: RefineConfig, mesh: Mesh | None, splat: SplatConfig
+        self,
+        avatar: Avatar,
+        views: SubjectViews,
+        config: RefineConfig,
+        mesh: Mesh | None,
+        splat: SplatConfig,
+        fresh: Avatar | None = None,
     ):
         self.avatar, self.config, self.mesh, self.splat = with_room(avatar, config.growth), config, mesh, splat
-        self.original = avatar
+        self.original, self.fresh = avatar, with_room(fresh or avatar, config.growth)
         self.compile_seconds = 0.0
         self.compiled_for = dataclasses.replace(config, **HOST_SETTINGS)  # the same for runs of 5 s and of 15 s
         everything = jnp.ones(views.masks.shape, bool)
@@ -207,8 +227,8 @@ class _Run:
         self.seen, self.held = photos_of(views, ~held), photos_of(views, held)
         if mesh is not None:  # where each step leaves its results: other places would compile the step twice
             everywhere = NamedSharding(Mesh(mesh.devices, mesh.axis_names), PartitionSpec())
-            self.avatar, self.all, self.seen, self.held = jax.device_put(
-                (self.avatar, self.all, self.seen, self.held), everywhere
+            self.avatar, self.fresh, self.all, self.seen, self.held = jax.device_put(
+                (self.avatar, self.fresh, self.all, self.seen, self.held), everywhere
             )
         self.any_held = bool(np.asarray(held).any())  # a small crop may have no block to hold out
         self.useful = np.flatnonzero(np.asarray(~held).any(axis=(1, 2)))
@@ -218,8 +238,9 @@ class _Run:
         config, began = self.config, time.perf_counter()
         elapsed = lambda: time.perf_counter() - began - self.compile_seconds
         views, joints = len(self.all.images), len(self.avatar.parents)
+        initial = jax.jit(parameters_of, static_argnums=(1, 2))
         with self.compiling():
-            parameters = jax.jit(parameters_of, static_argnums=(1, 2))(self.avatar.gaussians, views, joints)
+            parameters = initial(self.avatar.gaussians, views, joints)
             before = self.compared(parameters, self.all)
             state = self.state(parameters, before)
             best, highest = (state, self.avatar), self.held_psnr(state)
@@ -229,7 +250,7 @@ class _Run:
             with self.compiling():
                 self.compile(state)
             if config.rounds:
-                parameters = self.learned(state.parameters, config.rounds)
+                parameters = self.learned(initial(self.fresh.gaussians, views, joints), config.rounds)
                 found = self.compared(parameters, self.all)
                 if float(found.loss) < float(before.loss):
                     state, rounds = self.state(parameters, found), config.rounds

@@ -14,6 +14,7 @@ from humangs_jax.core.checks import FINITE, NOT_NEGATIVE, UNIT, Values
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.svd3 import left_singular_vectors
+from humangs_jax.rendering.constants import MIP_EPS2D
 
 
 @pytree_dataclass
@@ -23,6 +24,8 @@ class Gaussians(Batchable):
     means: (g, 3) metres. quats: (g, 4) wxyz, normalised where used. scales: (g, 3) standard deviations, metres.
     opacities: (g,) in [0, 1]. colors: (g, 3) linear RGB in [0, 1].
     deformations: (g, 3, 3) or None; applied to the covariance after the rotation, never to the mean.
+    low_pass: (g,) or None; metres: side of the pixels of the images whose low-pass the scales contain (`avatar.low_pass`).
+    Renderers add no more than `MIP_EPS2D` pixels^2 then.
     """
 
     means: Float[Array, "g 3"]
@@ -31,6 +34,7 @@ class Gaussians(Batchable):
     opacities: Float[Array, " g"]
     colors: Float[Array, "g 3"]
     deformations: Float[Array, "g 3 3"] | None = None
+    low_pass: Float[Array, " g"] | None = None
 
 
 def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Values]]:
@@ -41,6 +45,11 @@ def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Value
     ranges = {"opacities": UNIT, "scales": NOT_NEGATIVE}
     names = (field.name for field in dataclasses.fields(gaussians))
     return {f"gaussians.{name}": (getattr(gaussians, name), ranges.get(name, FINITE)) for name in names}
+
+
+def added_variance(gaussians: Gaussians, eps2d: float) -> float:
+    """Pixels^2 that are added to the projected variances: `eps2d`, no more than `MIP_EPS2D` if the scales contain a low-pass."""
+    return eps2d if gaussians.low_pass is None else min(eps2d, MIP_EPS2D)
 
 
 def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:

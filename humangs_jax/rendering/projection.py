@@ -27,7 +27,7 @@ from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering import constants
-from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.gaussians import Gaussians, added_variance
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
 
 
@@ -73,10 +73,11 @@ def project(
 ) -> ProjectedGaussians:
     """Projects every Gaussian.
 
-    Arguments: near: metres. eps2d: pixels^2. jacobian_margin: None for the exact Jacobian; a number clamps the point
-    where it is evaluated, to that fraction of the half field of view beyond the border (`INRIA_JACOBIAN_MARGIN`).
-    normalize_quats: False uses quaternions without normalising them.
+    Arguments: near: metres. eps2d: pixels^2, see `added_variance`. jacobian_margin: None for the exact Jacobian; a number
+    clamps the point where it is evaluated, to that fraction of the half field of view beyond the border
+    (`INRIA_JACOBIAN_MARGIN`). normalize_quats: False uses quaternions without normalising them.
     """
+    eps2d = added_variance(gaussians, eps2d)
     K, rotation, translation = camera.K, camera.cam_from_world[:3, :3], camera.cam_from_world[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means = _planes(gaussians.means)

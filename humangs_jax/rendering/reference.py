@@ -20,7 +20,7 @@ from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.constants import LARGEST_FOOTPRINT
 from humangs_jax.rendering.drawing import Rendering, with_background
-from humangs_jax.rendering.gaussians import Gaussians, covariance_factors
+from humangs_jax.rendering.gaussians import Gaussians, added_variance, covariance_factors
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
 
 
@@ -37,7 +37,8 @@ def render_reference(
     """
     gaussians, camera, background = with_background(gaussians, camera, background)
     centers, axes, depths, visible = _project(gaussians, camera, config)
-    determinants = _determinant(axes, config.eps2d)
+    eps2d = added_variance(gaussians, config.eps2d)
+    determinants = _determinant(axes, eps2d)
     order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
     y, x = jnp.mgrid[: camera.height, : camera.width] + 0.5
     pixels = jnp.stack([x, y], axis=-1).astype(centers.dtype)
@@ -46,7 +47,7 @@ def render_reference(
         color, distance, transmittance, ended = state
         center, axis, determinant, depth, is_visible, opacity, rgb = splat
         d = pixels - center
-        squared = jnp.sum(_cross(axis, d[..., None]) ** 2, axis=-1) + config.eps2d * jnp.sum(d**2, axis=-1)
+        squared = jnp.sum(_cross(axis, d[..., None]) ** 2, axis=-1) + eps2d * jnp.sum(d**2, axis=-1)
         raw = opacity * jnp.exp(-0.5 * squared / determinant)
         alpha = jnp.where(raw < config.alpha_max, raw, config.alpha_max)
         alpha = jnp.where(is_visible & (raw >= config.alpha_min), alpha, 0.0)

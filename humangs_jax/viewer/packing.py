@@ -10,6 +10,8 @@ opacities          uint16 (g,)          [0, 1]
 colors             uint16 (g, 3)        from `low` to `high` ([0, 1] unless colours lie outside of it)
 weights            uint16 (g, 8)        skinning weights, the largest first; every row sums to 65535
 weight_joints      uint8 (g, 8)         their joints
+light_normals      int8 (g, 3)          times 127
+light_shading      uint16 (g,)          from `low` to `high` of the header
 rest_joints        float32 (j, 3)       metres
 rotations          int16 (m, j, 3)      motion: axis-angle, times `step` of the header, radians
 translations       float32 (m, 3)       motion: metres
@@ -17,7 +19,8 @@ shape_directions   int16 (s, n, 3)      how vertices move per unit of a shape co
 shape_joints       float32 (s, j, 3)    how joints move per unit of a shape coefficient, metres
 =================  ===================  ========================================================================
 
-Little-endian; every array starts at a multiple of 4 bytes. The last two are there if the body is known.
+Little-endian; every array starts at a multiple of 4 bytes. Those of the light are there if the avatar has one, with its `light`
+in the header; the last two if the body is known.
 """
 
 import dataclasses
@@ -30,7 +33,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.checks import FINITE, check_values
 from humangs_jax.data.motion import Motion
-from humangs_jax.rendering.gaussians import gaussian_values
+from humangs_jax.rendering.gaussians import added_variance, gaussian_values
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 
 VERSION = 1
@@ -45,7 +48,7 @@ SHAPE_STEP = 1e-4
 """Metres."""
 SHAPE_TOLERANCE = 1e-3
 """Metres; a body explains an avatar if its vertices, in the shape that fits best, are this near (root mean square)."""
-DRAWN_FIELDS = ("near", "eps2d", "alpha_min", "alpha_max", "jacobian_margin")
+DRAWN_FIELDS = ("near", "alpha_min", "alpha_max", "jacobian_margin")
 
 
 @dataclasses.dataclass
@@ -82,7 +85,8 @@ def pack(
         "parents": avatar.parents,
         "joint_names": avatar.joint_names,
         "skinning": avatar.skinning,
-        "splatting": {name: getattr(how, name) for name in DRAWN_FIELDS},
+        "splatting": {name: getattr(how, name) for name in DRAWN_FIELDS}
+        | {"eps2d": added_variance(avatar.gaussians, how.eps2d)},
         "rest_bounds": [vertices.min(0).tolist(), vertices.max(0).tolist()],
     }
     arrays: dict[str, np.ndarray] = {}
@@ -155,6 +159,11 @@ def _pack_gaussians(avatar, header, arrays):
     joints, weights = largest_weights(np.asarray(avatar.skinning_weights))
     arrays["weights"], arrays["weight_joints"] = weights.astype("<u2"), joints.astype("u1")
     arrays["rest_joints"] = np.asarray(avatar.rest_joints, "<f4")
+    if avatar.light is not None:
+        header["light"] = np.asarray(avatar.light.coefficients, np.float64).tolist()
+        arrays["light_normals"] = np.rint(127 * np.asarray(avatar.light.normals)).astype("i1")
+        shading = np.asarray(avatar.light.shading, np.float64)
+        header["light_shading"], arrays["light_shading"] = _quantized(shading, shading.min(), shading.max())
 
 
 def _pack_shape(avatar, body, header, arrays):

@@ -18,7 +18,7 @@ from humangs_jax.network.inputs import subject_unit
 from humangs_jax.network.pixel_aligned import project_vertices
 from humangs_jax.network.shell_textures import DISTANCES, ShellTextureReader, fill_unseen
 from humangs_jax.network.systems import ONE_PHOTO, SYSTEMS
-from humangs_jax.network.two_stream import TwoStreamReader, along_curve
+from humangs_jax.network.two_stream import TwoStreamReader
 from humangs_jax.network.unet import UNet
 from humangs_jax.network.upsampler import UpsamplerConfig
 
@@ -134,15 +134,6 @@ def test_attention_needs_a_token_a_patch_and_whole_heads():
             reader(width=10, head_width=8)
     with pytest.raises(ValueError, match="0 layers: expected 1 to"):
         TwoStreamReader(blocks=0)
-
-
-def test_neighbours_along_the_curve_are_neighbours_in_space():
-    positions = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (512, 3)), jnp.float32)
-    ranks = jax.jit(along_curve)(positions)
-    assert sorted(ranks.tolist()) == list(range(512))
-    ordered = np.asarray(positions)[np.argsort(ranks)]
-    steps = np.linalg.norm(np.diff(ordered, axis=0), axis=-1).mean()
-    assert steps < 0.4 * np.linalg.norm(np.diff(positions, axis=0), axis=-1).mean()
 
 
 @pytest.mark.slow

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from refinement_cases import HEIGHT, STEPS, WIDTH, assert_nearly_all_close, toy_avatar, toy_capture
 
+from humangs_jax.avatar.low_pass import with_low_pass, without_low_pass
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
@@ -20,8 +21,10 @@ from humangs_jax.refinement import refine as refinement
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.crops import BLOCK, crop_to_person
 from humangs_jax.refinement.parameters import gaussians_of, parameters_of
+from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 from humangs_jax.rendering.splatting import plan_buffers, render
 
+SAME_SIZE = 2e-3  # of alpha, in the mean: flat Gaussians become a little thicker
 VMAP_TOLERANCE = 5e-4  # Adam divides by the gradient's size: rounding of gradients near 0 becomes a share of a rate
 
 
@@ -69,6 +72,36 @@ def test_never_worse_than_the_start(person):
     report = refinement.refine_with_report(avatar, truth, dataclasses.replace(STEPS, steps=3))
     assert not report.kept and report.loss[0] == report.loss[1]
     jax.tree.map(np.testing.assert_array_equal, report.avatar, avatar)
+
+
+def test_refined_avatars_look_the_same_at_other_sizes(person):
+    """As an image of the photos' size, reduced, does; and at that size as the optimised Gaussians do."""
+    avatar, capture = person
+    refined = refinement.refine(avatar, capture, STEPS)
+    raw = without_low_pass(refined)
+    camera, pose = capture.cameras[0], capture.pose(0)
+    drawn = lambda a, camera: render(refinement.posed(a, pose), camera, SPLAT_PRESETS[a.rendering]).alpha
+    assert refined.gaussians.low_pass is not None and avatar.gaussians.low_pass is None
+    assert jnp.abs(drawn(refined, camera) - drawn(raw, camera)).mean() < SAME_SIZE
+    reduced = drawn(raw, camera).reshape(HEIGHT // 2, 2, WIDTH // 2, 2).mean(axis=(1, 3))
+    errors = [
+        float(jnp.abs(drawn(a, camera.resized(WIDTH // 2, HEIGHT // 2)) - reduced).mean()) for a in (refined, raw)
+    ]
+    assert errors[0] < 0.7 * errors[1]
+    again = refinement.refine(refined, capture, dataclasses.replace(STEPS, steps=2))
+    np.testing.assert_array_equal(again.gaussians.low_pass, refined.gaussians.low_pass)
+
+
+def test_steps_start_from_what_the_photos_show_of_an_avatar(person):
+    """Also if its low-pass is that of other pixels: the loss before is its own, and it is never worse after."""
+    avatar, capture = person
+    pixel = refinement.pixel_size(avatar, crop_to_person(capture))
+    wide = with_low_pass(avatar, 3 * pixel)
+    drawn = lambda a: render(refinement.posed(a, capture.pose(0)), capture.cameras[0], SPLAT_PRESETS["exact"]).alpha
+    assert jnp.abs(drawn(without_low_pass(wide, pixel)) - drawn(wide)).mean() < SAME_SIZE
+    assert jnp.abs(drawn(without_low_pass(wide)) - drawn(wide)).mean() > 3 * SAME_SIZE
+    losses = [refinement.refine_with_report(a, capture, STEPS).loss[0] for a in (avatar, wide)]
+    assert losses[1] > 1.1 * losses[0]
 
 
 def test_interruption_returns_the_best_state(person, monkeypatch):

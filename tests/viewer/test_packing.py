@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from viewer_cases import small_avatar, small_body
 
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.light import Light
 from humangs_jax.body.model import shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion
@@ -53,6 +54,24 @@ def test_what_the_page_reads_is_the_avatar(seed):
     assert np.abs(got["colors"] - double(g.colors)).max() <= HALF * STEP
     assert np.abs(got["quats"] - quats / np.linalg.norm(quats, axis=1, keepdims=True)).max() <= HALF / 32767
     assert np.abs(got["weights"] - double(avatar.skinning_weights)).max() <= 3 * STEP
+
+
+def test_the_light_is_kept():
+    avatar, rng = small_avatar(), np.random.default_rng(0)
+    normals = rng.normal(size=avatar.gaussians.means.shape)
+    numbers = (
+        rng.normal(size=8),
+        normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        rng.normal(size=len(normals)),
+    )
+    light = Light(*(jnp.asarray(x, jnp.float32) for x in numbers))
+    packed = packing.pack(replace(avatar, light=light))
+    arrays, header = packing.unpack(packed), packed.header
+    low, high = header["light_shading"]["low"], header["light_shading"]["high"]
+    assert header["light"] == [float(x) for x in light.coefficients]
+    assert np.abs(arrays["light_normals"] / 127 - np.asarray(light.normals)).max() <= HALF / 127
+    shading = low + arrays["light_shading"] * STEP * (high - low)
+    assert np.abs(shading - np.asarray(light.shading, np.float64)).max() <= HALF * STEP * (high - low)
 
 
 def test_colours_beyond_one_and_flat_gaussians_are_kept():

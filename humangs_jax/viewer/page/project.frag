@@ -10,7 +10,7 @@ precision highp usampler2D;
 uniform usampler2D order;      // nearest first
 uniform int count;
 uniform usampler2D gaussians;  // three texels each, see scene.js
-uniform sampler2D means;       // canonical, metres
+uniform sampler2D means;       // canonical, metres; the normal in 24 bits
 layout(std140) uniform Joints {
   vec4 joints[3 * 256];        // three rows of [linear | offset] per joint
 };
@@ -20,6 +20,10 @@ uniform vec4 K;                // fx, fy, cx, cy, pixels
 uniform vec2 size;             // pixels
 uniform vec2 log_scale;        // lowest, highest
 uniform vec2 color_range;
+uniform vec3 first_light;      // humangs_jax/avatar/light.py: coefficients of x, y, z; all 0: colours stay
+uniform vec3 more_light;       // of xy, yz, zx
+uniform vec2 last_light;       // of zz - xx, 3 yy - 1
+uniform vec2 shading_range;
 uniform float near;
 uniform float eps2d;
 uniform float alpha_min;
@@ -31,6 +35,7 @@ layout(location = 1) out uvec4 shape;   // shorter axis; where alpha falls below
 layout(location = 2) out uvec4 color;
 
 const int GAUSSIANS_PER_ROW = 1024;
+const float LIGHT_LIMIT = 0.7;
 
 mat3 matrix_of(vec4 q) {       // wxyz
   float w = q.x, x = q.y, y = q.z, z = q.w;
@@ -61,11 +66,15 @@ void main() {
   uvec4 a = texelFetch(gaussians, ivec2(3 * column, row), 0);
   uvec4 b = texelFetch(gaussians, ivec2(3 * column + 1, row), 0);
   uvec4 c = texelFetch(gaussians, ivec2(3 * column + 2, row), 0);
-  vec4 mean = vec4(texelFetch(means, ivec2(column, row), 0).xyz, 1.0);
+  vec4 mean = texelFetch(means, ivec2(column, row), 0);
+  int bits = int(mean.w);
+  vec3 normal = vec3(bits >> 16, bits >> 8 & 255, bits & 255) - 127.0;
+  mean.w = 1.0;
   vec2 scale_and_opacity = unpackUnorm2x16(a.y);
   vec3 scale = exp(log_scale.x + (log_scale.y - log_scale.x) * vec3(unpackUnorm2x16(a.x), scale_and_opacity.x));
   vec4 quat = normalize(vec4(unpackSnorm2x16(a.z), unpackSnorm2x16(a.w)));
   vec3 rgb = color_range.x + (color_range.y - color_range.x) * vec3(unpackUnorm2x16(b.x), unpackUnorm2x16(b.y).x);
+  float shading = shading_range.x + (shading_range.y - shading_range.x) * unpackUnorm2x16(b.y).y;
   float opacity = scale_and_opacity.y;
 
   vec4 x = vec4(0.0), y = vec4(0.0), z = vec4(0.0);  // rows of the blended transform
@@ -83,6 +92,12 @@ void main() {
 
   if (!(p.z > near) || opacity <= alpha_min) return;
 
+  normal = mat3(cross(linear[1], linear[2]), cross(linear[2], linear[0]), cross(linear[0], linear[1])) * normal;
+  normal /= max(length(normal), 1e-12);
+  float change = dot(first_light, normal) + dot(more_light, normal * normal.yzx) - shading
+               + dot(last_light, vec2(normal.z * normal.z - normal.x * normal.x, 3.0 * normal.y * normal.y - 1.0));
+  rgb = min(rgb * exp(clamp(change, -LIGHT_LIMIT, LIGHT_LIMIT)), max(rgb, 1.0));
+
   mat3 turned = matrix_of(quat);
   turned = rotation_only ? matrix_of(quat_of(linear * turned)) : linear * turned;
   mat3 factor = camera_rotation * turned;            // columns: the Gaussian's axes in the camera's frame
@@ -96,8 +111,8 @@ void main() {
   vec3 m1 = (K.y / p.z) * vec3(factor[0].y - at.y * factor[0].z, factor[1].y - at.y * factor[1].z,
                                factor[2].y - at.y * factor[2].z) * scale;
   float s00 = dot(m0, m0), s01 = dot(m0, m1), s11 = dot(m1, m1);
-  vec3 normal = cross(m0, m1);                       // a determinant without cancellation
-  float determinant = dot(normal, normal) + eps2d * (s00 + s11) + eps2d * eps2d;
+  vec3 across = cross(m0, m1);                       // a determinant without cancellation
+  float determinant = dot(across, across) + eps2d * (s00 + s11) + eps2d * eps2d;
   s00 += eps2d;
   s11 += eps2d;
   float half_difference = 0.5 * (s00 - s11);

@@ -10,7 +10,7 @@ async function readScene() {
   const packed = new Uint8Array(text.length);
   for (let i = 0; i < text.length; i++) packed[i] = text.charCodeAt(i);
   const buffer = await inflate(packed, "gzip");
-  const types = { "<u2": Uint16Array, "<i2": Int16Array, "|u1": Uint8Array, "<f4": Float32Array };
+  const types = { "<u2": Uint16Array, "<i2": Int16Array, "|u1": Uint8Array, "|i1": Int8Array, "<f4": Float32Array };
   const arrays = {};
   for (const [name, { type, shape, offset }] of Object.entries(header.arrays))
     arrays[name] = new types[type](buffer, offset, shape.reduce((a, b) => a * b, 1));
@@ -48,7 +48,7 @@ function unpackMotion(header, arrays) {
 // Three texels of four 32-bit numbers for each Gaussian; project.frag takes them apart.
 function gaussianTexels(scene) {
   const { arrays, count } = scene, height = Math.ceil(count / ROW), out = new Uint32Array(4 * TEXELS_PER_ROW * height);
-  const { scales, quats, colors, opacities, weights, weight_joints: joints } = arrays;
+  const { scales, quats, colors, opacities, weights, weight_joints: joints, light_shading: shading } = arrays;
   const pair = (a, b) => ((a & 0xffff) | (b << 16)) >>> 0;
   for (let i = 0; i < count; i++) {
     const t = 12 * i;
@@ -57,7 +57,7 @@ function gaussianTexels(scene) {
     out[t + 2] = pair(quats[4 * i], quats[4 * i + 1]);
     out[t + 3] = pair(quats[4 * i + 2], quats[4 * i + 3]);
     out[t + 4] = pair(colors[3 * i], colors[3 * i + 1]);
-    out[t + 5] = colors[3 * i + 2];
+    out[t + 5] = pair(colors[3 * i + 2], shading ? shading[i] : 0);
     for (let k = 0; k < 4; k++) {
       out[t + 6] |= joints[8 * i + k] << (8 * k);
       out[t + 7] |= joints[8 * i + 4 + k] << (8 * k);
@@ -67,9 +67,13 @@ function gaussianTexels(scene) {
   return { data: out, width: TEXELS_PER_ROW, height };
 }
 
+// Means, and the normals that the light needs: three numbers of 8 bits are a whole number that a float holds.
 function meanTexels(scene) {
-  const height = Math.ceil(scene.count / ROW), out = new Float32Array(4 * ROW * height);
-  for (let i = 0; i < scene.count; i++) out.set(scene.means.subarray(3 * i, 3 * i + 3), 4 * i);
+  const height = Math.ceil(scene.count / ROW), out = new Float32Array(4 * ROW * height), n = scene.arrays.light_normals;
+  for (let i = 0; i < scene.count; i++) {
+    out.set(scene.means.subarray(3 * i, 3 * i + 3), 4 * i);
+    if (n) out[4 * i + 3] = ((n[3 * i] + 127) << 16) | ((n[3 * i + 1] + 127) << 8) | (n[3 * i + 2] + 127);
+  }
   return { data: out, width: ROW, height };
 }
 

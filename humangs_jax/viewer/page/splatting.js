@@ -10,6 +10,7 @@ function makeRenderer(canvas, scene) {
   const floats = gl.getExtension("EXT_color_buffer_float") || gl.getExtension("EXT_color_buffer_half_float");
 
   const { count, header } = scene, how = header.splatting;
+  const light = header.light ?? Array(8).fill(0), shading = header.light_shading ?? { low: 0, high: 0 };
   const source = (id) => document.getElementById(id).textContent.trim();
   const project = makeProgram(gl, source("whole.vert"), source("project.frag"));
   const draw = makeProgram(gl, source("splat.vert"), source("splat.frag"));
@@ -69,6 +70,7 @@ function makeRenderer(canvas, scene) {
       order: 0, gaussians: 1, means: 2, count, camera_rotation: camera.rotation, camera_offset: camera.translation, K: camera.K,
       size: [width, height], log_scale: [header.scales.low, header.scales.high],
       color_range: [header.colors.low, header.colors.high], near: how.near, eps2d: how.eps2d, alpha_min: how.alpha_min,
+      first_light: light.slice(0, 3), more_light: light.slice(3, 6), last_light: light.slice(6), shading_range: [shading.low, shading.high],
       jacobian_margin: how.jacobian_margin ?? -1, rotation_only: header.skinning === "rotation" ? 1 : 0,
     });
     gl.disable(gl.BLEND);
