@@ -177,7 +177,8 @@ def observer(model, run):
         with nn.intercept_methods(recorder.watch):
             prepared = prepare_inputs(body, example.inputs, model)
             outputs, _ = apply_humangs(variables, prepared, model, True, None, recorder)
-            draw_targets(outputs, body, example.targets, white_backgrounds(example.targets), run, recorder)
+            backgrounds = white_backgrounds(example.targets)
+            draw_targets(outputs, body, example.inputs, example.targets, backgrounds, run, recorder)
         return recorder.given
 
     return jax.jit(forward)

@@ -194,7 +194,7 @@ def network_case(names: list[str]) -> tuple[Any, Any]:
         outputs, _ = reconstruct_example(
             {"params": point, "batch_stats": batch_stats}, body, example.inputs, config, True
         )
-        drawn = draw_targets(outputs, body, example.targets, white_backgrounds(example.targets), config)
+        drawn = draw_targets(outputs, body, example.inputs, example.targets, white_backgrounds(example.targets), config)
         return drawn.rendering.depth
 
     depth = depths(point)

@@ -127,7 +127,7 @@ def stages(case: Case) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
 
     def draw(outputs, gaussians):
         outputs = replace(outputs, gaussians=gaussians)
-        return draw_targets(outputs, body, targets, white_backgrounds(targets), config).rendering
+        return draw_targets(outputs, body, example.inputs, targets, white_backgrounds(targets), config).rendering
 
     def compare(outputs, drawn, rgb):
         terms = loss_terms(

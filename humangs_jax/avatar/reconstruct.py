@@ -132,18 +132,18 @@ def make_avatar(outputs: HumanGSOutputs, body: BodyModel, betas: Float[Array, " 
     )
 
 
-def _assemble(variables, config, body, views, inputs):
-    outputs, _ = apply_humangs(variables, inputs, config)
-    avatar = make_avatar(outputs, body, views.betas, config)
-    if config.conventions.skinning_reach is not None and outputs.skinning_weights is None:
+def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> Avatar:
+    """`make_avatar`, and what the conventions take from the photos: the skinning between the legs, the light, the low-pass."""
+    conventions, avatar = config.conventions, make_avatar(outputs, body, views.betas, config)
+    if conventions.skinning_reach is not None and outputs.skinning_weights is None:
         avatar = with_spread_weights(
-            avatar, BodyPose(views.rotations[0], views.translations[0]), config.conventions.skinning_reach
+            avatar, BodyPose(views.rotations[0], views.translations[0]), conventions.skinning_reach
         )
-    if config.conventions.light and outputs.skinning_weights is None:
+    if conventions.light and outputs.skinning_weights is None:
         avatar = with_light(avatar, views)
-    if config.conventions.low_pass is not None:
-        avatar = with_low_pass(avatar, config.conventions.low_pass)
-    return avatar, outputs.dropped_tokens
+    if conventions.low_pass is not None:
+        avatar = with_low_pass(avatar, conventions.low_pass)
+    return avatar
 
 
 def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
@@ -191,6 +191,11 @@ def with_spread_weights(avatar: Avatar, pose: BodyPose, reach: float) -> Avatar:
     means = jnp.where(safe[:, None], held, gaussians.means)
     weights = jnp.where(safe[:, None], spread, own)
     return replace(avatar, gaussians=replace(gaussians, means=means), skinning_weights=weights)
+
+
+def _assemble(variables, config, body, views, inputs):
+    outputs, _ = apply_humangs(variables, inputs, config)
+    return completed_avatar(outputs, body, views, config), outputs.dropped_tokens
 
 
 def _prepare_subjects(body, batch, config):

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.avatar.animate import skin
-from humangs_jax.avatar.reconstruct import make_avatar
+from humangs_jax.avatar.reconstruct import completed_avatar, make_avatar
 from humangs_jax.avatar.targets import frame_outputs, target_pixels
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
@@ -71,14 +71,16 @@ class DrawnTargets(NamedTuple):
 def draw_targets(
     outputs: HumanGSOutputs,
     body: BodyModel,
+    inputs: SubjectViews,
     targets: SubjectViews,
     backgrounds: Float[Array, "v 3"],
     config: TrainConfig,
     stage: StageCaller = call,
     variables: Variables | None = None,
 ) -> DrawnTargets:
-    """The Gaussians in the pose and before the camera of every target. variables: of a network that runs again for every
-    target (a driver, or a decoder that draws pixels, on white whatever the backgrounds); others need none.
+    """The Gaussians in the pose and before the camera of every target. inputs: the photos that they are from. variables: of a
+    network that runs again for every target (a driver, or a decoder that draws pixels, on white whatever the backgrounds);
+    others need none.
     """
     poses = (targets.rotations, targets.translations)
     if variables is None:
@@ -90,7 +92,7 @@ def draw_targets(
         return DrawnTargets(stage("images", pixels, outputs))
 
     def pose_all(outputs):
-        avatar = make_avatar(outputs, body, targets.betas, config.model)
+        avatar = completed_avatar(outputs, body, inputs, config.model)
         return jax.lax.map(lambda pose: skin(avatar, BodyPose(*pose)), poses)
 
     def drive_all(outputs):
@@ -150,5 +152,5 @@ def predict(
     """What the trained network shows of an example's targets, on white, and the Gaussians that it shows."""
     outputs, _ = reconstruct_example(variables, body, example.inputs, config)
     backgrounds = white_backgrounds(example.targets)
-    drawn = draw_targets(outputs, body, example.targets, backgrounds, config, variables=variables)
+    drawn = draw_targets(outputs, body, example.inputs, example.targets, backgrounds, config, variables=variables)
     return drawn.rendering, outputs

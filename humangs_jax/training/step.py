@@ -149,7 +149,7 @@ def subject_loss(
     backgrounds = random_backgrounds(key, len(targets.translations), colored)
     backgrounds = backgrounds.astype(targets.images.dtype)
     images = change_background(targets, backgrounds)
-    drawn = draw_targets(outputs, body, targets, backgrounds, config, stage, variables)
+    drawn = draw_targets(outputs, body, example.inputs, targets, backgrounds, config, stage, variables)
     terms = loss_terms(drawn, outputs, images, targets, config.loss, networks, stage)
     total = lambda terms: sum(getattr(config.loss, name) * term for name, term in terms.items())
     loss = stage("loss", total, terms)

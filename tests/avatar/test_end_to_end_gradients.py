@@ -241,7 +241,7 @@ def compiled(case, dtype):
         targets = replace(targets, cameras=point["target_cameras"], **point["target_pose"])
         variables = {"params": point["params"], "batch_stats": batch_stats}
         outputs, _ = apply_humangs(variables, inputs, config.model, case.train)
-        drawn = draw_targets(outputs, as_jax(own_body), targets, white_backgrounds(targets), config)
+        drawn = draw_targets(outputs, as_jax(own_body), targets, targets, white_backgrounds(targets), config)
         terms = loss_terms(drawn, outputs, targets.images, targets, config.loss)
         total = sum(getattr(config.loss, name) * term for name, term in terms.items())
         return total, {

@@ -1,6 +1,7 @@
 """The training step: terms, backgrounds, gradients, and what a bad batch may do."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,9 @@ import pytest
 from rounding import bound
 from training_cases import without_upsampler
 
+from humangs_jax.avatar.animate import skin
+from humangs_jax.avatar.reconstruct import reconstruct_views
+from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.views import SubjectViews
@@ -18,8 +22,9 @@ from humangs_jax.objectives.backbones import VGG16, channels, random_weights
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.objectives.perceptual import VGG19, Vgg19
+from humangs_jax.rendering.splatting import render
 from humangs_jax.training.config import tiny
-from humangs_jax.training.forward import token_share
+from humangs_jax.training.forward import predict, token_share
 from humangs_jax.training.state import TrainState, init_state
 from humangs_jax.training.step import (
     batch_gradients,
@@ -54,6 +59,20 @@ def test_a_step_moves_the_parameters_and_tells_of_it(body, source, variables):
     assert float(metrics["loss"]) == pytest.approx(expected, rel=bound(FLOAT32))
     assert float(metrics["grad_norm"]) > 0
     assert int(metrics["skipped"]) == int(metrics["dropped_tokens"]) == int(metrics["overflow"]) == 0
+
+
+def test_it_draws_the_avatars_that_reconstruct_makes(body, source, variables):
+    model = CONFIG.model.with_conventions(light=True, low_pass=0.02)
+    example = jax.tree.map(lambda x: x[0], source.batch_at(0))
+    run, compiled = dataclasses.replace(CONFIG, model=model), functools.partial(jax.jit, static_argnames="config")
+    predicted, _ = compiled(predict)(variables, body, example, config=run)
+    avatar, _ = compiled(reconstruct_views)(variables, body=body, views=example.inputs, config=model)
+    targets = example.targets
+    assert jnp.abs(avatar.light.coefficients).max() > 0.01
+    for i, rgb in enumerate(predicted.rgb):
+        pose = BodyPose(targets.rotations[i], targets.translations[i])
+        expected = render(skin(avatar, pose), targets.cameras[i], CONFIG.splat, jnp.ones(3)).rgb
+        np.testing.assert_allclose(rgb, expected, atol=bound(FLOAT32))
 
 
 AGAINST_FOG = {"absolute": 0.2, "outline": 0.1, "depth": 0.3, "distortion": 1.0, "opaque": 0.003, "shells": 3.0}
