@@ -205,8 +205,9 @@ def random_start(avatar, seed):
         scales=jnp.full((count, 3), 0.01),
         opacities=jnp.full(count, 0.5),
         colors=jnp.asarray(rng.random((count, 3)), jnp.float32),
+        low_pass=None,
     )
-    return replace(avatar, gaussians=gaussians)
+    return replace(avatar, gaussians=gaussians, light=None)
 
 
 def score_all(avatar, held_out, view=0):

@@ -94,15 +94,14 @@ def levenberg_marquardt(avatar, capture, seconds):
     """The avatar after that many seconds of damped Gauss-Newton steps on all photos."""
     import jax.numpy as jnp
 
-    from humangs_jax.avatar.low_pass import without_low_pass
-    from humangs_jax.core.pytree import replace
+    from humangs_jax.avatar.low_pass import with_low_pass_of
     from humangs_jax.refinement import refine as refinement
     from humangs_jax.refinement.config import RefineConfig
     from humangs_jax.refinement.crops import crop_to_person
-    from humangs_jax.refinement.objective import photos_of
-    from humangs_jax.refinement.parameters import gaussians_of
+    from humangs_jax.refinement.objective import avatar_of, photos_of
 
-    avatar, views, config = without_low_pass(avatar), crop_to_person(capture), RefineConfig()
+    views, config = crop_to_person(capture), RefineConfig()
+    avatar = with_low_pass_of(avatar, views)
     photos, splat = photos_of(views, jnp.ones(views.masks.shape, bool)), refinement._planned(avatar, views)
     state = refinement._compiled(refinement.start)(avatar, photos, config, splat)
     step = compiled_step()
@@ -113,7 +112,7 @@ def levenberg_marquardt(avatar, capture, seconds):
         if began is None:  # the first call compiles
             parameters, damping, began = state.parameters, jnp.float32(DAMPING), time.perf_counter()
         parameters.means.block_until_ready()
-    return replace(avatar, gaussians=gaussians_of(parameters))
+    return avatar_of(parameters, avatar)
 
 
 @functools.cache

@@ -3,7 +3,7 @@
 import jax
 
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.light import relit
+from humangs_jax.avatar.light import light_values, relit
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
 from humangs_jax.core.checks import FINITE, check_values
@@ -42,7 +42,7 @@ def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
         "pose.translation": (pose.translation, FINITE),
         "avatar.rest_joints": (avatar.rest_joints, FINITE),
     }
-    check_values("animate", gaussian_values(avatar.gaussians) | moves)
+    check_values("animate", gaussian_values(avatar.gaussians) | light_values(avatar.light) | moves)
     return _animate(avatar, pose)
 
 

@@ -118,6 +118,7 @@ def _load(cls, path):
         raise Refused(f"rest_joints: expected shape ({len(header['parents'])}, 3), got {arrays['rest_joints'].shape}")
     unit = (-ROUNDING, 1 + ROUNDING)
     ranges = {"scales": (0.0,), "low_pass": (0.0,), "opacities": unit, "skinning_weights": unit}
+    ranges["light_normals"] = (-1 - ROUNDING, 1 + ROUNDING)
     shapes = {
         "means": (g, 3),
         "quats": (g, 4),

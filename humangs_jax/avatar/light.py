@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.checks import FINITE, Values
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry.curve import along_curve
 from humangs_jax.geometry.transform import EXACT
@@ -48,6 +49,11 @@ class Light:
     coefficients: Float[Array, "8"]
     normals: Float[Array, "g 3"]
     shading: Float[Array, " g"]
+
+
+def light_values(light: Light | None) -> dict[str, tuple[Array | None, Values]]:
+    """What `core.checks.check_values` needs to check the light of an avatar."""
+    return {f"light.{name}": (getattr(light, name, None), FINITE) for name in ("coefficients", "normals", "shading")}
 
 
 def light_terms(normals: Float[Array, "g 3"]) -> Float[Array, "g 8"]:

@@ -6,18 +6,20 @@ scales, for the size of the images that they fit (after Mip-Splatting, https://a
 tells renderers so.
 """
 
+import jax
 import jax.numpy as jnp
 
+from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
-from humangs_jax.rendering.constants import EPS2D, MIP_EPS2D
+from humangs_jax.data.views import SubjectViews
+from humangs_jax.geometry.camera import project
+from humangs_jax.rendering.gaussians import widened
 
-SMALLEST = 1e-5
-"""Metres, a thousandth of a pixel; where more is to be taken away than a scale contains."""
 
-
-def with_low_pass(avatar: Avatar, pixel: Float[Array, ""] | float) -> Avatar:
+def with_low_pass(avatar: Avatar, pixel: Float[Array, "*g"] | float) -> Avatar:
     """The avatar whose scales contain the low-pass of images with pixels of this size in metres.
 
     One that is drawn by other conventions than "exact", or has a low-pass already, is returned as it is.
@@ -25,19 +27,41 @@ def with_low_pass(avatar: Avatar, pixel: Float[Array, ""] | float) -> Avatar:
     gaussians = avatar.gaussians
     if avatar.rendering != "exact" or gaussians.low_pass is not None:
         return avatar
-    low_pass = jnp.full_like(gaussians.opacities, pixel)
-    return replace(avatar, gaussians=replace(gaussians, scales=_widened(gaussians.scales, low_pass), low_pass=low_pass))
+    low_pass = jnp.broadcast_to(jnp.asarray(pixel, gaussians.scales.dtype), gaussians.opacities.shape)
+    return replace(avatar, gaussians=replace(gaussians, scales=widened(gaussians.scales, low_pass), low_pass=low_pass))
 
 
-def without_low_pass(avatar: Avatar, pixel: Float[Array, ""] | float | None = None) -> Avatar:
-    """The avatar that `with_low_pass` had; with `pixel`, one that looks like this in images with pixels of this size."""
+def without_low_pass(avatar: Avatar) -> Avatar:
+    """The avatar that `with_low_pass` had."""
     gaussians = avatar.gaussians
+    scales = widened(gaussians.scales, gaussians.low_pass, -1)
+    return replace(avatar, gaussians=replace(gaussians, scales=scales, low_pass=None))
+
+
+def with_low_pass_of(avatar: Avatar, views: SubjectViews) -> Avatar:
+    """The avatar with the low-pass of photos that it is to be fitted to, where its own is not that of smaller pixels.
+
+    It looks as before: what its own low-pass had more is a part of the scales now that a fit can take away.
+    """
+    gaussians, sizes = avatar.gaussians, pixel_sizes(avatar, views)
     if gaussians.low_pass is None:
-        return avatar
-    left = gaussians.low_pass if pixel is None else jnp.full_like(gaussians.low_pass, pixel)
-    return replace(avatar, gaussians=replace(gaussians, scales=_widened(gaussians.scales, left, -1), low_pass=None))
+        return with_low_pass(avatar, sizes)
+    return replace(avatar, gaussians=replace(gaussians, low_pass=jnp.minimum(gaussians.low_pass, sizes)))
 
 
-def _widened(scales, low_pass, sign=1):
-    added = sign * (EPS2D - MIP_EPS2D) * jnp.square(low_pass)
-    return jnp.sqrt(jnp.maximum(jnp.square(scales) + added[:, None], SMALLEST**2))
+@jax.jit
+def pixel_sizes(avatar: Avatar, views: SubjectViews) -> Float[Array, " g"]:
+    """Metres that a pixel of the photos shows at each Gaussian, in the photo that shows it largest.
+
+    Where no photo has it in its frame: the largest of the others.
+    """
+
+    def in_photo(photo):
+        rotations, translation, camera = photo
+        pixels, depths = project(camera, skin(avatar, BodyPose(rotations, translation)).means)
+        inside = (pixels >= 0) & (pixels <= jnp.asarray([camera.width, camera.height]))
+        return jnp.where(jnp.all(inside, axis=-1) & (depths > 0), depths / camera.K[0, 0], jnp.inf)
+
+    smallest = jnp.min(jax.lax.map(in_photo, (views.rotations, views.translations, views.cameras)), axis=0)
+    found = jnp.isfinite(smallest)
+    return jnp.where(found, smallest, jnp.max(jnp.where(found, smallest, 0.0)))

@@ -21,17 +21,19 @@ from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, gaussian_body, pad_views, prepare_inputs, standardize
-from humangs_jax.geometry import transform
+from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import camera_values
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, needed_tokens
-from humangs_jax.network.inputs import HumanGSInputs
+from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.buffers import round_up
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 
 LEGS = tuple(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
+UPRIGHT = 0.5
+"""Cosine between the pelvis's own up and the y axis, mean over the photos, from which on the world is taken to be y-up."""
 SMALLEST_VOLUME = 0.2
 """Blended transforms of limbs that are turned against each other collapse; below this determinant they are not inverted."""
 
@@ -142,13 +144,17 @@ def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectVie
     if conventions.light and outputs.skinning_weights is None:
         avatar = with_light(avatar, views)
     if conventions.low_pass is not None:
-        avatar = with_low_pass(avatar, conventions.low_pass)
+        avatar = with_low_pass(avatar, conventions.low_pass * subject_unit(avatar.rest_vertices))
     return avatar
 
 
 def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
-    """The avatar with the light of its photos (`avatar.light`). Gradients do not pass through the light."""
-    fixed = jax.lax.stop_gradient(avatar)
+    """The avatar with the light of its photos (`avatar.light`). Gradients do not pass through the light.
+
+    Without light if the people in the photos do not stand upright in a world whose y axis points up: other poses are of such
+    worlds, and their light comes from above.
+    """
+    fixed, views = jax.lax.stop_gradient((avatar, views))
     vertices, gaussians = fixed.rest_vertices, fixed.gaussians
     per_vertex = len(gaussians.means) // len(vertices)
     normals = jnp.repeat(vertex_normals(vertices, fixed.faces), per_vertex, axis=0)
@@ -164,6 +170,9 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
     weights = pooled(gaussians.opacities)
     mean = lambda values: pooled(values * gaussians.opacities[:, None]) / jnp.maximum(weights, 1e-6)
     coefficients = light_coefficients(vertices, mean(gaussians.colors), weights[:, 0], mean(terms))
+    pelvis = quaternion.matrix_from_axis_angle(views.rotations[:, 0])
+    upright = jnp.sum(share * pelvis[:, 1, 1]) > UPRIGHT
+    coefficients = jnp.where(upright, coefficients, 0.0)
     return replace(avatar, light=Light(coefficients, normals, log_brightness(terms, coefficients)))
 
 

@@ -94,10 +94,10 @@ class Conventions:
     its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex (paper) or over all (release).
     pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn. skinning_reach: Gaussians
     between the legs farther than this from their vertex, metres, move with both (`body.skinning.spread_weights`); None: all with
-    their vertex. light: other poses are drawn in the light of the photos (`avatar.light`). low_pass: metres that
-    a pixel of the training images shows of the person, if their low-pass is to be part of the scales (`avatar.low_pass`); None:
-    it stays with the renderer. body_vertices, longest_edge: number of vertices to which bodies are decimated, and metres to which
-    their edges are split afterwards; None for neither.
+    their vertex. light: other poses are drawn in the light of the photos (`avatar.light`). low_pass: what a pixel of the training
+    images shows of the person, normalised units (`subject_unit`), if their low-pass is to be part of the scales
+    (`avatar.low_pass`); None: it stays with the renderer. body_vertices, longest_edge: number of vertices to which bodies are
+    decimated, and metres to which their edges are split afterwards; None for neither.
     """
 
     image_size: int = knob(
@@ -125,11 +125,11 @@ class Conventions:
     )
 
     def __post_init__(self):
-        """Raises ValueError for metres that are none."""
+        """Raises ValueError for lengths that are none."""
         for name in ("skinning_reach", "low_pass"):
-            metres = getattr(self, name)
-            if metres is not None and not 0 < metres < math.inf:
-                raise ValueError(f"{name} {metres}: expected a positive number of metres, or None")
+            length = getattr(self, name)
+            if length is not None and not 0 < length < math.inf:
+                raise ValueError(f"{name} {length}: expected a positive length, or None")
 
 
 @dataclasses.dataclass(frozen=True)

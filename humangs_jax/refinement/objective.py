@@ -53,6 +53,11 @@ def photos_of(views: SubjectViews, counted: Bool[Array, "v h w"]) -> Photos:
     return Photos(views.images, views.masks, counted, views.cameras, views.rotations, views.translations, index)
 
 
+def avatar_of(parameters: Parameters, avatar: Avatar) -> Avatar:
+    """The avatar with the Gaussians that the parameters stand for."""
+    return replace(avatar, gaussians=gaussians_of(parameters, avatar.gaussians.low_pass))
+
+
 def posed_gaussians(parameters: Parameters, avatar: Avatar, photo: Photos, poses: bool) -> Gaussians:
     """The Gaussians in the pose of one photo (without the axis v), corrected as far as it has been refined.
 
@@ -67,7 +72,7 @@ def posed_gaussians(parameters: Parameters, avatar: Avatar, photo: Photos, poses
     pose = BodyPose(
         photo.rotations + parameters.rotations[photo.index], photo.translations + parameters.translations[photo.index]
     )
-    return skin(replace(avatar, gaussians=gaussians_of(parameters)), pose)
+    return skin(avatar_of(parameters, avatar), pose)
 
 
 def drawn_photo(

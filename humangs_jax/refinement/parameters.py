@@ -14,7 +14,7 @@ from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.refinement.config import RefineConfig
-from humangs_jax.rendering.gaussians import Gaussians
+from humangs_jax.rendering.gaussians import Gaussians, widened
 
 SMALLEST_SCALE = 1e-6
 """Metres; keeps the logarithm finite for flat Gaussians."""
@@ -30,7 +30,7 @@ ADAM = optax.scale_by_adam()
 class Parameters:
     """What refinement moves, each without bounds.
 
-    means: (g, 3) metres. quats: (g, 4). log_scales: (g, 3) of metres. opacity_logits: (g,). color_logits: (g, 3).
+    means: (g, 3) metres. quats: (g, 4). log_scales: (g, 3) of metres, no low-pass. opacity_logits: (g,). color_logits: (g, 3).
     rotations: (v, j, 3) and translations: (v, 3), what is added to the pose of each photo.
     """
 
@@ -48,7 +48,7 @@ def parameters_of(gaussians: Gaussians, views: int, joints: int) -> Parameters:
     return Parameters(
         gaussians.means,
         gaussians.quats,
-        jnp.log(jnp.maximum(gaussians.scales, SMALLEST_SCALE)),
+        jnp.log(jnp.maximum(widened(gaussians.scales, gaussians.low_pass, -1), SMALLEST_SCALE)),
         inverse_sigmoid(gaussians.opacities, OPACITY_MARGIN),
         inverse_sigmoid(gaussians.colors, COLOR_MARGIN),
         jnp.zeros((views, joints, 3)),
@@ -56,14 +56,15 @@ def parameters_of(gaussians: Gaussians, views: int, joints: int) -> Parameters:
     )
 
 
-def gaussians_of(parameters: Parameters) -> Gaussians:
-    """The Gaussians that the parameters stand for."""
+def gaussians_of(parameters: Parameters, low_pass: Float[Array, " g"] | None) -> Gaussians:
+    """The Gaussians that the parameters stand for, with a low-pass on top of their scales."""
     return Gaussians(
         parameters.means,
         parameters.quats,
-        jnp.exp(parameters.log_scales),
+        widened(jnp.exp(parameters.log_scales), low_pass),
         jax.nn.sigmoid(parameters.opacity_logits),
         jax.nn.sigmoid(parameters.color_logits),
+        low_pass=low_pass,
     )
 
 

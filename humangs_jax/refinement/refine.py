@@ -11,7 +11,7 @@ import functools
 import inspect
 import time
 from collections.abc import Callable, Generator, Iterator
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -20,15 +20,13 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
-from humangs_jax.avatar.low_pass import with_low_pass, without_low_pass
+from humangs_jax.avatar.low_pass import with_low_pass, with_low_pass_of, without_low_pass
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.core.progress import bar as progress_bar
-from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews
-from humangs_jax.geometry.camera import project
 from humangs_jax.objectives.metrics import decibels
 from humangs_jax.refinement.config import SPLITS, RefineConfig
 from humangs_jax.refinement.crops import crop_to_person, held_out_blocks
@@ -52,6 +50,7 @@ from humangs_jax.refinement.objective import (
     Image,
     Photos,
     PullBack,
+    avatar_of,
     compare_photos,
     compared,
     comparison_of,
@@ -60,7 +59,7 @@ from humangs_jax.refinement.objective import (
     photos_gradient,
     photos_of,
 )
-from humangs_jax.refinement.parameters import Parameters, RefineState, gaussians_of, init_state, parameters_of, update
+from humangs_jax.refinement.parameters import Parameters, RefineState, init_state, parameters_of, update
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.splatting import Rendering, plan_buffers
 
@@ -143,17 +142,10 @@ def refine_with_report(
     config = config or RefineConfig()
     _check(avatar, capture, config, mesh)
     views = crop_to_person(capture, config.image_size)
-    pixel = pixel_size(avatar, views)
-    start = without_low_pass(avatar, pixel)
-    report = _Run(start, views, config, mesh, _planned(start, views), without_low_pass(avatar)).go(progress, watch)
-    return dataclasses.replace(report, avatar=with_low_pass(report.avatar, pixel) if report.kept else avatar)
-
-
-def pixel_size(avatar: Avatar, views: SubjectViews) -> Float[Array, ""]:
-    """Metres that a pixel of the photos shows at the person's pelvis, mean over the photos."""
-    places = views.translations + avatar.rest_joints[0]
-    depths = jax.vmap(lambda camera, place: project(camera, place)[1])(views.cameras, places)
-    return jnp.mean(depths / views.cameras.K[:, 0, 0])
+    start = with_low_pass_of(avatar, views)
+    fresh = with_low_pass(without_low_pass(avatar), cast(Array, start.gaussians.low_pass))
+    report = _Run(start, views, config, mesh, _planned(start, views), fresh).go(progress, watch)
+    return report if report.kept else dataclasses.replace(report, avatar=avatar)
 
 
 def refine_views(
@@ -165,7 +157,7 @@ def refine_views(
     `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs that did not fit. Batch over people whose arrays have
     the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
     """
-    photos = photos_of(views, jnp.ones(views.masks.shape, bool))
+    avatar, photos = with_low_pass_of(avatar, views), photos_of(views, jnp.ones(views.masks.shape, bool))
     state = start(avatar, photos, config, splat)
 
     def one(carry, i):
@@ -175,7 +167,7 @@ def refine_views(
         return (state, overflow + missing), None
 
     (state, overflow), _ = jax.lax.scan(one, (state, jnp.zeros((), jnp.int32)), jnp.arange(steps))
-    return replace(avatar, gaussians=gaussians_of(state.parameters)), overflow
+    return avatar_of(state.parameters, avatar), overflow
 
 
 def start(avatar: Avatar, photos: Photos, config: RefineConfig, splat: SplatConfig) -> RefineState:
@@ -200,7 +192,7 @@ def refine_step(
 class _Run:
     """What one call of `refine` works with.
 
-    avatar: that is refined. fresh: the same as the network made it, with the scales that the rounds were trained with.
+    avatar: that is refined. fresh: the same with the scales that the rounds were trained with, those without any low-pass.
     """
 
     def __init__(
@@ -256,7 +248,7 @@ class _Run:
                     state, rounds = self.state(parameters, found), config.rounds
                     best, highest = (state, self.avatar), self.held_psnr(state)
                 if watch is not None:
-                    watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
+                    watch(avatar_of(state.parameters, self.avatar))
             checked, splits = 0, list(SPLITS) if config.growth > 1 else []
             now = first = elapsed()
             passed = self.passed(0, now)
@@ -273,7 +265,7 @@ class _Run:
                     if psnr > highest or not self.any_held:
                         best, highest = (state, self.avatar), psnr
                     if watch is not None:
-                        watch(replace(self.avatar, gaussians=gaussians_of(state.parameters)))
+                        watch(avatar_of(state.parameters, self.avatar))
                 bar.update(int(100 * passed) - bar.n)
             bar.update(100 - bar.n)
         except KeyboardInterrupt:
@@ -285,7 +277,7 @@ class _Run:
         kept = float(after.loss) < float(before.loss)
         refined = self.original
         if kept:
-            refined = replace(self.avatar, gaussians=gaussians_of(state.parameters))
+            refined = avatar_of(state.parameters, self.avatar)
             refined = refined if config.growth == 1 else without_clear(refined, self.splat.alpha_min)
         if self.mesh is not None:  # back from all devices to the default one
             refined = jax.tree.map(jnp.asarray, jax.device_get(refined))
@@ -361,7 +353,7 @@ class _Run:
     def enlarge_buffers(self, parameters: Parameters) -> None:
         """Room for the Gaussians as they are now."""
         with self.compiling():
-            self.splat = _planned(replace(self.avatar, gaussians=gaussians_of(parameters)), self.all)
+            self.splat = _planned(avatar_of(parameters, self.avatar), self.all)
             image, pull_back, _ = self.drawn_once(parameters, _compiled(_chosen)(self.seen, 0))
             _compiled(_pulled)(pull_back, image)
             if self.mesh is not None:

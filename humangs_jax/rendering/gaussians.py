@@ -14,7 +14,10 @@ from humangs_jax.core.checks import FINITE, NOT_NEGATIVE, UNIT, Values
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.svd3 import left_singular_vectors
-from humangs_jax.rendering.constants import MIP_EPS2D
+from humangs_jax.rendering.constants import EPS2D, MIP_EPS2D
+
+THINNEST = 1e-5
+"""Metres, a thousandth of a pixel; where a low-pass is taken away, no scale gets smaller."""
 
 
 @pytree_dataclass
@@ -42,7 +45,7 @@ def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Value
 
     Colours may be any finite numbers: splatting is linear in them, and people draw normals and labels as colours.
     """
-    ranges = {"opacities": UNIT, "scales": NOT_NEGATIVE}
+    ranges = {"opacities": UNIT, "scales": NOT_NEGATIVE, "low_pass": NOT_NEGATIVE}
     names = (field.name for field in dataclasses.fields(gaussians))
     return {f"gaussians.{name}": (getattr(gaussians, name), ranges.get(name, FINITE)) for name in names}
 
@@ -50,6 +53,14 @@ def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Value
 def added_variance(gaussians: Gaussians, eps2d: float) -> float:
     """Pixels^2 that are added to the projected variances: `eps2d`, no more than `MIP_EPS2D` if the scales contain a low-pass."""
     return eps2d if gaussians.low_pass is None else min(eps2d, MIP_EPS2D)
+
+
+def widened(scales: Float[Array, "g 3"], low_pass: Float[Array, " g"] | None, sign: int = 1) -> Float[Array, "g 3"]:
+    """Scales with the low-pass of pixels of a size in metres, all but `MIP_EPS2D` of it. sign: -1 takes it away again."""
+    if low_pass is None:
+        return scales
+    added = sign * (EPS2D - MIP_EPS2D) * jnp.square(low_pass)
+    return jnp.sqrt(jnp.maximum(jnp.square(scales) + added[:, None], THINNEST**2))
 
 
 def covariance_factors(gaussians: Gaussians, normalize_quats: bool = True) -> Float[Array, "g 3 3"]:

@@ -33,7 +33,7 @@ from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.motion import Motion, load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
 from humangs_jax.network.weights import load_weights
-from humangs_jax.rendering.gaussians import covariances
+from humangs_jax.rendering.gaussians import Gaussians, covariances
 
 WEIGHTS = "weights.safetensors"
 """What a training run writes with every checkpoint."""
@@ -107,10 +107,9 @@ class LiveView:
         with self.lock:
             if self.avatar is None:
                 return
-            means, covariance = _posed(self.avatar, self._chosen_pose(self.avatar))
-            gaussians = self.avatar.gaussians
+            gaussians, covariance = _posed(self.avatar, self._chosen_pose(self.avatar))
             arrays = {
-                "centers": np.asarray(means) / UNIT,
+                "centers": np.asarray(gaussians.means) / UNIT,
                 "covariances": np.asarray(covariance) / UNIT**2,
                 "rgbs": np.clip(np.asarray(gaussians.colors), 0, 1),
                 "opacities": np.clip(np.asarray(gaussians.opacities), 0, 1)[:, None],
@@ -188,9 +187,9 @@ def show_newest(view: LiveView, path: Path, photos: Capture | None, shown: tuple
 
 
 @jax.jit
-def _posed(avatar: Avatar, pose: BodyPose) -> tuple[Float[Array, "g 3"], Float[Array, "g 3 3"]]:
+def _posed(avatar: Avatar, pose: BodyPose) -> tuple[Gaussians, Float[Array, "g 3 3"]]:
     gaussians = skin(avatar, pose)
-    return gaussians.means, covariances(gaussians)
+    return gaussians, covariances(gaussians)
 
 
 def _viser() -> Any:

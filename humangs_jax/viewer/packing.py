@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.light import light_values
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.core.checks import FINITE, check_values
@@ -69,7 +70,9 @@ def pack(
     Raises: ValueError, one line, for numbers that are not finite or out of range, a motion of other joints, or a body that
     does not explain the avatar's vertices.
     """
-    check_values("the page", gaussian_values(avatar.gaussians) | _other_values(avatar, motion))
+    check_values(
+        "the page", gaussian_values(avatar.gaussians) | light_values(avatar.light) | _other_values(avatar, motion)
+    )
     joints = len(avatar.parents)
     if joints > 256:
         raise ValueError(f"the page draws avatars of up to 256 joints, got {joints}")

@@ -1,3 +1,4 @@
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -52,7 +53,8 @@ def test_renderers_add_what_the_scales_do_not_contain(draw):
 
 def test_only_avatars_that_are_drawn_exactly_are_widened():
     avatar = replace(flat_avatar(), rendering="inria")
-    assert with_low_pass(avatar, PIXEL) is avatar and without_low_pass(avatar) is avatar
+    assert with_low_pass(avatar, PIXEL) is avatar
+    jax.tree.map(np.testing.assert_array_equal, without_low_pass(avatar), avatar)
     wide = with_low_pass(flat_avatar(), PIXEL)
     assert with_low_pass(wide, 2 * PIXEL) is wide
 

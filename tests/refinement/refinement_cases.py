@@ -30,11 +30,11 @@ def toy_avatar(body, shade):
     )
 
 
-def toy_capture(body, avatar, views=3, moving=False):
-    """Photos of an avatar, each in a pose of its own if `moving`."""
+def toy_capture(body, avatar, views=3, moving=False, distance=3.6):
+    """Photos of an avatar, each in a pose of its own if `moving`. distance: of each camera, metres."""
     cameras = orbit(
         jnp.asarray([0.0, 0.9, 0.0]),
-        3.6,
+        distance,
         jnp.arange(float(views)),
         0.1,
         intrinsics_from_fov(np.pi / 6, WIDTH, HEIGHT),

@@ -60,7 +60,7 @@ def test_halves_have_the_mean_and_the_variance_of_the_whole(person):
     avatar = replace(avatar, gaussians=replace(avatar.gaussians, scales=scales, quats=quats))
     errors = jnp.zeros(len(scales)).at[7].set(2.0).at[11].set(1.0)
     state, denser = split(state_of(avatar), avatar, errors, 4)
-    before, after = avatar.gaussians, gaussians_of(state.parameters)
+    before, after = avatar.gaussians, gaussians_of(state.parameters, None)
     used = np.flatnonzero(np.asarray(after.opacities[count:]) > CLEAR) + count
     assert len(used) == 2
     for whole in (7, 11):

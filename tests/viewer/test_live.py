@@ -6,14 +6,20 @@ import threading
 import urllib.request
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from viewer_cases import small_avatar
 
 from experiments.common import chromium
+from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import rest_pose_of
+from humangs_jax.avatar.light import Light
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.rendering.gaussians import covariances
 from humangs_jax.viewer import live
 
 needs_viser = pytest.mark.skipif(importlib.util.find_spec("viser") is None, reason="needs viser (extra viewer)")
@@ -121,10 +127,15 @@ def test_the_server_takes_a_free_port_and_refuses_a_taken_one(person):
         port = view.server.get_port()
         centres = np.asarray(view.splats.centers) * live.UNIT
         np.testing.assert_allclose(centres, person.gaussians.means, atol=1e-5)
-        from humangs_jax.rendering.gaussians import covariances
-
         ours = np.asarray(covariances(person.gaussians))
         np.testing.assert_allclose(np.asarray(view.splats.covariances) * live.UNIT**2, ours, rtol=1e-3, atol=1e-8)
+        lit = jax.tree.map(jnp.asarray, person)
+        light = Light(0.1 * jnp.arange(8.0), 2 * lit.gaussians.means, lit.gaussians.opacities)
+        lit = replace(lit, light=light)
+        view.show(lit)
+        expected = skin(lit, rest_pose_of(lit)).colors
+        assert jnp.abs(expected - person.gaussians.colors).max() > 0.1
+        np.testing.assert_allclose(view.splats.rgbs, 255 * jnp.clip(expected, 0, 1), atol=1)
         with pytest.raises(OSError, match=f"--port {port}: "):
             live.LiveView(port=port)
 
