@@ -151,8 +151,8 @@ def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectVie
 def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
     """The avatar with the light of its photos (`avatar.light`). Gradients do not pass through the light.
 
-    Without light if the people in the photos do not stand upright in a world whose y axis points up: other poses are of such
-    worlds, and their light comes from above.
+    The light is 0 where the person does not stand upright along y, as in a world with z up: motions and the T-pose belong to worlds
+    with y up, and would be lit from the side.
     """
     fixed, views = jax.lax.stop_gradient((avatar, views))
     vertices, gaussians = fixed.rest_vertices, fixed.gaussians
