@@ -151,8 +151,8 @@ def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectVie
 def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
     """The avatar with the light of its photos (`avatar.light`). Gradients do not pass through the light.
 
-    The light is 0 where the person does not stand upright along y, as in a world with z up: motions and the T-pose belong to worlds
-    with y up, and would be lit from the side.
+    The light is 0 where the person does not stand upright along y, as in a world with z up: motions and the T-pose belong to
+    worlds with y up, and would be lit from the side.
     """
     fixed, views = jax.lax.stop_gradient((avatar, views))
     vertices, gaussians = fixed.rest_vertices, fixed.gaussians
