@@ -20,8 +20,8 @@ from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import SubjectViews, gaussian_body, pad_views, prepare_inputs, standardize
-from humangs_jax.geometry import quaternion, transform
+from humangs_jax.data.views import SubjectViews, gaussian_body, pad_views, prepare_inputs, standardize, upright
+from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import camera_values
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, needed_tokens
@@ -32,8 +32,6 @@ from humangs_jax.rendering.buffers import round_up
 from humangs_jax.rendering.mesh.position_map import vertex_normals
 
 LEGS = tuple(tuple(f"{side}_{joint}" for joint in ("hip", "knee", "ankle", "foot")) for side in ("left", "right"))
-UPRIGHT = 0.5
-"""Cosine between the pelvis's own up and the y axis, mean over the photos, from which on the world is taken to be y-up."""
 SMALLEST_VOLUME = 0.2
 """Blended transforms of limbs that are turned against each other collapse; below this determinant they are not inverted."""
 
@@ -44,20 +42,23 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     The photos are brought to the network's image size (white, centred square), the body to the vertices that the weights
     want (`gaussian_body`), and the token capacity to what these photos need. Up to 8 views each number has a program of
     its own, beyond that at most a fifth of the views is padding. Of a network with a driver this is the avatar before any
-    correction of a frame, see `avatar.targets`.
+    correction of a frame, see `avatar.targets`. Worlds that are not y-up are turned for the network (`data.views.upright`); the
+    avatar then has no light, whose directions would be those of another world.
 
     Raises: ValueError if the network makes no Gaussians, the capture has no view, or values that are not finite or out of range,
     naming the array.
     """
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
-    views = standardize(capture, config.image_size, config.execution.crop)
-    bucket = round_up(capture.view_count, smallest=1)
+    photos = standardize(capture, config.image_size, config.execution.crop)
+    views, bucket = upright(photos, capture.body), round_up(capture.view_count, smallest=1)
+    turned = views is not photos
     if bucket > capture.view_count:
         views = pad_views(views, bucket)
     inputs = _prepare(body, views, config)
     _check_posed(inputs, "capture")
-    return _assemble_compiled(variables, fit_buffers(inputs, config), body, views, inputs)[0]
+    avatar, _ = _assemble_compiled(variables, fit_buffers(inputs, config), body, views, inputs)
+    return replace(avatar, light=None) if turned else avatar
 
 
 def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
@@ -80,16 +81,19 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
     body = gaussian_body(model, config)
     bucket = round_up(max(capture.view_count for capture in captures), smallest=1)
     coefficients = max(len(capture.betas) for capture in captures)
-    subjects = []
+    subjects, turned = [], []
     for capture in captures:
-        views = pad_views(standardize(capture, config.image_size, config.execution.crop), bucket)
+        photos = standardize(capture, config.image_size, config.execution.crop)
+        turned.append((views := upright(photos, model)) is not photos)
+        views = pad_views(views, bucket)
         betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
         subjects.append(replace(views, betas=betas))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
     inputs = _prepare_batch(body, batch, config)
     _check_posed(inputs, "captures")
     avatars, _ = _assemble_batch(variables, fit_buffers(inputs, config), body, batch, inputs)
-    return [jax.tree.map(lambda leaf, i=index: leaf[i], avatars) for index in range(len(captures))]
+    alone = [jax.tree.map(lambda leaf, i=index: leaf[i], avatars) for index in range(len(captures))]
+    return [replace(avatar, light=None) if moved else avatar for avatar, moved in zip(alone, turned, strict=True)]
 
 
 def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
@@ -149,11 +153,7 @@ def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectVie
 
 
 def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
-    """The avatar with the light of its photos (`avatar.light`). Gradients do not pass through the light.
-
-    The light is 0 where the person does not stand upright along y, as in a world with z up: motions and the T-pose belong to
-    worlds with y up, and would be lit from the side.
-    """
+    """The avatar with the light of its photos (`avatar.light`). Gradients do not pass through the light."""
     fixed, views = jax.lax.stop_gradient((avatar, views))
     vertices, gaussians = fixed.rest_vertices, fixed.gaussians
     per_vertex = len(gaussians.means) // len(vertices)
@@ -170,9 +170,6 @@ def with_light(avatar: Avatar, views: SubjectViews) -> Avatar:
     weights = pooled(gaussians.opacities)
     mean = lambda values: pooled(values * gaussians.opacities[:, None]) / jnp.maximum(weights, 1e-6)
     coefficients = light_coefficients(vertices, mean(gaussians.colors), weights[:, 0], mean(terms))
-    pelvis = quaternion.matrix_from_axis_angle(views.rotations[:, 0])
-    upright = jnp.sum(share * pelvis[:, 1, 1]) > UPRIGHT
-    coefficients = jnp.where(upright, coefficients, 0.0)
     return replace(avatar, light=Light(coefficients, normals, log_brightness(terms, coefficients)))
 
 

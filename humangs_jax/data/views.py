@@ -13,6 +13,7 @@ from humangs_jax.body.subdivision import split_long_edges
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.motion.world import turned_upright, up_axis, upright_matrix
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum
 from humangs_jax.io.images import resized
@@ -205,6 +206,24 @@ def _window(image, left, top, side, fill):
     rows, columns = slice(max(top, 0), min(top + side, height)), slice(max(left, 0), min(left + side, width))
     window[rows.start - top : rows.stop - top, columns.start - left : columns.stop - left] = image[rows, columns]
     return window
+
+
+def upright(views: SubjectViews, body: BodyModel) -> SubjectViews:
+    """The views in a world whose y axis points up, as far as the pelvis tells; the same object if theirs does.
+
+    Captures are to have y up. One with z up is as consistent, but the network has seen no such world. On the host.
+    """
+    rotations, translations = np.asarray(views.rotations), np.asarray(views.translations)
+    up = up_axis(rotations[:, 0], "y")
+    if up == "y":
+        return views
+    pelvis, turn = np.asarray(shape_body(body, views.betas).joints[0]), upright_matrix(up)
+    rotations, translations = turned_upright(rotations, translations, up, pelvis)
+    back = np.eye(4)
+    back[:3, :3] = turn.T
+    cameras = replace(views.cameras, cam_from_world=jnp.asarray(views.cameras.cam_from_world @ back, jnp.float32))
+    moved = {"rotations": rotations, "translations": translations}
+    return replace(views, cameras=cameras, **{name: jnp.asarray(x, jnp.float32) for name, x in moved.items()})
 
 
 def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews:

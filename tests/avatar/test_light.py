@@ -89,12 +89,6 @@ def test_colours_have_the_mean_light_of_photos_in_several_poses(person):
     np.testing.assert_allclose(found.shading, sum(terms) / 2 @ found.coefficients, atol=ROUNDING)
 
 
-def test_worlds_that_are_not_y_up_have_no_light(person):
-    avatar, _ = person
-    turned = PHOTOS.at[0].set(jnp.asarray([1.5, 0.0, 0.0]))
-    assert not with_light(avatar, in_pose(turned)).light.coefficients.any()
-
-
 def test_bodies_of_one_brightness_have_no_light():
     avatar = two_balls(2)
     grey = replace(avatar, gaussians=replace(avatar.gaussians, colors=jnp.full_like(avatar.gaussians.colors, 0.4)))

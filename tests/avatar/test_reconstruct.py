@@ -16,10 +16,10 @@ from humangs_jax.avatar.reconstruct import (
 )
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyPose
+from humangs_jax.body.model import BodyPose, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays
-from humangs_jax.data.views import SubjectViews, cropped, gaussian_body, pad_views, prepare_inputs, standardize
+from humangs_jax.data.views import SubjectViews, cropped, gaussian_body, pad_views, prepare_inputs, standardize, upright
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import HumanGSOutputs
@@ -29,6 +29,7 @@ from humangs_jax.rendering.splatting import SplatConfig, render
 
 SIZE = 32
 VMAP_TOLERANCE = 2e-5  # batched matrix products round differently
+TURNED = 1e-6  # rounding of positions of some metres
 DEPTH_TOLERANCE = 2e-6  # another program rounds the some ten operations of a depth differently: 16 ulps
 
 
@@ -163,6 +164,27 @@ def test_photos_of_any_size_become_squares_with_cameras_that_follow(body):
     before, _ = project(photos.cameras[1], point)
     after, _ = project(views.cameras[1], point)
     np.testing.assert_allclose(after, (np.asarray(before) + np.asarray([6, 0])) * SIZE / 48, atol=1e-3)
+
+
+def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
+    photos, pelvis = capture(body, SIZE, SIZE), np.asarray(shape_body(body, jnp.zeros(2)).joints[0])
+    turn = np.asarray([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # y becomes z
+    rotations = np.asarray(photos.poses.rotations)
+    rotations = np.concatenate([rotations[:, :1] + [np.pi / 2, 0, 0], rotations[:, 1:]], axis=1)
+    shift = jnp.asarray([turn[:3, :3] @ pelvis - pelvis], jnp.float32)
+    poses = replace(photos.poses, rotations=jnp.asarray(rotations, jnp.float32), translation=shift)
+    cameras = replace(photos.cameras, cam_from_world=photos.cameras.cam_from_world @ jnp.asarray(turn.T, jnp.float32))
+    turned = dataclasses.replace(photos, cameras=cameras, poses=poses)
+    own, views = standardize(photos, SIZE), upright(standardize(turned, SIZE), body)
+    assert upright(own, body) is own
+    for got, expected in zip(jax.tree.leaves(views), jax.tree.leaves(own), strict=True):
+        np.testing.assert_allclose(got, expected, atol=TURNED)
+    avatars = [reconstruct(*network, x).gaussians for x in (photos, turned)]
+    lit, unlit = reconstruct_batch(network[0], network[1].with_conventions(light=True), [photos, turned])
+    assert lit.light is not None and unlit.light is None
+    for second, first in (avatars, (lit.gaussians, unlit.gaussians)):
+        for got, expected in zip(jax.tree.leaves(second), jax.tree.leaves(first), strict=True):
+            np.testing.assert_allclose(got, expected, atol=100 * TURNED)
 
 
 def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):

@@ -44,9 +44,12 @@ def up_axis(root: Float[np.ndarray, "m 3"], usual: str) -> str:
 
 
 def turned_upright(
-    rotations: Float[np.ndarray, "m j 3"], translations: Float[np.ndarray, "m 3"], up: str
+    rotations: Float[np.ndarray, "m j 3"],
+    translations: Float[np.ndarray, "m 3"],
+    up: str,
+    pelvis: Float[np.ndarray, "3"] = PELVIS,
 ) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]:
-    """Poses and positions in a world turned so that the axis `up` becomes +y."""
+    """Poses and positions in a world turned so that the axis `up` becomes +y. pelvis: the root joint in T-pose, metres."""
     if up == "y":
         return rotations, translations
     turn = upright_matrix(up)
@@ -57,4 +60,4 @@ def turned_upright(
     angle = 2 * np.arctan2(sine, root[:, :1])
     axis_angle = root[:, 1:] * np.where(sine > 0, angle / np.where(sine > 0, sine, 1), 2)
     rotations = np.concatenate([axis_angle[:, None], rotations[:, 1:]], axis=1)
-    return rotations, (translations + PELVIS) @ turn.T - PELVIS
+    return rotations, (translations + pelvis) @ turn.T - pelvis
