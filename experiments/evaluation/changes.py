@@ -1,6 +1,6 @@
 """Changes of a capture (other photos, masks, cameras, poses, bodies), and what `reconstruct` makes of it then.
 
-A `Change` takes a capture and gives another; `check_extremes.py` and `check_limits.py` have them by name.
+A `Change` takes a capture and gives another; `check_extremes.py` and `check_limits.py` list them by name.
 """
 
 import dataclasses

@@ -60,7 +60,7 @@ def compare(results: dict[str, Any]) -> dict[str, Any]:
 
 
 def seeds(result: dict[str, Any]) -> list[int]:
-    """Of its people."""
+    """Seeds of its people."""
     return [subject["seed"] for subject in result["subjects"]]
 
 

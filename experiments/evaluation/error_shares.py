@@ -4,9 +4,9 @@
         [--views 4] [--targets 6] [--json OUT] [--page docs/evaluation.md]
 
 PEOPLE is a folder of captures with masks, such as `humangs synth --poses 2 --views 12 --close-views 0` writes them. NAME=
-without a file stands for the shipped weights. Numbers are means over all views of all people: PSNR, also that which the
-predicted colours would have under the true coverage; shares of the squared error; fog, and what the true images have of it.
-About 20 s and 2 s a person on 2 CPU cores.
+without a file stands for the shipped weights. Numbers are means over all views of all people: PSNR; PSNR of the predicted
+colours under the true coverage; shares of the squared error; fog, also of the true images. About 20 s and 2 s a person on 2
+CPU cores.
 """
 
 import argparse

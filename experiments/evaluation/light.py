@@ -1,11 +1,11 @@
-"""What the light of the photos (`avatar.light`) is worth: avatars with it and without, and how far none of them can come.
+"""What the light of the photos (`avatar.light`) gains: avatars with it and without, and the limit of those without.
 
     python experiments/evaluation/light.py --subjects 16 --json OUT --page docs/evaluation.md
     python experiments/evaluation/light.py --subjects 8 --sheet docs/images/light.jpg
 
 "One pose": four photos of one pose. "Four poses": one photo of each of four poses. Two more poses are unseen. Avatars are those
-of the pass and of the four rounds of refinement. "True surface": the generator's own people, drawn with the light that each
-point has in the photos of one pose instead of its own: the best that an avatar with fixed colours can do.
+of the pass and of the four rounds of refinement. "True surface": the generator's own people, drawn in a new pose with the
+light that each point has in the photos of one pose. This is the best that an avatar with fixed colours can do.
 """
 
 import argparse

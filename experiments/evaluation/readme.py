@@ -65,7 +65,7 @@ def quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any
 
 
 def times(demo: dict[str, Any]) -> str:
-    """Of the demo's stages."""
+    """Times of the demo's stages."""
     spent, views = demo["timings"], demo["views"]
     stages = {
         f"reconstruct: {views['input']} photos of {demo['image_size'][0]} px -> {demo['gaussians']:,} Gaussians": "reconstruct",

@@ -4,11 +4,11 @@
     python experiments/training/benchmark.py --json OUT --only "small 256" --stages --variants
     python experiments/training/benchmark.py --json OUT --page docs/performance_training.md
 
-A synthetic person is made and read by the loader; weights are random, of loss networks, too: they cost what trained ones
-cost. Operations and bytes are counted from the compiled step, loops included (`common/compiled_costs.py`). The floor is the time
-that these operations take as plain products in the same turns. `--stages` compiles parts of a step by themselves and times
-them: gradients of a part include the part itself. `--variants` times the step with one thing changed at a time. Results are
-added to OUT, so cases can be run one by one; `--page` writes them into a page and runs nothing.
+A synthetic person is made and read by the loader; all weights are random, also those of loss networks: they cost what trained
+ones cost. Operations and bytes are counted from the compiled step, loops included (`common/compiled_costs.py`). The floor is
+the time that these operations take as plain products in the same turns. `--stages` compiles parts of a step by themselves and
+times them: gradients of a part include the part itself. `--variants` times the step with one thing changed at a time. Results
+are added to OUT, so cases can be run one by one; `--page` writes them into a page and runs nothing.
 
 Numbers: docs/performance_training.md.
 """

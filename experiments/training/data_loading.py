@@ -6,9 +6,9 @@ For every image size, on this machine: `synth` (people written to disk: subjects
 `read` (written people through the loader: every example decoded from disk, and kept in memory), and `on_the_fly` (people from a
 bank: building it, compiling, views per second). Then the time of one step of the small preset (measured at its own sizes unless
 --train-step-s gives it), which consumes the views of one example, and how long a step would wait. The loader works beside the
-step, so a step waits for the time of a batch beyond its own; on-the-fly people are rendered on the device of the step, so all of
-their time is added, unless the device has time to spare (CPUs of several cores). Where the step is measured, its waiting time
-with each source is measured too. CPU seconds count the work of all threads and depend little on other programs.
+step, so a step waits only if a batch takes longer than the step. On-the-fly people are rendered on the device of the step, so
+all of their time is added, unless the device has time to spare (CPUs of several cores). Where the step is measured, its
+waiting time with each source is measured too. CPU seconds count the work of all threads and depend little on other programs.
 
 About 4 minutes on 2 CPU cores to themselves, 2 of them with --train-step-s. Expected there, CPU ms a view at 256: written
 170, on the fly 32, read 9 from disk and 1 from memory; rendering an example on the fly takes a sixth of the CPU time of a step.

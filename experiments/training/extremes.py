@@ -2,10 +2,11 @@
 
     python experiments/training/extremes.py --json OUT --page docs/stability.md --image training_extremes.png [--quick]
 
-Short runs of the smallest network on three synthetic people, each as `humangs train` makes it, that differ in one thing. "loss":
-mean of the last five steps, over the scale of the loss. "PSNR": of the training targets, the same five steps. "gradient": the
-largest norm before clipping. "clipped", "skipped": steps by the guard of `training.optimizer`. "log": what the log reports beside
-numbers. All parameters, moments and batch statistics have to be finite at the end. Runs that are in OUT are not made again.
+Short runs of the smallest network on three synthetic people, each as `humangs train` makes it, with one thing changed.
+"loss": mean of the last five steps, over the scale of the loss. "PSNR": of the training targets, the same five steps.
+"gradient": the largest norm before clipping. "clipped", "skipped": steps by the guard of `training.optimizer`. "log": what
+the log reports beside numbers. All parameters, moments and batch statistics have to be finite at the end. Runs that are in
+OUT are not made again.
 --quick: 4 steps of three of the runs.
 """
 

@@ -74,7 +74,7 @@ def table(rows: list[dict]) -> str:
 
 
 def format_row(row: dict) -> list[str]:
-    """For the table."""
+    """Cells of a row of the table."""
     pair = lambda field, digits: [f"{row[kind][field]:.{digits}f}" for kind in ("forward", "gradient")]
     numbers = [*pair("gflop", 0), *pair("temporary_mib", 0), *pair("cpu_seconds", 2)]
     return [row["loss"], str(row["size"]), *numbers]

@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def training_variants(base):
-    """Name -> (configuration, settings of the on-the-fly people): of how the network is trained, from weights."""
+    """Name -> (configuration, settings of the on-the-fly people): changes of the training, starting from weights."""
     replace = dataclasses.replace
     model = base.model
     view = lambda **changes: replace(base, views=replace(base.views, **changes))
@@ -99,7 +99,7 @@ def fog_variants(base):
 
 
 def network_variants(base):
-    """Name -> (configuration, settings of the on-the-fly people): of the network, from nothing."""
+    """Name -> (configuration, settings of the on-the-fly people): changes of the network, from fresh weights."""
     replace, model = dataclasses.replace, base.model
     parts = model.architecture
     bare = model.with_parts(reader=replace(parts.reader, shells=()))

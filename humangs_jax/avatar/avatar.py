@@ -1,4 +1,4 @@
-"""The avatar: canonical Gaussians, their skinning weights and the body that they hang on, as one pytree and one file."""
+"""The avatar: canonical Gaussians, their skinning weights and the body that they belong to, as one pytree and one file."""
 
 import json
 import os

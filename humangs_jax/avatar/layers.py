@@ -46,8 +46,8 @@ COVERED = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class ExrLayers:
-    """What an EXR file of views has. Colours always are there. half: colours, normals and parts in 16 bits; Z and positions stay
-    in 32, since half floats are 2 mm apart at 4 m.
+    """The contents of an EXR file of views, besides colours. half: colours, normals and parts in 16 bits; Z and positions
+    stay in 32, since half floats are 2 mm apart at 4 m.
     """
 
     layers: tuple[str, ...] = ("rgba", "z")

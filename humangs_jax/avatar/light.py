@@ -1,10 +1,10 @@
-"""The light of the photos: colours contain it, and parts that turn in another pose are lit from where the photos were lit.
+"""The light of the photos. Colours contain it, so they are corrected (`relit`) for parts that turn in another pose.
 
 The log of the brightness is a polynomial of second order in the surface's unit normal, the same for all colours. A Lambertian
 surface in distant light has a brightness of that order (Ramamoorthi and Hanrahan 2001, https://doi.org/10.1145/383259.383317).
 
-Its coefficients come from the colours of the avatar. Vertices that are near each other mostly have the same albedo; where the
-surface turns between them and the brightness changes, that is light (Retinex: Land and McCann 1971,
+Its coefficients come from the colours of the avatar. Vertices that are near each other mostly have the same albedo. If their
+normals and their brightness differ, the light is the cause (Retinex: Land and McCann 1971,
 https://doi.org/10.1364/JOSA.61.000001). Prints and the edges of clothes are outliers.
 """
 

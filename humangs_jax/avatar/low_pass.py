@@ -39,9 +39,9 @@ def without_low_pass(avatar: Avatar) -> Avatar:
 
 
 def with_low_pass_of(avatar: Avatar, views: SubjectViews) -> Avatar:
-    """The avatar with the low-pass of photos that it is to be fitted to, where its own is not that of smaller pixels.
+    """The avatar with the low-pass of the photos that it will be fitted to, unless its own is that of smaller pixels.
 
-    It looks as before: what its own low-pass had more is a part of the scales now that a fit can take away.
+    It looks as before: the excess of its own low-pass is now an ordinary part of the scales, which a fit can reduce.
     """
     gaussians, sizes = avatar.gaussians, pixel_sizes(avatar, views)
     if gaussians.low_pass is None:
@@ -53,7 +53,7 @@ def with_low_pass_of(avatar: Avatar, views: SubjectViews) -> Avatar:
 def pixel_sizes(avatar: Avatar, views: SubjectViews) -> Float[Array, " g"]:
     """Metres that a pixel of the photos shows at each Gaussian, in the photo that shows it largest.
 
-    Where no photo has it in its frame: the largest of the others.
+    Gaussians outside of all frames get the largest value of the others.
     """
 
     def in_photo(photo):

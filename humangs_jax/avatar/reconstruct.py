@@ -41,7 +41,7 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
 
     The photos are brought to the network's image size (white, centred square), the body to the vertices that the weights
     want (`gaussian_body`), and the token capacity to what these photos need. Up to 8 views each number has a program of
-    its own, beyond that at most a fifth of the views is padding. Of a network with a driver this is the avatar before any
+    its own, beyond that at most a fifth of the views is padding. For a network with a driver this is the avatar before any
     correction of a frame, see `avatar.targets`. Worlds that are not y-up are turned for the network (`data.views.upright`); the
     avatar then has no light, whose directions would be those of another world.
 

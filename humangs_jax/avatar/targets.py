@@ -1,7 +1,7 @@
-"""What networks show that run again for every target: with a driver, or with a decoder that draws pixels.
+"""Images by networks that run again for every target: with a driver, or with a decoder that draws pixels.
 
-Training and evaluation make their images here. Avatars of files, exports and the viewer know nothing of it: there a person moves
-by skinning alone, and an avatar of a network with a driver is the one before any correction.
+Training and evaluation make their images here. Avatar files, exports and the viewer do not use this module: there a person
+moves by skinning alone, and the avatar of a network with a driver is the one before any correction.
 """
 
 import functools
@@ -68,7 +68,7 @@ def target_pixels(
 def show_targets(
     variables: Variables, config: HumanGSConfig, inputs: Capture, targets: Capture, background: float = 1.0
 ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
-    """Images of the views of `targets`, and their alpha: of the person of `inputs`, by the network that runs for each of them.
+    """Images and alpha of the person of `inputs` in the views of `targets`, by a network that runs for each of them.
 
     Raises: ValueError for another background than white with a network that draws pixels: it has no alpha.
     """

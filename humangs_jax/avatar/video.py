@@ -31,7 +31,7 @@ PALETTE_FRAMES = 16
 def check_video(
     path: str | Path, frames: int, width: int, height: int, transparent: bool = False, option: str = "--out"
 ) -> None:
-    """Whether such a video can be written; to be asked before its frames are drawn.
+    """Check that such a video can be written; call it before its frames are drawn.
 
     Raises: ValueError naming the option for a suffix that is no video (none is a folder of PNG files), transparency that the
     format does not have, or a GIF that would not fit into memory; OSError if there is something else of that name.

@@ -85,19 +85,19 @@ def paper_parts(architecture: Architecture) -> tuple[PatchTransformer, PixelAlig
 
 @dataclasses.dataclass(frozen=True)
 class Conventions:
-    """What the weights were trained with. No tensor's shape depends on it; with other values the answers are worse.
+    """What the weights were trained with. No tensor's shape depends on it; with other values the results are worse.
 
     image_size: side of the photos, pixels (the network takes any multiple of the patch size). tokens: patches that became
-    tokens. pixels: "person": where there are masks, only their pixels count. The body, where it covers the background, is then
-    seen by no photo, and Gaussians of vertices that all photos show off the person are dropped. position_map: its shading.
-    ray_origins: the release divides camera centres by s, and the ray origins taken from them once more, so that the moments of
-    its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex (paper) or over all (release).
-    pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn. skinning_reach: Gaussians
-    between the legs farther than this from their vertex, metres, move with both (`body.skinning.spread_weights`); None: all with
-    their vertex. light: other poses are drawn in the light of the photos (`avatar.light`). low_pass: what a pixel of the training
-    images shows of the person, normalised units (`subject_unit`), if their low-pass is to be part of the scales
-    (`avatar.low_pass`); None: it stays with the renderer. body_vertices, longest_edge: number of vertices to which bodies are
-    decimated, and metres to which their edges are split afterwards; None for neither.
+    tokens. pixels: "person": where there are masks, only their pixels count. No photo then sees the body where it covers the
+    background, and Gaussians of vertices that lie off the person in all photos are dropped. position_map: its shading.
+    ray_origins: the release divides camera centres by s, and the ray origins taken from them once more, so that the moments
+    of its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex (paper) or over all
+    (release). pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn. skinning_reach:
+    Gaussians between the legs farther than this from their vertex, metres, move with both (`body.skinning.spread_weights`);
+    None: all with their vertex. light: other poses are drawn in the light of the photos (`avatar.light`). low_pass: what a
+    pixel of the training images shows of the person, normalised units (`subject_unit`), if their low-pass is to be part of
+    the scales (`avatar.low_pass`); None: it stays with the renderer. body_vertices, longest_edge: number of vertices to which
+    bodies are decimated, and metres to which their edges are split afterwards; None for neither.
     """
 
     image_size: int = knob(

@@ -1,9 +1,9 @@
 """Corrections of canonical Gaussians for one driving frame, and the LCA-style driver: an MLP that gives them.
 
-LCA (Large-scale Codec Avatars, 2026, https://arxiv.org/abs/2604.02320) has no public code; of it we know: a transformer over
-image and anchor tokens, an MLP that gives canonical Gaussians, an MLP that corrects them for the driving signal, skinning.
-Our reading of the second MLP: it takes the features of a vertex, which the canonical MLP takes too, and the rotations of all
-joints but the root.
+LCA (Large-scale Codec Avatars, 2026, https://arxiv.org/abs/2604.02320) has no public code; what is known of it: a transformer
+over image and anchor tokens, an MLP that gives canonical Gaussians, an MLP that corrects them for the driving signal,
+skinning. Our reading of the second MLP: it takes the features of a vertex, which the canonical MLP takes too, and the
+rotations of all joints but the root.
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """A reader that is not pixel-aligned: vertices look at all tokens of all photos by attention.
 
-It is what the paper replaces by back-projection. The arithmetic grows with vertices times tokens; back-projection's grows with
-vertices times views. One layer of it is
+The paper replaces it by back-projection. Its arithmetic grows with vertices times tokens; back-projection's grows with
+vertices times views. One layer is
 
     x += attention(q = norm(x), k, v = tokens);  x += mlp(norm(x))
 

@@ -141,7 +141,7 @@ class Driver(Protocol):
     def apply(
         self, variables: Variables, outputs: HumanGSOutputs, pose: BodyPose, posed: Float[Array, "n 3"], run: Pass
     ) -> HumanGSOutputs:
-        """The outputs with Gaussians as they are, before skinning, in a pose; `posed`: the body's vertices in it, metres."""
+        """The outputs with the Gaussians of one pose, before skinning; `posed`: the body's vertices in that pose, metres."""
         ...
 
 

@@ -53,7 +53,7 @@ def sample_shells(
     present: Bool[Array, " v"],
     grid: PixelGrid,
 ) -> Shells:
-    """Look the points at `distances` from the posed vertices up in every view that is `present`.
+    """Sample every view that is `present` at the points at `distances` from the posed vertices.
 
     images: in [0, 1]. foreground: pixels of the person or the body. depth_maps: rasterized z of the body, -1 on background.
     cameras, vertices: normalised units. normals: unit, of the posed body. distances: ascending, normalised units.

@@ -11,9 +11,9 @@ is that of the target.
 Animatable Gaussians (Li et al. 2023, https://arxiv.org/abs/2311.16096) is fitted to ONE person: maps of the front and the
 back of the T-pose, 1024 x 1024 texels each, a Gaussian for every texel that shows the body; three StyleUNets turn a map of
 posed positions into colours, offsets (times 0.05) and the rest. L1 + 0.1 LPIPS + 0.005 of squared offsets, Adam 5e-4, 800,000
-steps of one person. It reads no photo: the person is in the weights, which belong to nobody else. Our reading: plain U-Nets
-on maps of one size, colours that do not depend on the view, no PCA of novel poses, positions relative to the middle and the
-root's rotation.
+steps of one person. It reads no photo: the weights contain the person, and fit nobody else. Our reading: plain U-Nets on maps
+of one size, colours that do not depend on the view, no PCA of novel poses, positions relative to the middle and the root's
+rotation.
 
 Both start from the same Gaussians, flat ones on the surface: with zero corrections the body itself. Texels that show nothing
 are transparent.

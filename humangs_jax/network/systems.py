@@ -3,7 +3,7 @@
     config = SYSTEMS["lhm"]("bench")
 
 "published" has the sizes of their papers where these are known, "bench" trains on two cores at 128 pixels: the same body,
-tokens, width and losses for all, so that what differs is the system. Sizes and sources: the modules of the parts. Each takes the
+tokens, width and losses for all, so that only the system differs. Sizes and sources: the modules of the parts. Each takes the
 data, the body and the loop of this package, and none of the pretrained networks that some of them have.
 """
 
@@ -91,7 +91,7 @@ def giga(size: Size = "published") -> HumanGSConfig:
 
 def animatable(size: Size = "published") -> HumanGSConfig:
     """Animatable-Gaussians-style (`surface_gaussians`): maps of front and back, fitted to ONE person: train it on that person's
-    photos alone, and anew for the next. Photos are no input: those that reconstruction or evaluation give are not looked at.
+    photos alone, and anew for the next. Photos that reconstruction or evaluation give are ignored.
     """
     driver = PoseMapDriver() if size == "published" else PoseMapDriver((16, 32, 64))
     surface = SurfaceMap("front_back", 1024 if size == "published" else 96)

@@ -108,7 +108,7 @@ class TwoStreams(nn.Module):
 
 
 class TwoStreamBlock(nn.Module):
-    """Points (n, d) and tokens (l, d) -> both, the tokens as they were after the `last` one, which nothing reads.
+    """Points (n, d) and tokens (l, d) -> both. The `last` block returns the tokens unchanged, as nothing reads them.
 
     The modulation starts as the identity, and gates at 0 (Peebles & Xie 2023, https://arxiv.org/abs/2212.09748).
     """

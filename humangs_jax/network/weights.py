@@ -1,4 +1,4 @@
-"""Weights on disk: one safetensors file, tensors under their path in the variables, what they are in its header.
+"""Weights on disk: one safetensors file, tensors under their path in the variables, their description in its header.
 
 Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format": "humangs-weights",
 "version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}; the first files have no checksum. Files of

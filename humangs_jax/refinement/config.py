@@ -51,8 +51,8 @@ class RefineConfig:
     growth: the number of Gaussians may grow by this factor: at `SPLITS` of the run those with the largest errors are split.
 
     held_out: share of the pixels, in square blocks, that no step sees; with `HELD_OUT_PHOTOS` photos or more, one whole photo
-    instead; 0: nothing. Of the states after the rounds and after steps, the one with the highest PSNR there is returned. Rounds
-    alone hold them out, too, so that a later run can go on from them. checks: how often it is measured.
+    instead; 0: nothing. The state with the highest PSNR on these pixels is returned. Rounds alone hold them out, too, so that
+    a later run can go on from the result. checks: how often this PSNR is measured.
     seed: of the order of the photos and of the blocks.
     """
 

@@ -1,4 +1,4 @@
-"""Adaptive density: Gaussians are split where the photos still differ from the rendering; those that nobody sees make room.
+"""Adaptive density: Gaussians are split where the photos still differ from the rendering; invisible ones give up their slots.
 
 Buffers keep their size. A slot that is not in use holds a Gaussian too clear to be drawn.
 """
@@ -42,7 +42,7 @@ def without_clear(avatar: Avatar, smallest: float) -> Avatar:
 def inner_errors(image: Image, photo: Photos) -> Image:
     """Absolute errors of the colours of one photo. Their pull-back to the brightness of each Gaussian is its share of them.
 
-    Pixels near the outline do not count: more Gaussians there fit the masks of the photos, and are fur in other views.
+    Pixels near the outline do not count: more Gaussians there fit the masks of the photos, and look like fur in other views.
     After Rota Bulo et al. 2024 (https://arxiv.org/abs/2404.06109).
     """
     inside = photo.counted & (eroded(photo.masks, round(OUTLINE * max(photo.masks.shape))) > 0.5)
@@ -56,9 +56,9 @@ def eroded(mask: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:
 
 
 def split(state: RefineState, avatar: Avatar, errors: Float[Array, " g"], count: int) -> tuple[RefineState, Avatar]:
-    """The `count` Gaussians with the largest errors, as far as there are clear ones whose slots they can have, in two.
+    """Split the `count` Gaussians with the largest errors in two, as far as clear ones leave slots for them.
 
-    The halves lie on the longest axis, with the same variance together. They inherit the rest, the moments of Adam too.
+    The halves lie on the longest axis, and together have the same variance. They inherit the rest, also the moments of Adam.
     """
     p = state.parameters
     opacities, scales = jax.nn.sigmoid(p.opacity_logits), jnp.exp(p.log_scales)

@@ -1,4 +1,4 @@
-"""Learned refinement: a small recurrent network sees the errors of the photos at every Gaussian and moves it, a few rounds.
+"""Learned refinement: in a few rounds a small recurrent network reads the photos' errors at every Gaussian and moves it.
 
 After ReSplat (https://arxiv.org/abs/2510.08575): the input views are drawn, their errors are gathered at the Gaussians, and a
 network that knows the neighbours adds to their parameters; one set of weights for all rounds, no gradient through the errors.
@@ -6,8 +6,8 @@ Ours: the errors arrive as the gradient of the squared error with respect to eac
 a frozen network, and the neighbours are those in the T-pose, at two levels: of Gaussians, and of clusters of them. Between two
 photos, the nearest outline that a photo shows can be 20 cm away. Messages between Gaussians reach 5 cm; clusters carry them on.
 
-Trained (`experiments/training/train_refiner.py`) on views that are not among the photos. What no photo shows moves with its
-neighbours, which gradient descent on the photos cannot do.
+Trained (`experiments/training/train_refiner.py`) on views that are not among the photos. Parts that no photo shows move with
+their neighbours. Gradient descent on the photos cannot do that.
 """
 
 import functools
@@ -65,7 +65,7 @@ class Signals:
 
 @pytree_dataclass
 class Neighbors:
-    """A symmetric graph. index: the neighbours of each point, itself where it has fewer. share: 1 / how many, 0 there."""
+    """A symmetric graph. index: the neighbours of each point, itself where it has fewer. share: 1 / their number, else 0."""
 
     index: Int[Array, "g k"]
     share: Float[Array, "g k"]
@@ -128,7 +128,7 @@ def neighbors_of(means: Float[np.ndarray, "g 3"], count: int = NEIGHBORS) -> Nei
 
 @jax.custom_vjp
 def neighbor_mean(values: Float[Array, "g c"], neighbors: Neighbors) -> Float[Array, "g c"]:
-    """Mean over the neighbours. Its gradient reads, too: the graph is symmetric, and a CPU scatters slowly."""
+    """Mean over the neighbours. Its gradient gathers, too, because the graph is symmetric: scattering is slow on a CPU."""
     return jnp.sum(values[neighbors.index] * neighbors.share[..., None], axis=1)
 
 
@@ -201,7 +201,7 @@ class Refiner(nn.Module):
         return values + moves * LARGEST_MOVES, features
 
     def from_clusters(self, features: Float[Array, "g w"], graph: Graph) -> Float[Array, "g w"]:
-        """What the clusters around each Gaussian say, after messages between clusters and a mean over all of them."""
+        """Features of the clusters around each Gaussian, after messages between clusters and a mean over all of them."""
         dense = lambda name: nn.Dense(self.width, name=f"cluster_{name}")
         norm = lambda name: nn.LayerNorm(name=f"cluster_{name}")
         clusters = dense("enter")(norm("norm")(jnp.mean(features[graph.members], axis=1)))
@@ -240,7 +240,7 @@ def unstacked(values: Float[Array, "g 14"], like: Parameters) -> Parameters:
 def photo_signals(
     parameters: Parameters, avatar: Avatar, photo: Photos, splat: SplatConfig
 ) -> tuple[Signals, Int[Array, ""]]:
-    """Of one photo (without the axis v), and the overflow. Errors: of the pixels that count. splat: with `visibility`."""
+    """Signals of one photo (without the axis v), from the pixels that count; and the overflow. splat: with `visibility`."""
     image, pull_back, rendering = drawn_photo(parameters, avatar, photo, splat, poses=False)
     gradient, _ = pull_back(squared_errors(image, photo))
     _, pixels = pull_back(colors_alone(image))
@@ -259,7 +259,7 @@ def colors_alone(image: Image) -> Image:
 
 
 def signals_from(gradient: Parameters, colors: Float[Array, " g"], rendering: Rendering, photo: Photos) -> Signals:
-    """From what `squared_errors` and `colors_alone` mean for the Gaussians."""
+    """Signals from `squared_errors` and `colors_alone`, both pulled back to the Gaussians."""
     assert rendering.visibility is not None
     scale = PERSON / jnp.maximum(jnp.sum(photo.masks), 1.0)
     # a change of all three colours of a Gaussian changes the sum of an image by three times its weights

@@ -89,7 +89,7 @@ def drawn_photo(
 
 
 def image_loss(image: Image, photo: Photos, config: RefineConfig) -> Scalar:
-    """Of one photo (without the axis v): L1 of colours, structural dissimilarity and L1 of coverage, means over the crop.
+    """Loss of one photo (without the axis v): L1 of colours, structural dissimilarity, L1 of coverage; means over the crop.
 
     A pixel that does not count takes the photo's value, so that it contributes nothing anywhere.
     """
@@ -104,7 +104,7 @@ def image_loss(image: Image, photo: Photos, config: RefineConfig) -> Scalar:
 
 @pytree_dataclass
 class Comparison:
-    """Of an avatar with photos. loss: mean over them. squared: mean squared error of the pixels that count.
+    """Comparison of an avatar with photos. loss: mean over them. squared: mean squared error of the pixels that count.
 
     visibility: (g,) the largest weight of each Gaussian on any pixel of the photos. overflow: what the buffers had no room for.
     """
@@ -118,7 +118,7 @@ class Comparison:
 def compare_photos(
     parameters: Parameters, avatar: Avatar, photos: Photos, config: RefineConfig, splat: SplatConfig
 ) -> Comparison:
-    """With the photos, one after the other."""
+    """Comparison with the photos, one after the other."""
     splat = dataclasses.replace(splat, visibility=True)
 
     def one(photo):
@@ -137,7 +137,7 @@ def compared(image: Image, rendering: Rendering, photo: Photos, config: RefineCo
 
 
 def comparison_of(each: Comparison, photos: Photos) -> Comparison:
-    """Of all photos, from that of each (leading axis v)."""
+    """Comparison with all photos, from that with each (leading axis v)."""
     return Comparison(
         jnp.mean(each.loss),
         safe_divide(jnp.sum(each.squared), jnp.sum(photos.counted, dtype=each.squared.dtype)),

@@ -192,7 +192,7 @@ def refine_step(
 class _Run:
     """What one call of `refine` works with.
 
-    avatar: that is refined. fresh: the same with the scales that the rounds were trained with, those without any low-pass.
+    avatar: the one that is refined. fresh: the same with the scales that the rounds were trained with, without any low-pass.
     """
 
     def __init__(
@@ -295,7 +295,7 @@ class _Run:
         )
 
     def compile(self, state: RefineState) -> None:
-        """Run once what a run consists of."""
+        """Run each part of a run once, so that it is compiled."""
         if self.config.steps != 0:
             self.step(state, 0.0)
         if self.config.rounds:
@@ -310,7 +310,7 @@ class _Run:
         return _compiled(update)(state, find(state.parameters, chosen), passed, self.compiled_for, share)
 
     def gradient(self, parameters: Parameters, chosen: np.ndarray) -> Parameters:
-        """Of the mean loss over some photos."""
+        """Gradient of the mean loss over some photos."""
         each = []
         for i in chosen:
             photo = _compiled(_chosen)(self.seen, i)
@@ -319,7 +319,7 @@ class _Run:
         return each[0] if len(each) == 1 else jax.tree.map(lambda *x: sum(x) / len(x), *each)
 
     def shared_gradient(self, parameters: Parameters, chosen: np.ndarray) -> Parameters:
-        """The same, each device some of the photos."""
+        """The same, with the photos divided among the devices."""
         gradient, overflow = self.drawn_by_all(parameters, chosen)
         if int(overflow):
             self.enlarge_buffers(parameters)
@@ -361,7 +361,7 @@ class _Run:
 
     @contextlib.contextmanager
     def compiling(self) -> Generator[None]:
-        """The time within counts as compilation, and not as refinement. May be nested."""
+        """Time spent within counts as compilation, not as refinement. May be nested."""
         before, began = self.compile_seconds, time.perf_counter()
         try:
             yield
@@ -370,7 +370,7 @@ class _Run:
 
     @functools.cached_property
     def graph(self) -> Graph:
-        """Of the avatar's own Gaussians."""
+        """The graph of the avatar's own Gaussians."""
         return graph_of(np.asarray(self.original.gaussians.means))
 
     def learned(self, parameters: Parameters, rounds: int) -> Parameters:
@@ -391,7 +391,7 @@ class _Run:
         return parameters
 
     def signals(self, parameters: Parameters, view: int) -> Signals:
-        """What one photo says."""
+        """Signals of one photo."""
         photo = _compiled(_chosen)(self.seen, view)
         image, pull_back, rendering = self.drawn(parameters, photo)
         gradient, _ = _compiled(_pulled)(pull_back, _compiled(squared_errors)(image, photo))
@@ -409,11 +409,11 @@ class _Run:
         return _compiled(split)(state, self.avatar, errors, count)
 
     def state(self, parameters: Parameters, found: Comparison) -> RefineState:
-        """That Adam's steps start from, and are drawn back to."""
+        """The state that Adam's steps start from, and are drawn back to."""
         return _compiled(init_state)(parameters, found.visibility, self.compiled_for)
 
     def compared(self, parameters: Parameters, photos: Photos) -> Comparison:
-        """With the photos."""
+        """Comparison with the photos."""
         each = []
         for i in range(len(photos.images)):
             photo = _compiled(_chosen)(photos, i)
@@ -428,7 +428,8 @@ class _Run:
     def share(self, done: int, seconds: float, first: float) -> float:
         """Factor on the rates: `full_steps` over the number of steps that the run is expected to have, at most 1.
 
-        Before the first step of a run that only a clock ends: 0. seconds: that the `done` steps took. first: before them.
+        It is 0 before the first step of a run that only `seconds` limits. seconds: taken by the `done` steps. first: taken
+        before them.
         """
         ends: list[float] = [] if self.config.steps is None else [self.config.steps]
         if self.config.seconds is not None and done:

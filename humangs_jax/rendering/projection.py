@@ -165,9 +165,9 @@ def _conic_factor(m0, m1, eps2d):
 
         (r M)_0j = r00 / yy (sum_i m1_i (m_j x m_i) + eps2d m0_j),     (r M)_1j = r11 m1_j
 
-    what would cancel, m_j x m_j, is not there. Autodiff sums two terms that cancel, through yy and through the
-    determinant; that is ten times less accurate, and once the determinant passes 2e19 pixels^4 (7e4 pixels square: the
-    square of the determinant overflows) one of them is lost and the gradient along the long axis is as large as across.
+    the term that would cancel, m_j x m_j, is left out. Autodiff sums two terms that cancel, through yy and through the
+    determinant; that is ten times less accurate, and once the determinant passes 2e19 pixels^4 (7e4 pixels square: the square
+    of the determinant overflows) one of them is lost and the gradient along the long axis is as large as across.
     """
     _, xy, yy, determinant = _covariance(m0, m1, eps2d)
     regular = determinant > 0

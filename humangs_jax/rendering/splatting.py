@@ -73,8 +73,8 @@ def render_views(
     """Draws every camera of a batch (leading axis v), `batch_size` views at a time: working memory does not
     grow with v (what a gradient keeps of each view does).
 
-    `jax.vmap` of `render` draws all views at once (their tiles become one list of tiles) and holds the buffers of all: on
-    CPUs as fast, with gradients of many views slower. Arguments and errors: as `render`.
+    `jax.vmap` of `render` draws all views at once (their tiles become one list of tiles) and holds the buffers of all. On
+    CPUs it is as fast, but slower with gradients of many views. Arguments and errors: as `render`.
 
     Returns a Rendering with a leading axis v. Raises: also ValueError for a single camera or several batch axes.
     """

@@ -1,9 +1,8 @@
 """Checkpoints of a run: the newest few and the best, each complete or not there, bit for bit what was saved.
 
-Each records a checksum of its arrays. A damaged one is never continued from: the newest good one is, and it is said.
+Each records a checksum of its arrays. A damaged one is never used: the run continues from the newest good one and reports it.
 
-They are written while the run goes on, by all processes together, each what its devices hold; a run on other devices reads
-them as well.
+They are written while the run goes on. Each process writes what its devices hold. A run on other devices can read them.
 
 out/config.json          the configuration of the run
 out/checkpoints/STEP             Orbax checkpoints of the TrainState, with the score of their validation
@@ -91,9 +90,7 @@ class Checkpoints:
         step = int(state.step)
         if step in self._manager.all_steps():
             return
-        if (
-            jax.default_backend() == "cpu"
-        ):  # where what is written would be the very memory that the next step overwrites
+        if jax.default_backend() == "cpu":  # where the next step would overwrite the memory that is being written
             state = jax.tree.map(jnp.copy, state)
         metrics = {"score": UNSCORED if score is None else float(score), CHECKSUM: _checksum(state)}
         with self._writing():
@@ -218,9 +215,9 @@ def _without_score(folder: Path) -> list[Path]:
 
 
 def _not_being_deleted(folder: Path, unreadable: list[Path], keep: int) -> list[Path]:
-    """Those that were not being deleted when the run was killed: of which fewer than `keep` newer ones are there.
+    """Those that were not being deleted when the run was killed: fewer than `keep` newer ones exist.
 
-    The others are deleted: no checkpoint without a score is the best one.
+    The others are deleted; without a score none of them is the best one.
     """
     steps = [int(path.name) for path in folder.glob("[0-9]*") if path.name.isdecimal() and path not in unreadable]
     deleted = [path for path in unreadable if sum(step > int(path.name) for step in steps) >= keep]
@@ -296,5 +293,5 @@ def _flat(tree, prefix=""):
 
 
 def _not_of_orbax(record: logging.LogRecord) -> bool:
-    """A filter of absl's logger: Orbax tells every step there, and prints errors in full that it also raises."""
+    """A filter of absl's logger: Orbax logs every step there, and prints in full the errors that it also raises."""
     return "orbax" not in Path(record.pathname).parts

@@ -27,10 +27,10 @@ class LossConfig:
     features of VGG-19, lpips: learned distance of features; both need networks that the user has, see
     `objectives.loss_networks`.
 
-    Against fog, which is what squared errors make of doubt: absolute, outline: absolute errors of colours and of coverage.
-    depth: distance between the surfaces seen, metres; needs on-the-fly people. distortion: spread of the weights along the
-    rays. opaque: 4 o (1 - o) of the opacities o. shells: spread of the distances that a Gaussian mixes, normalised units.
-    Perceptual terms and those against fog are computed only where their weight is not 0.
+    Against fog, which squared errors cause where the network is in doubt: absolute, outline: absolute errors of colours and
+    of coverage. depth: distance between the surfaces seen, metres; needs on-the-fly people. distortion: spread of the weights
+    along the rays. opaque: 4 o (1 - o) of the opacities o. shells: spread of the distances that a Gaussian mixes, normalised
+    units. Perceptual terms and those against fog are computed only where their weight is not 0.
     random_background: share of the targets that are seen against one random colour instead of white, so that
     white Gaussians differ from missing ones.
     """

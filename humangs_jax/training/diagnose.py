@@ -100,9 +100,9 @@ def parameter_stage(name: str) -> str:
 def diagnose_step(
     state: TrainState, batch: Example, body: BodyModel, config: TrainConfig, networks: LossNetworks = NO_NETWORKS
 ) -> Diagnosis:
-    """Look at the step that `train_step` would make of these arguments (and which the state survives).
+    """Diagnose the step that `train_step` would make of these arguments; the state is not given away.
 
-    Subject by subject: where a microbatch shares its batch statistics, theirs are their own here.
+    It works subject by subject: each has its own batch statistics, even where a microbatch would share them.
     """
     config = config.at(int(state.step))
     parts = {

@@ -1,4 +1,4 @@
-"""What is wrong with real captures, added to the inputs of training: exposure, masks, cameras, poses and shape.
+"""Errors of real captures, added to the inputs of training: exposure, masks, cameras, poses and shape.
 
 The targets stay true. The network learns to place Gaussians well although its photos and bodies are a little off, as
 `humangs fit` leaves them.

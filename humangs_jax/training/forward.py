@@ -47,7 +47,7 @@ def reconstruct_example(
 def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
     """The network with the token capacity of a step with that number of photos.
 
-    The configured capacity is for the largest of `views.input_counts`. Fewer photos get their share and a view's share more,
+    The configured capacity is for the largest of `views.input_counts`. Fewer photos get their share plus that of one view,
     because one photo may show more of a person than the others.
     """
     most, capacity = max(config.views.input_counts), config.model.execution.token_capacity
@@ -78,9 +78,9 @@ def draw_targets(
     stage: StageCaller = call,
     variables: Variables | None = None,
 ) -> DrawnTargets:
-    """The Gaussians in the pose and before the camera of every target. inputs: the photos that they are from. variables: of a
-    network that runs again for every target (a driver, or a decoder that draws pixels, on white whatever the backgrounds);
-    others need none.
+    """The Gaussians drawn in the pose and from the camera of every target. inputs: the photos that they come from. variables:
+    of a network that runs again for every target (a driver, or a decoder that draws pixels, on white whatever the
+    backgrounds); others need none.
     """
     poses = (targets.rotations, targets.translations)
     if variables is None:

@@ -31,7 +31,7 @@ MANY_SKIPPED = 20
 
 
 class RunLog:
-    """The records of a run that continues after `step`: what was recorded of later steps by a run that was killed goes.
+    """The records of a run that continues after `step`: records of later steps, from a run that was killed, are dropped.
 
     recording: False in all processes but one; then nothing is written or shown.
     """

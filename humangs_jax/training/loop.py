@@ -112,7 +112,7 @@ def _train(config, body, training, out, leading, validation, variables, networks
             examples = [] if unseen is None else validation_examples(unseen, part, VALIDATED)
             batches = loader.batches(first, last, waiting=waiting)
             for step, batch in batches:
-                if step == first and mesh is None:  # for nothing: once, and the arrays are at hand
+                if step == first and mesh is None:  # costs nothing: once, and the arrays are in memory
                     for line in bad_samples(loader, step, batch):
                         log.event(step, "sample", line, samples=[line])
                 with stage("compiling the step") if step == first else contextlib.nullcontext():

@@ -1,4 +1,4 @@
-"""How a run lies on many devices: batches are divided among all of them, the state among those along one axis of the mesh.
+"""How a run is divided among many devices: batches among all of them, the state among those along one axis of the mesh.
 
 Data parallelism over both axes of the mesh ("data", "fsdp"); parameters, moments and averages are divided along "fsdp" and
 equal along "data". A step gathers the parameters once, works on its subjects, and sends every device the sum of its own

@@ -1,4 +1,4 @@
-"""What a run carries from step to step, all of it; randomness is folded from the seed and the step instead."""
+"""All that a run carries from step to step. Random numbers are not in it: they follow from the seed and the step."""
 
 import jax
 import jax.numpy as jnp
