@@ -25,7 +25,7 @@ from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import camera_values
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, needed_tokens
-from humangs_jax.network.inputs import HumanGSInputs, subject_unit
+from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.vertex_decoder import corrected_skinning_weights
 from humangs_jax.rendering.buffers import round_up
@@ -148,7 +148,7 @@ def completed_avatar(outputs: HumanGSOutputs, body: BodyModel, views: SubjectVie
     if conventions.light and outputs.skinning_weights is None:
         avatar = with_light(avatar, views)
     if conventions.low_pass is not None:
-        avatar = with_low_pass(avatar, conventions.low_pass * subject_unit(avatar.rest_vertices))
+        avatar = with_low_pass(avatar, conventions.low_pass)
     return avatar
 
 
