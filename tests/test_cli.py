@@ -126,6 +126,13 @@ def test_wrong_options_are_one_line_too(folder, tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_refinement_without_masks_is_refused_before_the_work(folder, tmp_path, monkeypatch, capsys):
+    photos = dataclasses.replace(load_capture(folder), masks=None)
+    save_capture(tmp_path / "bare", photos)
+    code, _, error = run(monkeypatch, capsys, "reconstruct", tmp_path / "bare", "--no-check", "--refine", "15s")
+    assert code == cli.BAD_DATA and error.count("\n") == 1 and "--refine 15s: needs masks" in error
+
+
 @pytest.mark.slow
 def test_from_photos_to_images(folder, tmp_path, monkeypatch, capsys):
     """reconstruct, render, animate, export and check, one after the other, as a user would."""
@@ -667,10 +674,12 @@ BAD_INPUT = [
     *((("demo", "--size", size), f"--size {size}: expected 16 to 8192") for size in ("-5", "0", HUGE)),
     *((("synth", "--size", size), f"--size {size}: expected 128, 256 or 512") for size in ("-5", "0", "100", HUGE)),
     (("refine", "me.npz", "me", "--image-size", "0"), "--image-size 0: expected 16 to 8192"),
-    (("refine", "me.npz", "me", "--growth", "nan"), "--growth nan: expected 1 to 100"),
+    (("refine", "me.npz", "me", "--growth", "nan"), "--growth nan: expected 1 to 16"),
     (("animate", "me.npz", "--azimuth", "nan"), "--azimuth nan: expected a number from"),
     (("demo", "--refine", "inf"), "--refine inf: expected at least 0"),
     (("synth", "--workers", "0"), "--workers 0: expected at least 1"),
+    (("synth", "--for-training", "--views", "7"), "--views 7: does not go with --for-training, which means 12"),
+    (("start", "me", "--out", "new", "--masks", "m", "--without-masks"), "--masks m: does not go with --without-masks"),
     (("train", "--on-the-fly", "-1"), "--on-the-fly -1: expected at least 0"),
     (("train", "--on-the-fly", "1", "--steps", "0"), "--steps 0: expected at least 1"),
     (("train",), "nobody to train on"),

@@ -176,5 +176,8 @@ def _has_cameras(place):
 
 
 def _has_alpha(photo):
+    """Whether a photo has transparent pixels; an opaque alpha channel is no mask."""
     with open_image(photo) as (image, _):
-        return "A" in image.getbands() or "transparency" in image.info
+        if "A" not in image.getbands() and "transparency" not in image.info:
+            return False
+        return image.convert("RGBA").getchannel("A").getextrema()[0] < 255

@@ -124,6 +124,11 @@ def load_front() -> list[FrontPoint]:
     return sorted(points, key=lambda point: point.make + point.refine)
 
 
+def usable(front: Sequence[FrontPoint], capture: Capture) -> list[FrontPoint]:
+    """The points that a capture can be made with: refinement needs masks."""
+    return [point for point in front if capture.masks is not None or point.settings.refinement is None]
+
+
 def predict(point: FrontPoint, front: Sequence[FrontPoint], measured: Mapping[str, Cost]) -> Cost:
     """The cost of a point that was not measured: for each part, that of the measured point nearest to it, times their ratio.
 
@@ -178,9 +183,7 @@ def tune(
     Raises: NoSettingError if none is, saying what the cheapest takes; ValueError if memory is limited where it cannot be
     measured.
     """
-    front = load_front() if front is None else front
-    if capture.masks is None:  # which refinement needs
-        front = [point for point in front if point.settings.refinement is None]
+    front = usable(load_front() if front is None else front, capture)
     measured: dict[str, Cost] = {}
     confirmed = set()
     with bar(total=len(front), desc="tune", unit="setting", shown=progress) as shown:

@@ -11,6 +11,7 @@ import numpy as np
 from humangs_jax.avatar.light import TERMS, Light
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import ROUNDING
+from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.io.arrays import check_array, check_checksum, check_indices, check_joints, checksum
 from humangs_jax.io.npz import read_npz, write_npz
@@ -31,6 +32,8 @@ _ARRAYS = (
     "rest_joints",
     "faces",
 )
+ALIKE = 1e-3
+"""Skinning weights that differ by less are those of one vertex."""
 _LIGHT = ("coefficients", "normals", "shading")
 
 
@@ -55,6 +58,17 @@ class Avatar:
     rendering: Literal["exact", "inria"] = static_field(default="exact")
     light: Light | None = None
 
+    @property
+    def gaussians_per_vertex(self) -> int | None:
+        """k, or None where refinement has added Gaussians, which do not stand with those of a vertex."""
+        weights, vertices = np.asarray(self.skinning_weights), len(self.rest_vertices)
+        if len(weights) % vertices:
+            return None
+        own = weights.reshape(vertices, -1, weights.shape[1])
+        # those between the legs may have weights of their own (`skinning.spread_weights`): most of a vertex's agree
+        alike = np.isclose(own, own[:, :1], atol=ALIKE).all(axis=(1, 2))
+        return own.shape[1] if alike.mean() > 0.5 else None
+
     def select(self, index: Array | np.ndarray) -> "Avatar":
         """The avatar with these of its Gaussians."""
         light = self.light
@@ -64,7 +78,12 @@ class Avatar:
         return replace(self, gaussians=gaussians, skinning_weights=self.skinning_weights[index], light=light)
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write one compressed `.npz` (no pickle); it appears whole or not at all."""
+        """Write one compressed `.npz` (no pickle); it appears whole or not at all.
+
+        Raises: ValueError if the Gaussians are deformed, as those of a pose are: avatars are in the T-pose.
+        """
+        if self.gaussians.deformations is not None:
+            raise ValueError("gaussians.deformations: expected an avatar in the T-pose, which has none")
         header = {
             "format": FORMAT,
             "version": VERSION,
@@ -73,12 +92,13 @@ class Avatar:
             "skinning": self.skinning,
             "rendering": self.rendering,
         }
-        values = {name: np.asarray(getattr(self.gaussians, name)) for name in _ARRAYS[:5]}
-        values |= {name: np.asarray(getattr(self, name)) for name in _ARRAYS[5:]}
+        values = {name: getattr(self.gaussians, name) for name in _ARRAYS[:5]}
+        values |= {name: getattr(self, name) for name in _ARRAYS[5:]}
         if self.light is not None:
-            values |= {f"light_{name}": np.asarray(getattr(self.light, name)) for name in _LIGHT}
+            values |= {f"light_{name}": getattr(self.light, name) for name in _LIGHT}
         if self.gaussians.low_pass is not None:
-            values["low_pass"] = np.asarray(self.gaussians.low_pass)
+            values["low_pass"] = self.gaussians.low_pass
+        values = {name: np.asarray(x if name == "faces" else at_least_float32(x)) for name, x in values.items()}
         write_npz(path, {"header": json.dumps(header | {"checksum": checksum(values)})} | values)
 
     @classmethod
@@ -114,6 +134,8 @@ def _load(cls, path):
             f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation', 'exact' or 'inria'"
         )
     g, j, n = (len(arrays[name]) for name in ("means", "rest_joints", "rest_vertices"))
+    if not g:
+        raise Refused("means: expected at least one Gaussian")
     if j != len(header["parents"]):
         raise Refused(f"rest_joints: expected shape ({len(header['parents'])}, 3), got {arrays['rest_joints'].shape}")
     unit = (-ROUNDING, 1 + ROUNDING)

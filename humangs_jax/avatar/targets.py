@@ -69,6 +69,7 @@ def show_targets(
     variables: Variables, config: HumanGSConfig, inputs: Capture, targets: Capture, background: float = 1.0
 ) -> tuple[Float[np.ndarray, "v h w 3"], Float[np.ndarray, "v h w"] | None]:
     """Images and alpha of the person of `inputs` in the views of `targets`, by a network that runs for each of them.
+    Their world has to be y-up, unlike that of `reconstruct`.
 
     Raises: ValueError for another background than white with a network that draws pixels: it has no alpha.
     """

@@ -39,7 +39,8 @@ class Animate:
     """File written by `humangs reconstruct`."""
     shot: OmitArgPrefixes[Shot] = FROM_THE_SIDE
     motion: Path | None = None
-    """.npz (ours, AMASS, AIST++, THuman4.0, AvatarReX) or LHM's .json. Default: the shipped walk."""
+    """.npz or .pkl (ours, AMASS, AIST++, THuman4.0, AvatarReX, SMPL), LHM's .json, or a skeleton's .bvh or .glb. Default: the
+    shipped walk."""
     out: Path = Path("animation.mp4")
     """The video to write; a name without suffix is a folder for frame_00000.png and so on."""
     turn: float = 0.0

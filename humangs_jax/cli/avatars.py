@@ -21,7 +21,7 @@ from humangs_jax.cli.options import (
     require_suffix,
 )
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
-from humangs_jax.refinement.config import ROUNDS, RefineConfig
+from humangs_jax.refinement.config import MAX_GROWTH, ROUNDS, RefineConfig
 
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
@@ -105,6 +105,8 @@ class Reconstruct:
 
             settings = chosen_settings(self.preset, self.config)
         photos = _read_capture(self.capture, self.check)
+        if self.refine not in (None, "0") and photos.masks is None:
+            raise ValueError(f"--refine {self.refine}: needs masks, and {self.capture} has none")
         views = settings.views if settings is not None and self.views is None else self.views
         if views == "auto" or (views is not None and views < photos.view_count):
             with stage("choosing photos"):
@@ -161,7 +163,7 @@ class Refine:
     def run(self) -> None:
         limits = refine_limits(self.limit, "--limit")
         require_between(16, LARGEST_IMAGE, image_size=self.image_size)
-        require_between(1, 100, growth=self.growth)
+        require_between(1, MAX_GROWTH, growth=self.growth)
         require_between(0 if limits["steps"] != 0 else 1, 16, rounds=self.rounds)
         require_avatar(self.out, inputs=(self.avatar,))
         with stage("starting"):
@@ -358,13 +360,13 @@ class Tune:
         for path in (self.out, self.out.with_suffix(".png")):
             require_parent(path, inputs=(self.weights,))
         with stage("starting"):
-            from humangs_jax.apps.tune import Budget, both_avatars, in_words, load_front, tune, write_tuned
+            from humangs_jax.apps.tune import Budget, both_avatars, in_words, load_front, tune, usable, write_tuned
             from humangs_jax.network.weights import load_weights
 
         photos = _read_capture(self.capture, check=False)
         with stage("loading the network"):
             variables, config = load_weights(self.weights)
-        front, budget = load_front(), Budget(**budgets)
+        front, budget = usable(load_front(), photos), Budget(**budgets)
         best = max(front, key=lambda point: point.quality)
         with stage("measuring"):
             tuned = tune(variables, config, photos, budget, self.size, front, progress=True)
@@ -373,4 +375,5 @@ class Tune:
         write_tuned(self.out, image, tuned, budget, self.size)
         tell(in_words(tuned, best))
         wrote(self.out, f"settings; {self.out.with_suffix('.png')}: the person made by them and by {best.name!r}")
-        suggest("humangs reconstruct", self.capture, "--config", self.out)
+        weights = () if self.weights is None else ("--weights", self.weights)
+        suggest("humangs reconstruct", self.capture, "--config", self.out, *weights)

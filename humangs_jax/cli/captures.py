@@ -59,6 +59,10 @@ class ImportCameras:
         suggest("humangs fit", self.out, "--keypoints FILE")
 
 
+FOR_TRAINING = {"size": 256, "poses": 2, "views": 12, "close_views": 0}
+"""What --for-training stands for."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Extras:
     """Besides the photos."""
@@ -113,22 +117,28 @@ class Synth:
         if self.sequences and self.poses > self.frames:
             raise UsageError(f"--poses {self.poses}: expected at most --frames {self.frames}, the length of the motion")
         require_folder(self.out)
+        small = FOR_TRAINING if self.for_training else {}
+        defaults = {field.name: field.default for field in dataclasses.fields(self)}
+        for name, value in small.items():
+            if getattr(self, name) not in (value, defaults[name]):
+                option = name.replace("_", "-")
+                raise UsageError(
+                    f"--{option} {getattr(self, name)}: does not go with --for-training, which means {value}"
+                )
         with stage("starting"):
             from humangs_jax.people.writer import Layout, write_set
 
         layout = Layout(
-            self.size,
-            self.poses,
-            self.views,
-            self.close_views,
+            small.get("size", self.size),
+            small.get("poses", self.poses),
+            small.get("views", self.views),
+            small.get("close_views", self.close_views),
             extras.held_out,
             frames=self.frames if self.sequences else 0,
             depth=extras.depth,
             maps=extras.maps,
             scan_texture=2048 if extras.scans else 0,
         )
-        if self.for_training:
-            layout = Layout(256, poses=2, views=12)
         workers = _cores() if self.workers is None else self.workers
         with stage("making people"):
             folders = write_set(self.out, self.subjects, layout, self.split, self.first, workers=workers)

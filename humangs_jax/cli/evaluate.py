@@ -102,6 +102,13 @@ class Evaluate:
             if path is not None:
                 wrote(path, {"json": "all numbers", "html": "the images, worst first"}.get(name, "a table"))
         if self.html is None:
-            given = {"--avatar": self.avatar, "--weights": self.weights, "--predictions": self.predictions}
-            parts = [part for option, path in given.items() if path is not None for part in (option, path)]
-            suggest("humangs evaluate", self.source, *parts, "--html scores.html")
+            suggest("humangs evaluate", self.source, *self._given(), "--html scores.html")
+
+    def _given(self):
+        """The options that say what is evaluated and how, as they were given."""
+        names = ("avatar", "weights", "predictions", "protocol", "body", "inputs", "indices")
+        options = {f"--{name}": getattr(self, name) for name in names if getattr(self, name) is not None}
+        options |= {f"--{name.replace('_', '-')}": files for name, files in vars(self.lpips).items()}
+        for option, values in options.items():
+            for value in values if isinstance(values, tuple) else (values,):
+                yield from (option, value if isinstance(value, Path) else str(value))

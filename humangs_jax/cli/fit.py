@@ -109,7 +109,7 @@ class Fit:
         for option in self._given():
             if option not in WAYS[way] and f"--{option}" != way:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
-                raise UsageError(f"--{option} is for {owners or 'captures'}, not for {way}")
+                raise UsageError(f"--{option.replace('_', '-')} is for {owners or 'captures'}, not for {way}")
         if way == "--keypoints" and self.detections.keypoints is None:
             raise UsageError("--keypoints FILE is missing (or --refine, to improve the body that a capture has)")
         self._check_places(way)

@@ -64,7 +64,9 @@ class Preprocess:
         match = re.fullmatch(r"(\d+)/(\d+)", self.shard)
         if match is None or not int(match[1]) < int(match[2]):
             raise UsageError(f"--shard {self.shard}: expected I/N with I from 0 to N - 1, as in 0/8")
-        factors = (2.0, 2.0) if scans.near else scans.factors
+        from humangs_jax.data.preprocess.protocol import NEAR_FACTORS
+
+        factors = NEAR_FACTORS if scans.near else scans.factors
         if not 0 < factors[0] <= factors[1]:
             raise UsageError(f"--factors {factors[0]:g} {factors[1]:g}: expected a range of positive numbers")
         if not self.body.is_file():
@@ -92,4 +94,4 @@ class Preprocess:
         with stage("preprocessing"):
             report = preprocess(self.source, self.out, self.body, settings, part, workers)
         wrote(self.out, str(report))
-        suggest("humangs train", self.out, "--out RUN")
+        suggest("humangs train", self.out, "--body", self.body, "--out RUN")

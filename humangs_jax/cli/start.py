@@ -14,6 +14,9 @@ if TYPE_CHECKING:
     from humangs_jax.apps.start import Material
     from humangs_jax.data.capture import Capture
 
+MARK = "start.json"
+"""In a capture folder that `humangs start` imported: a later run may replace it until it has a body, and go on from there."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Start:
@@ -54,12 +57,16 @@ class Start:
         require_at_least(0, person=self.person)
         if self.refine not in (None, "0") and self.without_masks:
             raise UsageError("--refine needs masks: leave out --without-masks")
+        if self.masks is not None and self.without_masks:
+            raise UsageError(f"--masks {self.masks}: does not go with --without-masks")
         self._resumes()  # what is wrong with --out is said before the work
         with stage("starting"):
             from humangs_jax.apps.start import look
             from humangs_jax.io.atomic import only_maker
 
         material = look(self.photos, cameras=self.cameras, masks=self.masks, keypoints=self.keypoints)
+        if self.without_masks:
+            material = dataclasses.replace(material, masks=None)
         tell(material)
         with only_maker(self.out):
             self._go_on(material, limits)
@@ -89,11 +96,10 @@ class Start:
 
     def _resumes(self) -> bool:
         """Whether an earlier run left a body to go on from. Raises: UsageError if --out may not be replaced."""
-        # by an earlier run that missed something, or was interrupted: nothing is lost
-        begun = not (self.out / "body.npz").exists()
-        fitted = (self.out / "fit.json").exists() and not (
-            begun or (self.out / "avatar.html").exists() or self.overwrite
-        )
+        ours = (self.out / MARK).is_file()
+        begun = ours and not (self.out / "body.npz").exists()
+        finished = begun or self.overwrite or (self.out / "avatar.html").exists()
+        fitted = ours and (self.out / "fit.json").exists() and not finished
         inputs = (self.photos, self.cameras, self.masks, self.keypoints)
         require_replaceable(self.out, self.overwrite or begun or fitted, "capture.json", inputs)
         return fitted
@@ -107,6 +113,7 @@ class Start:
         """Photos and cameras as a capture folder; the folder of its photos if lens distortion was removed from them."""
         with stage("importing photos and cameras"):
             from humangs_jax.data.calibration.importing import import_cameras
+            from humangs_jax.io.text import write_json
 
             assert material.cameras is not None
             report = import_cameras(
@@ -118,6 +125,7 @@ class Start:
                 up=self.up,
                 overwrite=True,
             )
+        write_json(self.out / MARK, {"photos": str(self.photos.resolve())})
         tell(report)
         if report.undistorted and material.keypoints is not None:
             warn(f"lens distortion was removed: {material.keypoints} should be of the photos in {self.out / 'images'}")

@@ -194,6 +194,8 @@ def _read_images(folder, views, on_white):
             raise CaptureError(file, "size", f"{size}, but the first view has {width} x {height}: expected one size")
         if (mask is None) != (masks[0] is None):
             raise CaptureError(file, "alpha", "expected an alpha channel in all images or in none")
+    if "mask" not in views[0] and masks[0] is not None and all(mask.min() == 1 for mask in masks):
+        masks = (None,)  # many programs write an opaque alpha channel: it says nothing
     return np.stack(images), None if masks[0] is None else np.stack(masks)
 
 

@@ -130,7 +130,7 @@ def _find_in_data_set(path, inputs, indices, body, reconstructs):
     """The people of a data set; photos are read when a case is loaded."""
     file_body = FileBody(body) if isinstance(body, BodyModel) else FileBody.load(body)
     people = open_people(path, file_body)
-    names = tuple(Path(person.name.rpartition(": ")[2]).name for person in people)
+    names = _short_names([Path(person.name.rpartition(": ")[2]) for person in people])
 
     def load(index: int) -> Case:
         subject, size, name = people[index].subject, people[index].size, names[index]
@@ -143,6 +143,15 @@ def _find_in_data_set(path, inputs, indices, body, reconstructs):
         return Case(name, subject.capture(targets, file_body, size), seen)
 
     return People(names, load)
+
+
+def _short_names(paths):
+    """The last parts of the paths, as many as tell all of them apart: ActorsHQ has a Sequence1 of every actor."""
+    for parts in range(1, 1 + max(len(path.parts) for path in paths)):
+        names = tuple("_".join(path.parts[-parts:]) for path in paths)
+        if len(set(names)) == len(names):
+            return names
+    return tuple(f"{index:04d}" for index in range(len(paths)))
 
 
 def _split(name, capture, inputs, indices, reconstructs):

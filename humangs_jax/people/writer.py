@@ -24,6 +24,7 @@ from humangs_jax.core.workers import in_processes
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.loading.captures import find_captures
 from humangs_jax.data.motion import Motion, save_motion
+from humangs_jax.data.preprocess.run import FORMAT as OF_A_DATA_SET
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
 from humangs_jax.io.text import read_json, write_json
@@ -288,12 +289,15 @@ def write_manifest(folder: str | Path, split: str, settings: dict[str, Any]) -> 
 def find_people(root: str | Path, split: str | None = "train") -> tuple[Path, ...]:
     """The capture folders in `root`, sorted by name; where a manifest says that they are synthetic, only of one split.
 
-    Folders without a manifest (real captures) are taken as they are. split None: any.
+    Other folders (real captures, those of `humangs preprocess`) are taken as they are. split None: any.
     Raises: ValueError if a written set holds a subject of another split, or there is no capture.
     """
     root = Path(root)
     folders = find_captures(root)
     if split is not None and (root / MANIFEST).is_file():
+        content = read_json(root / MANIFEST)
+        if isinstance(content, dict) and content.get("format") == OF_A_DATA_SET:
+            return folders
         read_manifest(root)
         for folder in folders:
             if folder.name.isdigit() and (other := split_of(int(folder.name))) != split:

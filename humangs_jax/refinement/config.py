@@ -8,7 +8,8 @@ MEASURED = "refinement.md"
 SPLITS = (0.0, 0.2, 0.4)
 """Shares of a run after which Gaussians are split."""
 ROUNDS = 4
-"""One more than the learned update was trained with; docs/tradeoff.md has what each gains."""
+"""As many as the learned update was trained with; docs/tradeoff.md has what each gains."""
+MAX_GROWTH = 16.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +91,7 @@ class RefineConfig:
         shares = {name: getattr(self, name) for name in ("final_rate", "decay", "held_out")}
         if wrong := [name for name, value in shares.items() if not 0 <= value <= 1]:
             raise ValueError(f"RefineConfig: {', '.join(wrong)} must be in [0, 1]")
-        if not 1 <= self.growth <= 16:
-            raise ValueError(f"RefineConfig: growth must be between 1 and 16, got {self.growth}")
+        if not 1 <= self.growth <= MAX_GROWTH:
+            raise ValueError(f"RefineConfig: growth must be between 1 and {MAX_GROWTH:g}, got {self.growth}")
         if not self.held_out < 1 or not self.visible > 0 or min(self.checks, self.full_steps) < 1:
             raise ValueError("RefineConfig: need held_out < 1, visible > 0, checks >= 1 and full_steps >= 1")

@@ -132,7 +132,7 @@ def refine_with_report(
     Arguments:
         avatar: of the person in the photos, on the body of the capture. capture: photos with masks, in any poses. mesh: of one
             axis, whose devices share the `views_per_step` photos of a step. progress: show a bar. watch: gets the avatar so
-            far at each of the `checks`; its time counts.
+            far after the rounds and at each of the `checks`; its time counts.
 
     Ctrl-C ends the run; the best state until then is returned.
 

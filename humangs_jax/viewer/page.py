@@ -148,15 +148,8 @@ def known_body(avatar: Avatar) -> BodyModel | None:
     body = load_body()
     if len(avatar.rest_vertices) != len(body.template):
         body = gaussian_body(body, _shipped_network())
-    same = np.array_equal(body.faces, avatar.faces) and _vertex_major(avatar, body)
+    same = np.array_equal(body.faces, avatar.faces) and avatar.gaussians_per_vertex is not None
     return body if same and fitted_shape(avatar, body) is not None else None
-
-
-def _vertex_major(avatar, body):
-    """Whether the Gaussians of a vertex stand together, which those added by refinement do not."""
-    each, rest = divmod(len(avatar.gaussians.means), len(body.template))
-    weights = np.repeat(np.asarray(body.skinning_weights), each, axis=0)
-    return not rest and np.allclose(avatar.skinning_weights, weights, atol=1e-3)
 
 
 def _shipped_network() -> HumanGSConfig:

@@ -67,6 +67,22 @@ def test_alpha_is_a_mask(mine):
     assert found.alpha and missing(found) == () and "in the photos' alpha channel" in str(found)
 
 
+@pytest.mark.parametrize("distortion", [0, 0.1])
+def test_opaque_alpha_is_no_mask(distortion, mine, capsys):
+    calibration = json.loads((mine / "calibration.json").read_text())
+    for camera in calibration.values():
+        camera["dist"] = [distortion, 0, 0, 0, 0]
+    (mine / "calibration.json").write_text(json.dumps(calibration))
+    for name in ("masks", "keypoints"):
+        shutil.rmtree(mine / name)
+    for path in (mine / "images").iterdir():
+        write_png(path, np.ones((512, 512, 4)))
+    found = look(mine)
+    assert not found.alpha and [each.name for each in missing(found)] == ["masks", "keypoints"]
+    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
+    assert load_photos("me").masks is None and "masks and keypoints missing" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", NEEDED)
 def test_what_is_missing_comes_with_its_tools(name, mine, capsys):
     shutil.rmtree(mine / name, ignore_errors=True)
@@ -142,6 +158,25 @@ def test_a_body_that_is_there_is_not_replaced(mine, capsys):
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_USAGE
     assert "--out me: the folder is not empty" in capsys.readouterr().err
     assert Path("me/body.npz").read_text() == "mine"
+
+
+@pytest.mark.parametrize("files", [("capture.json", "pose.npz"), ("capture.json", "body.npz", "fit.json")])
+def test_a_capture_of_something_else_is_not_replaced(files, mine, capsys):
+    Path("me").mkdir()
+    for name in files:
+        Path("me", name).write_text("mine")
+    shutil.rmtree(mine / "keypoints")
+    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_USAGE
+    assert "--out me: the folder is not empty" in capsys.readouterr().err
+    assert {path.name: path.read_text() for path in Path("me").iterdir()} == dict.fromkeys(files, "mine")
+
+
+def test_masks_that_are_there_may_be_left_out(mine, capsys):
+    shutil.rmtree(mine / "keypoints")
+    for _ in range(2):  # what the first run has imported is replaced
+        assert cli.execute(["start", str(mine), "--out", "me", "--without-masks"]) == cli.BAD_DATA
+        assert "masks:     missing" in capsys.readouterr().out
+        assert load_photos("me").masks is None
 
 
 @pytest.mark.slow

@@ -163,6 +163,13 @@ def test_what_is_given_up_is_said():
     assert "is the best of all settings" in in_words(tuning.Tuned(best, Cost(1.0, 0.0, 1.0), {}), best)
 
 
+def test_without_masks_nothing_that_refines_is_tried():
+    front, photos = load_front(), load_capture("demo_capture")
+    assert tuning.usable(front, photos) == front
+    unrefined = tuning.usable(front, dataclasses.replace(photos, masks=None))
+    assert unrefined == [point for point in front if point.settings.refinement is None] != []
+
+
 # The command -------------------------------------------------------------------------------------------------------------
 
 

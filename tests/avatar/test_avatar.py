@@ -52,6 +52,22 @@ def test_save_and_load_are_exact(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
 
 
+def test_what_a_file_cannot_hold_is_refused_and_short_numbers_become_float32(tmp_path):
+    avatar = make_avatar()
+    posed = replace(avatar, gaussians=replace(avatar.gaussians, deformations=jnp.zeros((12, 3, 3))))
+    with pytest.raises(ValueError, match="deformations: expected an avatar in the T-pose"):
+        posed.save(tmp_path / "a.npz")
+    assert not any(tmp_path.iterdir())
+    short = jax.tree.map(lambda x: x.astype(jnp.bfloat16) if x.dtype == jnp.float32 else x, avatar)
+    short.save(tmp_path / "a.npz")
+    loaded = Avatar.load(tmp_path / "a.npz")
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.asarray(a, np.float32), b), short, loaded)
+    assert loaded.gaussians.means.dtype == jnp.float32
+    avatar.select(np.zeros(0, int)).save(tmp_path / "nobody.npz")
+    with pytest.raises(ValueError, match=r"nobody\.npz: means: expected at least one Gaussian"):
+        Avatar.load(tmp_path / "nobody.npz")
+
+
 def test_a_file_may_have_any_name(tmp_path):
     make_avatar().save(tmp_path / "me")
     assert [file.name for file in tmp_path.iterdir()] == ["me"]

@@ -19,6 +19,7 @@ from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import (
     SH_C0,
+    export,
     frame_range,
     grounded_gaussians,
     turned,
@@ -297,6 +298,21 @@ def test_a_sequence_of_frames_stands_on_one_floor(tmp_path, monkeypatch, capsys)
     np.testing.assert_allclose(first - last, np.tile([0, 2.0, 0], (20, 1)), atol=1e-5)  # -y is up
     exported(monkeypatch, source, "--out", tmp_path / "y.spz", "--motion", tmp_path / "jump.npz", "--frame", "3")
     assert np.asarray(read_spz(tmp_path / "y.spz").means)[:, 1].min() == pytest.approx(0, abs=1e-5)
+
+
+def test_the_function_checks_as_the_command_does(tmp_path):
+    small_file(tmp_path)
+    avatar = Avatar.load(tmp_path / "me.npz")
+    jump = Motion(jnp.zeros((4, 1, 3)), jnp.zeros((4, 3)), 24.0)
+    for name, options, message in (
+        ("x.sog", {}, "expected a name ending in .ply or .splat or .spz or .glb"),
+        ("x.ply", {"mesh": True}, "expected a name ending in .glb or .obj for a mesh"),
+        ("x.ply", {"motion": jump}, "each of the 4 frames, got no numbers"),
+        ("x.ply", {"motion": jump, "numbers": [1, 2]}, "each of the 4 frames, got 2 numbers"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            export(tmp_path / name, avatar, **options)
+    assert not list(tmp_path.glob("x*"))
 
 
 MISUSES = {

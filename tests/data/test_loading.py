@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from humangs_jax.data.loader import Example, Loader, Mixture, Source, Waiting, has_grain
 from humangs_jax.data.loading.order import MIX_BLOCK, block_counts, source_at
 from humangs_jax.data.loading.threads import read_in_order
+from humangs_jax.data.preprocess.run import FORMAT
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.people.on_the_fly import GeneratedSource
@@ -281,6 +282,8 @@ def test_people_of_another_split_are_refused(tmp_path):
     (tmp_path / "manifest.json").write_text(json.dumps({"format": "other"}))
     with pytest.raises(ValueError, match="expected a manifest of"):
         find_people(tmp_path)
+    (tmp_path / "manifest.json").write_text(json.dumps({"format": FORMAT}))
+    assert len(find_people(tmp_path)) == 2  # of a data set: scans have numbers for names, too
 
 
 @pytest.mark.parametrize("reader", READERS)

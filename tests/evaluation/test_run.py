@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +16,7 @@ from humangs_jax.data.capture import save_capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
-from humangs_jax.evaluation.cases import Case, Predicted, find_people, spread_views
+from humangs_jax.evaluation.cases import Case, Predicted, _short_names, find_people, spread_views
 from humangs_jax.io.images import write_png
 
 NAMES = ("front", "left", "back", "right")
@@ -218,6 +219,13 @@ class People:
         )
 
 
+def test_people_of_one_name_are_told_apart():
+    paths = [Path("/data/Actor01/Sequence1"), Path("/data/Actor02/Sequence1")]
+    assert _short_names(paths) == ("Actor01_Sequence1", "Actor02_Sequence1")
+    assert _short_names([Path("a/x"), Path("a/y")]) == ("x", "y")
+    assert _short_names([Path("a"), Path("a")]) == ("0000", "0001") and _short_names([Path("scene")]) == ("scene",)
+
+
 def test_a_source_gives_people(people):
     """Views of equal poses are one frame, in the order of appearance."""
     found = find_people(People(people["ann"][0]), body=small_body())
@@ -256,6 +264,11 @@ def test_the_command(people, folders, tmp_path, monkeypatch, capsys):
     )
     assert code == 0, error
     assert "theirs, protocol lhm++: 8 images of 2 people" in printed and str(out / "a.html") in printed
+    code, printed, error = run(folders, *options, "--inputs", 2)
+    suggested = (
+        f"next: humangs evaluate {folders} --predictions {tmp_path / 'theirs'} --protocol lhm++ --inputs 2 --html"
+    )
+    assert code == 0 and suggested in printed, printed
     assert json.loads((out / "a.json").read_text())["means"]["iou"]["count"] == 2
     wrong = {
         "--html": ("--html", tmp_path / "nowhere" / "a.html"),

@@ -9,12 +9,17 @@ import urllib.request
 from http.server import ThreadingHTTPServer
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from command_line import run
 from viewer_cases import small_avatar
 
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.motion import Motion, save_motion
+from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.viewer import page
 
 
@@ -40,6 +45,28 @@ def test_every_part_is_in_its_place_and_none_ends_a_script_early(text):
 def test_a_joint_may_have_any_name():
     text = page.page_html(replace(small_avatar(), joint_names=("</script><b>", "b", "c")))
     assert "</script><b>" not in text
+
+
+def test_shape_sliders_come_with_the_shipped_body_and_vertex_major_gaussians():
+    """Also where those between the legs have weights of their own; not where refinement has added Gaussians."""
+    body, each = load_body(), 3
+    rest = shape_body(body, jnp.zeros(body.shape_directions.shape[-1]))
+    means = jnp.repeat(rest.vertices, each, axis=0)
+    count = len(means)
+    gaussians = Gaussians(
+        means, jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (count, 1)), 0.01 + 0 * means, means[:, 0] * 0 + 0.5, 0 * means
+    )
+    weights = np.repeat(np.asarray(body.skinning_weights), each, axis=0)
+    names = (body.parents, body.joint_names)
+    avatar = Avatar(gaussians, jnp.asarray(weights), rest.vertices, rest.joints, body.faces, *names)
+    weights[::40] = 0.5 * np.eye(len(body.parents))[[1, 2]].sum(axis=0)
+    between_the_legs = replace(avatar, skinning_weights=jnp.asarray(weights))
+    for person in (avatar, between_the_legs):
+        assert person.gaussians_per_vertex == each and page.known_body(person) is not None
+    order = np.random.default_rng(0).permutation(count)
+    for grown in (np.arange(count - 1), order, np.concatenate([np.arange(count), order])):
+        person = avatar.select(grown)
+        assert person.gaussians_per_vertex is None and page.known_body(person) is None
 
 
 def test_fast_motions_are_thinned_out():

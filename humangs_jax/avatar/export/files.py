@@ -69,7 +69,10 @@ def export(
         numbers: of the motion's frames: "x.ply" becomes "x_0007.ply". All stand on one floor: who jumps leaves it. None: the
             motion has one frame, whose feet are on 0.
         up: the axis that points up; None for USUAL_UP. rest_fields: see `write_ply`. name: of the animation.
+
+    Raises: ValueError for another suffix, or if `numbers` are not one for each frame of the motion.
     """
+    _check(path, motion, numbers, mesh)
     suffix = path.suffix.lower()
     up = up or USUAL_UP[suffix]
     if motion is not None and (mesh or numbers is not None):
@@ -86,6 +89,19 @@ def export(
     for file, pose in zip(paths, poses, strict=True):
         write(file, pose)
     return paths
+
+
+def _check(path, motion, numbers, mesh):
+    """Before any file is written."""
+    suffixes = MESHES if mesh else tuple(GAUSSIANS)
+    if path.suffix.lower() not in suffixes:
+        raise ValueError(f"{path}: expected a name ending in {' or '.join(suffixes)}{' for a mesh' if mesh else ''}")
+    if mesh and path.suffix.lower() == ".glb":
+        return
+    frames = 1 if motion is None else len(motion.translations)
+    if frames != (1 if numbers is None else len(numbers)):
+        given = "no numbers" if numbers is None else f"{len(numbers)} numbers"
+        raise ValueError(f"numbers: expected one for each of the {frames} frames, got {given}")
 
 
 def _gaussian_writer(avatar, up, rest_fields, each_on_the_floor):

@@ -85,8 +85,8 @@ def vertex_weights(avatar: Avatar) -> Float[np.ndarray, "n j"]:
     Where refinement has added Gaussians, these are the nearest ones.
     """
     weights = np.asarray(avatar.skinning_weights, np.float32)
-    each, rest = divmod(len(weights), len(avatar.rest_vertices))
-    if rest:
+    each = avatar.gaussians_per_vertex
+    if each is None:
         count = min(4, len(weights))
         nearest = KDTree(np.asarray(avatar.gaussians.means)).query(np.asarray(avatar.rest_vertices), k=count)[1]
         return weights[nearest.reshape(-1, count)].mean(axis=1)

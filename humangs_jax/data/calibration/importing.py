@@ -211,10 +211,11 @@ def _write(folder: Path, calibration: Calibration, photos: tuple[Photo, ...], na
     if photos[0].mask is not None:
         (folder / "masks").mkdir()
     as_they_are = all(camera.distortion is None for camera in calibration.cameras)
+    transparent = not as_they_are and any(_is_transparent(photo.image) for photo in photos)
     views = []
     for photo, name in zip(photos, names, strict=True):
         camera = calibration.cameras[photo.camera]
-        files = _copy(folder, photo, name) if as_they_are else _undistort(folder, photo, name, camera)
+        files = _copy(folder, photo, name) if as_they_are else _undistort(folder, photo, name, camera, transparent)
         matrices = {"K": camera.K.tolist(), "cam_from_world": camera.cam_from_world.tolist()}
         views.append({**files, "frame": photo.frame, **matrices})
     write_description(folder, views)
@@ -230,12 +231,19 @@ def _copy(folder, photo, name):
     return files
 
 
-def _undistort(folder, photo, name, camera):
+def _is_transparent(photo):
+    """Whether any pixel is."""
+    alpha = read_checked(read_image, photo)[1]
+    return alpha is not None and alpha.min() < 1
+
+
+def _undistort(folder, photo, name, camera, transparent):
     """Photo and mask (or its alpha) as a pinhole sees them; pixels that it does not see are white and background.
 
-    A photo that has alpha besides its mask keeps it.
+    A photo that has alpha besides its mask keeps it. Opaque alpha, where no photo is `transparent`, is left out.
     """
     image, alpha = read_checked(read_image, photo.image)
+    alpha = alpha if transparent else None
     mask = alpha if photo.mask is None else read_checked(read_grey, photo.mask)
     if camera.distortion is not None:
         image = undistort(image, camera.K, camera.distortion, fill=1.0)

@@ -32,8 +32,6 @@ from humangs_jax.io.reading import limits, reading
 
 CALIBRATION, SCALES = "calibration.csv", ("4x", "2x", "1x")
 COLUMNS = ["w", "h", "rx", "ry", "rz", "tx", "ty", "tz", "fx", "fy", "px", "py"]
-TEST_CAMERAS = (0, 13, 24, 30, 43, 57, 63, 64, 70, 84, 97, 103, 114, 126)
-"""Official, counted from 0: camera i is called Cam(i + 1)."""
 
 
 def find_actorshq(folder: str | Path) -> tuple[Path, ...]:

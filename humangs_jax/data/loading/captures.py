@@ -133,7 +133,8 @@ class CaptureFolder:
     def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
         """See `StoredPerson`."""
         capture = load_capture(self.name, body=self.body, views=views)
-        assert capture.masks is not None  # the outline has seen them
+        if capture.masks is None:
+            raise CaptureError(self.name, "", "alpha channels without a transparent pixel: expected masks")
         return to_uint8(capture.images), to_uint8(capture.masks)
 
     def posed(self, subject: StoredSubject) -> StoredSubject:

@@ -20,7 +20,7 @@ ELEVATIONS = (-5.0, 15.0)
 """Degrees, uniform."""
 FACTORS = (1.0, 1.75)
 """Camera distance in bounding radii, uniform, as the paper has it. At 60 degrees below 1.7 the frame cuts heads and feet."""
-NEAR_FACTOR = 2.0
+NEAR_FACTORS = (2.0, 2.0)
 """The paper's "near" test set; also what the release uses for all sets."""
 VIEWS, SIZE = 60, 512
 TRAIN, TEST = 2300, 145

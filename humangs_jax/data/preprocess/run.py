@@ -59,11 +59,11 @@ def preprocess(
     fits. shard: (i, n): the i-th of n parts, from 0. workers: processes, for scans.
     Raises: ValueError if there is nobody, `out` holds another set, or (at the end) nobody could be made.
     """
-    source, out = Path(source), Path(out)
+    source, out = Path(source).resolve(), Path(out)
     index, count = shard
     if not 0 <= index < count:
         raise ValueError(f"shard {index}/{count}: expected a number from 0 to {count - 1}")
-    if out.resolve() == source.resolve() or source.resolve() in out.resolve().parents:
+    if out.resolve() == source or source in out.resolve().parents:
         raise ValueError(f"{out}: lies in the data set {source}: expected another place")
     names, absent = _subjects(source, settings)
     body = FileBody.load(body_file)
@@ -81,7 +81,7 @@ def preprocess(
             else:
                 _skip(out, name, error)
     finally:
-        manifest = _finish(out, names, settings)
+        manifest = _finish(out, [*names, *absent], settings)
     counts = manifest["counts"]
     if due and not counts["scenes"]:
         reason = next(iter(manifest["skipped"].values()), "nothing was made")

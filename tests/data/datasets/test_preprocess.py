@@ -196,6 +196,24 @@ def test_scans_become_scenes_by_the_command(tmp_path, body, capsys):
     )
 
 
+def test_the_split_is_that_of_all_scans_also_where_one_lacks_a_file(tmp_path, body):
+    source = write_thuman(tmp_path / "thuman", model_arrays())
+    names = sorted(folder.name for folder in (source / "model").iterdir())
+    options = Settings("thuman", "scenes", SIZE, views=2, supersample=1, train=len(names) - 1, test=1)
+    run(source, tmp_path / "all", body, options)
+    whole = json.loads((tmp_path / "all" / "manifest.json").read_text())["split"]
+    (source / "smplx" / whole["train"][0] / "mesh_smplx.obj").unlink()
+    run(source, tmp_path / "less", body, options)
+    less = json.loads((tmp_path / "less" / "manifest.json").read_text())["split"]
+    assert less == {"train": whole["train"][1:], "test": whole["test"]}
+
+
+def test_the_working_folder_may_be_the_data_set(videos, tmp_path, body, monkeypatch):
+    monkeypatch.chdir(videos / "avatarrex_a")
+    report = run(".", tmp_path / "out", body, settings())
+    assert report.scenes == 1 and (tmp_path / "out" / "avatarrex_a" / "scene.json").is_file()
+
+
 def test_wrong_options_are_one_line(tmp_path):
     (tmp_path / "model.npz").write_bytes(b"")
     command = lambda scans=ScanViews(), body="model.npz", **options: Preprocess(

@@ -48,7 +48,7 @@ def test_cameras_look_at_the_origin_from_the_protocols_ranges():
     quarters = np.histogram(np.arctan2(centers[:, 0], centers[:, 2]), 4, (-np.pi, np.pi))[0]
     assert quarters.min() > 70
     np.testing.assert_array_equal(cameras, protocol.scan_cameras(7, 2.0, 400, (1.0, 1.75)))
-    near = protocol.scan_cameras(7, 2.0, 10, (protocol.NEAR_FACTOR,) * 2)
+    near = protocol.scan_cameras(7, 2.0, 10, protocol.NEAR_FACTORS)
     np.testing.assert_allclose(near[:, 2, 3], 4.0)
     focal = protocol.intrinsics(512)[1, 1]
     assert 2 * np.rad2deg(np.arctan(256 / focal)) == pytest.approx(60)
