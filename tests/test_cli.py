@@ -129,7 +129,17 @@ def test_wrong_options_are_one_line_too(folder, tmp_path, monkeypatch, capsys):
 def test_refinement_without_masks_is_refused_before_the_work(folder, tmp_path, monkeypatch, capsys):
     photos = dataclasses.replace(load_capture(folder), masks=None)
     save_capture(tmp_path / "bare", photos)
-    code, _, error = run(monkeypatch, capsys, "reconstruct", tmp_path / "bare", "--no-check", "--refine", "15s", "--out", tmp_path / "a.npz")
+    code, _, error = run(
+        monkeypatch,
+        capsys,
+        "reconstruct",
+        tmp_path / "bare",
+        "--no-check",
+        "--refine",
+        "15s",
+        "--out",
+        tmp_path / "a.npz",
+    )
     assert code == cli.BAD_USAGE and error.count("\n") == 1 and "--refine 15s: needs masks" in error
 
 

@@ -80,6 +80,12 @@ def load_lpips(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -
         parser.error(str(error))
 
 
+def shipped_digest(asset: str) -> str:
+    """SHA-256 of a file of the package."""
+    with resources.as_file(resources.files("humangs_jax").joinpath(asset)) as path:
+        return file_digest(path)
+
+
 def load_network(arguments: argparse.Namespace) -> tuple[Any, Any, str]:
     """Variables, configuration, and SHA-256 of the weights file."""
     from humangs_jax.network.weights import SHIPPED, load_weights

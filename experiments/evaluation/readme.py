@@ -1,12 +1,10 @@
-r"""README's tables of quality and of the demo's times, from what other programs have written.
+"""README's tables of quality and of the demo's times, from two runs of the demo and from tables of the docs.
 
 HUMANGS_COMPILE_CACHE=0 humangs demo --refine 0 --out a && humangs demo --refine 15 --out b
-python experiments/evaluation/synthetic.py --subjects 32 --views 1 2 4 6 --json evaluation.json
-python experiments/evaluation/refinement.py --subjects 32 --seconds 1 15 --sizes 256 --rounds 4 --json refinement.json
-python experiments/evaluation/readme.py --timed a/report.json --refined b/report.json --people evaluation.json \
-    --refined-people refinement.json
+python experiments/evaluation/readme.py --timed a/report.json --refined b/report.json
 
-Times are those of an idle machine, from an empty compile cache.
+The scores of the test people are those of docs/results/evaluation_views.json and refinement_32.json. Times are those of an idle
+machine, from an empty compile cache.
 """
 
 import argparse
@@ -18,7 +16,8 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import REPOSITORY, markdown_table, publish, significant
 
-VIEWS = "4"
+VIEWS, SIZE = "4", "256"
+"""Photos, and their side in pixels in evaluation_views.json."""
 
 
 def main() -> None:
@@ -28,36 +27,41 @@ def main() -> None:
         "--timed", type=Path, required=True, help="report of the unrefined demo, nothing compiled before"
     )
     parser.add_argument("--refined", type=Path, required=True, help="report of the refined demo")
-    parser.add_argument("--people", type=Path, required=True, help="result of synthetic.py")
-    parser.add_argument(
-        "--refined-people", type=Path, required=True, help="result of refinement.py for the same people"
-    )
     arguments = parser.parse_args()
-    paths = (arguments.timed, arguments.refined, arguments.people, arguments.refined_people)
-    timed, refined, *people = (json.loads(path.read_text()) for path in paths)
+    timed, refined = (json.loads(path.read_text()) for path in (arguments.timed, arguments.refined))
+    results = (REPOSITORY / "docs" / "results" / f"{name}.json" for name in ("evaluation_views", "refinement_32"))
+    people = [json.loads(path.read_text())["numbers"] for path in results]
     for name, text in {"readme_quality": quality(refined, *people), "readme_demo": times(timed)}.items():
         print(text)
         publish(REPOSITORY / "README.md", name, text)
 
 
 def quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any]) -> str:
-    """The demo person and the test people. Raises: ValueError if the demo was not refined, or the people are not the same."""
+    """The demo person and the test people.
+
+    Raises: ValueError if the demo was not refined, or the people or the weights of the two tables are not the same.
+    """
     if "refined" not in demo:
         raise ValueError("the report of the refined demo has no refined scores: expected `humangs demo --refine 15`")
     count = len(people["subjects"])
-    if len(refined["subjects"]) != count:
-        raise ValueError(f"{len(refined['subjects'])} people were refined: expected the same {count}")
+    if refined["people"] != count:
+        raise ValueError(f"{refined['people']} people were refined: expected the same {count}")
+    if people["settings"]["weights"] != refined["settings"]["weights"]:
+        raise ValueError("evaluation_views and refinement_32 are of different weights: measure them again")
     dashes = {"baseline_psnr": None, "baseline_psnr_foreground": None}
     rows = {
         f"the shipped person, {demo['image_size'][0]} px ({demo['views']['held_out']} views)": demo,
         f"the same, refined for {demo['refined']['seconds']:.0f} s": demo["refined"] | dashes,
-        f"{count} people of the test seeds, 256 px, other cameras": people["by_views"][VIEWS]["novel"],
+        f"{count} people of the test seeds, {SIZE} px, other cameras": people["by_views"][VIEWS]["novel"],
         f"these {count}, in poses that no photo shows": people["by_views"][VIEWS]["animation"],
     }
-    (lengths,) = refined["means"].values()
-    for seconds in (x for x in lengths if x != "0"):
-        rows[f"these {count}, refined for {seconds} s, other cameras"] = lengths[seconds]["novel"] | dashes
-        rows[f"refined for {seconds} s, in poses that no photo shows"] = lengths[seconds]["animation"] | dashes
+    for name, lengths in refined["means"].items():
+        size = name.split()[0]
+        for seconds in lengths:
+            if (size, seconds) != (SIZE, "0"):
+                how = f"{size} px" if seconds == "0" else f"{size} px, refined for {seconds} s"
+                rows[f"these {count}, {how}, other cameras"] = lengths[seconds]["novel"] | dashes
+                rows[f"{how}, in poses that no photo shows"] = lengths[seconds]["animation"] | dashes
     columns = {"psnr": 1, "ssim": 3, "psnr_foreground": 1, "baseline_psnr": 1, "baseline_psnr_foreground": 1}
     cells = lambda scores: ["" if scores[key] is None else f"{scores[key]:.{n}f}" for key, n in columns.items()]
     header = ["", "PSNR", "SSIM", "PSNR on the person", "painted body mesh: PSNR", "on the person"]

@@ -32,6 +32,7 @@ from experiments.evaluation.options import (
     load_network,
     seeds_asked_for,
     settings_of,
+    shipped_digest,
 )
 from experiments.evaluation.results import TASK_NAMES, kept_rows
 from humangs_jax.evaluation.tables import mean_scores
@@ -78,7 +79,8 @@ def main() -> None:
     text = section(report)
     print(text)
     if arguments.page:
-        publish(arguments.page, arguments.table, text, {"settings": report["settings"], "means": report["means"]})
+        numbers = {name: report[name] for name in ("settings", "means")} | {"people": len(report["subjects"])}
+        publish(arguments.page, arguments.table, text, numbers)
     if arguments.plot:
         plot(arguments.plot, report)
 
@@ -90,6 +92,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     from experiments.evaluation.pictures import cropped, write_triples
     from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
     from humangs_jax.body.library import load_body
+    from humangs_jax.refinement.learned import SHIPPED
 
     body, (variables, config, digest) = load_body(), load_network(arguments)
     drawing = arguments.sheet or arguments.details
@@ -100,6 +103,8 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
         for name in ("seconds", "sizes", "views", "starts", "rounds", "growth", "off", "refine_poses", "longest_edge")
     }
     settings |= {"scored_at": arguments.scored_at} if arguments.scored_at else {}
+    learned = any(arguments.rounds) or "after rounds" in arguments.starts
+    settings |= {"refiner": shipped_digest(SHIPPED)} if learned else {}
     rows, images = kept_rows(arguments.json, settings, "cells"), {}
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
     seeds = seeds_asked_for(arguments, body)

@@ -19,19 +19,27 @@ DEMO = {
 
 
 def test_quality():
-    people = {"subjects": [{}] * 3, "by_views": {"4": {task: SCORES | BASELINE for task in ("novel", "animation")}}}
+    settings = {"settings": {"weights": "a"}}
+    people = settings | {
+        "subjects": [{}] * 3,
+        "by_views": {"4": {task: SCORES | BASELINE for task in ("novel", "animation")}},
+    }
     lengths = {seconds: {task: SCORES for task in ("novel", "animation")} for seconds in ("0", "1")}
-    refined = {"subjects": [{}] * 3, "means": {"256 4 network, 4 rounds": lengths}}
+    means = {f"{size} 4 network, 4 rounds": lengths for size in (256, 512)}
+    refined = settings | {"people": 3, "means": means}
     demo = DEMO | {"refined": SCORES | {"psnr": 29.16, "seconds": 15.2}}
     rows = quality(demo, people, refined).splitlines()[2:]
     assert rows[0] == "| the shipped person, 256 px (6 views) | 27.4 | 0.946 | 18.8 | 20.7 | 11.3 |"
     assert rows[1] == "| the same, refined for 15 s | 29.2 | 0.946 | 18.8 |  |  |"
     assert rows[2].startswith("| 3 people of the test seeds, 256 px, other cameras | 27.4 |")
-    assert rows[4] == "| these 3, refined for 1 s, other cameras | 27.4 | 0.946 | 18.8 |  |  |" and len(rows) == 6
+    assert rows[4] == "| these 3, 256 px, refined for 1 s, other cameras | 27.4 | 0.946 | 18.8 |  |  |"
+    assert rows[7] == "| 512 px, in poses that no photo shows | 27.4 | 0.946 | 18.8 |  |  |" and len(rows) == 10
     with pytest.raises(ValueError, match="expected `humangs demo --refine 15`"):
         quality(DEMO, people, refined)
     with pytest.raises(ValueError, match="2 people were refined: expected the same 3"):
-        quality(demo, people, refined | {"subjects": [{}] * 2})
+        quality(demo, people, refined | {"people": 2})
+    with pytest.raises(ValueError, match="of different weights"):
+        quality(demo, people, refined | {"settings": {"weights": "b"}})
 
 
 def test_times():
