@@ -30,7 +30,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import prepare_process, timed
 from experiments.common.results import write_json
-from experiments.evaluation.results import TASKS, file_digest
+from experiments.evaluation.options import shipped_digest
+from experiments.evaluation.results import TASKS
 
 SHOTS = {"held_out": 3, "poses": 2, "pose_views": 1}
 """Held-out views of a person: of the pose of the photos; unseen poses; views of each."""
@@ -95,21 +96,19 @@ def sweep(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def settings_of() -> dict[str, Any]:
     """What all points depend on."""
-    from importlib import resources
-
     from humangs_jax.network.weights import SHIPPED
     from humangs_jax.people.seeds import GENERATOR_VERSION
 
-    with resources.as_file(resources.files("humangs_jax").joinpath(SHIPPED)) as weights:
-        digest = file_digest(weights)
-    return {"weights": digest, "generator": GENERATOR_VERSION, "size": TRUE_SIZE, **SHOTS}
+    return {"weights": shipped_digest(SHIPPED), "generator": GENERATOR_VERSION, "size": TRUE_SIZE, **SHOTS}
 
 
 def described(point) -> dict[str, Any]:
-    """A point as data."""
+    """A point as data; what it says of weights decides whether an earlier measurement still counts."""
     from humangs_jax.core.configuration import config_to_json
+    from humangs_jax.refinement.learned import SHIPPED
 
-    return {
+    learned = {"refiner": shipped_digest(SHIPPED)} if point.settings.refine_rounds else {}
+    return learned | {
         "knob": point.knob,
         "size": point.size,
         "start": point.start,
