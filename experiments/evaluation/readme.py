@@ -24,14 +24,17 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--timed", type=Path, required=True, help="report of the unrefined demo, nothing compiled before"
+        "--timed", type=Path, help="report of the unrefined demo, nothing compiled before; without it times stay"
     )
     parser.add_argument("--refined", type=Path, required=True, help="report of the refined demo")
     arguments = parser.parse_args()
-    timed, refined = (json.loads(path.read_text()) for path in (arguments.timed, arguments.refined))
+    refined = json.loads(arguments.refined.read_text())
     results = (REPOSITORY / "docs" / "results" / f"{name}.json" for name in ("evaluation_views", "refinement_32"))
     people = [json.loads(path.read_text())["numbers"] for path in results]
-    for name, text in {"readme_quality": quality(refined, *people), "readme_demo": times(timed)}.items():
+    tables = {"readme_quality": quality(refined, *people)}
+    if arguments.timed:
+        tables["readme_demo"] = times(json.loads(arguments.timed.read_text()))
+    for name, text in tables.items():
         print(text)
         publish(REPOSITORY / "README.md", name, text)
 
