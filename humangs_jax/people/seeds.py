@@ -60,8 +60,3 @@ def subject_key(seed: int, appearance: int = 0) -> Key:
     split_of(seed)
     words = np.asarray([appearance % APPEARANCES, seed], np.uint32)
     return jax.random.wrap_key_data(jnp.asarray(words), impl=KEY_KIND)
-
-
-def seed_of_key(key: Key) -> int:
-    """The seed of the person that a key of `subject_key` is for."""
-    return int(jax.random.key_data(key)[..., 1])
