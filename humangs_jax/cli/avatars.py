@@ -90,6 +90,8 @@ class Reconstruct:
     """Speed against accuracy (docs/tradeoff.md): photos, network and refinement, where the options above do not say."""
     config: Path | None = None
     """As --preset, from a file of `humangs tune`."""
+    fit_masks: bool = True
+    """Move masks that are too large or too small to the edges in the photos; --no-fit-masks takes them as they are."""
     check: bool = True
     """Look first whether photos, cameras and poses belong together, the quick part of `humangs check`; --no-check skips it."""
 
@@ -104,7 +106,7 @@ class Reconstruct:
             from humangs_jax.refinement.config import RefineConfig
 
             settings = chosen_settings(self.preset, self.config)
-        photos = _read_capture(self.capture, self.check)
+        photos = _read_capture(self.capture, self.check, self.fit_masks)
         if self.refine not in (None, "0") and photos.masks is None:
             raise ValueError(f"--refine {self.refine}: needs masks, and {self.capture} has none")
         views = settings.views if settings is not None and self.views is None else self.views
@@ -157,6 +159,8 @@ class Refine:
     """The number of Gaussians may grow by this factor: those with the largest errors are split."""
     live: bool = False
     """Write the avatar so far to --out now and then, which `humangs view --live OUT` shows."""
+    fit_masks: bool = True
+    """Move masks that are too large or too small to the edges in the photos; --no-fit-masks takes them as they are."""
     check: bool = True
     """Look first whether photos, cameras and poses belong together, the quick part of `humangs check`; --no-check skips it."""
 
@@ -171,19 +175,19 @@ class Refine:
             from humangs_jax.refinement.config import RefineConfig
 
             avatar = Avatar.load(self.avatar)
-        photos = _read_capture(self.capture, self.check)
+        photos = _read_capture(self.capture, self.check, self.fit_masks)
         how = RefineConfig(
             rounds=self.rounds, image_size=self.image_size, poses=self.refine_poses, growth=self.growth, **limits
         )
         _refine_and_save(avatar, photos, self.out, how, self.live)
 
 
-def _read_capture(path: Path, check: bool) -> "Capture":
+def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
     """A capture, after warnings about what looks wrong in it."""
     with stage("reading the capture"):
         from humangs_jax.data.capture import load_capture
 
-        photos = load_capture(path)
+        photos = load_capture(path, fit_masks=fit_masks)
     if check:
         with stage("checking it"):
             from humangs_jax.apps.quick_check import likely_mistakes

@@ -184,7 +184,7 @@ class Fit:
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
         tell_deleted(target, unless=target if self.out is None else self.capture)
         with stage("reading photos and keypoints"):
-            start = load_capture(self.capture)
+            start = load_capture(self.capture, fit_masks=True)
             keypoints = self.detections.read(start)
         config = CaptureRefineConfig(fixed_cameras=self.refinement.fixed_cameras)
         with stage("refining cameras and body"):
@@ -269,7 +269,7 @@ class Check:
             from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
         with stage("reading the capture"):
-            capture = load_capture(self.capture)
+            capture = load_capture(self.capture, fit_masks=True)
             keypoints, record = self.detections.read(capture), None
             record_file = capture_folder(self.capture) / FIT_FILE
             if keypoints is None and record_file.exists():

@@ -44,6 +44,8 @@ class Start:
     """Axis of the calibration's world that points up, like --up=+z or --up=-y. Default: the format's."""
     without_masks: bool = False
     """Do without masks: the photos have nothing but white behind the person."""
+    fit_masks: bool = True
+    """Move masks that are too large or too small to the edges in the photos; --no-fit-masks takes them as they are."""
     refine: str | None = None
     """Fit the avatar to the photos for so long: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not at all.
     Needs masks. Default, if there are masks: rounds of a learned update alone, one to two seconds."""
@@ -79,7 +81,7 @@ class Start:
             with stage("reading the fit of an earlier run"):
                 from humangs_jax.data.capture import load_capture
 
-                capture = load_capture(self.out)
+                capture = load_capture(self.out, fit_masks=self.fit_masks)
             tell(f"{self.out} has a body: going on from there (--overwrite begins anew)")
             self._finish(capture, limits)
             return
@@ -151,7 +153,7 @@ class Start:
             report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
             write_fitted(self.out, self.out, fitted.capture, report, fitted.record)
         tell(f"\n{report}")
-        return load_capture(self.out)
+        return load_capture(self.out, fit_masks=self.fit_masks)
 
     def _check(self, capture: "Capture") -> None:
         """The sheet of the body over the photos, and what it says."""

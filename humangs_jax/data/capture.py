@@ -167,7 +167,11 @@ def capture_from_arrays(
 
 
 def load_capture(
-    path: str | Path, *, body: BodyModel | None = None, views: Sequence[int] | Int[np.ndarray, " any"] | None = None
+    path: str | Path,
+    *,
+    body: BodyModel | None = None,
+    views: Sequence[int] | Int[np.ndarray, " any"] | None = None,
+    fit_masks: bool = False,
 ) -> Capture:
     """Read and check a capture folder.
 
@@ -176,6 +180,7 @@ def load_capture(
             with the package (and "demo_capture/held_out" its held-out views).
         body: a model to use in place of the one that body.npz names.
         views: read these views only, in this order; the photos of others are not opened.
+        fit_masks: move masks that are too large or too small to the edges in the photos (`data.masks`), and log by how much.
 
     Raises: CaptureError, one line naming file and field.
     """
@@ -187,7 +192,7 @@ def load_capture(
         if body is None:
             body = _load_model(parameter_file, body_file, folder)
         betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
-        photos = read_photos(folder, description, views, len(rotations))
+        photos = read_photos(folder, description, views, len(rotations), fit_masks)
         if body_file != DEFAULT_BODY:
             body_file = str(folder / body_file)
         return _assemble(photos, body, betas, rotations, translations, body_file)

@@ -5,6 +5,7 @@ is a `CaptureError`, one line with file and field. docs/capture_format.md descri
 """
 
 import dataclasses
+import logging
 import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
@@ -15,10 +16,13 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_frame, checked_json, numbers
+from humangs_jax.data.masks import fit_mask
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import read_grey, read_image
 from humangs_jax.io.reading import FileError, inside, reading
 from humangs_jax.io.text import write_json
+
+logger = logging.getLogger(__name__)
 
 FORMAT = "humangs-capture"
 VERSION = 1
@@ -49,14 +53,14 @@ class Photos:
         return int(self.frames.max()) + 1
 
 
-def load_photos(path: str | Path) -> Photos:
-    """Read the photos of a capture folder, whose body.npz need not exist.
+def load_photos(path: str | Path, *, fit_masks: bool = False) -> Photos:
+    """Read the photos of a capture folder, whose body.npz need not exist. fit_masks: see `read_photos`.
 
     Raises: CaptureError, one line naming file and field.
     """
     folder = capture_folder(path)
     with reading(folder / "capture.json", "capture", CaptureError):
-        return read_photos(folder, read_description(folder / "capture.json"))
+        return read_photos(folder, read_description(folder / "capture.json"), fit_masks=fit_masks)
 
 
 def capture_folder(path: str | Path) -> Path:
@@ -156,11 +160,13 @@ def read_photos(
     description: dict[str, Any],
     chosen: Sequence[int] | Int[np.ndarray, " any"] | None = None,
     poses: int | None = None,
+    fit_masks: bool = False,
 ) -> Photos:
     """Photos and cameras that a checked capture.json describes.
 
     Arguments: chosen: read these views only, in this order. poses: how many frames there are; None: one more than the
-    last that a view names.
+    last that a view names. fit_masks: move masks that are too large or too small to the edges in the photos (`data.masks`), and
+    log by how much; only masks in files of their own, of photos that show a background.
     Raises: CaptureError.
     """
     file, views = folder / "capture.json", description["views"]
@@ -176,16 +182,21 @@ def read_photos(
         first = with_mask.index(False)
         raise CaptureError(file, f"views[{first}].mask", "missing, but other views have one: give all or none")
     frames, K, cam_from_world = read_frames_and_matrices(views, poses, file)
-    images, masks = _read_images(folder, views, description.get("background", "photo") == "white")
+    images, masks = _read_images(folder, views, description.get("background", "photo") == "white", fit_masks)
     height, width = images.shape[1:3]
     cameras = [checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]") for i in range(len(views))]
     names = names_from_paths([view["image"] for view in views])
     return Photos(images, masks, stack_cameras(cameras), frames, names)
 
 
-def _read_images(folder, views, on_white):
+def _read_images(folder, views, on_white, fit_masks):
     """Images and masks (or None), all of one size."""
-    images, masks = zip(*[read_view(folder, view, on_white) for view in views], strict=True)
+    images, masks, excesses = zip(*[_read_view(folder, view, on_white, fit_masks) for view in views], strict=True)
+    if moved := [excess for excess in excesses if excess]:
+        off = float(np.median(moved))
+        wrong = f"{abs(off):.1f} pixels too {'large' if off > 0 else 'small'}"
+        count = f"{len(moved)} of {len(views)} masks"
+        logger.warning("%s: %s were off, the median %s: moved to the edges in the photos", folder, count, wrong)
     height, width = images[0].shape[:2]
     for view, image, mask in zip(views, images, masks, strict=True):
         file = folder / view["image"]
@@ -203,11 +214,16 @@ def read_view(
     folder: Path, view: dict[str, Any], on_white: bool
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
     """Image on white where a mask or alpha is known, and the mask or None."""
+    return _read_view(folder, view, on_white, False)[:2]
+
+
+def _read_view(folder, view, on_white, fit_masks):
+    """`read_view`, and by how many pixels the mask was too large, if it was to be fitted."""
     image, alpha = read_checked(read_image, folder / view["image"])
     if alpha is not None:
         image = on_white_background(image, alpha)
     if "mask" not in view:
-        return image, alpha
+        return image, alpha, 0.0
     file = folder / view["mask"]
     mask = read_checked(read_grey, file)
     if mask.shape != image.shape[:2]:
@@ -215,8 +231,10 @@ def read_view(
         raise CaptureError(file, "size", f"{sizes}: expected the same")
     if 0 < mask.max() < 1.5 / 255:
         raise CaptureError(file, "values", "0 and 1: expected 0 (background) to 255 (person)")
-    # where alpha has composited the image already, the mask file only says what the person is
-    return (image if on_white or alpha is not None else on_white_background(image, mask)), mask
+    if on_white or alpha is not None:  # composited already: the mask file only says what the person is
+        return image, mask, 0.0
+    mask, excess = fit_mask(image, mask) if fit_masks else (mask, 0.0)
+    return on_white_background(image, mask), mask, excess
 
 
 def read_checked(reader: Callable[[Path], Any], file: Path) -> Any:

@@ -1,0 +1,160 @@
+"""Masks that are too large or too small, moved to the edges in the photos."""
+
+import json
+import logging
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.masks import PERSON_HEIGHT, fit_mask, outline_moves, signed_distance
+from humangs_jax.io.images import write_png
+
+HEIGHT, WIDTH = 240, 160
+FOUND = 0.5
+"""Of a step more than that of the search, in pixels of a person `PERSON_HEIGHT` high."""
+LEFT = 0.7
+"""Mean distance of an outline from the true one, in the same pixels; measured up to 0.4. The search has steps of 0.5; outlines
+with corners do not grow and shrink by a distance."""
+
+
+def figure(scale=1):
+    """Coverage of a figure of two ellipses and a box, `PERSON_HEIGHT` pixels high at scale 1, with soft edges."""
+    fine = 4
+    y, x = (np.mgrid[: HEIGHT * scale * fine, : WIDTH * scale * fine] + 0.5) / fine / scale
+    parts = [((x - 80) / 18) ** 2 + ((y - 42) / 22) ** 2 < 1, ((x - 80) / 42) ** 2 + ((y - 120) / 62) ** 2 < 1]
+    whole = parts[0] | parts[1] | ((abs(x - 80) < 24) & (y > 120) & (y < 220))
+    return whole.reshape(HEIGHT * scale, fine, WIDTH * scale, fine).mean(axis=(1, 3)).astype(np.float32)
+
+
+def photo_of(mask, seed=0, background=None):
+    """A striped person in front of blurred noise."""
+    rng = np.random.default_rng(seed)
+    size = (*mask.shape, 3)
+    if background is None:
+        noise = ndimage.gaussian_filter(rng.normal(size=size), (3, 3, 0))
+        background = np.clip(0.35 + 0.1 * noise / noise.std(), 0, 1)
+    stripes = 0.75 + 0.15 * np.sign(np.sin(np.arange(mask.shape[0]) / 5))[:, None, None] * np.asarray([1, 0.3, -0.5])
+    return (mask[..., None] * stripes + (1 - mask[..., None]) * background).astype(np.float32)
+
+
+def grown(mask, pixels):
+    """The mask with an outline that lies that many pixels further out."""
+    return np.clip(signed_distance(mask) + pixels + 0.5, 0, 1).astype(np.float32)
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.floats(1.0, 3.5), st.booleans(), st.integers(0, 1000))
+def test_an_outline_that_is_off_is_moved_back(pixels, larger, seed):
+    mask = figure()
+    wrong = grown(mask, pixels if larger else -pixels)
+    fitted, excess = fit_mask(photo_of(mask, seed), wrong)
+    assert abs(excess - (pixels if larger else -pixels)) < FOUND
+    assert np.abs(fitted - mask).sum() < LEFT * np.abs(wrong - mask).sum() / pixels
+    assert fitted.min() >= 0 and fitted.max() <= 1 and fitted.dtype == mask.dtype
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+def test_larger_photos_have_larger_errors(scale):
+    mask = figure(scale)
+    wrong = grown(mask, 3.0 * scale)
+    fitted, excess = fit_mask(photo_of(mask), wrong)
+    assert abs(excess - 3.0 * scale) < FOUND * scale
+    assert np.abs(fitted - mask).sum() < LEFT * np.abs(wrong - mask).sum() / 3
+
+
+def test_one_side_alone_is_moved():
+    """The upper half is too large, the rest is right: each part of the outline is moved by its own error."""
+    mask = figure()
+    wrong = np.where(np.arange(HEIGHT)[:, None] < 150, grown(mask, 3.0), mask)
+    fitted, excess = fit_mask(photo_of(mask), wrong)
+    assert excess > 0
+    assert np.abs(fitted - mask).sum() < LEFT * np.abs(wrong - mask).sum() / 3
+    assert np.abs(fitted - mask)[190:].mean() < 2e-3
+
+
+def test_an_exact_mask_stays():
+    mask = figure()
+    for pixels in (0.0, 0.3, -0.3):
+        given_mask = grown(mask, pixels) if pixels else mask
+        fitted, excess = fit_mask(photo_of(mask), given_mask)
+        assert fitted is given_mask and excess == 0
+
+
+def test_nothing_is_found_where_nothing_can_be():
+    mask = figure()
+    wrong = grown(mask, 2.0)
+    for photo, own in (
+        (photo_of(mask, background=1.0), grown(mask, -2.0)),  # on white already
+        (photo_of(mask), np.zeros_like(mask)),
+        (photo_of(mask), np.ones_like(mask)),
+    ):
+        fitted, excess = fit_mask(photo, own)
+        assert fitted is own and excess == 0
+    flat = np.full((*mask.shape, 3), 0.5, np.float32)
+    fitted, _ = fit_mask(flat, wrong)
+    assert np.isfinite(fitted).all() and fitted.min() >= 0 and fitted.max() <= 1
+
+
+def test_a_person_cut_at_the_frame_and_one_of_few_pixels():
+    mask = figure()
+    cut = slice(60, 200), slice(50, 110)
+    fitted, excess = fit_mask(photo_of(mask)[cut], grown(mask, 3.0)[cut])
+    assert excess > 0
+    assert np.abs(fitted - mask[cut]).sum() < np.abs(grown(mask, 3.0)[cut] - mask[cut]).sum()
+    for rows in (1, 2, 5):
+        small = np.zeros((20, 20), np.float32)
+        small[8 : 8 + rows, 8:11] = 1
+        fitted, _ = fit_mask(photo_of(small), small)
+        assert np.isfinite(fitted).all()
+
+
+def test_moves_are_positive_inside():
+    mask = figure()
+    whole, moves = outline_moves(photo_of(mask), grown(mask, 2.0), 1.0)
+    assert abs(whole - 2.0) < FOUND
+    assert abs(np.median(moves[(mask > 0.1) & (mask < 0.9)]) - 2.0) < FOUND
+    assert np.ptp(np.flatnonzero(mask.any(axis=1))) + 1 == PERSON_HEIGHT
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A capture of one photo whose mask is three pixels too large, and the true mask."""
+    mask = figure()
+    place = tmp_path / "me"
+    place.mkdir()
+    write_png(place / "photo.png", photo_of(mask))
+    write_png(place / "mask.png", grown(mask, 3.0))
+    K, pose = [[200, 0, 80], [0, 200, 120], [0, 0, 1]], np.eye(4).tolist()
+    view = {"image": "photo.png", "mask": "mask.png", "K": K, "cam_from_world": pose}
+    description = {"format": "humangs-capture", "version": 1, "body": "body.npz", "views": [view]}
+    (place / "capture.json").write_text(json.dumps(description))
+    arrays = {"betas": np.zeros(10), "rotations": np.zeros((1, 55, 3)), "translations": np.asarray([[0, 0, 3.0]])}
+    np.savez(place / "body.npz", body="makehuman", **arrays)
+    return place, mask
+
+
+def test_captures_are_read_as_they_are_unless_asked(folder, caplog):
+    place, mask = folder
+    with caplog.at_level(logging.WARNING):
+        plain = load_capture(place)
+    assert not caplog.records
+    np.testing.assert_allclose(plain.masks[0], grown(mask, 3.0), atol=0.5 / 255)
+    with caplog.at_level(logging.WARNING):
+        fitted = load_capture(place, fit_masks=True)
+    assert "1 of 1 masks were off, the median 3." in caplog.text and "too large" in caplog.text
+    assert np.abs(fitted.masks[0] - mask).sum() < LEFT * np.abs(plain.masks[0] - mask).sum() / 3
+    np.testing.assert_array_equal(fitted.images[0][fitted.masks[0] == 0], 1)
+
+
+def test_masks_of_photos_on_white_are_never_moved(folder, caplog):
+    place, mask = folder
+    description = json.loads((place / "capture.json").read_text())
+    (place / "capture.json").write_text(json.dumps(description | {"background": "white"}))
+    with caplog.at_level(logging.WARNING):
+        capture = load_capture(place, fit_masks=True)
+    assert not caplog.records
+    np.testing.assert_allclose(capture.masks[0], grown(mask, 3.0), atol=0.5 / 255)
