@@ -30,6 +30,7 @@ from humangs_jax.data.capture_checks import (
     checked_frame,
     numbers,
 )
+from humangs_jax.data.masks import fit_mask
 from humangs_jax.data.photos import (
     Photos,
     capture_folder,
@@ -117,6 +118,7 @@ def capture_from_arrays(
     frames: Any | None = None,
     names: Sequence[str] | None = None,
     background: str = "photo",
+    fit_masks: bool = False,
     body: BodyModel | None = None,
     body_file: str | Path = DEFAULT_BODY,
     source: str = "arrays",
@@ -130,6 +132,7 @@ def capture_from_arrays(
         frames: (v,) which of the m poses each view shows; may be left out when m is 1.
         names: (v,) file names without suffix; "000", "001", ... if left out.
         background: "photo": the masks are used to put the images on white; "white": they are on white already.
+        fit_masks: first move masks of photos that are too large or too small to the edges in the photos (`data.masks`).
         body: the model; None loads `body_file`, by default the body that comes with the package.
         source: what errors call the arrays.
 
@@ -161,6 +164,8 @@ def capture_from_arrays(
     check_names(names, v, source)
     check_background(background, source)
     if masks is not None and background == "photo":
+        if fit_masks:
+            masks = np.stack([fit_mask(image, mask)[0] for image, mask in zip(images, masks, strict=True)])
         images = on_white_background(images, masks)
     photos = Photos(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names)
     return _assemble(photos, body, betas, rotations, translations, body_file)

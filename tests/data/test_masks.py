@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from humangs_jax.data.capture import load_capture
+from humangs_jax.data.capture import capture_from_arrays, load_capture
 from humangs_jax.data.masks import PERSON_HEIGHT, fit_mask, outline_moves, signed_distance
-from humangs_jax.io.images import write_png
+from humangs_jax.io.images import read_grey, read_image, write_png
 
 HEIGHT, WIDTH = 240, 160
 FOUND = 0.5
@@ -148,6 +148,11 @@ def test_captures_are_read_as_they_are_unless_asked(folder, caplog):
     assert "1 of 1 masks were off, the median 3." in caplog.text and "too large" in caplog.text
     assert np.abs(fitted.masks[0] - mask).sum() < LEFT * np.abs(plain.masks[0] - mask).sum() / 3
     np.testing.assert_array_equal(fitted.images[0][fitted.masks[0] == 0], 1)
+    photo, wrong = read_image(place / "photo.png")[0], read_grey(place / "mask.png")
+    arrays = photo[None], fitted.cameras.K, fitted.cameras.cam_from_world, np.zeros((1, 55, 3)), np.zeros((1, 3))
+    same = capture_from_arrays(*arrays, masks=wrong[None], fit_masks=True)
+    np.testing.assert_array_equal(same.masks, fitted.masks)
+    np.testing.assert_array_equal(same.images, fitted.images)
 
 
 def test_masks_of_photos_on_white_are_never_moved(folder, caplog):
