@@ -5,6 +5,7 @@ import logging
 
 import numpy as np
 import pytest
+from command_line import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
@@ -163,3 +164,14 @@ def test_masks_of_photos_on_white_are_never_moved(folder, caplog):
         capture = load_capture(place, fit_masks=True)
     assert not caplog.records
     np.testing.assert_allclose(capture.masks[0], grown(mask, 3.0), atol=0.5 / 255)
+
+
+@pytest.mark.parametrize(("option", "moved"), [((), True), (("--no-fit-masks",), False)])
+def test_reconstruct_moves_masks_unless_told_not_to(option, moved, folder, caplog, monkeypatch, capsys):
+    place, _ = folder
+    # ends when the capture was read: these are no weights
+    ends = "--weights", place / "body.npz", "--out", place / "avatar.npz"
+    with caplog.at_level(logging.WARNING):
+        code, _, err = run(monkeypatch, capsys, "reconstruct", place, "--no-check", *ends, *option)
+    assert code == 1 and "body.npz" in err
+    assert ("masks were off" in caplog.text) == moved
