@@ -191,7 +191,7 @@ def read_photos(
 
 def _read_images(folder, views, on_white, fit_masks):
     """Images and masks (or None), all of one size."""
-    images, masks, excesses = zip(*[_read_view(folder, view, on_white, fit_masks) for view in views], strict=True)
+    images, masks, excesses = zip(*[read_view(folder, view, on_white, fit_masks) for view in views], strict=True)
     if moved := [excess for excess in excesses if excess]:
         off = float(np.median(moved))
         wrong = f"{abs(off):.1f} pixels too {'large' if off > 0 else 'small'}"
@@ -211,14 +211,9 @@ def _read_images(folder, views, on_white, fit_masks):
 
 
 def read_view(
-    folder: Path, view: dict[str, Any], on_white: bool
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
-    """Image on white where a mask or alpha is known, and the mask or None."""
-    return _read_view(folder, view, on_white, False)[:2]
-
-
-def _read_view(folder, view, on_white, fit_masks):
-    """`read_view`, and by how many pixels the mask was too large, if it was to be fitted."""
+    folder: Path, view: dict[str, Any], on_white: bool, fit_masks: bool = False
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, float]:
+    """Image on white where a mask or alpha is known, the mask or None, and by how many pixels `fit_mask` found it too large."""
     image, alpha = read_checked(read_image, folder / view["image"])
     if alpha is not None:
         image = on_white_background(image, alpha)

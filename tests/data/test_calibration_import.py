@@ -220,7 +220,7 @@ def test_alpha_becomes_a_mask_when_undistorted(rig):
         Image.fromarray(pixels).save(rig[1] / file)
     assert import_rig(rig).undistorted == 3
     for view in views_of(rig[2]):
-        image, mask = read_view(rig[2], view, on_white=False)
+        image, mask, _ = read_view(rig[2], view, on_white=False)
         assert mask is not None and mask[20, 30] == 1 and mask[2, 2] == 0
         np.testing.assert_allclose(image[20, 30], [1, 0, 0])
         np.testing.assert_allclose(image[2, 2], 1)
@@ -238,7 +238,7 @@ def test_alpha_stays_beside_masks_when_undistorted(rig, tmp_path):
         Image.fromarray(np.full((written.HEIGHT, written.WIDTH), 255, np.uint8)).save(tmp_path / "masks" / file)
     import_rig(rig, masks=tmp_path / "masks")
     for view in views_of(rig[2]):
-        image, mask = read_view(rig[2], view, on_white=False)
+        image, mask, _ = read_view(rig[2], view, on_white=False)
         assert mask is not None and mask[20, 30] == mask[5, 30] == 1
         np.testing.assert_allclose(image[20, 30], [1, 0, 0])
         np.testing.assert_allclose(image[5, 30], 1)
