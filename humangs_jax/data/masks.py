@@ -33,10 +33,10 @@ def fit_mask(
     """The mask with its outline at the photo's edges, and by how many pixels of the photo it was too large (negative: small).
 
     Arguments: image: the photo with its background, values in [0, 1]. mask: coverage in [0, 1].
-    A mask that is empty or full, off by less than `LEAST`, or of a photo without a background comes back as it is, with 0.
+    A mask that is empty, full or a line, off by less than `LEAST`, or of a photo without a background comes back as it is, with 0.
     """
     rows, columns = (np.flatnonzero((mask >= 0.5).any(axis)) for axis in (1, 0))
-    if not len(rows) or mask.min() >= 0.5:
+    if not len(rows) or mask.min() >= 0.5 or min(mask.shape) < 2:
         return mask, 0.0
     unit = (rows[-1] + 1 - rows[0]) / PERSON_HEIGHT
     margin = int(np.ceil((REACH + 3 * STEP) * unit)) + 1

@@ -92,6 +92,7 @@ def test_nothing_is_found_where_nothing_can_be():
         (photo_of(mask, background=1.0), grown(mask, -2.0)),  # on white already
         (photo_of(mask), np.zeros_like(mask)),
         (photo_of(mask), np.ones_like(mask)),
+        (photo_of(mask)[:1], np.eye(1, WIDTH, dtype=np.float32)),
     ):
         fitted, excess = fit_mask(photo, own)
         assert fitted is own and excess == 0
