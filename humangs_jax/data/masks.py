@@ -33,7 +33,7 @@ def fit_mask(
     """The mask with its outline at the photo's edges, and by how many pixels of the photo it was too large (negative: small).
 
     Arguments: image: the photo with its background, values in [0, 1]. mask: coverage in [0, 1].
-    A mask that is empty, full or a line, off by less than `LEAST`, or of a photo without a background comes back as it is, with 0.
+    A mask that is empty, full or a line, off by less than `LEAST`, or of a photo without a background is kept, with 0.
     """
     rows, columns = (np.flatnonzero((mask >= 0.5).any(axis)) for axis in (1, 0))
     if not len(rows) or mask.min() >= 0.5 or min(mask.shape) < 2:
