@@ -107,9 +107,15 @@ def _rebuild_parameter(tensor: Any, *_: Any) -> _Tensor:
 
 
 def _ordered_dict(*arguments: Any) -> dict:
-    if arguments:  # items follow, but for those of Python 2.6
-        raise Refused("an ordered dict that is made of something")
-    return {}
+    """An empty one, whose items follow. Python 2 wrote them before, as a list of [key, value]."""
+    pairs = arguments[0] if arguments else []
+    if len(arguments) > 1 or type(pairs) is not list:
+        raise Refused("an ordered dict that is made of something else than a list of pairs")
+    if not all(type(pair) is list and len(pair) == 2 and type(pair[0]) is str for pair in pairs):
+        raise Refused("an ordered dict that is made of something else than pairs of a name and a value")
+    made = {key: value for key, value in pairs}
+    pairs.clear()  # a pickle may name one list many times: each of its instructions makes one item, no more
+    return made
 
 
 MOST_AXES = 32

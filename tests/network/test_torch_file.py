@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from torch_writer import FakeTensor, pickled, write_checkpoint, write_stream
+from torch_writer import FakeTensor, pickled, write_checkpoint, write_python2_stream, write_stream
 
 from humangs_jax.io.torch_file import read_torch_file
 
@@ -242,6 +242,53 @@ def test_parts_of_storages_in_old_streams(tmp_path):
     beyond = FakeTensor(numbers, shape=(2,), strides=(1,), part=("1", 8, 2))
     with pytest.raises(ValueError, match="does not fit storage"):
         read_torch_file(write_stream(tmp_path / "a.pt", {"w": beyond}))
+
+
+def test_state_dicts_that_python_2_wrote(tmp_path):
+    numbers = np.arange(12, dtype=np.float32)
+    truth = {
+        "lin0.model.1.weight": numbers.reshape(1, 12, 1, 1),
+        "lin1.model.1.weight": numbers[:3].reshape(1, 3, 1, 1),
+    }
+    state, skipped = read_torch_file(write_python2_stream(tmp_path / "a.pth", truth))
+    assert skipped == 0 and list(state) == list(truth)
+    for key, expected in truth.items():
+        assert state[key].dtype == np.float32 and np.array_equal(state[key], expected), key
+
+
+ORDERED = b"\x80\x02ccollections\nOrderedDict\n"
+
+
+@pytest.mark.parametrize(
+    ("items", "words"),
+    [
+        (b"K\x03\x85R.", "a list of pairs"),
+        (b"]]\x86R.", "a list of pairs"),
+        (b"](]eK\x01\x86R.", "a list of pairs"),
+        (b"](]e\x85R.", "pairs of a name and a value"),
+        (b"](](K\x01K\x02ee\x85R.", "pairs of a name and a value"),
+        (b"](](]K\x02ee\x85R.", "pairs of a name and a value"),
+        (b"](K\x07e\x85R.", "pairs of a name and a value"),
+    ],
+)
+def test_ordered_dicts_of_other_things_are_refused(items, words, tmp_path):
+    with pytest.raises(ValueError, match=rf"a\.pt: .*{words}"):
+        read_torch_file(write_pickle(tmp_path / "a.pt", ORDERED + items))
+
+
+def test_a_list_of_pairs_makes_one_dict(tmp_path):
+    """Named again, it is empty: a pickle of n instructions never makes n^2 items."""
+    tensor = b"ctorch._utils\n_rebuild_tensor_v2\n((U\x07storagectorch\nFloatStorage\nU\x010U\x03cpuK\x00tQK\x00K\x00\x85K\x01\x85tR"
+    tensor = b"](U\x01w" + tensor + b"e"
+    pairs = b"](" + tensor + b"eq\x01"
+    data = (
+        b"\x80\x02}(U\x05modelccollections\nOrderedDict\n"
+        + pairs
+        + b"\x85RU\x05otherccollections\nOrderedDict\nh\x01\x85Ru."
+    )
+    assert list(read_torch_file(write_pickle(tmp_path / "a.pt", data, **{"0": b""}))[0]) == ["w"]
+    data = data.replace(b"U\x05model", b"U\x05third").replace(b"U\x05other", b"U\x05model")
+    assert not read_torch_file(write_pickle(tmp_path / "a.pt", data, **{"0": b""}))[0]
 
 
 def test_a_storage_of_two_types_is_refused(tmp_path):

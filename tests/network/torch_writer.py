@@ -97,3 +97,34 @@ def write_stream(path, content, magic=MAGIC_NUMBER, version=STREAM_VERSION, litt
         for storage in storages:
             file.write(struct.pack("<q", count(storage.size)) + storage.tobytes())
     return path
+
+
+def write_python2_stream(path, state, device="cuda:0"):
+    """A state dict as Python 2 wrote it in the older format, instruction by instruction: the form of lpips' heads.
+
+    Strings are bytes, an OrderedDict is a call with a list of [key, value] lists, and its attributes follow.
+    """
+    text = lambda value: b"U" + bytes([len(value)]) + value.encode()
+    count = lambda value: b"J" + struct.pack("<i", value)
+    counts = lambda values: b"(" + b"".join(map(count, values)) + b"t"
+    metadata = (
+        text("_metadata") + b"ccollections\nOrderedDict\n(](](" + text("") + b"}" + text("version") + b"K\x01seetR"
+    )
+
+    def tensor(i, x):
+        kind = f"ctorch\n{KINDS[x.dtype]}\n".encode()
+        reference = (
+            b"(" + text("storage") + kind + text(str(i)) + text(device) + b"\x8a\x03" + x.size.to_bytes(3, "little")
+        )
+        view = count(0) + counts(x.shape) + counts(contiguous(x.shape))
+        return b"ctorch._utils\n_rebuild_tensor_v2\n(" + reference + b"NtQ" + view + b"\x89NtR"
+
+    pairs = (b"](" + text(key) + tensor(i, x) + b"e" for i, (key, x) in enumerate(state.items()))
+    data = b"\x80\x02ccollections\nOrderedDict\n](" + b"".join(pairs) + b"e\x85R}" + metadata + b"sb."
+    machine = b"\x80\x02}(" + text("protocol_version") + b"M\xe9\x03" + text("little_endian") + b"\x88u."
+    with open(path, "wb") as file:
+        file.write(pickle.dumps(MAGIC_NUMBER, 2) + pickle.dumps(STREAM_VERSION, 2) + machine + data)
+        file.write(b"\x80\x02](" + b"".join(text(str(i)) for i in range(len(state))) + b"e.")
+        for x in state.values():
+            file.write(struct.pack("<q", x.size) + x.tobytes())
+    return path
