@@ -278,14 +278,11 @@ def test_ordered_dicts_of_other_things_are_refused(items, words, tmp_path):
 
 def test_a_list_of_pairs_makes_one_dict(tmp_path):
     """Named again, it is empty: a pickle of n instructions never makes n^2 items."""
-    tensor = b"ctorch._utils\n_rebuild_tensor_v2\n((U\x07storagectorch\nFloatStorage\nU\x010U\x03cpuK\x00tQK\x00K\x00\x85K\x01\x85tR"
-    tensor = b"](U\x01w" + tensor + b"e"
-    pairs = b"](" + tensor + b"eq\x01"
-    data = (
-        b"\x80\x02}(U\x05modelccollections\nOrderedDict\n"
-        + pairs
-        + b"\x85RU\x05otherccollections\nOrderedDict\nh\x01\x85Ru."
-    )
+    tensor = b"](U\x01wctorch._utils\n_rebuild_tensor_v2\n("
+    tensor += b"(U\x07storagectorch\nFloatStorage\nU\x010U\x03cpuK\x00tQK\x00K\x00\x85K\x01\x85tR"
+    pairs = b"](" + tensor + b"eeq\x01"
+    made = lambda name, items: b"U\x05" + name + b"ccollections\nOrderedDict\n" + items + b"\x85R"
+    data = b"\x80\x02}(" + made(b"model", pairs) + made(b"other", b"h\x01") + b"u."
     assert list(read_torch_file(write_pickle(tmp_path / "a.pt", data, **{"0": b""}))[0]) == ["w"]
     data = data.replace(b"U\x05model", b"U\x05third").replace(b"U\x05other", b"U\x05model")
     assert not read_torch_file(write_pickle(tmp_path / "a.pt", data, **{"0": b""}))[0]
