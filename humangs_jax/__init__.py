@@ -74,6 +74,7 @@ _PUBLIC = {
     "show": "viewer.page",
     "skin": "avatar.animate",
     "stack_cameras": "geometry.camera",
+    "stack_captures": "avatar.reconstruct",
     "train": "training.loop",
     "write_page": "viewer.page",
     "write_ply": "avatar.export",

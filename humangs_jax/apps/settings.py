@@ -14,7 +14,8 @@ import jax
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
-from humangs_jax.core.configuration import config_from_json, config_to_json, knob
+from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.configuration import Presets, check_fields, config_from_json, config_to_json, knob
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.view_selection import select_views
 from humangs_jax.io.reading import Refused, reading
@@ -50,7 +51,8 @@ class Settings:
     prune: bool = knob(False, cost="3 of 255 levels", gain="time of frames that are drawn often", measured="video.md")
 
     def __post_init__(self):
-        """Raises ValueError for settings out of range, naming them."""
+        """Raises ValueError for settings out of range or of another type, naming them."""
+        check_fields(self)
         counts = {"views": self.views, "refine_size": self.refine_size}
         if wrong := [name for name, value in counts.items() if value is not None and value < 1]:
             raise ValueError(f"Settings: {', '.join(wrong)} must be at least 1")
@@ -88,27 +90,41 @@ class Settings:
         return dataclasses.replace(shot, splat=splat, prune=shot.prune or self.prune)
 
 
-PRESETS: dict[str, Settings] = {
-    "realtime": Settings(views=4, execution=EXECUTIONS["realtime"], splat="fast"),
-    "balanced": Settings(
-        views=4, execution=EXECUTIONS["balanced"], refine_rounds=4, refine_size=256, splat="near_exact"
-    ),
-    "quality": Settings(views=4, execution=EXECUTIONS["quality"], refine_rounds=4, refine_size=512, splat="near_exact"),
-    "best": Settings(execution=EXECUTIONS["best"], refine_rounds=4, refine_steps=100, refine_size=512),
-}
+PRESETS: Presets[Settings] = Presets(
+    {
+        "realtime": Settings(views=4, execution=EXECUTIONS["realtime"], splat="fast"),
+        "balanced": Settings(
+            views=4, execution=EXECUTIONS["balanced"], refine_rounds=4, refine_size=256, splat="near_exact"
+        ),
+        "quality": Settings(
+            views=4, execution=EXECUTIONS["quality"], refine_rounds=4, refine_size=512, splat="near_exact"
+        ),
+        "best": Settings(execution=EXECUTIONS["best"], refine_rounds=4, refine_steps=100, refine_size=512),
+    },
+    "; those of training are in humangs_jax.training.config",
+)
 """From the fastest to the slowest; docs/tradeoff.md has what each takes and gains."""
 
 
+@checked_arguments
 def reconstruct_with(
-    settings: Settings, variables: Variables, config: HumanGSConfig, capture: Capture, progress: bool = False
+    settings: Settings | str,
+    variables: Variables,
+    config: HumanGSConfig,
+    capture: Capture,
+    progress: bool = False,
 ) -> Avatar:
     """An avatar of the person of a capture: `reconstruct`, then `refine` where the settings say so.
 
-    Arguments: config: of the weights; its execution is replaced by that of the settings. capture: `Settings.photos` are used.
-    progress: show the bar of refinement.
+    Arguments: settings: or the name of one of `PRESETS`. config: of the weights; its execution is replaced by that of the
+    settings. capture: `Settings.photos` are used. progress: show the bar of refinement.
 
     Raises: ValueError as `reconstruct` and `refine`.
     """
+    if isinstance(settings, str):
+        if settings not in PRESETS:
+            raise ValueError(f"settings {settings!r}: expected Settings or one of {', '.join(PRESETS)}")
+        settings = PRESETS[settings]
     photos = settings.photos(capture)
     avatar = reconstruct(variables, settings.network(config), photos)
     if settings.refinement is not None:

@@ -6,11 +6,13 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.light import light_values, relit
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.checks import FINITE, check_values
 from humangs_jax.core.pytree import replace
 from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values, skin_gaussians
 
 
+@checked_arguments
 def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
     """Posed Gaussians, differentiable in avatar and pose; affine skinning leaves its linear part in `deformations`.
 
@@ -23,6 +25,7 @@ def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
     return skin_gaussians(gaussians, transforms, avatar.skinning)
 
 
+@checked_arguments
 def animate(avatar: Avatar, pose: BodyPose) -> Gaussians:
     """Posed Gaussians that means, quats and scales describe completely (the linear deformation is factored into them).
 

@@ -2,7 +2,7 @@
 
 import json
 import os
-from typing import Literal
+from typing import ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from humangs_jax.avatar.light import TERMS, Light
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.checks import ROUNDING
 from humangs_jax.core.numerics import at_least_float32
-from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
+from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, shape_fault, static_field
 from humangs_jax.io.arrays import check_array, check_checksum, check_indices, check_joints, checksum
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import FileError, Refused, reading
@@ -38,8 +38,11 @@ _LIGHT = ("coefficients", "normals", "shading")
 
 
 @pytree_dataclass
-class Avatar:
+class Avatar(Batchable):
     """A person who can be animated: Gaussians in the T-pose (theta = 0).
+
+    Or a batch of people, leading axes on every array: it can be indexed and iterated over, and functions are mapped over it with
+    `jax.vmap`.
 
     gaussians: canonical, metres; vertex-major, the k Gaussians of a vertex together, unless refinement has added some.
     skinning_weights: (g, j), rows sum to 1. rest_vertices: (n, 3) and rest_joints: (j, 3), the shaped body in the T-pose. faces:
@@ -57,6 +60,7 @@ class Avatar:
     skinning: Literal["affine", "rotation"] = static_field(default="affine")
     rendering: Literal["exact", "inria"] = static_field(default="exact")
     light: Light | None = None
+    one_at_a_time: ClassVar[bool] = True
 
     @property
     def gaussians_per_vertex(self) -> int | None:
@@ -80,8 +84,13 @@ class Avatar:
     def save(self, path: str | os.PathLike) -> None:
         """Write one compressed `.npz` (no pickle); it appears whole or not at all.
 
-        Raises: ValueError if the Gaussians are deformed, as those of a pose are: avatars are in the T-pose.
+        Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and if the Gaussians are deformed, as
+        those of a pose are: avatars are in the T-pose.
         """
+        if self.batch_shape:
+            raise ValueError(f"expected one avatar, got a batch {self.batch_shape}: save each, avatars[0].save(path)")
+        if fault := shape_fault(self):
+            raise ValueError(f"avatar{fault}")
         if self.gaussians.deformations is not None:
             raise ValueError("gaussians.deformations: expected an avatar in the T-pose, which has none")
         header = {

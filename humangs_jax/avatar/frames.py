@@ -13,7 +13,8 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
-from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.array_types import Float
 from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
@@ -21,6 +22,7 @@ from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov
 from humangs_jax.rendering.constants import ALPHA_MIN
+from humangs_jax.rendering.drawing import Background
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig, drawn_as
 from humangs_jax.rendering.splatting import BufferOverflowError, Rendering, plan_buffers, render
@@ -42,7 +44,7 @@ def draw(
     avatar: Avatar,
     poses: Iterable[BodyPose],
     cameras: Iterable[Camera],
-    background: Float[Array, "3"] | None = None,
+    background: Background = None,
     how: SplatConfig | None = None,
 ) -> Iterator[Rendering]:
     """One rendering per pose and camera. how: None for what the avatar's weights were trained with."""
@@ -53,7 +55,7 @@ def draw(
 def draw_gaussians(
     gaussians: Iterable[Gaussians],
     cameras: Iterable[Camera],
-    background: Float[Array, "3"] | None = None,
+    background: Background = None,
     how: SplatConfig = SPLAT_PRESETS["exact"],
 ) -> Iterator[Rendering]:
     """One rendering per frame of Gaussians and camera.
@@ -260,7 +262,7 @@ def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
 
 
 def capture_renderings(
-    avatar: Avatar, capture: Capture, background: Float[Array, "3"] | None = None, how: SplatConfig | None = None
+    avatar: Avatar, capture: Capture, background: Background = None, how: SplatConfig | None = None
 ) -> tuple[Camera, list[Rendering]]:
     """The avatar in the poses and from the cameras of a capture. how: as for `draw`. Raises: as `capture_views`."""
     poses, cameras = capture_views(avatar, capture)
@@ -279,6 +281,7 @@ def images(
     return (image_of(rendering, shot.color()) for rendering in shown)
 
 
+@checked_arguments
 def motion_frames(
     avatar: Avatar,
     motion: Motion,

@@ -16,11 +16,12 @@ from humangs_jax.avatar.light import Light, light_coefficients, light_terms, log
 from humangs_jax.avatar.low_pass import with_low_pass
 from humangs_jax.body.model import BodyModel, BodyPose, shape_body
 from humangs_jax.body.skinning import blend_transforms, joint_transforms, spread_weights
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.views import SubjectViews, gaussian_body, pad_views, prepare_inputs, standardize, upright
+from humangs_jax.data.views import SubjectViews, fits, gaussian_body, pad_views, prepare_inputs, standardize, upright
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import camera_values
 from humangs_jax.network.config import HumanGSConfig
@@ -36,6 +37,7 @@ SMALLEST_VOLUME = 0.2
 """Blended transforms of limbs that are turned against each other collapse; below this determinant they are not inverted."""
 
 
+@checked_arguments
 def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> Avatar:
     """Reconstruct the person of a capture.
 
@@ -61,6 +63,7 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     return replace(avatar, light=None) if turned else avatar
 
 
+@checked_arguments
 def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequence[Capture]) -> list[Avatar]:
     """Reconstruct several people in one program: `reconstruct` for each, whatever their numbers of views.
 
@@ -69,31 +72,63 @@ def reconstruct_batch(variables: PyTree, config: HumanGSConfig, captures: Sequen
     Raises: ValueError if there is no capture, one has no view or values that are not finite or out of range, or their bodies
     differ (their shapes may).
     """
-    if not captures:
-        raise ValueError("captures: none given")
-    model = captures[0].body
+    body, views, config, turned = _stacked(config, captures)
+    avatars, _ = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(variables, config, body, views)
+    return [replace(avatar, light=None) if moved else avatar for avatar, moved in zip(avatars, turned, strict=True)]
+
+
+@checked_arguments
+def stack_captures(config: HumanGSConfig, captures: Sequence[Capture]) -> tuple[BodyModel, SubjectViews, HumanGSConfig]:
+    """What several people are reconstructed from in one program of your own: body, views, configuration.
+
+        body, views, config = stack_captures(config, captures)
+        batched = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))
+        avatars, dropped = batched(variables, config, body, views)    # `reconstruct_batch`, as one batch of avatars
+
+    Returns the body that carries the Gaussians; the photos as the network wants them (leading axis b, padded to the largest
+    number of views); `config` with room for as many tokens as these photos need.
+
+    Raises: ValueError as `reconstruct_batch`; also if some worlds, but not all, are not y-up and the avatars are to have the
+    light of their photos: in a batch all have one or none has.
+    """
+    body, views, config, turned = _stacked(config, captures)
+    if config.conventions.light and any(turned):
+        if not all(turned):
+            raise ValueError(
+                f"captures[{turned.index(True)}]: its world is not y-up, so that its avatar has no light, but others have: "
+                "stack them apart, or use reconstruct_batch"
+            )
+        config = config.with_conventions(light=False)
+    return body, views, config
+
+
+def _stacked(config, captures):
+    """Body, views, configuration; and whether each world has been turned."""
+    if not isinstance(captures, Sequence) or not captures:
+        none = isinstance(captures, Sequence)
+        raise ValueError(f"captures: {'none given' if none else f'expected a list, got {type(captures).__name__}'}")
     for index, capture in enumerate(captures):
+        if not isinstance(capture, Capture):
+            raise TypeError(f"captures[{index}]: expected Capture, got {type(capture).__name__}")
         _check(capture, f"captures[{index}]")
-        if capture.body is not model and not _equal(capture.body, model):
+        if capture.body is not captures[0].body and not _equal(capture.body, captures[0].body):
             raise ValueError(
                 f"captures[{index}]: its body is not the one of captures[0]; a batch shares one body model"
             )
-    body = gaussian_body(model, config)
+    body = gaussian_body(captures[0].body, config)
     bucket = round_up(max(capture.view_count for capture in captures), smallest=1)
     coefficients = max(len(capture.betas) for capture in captures)
     subjects, turned = [], []
     for capture in captures:
         photos = standardize(capture, config.image_size, config.execution.crop)
-        turned.append((views := upright(photos, model)) is not photos)
+        turned.append((views := upright(photos, capture.body)) is not photos)
         views = pad_views(views, bucket)
         betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
         subjects.append(replace(views, betas=betas))
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *subjects)
     inputs = _prepare_batch(body, batch, config)
     _check_posed(inputs, "captures")
-    avatars, _ = _assemble_batch(variables, fit_buffers(inputs, config), body, batch, inputs)
-    alone = [jax.tree.map(lambda leaf, i=index: leaf[i], avatars) for index in range(len(captures))]
-    return [replace(avatar, light=None) if moved else avatar for avatar, moved in zip(alone, turned, strict=True)]
+    return body, batch, fit_buffers(inputs, config), turned
 
 
 def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
@@ -103,16 +138,31 @@ def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
     return config.with_execution(token_capacity=capacity, vertex_capacity=None)
 
 
+@checked_arguments
 def reconstruct_views(
     variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews
 ) -> tuple[Avatar, Int[Array, ""]]:
     """The pure function behind `reconstruct`: one subject's views -> avatar, and the count of foreground patches that did
     not fit into `config.execution.token_capacity`.
 
-    Weights files record no token capacity, and the default has room for all patches:
-    `config.with_execution(token_capacity=...)` saves the time of the others. Batch over subjects with
-    `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`, with a body from `gaussian_body`.
+    Batch over subjects with `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`; `stack_captures` makes the arguments.
+    Weights files record no token capacity, and the default has room for all patches, which takes the time of all.
+
+    Raises: ValueError if the body is not one of `gaussian_body` for this configuration, or the photos are not of its size.
     """
+    made = "body, views, config = stack_captures(config, captures) makes what it wants"
+    (height, width), side = views.images.shape[1:3], config.image_size
+    if {height, width, views.cameras.height, views.cameras.width} != {side}:
+        raise ValueError(f"reconstruct_views: photos of {width} x {height}, config wants {side} x {side}; {made}")
+    if not fits(body, config):
+        raise ValueError(
+            f"reconstruct_views: a body of {len(body.template)} vertices that gaussian_body(body, config) has not made; {made}"
+        )
+    return _reconstruct(variables, config, body, views)
+
+
+@jax.jit
+def _reconstruct(variables, config, body, views):
     return _assemble(variables, config, body, views, prepare_inputs(body, views, config))
 
 
@@ -257,13 +307,7 @@ def _equal(body, other):
     return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(body), jax.tree.leaves(other), strict=True))
 
 
-_assemble_compiled = jax.jit(_assemble, static_argnames="config")
-_assemble_batch = jax.jit(
-    lambda variables, config, body, batch, inputs: jax.vmap(_assemble, in_axes=(None, None, None, 0, 0))(
-        variables, config, body, batch, inputs
-    ),
-    static_argnames="config",
-)
-_prepare = jax.jit(prepare_inputs, static_argnames="config")
-_prepare_batch = jax.jit(_prepare_subjects, static_argnames="config")
-_needed_tokens = jax.jit(_most_needed, static_argnames="config")
+_assemble_compiled = jax.jit(_assemble)
+_prepare = jax.jit(prepare_inputs)
+_prepare_batch = jax.jit(_prepare_subjects)
+_needed_tokens = jax.jit(_most_needed)

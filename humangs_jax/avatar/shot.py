@@ -66,18 +66,11 @@ class Shot:
 
     def color(self) -> tuple[float, float, float] | None:
         """Red, green and blue of the background in [0, 1]; None: transparent. Raises: ValueError for what is no colour."""
-        if self.background == "white":  # without Pillow: --help asks for it, too
-            return 1.0, 1.0, 1.0
         if self.background.strip().lower() == "transparent":
             return None
-        from PIL import ImageColor
+        from humangs_jax.io.images import named_color
 
         try:
-            red, green, blue, *alpha = ImageColor.getrgb(self.background.strip())
-        except ValueError:
-            red = green = blue = -1
-            alpha = [0]
-        if alpha:
-            wanted = 'a colour such as white or "#20a0ff", or transparent'
-            raise ValueError(f"background {self.background!r}: expected {wanted}")
-        return red / 255, green / 255, blue / 255
+            return named_color(self.background)
+        except ValueError as error:
+            raise ValueError(f"{error}, or transparent") from None

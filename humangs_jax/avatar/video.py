@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Float
 from humangs_jax.io.atomic import add_files, replace_file
 from humangs_jax.io.images import to_uint8, write_png
@@ -54,6 +55,7 @@ def check_video(
         raise NotADirectoryError(f"{option} {path}: is a file: expected a folder name")
 
 
+@checked_arguments
 def write_video(
     path: str | Path, frames: Float[np.ndarray, "m h w c"] | Iterable[Float[np.ndarray, "h w c"]], fps: float | int
 ) -> int:

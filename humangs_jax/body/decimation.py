@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.pytree import replace
 
 FLATNESS = 100.0
@@ -286,6 +287,7 @@ def _carry_uvs(body, faces, target, kept_faces):
     return jnp.asarray(uvs[used]), jnp.asarray(renumbered.reshape(-1, 3), jnp.int32)
 
 
+@checked_arguments
 def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
     """A body on `vertex_count` of the body's own vertices, with the same joints for every shape.
 
@@ -327,6 +329,7 @@ def decimate(body: BodyModel, vertex_count: int) -> BodyModel:
         faces=jnp.asarray(renumber[ends[solid]], jnp.int32),
         uvs=uvs,
         uv_faces=uv_faces,
+        made_for=None,
         collapse_order=jnp.asarray(order[kept], jnp.int32),
         collapse_into=jnp.asarray(renumber[into[kept]], jnp.int32),
     )

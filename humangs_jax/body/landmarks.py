@@ -27,6 +27,7 @@ from humangs_jax.body import skinning
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, pose_features
 from humangs_jax.body.surface_points import SurfacePoints, pose_points, shaped
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass, static_field
 from humangs_jax.geometry import transform
@@ -61,6 +62,7 @@ class LandmarkModel:
     movers: tuple[int, ...] = static_field(default=())
 
 
+@checked_arguments
 def landmark_model(body: BodyModel, names: tuple[str, ...]) -> LandmarkModel:
     """The landmarks of a body by name; those that it does not have get rows of zeros. No names: the joints alone.
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.io.arrays import check_array, check_indices, check_joints
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import Refused, check_limit, open_file, reading
@@ -29,6 +30,7 @@ KEYS = {
 """What every file has; some have texture coordinates and an order of collapses, too."""
 
 
+@checked_arguments
 def load_body(path: str | Path | None = None, **smplx_options: Any) -> BodyModel:
     """A body model.
 

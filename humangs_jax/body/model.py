@@ -11,6 +11,7 @@ package another (`humangs_jax.body.library.load_body`).
 import jax.numpy as jnp
 
 from humangs_jax.body import skinning
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, static_field
 from humangs_jax.geometry import quaternion, transform
@@ -51,7 +52,8 @@ class BodyModel:
     collapse_order, collapse_into: (n,) or None: progressive decimation, see `humangs_jax.body.decimation`.
     spacing: (n,) or None: distance to neighbouring vertices relative to the mesh that was subdivided, see `body.subdivision`.
     texels: a map of the surface for networks that work on one, see `network.surface_map`; or None.
-    parents: static, parent of each joint, -1 for the root. joint_names, shape_names, name: static.
+    parents: static, parent of each joint, -1 for the root. joint_names, shape_names, name: static. made_for: static, what
+    `data.views.gaussian_body` has made it for; None: a body as it was read.
     """
 
     template: Float[Array, "n 3"]
@@ -70,6 +72,7 @@ class BodyModel:
     joint_names: tuple[str, ...] = static_field(default=())
     shape_names: tuple[str, ...] = static_field(default=())
     name: str = static_field(default="body")
+    made_for: tuple | None = static_field(default=None)
 
 
 @pytree_dataclass
@@ -104,12 +107,14 @@ class PosedBody(Batchable):
     joints: Float[Array, "j 3"]
 
 
+@checked_arguments
 def rest_pose(body: BodyModel) -> BodyPose:
     """The T-pose: no rotation, no translation."""
     dtype = body.template.dtype
     return BodyPose(jnp.zeros((len(body.parents), 3), dtype), jnp.zeros(3, dtype))
 
 
+@checked_arguments
 def shape_body(body: BodyModel, betas: Float[Array, " s_used"]) -> RestBody:
     """The T-pose of a person.
 
@@ -143,6 +148,7 @@ def person_vertices(body: BodyModel, betas: Float[Array, " s_used"], pose: BodyP
     return pose_body(body, shape_body(body, betas), pose).vertices
 
 
+@checked_arguments
 def pose_body(body: BodyModel, rest: RestBody, pose: BodyPose) -> PosedBody:
     """Pose a shaped body: correctives, blend skinning, translation."""
     vertices = rest.vertices

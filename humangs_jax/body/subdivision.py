@@ -60,6 +60,7 @@ def split_long_edges(body: BodyModel, longest: float) -> BodyModel:
         uv_faces=None,
         collapse_order=None,
         collapse_into=None,
+        made_for=None,
     )
 
 

@@ -6,8 +6,10 @@ A field annotated with a `typing.Protocol` may hold any dataclass that follows i
 
 import contextlib
 import dataclasses
+import functools
 import importlib
 import json
+import numbers
 import sys
 import types
 import typing
@@ -26,6 +28,63 @@ def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
     cost, gain: in a few words. measured: the page of docs/ with the measurement.
     """
     return dataclasses.field(default=default, metadata={"cost": cost, "gain": gain, "measured": measured})
+
+
+class Presets(dict[str, T]):
+    """Presets by name; another name is refused in a line that has all of them.
+
+    hint: ends that line.
+    """
+
+    def __init__(self, presets: dict[str, T], hint: str = "") -> None:
+        super().__init__(presets)
+        self.hint = hint
+
+    def __missing__(self, name: Any) -> T:
+        raise KeyError(f"no preset {name!r}: expected one of {', '.join(self)}{self.hint}")
+
+
+def check_fields(config: Any) -> None:
+    """Checks that the fields of a configuration are what their annotations say; for `__post_init__`.
+
+    Any integer and any real number will do. Raises: ValueError naming class and field.
+    """
+    for name, annotation in _annotations(type(config)).items():
+        if not _fits(value := getattr(config, name), annotation):
+            raise ValueError(f"{type(config).__name__}: {name}: expected {_in_words(annotation)}, got {value!r}")
+
+
+@functools.cache
+def _annotations(cls):
+    return typing.get_type_hints(cls)
+
+
+def _fits(value, annotation):
+    """Whether a value is what an annotation says, as far as that is plain; parts and arrays may be anything."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin in (typing.Union, types.UnionType):
+        return any(_fits(value, option) for option in arguments)
+    if origin is Literal:
+        return isinstance(value, str | int | None) and value in arguments
+    if annotation in (bool, int, float):
+        kind = {bool: bool, int: numbers.Integral, float: numbers.Real}[annotation]
+        return isinstance(value, kind) and (annotation is bool or not isinstance(value, bool))
+    if annotation in (str, type(None)) or dataclasses.is_dataclass(annotation):
+        return isinstance(value, annotation)
+    return origin is not tuple or isinstance(value, tuple)
+
+
+def _in_words(annotation):
+    options = (
+        typing.get_args(annotation)
+        if typing.get_origin(annotation) in (typing.Union, types.UnionType)
+        else [annotation]
+    )
+    words = []
+    for option in options:
+        literal = typing.get_origin(option) is Literal
+        words += map(repr, typing.get_args(option)) if literal else [_named(option).replace("NoneType", "None")]
+    return words[0] if len(words) == 1 else f"one of {', '.join(words)}"
 
 
 def config_to_json(config: Any, indent: int | None = None) -> str:

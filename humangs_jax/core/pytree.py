@@ -5,6 +5,7 @@ never calls `__init__`, so shape checks of the constructor (jaxtyping) hold for 
 """
 
 import dataclasses
+import functools
 import operator
 import typing
 from collections.abc import Iterator
@@ -15,6 +16,7 @@ from jax.core import Tracer
 
 T = TypeVar("T")
 B = TypeVar("B", bound="Batchable")
+_PYTREES: set[type] = set()
 
 
 def static_field(**kwargs: Any) -> Any:
@@ -49,6 +51,7 @@ def pytree_dataclass(cls: type[T]) -> type[T]:
         return tree
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    _PYTREES.add(cls)
     return cls
 
 
@@ -107,6 +110,49 @@ def _annotated_rank(annotation):
         if isinstance(dims, tuple) and option.index_variadic is None:
             return len(dims)
     return None
+
+
+def shape_fault(tree: Any) -> str | None:
+    """What is wrong with the shapes of a pytree dataclass, by the annotations of its fields: ".colors: expected shape ...".
+
+    Axes of one name have one size, in a batch behind its own axes. None if all fit, or for anything else.
+    """
+    cls, sizes = type(tree), {}
+    if cls not in _PYTREES:
+        return None
+    for name, axes in _annotated_axes(cls).items():
+        value = getattr(tree, name)
+        if axes is None:
+            if fault := shape_fault(value):
+                return f".{name}{fault}"
+            continue
+        shape = getattr(value, "shape", None)
+        if not isinstance(shape, tuple):
+            continue
+        batch = len(shape) - len(axes) if issubclass(cls, Batchable) and len(shape) > len(axes) else 0
+        wanted = [sizes.get(axis, axis) for axis in axes]
+        if len(shape) - batch != len(axes) or any(
+            isinstance(want, int) and want != size for want, size in zip(wanted, shape[batch:], strict=True)
+        ):
+            words = ", ".join(map(str, (*shape[:batch], *wanted))) + ("," if len(wanted) + batch == 1 else "")
+            return f".{name}: expected shape ({words}), got {shape}"
+        sizes |= {axis: size for axis, size in zip(axes, shape[batch:], strict=True) if isinstance(axis, str)}
+    return None
+
+
+@functools.cache
+def _annotated_axes(cls):
+    """By field: its axes, names and sizes, or None where it is no array (a pytree of its own, or static)."""
+    fields = [field for field in dataclasses.fields(cls) if not field.metadata.get("static")]
+    found = {}
+    for field in fields:
+        options = typing.get_args(field.type) or (field.type,)
+        texts = [str(x.dim_str) for x in options if hasattr(x, "dim_str")]
+        axes = [int(axis) if axis.isdigit() else axis for axis in texts[0].split()] if texts else None
+        if axes is not None and not all(isinstance(axis, int) or axis.strip("_").isidentifier() for axis in axes):
+            continue  # of any shape
+        found[field.name] = axes
+    return found
 
 
 def replace(tree: T, **changes: Any) -> T:

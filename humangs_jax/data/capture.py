@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, BodyPose
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import (
     CaptureError,
@@ -106,6 +107,7 @@ class Capture:
         return dataclasses.replace(self, images=resize(self.images), masks=masks, cameras=self.cameras.resized(*size))
 
 
+@checked_arguments
 def capture_from_arrays(
     images: Any,
     K: Any,
@@ -171,6 +173,7 @@ def capture_from_arrays(
     return _assemble(photos, body, betas, rotations, translations, body_file)
 
 
+@checked_arguments
 def load_capture(
     path: str | Path,
     *,
@@ -203,6 +206,7 @@ def load_capture(
         return _assemble(photos, body, betas, rotations, translations, body_file)
 
 
+@checked_arguments
 def save_capture(path: str | Path, capture: Capture, *, overwrite: bool = False) -> None:
     """Write a capture folder: 8-bit PNG images and masks, capture.json and body.npz; all of it or nothing.
 

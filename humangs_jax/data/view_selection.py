@@ -7,6 +7,7 @@ import numpy as np
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel
 from humangs_jax.body.subdivision import vertex_areas
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, prepare_inputs, standardize
@@ -22,6 +23,7 @@ LEAST_GAIN = 0.03
 """A further photo has to add this share to what the chosen ones show. Only where no number of photos is given."""
 
 
+@checked_arguments
 def select_views(capture: Capture, count: int | None) -> list[int]:
     """The numbers of `count` photos, in ascending order, that together show the body best; all of them if there are no more.
 

@@ -10,6 +10,7 @@ import numpy as np
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.model import BodyModel, BodyPose, pose_body, shape_body
 from humangs_jax.body.subdivision import split_long_edges
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
@@ -66,6 +67,7 @@ def pad_views(views: SubjectViews, count: int) -> SubjectViews:
     return replace(views, **padded, view_count=jnp.asarray(own, jnp.int32))
 
 
+@checked_arguments
 def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it; with the map
     of its surface where the network works on one.
@@ -76,14 +78,23 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
 
     Raises: ValueError if `execution` has both.
     """
-    trained, asked = config.conventions, config.execution
+    asked = config.execution
     if None not in (asked.body_vertices, asked.longest_edge):
         raise ValueError(
             "execution: body_vertices asks for fewer vertices, longest_edge for more: expected one of them"
         )
-    wanted = config.architecture.surface_map
-    settings = (trained.body_vertices, trained.longest_edge, asked.body_vertices, asked.longest_edge, wanted)
-    return body if settings == (None,) * 5 else _remeshed(_ByContent(body), *settings)
+    return body if fits(body, config) else _remeshed(_ByContent(body), *_wanted(config))
+
+
+def fits(body: BodyModel, config: HumanGSConfig) -> bool:
+    """Whether a body is one of `gaussian_body` for this configuration; any is if the configuration asks for nothing."""
+    return body.made_for == _wanted(config) or not any(_wanted(config))
+
+
+def _wanted(config):
+    trained, asked = config.conventions, config.execution
+    vertices, edges = (trained.body_vertices, trained.longest_edge), (asked.body_vertices, asked.longest_edge)
+    return *vertices, *edges, config.architecture.surface_map
 
 
 class _ByContent:
@@ -117,9 +128,11 @@ def _remeshed(key, vertices, edge, fewer, longest, wanted):
         body = replace(coarse, spacing=jnp.full(len(coarse.template), wider, body.template.dtype))
     if longest is not None:
         body = split_long_edges(body, longest)
-    return body if wanted is None else replace(body, texels=surface_texels(body, wanted))
+    body = body if wanted is None else replace(body, texels=surface_texels(body, wanted))
+    return replace(body, made_for=(vertices, edge, fewer, longest, wanted))
 
 
+@checked_arguments
 def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) -> HumanGSInputs:
     """Pose the body for every view and rasterize it: position maps, depth maps and the foreground of the photos.
 

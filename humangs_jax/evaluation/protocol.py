@@ -10,6 +10,7 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.configuration import Presets
 from humangs_jax.io.images import resized
 from humangs_jax.objectives.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM, SsimWindow
 
@@ -137,15 +138,17 @@ class EvaluationProtocol:
         return self.masked or self.background == "black" or any(not isinstance(crop, WholeFrame) for crop in crops)
 
 
-PROTOCOLS: dict[str, EvaluationProtocol] = {
-    "humangs": EvaluationProtocol(published_side=512),
-    "animatable-gaussians": EvaluationProtocol(lpips_crop=SquareBox(), ssim=UNIFORM),
-    "ghg": EvaluationProtocol("black", CentredWindow(), lpips=("alex", "vgg"), ssim=UNIFORM, published_side=1024),
-    "giga": EvaluationProtocol("black", MaskBox(), masked=True, lpips=("alex",), ssim=TORCHMETRICS),
-    "lhm": EvaluationProtocol(lpips=("squeeze",), ssim=TORCHMETRICS),
-    "lhm++": EvaluationProtocol(masked=True, lpips=("alex",), ssim=UNIFORM),
-    "lvsm": EvaluationProtocol("dataset"),
-}
+PROTOCOLS: Presets[EvaluationProtocol] = Presets(
+    {
+        "humangs": EvaluationProtocol(published_side=512),
+        "animatable-gaussians": EvaluationProtocol(lpips_crop=SquareBox(), ssim=UNIFORM),
+        "ghg": EvaluationProtocol("black", CentredWindow(), lpips=("alex", "vgg"), ssim=UNIFORM, published_side=1024),
+        "giga": EvaluationProtocol("black", MaskBox(), masked=True, lpips=("alex",), ssim=TORCHMETRICS),
+        "lhm": EvaluationProtocol(lpips=("squeeze",), ssim=TORCHMETRICS),
+        "lhm++": EvaluationProtocol(masked=True, lpips=("alex",), ssim=UNIFORM),
+        "lvsm": EvaluationProtocol("dataset"),
+    }
+)
 """By the name of the system whose paper reports such numbers; docs/evaluation.md has them as a table."""
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
@@ -144,6 +145,7 @@ class Evaluation:
         write_texts({path: text() for path, text in texts.items() if path is not None})
 
 
+@checked_arguments
 def evaluate(
     source: str | Path | Capture | Case | Source | Iterable[Case],
     *,

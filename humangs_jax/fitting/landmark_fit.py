@@ -23,6 +23,7 @@ import numpy as np
 from humangs_jax.body.joints import BODY_NAMES
 from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
 from humangs_jax.body.model import BodyPose
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.fitting.residuals.keypoints import (
@@ -95,6 +96,7 @@ class LandmarkFit:
     smoothness: Float[Array, ""]
 
 
+@checked_arguments
 def fit_landmarks(model: LandmarkModel, observations: Observations, config: FitConfig = FitConfig()) -> LandmarkFit:
     """Shape and poses of one person.
 

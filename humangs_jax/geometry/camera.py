@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Matrix3, Matrix4, Vector3
 from humangs_jax.core.checks import FINITE, POSITIVE, Values
 from humangs_jax.core.numerics import safe_normalize
@@ -16,6 +17,10 @@ from humangs_jax.geometry import transform
 
 RIGID_TOLERANCE = 1e-3
 """Calibrations are stored with few digits: R R^T may be this far from the identity before a camera is refused."""
+
+
+RIGHT_ANGLE = np.pi / 2 + 1e-6
+"""Radians, with the rounding of float32."""
 
 
 @pytree_dataclass
@@ -101,8 +106,8 @@ def camera_values(cameras: Camera) -> dict[str, tuple[Array | np.ndarray, Values
 
 def stack_cameras(cameras: list[Camera]) -> Camera:
     """A batch from cameras of one image size. Raises ValueError if sizes differ or the list is empty."""
-    if not cameras:
-        raise ValueError("no cameras to stack")
+    if not isinstance(cameras, list | tuple) or not cameras:
+        raise ValueError(f"stack_cameras: expected a list of cameras, got {type(cameras).__name__} {cameras!r:.40}")
     if len({(c.width, c.height) for c in cameras}) > 1:
         raise ValueError(f"image sizes differ: {sorted({(c.width, c.height) for c in cameras})}")
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)
@@ -117,11 +122,20 @@ def project(camera: Camera, points: Float[Array, "*b 3"]) -> tuple[Float[Array, 
 
 
 def intrinsics_from_fov(vertical_fov: float, width: int, height: int) -> Matrix3:
-    """K of a camera with square pixels and a centred axis; field of view in radians."""
+    """K of a camera with square pixels and a centred axis; field of view in radians.
+
+    Raises: ValueError for an angle that is not between 0 and pi.
+    """
+    if not isinstance(vertical_fov, Tracer) and not 0 < float(vertical_fov) < np.pi:
+        raise ValueError(
+            f"intrinsics_from_fov: vertical_fov {float(vertical_fov):.6g}: expected radians between 0 and pi; "
+            f"{float(vertical_fov):.6g} degrees are np.deg2rad({float(vertical_fov):.6g})"
+        )
     focal = 0.5 * height / np.tan(0.5 * vertical_fov)
     return jnp.asarray([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]], jnp.float32)
 
 
+@checked_arguments
 def look_at(eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, height: int) -> Camera:
     """A camera at `eye` whose axis passes through `target`, image up along `up` (which may not be parallel to the axis)."""
     forward = safe_normalize(target - eye, jnp.asarray([0.0, 0.0, 1.0]))
@@ -131,6 +145,7 @@ def look_at(eye: Vector3, target: Vector3, up: Vector3, K: Matrix3, width: int, 
     return Camera(K, transform.make(rotation, -jnp.matmul(rotation, eye, precision=transform.EXACT)), width, height)
 
 
+@checked_arguments
 def orbit(
     target: Vector3,
     distance: Float[Array, " v"] | float,
@@ -140,8 +155,13 @@ def orbit(
     width: int,
     height: int,
 ) -> Camera:
-    """A batch of cameras on circles around `target`, y up; azimuth 0 stands at +z, angles in radians."""
+    """A batch of cameras on circles around `target`, y up; azimuth 0 stands at +z, angles in radians.
+
+    Raises: ValueError for elevations beyond a right angle.
+    """
     azimuths = jnp.asarray(azimuths)
+    if not isinstance(elevations, Tracer) and np.any(np.abs(elevations) > RIGHT_ANGLE):
+        raise ValueError(f"orbit: elevations {elevations}: expected radians between -pi/2 and pi/2")
     distance, elevations = (
         jnp.broadcast_to(jnp.asarray(x, azimuths.dtype), azimuths.shape) for x in (distance, elevations)
     )

@@ -65,6 +65,21 @@ def to_uint8(image: Float[np.ndarray, "*shape"]) -> np.ndarray:
     return np.rint(255 * np.clip(np.nan_to_num(np.asarray(image)), 0, 1)).astype(np.uint8)
 
 
+def named_color(name: str) -> tuple[float, float, float]:
+    """Red, green and blue in [0, 1] of a CSS name or "#rrggbb". Raises: ValueError for what is no opaque colour."""
+    if name == "white":  # without Pillow: --help asks for it, too
+        return 1.0, 1.0, 1.0
+    from PIL import ImageColor
+
+    try:
+        red, green, blue, *alpha = ImageColor.getrgb(name.strip())
+    except ValueError:
+        alpha = [0]
+    if alpha:
+        raise ValueError(f'background {name!r}: expected a colour such as white or "#20a0ff"')
+    return red / 255, green / 255, blue / 255
+
+
 def resized(image: Float[np.ndarray, "h w *c"], width: int, height: int) -> Float[np.ndarray, "height width *c"]:
     """A float32 image at another size: box-averaged where it becomes narrower, else bicubic."""
     from PIL import Image

@@ -7,7 +7,9 @@ import dataclasses
 import math
 from typing import Any, Literal
 
-from humangs_jax.core.configuration import knob
+import jax
+
+from humangs_jax.core.configuration import check_fields, knob
 from humangs_jax.network.bilinear import PixelGrid
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.execution import Execution, TokenSelection
@@ -125,23 +127,26 @@ class Conventions:
     )
 
     def __post_init__(self):
-        """Raises ValueError for lengths that are none."""
+        """Raises ValueError for lengths that are none, and for fields of other types."""
+        check_fields(self)
         for name in ("skinning_reach", "low_pass"):
             length = getattr(self, name)
             if length is not None and not 0 < length < math.inf:
                 raise ValueError(f"{name} {length}: expected a positive length, or None")
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class HumanGSConfig:
-    """A network: see `Architecture`, `Conventions`, `Execution`, and `network.presets`."""
+    """A network: see `Architecture`, `Conventions`, `Execution`, and `network.presets`. For JAX a pytree without leaves."""
 
     architecture: Architecture = dataclasses.field(default_factory=Architecture)
     conventions: Conventions = dataclasses.field(default_factory=Conventions)
     execution: Execution = dataclasses.field(default_factory=Execution)
 
     def __post_init__(self):
-        """Raises ValueError for photos that the encoder cannot cut into patches."""
+        """Raises ValueError for photos that the encoder cannot cut into patches, and for fields of other types."""
+        check_fields(self)
         patch = self.architecture.encoder.patch_size
         for size in (self.conventions.image_size, self.image_size):
             if size % patch:

@@ -1,11 +1,11 @@
 """How the network runs: settings of time and memory. Weights files do not record them."""
 
 import dataclasses
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import jax.numpy as jnp
 
-from humangs_jax.core.configuration import knob
+from humangs_jax.core.configuration import Presets, check_fields, knob
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
 MEASURED, TRADE = "performance_reconstruction.md", "tradeoff.md"
@@ -81,8 +81,7 @@ class Execution:
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
 
     def __post_init__(self):
-        if self.dtype not in get_args(ComputeType):
-            raise ValueError(f"execution.dtype: expected one of {', '.join(get_args(ComputeType))}, got {self.dtype!r}")
+        check_fields(self)
 
     @staticmethod
     def preset(name: str) -> "Execution":
@@ -97,10 +96,12 @@ class Execution:
         return None if self.dtype == "float32" else jnp.dtype(self.dtype)
 
 
-EXECUTIONS = {
-    "realtime": Execution(crop=True, body_vertices=1000),
-    "balanced": Execution(crop=True, body_vertices=2000),
-    "quality": Execution(crop=True),
-    "best": Execution(crop=True),
-}
+EXECUTIONS = Presets(
+    {
+        "realtime": Execution(crop=True, body_vertices=1000),
+        "balanced": Execution(crop=True, body_vertices=2000),
+        "quality": Execution(crop=True),
+        "best": Execution(crop=True),
+    }
+)
 """The network's part of `apps.settings.PRESETS`, measured in docs/tradeoff.md."""

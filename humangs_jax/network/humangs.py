@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.body.model import BodyPose, Texels
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera
@@ -30,6 +31,7 @@ from humangs_jax.network.stages import StageCaller, call
 PARTS = ("encoder", "reader", "decoder", "driver")
 
 
+@checked_arguments
 def apply_humangs(
     variables: Variables,
     inputs: HumanGSInputs,
@@ -60,7 +62,8 @@ def apply_humangs(
     )
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@jax.jit
+@checked_arguments
 def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
     """Fresh variables {"params": {"encoder", "reader", "decoder", "driver"}, "batch_stats": {"encoder"}}, float32.
 

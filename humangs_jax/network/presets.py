@@ -2,6 +2,7 @@
 
 import dataclasses
 
+from humangs_jax.core.configuration import Presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.execution import Execution
@@ -89,4 +90,4 @@ def tiny() -> HumanGSConfig:
     )
 
 
-PRESETS = {"published": published, "paper": paper, "small": small, "tiny": tiny}
+PRESETS = Presets({"published": published, "paper": paper, "small": small, "tiny": tiny})

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.io.arrays import check_checksum, checksum
 from humangs_jax.io.atomic import write_bytes
@@ -42,6 +43,7 @@ def flatten_variables(variables: Variables) -> dict[str, Any]:
     return {"/".join(str(entry.key) for entry in path): leaf for path, leaf in leaves}
 
 
+@checked_arguments
 def save_weights(
     path: str | os.PathLike,
     variables: Variables,
@@ -65,6 +67,7 @@ def save_weights(
     write_bytes(path, save(stored, metadata | {"checksum": checksum(stored, *recorded.values())}))
 
 
+@checked_arguments
 def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, HumanGSConfig]:
     """Variables (float32) and configuration of a file, with default `Execution`; None loads the weights of this package.
 

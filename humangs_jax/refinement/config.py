@@ -2,7 +2,9 @@
 
 import dataclasses
 
-from humangs_jax.core.configuration import knob
+import jax
+
+from humangs_jax.core.configuration import check_fields, knob
 
 MEASURED = "refinement.md"
 SPLITS = (0.0, 0.2, 0.4)
@@ -30,6 +32,7 @@ class LearningRates:
     translations: float = 2e-4
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class RefineConfig:
     """How `refine` fits an avatar to its photos.
@@ -78,6 +81,7 @@ class RefineConfig:
     seed: int = 0
 
     def __post_init__(self):
+        check_fields(self)
         """Raises ValueError for settings out of range, naming them."""
         if self.steps is None and self.seconds is None:
             raise ValueError("RefineConfig: expected steps, seconds or both; without either a run would not end")

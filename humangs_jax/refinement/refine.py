@@ -22,6 +22,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.frames import posed
 from humangs_jax.avatar.low_pass import with_low_pass, with_low_pass_of, without_low_pass
 from humangs_jax.body.model import BodyPose
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.core.progress import bar as progress_bar
@@ -113,11 +114,13 @@ class Refinement:
         return f"refined by {took}{ended}: {verdict}"
 
 
+@checked_arguments
 def refine(avatar: Avatar, capture: Capture, config: RefineConfig | None = None, **how: Any) -> Avatar:
     """The avatar, fitted to the photos of a capture; never worse on them than before. See `refine_with_report`."""
     return refine_with_report(avatar, capture, config, **how).avatar
 
 
+@checked_arguments
 def refine_with_report(
     avatar: Avatar,
     capture: Capture,
@@ -148,6 +151,7 @@ def refine_with_report(
     return report if report.kept else dataclasses.replace(report, avatar=avatar)
 
 
+@checked_arguments
 def refine_views(
     avatar: Avatar, views: SubjectViews, config: RefineConfig, splat: SplatConfig, steps: int
 ) -> tuple[Avatar, Int[Array, ""]]:

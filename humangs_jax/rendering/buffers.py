@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.sharding import Mesh
 
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Int
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.geometry.camera import Camera
@@ -20,7 +21,7 @@ from humangs_jax.rendering import binning
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import drawn_camera, project_gaussians
 from humangs_jax.rendering.sharing import device_count
-from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig, splat_config
 from humangs_jax.rendering.tiling import TileGrid
 
 PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
@@ -60,10 +61,11 @@ def with_default_buffers(gaussians: Gaussians, camera: Camera, config: SplatConf
     return dataclasses.replace(config, max_pairs=pairs)
 
 
+@checked_arguments
 def plan_buffers(
     gaussians: Gaussians,
     cameras: Camera,
-    config: SplatConfig = DEFAULT_CONFIG,
+    config: SplatConfig | str = DEFAULT_CONFIG,
     margin: float = 1.25,
     mesh: Mesh | None = None,
 ) -> SplatConfig:
@@ -72,6 +74,7 @@ def plan_buffers(
     Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. Measures concrete arrays:
     call it outside of transformations. mesh: the one that `render` will be given, if any.
     """
+    config = splat_config(config)
     rows, pairs = (round_up(int(most * margin)) for most in _needed(gaussians, cameras, config, mesh))
     return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
 

@@ -5,6 +5,8 @@ look at what lies between them.
 """
 
 import dataclasses
+from collections.abc import Sequence
+from numbers import Real
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +18,7 @@ from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.numerics import at_least_float32, safe_divide
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.images import named_color
 from humangs_jax.rendering import binning
 from humangs_jax.rendering.buffers import with_default_buffers
 from humangs_jax.rendering.compositing import composite, pack_splats
@@ -44,12 +47,32 @@ class Rendering(Batchable):
     visibility: Float[Array, " g"] | None = None
 
 
+Background = Float[Array, "3"] | Float[np.ndarray, "3"] | Sequence[float | int] | str | None
+"""(3,) RGB, three numbers in [0, 1], a CSS name or "#rrggbb"; None: white."""
+
+
 def with_background(
-    gaussians: Gaussians, cameras: Camera, background: Float[Array, "3"] | None
+    gaussians: Gaussians, cameras: Camera, background: Background
 ) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
-    """What is drawn, in float32 at least; a background of None is white."""
-    background = jnp.ones(3, gaussians.means.dtype) if background is None else background
-    return at_least_float32((gaussians, cameras, background))
+    """What is drawn, in float32 at least. Raises: ValueError for a background that is no colour."""
+    return at_least_float32((gaussians, cameras, _color(background, gaussians.means.dtype)))
+
+
+def _color(background, dtype):
+    if background is None:
+        return jnp.ones(3, dtype)
+    if isinstance(background, str):
+        return jnp.asarray(named_color(background), dtype)
+    if hasattr(background, "shape"):
+        color, fits = background, background.shape == (3,)
+    else:
+        color = background
+        fits = isinstance(background, Sequence) and len(background) == 3
+        fits = fits and all(isinstance(x, jax.Array) or (isinstance(x, Real) and 0 <= x <= 1) for x in background)
+    if not fits:
+        shown = f"shape {color.shape}" if hasattr(color, "shape") else repr(color)
+        raise ValueError(f"background: expected 3 numbers in [0, 1] or the name of a colour, got {shown}")
+    return color if isinstance(color, jax.Array) else jnp.asarray(color, dtype)
 
 
 def draw_projected(
@@ -57,12 +80,12 @@ def draw_projected(
     gaussians: Gaussians,
     camera: Camera,
     config: SplatConfig = DEFAULT_CONFIG,
-    background: Float[Array, "3"] | None = None,
+    background: Background = None,
 ) -> Rendering:
     """The second half of `render`, for use inside transformations.
 
     projected: by `project_gaussians`, of these Gaussians, camera and config. Of the Gaussians only opacities and colours
-    are read here. background: (3,) RGB; None: white.
+    are read here. background: as `Background`.
     """
     gaussians, camera, background = with_background(gaussians, camera, background)
     config = with_default_buffers(gaussians, camera, config)

@@ -15,27 +15,31 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.constants import LARGEST_FOOTPRINT
-from humangs_jax.rendering.drawing import Rendering, with_background
+from humangs_jax.rendering.drawing import Background, Rendering, with_background
 from humangs_jax.rendering.gaussians import Gaussians, added_variance, covariance_factors
-from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig, splat_config
 
 
-@functools.partial(jax.jit, static_argnames="config")
+@checked_arguments
 def render_reference(
     gaussians: Gaussians,
     camera: Camera,
-    config: SplatConfig = DEFAULT_CONFIG,
-    background: Float[Array, "3"] | None = None,
+    config: SplatConfig | str = DEFAULT_CONFIG,
+    background: Background = None,
 ) -> Rendering:
     """The image of `splatting.render` by its definition, without tiles or buffers, in the precision of its arguments.
 
     Arguments as `splatting.render`; of `config`, only what decides on what is drawn is read. Values are not checked.
     """
-    gaussians, camera, background = with_background(gaussians, camera, background)
+    return _reference(*with_background(gaussians, camera, background), splat_config(config))
+
+
+@jax.jit
+def _reference(gaussians, camera, background, config):
     centers, axes, depths, visible = _project(gaussians, camera, config)
     eps2d = added_variance(gaussians, config.eps2d)
     determinants = _determinant(axes, eps2d)

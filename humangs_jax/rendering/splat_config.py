@@ -1,13 +1,17 @@
-"""Every knob of the splatting renderer, in one frozen (hashable, hence static) dataclass, and its presets."""
+"""Every knob of the splatting renderer, in one frozen dataclass, and its presets. For JAX it is a pytree without leaves."""
 
 import dataclasses
+from typing import Literal
 
-from humangs_jax.core.configuration import knob
+import jax
+
+from humangs_jax.core.configuration import Presets, check_fields, knob
 from humangs_jax.rendering import constants
 
 MEASURED = "performance.md"
 
 
+@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class SplatConfig:
     """What is drawn, in which buffers, on which schedule. docs/performance.md gives what each knob costs and gains.
@@ -84,7 +88,7 @@ class SplatConfig:
     block: int = knob(32, cost="none", gain="within 4 % from 16 to 64 on CPUs", measured=MEASURED)
     chunk: int = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
     chunk_backward: int = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
-    matmul_precision: str = knob(
+    matmul_precision: Literal["float32", "bfloat16"] = knob(
         "float32",
         cost="8e-4 of the gradient",
         gain="none on CPUs; meant for accelerators, not timed there",
@@ -92,6 +96,7 @@ class SplatConfig:
     )
 
     def __post_init__(self):
+        check_fields(self)
         positive = ("alpha_min", "scale", "tile_size", "block", "chunk", "chunk_backward")
         if wrong := [name for name in positive if not getattr(self, name) > 0]:
             raise ValueError(f"SplatConfig: {', '.join(wrong)} must be positive")
@@ -105,32 +110,39 @@ class SplatConfig:
             raise ValueError(f"SplatConfig: radius_sigma must be positive or None, got {self.radius_sigma}")
         if self.square and self.radius_sigma is None:
             raise ValueError("SplatConfig: a square footprint needs a radius_sigma")
-        if self.matmul_precision not in MATMUL_PRECISIONS:
-            raise ValueError(
-                f"SplatConfig: matmul_precision must be one of {MATMUL_PRECISIONS}, got {self.matmul_precision!r}"
-            )
 
-
-MATMUL_PRECISIONS = ("float32", "bfloat16")
 
 DEFAULT_CONFIG = SplatConfig()
 
-SPLAT_PRESETS = {
-    "exact": DEFAULT_CONFIG,
-    "near_exact": SplatConfig(radius_sigma=2.5, transmittance_stop=1e-3),
-    "fast": SplatConfig(radius_sigma=1.75, transmittance_stop=3e-3),
-    "inria": SplatConfig(
-        near=constants.INRIA_NEAR,
-        alpha_max=constants.INRIA_ALPHA_MAX,
-        jacobian_margin=constants.INRIA_JACOBIAN_MARGIN,
-        normalize_quats=False,
-        radius_sigma=constants.INRIA_RADIUS_SIGMA,
-        square=True,
-        tile_size=constants.INRIA_TILE_SIZE,
-    ),
-}
+SPLAT_PRESETS: Presets[SplatConfig] = Presets(
+    {
+        "exact": DEFAULT_CONFIG,
+        "near_exact": SplatConfig(radius_sigma=2.5, transmittance_stop=1e-3),
+        "fast": SplatConfig(radius_sigma=1.75, transmittance_stop=3e-3),
+        "inria": SplatConfig(
+            near=constants.INRIA_NEAR,
+            alpha_max=constants.INRIA_ALPHA_MAX,
+            jacobian_margin=constants.INRIA_JACOBIAN_MARGIN,
+            normalize_quats=False,
+            radius_sigma=constants.INRIA_RADIUS_SIGMA,
+            square=True,
+            tile_size=constants.INRIA_TILE_SIZE,
+        ),
+    },
+    '; "as_trained" of Settings and Shot is SPLAT_PRESETS[avatar.rendering]',
+)
 """exact: every alpha of 1/255 and more, in float32. near_exact and fast: see docs/performance.md for their errors and
 gains. inria: the conventions of diff-gaussian-rasterization, which the published weights were trained with."""
+
+
+def splat_config(config: SplatConfig | str) -> SplatConfig:
+    """A configuration, or a preset by its name. Raises: ValueError for another name."""
+    if not isinstance(config, str):
+        return config
+    try:
+        return SPLAT_PRESETS[config]
+    except KeyError as error:
+        raise ValueError(f"config: {error.args[0]}") from None
 
 
 def drawn_as(config: SplatConfig, rendering: str) -> SplatConfig:

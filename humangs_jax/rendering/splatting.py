@@ -15,24 +15,26 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jax.sharding import Mesh
 
-from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.array_types import Array, Bool
 from humangs_jax.core.checks import FINITE, check_values
 from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.rendering import constants
 from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers, raise_on_overflow, with_default_buffers
-from humangs_jax.rendering.drawing import Rendering, draw, draw_views, with_background
+from humangs_jax.rendering.drawing import Background, Rendering, draw, draw_views, with_background
 from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
-from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
+from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig, splat_config
 
 __all__ = ["BufferOverflowError", "Rendering", "SplatConfig", "plan_buffers", "render", "render_views", "seen_from"]
 
 
+@checked_arguments
 def render(
     gaussians: Gaussians,
     camera: Camera,
-    config: SplatConfig = DEFAULT_CONFIG,
-    background: Float[Array, "3"] | None = None,
+    config: SplatConfig | str = DEFAULT_CONFIG,
+    background: Background = None,
     mesh: Mesh | None = None,
 ) -> Rendering:
     """Draws Gaussians as one camera sees them.
@@ -43,14 +45,15 @@ def render(
         gradient = jax.jit(jax.grad(loss), compiler_options=compiler_options())(gaussians)
 
     Arguments: gaussians: (g, ...) one set, metres. camera: one camera; its size is the image's. config: what is drawn, and
-    the buffers. background: (3,) RGB; None: white. mesh: of one axis, whose devices share the image's rows of tiles; None:
-    one device draws it all. (A CPU runs one program on one core; it has as many devices as
-    `jax.config.update("jax_num_cpu_devices", 2)` says before JAX is first used.)
+    the buffers; or the name of one of `SPLAT_PRESETS`. background: (3,) RGB, three numbers, or a colour's name; None: white.
+    mesh: of one axis, whose devices share the image's rows of tiles; None: one device draws it all. (A CPU runs one program on
+    one core; it has as many devices as `jax.config.update("jax_num_cpu_devices", 2)` says before JAX is first used. There,
+    wait for each compiled call that shares an image, `jax.block_until_ready`, or set PJRT_NPROC: docs/performance.md.)
 
-    Raises: ValueError for a batch of cameras or of sets; for values that are not finite, opacities outside of [0, 1] and
-    negative scales or focal lengths; BufferOverflowError if `config.max_pairs` or `max_rows` is too small. Inside a
-    transformation values are not checked, and missing pairs are counted in `Rendering.overflow`: loops that draw often jit
-    `render`, which saves both checks.
+    Raises: TypeError for arguments of other classes; ValueError for a batch of cameras or of sets, for shapes that do not fit
+    each other, a background that is no colour, values that are not finite, opacities outside of [0, 1] and negative scales or
+    focal lengths; BufferOverflowError if `config.max_pairs` or `max_rows` is too small. Inside a transformation values are not
+    checked, and missing pairs are counted in `Rendering.overflow`: loops that draw often jit `render`, which saves both checks.
 
     After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079), with gsplat's conventions (see `constants`).
     """
@@ -62,11 +65,12 @@ def render(
     return _render(_draw_image, gaussians, camera, config, background, mesh)
 
 
+@checked_arguments
 def render_views(
     gaussians: Gaussians,
     cameras: Camera,
-    config: SplatConfig = DEFAULT_CONFIG,
-    background: Float[Array, "3"] | None = None,
+    config: SplatConfig | str = DEFAULT_CONFIG,
+    background: Background = None,
     batch_size: int = 1,
     mesh: Mesh | None = None,
 ) -> Rendering:
@@ -86,14 +90,18 @@ def render_views(
     return _render(draw_views, gaussians, cameras, config, background, mesh, batch_size)
 
 
+@checked_arguments
 def seen_from(
-    gaussians: Gaussians, cameras: Camera, config: SplatConfig = DEFAULT_CONFIG, threshold: float = constants.ALPHA_MIN
+    gaussians: Gaussians,
+    cameras: Camera,
+    config: SplatConfig | str = DEFAULT_CONFIG,
+    threshold: float = constants.ALPHA_MIN,
 ) -> Bool[Array, " g"]:
     """Which Gaussians weigh at least `threshold` on some pixel of some camera (leading axis v).
 
     The others can be left out for cameras like these: an avatar's inside is never seen.
     """
-    visibility = render_views(gaussians, cameras, dataclasses.replace(config, visibility=True)).visibility
+    visibility = render_views(gaussians, cameras, dataclasses.replace(splat_config(config), visibility=True)).visibility
     assert visibility is not None
     return jnp.max(visibility, axis=0) >= threshold
 
@@ -103,6 +111,7 @@ def _render(
 ) -> Rendering:
     if gaussians.batch_shape:
         raise ValueError(f"expected one set of Gaussians, got a batch {gaussians.batch_shape}: draw it with jax.vmap")
+    config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gaussians, cameras, background))):
         return draw(gaussians, cameras, background, with_default_buffers(gaussians, cameras, config), mesh, *more)

@@ -5,7 +5,7 @@ import itertools
 import logging
 from pathlib import Path
 
-from humangs_jax.core.configuration import knob
+from humangs_jax.core.configuration import Presets, check_fields, knob
 from humangs_jax.data.loader import ViewSampling
 from humangs_jax.io.text import read_configuration
 from humangs_jax.network import presets
@@ -97,6 +97,7 @@ class TrainConfig:
     keep_checkpoints: int = 2
 
     def __post_init__(self):
+        check_fields(self)
         counts = ("steps", "batch_size", "microbatch_size", "target_size", "log_every", "validate_every")
         for name in (*counts, "checkpoint_every", "keep_checkpoints"):
             if getattr(self, name) < 1:
@@ -202,7 +203,7 @@ def tiny() -> TrainConfig:
     )
 
 
-PRESETS = {"published": published, "paper": paper, "small": small, "tiny": tiny}
+PRESETS = Presets({"published": published, "paper": paper, "small": small, "tiny": tiny})
 
 
 def read_config(preset_or_path: str | Path) -> TrainConfig:

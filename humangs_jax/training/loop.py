@@ -21,6 +21,7 @@ from pathlib import Path
 import jax
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.progress import stage
 from humangs_jax.data.loader import Waiting
 from humangs_jax.data.views import gaussian_body
@@ -46,6 +47,7 @@ SHOWN = 4
 """Validation subjects on the sheet."""
 
 
+@checked_arguments
 def train(
     config: TrainConfig,
     body: BodyModel,

@@ -21,6 +21,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.joints import PARENTS
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, RestBody
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.configuration import config_from_json
 from humangs_jax.data.motion import Motion, grounded, load_motion
 from humangs_jax.data.views import gaussian_body
@@ -64,6 +65,7 @@ def page_html(
     return _MARK.sub(lambda mark: parts[mark[1]], _template())
 
 
+@checked_arguments
 def write_page(
     path: str | os.PathLike,
     avatar: Avatar,
@@ -89,6 +91,7 @@ class NotebookPage:
         return f'<iframe srcdoc="{html.escape(self._text)}" style="{style}" allowfullscreen></iframe>'
 
 
+@checked_arguments
 def show(avatar: Avatar, motion: Motion | None = None, height: int = 560) -> NotebookPage:
     """The avatar in a notebook, moving: the last expression of a cell, or `display(hg.show(avatar))`.
 

@@ -52,6 +52,24 @@ def test_save_and_load_are_exact(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["a.npz"]
 
 
+def test_batches_of_avatars_are_indexed_and_not_saved(tmp_path):
+    people = [make_avatar(seed) for seed in range(3)]
+    batch = jax.tree.map(lambda *x: jnp.stack(x), *people)
+    assert len(batch) == 3 and batch.batch_shape == (3,) and batch[1:].batch_shape == (2,)
+    for one, person in zip(batch, people, strict=True):
+        jax.tree.map(np.testing.assert_array_equal, one, person)
+    assert batch[-1].parents == people[2].parents and batch
+    with pytest.raises(IndexError, match="index 3 is out of range for a batch of 3"):
+        batch[3]
+    with pytest.raises(TypeError, match="this Avatar is not a batch"):
+        len(people[0])
+    with pytest.raises(ValueError, match=r"expected one avatar, got a batch \(3,\): save each"):
+        batch.save(tmp_path / "all.npz")
+    with pytest.raises(ValueError, match=r"avatar\.rest_joints: expected shape \(3, 3\), got \(2, 3\)"):
+        replace(people[0], rest_joints=people[0].rest_joints[:2]).save(tmp_path / "all.npz")
+    assert not any(tmp_path.iterdir())
+
+
 def test_what_a_file_cannot_hold_is_refused_and_short_numbers_become_float32(tmp_path):
     avatar = make_avatar()
     posed = replace(avatar, gaussians=replace(avatar.gaussians, deformations=jnp.zeros((12, 3, 3))))

@@ -1,4 +1,6 @@
 import dataclasses
+import sys
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ from humangs_jax.avatar.reconstruct import (
     reconstruct,
     reconstruct_batch,
     reconstruct_views,
+    stack_captures,
     with_spread_weights,
 )
 from humangs_jax.body.decimation import decimate
@@ -363,6 +366,57 @@ def test_what_cannot_be_one_batch_is_named(body, network):
     other = capture(decimate(load_body(), 400), SIZE, SIZE)
     with pytest.raises(ValueError, match=r"captures\[1\]: its body is not the one of captures\[0\]"):
         reconstruct_batch(*network, [photos, other])
+
+
+@pytest.mark.slow
+def test_stacked_captures_are_a_batch_for_vmap(body, network):
+    """The line of the README gives what `reconstruct_batch` gives, bit by bit: it is the same program."""
+    variables, config = network
+    config = config.with_conventions(body_vertices=300, light=True).with_execution(token_capacity=0)
+    captures = [capture_of(body, seed, views) for seed, views in enumerate((2, 1))]
+    made, views, fitted = stack_captures(config, captures)
+    assert len(made.template) == 300 and fitted.execution.token_capacity > 0 and views.images.shape[:2] == (2, 2)
+    avatars, dropped = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(variables, fitted, made, views)
+    assert len(avatars) == 2 and dropped.tolist() == [0, 0]
+    expected = reconstruct_batch(variables, config, captures)
+    for avatar, other in zip(avatars, expected, strict=True):
+        assert jax.tree.structure(avatar) == jax.tree.structure(other)
+        jax.tree.map(np.testing.assert_array_equal, avatar, other)
+    alone, _ = jax.jit(reconstruct_views)(variables, fitted, made, jax.tree.map(lambda x: x[0], views))
+    assert alone.gaussians.means.shape == expected[0].gaussians.means.shape  # the configuration needs no static_argnums
+
+
+def test_views_and_bodies_of_another_configuration_are_refused(body, network):
+    variables, config = network
+    config = config.with_conventions(body_vertices=300)
+    made, views = gaussian_body(body, config), subject_views(0)
+    with pytest.raises(
+        ValueError, match=r"a body of 500 vertices that gaussian_body\(body, config\) has not made; .*stack"
+    ):
+        reconstruct_views(variables, config, body, views)
+    with pytest.raises(ValueError, match="has not made"):
+        reconstruct_views(variables, config, decimate(made, 200), views)
+    with pytest.raises(
+        ValueError, match=r"photos of 32 x 32, config wants 64 x 64; body, views, config = stack_captures"
+    ):
+        reconstruct_views(variables, config.with_execution(image_size=64), made, views)
+    with pytest.raises(ValueError, match=r"views\.images: expected shape \(v, h, w, 3\), got \(1, 2, 32, 32, 3\)"):
+        reconstruct_views(variables, config, made, jax.tree.map(lambda x: x[None], views))
+
+
+def test_worlds_with_and_without_light_are_no_batch(body, network, monkeypatch):
+    module = sys.modules[reconstruct_batch.__module__]
+    inputs = SimpleNamespace()
+    monkeypatch.setattr(module, "_prepare_batch", lambda *_: inputs)
+    monkeypatch.setattr(module, "_check_posed", lambda *_: None)
+    monkeypatch.setattr(module, "fit_buffers", lambda _, config: config)
+    photos, config = capture(body, SIZE, SIZE), network[1].with_conventions(light=True)
+    lying = np.asarray(photos.poses.rotations) + np.eye(55, 3)[None] * [np.pi / 2, 0, 0]
+    turned = dataclasses.replace(photos, poses=replace(photos.poses, rotations=jnp.asarray(lying, jnp.float32)))
+    with pytest.raises(ValueError, match=r"captures\[1\]: its world is not y-up, .*: stack them apart"):
+        stack_captures(config, [photos, turned])
+    assert not stack_captures(config, [turned, turned])[2].conventions.light
+    assert stack_captures(config, [photos])[2].conventions.light
 
 
 def test_views_are_padded_to_a_number_not_below_their_own():

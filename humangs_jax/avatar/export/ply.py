@@ -9,6 +9,7 @@ import os
 import numpy as np
 
 from humangs_jax.avatar.export.world import plain_arrays, sh_of
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.io.atomic import replace_file
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -18,6 +19,7 @@ SMALLEST_SCALE = 1e-9
 """Metres; keeps the logarithm finite for flat Gaussians."""
 
 
+@checked_arguments
 def write_ply(path: str | os.PathLike, gaussians: Gaussians, spherical_harmonics_rest: bool = False) -> None:
     """Write a 3DGS `.ply`; the file appears whole or not at all.
 

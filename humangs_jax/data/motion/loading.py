@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.smplx import HandBasis
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.motion import arrays, skeleton, world
 from humangs_jax.data.motion.bvh import read_bvh
@@ -20,6 +21,7 @@ LARGEST_DISTANCE = 1e4
 _SKELETONS = {".bvh": read_bvh, ".glb": read_animation}
 
 
+@checked_arguments
 def load_motion(
     path: str | Path | None = None,
     *,

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
+from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera
@@ -74,6 +75,7 @@ class Fragments(Batchable):
 
 
 @functools.partial(jax.jit, static_argnames="config")
+@checked_arguments
 def rasterize_mesh(
     vertices: Float[Array, "n 3"], faces: Int[Array, "f 3"], camera: Camera, config: RasterConfig = DEFAULT_CONFIG
 ) -> Fragments:
@@ -99,6 +101,7 @@ def rasterize_mesh(
 
 
 @jax.jit
+@checked_arguments
 def interpolate_attributes(
     fragments: Fragments, faces: Int[Array, "f 3"], attributes: Float[Array, "n c"], background: Float[Array, " c"]
 ) -> Float[Array, "h w c"]:
