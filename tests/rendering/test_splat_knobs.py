@@ -1,6 +1,7 @@
 """What each knob of SplatConfig does to the image, the visibility of Gaussians, and images shared among devices."""
 
 import dataclasses
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -259,3 +260,34 @@ def test_cameras_of_a_batch_are_planned_together():
     far = Camera(near.K, near.cam_from_world.at[2, 3].add(3.0), WIDTH, HEIGHT)
     both = plan_buffers(gaussians, stack_cameras([near, far]), SMALL)
     assert both == max((plan_buffers(gaussians, c, SMALL) for c in (near, far)), key=lambda c: c.max_pairs)
+
+
+IN_FLIGHT = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import jax
+jax.config.update("jax_platforms", "cpu")
+jax.config.update("jax_num_cpu_devices", 2)
+import numpy as np
+from splat_scenes import camera, random_gaussians
+from humangs_jax.rendering.splatting import plan_buffers, render
+
+gaussians, view, mesh = random_gaussians(1, np.float32), camera(np.float32), jax.make_mesh((2,), ("rows",))
+config = plan_buffers(gaussians, view, mesh=mesh)
+draw = jax.jit(lambda gaussians: render(gaussians, view, config, mesh=mesh).rgb)
+wait = jax.block_until_ready if sys.argv[2] == "wait" else lambda image: image
+expected = np.asarray(draw(gaussians))
+images = [wait(draw(gaussians)) for _ in range(200)]
+assert all(np.array_equal(image, expected) for image in images)
+print("drawn")
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("how", "threads"), [("wait", {}), ("fly", {"PJRT_NPROC": "80"})])
+def test_loops_on_two_devices_survive(how, threads):
+    """As docs/performance.md says: wait for each call, or start more threads than calls can be in flight."""
+    here, environment = Path(__file__).parent, {**os.environ, **threads}
+    command = [sys.executable, "-c", IN_FLIGHT, str(here), how]
+    run = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=here.parents[1])
+    assert run.returncode == 0 and run.stdout.endswith("drawn\n"), run.stderr[-2000:]
