@@ -23,7 +23,6 @@ AWAY = (0.02, -0.03, 0.01, 0.02, 0.01, -0.03)
 CUTS = {
     "as drawn: alpha_min 1/255, transmittance_stop 1e-4": {},
     "alpha_min 1e-6": {"alpha_min": 1e-6},
-    "transmittance_stop 0": {"transmittance_stop": 0.0},
     "alpha_min 1e-6, transmittance_stop 0": {"alpha_min": 1e-6, "transmittance_stop": 0.0},
 }
 
@@ -55,19 +54,19 @@ def measure(size: int = SIZE) -> dict[str, list[float]]:
     jax.config.update("jax_enable_x64", True)
     gaussians, camera = scene.gaussians(np.float64), scene.camera(np.float64)
 
-    def drawn(twist, config):
+    def drawn(twist, gaussians, config):
         x, y, z = twist[:3]
         turn = jax.scipy.linalg.expm(jnp.asarray([[0, -z, y], [z, 0, -x], [-y, x, 0]]))
         moved = replace(camera, cam_from_world=transform.make(turn, twist[3:]) @ camera.cam_from_world)
         return render(gaussians, moved, config).rgb
 
-    target = jax.jit(drawn)(jnp.asarray(AWAY), plan_buffers(gaussians, camera, margin=1.5))
-    both = jax.jit(jax.value_and_grad(lambda twist, config: jnp.mean(jnp.square(drawn(twist, config) - target))))
+    target = jax.jit(drawn)(jnp.asarray(AWAY), gaussians, plan_buffers(gaussians, camera, margin=1.5))
+    both = jax.jit(jax.value_and_grad(lambda *given: jnp.mean(jnp.square(drawn(*given) - target))))
     results = {}
     for name, cuts in CUTS.items():
         config = plan_buffers(gaussians, camera, dataclasses.replace(SplatConfig(), **cuts), margin=1.5)
-        gradient = np.asarray(both(jnp.zeros(6), config)[1])
-        value = lambda twist, config=config: float(both(jnp.asarray(twist), config)[0])
+        gradient = np.asarray(both(jnp.zeros(6), gaussians, config)[1])
+        value = lambda twist, config=config: float(both(jnp.asarray(twist), gaussians, config)[0])
         results[name] = []
         for step in STEPS:
             differences = [(value(step * axis) - value(-step * axis)) / (2 * step) for axis in np.eye(6)]

@@ -104,9 +104,8 @@ def stack_captures(config: HumanGSConfig, captures: Sequence[Capture]) -> tuple[
 
 def _stacked(config, captures):
     """Body, views, configuration; and whether each world has been turned."""
-    if not isinstance(captures, Sequence) or not captures:
-        none = isinstance(captures, Sequence)
-        raise ValueError(f"captures: {'none given' if none else f'expected a list, got {type(captures).__name__}'}")
+    if not captures:
+        raise ValueError("captures: none given")
     for index, capture in enumerate(captures):
         if not isinstance(capture, Capture):
             raise TypeError(f"captures[{index}]: expected Capture, got {type(capture).__name__}")

@@ -66,6 +66,8 @@ class Shot:
 
     def color(self) -> tuple[float, float, float] | None:
         """Red, green and blue of the background in [0, 1]; None: transparent. Raises: ValueError for what is no colour."""
+        if self.background == "white":  # without numpy: --help asks for it, too
+            return 1.0, 1.0, 1.0
         if self.background.strip().lower() == "transparent":
             return None
         from humangs_jax.io.images import named_color

@@ -10,7 +10,7 @@ import functools
 import inspect
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ParamSpec, TypeVar
 
 from humangs_jax.core.pytree import shape_fault
@@ -19,6 +19,8 @@ P = ParamSpec("P")
 T = TypeVar("T")
 NUMBERS = (int, float, complex, bool)
 """Not checked: those of numpy and JAX do as well."""
+SEQUENCES = {list: Sequence, Sequence: Sequence}
+"""What lists of something may be; what is in them is not checked."""
 HINTS = {
     ("Gaussians", "Avatar"): "animate(avatar, pose) poses them",
     ("Avatar", "Gaussians"): "an Avatar has what they need to be posed",
@@ -29,6 +31,8 @@ HINTS = {
     ("BodyPose", "Capture"): "capture.pose(frame) is one",
     ("BodyPose", "Motion"): "motion.pose(frame) is one",
     ("SubjectViews", "Capture"): "stack_captures makes them",
+    ("Sequence", "Camera"): "a list of cameras",
+    ("Sequence", "Capture"): "a list of captures",
     ("HumanGSConfig", "tuple"): "load_weights returns (variables, config)",
 }
 """What to do, by the class that is expected and the class that was given."""
@@ -37,7 +41,7 @@ HINTS = {
 def checked_arguments(function: Callable[P, T]) -> Callable[P, T]:
     """Decorator: arguments are of the classes of their annotations, and arrays of one pytree fit each other.
 
-    Parameters whose annotation is not made of plain classes (arrays, numbers, callables, sequences) are left alone.
+    Parameters whose annotation is not made of plain classes and sequences (arrays, numbers, callables) are left alone.
     Raises: TypeError, one line, for another class or a name that the function does not have; ValueError for shapes, and for
     a batch of what functions take one of (`one_at_a_time`).
     """
@@ -73,6 +77,7 @@ def _classes(annotation: Any) -> tuple[type, ...]:
     """The classes that an annotation stands for; none if that is not all that it says."""
     union = typing.get_origin(annotation) in (typing.Union, types.UnionType)
     options = typing.get_args(annotation) if union else (annotation,)
+    options = tuple(SEQUENCES.get(typing.get_origin(x), x) for x in options)
     plain = [isinstance(x, type) and not typing.get_args(x) and not hasattr(x, "dims") for x in options]
     known = [x not in (*NUMBERS, inspect.Parameter.empty, object, Any) for x in options]
     return options if all(plain) and all(known) and not any(getattr(x, "_is_protocol", False) for x in options) else ()

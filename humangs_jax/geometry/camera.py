@@ -104,10 +104,11 @@ def camera_values(cameras: Camera) -> dict[str, tuple[Array | np.ndarray, Values
     }
 
 
+@checked_arguments
 def stack_cameras(cameras: list[Camera]) -> Camera:
     """A batch from cameras of one image size. Raises ValueError if sizes differ or the list is empty."""
-    if not isinstance(cameras, list | tuple) or not cameras:
-        raise ValueError(f"stack_cameras: expected a list of cameras, got {type(cameras).__name__} {cameras!r:.40}")
+    if not cameras:
+        raise ValueError("no cameras to stack")
     if len({(c.width, c.height) for c in cameras}) > 1:
         raise ValueError(f"image sizes differ: {sorted({(c.width, c.height) for c in cameras})}")
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *cameras)

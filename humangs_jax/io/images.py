@@ -67,8 +67,6 @@ def to_uint8(image: Float[np.ndarray, "*shape"]) -> np.ndarray:
 
 def named_color(name: str) -> tuple[float, float, float]:
     """Red, green and blue in [0, 1] of a CSS name or "#rrggbb". Raises: ValueError for what is no opaque colour."""
-    if name == "white":  # without Pillow: --help asks for it, too
-        return 1.0, 1.0, 1.0
     from PIL import ImageColor
 
     try:

@@ -2,8 +2,6 @@
 
 import dataclasses
 
-import jax
-
 from humangs_jax.core.configuration import check_fields, knob
 
 MEASURED = "refinement.md"
@@ -32,7 +30,6 @@ class LearningRates:
     translations: float = 2e-4
 
 
-@jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class RefineConfig:
     """How `refine` fits an avatar to its photos.

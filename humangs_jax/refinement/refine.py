@@ -61,6 +61,7 @@ from humangs_jax.refinement.objective import (
     photos_of,
 )
 from humangs_jax.refinement.parameters import Parameters, RefineState, init_state, parameters_of, update
+from humangs_jax.refinement.report import Refinement
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.splatting import Rendering, plan_buffers
 
@@ -83,41 +84,21 @@ HOST_SETTINGS = {
     "seed": 0,
 }
 """Settings that no compiled program depends on, with the values that programs are compiled for."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Refinement:
-    """What `refine_with_report` returns.
-
-    avatar: the best state of the run. rounds, steps: how many of the learned update (0 if they were not kept) and of Adam.
-    seconds: of the run, without compilation (compile_seconds). loss: before and after, over all photos. psnr: before and after,
-    dB over the crops. kept: whether the loss has fallen; if not, the avatar is unchanged. interrupted: whether Ctrl-C ended the
-    run.
-    """
-
-    avatar: Avatar
-    rounds: int
-    steps: int
-    seconds: float
-    compile_seconds: float
-    loss: tuple[float, float]
-    psnr: tuple[float, float]
-    kept: bool
-    interrupted: bool = False
-
-    def summary(self) -> str:
-        """One line."""
-        gain = f"{self.psnr[0]:.1f} -> {self.psnr[1]:.1f} dB on the photos"
-        verdict = gain if self.kept else "no improvement on the photos: the avatar is unchanged"
-        ended = ", interrupted" if self.interrupted else ""
-        took = f"{self.rounds} rounds and {self.steps} steps in {self.seconds:.1f} s (compiled in {self.compile_seconds:.1f} s)"
-        return f"refined by {took}{ended}: {verdict}"
+jax.tree_util.register_static(RefineConfig)  # here: its own module is imported by the command line, without JAX
 
 
 @checked_arguments
-def refine(avatar: Avatar, capture: Capture, config: RefineConfig | None = None, **how: Any) -> Avatar:
+def refine(
+    avatar: Avatar,
+    capture: Capture,
+    config: RefineConfig | None = None,
+    *,
+    mesh: Mesh | None = None,
+    progress: bool = False,
+    watch: Callable[[Avatar], None] | None = None,
+) -> Avatar:
     """The avatar, fitted to the photos of a capture; never worse on them than before. See `refine_with_report`."""
-    return refine_with_report(avatar, capture, config, **how).avatar
+    return refine_with_report(avatar, capture, config, mesh=mesh, progress=progress, watch=watch).avatar
 
 
 @checked_arguments

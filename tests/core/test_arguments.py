@@ -72,7 +72,10 @@ WRONG = {
         r"reconstruct\(variables, config, capture\): config: expected HumanGSConfig, got dict",
     ),
     "a batch for reconstruct": (lambda: hg.reconstruct({}, CONFIG, [CAPTURE]), "capture: expected Capture, got list"),
-    "one for a batch": (lambda: hg.reconstruct_batch({}, CONFIG, CAPTURE), "captures: expected"),
+    "one for a batch": (
+        lambda: hg.reconstruct_batch({}, CONFIG, CAPTURE),
+        "captures: expected Sequence, got Capture; a list of captures",
+    ),
     "order of init": (lambda: hg.init_humangs(CONFIG, jax.random.key(0)), "config: expected HumanGSConfig, got "),
     "order of skin": (lambda: hg.skin(POSE, AVATAR), "avatar: expected Avatar, got BodyPose"),
     "a capture for a pose": (lambda: hg.animate(AVATAR, CAPTURE), "pose: expected BodyPose, got Capture; capture.pose"),
@@ -121,7 +124,10 @@ WRONG = {
         lambda: hg.orbit(jnp.zeros(3), 2.0, jnp.zeros(1), 30.0, jnp.eye(3), 8, 8),
         "elevations 30.0: expected radians",
     ),
-    "one camera": (lambda: hg.stack_cameras(CAMERA), "stack_cameras: expected a list of cameras, got Camera"),
+    "one camera": (
+        lambda: hg.stack_cameras(CAMERA),
+        r"stack_cameras\(cameras\): cameras: expected Sequence, got Camera; a list of cameras",
+    ),
     "as_trained": (lambda: hg.SPLAT_PRESETS["as_trained"], "no preset 'as_trained': .*SPLAT_PRESETS.avatar.rendering"),
     "of training": (lambda: hg.PRESETS["tiny"], "no preset 'tiny': expected one of realtime, .* training.config"),
 }
