@@ -30,6 +30,13 @@ def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
     return dataclasses.field(default=default, metadata={"cost": cost, "gain": gain, "measured": measured})
 
 
+class UnknownPresetError(KeyError):
+    """A `KeyError` whose text is a line, not its repr."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 class Presets(dict[str, T]):
     """Presets by name; another name is refused in a line that has all of them.
 
@@ -41,7 +48,7 @@ class Presets(dict[str, T]):
         self.hint = hint
 
     def __missing__(self, name: Any) -> T:
-        raise KeyError(f"no preset {name!r}: expected one of {', '.join(self)}{self.hint}")
+        raise UnknownPresetError(f"no preset {name!r}: expected one of {', '.join(self)}{self.hint}")
 
 
 def check_fields(config: Any) -> None:

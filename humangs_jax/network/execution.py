@@ -20,8 +20,8 @@ class Execution:
     """How the network runs.
 
     tokens: patches that become tokens: "all", those that the "foreground" touches, or None: as the weights were trained.
-    token_capacity: slots for foreground tokens over all views, 0: room for all patches (`reconstruct` fits it to the photos;
-    in training it is for the largest number of photos, see `training.forward.token_share`).
+    token_capacity: slots for foreground tokens over all views, 0: room for all patches (`reconstruct` and `stack_captures` fit
+    it to the photos; in training it is for the largest number of photos, see `training.forward.token_share`).
     dtype: of the encoder's products; parameters, norms, softmax statistics and the decoder stay float32 at least.
     attention: see `network.attention`. attention_chunk: queries per block of the chunked kernel.
     scan: run the blocks as one compiled loop. Their parameters are copied side by side in every call (12 layers of 768: 340 MB).
