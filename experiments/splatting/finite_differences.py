@@ -76,8 +76,8 @@ def measure(size: int = SIZE) -> dict[str, list[float]]:
 
 def section(results: dict[str, list[float]]) -> str:
     """The table."""
-    rows = [[name, *(f"{difference:.0e}" for difference in found)] for name, found in results.items()]
-    return markdown_table(["cuts", *(f"difference at a step of {step:.0e}" for step in STEPS)], rows)
+    rows = [[name, *(f"{difference:.2%}" for difference in found)] for name, found in results.items()]
+    return markdown_table(["cuts", *(f"step {step:g}" for step in STEPS)], rows)
 
 
 if __name__ == "__main__":

@@ -104,5 +104,5 @@ def test_float16_is_refused_for_training(tmp_path):
 def test_other_names_of_number_types_are_an_error(dtype):
     execution = Execution()
     object.__setattr__(execution, "dtype", dtype)  # the type checker of the tests would say it in its own words
-    with pytest.raises(ValueError, match=r"execution\.dtype: expected one of float32, bfloat16, float16, got"):
+    with pytest.raises(ValueError, match=r"Execution: dtype: expected one of 'float32', 'bfloat16', 'float16', got"):
         execution.__post_init__()
