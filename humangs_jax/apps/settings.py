@@ -16,6 +16,7 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.core.configuration import config_from_json, config_to_json, knob
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.view_selection import select_views
 from humangs_jax.io.reading import Refused, reading
 from humangs_jax.io.text import parse_json, read_text, write_json
@@ -78,6 +79,7 @@ class Settings:
 
     def photos(self, capture: Capture) -> Capture:
         """The photos that are used."""
+        capture = usable_views(capture)
         if self.views is None or self.views >= capture.view_count:
             return capture
         return capture.select(select_views(capture, self.views))

@@ -168,9 +168,11 @@ class Start:
         """Avatar and page."""
         with stage("reconstructing"):
             from humangs_jax.avatar.reconstruct import reconstruct
+            from humangs_jax.data.usable_views import usable_views
             from humangs_jax.network.weights import load_weights
             from humangs_jax.viewer.page import write_page
 
+            capture = usable_views(capture)
             avatar = reconstruct(*load_weights(), capture)
         if limits is not None and capture.masks is not None:
             with stage("refining"):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import logging
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading.examples import Source
+from humangs_jax.data.usable_views import empty_views
 from humangs_jax.evaluation.cases import Case, Indices, Method, choose_method, find_people
 from humangs_jax.evaluation.protocol import EvaluationProtocol, find_protocol
 from humangs_jax.evaluation.report import Gallery, page_html
@@ -37,6 +39,8 @@ from humangs_jax.io.text import json_text
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.objectives.lpips import Lpips
+
+logger = logging.getLogger(__name__)
 
 PAGE_IMAGES = 120
 """Images that a page shows, the worst first; the others are rows of its table."""
@@ -183,7 +187,7 @@ def evaluate(
     gallery = Gallery(page_images)
     for index in _progress(range(len(people.names)), progress):
         case = people.load(index)
-        predicted = predict(case, rules.behind)
+        predicted = _without_nobody(case, predict(case, rules.behind))
         missing += predicted.missing
         if not predicted.views:
             continue
@@ -220,6 +224,21 @@ def evaluate(
     }
     label = protocol if isinstance(protocol, str) else "custom"
     return Evaluation(name, rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
+
+
+def _without_nobody(case, predicted):
+    """The predictions of views whose true mask shows somebody: white compared with white would raise the mean."""
+    empty = set(empty_views(case.truth)) & set(predicted.views)
+    if not empty:
+        return predicted
+    names = ", ".join(case.truth.names[i] for i in sorted(empty))
+    logger.warning("%s: %d views are not compared, their mask is empty: %s", case.name, len(empty), names)
+    kept = [row for row, view in enumerate(predicted.views) if view not in empty]
+    return predicted._replace(
+        images=predicted.images[kept],
+        alpha=None if predicted.alpha is None else predicted.alpha[kept],
+        views=tuple(predicted.views[row] for row in kept),
+    )
 
 
 def _progress(indices, progress):
