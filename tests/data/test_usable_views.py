@@ -41,7 +41,16 @@ SPOILED = {
     "inverted": (lambda mask: 1 - mask, "hardly meet"),
     "a spot elsewhere": (elsewhere, "hardly meet"),
 }
+
+
+def head(mask):
+    """The top eighth of the person."""
+    rows = np.flatnonzero((mask > 0.5).any(axis=1))
+    return mask * (np.arange(len(mask)) < rows[0] + len(rows) // 8)[:, None]
+
+
 KEPT = {
+    "the head alone": head,
     "half of the person": lambda mask: mask * (np.arange(len(mask)) < 256)[:, None],
     "all of the photo": np.ones_like,
     "soft": lambda mask: 0.6 * mask,
@@ -75,7 +84,7 @@ def test_exact_masks_hold_the_body(demo):
 
 def test_a_body_that_is_out_of_the_frame_meets_no_mask(demo):
     poses = replace(demo.poses, translation=demo.poses.translation + jnp.asarray([50.0, 0, 0]))
-    with pytest.raises(CaptureError, match="no view is left that shows the person: .*hardly meet"):
+    with pytest.raises(CaptureError, match=r"no view is left that shows the person: .*hardly meet"):
         usable_views(dataclasses.replace(demo, poses=poses))
 
 
@@ -93,5 +102,7 @@ def test_all_that_reads_photos_leaves_it_out(demo):
 def test_no_view_left_is_an_error_that_names_them(demo):
     nobody = dataclasses.replace(demo, masks=0 * demo.masks)
     for read in (usable_views, lambda c: select_views(c, 2), lambda c: standardize(c, 64), crop_to_person):
-        with pytest.raises(CaptureError, match=f"capture: masks: no view is left .*{demo.names[0]}.*: the mask is empty"):
+        with pytest.raises(
+            CaptureError, match=f"capture: masks: no view is left .*{demo.names[0]}.*: the mask is empty"
+        ):
             read(nobody)
