@@ -17,7 +17,7 @@ logger = logging.getLogger(__name__)
 MASK_THRESHOLD = 0.5
 """A pixel belongs to the person when its mask is above this."""
 LEAST_SHARE = 0.05
-"""Of the body in the frame that lies on the mask. In the demo's photos the head alone has 6 to 7 %, an inverted mask up to 1.4 %."""
+"""Of the body in the frame that lies on the mask. In the demo's photos the head alone has 6 to 7 %, an inverted mask 1.4 %."""
 POINTS = 1000
 """On the skin."""
 

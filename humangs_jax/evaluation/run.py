@@ -232,7 +232,8 @@ def _without_nobody(case, predicted):
     if not empty:
         return predicted
     names = ", ".join(case.truth.names[i] for i in sorted(empty))
-    logger.warning("%s: %d views are not compared, their mask is empty: %s", case.name, len(empty), names)
+    count = "1 view is not compared, its" if len(empty) == 1 else f"{len(empty)} views are not compared, their"
+    logger.warning("%s: %s mask is empty: %s", case.name, count, names)
     kept = [row for row, view in enumerate(predicted.views) if view not in empty]
     return predicted._replace(
         images=predicted.images[kept],
