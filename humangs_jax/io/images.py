@@ -50,11 +50,11 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     """A mask, coverage in [0, 1]: a grey image, or what else segmentation tools write.
 
     A palette or colours: 1 where the image has the one label (of a palette) or the one colour that is not the background. The
-    background is label 0 if that is black, else what is black. An alpha channel is the mask if the colours are those of a photo,
-    all alike, or the same mask.
+    background is black, and label 0 if there is one. Several greys of a palette are those of a grey image. An alpha channel is
+    the mask if the colours are those of a photo, all alike, or the same mask.
 
-    Raises: as `read_image`; FileError for several labels or colours, for none that is black, and for alpha and greys that differ:
-    which is the person?
+    Raises: as `read_image`; FileError for several labels or colours, for a label 0 that is not black, for no black, and for alpha
+    and greys that differ: which is the person?
     """
     with open_image(path) as (image, _):
         if image.mode == "P" and image.convert("RGBA").getchannel("A").getextrema()[0] == 255:
@@ -81,15 +81,20 @@ def _mask_of_labels(labels, palette):
     """The mask of a palette image: labels (h, w), colours of the palette (256, 3) from 0 to 255."""
     used = np.unique(labels)
     black = [label for label in used.tolist() if not palette[label].any()]
-    background = 0 if 0 in black or (not black and not palette[0].any()) else black[0] if len(black) == 1 else None
+    if 0 in used:  # tools count the background as 0, people draw it black: where these differ nobody knows
+        background = 0 if 0 in black else None
+    elif not black and not palette[0].any():
+        background = 0
+    else:
+        background = black[0] if len(black) == 1 else None
     others = [label for label in used.tolist() if label != background]
     if background is not None and len(others) <= 1:
         return ((labels != background) & bool(others)).astype(np.float32)
     colours = palette[used]
-    if colours.max() >= 128 and _is_grey(colours / 255):
+    if len(used) > 2 and colours.max() >= 128 and _is_grey(colours / 255):
         return palette[labels].mean(axis=-1, dtype=np.float32) / np.float32(255)
     shown = ", ".join(map(str, others[:5])) + (", ..." if len(others) > 5 else "")
-    which = "which is the person" if background is not None else "none is black: which is the background"
+    which = "which is the person" if background is not None else "0 is not black: which is the background"
     raise Refused(f"a palette of the labels {shown}: {which}? expected one label besides a black 0, or {GREY_MASK}")
 
 

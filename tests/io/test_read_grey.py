@@ -42,8 +42,7 @@ READ = {
     "a label that is grey": palette(PERSON * 7, VOC),
     "labels on a ramp of greys": palette(PERSON * 1, RAMP),
     "a white palette": palette(PERSON * 1, [0, 0, 0, 255, 255, 255]),
-    "label 0 is white": palette(~PERSON * 1, [255, 255, 255, 0, 0, 0]),
-    "label 0 is red": palette(~PERSON * 1, [128, 0, 0, 0, 0, 0]),
+    "no label 0": palette(np.where(PERSON, 3, 2), [0, 0, 255, 0, 255, 0, 0, 0, 0, 128, 0, 0]),
     "fewer colours than labels": palette(PERSON * 1, [0, 0, 0]),
     "an opaque palette": palette(PERSON * 1, VOC, transparency=bytes([255, 255])),
     "a transparent background": palette(PERSON * 1, VOC, transparency=0),
@@ -92,7 +91,10 @@ def test_soft_masks_keep_their_greys(tmp_path):
 TWO = PERSON * 1 + (np.arange(8) > 3) * PERSON
 REFUSED = {
     "a palette of the labels 1, 2: which is the person": palette(TWO, VOC),
-    "a palette of the labels 0, 1: none is black: which is the background": palette(PERSON * 1, [9, 9, 200, 200, 9, 9]),
+    "a palette of the labels 0, 1: 0 is not black: which is the background": palette(
+        PERSON * 1, [9, 9, 200, 200, 9, 9]
+    ),
+    "labels 0, 1: 0 is not black": palette(PERSON * 1, [255, 255, 255, 0, 0, 0]),
     "2 colours: which is the person": pixels(coloured(TWO == 1, (255, 0, 0)) + coloured(TWO == 2, (0, 255, 0))),
     "2 colours without black: which": pixels(coloured(PERSON, (255, 0, 0), (0, 0, 200))),
     "an alpha channel besides its greys": pixels(np.dstack([grey(TWO == 1), grey(PERSON)])),
