@@ -10,6 +10,7 @@ from typing import Any
 
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyModel
+from humangs_jax.core.printable import printable
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
@@ -188,7 +189,8 @@ def evaluate(
     for index in _progress(range(len(people.names)), progress):
         case = people.load(index)
         predicted = _without_nobody(case, predict(case, rules.behind))
-        missing += predicted.missing
+        person = printable(case.name)  # of a folder: every report gets a name of one line
+        missing += map(printable, predicted.missing)
         if not predicted.views:
             continue
         truth = case.truth.select(predicted.views)
@@ -196,14 +198,14 @@ def evaluate(
         everything |= case.inputs is None and isinstance(source, str | Path | Capture)
         sides.add(truth.images.shape[2:0:-1])
         if case.inputs is not None:
-            gallery.add_inputs(case.name, case.inputs.images)
+            gallery.add_inputs(person, case.inputs.images)
             shown_inputs.append(case.inputs.view_count)
         try:
             scored = list(score_views(predicted.images, truth, rules, predicted.alpha, networks))
         except ValueError as error:
-            raise ValueError(f"{case.name}: {error}") from error
+            raise ValueError(f"{person}: {error}") from error
         for i, scores in enumerate(scored):
-            row = Scored(case.name, int(truth.frames[i]), truth.names[i], scores)
+            row = Scored(person, int(truth.frames[i]), printable(truth.names[i]), scores)
             mask = None if truth.masks is None else truth.masks[i]
             gallery.add(len(rows), scores["psnr"], on_background(truth.images[i], mask, rules), predicted.images[i])
             rows.append(row)
@@ -211,7 +213,7 @@ def evaluate(
         raise ValueError(f"no prediction was found; {len(missing)} were expected: {_listed(missing)}")
     people_shown = {row.person for row in rows}
     about = {
-        "source": str(source) if isinstance(source, str | Path) else type(source).__name__,
+        "source": printable(source) if isinstance(source, str | Path) else type(source).__name__,
         "counts": f"{_counted(len(rows), 'image', 'images')} of {_counted(len(people_shown), 'person', 'people')}",
         "sides": sorted(map(list, sides)),
         "inputs": sorted(set(shown_inputs)),
@@ -223,7 +225,7 @@ def evaluate(
         score: "no image is large enough, or shows enough of a person" for score in unknown if score not in reasons
     }
     label = protocol if isinstance(protocol, str) else "custom"
-    return Evaluation(name, rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
+    return Evaluation(printable(name), rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
 
 
 def _without_nobody(case, predicted):
