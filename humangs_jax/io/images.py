@@ -30,6 +30,8 @@ ORIENTATION_MARKS = (b"Exif", b"eXIf", b"Raw profile type", b"adobe.com/xap", b"
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOUR_TYPES = {2: "rgb", 4: "grey and alpha", 6: "rgba"}
 """Colour types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
+PALETTE = 3
+"""The colour type whose pixels are numbers of a palette."""
 ADAM7 = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
 """First row, first column and steps of the passes of an interlaced PNG (https://www.w3.org/TR/png-3/#8Interlace)."""
 
@@ -183,9 +185,9 @@ def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
 
     Raises: as `open_image`.
     """
-    with open_image(path) as (image, _):
+    with open_image(path) as (image, data):
         found = image.size, "A" in image.getbands() or "transparency" in image.info
-        image.verify() if image.format == "PNG" else image.load()
+        _checked_chunks(data) if image.format == "PNG" else image.load()
     return found
 
 
@@ -198,8 +200,10 @@ def image_size(path: str | Path) -> tuple[int, int]:
 def _read_pixels(path):
     """(h, w, channels) float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels."""
     with open_image(path) as (image, data):
-        if data[:8] == PNG_SIGNATURE and data[24] == 16 and data[25] in PNG_COLOUR_TYPES:
-            return _decode_deep_png(data).astype(np.float32) / np.float32(65535)
+        if data[:8] == PNG_SIGNATURE:
+            chunks = _checked_chunks(data)
+            if data[24] == 16 and data[25] in PNG_COLOUR_TYPES:
+                return _decode_deep_png(chunks).astype(np.float32) / np.float32(65535)
         if image.mode.startswith("I"):  # 16-bit grey
             return np.asarray(image, np.float32)[..., None] / np.float32(65535)
         has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
@@ -214,9 +218,8 @@ BAND = 1024
 """Rows that are decoded together."""
 
 
-def _decode_deep_png(data: bytes) -> UInt[np.ndarray, "h w c"]:
+def _decode_deep_png(chunks: list[tuple[bytes, bytes]]) -> UInt[np.ndarray, "h w c"]:
     """The pixels of a PNG file of 16 bits a channel (https://www.w3.org/TR/png-3/)."""
-    chunks = list(_png_chunks(data))
     width, height, _, colour_type, *methods = struct.unpack(">IIBBBBB", chunks[0][1])
     if methods[:2] != [0, 0] or methods[2] > 1 or 0 in (width, height):
         raise Refused("not a readable image: a PNG header with unknown methods")
@@ -235,6 +238,17 @@ def _decode_deep_png(data: bytes) -> UInt[np.ndarray, "h w c"]:
             pixels[y::dy, x::dx] = _unfiltered(rows.reshape(h, -1), 2 * channels).view(">u2").reshape(h, w, channels)
         at += length
     return pixels
+
+
+def _checked_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
+    """The chunks of a whole PNG file: Pillow decodes some that are damaged, and pixels of a palette that is not there."""
+    chunks = list(_png_chunks(data))
+    names = {name for name, _ in chunks}
+    if missing := {b"IDAT", b"IEND"} - names:
+        raise Refused(f"not a readable image: cut off, without the chunk {min(missing).decode()}")
+    if data[25] == PALETTE and b"PLTE" not in names:
+        raise Refused("not a readable image: its pixels are numbers of a palette, and it has none")
+    return chunks
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
