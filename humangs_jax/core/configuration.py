@@ -113,7 +113,7 @@ def check_range(cls: type, name: str, value: Any, path: str) -> None:
     for allowed in ranges:
         for each in values:
             if isinstance(each, numbers.Real) and not allowed.low <= each <= allowed.high:  # nor NaN
-                raise ValueError(f"{path} {each:g}: expected {allowed}")
+                raise ValueError(f"{path} {each:.15g}: expected {allowed}")
 
 
 @functools.cache

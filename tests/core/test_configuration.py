@@ -77,7 +77,7 @@ class Fit:
     ("changes", "said"),
     [
         ({"steps": 0}, "steps 0: expected 1 to 1,000"),
-        ({"steps": 10**6}, "steps 1e+06: expected 1 to 1,000"),
+        ({"steps": 10**6}, "steps 1000000: expected 1 to 1,000"),
         ({"steps": np.int64(0)}, "steps 0: expected 1 to 1,000"),
         ({"shares": (0.5, 1.5)}, "shares 1.5: expected 0 to 1"),
         ({"shares": (float("nan"),)}, "shares nan: expected 0 to 1"),
