@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import logging
 import os
 import re
 import shutil
@@ -319,6 +320,26 @@ def test_a_command_ends_with_what_it_wrote_how_long_it_took_and_what_is_next(sam
     assert (report, written, err) == ("the report", "my file.npz: 3 numbers", "humangs: warning: odd\n")
     assert re.fullmatch(r"took \d+\.\d s: counting \d+\.\d, writing \d+\.\d", took)
     assert following == "next: humangs view 'my file.npz'"
+
+
+@pytest.mark.parametrize("verbose", [(), ("--verbose",)])
+def test_what_a_file_says_does_not_act_on_the_terminal(verbose, monkeypatch, sample, capsys):
+    hostile = "x\x1b]0;OWNED\x07\x9b2J\u202e\r\nhumangs: error: forged\udce9"
+
+    def run(self):
+        screen.warn(hostile)
+        screen.tell(hostile)
+        screen.wrote(Path(hostile), hostile)
+        logging.getLogger("humangs_jax.sample").warning("%s", hostile)
+        with stage(hostile):
+            raise ValueError(hostile)
+
+    monkeypatch.setattr(Sample, "run", run)
+    assert cli.execute(["sample", *verbose]) == cli.BAD_DATA
+    out, err = capsys.readouterr()
+    assert set((out + err).replace("\n", "")) == {c for c in out + err if c.isprintable()}
+    last = err.splitlines()[-1]
+    assert last == r"humangs: error: x\x1b]0;OWNED\x07\x9b2J\u202e\r\nhumangs: error: forged\xe9"
 
 
 def test_quiet_and_verbose(sample, capsys):

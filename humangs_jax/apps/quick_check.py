@@ -10,8 +10,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.array_types import Bool
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.surface_points import points_in_image, surface_points
 
 LEAST_IOU = 0.5
 """Clothes and hair cover about a fifth of a silhouette that the body does not; half means another pose or camera."""
@@ -103,7 +104,7 @@ def _views(capture) -> _Views:
     return _Views(
         names=tuple(capture.names[i] for i in chosen),
         frames=frames,
-        points=_surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames),
+        points=surface_points(capture.body, np.asarray(capture.betas), rotations, translations, frames, POINTS),
         masks=None if masks is None else [_mask_cells(np.asarray(masks[i])) for i in chosen],
         exposures=[_exposure(capture.images[i], None if masks is None else masks[i]) for i in chosen],
         K=np.asarray(capture.cameras.K, float)[chosen],
@@ -202,47 +203,6 @@ def _cause(views, i, covered, mask):
 # Coarse silhouettes ---------------------------------------------------------------------------------------------------
 
 
-def _surface_points(body, betas, rotations, translations, frames) -> dict[int, Float[np.ndarray, "p 3"]]:
-    """Points spread over the posed skin, by frame."""
-    rest = np.asarray(body.template) + np.asarray(body.shape_directions)[..., : len(betas)] @ betas
-    joints = np.asarray(body.joint_regressor) @ rest
-    corners, weights = _sampling(rest, np.asarray(body.faces))
-    skinning, posed = np.asarray(body.skinning_weights), {}
-    for frame in sorted(set(frames)):
-        moves = _joint_moves(joints, body.parents, rotations[frame])
-        blended = (skinning @ moves.reshape(len(moves), -1)).reshape(-1, 3, 4)
-        vertices = np.einsum("nrc,nc->nr", blended[..., :3], rest) + blended[..., 3] + translations[frame]
-        posed[frame] = np.einsum("pc,pcx->px", weights, vertices[corners])
-    return posed
-
-
-def _sampling(vertices, faces):
-    """Corners (p, 3) and weights (p, 3) of points that are spread evenly over a mesh."""
-    a, b, c = np.moveaxis(vertices[faces], 1, 0)
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
-    rng = np.random.default_rng(0)
-    chosen = np.searchsorted(np.cumsum(areas), (np.arange(POINTS) + 0.5) / POINTS * areas.sum())
-    u, v = rng.random((2, POINTS))
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    return faces[np.minimum(chosen, len(faces) - 1)], np.stack([1 - u - v, u, v], axis=-1)
-
-
-def _joint_moves(joints, parents, rotations) -> Float[np.ndarray, "j 3 4"]:
-    """Rigid transforms from the rest pose to the pose."""
-    angles = np.linalg.norm(rotations, axis=-1)
-    x, y, z = (rotations / np.maximum(angles, 1e-12)[:, None]).T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=-1).reshape(-1, 3, 3)
-    sine, cosine = np.sin(angles)[:, None, None], np.cos(angles)[:, None, None]
-    local = np.eye(3) + sine * cross + (1 - cosine) * cross @ cross
-    moves = np.zeros((len(parents), 3, 4))
-    for j, parent in enumerate(parents):  # parents come first
-        turn = local[j] if parent < 0 else moves[parent, :, :3] @ local[j]
-        place = joints[j] if parent < 0 else moves[parent, :, :3] @ joints[j] + moves[parent, :, 3]
-        moves[j] = np.concatenate([turn, (place - turn @ joints[j])[:, None]], axis=1)
-    return moves
-
-
 def _silhouette(views, i, camera=None, matrix=None) -> tuple[Bool[np.ndarray, "rows columns"], float]:
     """The cells that the body of view i covers, and the share of its points in the image.
 
@@ -251,15 +211,12 @@ def _silhouette(views, i, camera=None, matrix=None) -> tuple[Bool[np.ndarray, "r
     camera = i if camera is None else camera
     matrix = views.cam_from_world[camera] if matrix is None else matrix
     points = views.points[views.frames[i]]
-    seen = points @ matrix[:3, :3].T + matrix[:3, 3]
-    seen = seen[seen[:, 2] > 1e-6]
-    x, y, _ = views.K[camera] @ (seen / seen[:, 2:]).T
-    inside = (x >= 0) & (y >= 0) & (x < views.width) & (y < views.height)
+    pixels = points_in_image(points, views.K[camera], matrix, views.width, views.height)
     shape, cell = _shape(views.width, views.height), _cell(views.width, views.height)
     covered = np.zeros(shape, bool)
-    at = lambda pixels, most: np.minimum((pixels[inside] / cell).astype(int), most - 1)
-    covered[at(y, shape[0]), at(x, shape[1])] = True
-    return _closed(covered), float(inside.sum() / len(points))
+    column, row = np.minimum((pixels / cell).astype(int), np.asarray(shape[::-1]) - 1).T
+    covered[row, column] = True
+    return _closed(covered), len(pixels) / len(points)
 
 
 def _closed(cells):

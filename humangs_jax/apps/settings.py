@@ -15,8 +15,19 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.core.arguments import checked_arguments
-from humangs_jax.core.configuration import Presets, check_fields, config_from_json, config_to_json, knob
+from humangs_jax.core.configuration import (
+    Few,
+    PhotoSide,
+    Presets,
+    RefineSteps,
+    Rounds,
+    config_from_json,
+    config_to_json,
+    configuration,
+    knob,
+)
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.view_selection import select_views
 from humangs_jax.io.reading import Refused, reading
 from humangs_jax.io.text import parse_json, read_text, write_json
@@ -31,7 +42,7 @@ KIND = "humangs_jax settings"
 """Of a file of settings, its field "kind"."""
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class Settings:
     """How an avatar is made and drawn. The size of the frames is not in it: it belongs to the screen.
 
@@ -40,25 +51,15 @@ class Settings:
     to it for refinement, pixels. splat: as `Shot.splat`. prune: as `Shot.prune`.
     """
 
-    views: int | None = knob(None, cost="what the other photos show", gain="time in proportion", measured=MEASURED)
+    views: Few | None = knob(None, cost="what the other photos show", gain="time in proportion", measured=MEASURED)
     execution: Execution = dataclasses.field(default_factory=Execution)
-    refine_rounds: int = knob(0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED)
-    refine_steps: int = knob(0, cost="time in proportion", gain="detail of the photos", measured=MEASURED)
-    refine_size: int | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
+    refine_rounds: Rounds = knob(0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED)
+    refine_steps: RefineSteps = knob(0, cost="time in proportion", gain="detail of the photos", measured=MEASURED)
+    refine_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
         "as_trained", cost="see performance.md", gain="time of a frame", measured=MEASURED
     )
     prune: bool = knob(False, cost="3 of 255 levels", gain="time of frames that are drawn often", measured="video.md")
-
-    def __post_init__(self):
-        """Raises ValueError for settings out of range or of another type, naming them."""
-        check_fields(self)
-        counts = {"views": self.views, "refine_size": self.refine_size}
-        if wrong := [name for name, value in counts.items() if value is not None and value < 1]:
-            raise ValueError(f"Settings: {', '.join(wrong)} must be at least 1")
-        limits = {"refine_rounds": self.refine_rounds, "refine_steps": self.refine_steps}
-        if wrong := [f"{name} {value}" for name, value in limits.items() if value < 0]:
-            raise ValueError(f"Settings: {', '.join(wrong)}: must not be negative")
 
     @property
     def refinement(self) -> RefineConfig | None:
@@ -80,6 +81,7 @@ class Settings:
 
     def photos(self, capture: Capture) -> Capture:
         """The photos that are used."""
+        capture = usable_views(capture)
         if self.views is None or self.views >= capture.view_count:
             return capture
         return capture.select(select_views(capture, self.views))

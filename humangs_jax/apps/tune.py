@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
+from typing import Annotated
 
 import jax
 import numpy as np
@@ -23,7 +24,7 @@ from humangs_jax.avatar.frames import draw, rest_pose_of, splatting_of, turntabl
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.core.allocator import peak_memory
 from humangs_jax.core.array_types import Float
-from humangs_jax.core.configuration import config_from_json
+from humangs_jax.core.configuration import Range, config_from_json, configuration
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.io.images import write_png
@@ -39,7 +40,7 @@ MAKES, FRAMES, STEPS = 3, 16, 6
 """Repetitions of a measurement, and steps of refinement that are timed. The slowest counts, of frames the 90th percentile."""
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class FrontPoint:
     """A point of the front. `make`, `refine` and `frame`: times over those of the sweep's default point, of making the avatar
     without refinement, of refinement, and of a frame. memory_mb as in `Cost`. psnr, psnr_poses: dB, of new views
@@ -48,12 +49,12 @@ class FrontPoint:
 
     name: str
     settings: Settings
-    make: float
-    refine: float
-    frame: float
-    memory_mb: float
-    psnr: float
-    psnr_poses: float
+    make: Annotated[float, Range(0, 1e9)]
+    refine: Annotated[float, Range(0, 1e9)]
+    frame: Annotated[float, Range(0, 1e9)]
+    memory_mb: Annotated[float, Range(0, 1e9)]
+    psnr: Annotated[float, Range(-1000, 1000)]
+    psnr_poses: Annotated[float, Range(-1000, 1000)]
 
     @property
     def quality(self) -> float:

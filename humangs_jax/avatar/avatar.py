@@ -10,10 +10,10 @@ import numpy as np
 
 from humangs_jax.avatar.light import TERMS, Light
 from humangs_jax.core.array_types import Array, Float, Int
-from humangs_jax.core.checks import ROUNDING
+from humangs_jax.core.checks import LARGEST, ROUNDING
 from humangs_jax.core.numerics import at_least_float32
 from humangs_jax.core.pytree import Batchable, pytree_dataclass, replace, shape_fault, static_field
-from humangs_jax.io.arrays import check_array, check_checksum, check_indices, check_joints, checksum
+from humangs_jax.io.arrays import check_array, check_checksum, check_indices, check_joints, check_row_sums, checksum
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import FileError, Refused, reading
 from humangs_jax.io.text import parse_json
@@ -85,7 +85,8 @@ class Avatar(Batchable):
         """Write one compressed `.npz` (no pickle); it appears whole or not at all.
 
         Raises: ValueError for a batch of avatars, for arrays that do not fit each other, and if the Gaussians are deformed, as
-        those of a pose are: avatars are in the T-pose.
+        those of a pose are: avatars are in the T-pose; FileError if
+        `load` would refuse the file, as it does numbers that are not finite.
         """
         if self.batch_shape:
             raise ValueError(f"expected one avatar, got a batch {self.batch_shape}: save each, avatars[0].save(path)")
@@ -108,6 +109,8 @@ class Avatar(Batchable):
         if self.gaussians.low_pass is not None:
             values["low_pass"] = self.gaussians.low_pass
         values = {name: np.asarray(x if name == "faces" else at_least_float32(x)) for name, x in values.items()}
+        with reading(path, "avatar"):
+            _check_arrays(values, len(self.parents))
         write_npz(path, {"header": json.dumps(header | {"checksum": checksum(values)})} | values)
 
     @classmethod
@@ -142,13 +145,28 @@ def _load(cls, path):
         raise Refused(
             f"skinning {skinning!r}, rendering {rendering!r}: expected 'affine' or 'rotation', 'exact' or 'inria'"
         )
-    g, j, n = (len(arrays[name]) for name in ("means", "rest_joints", "rest_vertices"))
-    if not g:
-        raise Refused("means: expected at least one Gaussian")
-    if j != len(header["parents"]):
-        raise Refused(f"rest_joints: expected shape ({len(header['parents'])}, 3), got {arrays['rest_joints'].shape}")
-    unit = (-ROUNDING, 1 + ROUNDING)
-    ranges = {"scales": (0.0,), "low_pass": (0.0,), "opacities": unit, "skinning_weights": unit}
+    arrays = {name: arrays[name] for name in wanted}
+    _check_arrays(arrays, len(header["parents"]))
+    check_checksum(header.get("checksum"), checksum(arrays))
+    loaded = {name: jnp.asarray(value) for name, value in arrays.items()}
+    return cls(
+        Gaussians(*(loaded[name] for name in _ARRAYS[:5]), low_pass=loaded.get("low_pass")),
+        *(loaded[name] for name in _ARRAYS[5:]),
+        parents=tuple(header["parents"]),
+        joint_names=tuple(header["joint_names"]),
+        skinning=skinning,
+        rendering=rendering,
+        light=Light(*(loaded[f"light_{name}"] for name in _LIGHT)) if with_light else None,
+    )
+
+
+def _check_arrays(arrays, j):
+    """Of an avatar of j joints, as its file holds them. Raises: Refused."""
+    g, n = (len(arrays[name]) for name in ("means", "rest_vertices"))
+    if not g or not n:
+        raise Refused(f"{'rest_vertices' if g else 'means'}: expected at least one {'vertex' if g else 'Gaussian'}")
+    unit, lengths = (-ROUNDING, 1 + ROUNDING), (0.0, LARGEST)
+    ranges = {"scales": lengths, "low_pass": lengths, "opacities": unit, "skinning_weights": unit}
     ranges["light_normals"] = (-1 - ROUNDING, 1 + ROUNDING)
     shapes = {
         "means": (g, 3),
@@ -161,19 +179,8 @@ def _load(cls, path):
         "rest_joints": (j, 3),
     }
     shapes |= {"light_coefficients": (TERMS,), "light_normals": (g, 3), "light_shading": (g,), "low_pass": (g,)}
-    for name in wanted:
+    for name in arrays:
         if name in shapes:
-            check_array(name, arrays[name], shapes[name], *ranges.get(name, ()))
+            check_array(name, arrays[name], shapes[name], *ranges.get(name, (-LARGEST, LARGEST)))
     check_indices("faces", arrays["faces"], (None, 3), n)
-    arrays = {name: arrays[name] for name in wanted}
-    check_checksum(header.get("checksum"), checksum(arrays))
-    loaded = {name: jnp.asarray(value) for name, value in arrays.items()}
-    return cls(
-        Gaussians(*(loaded[name] for name in _ARRAYS[:5]), low_pass=loaded.get("low_pass")),
-        *(loaded[name] for name in _ARRAYS[5:]),
-        parents=tuple(header["parents"]),
-        joint_names=tuple(header["joint_names"]),
-        skinning=skinning,
-        rendering=rendering,
-        light=Light(*(loaded[f"light_{name}"] for name in _LIGHT)) if with_light else None,
-    )
+    check_row_sums("skinning_weights", arrays["skinning_weights"])

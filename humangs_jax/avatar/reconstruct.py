@@ -45,17 +45,18 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     want (`gaussian_body`), and the token capacity to what these photos need. Up to 8 views each number has a program of
     its own, beyond that at most a fifth of the views is padding. For a network with a driver this is the avatar before any
     correction of a frame, see `avatar.targets`. Worlds that are not y-up are turned for the network (`data.views.upright`); the
-    avatar then has no light, whose directions would be those of another world.
+    avatar then has no light, whose directions would be those of another world. Views whose mask does not show the person are left
+    out (`data.usable_views`).
 
-    Raises: ValueError if the network makes no Gaussians, the capture has no view, or values that are not finite or out of range,
-    naming the array.
+    Raises: ValueError if the network makes no Gaussians, the capture has no view, none that shows the person, or values that are
+    not finite or out of range, naming the array.
     """
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
     photos = standardize(capture, config.image_size, config.execution.crop)
-    views, bucket = upright(photos, capture.body), round_up(capture.view_count, smallest=1)
-    turned = views is not photos
-    if bucket > capture.view_count:
+    views, count = upright(photos, capture.body), len(photos.images)
+    turned, bucket = views is not photos, round_up(count, smallest=1)
+    if bucket > count:
         views = pad_views(views, bucket)
     inputs = _prepare(body, views, config)
     _check_posed(inputs, "capture")

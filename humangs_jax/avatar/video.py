@@ -135,7 +135,7 @@ def _write_by_ffmpeg(path, frames, fps, shape, quality):
     command += ["-r", str(Fraction(fps).limit_denominator(100_000)), "-i", "-", "-an", *quality]
     # said and done in BT.709: players guess the matrix of an untagged file by its size
     command += ["-vf", "scale=out_color_matrix=bt709:out_range=tv"]
-    command += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", str(path)]
+    command += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709", f"file:{path}"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
         assert ffmpeg.stdin is not None and ffmpeg.stderr is not None  # pipes, as asked for
         try:

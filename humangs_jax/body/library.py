@@ -14,6 +14,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.checks import LARGEST
 from humangs_jax.io.arrays import check_array, check_indices, check_joints
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import Refused, check_limit, open_file, reading
@@ -73,7 +74,7 @@ def _sparse_rows(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _dense_rows(arrays: dict[str, np.ndarray], rows: str, columns: str, count: int, width: int) -> np.ndarray:
     check_limit("plain_bytes", 8 * count * width, "bytes of a matrix")
     check_indices(columns, arrays[columns], (count, None), width)
-    check_array(f"{rows}_values", arrays[f"{rows}_values"], arrays[columns].shape)
+    check_array(f"{rows}_values", arrays[f"{rows}_values"], arrays[columns].shape, -LARGEST, LARGEST)
     matrix = np.zeros((count, width), np.float64)
     np.add.at(matrix, (np.arange(count)[:, None], arrays[columns].astype(np.int64)), arrays[f"{rows}_values"])
     sums = matrix.sum(1, keepdims=True)
@@ -141,8 +142,8 @@ def _read_body(path):
     parents, joint_names = arrays["parents"].tolist(), [str(name) for name in arrays["joint_names"]]
     check_joints(parents, joint_names)
     joints, vertices, shapes = len(parents), len(arrays["template"]), len(arrays["shape_names"])
-    check_array("template", arrays["template"], (vertices, 3))
-    check_array("shape_directions", arrays["shape_directions"], (shapes, vertices, 3))
+    check_array("template", arrays["template"], (vertices, 3), -LARGEST, LARGEST)
+    check_array("shape_directions", arrays["shape_directions"], (shapes, vertices, 3), -LARGEST, LARGEST)
     check_indices("faces", arrays["faces"], (None, 3), vertices)
     directions = np.moveaxis(arrays["shape_directions"], 0, -1)
     if directions.dtype == np.int16:

@@ -17,8 +17,10 @@ import numpy as np
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.checks import LARGEST
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.io.array_file import ArrayFile
+from humangs_jax.io.arrays import check_row_sums
 from humangs_jax.io.reading import FileError, reading
 
 SHAPE_COLUMNS, EXPRESSION_COLUMNS = 300, 100
@@ -51,8 +53,10 @@ def load_smplx(path: str | Path, *, shape_count: int = 10, expression_count: int
 
 def _load_smplx(path, shape_count, expression_count):
     file = ArrayFile.open(path, wanted=lambda key: not key.startswith("hands_"))
-    template = file.numbers("v_template", (None, 3))
+    template = file.numbers("v_template", (None, 3), LARGEST)
     n = len(template)
+    weights = file.numbers("weights", (n, JOINTS), LARGEST)
+    check_row_sums("weights", weights)
     directions, names = _shape_directions(file, n, shape_count, expression_count)
     has_uvs = "vt" in file and "ft" in file
     uvs = file.numbers("vt", (None, 2)) if has_uvs else None
@@ -60,9 +64,9 @@ def _load_smplx(path, shape_count, expression_count):
     return BodyModel(
         template=number(template),
         shape_directions=number(directions),
-        pose_directions=number(file.numbers("posedirs", (n, 3, 9 * (JOINTS - 1)))),
-        joint_regressor=number(file.numbers("J_regressor", (JOINTS, n))),
-        skinning_weights=number(file.numbers("weights", (n, JOINTS))),
+        pose_directions=number(file.numbers("posedirs", (n, 3, 9 * (JOINTS - 1)), LARGEST)),
+        joint_regressor=number(file.numbers("J_regressor", (JOINTS, n), LARGEST)),
+        skinning_weights=number(weights),
         faces=jnp.asarray(file.indices("f", n), jnp.int32),
         uvs=None if uvs is None else number(uvs),
         uv_faces=None if uvs is None else jnp.asarray(file.indices("ft", len(uvs)), jnp.int32),
@@ -74,7 +78,7 @@ def _load_smplx(path, shape_count, expression_count):
 
 
 def _shape_directions(file: ArrayFile, n: int, shape_count: int, expression_count: int):
-    stored = file.numbers("shapedirs", (n, 3, None))
+    stored = file.numbers("shapedirs", (n, 3, None), LARGEST)
     columns = stored.shape[-1]
     if columns >= SHAPE_COLUMNS + EXPRESSION_COLUMNS:
         available = SHAPE_COLUMNS, EXPRESSION_COLUMNS

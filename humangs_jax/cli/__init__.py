@@ -78,7 +78,7 @@ def execute(arguments: Sequence[str]) -> int:
     verbose = "--verbose" in given
     try:
         if "--version" in given:
-            print(f"humangs_jax {__version__}")
+            screen.tell(f"humangs_jax {__version__}")
         else:
             command = _parsed(arguments)
             screen.begin("--quiet" in given, verbose)
@@ -96,6 +96,10 @@ def execute(arguments: Sequence[str]) -> int:
             return _interrupted()
         if isinstance(error, ValueError | OSError):
             return _failed(error, verbose)
+        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(
+            error
+        ):  # numpy; XLA, whose text has many lines
+            return _failed(MemoryError(f"out of memory: {(str(error).splitlines() or [''])[0]}"), verbose)
         raise
     finally:
         screen.end()
@@ -132,16 +136,18 @@ def _command(name: str) -> Callable[..., Any]:
 
 def _failed(error: Exception, verbose: bool) -> int:
     """One line. What begins with an option is bad usage, wherever it was raised."""
-    if verbose:
-        import traceback
-
-        traceback.print_exc()
+    from humangs_jax.cli import screen
     from humangs_jax.cli.options import UsageError
 
-    print(f"humangs: error: {error}", file=sys.stderr)
+    if isinstance(error, UnicodeEncodeError):  # of a library that takes names in UTF-8 only
+        error = ValueError(f"{error.object[:200]}: expected a name in UTF-8")
+    screen.fail(error, verbose)
     return BAD_USAGE if isinstance(error, UsageError) or str(error).startswith("--") else BAD_DATA
 
 
 def _interrupted() -> int:
-    print("\nhumangs: interrupted", file=sys.stderr, flush=True)  # after the terminal's ^C, or a bar
+    from humangs_jax.core.progress import end, say
+
+    end()
+    say("\nhumangs: interrupted", error=True)  # after the terminal's ^C
     return INTERRUPTED

@@ -183,11 +183,17 @@ class Refine:
 
 
 def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
-    """A capture, after warnings about what looks wrong in it."""
+    """The views of a capture that show the person, after warnings about what looks wrong in them. Raises: ValueError for none."""
     with stage("reading the capture"):
         from humangs_jax.data.capture import load_capture
+        from humangs_jax.data.usable_views import usable_views
 
         photos = load_capture(path, fit_masks=fit_masks)
+    nobody = None
+    try:
+        photos = usable_views(photos)
+    except ValueError as error:
+        nobody = error
     if check:
         with stage("checking it"):
             from humangs_jax.apps.quick_check import likely_mistakes
@@ -195,8 +201,10 @@ def _read_capture(path: Path, check: bool, fit_masks: bool = True) -> "Capture":
             mistakes = likely_mistakes(photos)
         for mistake in mistakes:
             warn(mistake)
-        if mistakes:
+        if mistakes and nobody is None:
             warn(f"go on at your own risk: `humangs check {path}` draws the body over each photo")
+    if nobody is not None:
+        raise nobody
     return photos
 
 

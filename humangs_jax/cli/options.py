@@ -13,6 +13,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from humangs_jax.core.progress import say
+
 if TYPE_CHECKING:
     from humangs_jax.apps.settings import Settings
 
@@ -93,7 +95,7 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
     from humangs_jax.io.atomic import contents
 
     if (unless is None or folder.resolve() != unless.resolve()) and (found := contents(folder)):
-        print(f"--overwrite: once the work is done, {folder} is replaced; this is deleted: {found}", flush=True)
+        say(f"--overwrite: once the work is done, {folder} is replaced; this is deleted: {found}")
 
 
 def require_suffix(path: Path, suffixes: tuple[str, ...], option: str = "--out") -> None:

@@ -1,23 +1,26 @@
 """What a command shows: stages while it works, warnings, what it wrote, how long its stages took, and what to do next.
 
-Commands use `stage`, `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `begin`, `finish` and `end`.
+Commands use `stage`, `tell`, `wrote`, `warn` and `suggest`; `humangs_jax.cli.execute` calls `begin`, `finish`, `fail` and `end`.
 Results go to stdout, everything else to stderr. --quiet leaves results and errors, --verbose shows what libraries log as well.
 """
 
 import dataclasses
+import io
 import logging
 import os
 import shlex
 import sys
 import threading
 import time
+import traceback
 import warnings
 from pathlib import Path
+from typing import TextIO
 
 from humangs_jax.core import progress
-from humangs_jax.core.progress import stage
+from humangs_jax.core.progress import say, stage
 
-__all__ = ["begin", "end", "finish", "stage", "suggest", "tell", "warn", "wrote"]
+__all__ = ["begin", "end", "fail", "finish", "stage", "suggest", "tell", "warn", "wrote"]
 
 XLA_LEVELS = {False: "3", True: "0"}
 """TF_CPP_MIN_LOG_LEVEL without and with --verbose. 3 leaves fatal errors: XLA logs its boxes about slow compilation as errors,
@@ -36,6 +39,27 @@ class _Screen:
 _screen = _Screen()
 
 
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    say(warnings.formatwarning(message, category, filename, lineno, line).rstrip(), error=True)
+
+
+class _Handler(logging.Handler):
+    """What libraries log, through the one door."""
+
+    def emit(self, record):
+        try:
+            say(self.format(record), error=True)
+        except Exception:  # as all handlers do: a log must not end the work
+            self.handleError(record)
+
+
 def silence(verbose: bool) -> None:
     """Keep what libraries log off the screen, and errors in threads of their own, for a program of its own (not a test). Before
     JAX is imported.
@@ -52,9 +76,14 @@ def silence(verbose: bool) -> None:
             shown(what)
 
     sys.unraisablehook = unraisable
+    sys.excepthook = lambda *what: say("".join(traceback.format_exception(*what)).rstrip(), error=True)
+    warnings.showwarning = _show_warning  # ty: ignore[invalid-assignment]
+    for stream in (sys.stdout, sys.stderr):  # what others print, such as --help; it may be no file
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     root = logging.getLogger()
     if not root.handlers:  # else Python prints the warnings of all loggers, Orbax's among them
-        handler = logging.StreamHandler()
+        handler = _Handler()
         handler.addFilter(lambda record: verbose or record.name.startswith("humangs_jax"))
         handler.setFormatter(logging.Formatter("%(name)s: %(message)s" if verbose else "humangs: %(message)s"))
         root.addHandler(handler)
@@ -68,19 +97,26 @@ def begin(quiet: bool, verbose: bool) -> None:
 
 def tell(text: object) -> None:
     """A result that was asked for, such as a report: shown with --quiet too."""
-    print(text, flush=True)
+    say(text)
 
 
 def wrote(path: str | Path, what: str) -> None:
     """A file or folder was written."""
     if not _screen.quiet:
-        print(f"{path}: {what}", flush=True)
+        say(f"{path}: {what}")
 
 
 def warn(text: object) -> None:
     """Something looks wrong, and the command goes on."""
-    clear = progress.CLEAR if _screen.measured.ticking else ""
-    print(f"{clear}humangs: warning: {text}", file=sys.stderr, flush=True)
+    say(f"humangs: warning: {text}", error=True, lines=False)
+
+
+def fail(error: BaseException, verbose: bool) -> None:
+    """The command ends with this error: one line below what is on the screen, with --verbose the traceback above it."""
+    progress.end()
+    if verbose:
+        say("".join(traceback.format_exception(error)).rstrip(), error=True)
+    say(f"humangs: error: {error}", error=True, lines=False)
 
 
 def suggest(*command: str | Path) -> None:
@@ -93,9 +129,9 @@ def finish() -> None:
     seconds, total = _screen.measured.seconds, time.perf_counter() - _screen.started
     if not _screen.quiet and seconds:
         parts = ", ".join(f"{name} {took:.1f}" for name, took in seconds.items())
-        print(f"took {total:.1f} s: {parts}")
+        say(f"took {total:.1f} s: {parts}")
     if not _screen.quiet and _screen.next:
-        print(f"next: {'  or  '.join(_screen.next)}")
+        say(f"next: {'  or  '.join(_screen.next)}")
 
 
 def end() -> None:

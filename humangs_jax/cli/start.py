@@ -12,6 +12,7 @@ from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 
 if TYPE_CHECKING:
     from humangs_jax.apps.start import Material
+    from humangs_jax.data.calibration.importing import ImportReport
     from humangs_jax.data.capture import Capture
 
 MARK = "start.json"
@@ -87,8 +88,11 @@ class Start:
             return
         if self.overwrite:
             tell_deleted(self.out)
-        undistorted = self._import(material) if material.cameras is not None else None
-        needed = [each for each in missing(material, undistorted) if not (self.without_masks and each.name == "masks")]
+        report = self._import(material) if material.cameras is not None else None
+        changed = report is not None and (report.undistorted or report.turned)
+        masked = self.without_masks or (report is not None and report.masks)
+        needed = missing(material, self.out / "images" if changed else None)
+        needed = [each for each in needed if not (masked and each.name == "masks")]
         if needed:
             tell("\nto be made:\n" + "\n".join(map(str, needed)))
             suggest("humangs start", self.photos, "--out", self.out)
@@ -111,8 +115,8 @@ class Start:
         self._check(capture)
         self._reconstruct(capture, limits)
 
-    def _import(self, material: "Material") -> Path | None:
-        """Photos and cameras as a capture folder; the folder of its photos if lens distortion was removed from them."""
+    def _import(self, material: "Material") -> "ImportReport":
+        """Photos and cameras as a capture folder."""
         with stage("importing photos and cameras"):
             from humangs_jax.data.calibration.importing import import_cameras
             from humangs_jax.io.text import write_json
@@ -131,7 +135,9 @@ class Start:
         tell(report)
         if report.undistorted and material.keypoints is not None:
             warn(f"lens distortion was removed: {material.keypoints} should be of the photos in {self.out / 'images'}")
-        return self.out / "images" if report.undistorted else None
+        if report.turned and material.keypoints is not None:
+            warn(f"photos were turned upright: {material.keypoints} should be of those in {self.out / 'images'}")
+        return report
 
     def _fit(self, material: "Material") -> "Capture":
         """The body, written into the capture folder."""
@@ -168,9 +174,11 @@ class Start:
         """Avatar and page."""
         with stage("reconstructing"):
             from humangs_jax.avatar.reconstruct import reconstruct
+            from humangs_jax.data.usable_views import usable_views
             from humangs_jax.network.weights import load_weights
             from humangs_jax.viewer.page import write_page
 
+            capture = usable_views(capture)
             avatar = reconstruct(*load_weights(), capture)
         if limits is not None and capture.masks is not None:
             with stage("refining"):

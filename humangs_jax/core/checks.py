@@ -29,6 +29,10 @@ class Values(NamedTuple):
 
 
 FINITE = Values("finite numbers")
+LARGEST = 1e6
+"""Of avatars and what is written of them, metres or any unit: nobody is larger, and float32 holds products of several such
+numbers."""
+BOUNDED = Values(f"finite numbers of at most {LARGEST:g} in magnitude", -LARGEST, LARGEST)
 ROUNDING = 1e-6
 """Photos that were resized, and opacities from a sigmoid, may be a few float32 roundings outside of [0, 1]."""
 UNIT = Values("numbers in [0, 1]", -ROUNDING, 1 + ROUNDING)

@@ -1,5 +1,11 @@
 """Configurations (frozen dataclasses, nested) as JSON and back, checked against their annotations.
 
+Numbers are annotated with their range, which every way to make a configuration checks:
+
+    @configuration
+    class Fit:
+        steps: Annotated[int, Range(1, 1000)] = 100
+
 A field annotated with a `typing.Protocol` may hold any dataclass that follows it. Its JSON names the class under "kind", as
 "humangs_jax.network.encoder.PatchTransformer". Reading imports modules of this package only; others must be imported before.
 """
@@ -13,13 +19,66 @@ import numbers
 import sys
 import types
 import typing
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar
 
 T = TypeVar("T")
 KIND = "kind"
 """Key of the class of a part."""
 LARGEST, LARGEST_INTEGER = sys.float_info.max, 1 << 63
 """Numbers beyond these have no place in any configuration."""
+
+
+MOST_ITEMS = 256
+"""Of a list in a configuration."""
+
+
+class Range(NamedTuple):
+    """Of the numbers of a field, both ends included."""
+
+    low: float
+    high: float
+
+    def __str__(self):
+        return f"{self.low:,.15g} to {self.high:,.15g}"
+
+
+InputSide = Annotated[int, Range(1, 2048)]
+"""Of a photo as a network sees it, pixels."""
+Side = Annotated[int, Range(1, 4096)]
+"""Of an image or map that is drawn or made, pixels."""
+PhotoSide = Annotated[int, Range(1, 32_768)]
+"""Of a photo as it comes, pixels."""
+Width = Annotated[int, Range(1, 16_384)]
+"""Features of a layer."""
+Ratio = Annotated[int, Range(1, 64)]
+"""Of one width to another."""
+Patch = Annotated[int, Range(1, 256)]
+"""Side of a patch of a photo, pixels."""
+Layers = Annotated[int, Range(1, 256)]
+Few = Annotated[int, Range(1, 1024)]
+"""Views, joints, heads, subjects: things of which there are some."""
+Slots = Annotated[int, Range(1, 1 << 31)]
+"""Of a buffer."""
+Room = Annotated[int, Range(0, 1 << 31)]
+"""Slots, or 0 for as many as may be needed."""
+Chunk = Annotated[int, Range(1, 65_536)]
+"""What is worked on at once."""
+Rounds = Annotated[int, Range(0, 1000)]
+RefineSteps = Annotated[int, Range(0, 100_000)]
+"""Of refinement: some hours."""
+Steps = Annotated[int, Range(1, 100_000_000)]
+Seed = Annotated[int, Range(0, (1 << 32) - 1)]
+Share = Annotated[float, Range(0, 1)]
+Weight = Annotated[float, Range(0, 1e6)]
+"""Of a term of a sum."""
+Spread = Annotated[float, Range(0, 100)]
+"""A standard deviation, distance or bound in any unit."""
+Length = Annotated[float, Range(1e-6, 100)]
+"""Metres, above 0."""
+Bias = Annotated[float, Range(-100, 100)]
+Vertices = Annotated[int, Range(1, 10_000_000)]
+Edge = Annotated[float, Range(0.005, 10)]
+"""Metres to which edges of a body are split: below, there would be millions of Gaussians."""
 
 
 def knob(default: Any, *, cost: str, gain: str, measured: str) -> Any:
@@ -94,6 +153,49 @@ def _in_words(annotation):
     return words[0] if len(words) == 1 else f"one of {', '.join(words)}"
 
 
+@typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, knob))
+def configuration(cls: type[T]) -> type[T]:
+    """A frozen dataclass whose fields are checked when it is made: ValueError naming class, field, value and what it may be."""
+    own = vars(cls).get("__post_init__")
+
+    def __post_init__(self):
+        check_fields(self)
+        for name in _ranges(type(self)):
+            check_range(type(self), name, getattr(self, name), f"{type(self).__name__}.{name}")
+        if own is not None:
+            own(self)
+
+    setattr(cls, "__post_init__", __post_init__)  # noqa: B010 (a class of any kind)
+    return dataclasses.dataclass(frozen=True)(cls)
+
+
+def check_range(cls: type, name: str, value: Any, path: str) -> None:
+    """Raises: ValueError if a number of a field, or one in its tuple, is out of the range of its annotation."""
+    ranges = _ranges(cls).get(name, ())
+    values = value if isinstance(value, tuple | list) else (value,)
+    if len(values) > MOST_ITEMS:
+        raise ValueError(f"{path}: expected at most {MOST_ITEMS} numbers, got {len(values)}")
+    for allowed in ranges:
+        for each in values:
+            if isinstance(each, numbers.Real) and not allowed.low <= each <= allowed.high:  # nor NaN
+                raise ValueError(f"{path} {each:.15g}: expected {allowed}")
+
+
+@functools.cache
+def _ranges(cls: Any) -> dict[str, tuple[Range, ...]]:
+    """Of the fields that have one."""
+    hints = typing.get_type_hints(cls, include_extras=True)
+    found = {field.name: tuple(_ranges_in(hints[field.name])) for field in dataclasses.fields(cls)}
+    return {name: ranges for name, ranges in found.items() if ranges}
+
+
+def _ranges_in(annotation):
+    if typing.get_origin(annotation) is Annotated:
+        yield from (each for each in annotation.__metadata__ if isinstance(each, Range))
+    for part in typing.get_args(annotation):
+        yield from _ranges_in(part)
+
+
 def config_to_json(config: Any, indent: int | None = None) -> str:
     """A configuration as JSON, sub-configurations nested."""
     return json.dumps(_plain(config), indent=indent)
@@ -147,10 +249,12 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
     if origin is tuple and isinstance(value, list):
         whole = len(arguments) == 2 and arguments[1] is Ellipsis
         items = [arguments[0]] * len(value) if whole else list(arguments)
+        if len(value) > MOST_ITEMS:
+            raise ValueError(f"{path}: expected at most {MOST_ITEMS} items, got {len(value)}")
         if len(items) == len(value):
             return tuple(_build(item, x, f"{path}[{i}]") for i, (item, x) in enumerate(zip(items, value, strict=True)))
     elif _matches(value, annotation):
-        return value
+        return float(value) if annotation is float else value
     raise ValueError(f"{path}: expected {_named(annotation)}, got {value!r}")
 
 
@@ -187,6 +291,8 @@ def _build_dataclass(cls, values, path):
     needed = [f.name for f in dataclasses.fields(cls) if f.default is f.default_factory is dataclasses.MISSING]
     if missing := [name for name in needed if name not in fields]:
         raise ValueError(f"{path}.{missing[0]} is missing")
+    for name, value in fields.items():
+        check_range(cls, name, value, f"{path}.{name}")
     try:
         return cls(**fields)
     except ArithmeticError as error:  # sizes of 0

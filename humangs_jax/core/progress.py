@@ -1,12 +1,13 @@
-"""Stages of long work, and bars, for programs that show them.
+"""What the package shows on a terminal: stages of long work, bars, and lines of text (`say`), all of it printable.
 
     with stage("reading the capture"):
         ...
     for view in bar(views, desc="render"):
         ...
 
-The library opens stages where work takes long. Unless a program asked for it by `begin`, a stage shows and costs nothing. The
-seconds of the outermost stages are kept for whoever began; stages inside of them only change the line that is shown.
+No other module prints. The library opens stages where work takes long. Unless a program asked for it by `begin`, a stage shows
+and costs nothing. The seconds of the outermost stages are kept for whoever began; stages inside of them only change the line that
+is shown.
 """
 
 import contextlib
@@ -14,8 +15,11 @@ import dataclasses
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Generator, Iterable
 from typing import Any
+
+from humangs_jax.core.printable import printable
 
 TICK = 0.2
 """Seconds between two updates of the line."""
@@ -41,6 +45,8 @@ class Progress:
 
 
 _current = Progress()
+_bars: "weakref.WeakSet[Any]" = weakref.WeakSet()
+"""Those that may not be closed yet."""
 
 
 def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
@@ -54,15 +60,33 @@ def begin(*, quiet: bool = False, lines: bool = False) -> Progress:
 
 
 def end() -> None:
-    """Show nothing any more, as before `begin`."""
+    """Show nothing any more, as before `begin`. Bars that an error has left open get their last line."""
     global _current
     _current = Progress()
+    _close(set(_bars))
+
+
+def say(text: object, *, error: bool = False, lines: bool = True) -> None:
+    """Print text, with what a terminal would act on escaped. Bars and the line of a stage make room for it.
+
+    Arguments: error: to stderr. lines: whether it may have several lines; else line feeds are escaped, too.
+    """
+    stream = sys.stderr if error else sys.stdout
+    encoding = getattr(stream, "encoding", None) or "utf-8"  # a terminal may know ASCII only
+    text = printable(text, lines).encode(encoding, "backslashreplace").decode(encoding)
+    tqdm = sys.modules.get("tqdm")
+    with tqdm.tqdm.external_write_mode(stream) if tqdm and len(_bars) else contextlib.nullcontext():
+        if _current.ticking and (error or _current.names):
+            sys.stderr.write(CLEAR)
+            sys.stderr.flush()
+        print(text, file=stream, flush=True)
 
 
 @contextlib.contextmanager
 def stage(name: str) -> Generator[None]:
     """A part of long work."""
-    current, paused = _current, _current.paused
+    current, paused, bars = _current, _current.paused, set(_bars)
+    name = printable(name)
     current.names.append(name)
     current.paused = False
     started, stop = time.perf_counter(), threading.Event()
@@ -72,6 +96,9 @@ def stage(name: str) -> Generator[None]:
         ticker.start()
     try:
         yield
+    except BaseException:
+        _close(set(_bars) - bars)  # else the traceback keeps them open, and the next line is glued to them
+        raise
     finally:
         stop.set()
         if ticker.is_alive():
@@ -82,8 +109,7 @@ def stage(name: str) -> Generator[None]:
         if outermost:
             current.seconds[name] = current.seconds.get(name, 0.0) + seconds
             if current.ticking or current.lines:
-                clear = CLEAR if current.ticking else ""
-                print(f"{clear}{name}: {seconds:.1f} s", file=sys.stderr, flush=True)
+                say(f"{name}: {seconds:.1f} s", error=True)
 
 
 def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, **how: Any) -> Any:
@@ -96,7 +122,17 @@ def bar(iterable: Iterable[Any] | None = None, *, shown: bool = True, **how: Any
     if shown and _current.bars and _current.ticking and _current.names:
         _current.paused = True
         sys.stderr.write(CLEAR)
-    return tqdm(iterable, disable=not (shown and _current.bars), **how)
+    if how.get("desc") is not None:
+        how["desc"] = printable(how["desc"])
+    made = tqdm(iterable, disable=not (shown and _current.bars), **how)
+    if not made.disable:
+        _bars.add(made)
+    return made
+
+
+def _close(bars):
+    for each in bars:
+        each.close()
 
 
 def watched() -> bool:

@@ -18,6 +18,11 @@ COLOUR_SLACK = 1e-3
 """Resampled images overshoot [0, 1] a little; values further outside have another range, for instance 0 to 255."""
 
 
+LARGEST_TURN, LARGEST_DISTANCE, LARGEST_BETA = 1e3, 1e4, 100.0
+"""Radians of a rotation; metres from the origin (farther, float32 loses millimetres, and the numbers are no metres); shape
+coefficients, of which bodies that exist have less than 10."""
+
+
 class CaptureError(FileError):
     """Something is wrong with a capture; the message is one line: file, field, and what was expected."""
 
@@ -65,7 +70,8 @@ def numbers(value: Any, file: object, field: str, shape: tuple[int, ...] | None 
         array = np.asarray(value)
         if array.dtype.kind not in "fiub":
             raise TypeError
-        array = array.astype(np.float32)
+        with np.errstate(over="ignore"):  # looked at below
+            array = array.astype(np.float32)
     except (ValueError, TypeError, OverflowError):
         wanted = "numbers" if shape is None else f"{' x '.join(map(str, shape))} numbers"
         raise CaptureError(file, field, f"expected {wanted}") from None
@@ -127,6 +133,13 @@ def body_parameters(
         )
     translations = numbers(translations, file, "translations", (len(rotations), 3))
     betas = numbers(betas, file, "betas")
+    for field, array, largest in (
+        ("rotations", rotations, LARGEST_TURN),
+        ("translations", translations, LARGEST_DISTANCE),
+        ("betas", betas, LARGEST_BETA),
+    ):
+        if (most := np.abs(array).max(initial=0)) > largest:
+            raise CaptureError(file, field, f"expected numbers of at most {largest:g} in magnitude, got {most:.4g}")
     if betas.ndim != 1 or len(betas) > shapes:
         raise CaptureError(file, "betas", f"expected at most {shapes} numbers for this body, got shape {betas.shape}")
     return betas, rotations, translations

@@ -18,7 +18,7 @@ from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_frame, checked_json, numbers
 from humangs_jax.data.masks import fit_mask
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.io.images import read_grey, read_image
+from humangs_jax.io.images import orientation, read_grey, read_image
 from humangs_jax.io.reading import FileError, inside, reading
 from humangs_jax.io.text import write_json
 
@@ -31,6 +31,11 @@ DEMO_CAPTURE = "demo_capture"
 TOP_KEYS = {"format", "version", "body", "background", "views"}
 VIEW_KEYS = {"image", "mask", "K", "cam_from_world", "frame"}
 Background = Literal["photo", "white"]
+OFF_CENTER = 0.05
+"""Share of a side by which a principal point has to be nearer to the middle of the turned photo to be one of that."""
+LARGEST_LABEL, NEARLY_WHITE, LEAST_LABELLED = 20 / 255, 0.9, 1e-3
+"""Masks with nothing above the first are labels (0 and 1, or parts of a person), as are those of 0 and one other value below the
+second; with fewer pixels than the third share they are the rim of someone outside the photo."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -184,9 +189,29 @@ def read_photos(
     frames, K, cam_from_world = read_frames_and_matrices(views, poses, file)
     images, masks = _read_images(folder, views, description.get("background", "photo") == "white", fit_masks)
     height, width = images.shape[1:3]
+    _check_orientations(folder, views, K, width, height, warns=chosen is None)
     cameras = [checked_camera(K[i], cam_from_world[i], width, height, file, f"views[{i}]") for i in range(len(views))]
     names = names_from_paths([view["image"] for view in views])
     return Photos(images, masks, stack_cameras(cameras), frames, names)
+
+
+def _check_orientations(folder, views, K, width, height, warns):
+    """Photos are read as stored: those with an EXIF flag are warned of, and refused where K is of the turned photo."""
+    flagged = []
+    for view, camera in zip(views, K, strict=True):
+        if (flag := read_checked(orientation, file := folder / view["image"])) == 1:
+            continue
+        flagged.append(file.name)
+        stored, shown = (np.abs(camera[:2, 2] / size - 0.5).max() for size in ((width, height), (height, width)))
+        if flag >= 5 and shown < stored - OFF_CENTER:
+            problem = (
+                f"EXIF orientation {flag} is ignored, but K is of the turned photo: save it turned, without the flag"
+            )
+            raise CaptureError(file, "orientation", problem)
+    if flagged and warns:
+        names = flagged[0] + (f" and {len(flagged) - 1} more" if len(flagged) > 1 else "")
+        told = "K, mask and keypoints have to be of the pixels as stored (`humangs import cameras` turns such photos)"
+        logger.warning("%s: EXIF orientation of %s is ignored: %s", folder, names, told)
 
 
 def _read_images(folder, views, on_white, fit_masks):
@@ -219,17 +244,31 @@ def read_view(
         image = on_white_background(image, alpha)
     if "mask" not in view:
         return image, alpha, 0.0
-    file = folder / view["mask"]
-    mask = read_checked(read_grey, file)
-    if mask.shape != image.shape[:2]:
-        sizes = f"{mask.shape[1]} x {mask.shape[0]}, but its image has {image.shape[1]} x {image.shape[0]}"
-        raise CaptureError(file, "size", f"{sizes}: expected the same")
-    if 0 < mask.max() < 1.5 / 255:
-        raise CaptureError(file, "values", "0 and 1: expected 0 (background) to 255 (person)")
+    mask = read_mask(folder / view["mask"], "its image", image.shape[1], image.shape[0])
     if on_white or alpha is not None:  # composited already: the mask file only says what the person is
         return image, mask, 0.0
     mask, excess = fit_mask(image, mask) if fit_masks else (mask, 0.0)
     return on_white_background(image, mask), mask, excess
+
+
+def read_mask(file: Path, owner: str, width: int, height: int) -> Float[np.ndarray, "h w"]:
+    """A mask, see `io.images.read_grey`. owner: what has that width and height.
+
+    Raises: CaptureError, also for another size, and for labels in place of 0 to 255.
+    """
+    mask = read_checked(read_grey, file)
+    if mask.shape != (height, width):
+        sizes = f"{mask.shape[1]} x {mask.shape[0]}, but {owner} has {width} x {height}"
+        if mask.shape == (width, height):
+            sizes += " (is one of them turned by an EXIF orientation?)"
+        raise CaptureError(file, "size", f"{sizes}: expected the same")
+    top, some = float(mask.max()), np.count_nonzero(mask) > LEAST_LABELLED * mask.size
+    if some and (
+        top <= LARGEST_LABEL or (top < NEARLY_WHITE and mask.min() == 0 and ((mask == 0) | (mask == top)).all())
+    ):
+        problem = f"the largest is {255 * top:.3g} of 255: expected 0 (background) to 255 (person)"
+        raise CaptureError(file, "values", problem)
+    return mask
 
 
 def read_checked(reader: Callable[[Path], Any], file: Path) -> Any:

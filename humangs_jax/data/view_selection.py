@@ -10,6 +10,7 @@ from humangs_jax.body.subdivision import vertex_areas
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.usable_views import usable_indices
 from humangs_jax.data.views import SubjectViews, prepare_inputs, standardize
 from humangs_jax.network import presets
 from humangs_jax.network.inputs import subject_unit
@@ -31,19 +32,23 @@ def select_views(capture: Capture, count: int | None) -> list[int]:
 
     Greedy: each next photo adds most to the sum, over the vertices, of area times the best `view_quality`. The sum
     is submodular, so the choice reaches at least 63 % of the best one (Nemhauser, Wolsey, Fisher 1978,
-    https://doi.org/10.1007/BF01588971). What a photo shows outside its mask does not count.
+    https://doi.org/10.1007/BF01588971). What a photo shows outside its mask does not count; photos whose mask does not show
+    the person are never chosen (`usable_indices`).
 
-    Raises: ValueError for a count below 1.
+    Raises: ValueError for a count below 1; CaptureError if no photo shows the person.
     """
     if count is not None and count < 1:
         raise ValueError(f"select_views: expected at least 1 photo, got {count}")
-    if count is not None and capture.view_count <= count:
-        return list(range(capture.view_count))
+    usable = usable_indices(capture)
+    if count is not None and len(usable) <= count:
+        return usable
+    capture = capture.select(usable)
     body = decimate(capture.body, VERTICES) if len(capture.body.template) > VERTICES else capture.body
     quality = np.asarray(_quality(body, standardize(capture, SIZE)))
     area = vertex_areas(np.asarray(body.template), np.asarray(body.faces))
     least = LEAST_GAIN if count is None else 0.0
-    return sorted(greedy_cover(quality * area, capture.view_count if count is None else count, least))
+    chosen = greedy_cover(quality * area, capture.view_count if count is None else count, least)
+    return sorted(usable[i] for i in chosen)
 
 
 def greedy_cover(quality: Float[np.ndarray, "v n"], count: int, least: float = 0.0) -> list[int]:

@@ -15,6 +15,7 @@ from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion.world import turned_upright, up_axis, upright_matrix
+from humangs_jax.data.usable_views import MASK_THRESHOLD, usable_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum
 from humangs_jax.io.images import resized
@@ -28,9 +29,6 @@ from humangs_jax.rendering.mesh.position_map import (
     plain_position_map,
     vertex_normals,
 )
-
-MASK_THRESHOLD = 0.5
-"""A pixel belongs to the person when its mask is above this."""
 
 
 @pytree_dataclass
@@ -243,8 +241,9 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
     """A capture's photos as the network wants them: padded with white to a centred square and resized to `size`.
 
     Intrinsics follow the pixels. Without masks only what the posed body covers will count as foreground. crop: cut to the person
-    first, see `cropped`.
+    first, see `cropped`. Views whose mask does not show the person are left out, see `usable_views`.
     """
+    capture = usable_views(capture)
     capture = cropped(capture, size) if crop else capture
     images = capture.images
     masks = np.zeros(images.shape[:3], np.float32) if capture.masks is None else capture.masks

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import logging
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -10,10 +11,12 @@ from typing import Any
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.arguments import checked_arguments
+from humangs_jax.core.printable import printable
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.loading.examples import Source
+from humangs_jax.data.usable_views import empty_views
 from humangs_jax.evaluation.cases import Case, Indices, Method, choose_method, find_people
 from humangs_jax.evaluation.protocol import EvaluationProtocol, find_protocol
 from humangs_jax.evaluation.report import Gallery, page_html
@@ -38,6 +41,8 @@ from humangs_jax.io.text import json_text
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.objectives.lpips import Lpips
+
+logger = logging.getLogger(__name__)
 
 PAGE_IMAGES = 120
 """Images that a page shows, the worst first; the others are rows of its table."""
@@ -185,8 +190,9 @@ def evaluate(
     gallery = Gallery(page_images)
     for index in _progress(range(len(people.names)), progress):
         case = people.load(index)
-        predicted = predict(case, rules.behind)
-        missing += predicted.missing
+        predicted = _without_nobody(case, predict(case, rules.behind))
+        person = printable(case.name)  # of a folder: every report gets a name of one line
+        missing += map(printable, predicted.missing)
         if not predicted.views:
             continue
         truth = case.truth.select(predicted.views)
@@ -194,14 +200,14 @@ def evaluate(
         everything |= case.inputs is None and isinstance(source, str | Path | Capture)
         sides.add(truth.images.shape[2:0:-1])
         if case.inputs is not None:
-            gallery.add_inputs(case.name, case.inputs.images)
+            gallery.add_inputs(person, case.inputs.images)
             shown_inputs.append(case.inputs.view_count)
         try:
             scored = list(score_views(predicted.images, truth, rules, predicted.alpha, networks))
         except ValueError as error:
-            raise ValueError(f"{case.name}: {error}") from error
+            raise ValueError(f"{person}: {error}") from error
         for i, scores in enumerate(scored):
-            row = Scored(case.name, int(truth.frames[i]), truth.names[i], scores)
+            row = Scored(person, int(truth.frames[i]), printable(truth.names[i]), scores)
             mask = None if truth.masks is None else truth.masks[i]
             gallery.add(len(rows), scores["psnr"], on_background(truth.images[i], mask, rules), predicted.images[i])
             rows.append(row)
@@ -209,7 +215,7 @@ def evaluate(
         raise ValueError(f"no prediction was found; {len(missing)} were expected: {_listed(missing)}")
     people_shown = {row.person for row in rows}
     about = {
-        "source": str(source) if isinstance(source, str | Path) else type(source).__name__,
+        "source": printable(source) if isinstance(source, str | Path) else type(source).__name__,
         "counts": f"{_counted(len(rows), 'image', 'images')} of {_counted(len(people_shown), 'person', 'people')}",
         "sides": sorted(map(list, sides)),
         "inputs": sorted(set(shown_inputs)),
@@ -221,7 +227,23 @@ def evaluate(
         score: "no image is large enough, or shows enough of a person" for score in unknown if score not in reasons
     }
     label = protocol if isinstance(protocol, str) else "custom"
-    return Evaluation(name, rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
+    return Evaluation(printable(name), rules, label, tuple(rows), reasons, tuple(missing), about, gallery)
+
+
+def _without_nobody(case, predicted):
+    """The predictions of views whose true mask shows somebody: white compared with white would raise the mean."""
+    empty = set(empty_views(case.truth)) & set(predicted.views)
+    if not empty:
+        return predicted
+    names = ", ".join(case.truth.names[i] for i in sorted(empty))
+    count = "1 view is not compared, its" if len(empty) == 1 else f"{len(empty)} views are not compared, their"
+    logger.warning("%s: %s mask is empty: %s", case.name, count, names)
+    kept = [row for row, view in enumerate(predicted.views) if view not in empty]
+    return predicted._replace(
+        images=predicted.images[kept],
+        alpha=None if predicted.alpha is None else predicted.alpha[kept],
+        views=tuple(predicted.views[row] for row in kept),
+    )
 
 
 def _progress(indices, progress):

@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from humangs_jax.core.printable import printable
+
 Row = dict[str, float | None]
 """Scores by name; None for what is missing."""
 ORDER = "mean over the images of a frame, then over the frames of a person, then over people"
@@ -147,11 +149,17 @@ def shown_mean(mean: Mean | None, name: str) -> str:
     return shown(mean.mean, name) + interval
 
 
+_MARKDOWN = {"<": "&lt;", "&": "&amp;"} | {sign: f"\\{sign}" for sign in "\\|`*"}
+"""What would begin HTML, code or another cell; links are broken between text and address."""
+
+
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """The first column to the left, the others to the right."""
     rule = ["---", *["---:"] * (len(header) - 1)]
-    escape = lambda cell: cell.replace("|", "\\|")
-    return "\n".join("| " + " | ".join(map(escape, row)) + " |" for row in (header, rule, *rows)) + "\n"
+    escape = lambda cell: "".join(_MARKDOWN.get(c, c) for c in printable(cell)).replace("](", "]\\(")
+    lines = (" | ".join(map(escape, row)) for row in (header, *rows))
+    first, *others = (f"| {line} |" for line in lines)
+    return "\n".join([first, f"| {' | '.join(rule)} |", *others]) + "\n"
 
 
 _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
@@ -160,18 +168,32 @@ _LATEX = {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasci
 def latex_table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A tabular with rules of the package booktabs."""
     special = _LATEX | {sign: f"\\{sign}" for sign in "&%$#_{}"}
-    line = lambda row: " & ".join("".join(special.get(c, c) for c in cell) for cell in row) + r" \\"
+    line = lambda row: " & ".join("".join(special.get(c, c) for c in printable(cell)) for cell in row) + r" \\"
     body = "\n".join(line(row) for row in rows)
     begin = f"\\begin{{tabular}}{{l{'r' * (len(header) - 1)}}}\n\\toprule\n{line(header)}\n\\midrule\n"
     return f"{begin}{body}\n\\bottomrule\n\\end{{tabular}}\n"
 
 
+_FORMULAS = tuple("=+-@\uff1d\uff0b\uff0d\uff20")
+"""Signs that a formula begins with, those of full width too."""
+
+
 def csv_text(rows: Sequence[Scored]) -> str:
-    """One line an image, all digits; an empty cell for a missing score. Reads back with any spreadsheet."""
+    """One line an image, all digits; an empty cell for a missing score. Reads back with any spreadsheet.
+
+    Names that a spreadsheet would take for a formula begin with an apostrophe.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     names = list(rows[0].scores)
     writer.writerow(["person", "frame", "view", *names])
     for row in rows:
-        writer.writerow([row.person, row.frame, row.view, *("" if (x := row.scores[n]) is None else x for n in names)])
+        writer.writerow(
+            [_cell(row.person), row.frame, _cell(row.view), *("" if (x := row.scores[n]) is None else x for n in names)]
+        )
     return text.getvalue()
+
+
+def _cell(name):
+    name = printable(name)
+    return f"'{name}" if name.lstrip()[:1] in _FORMULAS else name

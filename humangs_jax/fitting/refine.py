@@ -15,6 +15,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.usable_views import usable_indices
 from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene, capture_origin, moved_capture, start_state
 from humangs_jax.fitting.report import Change, FitReport, Stage, ViewReport, limit_violations
 from humangs_jax.fitting.residuals.colors import Likeness, color_residuals, likeness
@@ -52,7 +53,7 @@ def refine_capture(
     """Refine cameras (rotation, centre, focal length), shape and poses of a capture.
 
     Arguments: keypoints: of the capture's views. photometric: also by the photos' colours, with the weights that come with the
-    package. Views whose mask is empty take no part.
+    package. Views whose mask is empty take no part; those whose mask hardly meets the body take none in the colours.
     Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint, or colours are asked for without masks;
     ValueError if the keypoints are of another number of views.
     """
@@ -97,17 +98,29 @@ def _refine_by_colors(scene, capture, score, before, config):
     """The better capture, its score, PSNR of the avatar of the start and of the result, the stage, and a line about it."""
     from humangs_jax.network.weights import load_weights
 
-    look = functools.partial(likeness, *load_weights())
-    now = look(capture)
-    first = now.psnr if capture is scene.capture else look(scene.capture).psnr
-    tried, outcome = by_colors(now, capture, config)
-    then, found = look(tried).psnr, scene.score(tried)
+    look, usable = functools.partial(likeness, *load_weights()), usable_indices(capture)
+    shown = capture.select(usable)
+    now = look(shown)
+    first = now.psnr if capture is scene.capture else look(scene.capture.select(usable)).psnr
+    moved, outcome = by_colors(now, shown, config)
+    tried = _with_moved(capture, usable, moved)
+    then, found = look(moved).psnr, scene.score(tried)
     better = then > now.psnr and found.loss <= before.loss
     line = f"photos: PSNR of the avatar {now.psnr:.2f} -> {then:.2f} dB, {'kept' if better else 'not kept'}"
     stage = Stage.of("photos", outcome)
     if better:
         return tried, found, (first, then), stage, line
     return capture, score, (first, now.psnr), stage, line
+
+
+def _with_moved(capture, usable, moved):
+    """A capture with the shape and poses of another one and, for the views that this one has, its cameras."""
+    ours, theirs = capture.cameras, moved.cameras
+    at = np.asarray(usable)
+    cameras = replace(
+        ours, K=ours.K.at[at].set(theirs.K), cam_from_world=ours.cam_from_world.at[at].set(theirs.cam_from_world)
+    )
+    return dataclasses.replace(capture, cameras=cameras, betas=moved.betas, poses=moved.poses)
 
 
 def by_colors(found: Likeness, capture: Capture, config: CaptureRefineConfig) -> tuple[Capture, Outcome]:

@@ -17,6 +17,8 @@ from humangs_jax.geometry import transform
 
 RIGID_TOLERANCE = 1e-3
 """Calibrations are stored with few digits: R R^T may be this far from the identity before a camera is refused."""
+LARGEST_NUMBER = 1e7
+"""Pixels of a focal length, metres of a translation: larger ones are faults, and their products no numbers in float32."""
 
 
 RIGHT_ANGLE = np.pi / 2 + 1e-6
@@ -46,7 +48,8 @@ class Camera(Batchable):
         """
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((K, cam_from_world)))
         array = jnp.asarray if traced else np.asarray
-        K, cam_from_world = array(K, jnp.float32), array(cam_from_world, jnp.float32)
+        with np.errstate(over="ignore"):  # what becomes inf is refused below
+            K, cam_from_world = array(K, jnp.float32), array(cam_from_world, jnp.float32)
         if K.shape != (3, 3):
             raise ValueError(f"K: expected shape (3, 3), got {K.shape}")
         if cam_from_world.shape != (4, 4):
@@ -55,8 +58,9 @@ class Camera(Batchable):
             raise ValueError(f"width and height must be at least 1, got {width} x {height}")
         if traced:
             return cls(jnp.asarray(K), jnp.asarray(cam_from_world), int(width), int(height))
-        if not (np.isfinite(K).all() and np.isfinite(cam_from_world).all()):
-            raise ValueError("K and cam_from_world must be finite numbers")
+        for name, values in (("K", K), ("cam_from_world", cam_from_world)):
+            if not np.abs(values).max() <= LARGEST_NUMBER:  # nor NaN
+                raise ValueError(f"{name} must be finite numbers, at most {LARGEST_NUMBER:g} in magnitude")
         if not (K[0, 0] > 0 and K[1, 1] > 0):
             raise ValueError(f"K: focal lengths must be positive, got fx = {K[0, 0]}, fy = {K[1, 1]}")
         if abs(K[0, 1]) > RIGID_TOLERANCE * K[0, 0] or not np.allclose(K[[1, 2, 2, 2], [0, 0, 1, 2]], [0, 0, 0, 1]):

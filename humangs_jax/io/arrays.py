@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from humangs_jax.core.printable import printable
 from humangs_jax.io.reading import Refused, check_limit
 
 
@@ -23,10 +24,21 @@ def check_array(
     if not array.size:
         return
     least, most = float(array.min()), float(array.max())  # NaN if any entry is
-    largest = float(np.finfo(np.float32).max)
+    largest = float(np.finfo(np.float32).max)  # what becomes inf when it is cast is no number either
     if not (max(low, -largest) <= least and most <= min(high, largest)):
         words = "finite numbers" if math.inf in (-low, high) and low != 0 else f"numbers in [{low:g}, {high:g}]"
         raise Refused(f"{name}: expected {words}, got {least:.9g} to {most:.9g}")
+
+
+SUM_TOLERANCE = 1e-2
+"""Of weights of sum 1: eight of them in half floats are off by less."""
+
+
+def check_row_sums(name: str, weights: np.ndarray) -> None:
+    """Rows of weights that sum to 1."""
+    sums = weights.sum(axis=1, dtype=np.float64)
+    if sums.size and abs((worst := float(sums[np.abs(sums - 1).argmax()])) - 1) > SUM_TOLERANCE:
+        raise Refused(f"{name}: expected rows with the sum 1, got {worst:.6g}")
 
 
 def check_indices(name: str, array: np.ndarray, shape: tuple[int | None, ...], bound: int) -> None:
@@ -47,8 +59,8 @@ def check_joints(parents: Sequence[Any], names: Sequence[Any]) -> None:
         up = up[up]  # twice as far up each time
     if (up != count).any():
         raise Refused("parents: expected joints that all descend from the root")
-    if len(names) != len(parents) or not all(isinstance(name, str) for name in names):
-        raise Refused(f"joint_names: expected {len(parents)} names")
+    if len(names) != len(parents) or not all(isinstance(name, str) and name == printable(name) for name in names):
+        raise Refused(f"joint_names: expected {len(parents)} printable names")
 
 
 def checksum(arrays: Mapping[str, Any], *texts: str) -> str:

@@ -37,13 +37,21 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """Write a file in UTF-8. Raises: OSError."""
-    write_bytes(path, text.encode())
+    """Write a file in UTF-8, but for names of files whose bytes are no UTF-8: these stay. Raises: OSError."""
+    write_bytes(path, encoded(text))
+
+
+def encoded(text: str) -> bytes:
+    """What `write_text` writes. Half surrogates that are no bytes of a name are escaped."""
+    try:
+        return text.encode("utf-8", "surrogateescape")
+    except UnicodeEncodeError:
+        return text.encode("utf-8", "backslashreplace")
 
 
 def write_texts(texts: Mapping[str | os.PathLike, str]) -> None:
     """Write files in UTF-8, all of them or none. Raises: OSError."""
-    replace_files({path: functools.partial(Path.write_bytes, data=text.encode()) for path, text in texts.items()})
+    replace_files({path: functools.partial(Path.write_bytes, data=encoded(text)) for path, text in texts.items()})
 
 
 def replace_file(path: str | os.PathLike, write: Callable[[Path], object]) -> None:

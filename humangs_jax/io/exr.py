@@ -8,6 +8,7 @@ of sRGB, not linear in light.
 """
 
 import dataclasses
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -73,8 +74,10 @@ def write_exr(path: str | Path, views: ExrView | Sequence[ExrView], half: bool =
     parts = [_to_part(view, name, half) for view, name in zip(views, names, strict=True)]
 
     def write(temporary: Path):
+        content = io.BytesIO()  # it knows names in UTF-8 only
         with OpenEXR.File(parts) as file:
-            file.write(str(temporary))
+            file.write(content)
+        temporary.write_bytes(content.getvalue())
 
     try:
         replace_file(path, write)

@@ -140,7 +140,7 @@ class GlbWriter:
             "bufferViews": self.views,
             "buffers": [{"byteLength": len(self.data)}],
         }
-        text = json.dumps(document, separators=(",", ":")).encode()
+        text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()  # JSON has no NaN
         text += b" " * (-len(text) % 4)
         chunks = struct.pack("<II", len(text), JSON_CHUNK) + text
         chunks += struct.pack("<II", len(self.data), BINARY_CHUNK) + bytes(self.data)

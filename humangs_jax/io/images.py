@@ -1,12 +1,13 @@
 """Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel) and JPEG, values as stored, no gamma.
 
-The content decides, not the name: no other format is looked at. The orientation flag that phones write into JPEG files (EXIF) is
-ignored: calibrations refer to the stored pixels.
+The content decides, not the name: no other format is looked at. Pixels come as stored, whatever the orientation flag says that
+phones write into JPEG files (EXIF): `orientation` reads it, `oriented` obeys it, and who imports photos decides.
 """
 
 import contextlib
 import io
 import struct
+import warnings
 import zlib
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -16,13 +17,21 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.io.atomic import replace_file
-from humangs_jax.io.reading import FileError, Refused, check_limit, read_bytes, reading
+from humangs_jax.io.reading import Refused, check_limit, read_bytes, reading
 
 FORMATS = ("PNG", "JPEG")
 """Pillow knows some forty more, one of which starts Ghostscript."""
+GREY_SLACK = 16 / 255
+"""Channels of a grey image that was compressed differ by less."""
+GREY_MASK = "grey from 0 (background) to 255 (person)"
+ORIENTATION_TAG = 0x0112
+ORIENTATION_MARKS = (b"Exif", b"eXIf", b"Raw profile type", b"adobe.com/xap", b"com.adobe.xmp")
+"""A file without any of these has no orientation; looking further would decode a PNG."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOUR_TYPES = {2: "rgb", 4: "grey and alpha", 6: "rgba"}
 """Colour types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
+PALETTE = 3
+"""The colour type whose pixels are numbers of a palette."""
 ADAM7 = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
 """First row, first column and steps of the passes of an interlaced PNG (https://www.w3.org/TR/png-3/#8Interlace)."""
 
@@ -40,14 +49,82 @@ def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.n
 
 
 def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
-    """A one-channel image such as a mask; colour files are averaged.
+    """A mask, coverage in [0, 1]: a grey image, or what else segmentation tools write.
 
-    Raises: as `read_image`; FileError if it has alpha besides the colours (which is meant?).
+    A palette or colours: 1 where the image has the one label (of a palette) or the one colour that is not the background. The
+    background is black, and label 0 if there is one. Several greys of a palette are those of a grey image. An alpha channel is
+    the mask if the colours are those of a photo, all alike, or the same mask.
+
+    Raises: as `read_image`; FileError for several labels or colours, for a label 0 that is not black, for no black, and for alpha
+    and greys that differ: which is the person?
     """
+    with open_image(path) as (image, _):
+        if image.mode == "P" and image.convert("RGBA").getchannel("A").getextrema()[0] == 255:
+            colours = np.asarray(image.getpalette("RGB") or (), int).reshape(-1, 3)
+            return _mask_of_labels(np.asarray(image), np.pad(colours, ((0, 256 - len(colours)), (0, 0))))
     colours, alpha = read_image(path)
-    if alpha is not None and alpha.min() < 1:
-        raise FileError(path, "", "the image has an alpha channel besides its colours: expected one grey channel")
-    return colours[..., 0] if (colours == colours[..., :1]).all() else colours.mean(axis=-1)
+    with reading(path, "mask"):
+        if alpha is not None and alpha.min() < 1:
+            return _mask_of_alpha(colours, alpha)
+        if _is_grey(colours):
+            return colours[..., 0] if (colours == colours[..., :1]).all() else colours.mean(axis=-1)
+        codes = to_uint8(colours).astype(np.uint32) @ np.asarray([1 << 16, 1 << 8, 1], np.uint32)
+        if (count := np.count_nonzero(np.unique(codes))) != 1 or codes.all():
+            black = " without black" if codes.all() else ""
+            raise Refused(f"{count} colours{black}: which is the person? expected one on black, or {GREY_MASK}")
+        return (codes > 0).astype(np.float32)
+
+
+def _is_grey(colours):
+    return float(np.ptp(colours, axis=-1).max()) <= GREY_SLACK
+
+
+def _mask_of_labels(labels, palette):
+    """The mask of a palette image: labels (h, w), colours of the palette (256, 3) from 0 to 255."""
+    used = np.unique(labels)
+    black = [label for label in used.tolist() if not palette[label].any()]
+    if 0 in used:  # tools count the background as 0, people draw it black: where these differ nobody knows
+        background = 0 if 0 in black else None
+    elif not black and not palette[0].any():
+        background = 0
+    else:
+        background = black[0] if len(black) == 1 else None
+    others = [label for label in used.tolist() if label != background]
+    if background is not None and len(others) <= 1:
+        return ((labels != background) & bool(others)).astype(np.float32)
+    colours = palette[used]
+    if len(used) > 2 and colours.max() >= 128 and _is_grey(colours / 255):
+        return palette[labels].mean(axis=-1, dtype=np.float32) / np.float32(255)
+    shown = ", ".join(map(str, others[:5])) + (", ..." if len(others) > 5 else "")
+    which = "which is the person" if background is not None else "0 is not black: which is the background"
+    raise Refused(f"a palette of the labels {shown}: {which}? expected one label besides a black 0, or {GREY_MASK}")
+
+
+def _mask_of_alpha(colours, alpha):
+    shown = colours[alpha > 0]
+    flat = not len(shown) or np.ptp(shown, axis=0).max() <= GREY_SLACK
+    if flat or not _is_grey(shown) or np.abs(shown[:, 0] - alpha[alpha > 0]).max() <= GREY_SLACK:
+        return alpha
+    raise Refused("the image has an alpha channel besides its greys: which is the mask? expected one of them")
+
+
+def orientation(path: str | Path) -> int:
+    """The EXIF flag of a photo, 1 (none) to 8: how programs that obey it show it, see `oriented`. Raises: as `open_image`."""
+    with open_image(path) as (image, data):
+        if not any(mark in data for mark in ORIENTATION_MARKS):
+            return 1
+        with warnings.catch_warnings(), contextlib.suppress(Exception):  # damaged: nobody obeys it
+            warnings.simplefilter("ignore")
+            flag = image.getexif().get(ORIENTATION_TAG, 1)
+            return flag if flag in range(2, 9) else 1
+    return 1
+
+
+def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
+    """Pixels (h, w, ...) as an EXIF orientation from 1 to 8 wants them shown; from 5 on height and width are exchanged."""
+    pixels = np.swapaxes(pixels, 0, 1) if flag >= 5 else pixels
+    rows, columns = ((3, 4, 7, 8), (2, 3, 6, 7))  # that are reversed
+    return pixels[:: -1 if flag in rows else 1, :: -1 if flag in columns else 1]
 
 
 def write_png(path: str | Path, image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"]) -> None:
@@ -121,9 +198,9 @@ def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:
 
     Raises: as `open_image`.
     """
-    with open_image(path) as (image, _):
+    with open_image(path) as (image, data):
         found = image.size, "A" in image.getbands() or "transparency" in image.info
-        image.verify() if image.format == "PNG" else image.load()
+        _checked_chunks(data) if image.format == "PNG" else image.load()
     return found
 
 
@@ -136,8 +213,10 @@ def image_size(path: str | Path) -> tuple[int, int]:
 def _read_pixels(path):
     """(h, w, channels) float32 with 1 (grey), 2 (grey, alpha), 3 or 4 channels."""
     with open_image(path) as (image, data):
-        if data[:8] == PNG_SIGNATURE and data[24] == 16 and data[25] in PNG_COLOUR_TYPES:
-            return _decode_deep_png(data).astype(np.float32) / np.float32(65535)
+        if data[:8] == PNG_SIGNATURE:
+            chunks = _checked_chunks(data)
+            if data[24] == 16 and data[25] in PNG_COLOUR_TYPES:
+                return _decode_deep_png(chunks).astype(np.float32) / np.float32(65535)
         if image.mode.startswith("I"):  # 16-bit grey
             return np.asarray(image, np.float32)[..., None] / np.float32(65535)
         has_alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
@@ -152,9 +231,8 @@ BAND = 1024
 """Rows that are decoded together."""
 
 
-def _decode_deep_png(data: bytes) -> UInt[np.ndarray, "h w c"]:
+def _decode_deep_png(chunks: list[tuple[bytes, bytes]]) -> UInt[np.ndarray, "h w c"]:
     """The pixels of a PNG file of 16 bits a channel (https://www.w3.org/TR/png-3/)."""
-    chunks = list(_png_chunks(data))
     width, height, _, colour_type, *methods = struct.unpack(">IIBBBBB", chunks[0][1])
     if methods[:2] != [0, 0] or methods[2] > 1 or 0 in (width, height):
         raise Refused("not a readable image: a PNG header with unknown methods")
@@ -173,6 +251,17 @@ def _decode_deep_png(data: bytes) -> UInt[np.ndarray, "h w c"]:
             pixels[y::dy, x::dx] = _unfiltered(rows.reshape(h, -1), 2 * channels).view(">u2").reshape(h, w, channels)
         at += length
     return pixels
+
+
+def _checked_chunks(data: bytes) -> list[tuple[bytes, bytes]]:
+    """The chunks of a whole PNG file: Pillow decodes some that are damaged, and pixels of a palette that is not there."""
+    chunks = list(_png_chunks(data))
+    names = {name for name, _ in chunks}
+    if missing := {b"IDAT", b"IEND"} - names:
+        raise Refused(f"not a readable image: cut off, without the chunk {min(missing).decode()}")
+    if data[25] == PALETTE and b"PLTE" not in names:
+        raise Refused("not a readable image: its pixels are numbers of a palette, and it has none")
+    return chunks
 
 
 def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:

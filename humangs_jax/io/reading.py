@@ -12,13 +12,18 @@ that does not know the file raises `Refused`, whose text follows the name of the
 import contextlib
 import dataclasses
 import os
+import re
 import stat
 from collections.abc import Generator
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from humangs_jax.core.printable import printable
+
 ENVIRONMENT = "HUMANGS_LIMITS"
 """Variable with other limits, such as "pixels=2e8,photos_outside=1"."""
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
+"""No path in a file needs these."""
 LONGEST_LINE, LONGEST_REASON = 1000, 300
 """Characters of an error, in which values of files are quoted, and of what a library says."""
 
@@ -92,7 +97,7 @@ def _limits_of_text(text):
 
 
 def _one_line(text: object, longest: int = LONGEST_LINE) -> str:
-    line = " ".join(str(text).split())
+    line = printable(" ".join(str(text).split()))
     return line if len(line) <= longest else f"{line[:longest]} ..."
 
 
@@ -191,6 +196,8 @@ def inside(folder: str | os.PathLike, name: str, photo: bool = False) -> Path:
     Raises: Refused.
     """
     path = Path(folder) / name
+    if CONTROL.search(str(name)):  # it would be several lines, or none, in a report
+        raise Refused(f"{name!r} is no path: expected one without control characters")
     if photo and limits().photos_outside:
         return path
     try:

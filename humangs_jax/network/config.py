@@ -4,12 +4,11 @@ Weights files record `Architecture` and `Conventions`. `Execution` belongs to th
 """
 
 import dataclasses
-import math
 from typing import Any, Literal
 
 import jax
 
-from humangs_jax.core.configuration import check_fields, knob
+from humangs_jax.core.configuration import Edge, InputSide, Length, Vertices, configuration, knob
 from humangs_jax.network.bilinear import PixelGrid
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.execution import Execution, TokenSelection
@@ -21,7 +20,7 @@ from humangs_jax.network.vertex_decoder import VertexDecoder
 SCALING, EVALUATION = "performance_reconstruction.md", "evaluation.md"
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class Architecture:
     """What the weights are: the parts of the network with their sizes. It fixes the shape of every tensor.
 
@@ -85,7 +84,7 @@ def paper_parts(architecture: Architecture) -> tuple[PatchTransformer, PixelAlig
     raise ValueError(f"expected the parts of the paper's network, got {names}")
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class Conventions:
     """What the weights were trained with. No tensor's shape depends on it; with other values the results are worse.
 
@@ -102,7 +101,7 @@ class Conventions:
     decimated, and metres to which their edges are split afterwards; None for neither.
     """
 
-    image_size: int = knob(
+    image_size: InputSide = knob(
         512,
         cost="detail of the photos",
         gain="tokens grow with its square, attention with its fourth power",
@@ -116,27 +115,19 @@ class Conventions:
     pixel_grid: PixelGrid = "half_pixel"
     skinning: Literal["affine", "rotation"] = "affine"
     rendering: Literal["exact", "inria"] = "exact"
-    skinning_reach: float | None = None
+    skinning_reach: Length | None = None
     light: bool = False
-    low_pass: float | None = None
-    body_vertices: int | None = knob(
+    low_pass: Length | None = None
+    body_vertices: Vertices | None = knob(
         None, cost="detail of the body", gain="Gaussians, reads and decoding in proportion", measured=EVALUATION
     )
-    longest_edge: float | None = knob(
+    longest_edge: Edge | None = knob(
         None, cost="Gaussians grow as it shrinks", gain="detail where the body is coarse", measured=EVALUATION
     )
 
-    def __post_init__(self):
-        """Raises ValueError for lengths that are none, and for fields of other types."""
-        check_fields(self)
-        for name in ("skinning_reach", "low_pass"):
-            length = getattr(self, name)
-            if length is not None and not 0 < length < math.inf:
-                raise ValueError(f"{name} {length}: expected a positive length, or None")
-
 
 @jax.tree_util.register_static
-@dataclasses.dataclass(frozen=True)
+@configuration
 class HumanGSConfig:
     """A network: see `Architecture`, `Conventions`, `Execution`, and `network.presets`. For JAX a pytree without leaves."""
 
@@ -146,7 +137,6 @@ class HumanGSConfig:
 
     def __post_init__(self):
         """Raises ValueError for photos that the encoder cannot cut into patches, and for fields of other types."""
-        check_fields(self)
         patch = self.architecture.encoder.patch_size
         for size in (self.conventions.image_size, self.image_size):
             if size % patch:

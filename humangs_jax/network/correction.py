@@ -6,7 +6,6 @@ skinning. Our reading of the second MLP: it takes the features of a vertex, whic
 rotations of all joints but the root.
 """
 
-import dataclasses
 from typing import Any, NamedTuple, cast
 
 import flax.linen as nn
@@ -15,12 +14,12 @@ import jax.numpy as jnp
 
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.configuration import Few, Layers, Spread, Width, configuration
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.parts import HumanGSOutputs, Pass, Variables
-from humangs_jax.network.transformer import MOST_LAYERS
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -69,22 +68,17 @@ def pose_vector(pose: BodyPose, joints: int) -> Float[Array, " q"]:
     return pose.rotations[1:].reshape(-1)
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class CorrectionMLP:
     """The LCA-style driver, for readers that give features `local` of vertices, and a decoder with K Gaussians per vertex.
 
     hidden: width. layers: hidden ones. joints: of the body. offset_scale: metres, bound of the offsets.
     """
 
-    hidden: int = 512
-    layers: int = 3
-    joints: int = 55
-    offset_scale: float = 0.05
-
-    def __post_init__(self):
-        """Raises ValueError for a number of layers that no network has."""
-        if not 1 <= self.layers <= MOST_LAYERS:
-            raise ValueError(f"driver.layers {self.layers}: expected 1 to {MOST_LAYERS}")
+    hidden: Width = 512
+    layers: Layers = 3
+    joints: Few = 55
+    offset_scale: Spread = 0.05
 
     def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of the MLP. Raises: ValueError for features or a decoder without what it needs."""

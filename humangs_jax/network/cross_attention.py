@@ -8,7 +8,6 @@ vertices times views. One layer is
 where x begins as the encoded canonical position of a vertex.
 """
 
-import dataclasses
 from typing import cast
 
 import flax.linen as nn
@@ -16,6 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.core.configuration import Layers, Ratio, Width, configuration
 from humangs_jax.network.attention import NORM_EPSILON, attention
 from humangs_jax.network.encoder import touched_patches
 from humangs_jax.network.execution import Execution
@@ -23,26 +23,26 @@ from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, Pass, Variables
 from humangs_jax.network.reader import VertexFeatures
 from humangs_jax.network.tokenizer import pack_patches
-from humangs_jax.network.transformer import INIT_STD, MOST_LAYERS, layer_norm
+from humangs_jax.network.transformer import INIT_STD, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
 
 INIT = nn.initializers.normal(INIT_STD)
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class CrossAttentionReader:
     """Vertices as queries, image tokens as keys and values. width: features of a vertex. layers, mlp_ratio, head_width: as in
     `TransformerConfig`.
     """
 
-    width: int = 768
-    layers: int = 1
-    mlp_ratio: int = 4
-    head_width: int = 64
+    width: Width = 768
+    layers: Layers = 1
+    mlp_ratio: Ratio = 4
+    head_width: Width = 64
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
-        check_layers("reader", self.width, self.head_width, self.layers)
+        check_heads("reader", self.width, self.head_width)
 
     def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of the layers."""
@@ -82,11 +82,9 @@ def image_tokens(
     return tokens, None if inputs.view_count is None else inputs.view_count * (height * width)
 
 
-def check_layers(part: str, width: int, head_width: int, layers: int) -> None:
-    """Raises ValueError unless heads of that width fill the features, and there are 1 to `MOST_LAYERS` layers."""
-    if not 1 <= layers <= MOST_LAYERS:
-        raise ValueError(f"{part}: {layers} layers: expected 1 to {MOST_LAYERS}")
-    if min(width, head_width) < 1 or width % head_width:
+def check_heads(part: str, width: int, head_width: int) -> None:
+    """Raises ValueError unless heads of that width fill the features."""
+    if width % head_width:
         raise ValueError(f"{part}: width {width} is not a multiple of head_width {head_width}")
 
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
-from humangs_jax.core.configuration import knob
+from humangs_jax.core.configuration import Patch, configuration, knob
 from humangs_jax.geometry.camera import plucker_rays
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
@@ -18,7 +18,7 @@ from humangs_jax.network.transformer import INIT_STD, Transformer, TransformerCo
 from humangs_jax.network.upsampler import Upsampler, UpsamplerConfig
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class PatchTransformer:
     """The paper's encoder: one token per patch of every view, attention over all of them, an upsampler.
 
@@ -27,7 +27,7 @@ class PatchTransformer:
     place in the photo, for systems whose photos have neither cameras nor poses.
     """
 
-    patch_size: int = 8
+    patch_size: Patch = 8
     geometry: Literal["rays_and_positions", "place"] = "rays_and_positions"
     texture: TriplaneConfig = dataclasses.field(default_factory=TriplaneConfig)
     transformer: TransformerConfig = dataclasses.field(default_factory=TransformerConfig)
@@ -40,8 +40,6 @@ class PatchTransformer:
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
-        if self.patch_size < 1:
-            raise ValueError(f"patch_size {self.patch_size}: expected at least 1")
         layers = self.transformer.layers
         quarters = self.upsampler is not None and self.upsampler.features == "intermediate"
         if quarters and (layers < 4 or layers % 2):

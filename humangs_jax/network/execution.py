@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
-from humangs_jax.core.configuration import Presets, check_fields, knob
+from humangs_jax.core.configuration import Chunk, Edge, InputSide, Presets, Room, Vertices, configuration, knob
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
 MEASURED, TRADE = "performance_reconstruction.md", "tradeoff.md"
@@ -15,7 +15,7 @@ AttentionKernel = Literal["xla", "cudnn", "chunked"]
 ComputeType = Literal["float32", "bfloat16", "float16"]
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class Execution:
     """How the network runs.
 
@@ -45,7 +45,7 @@ class Execution:
         gain="5 x in time at a foreground share of 0.2",
         measured=MEASURED,
     )
-    token_capacity: int = knob(
+    token_capacity: Room = knob(
         0, cost="tokens beyond it are dropped and counted", gain="time and memory", measured=MEASURED
     )
     dtype: ComputeType = knob(
@@ -57,31 +57,30 @@ class Execution:
     attention: Literal["auto"] | AttentionKernel = knob(
         "auto", cost="none", gain="chunked: a third of the time on CPUs, memory linear in tokens", measured=MEASURED
     )
-    attention_chunk: int = knob(1024, cost="none", gain="memory", measured=MEASURED)
+    attention_chunk: Chunk = knob(1024, cost="none", gain="memory", measured=MEASURED)
     scan: bool = knob(
         False, cost="a copy of the blocks' parameters", gain="compile time on TPU and GPU", measured=MEASURED
     )
     remat: Literal["none", "full", "dots"] = knob(
         "none", cost="a third more arithmetic", gain="memory of training", measured=MEASURED
     )
-    vertex_capacity: int | None = knob(
+    vertex_capacity: Vertices | None = knob(
         None, cost="vertices beyond it are dropped and counted", gain="no gain measured", measured=MEASURED
     )
-    longest_edge: float | None = knob(
+    longest_edge: Edge | None = knob(
         None,
         cost="three times the Gaussians at 0.017",
         gain="detail where photos have more than the vertices of the body",
         measured="refinement.md",
     )
-    body_vertices: int | None = knob(
+    body_vertices: Vertices | None = knob(
         None, cost="detail of the body", gain="Gaussians and the time of a frame in proportion", measured=TRADE
     )
-    image_size: int | None = knob(None, cost="detail of the photos", gain="tokens grow with its square", measured=TRADE)
+    image_size: InputSide | None = knob(
+        None, cost="detail of the photos", gain="tokens grow with its square", measured=TRADE
+    )
     crop: bool = knob(False, cost="none", gain="pixels of the person in place of background", measured=TRADE)
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
-
-    def __post_init__(self):
-        check_fields(self)
 
     @staticmethod
     def preset(name: str) -> "Execution":

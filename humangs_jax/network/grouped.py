@@ -9,7 +9,6 @@ their order; offsets are in the canonical frame, so that the person can be posed
 outside of its group.
 """
 
-import dataclasses
 from typing import cast
 
 import flax.linen as nn
@@ -17,8 +16,9 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.core.configuration import Bias, Layers, Ratio, Spread, Vertices, Width, configuration
 from humangs_jax.geometry import quaternion
-from humangs_jax.network.cross_attention import CrossBlock, check_layers, image_tokens
+from humangs_jax.network.cross_attention import CrossBlock, check_heads, image_tokens
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
@@ -31,22 +31,22 @@ ATTRIBUTES = {"offsets": 3, "quats": 4, "scales": 3, "opacities": 1, "colors": 3
 """Numbers of each attribute of a Gaussian; the order of a group's tokens."""
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class GroupReader:
     """Learned tokens, one an attribute and group, that look at the tokens of one photo.
 
     groups: of vertices. width: of a token. layers, mlp_ratio, head_width: of the attention, as in `CrossAttentionReader`.
     """
 
-    groups: int = 26
-    width: int = 1024
-    layers: int = 6
-    mlp_ratio: int = 2
-    head_width: int = 64
+    groups: Vertices = 26
+    width: Width = 1024
+    layers: Layers = 6
+    mlp_ratio: Ratio = 2
+    head_width: Width = 64
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
-        check_layers("reader", self.width, self.head_width, self.layers)
+        check_heads("reader", self.width, self.head_width)
 
     def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of `GroupTokens`."""
@@ -79,7 +79,7 @@ class GroupTokens(nn.Module):
         return layer_norm(None, "norm", use_bias=True)(x).reshape(len(ATTRIBUTES), config.groups, config.width)
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class GroupDecoder:
     """A linear head an attribute, from a group's token to the Gaussians of its vertices.
 
@@ -87,9 +87,9 @@ class GroupDecoder:
     units. initial_log_scale: bias of the scales before the softplus.
     """
 
-    group_size: int = 265
-    offset_scale: float = 0.5
-    initial_log_scale: float = -4.8
+    group_size: Vertices = 265
+    offset_scale: Spread = 0.5
+    initial_log_scale: Bias = -4.8
 
     def init(self, key: Key, features: Float[Array, "a r d"], inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of `GroupHeads`."""

@@ -17,13 +17,14 @@ pixels.
 """
 
 import dataclasses
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.core.configuration import Range, configuration
 from humangs_jax.network.convolution import Convolution
 from humangs_jax.network.encoder import encoder_pixels
 from humangs_jax.network.execution import Execution
@@ -37,7 +38,7 @@ LEAST_WIDTH = 8
 """Of the maps of the convolutional decoder, whose width halves as their sides double."""
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class NoReader:
     """The reader of systems whose decoders read the inputs themselves: its features are the encoding."""
 
@@ -57,7 +58,7 @@ class Photos(NamedTuple):
     view_count: Int[Array, ""] | None
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class QueryDecoder:
     """A `PixelDecoder`. transformer: without a class token. texture: the neural texture (HumanRAM), None: the body is unknown
     (LVSM). fusion: width of the convolutional decoder, which needs a patch size that is a power of 2; None: the linear map.
@@ -65,7 +66,7 @@ class QueryDecoder:
 
     transformer: TransformerConfig = dataclasses.field(default_factory=lambda: lvsm_transformer(24))
     texture: TriplaneConfig | None = None
-    fusion: int | None = None
+    fusion: Annotated[int, Range(2, 16_384)] | None = None
 
     def __post_init__(self):
         """Raises ValueError for a class token, or too few layers to fuse four depths."""

@@ -3,7 +3,6 @@
 Vertices can also read the photos themselves, at the surface and at distances along their normals (`network.shells`).
 """
 
-import dataclasses
 import itertools
 import math
 from typing import cast
@@ -12,6 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
+from humangs_jax.core.configuration import Spread, Width, configuration
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.network.bilinear import sample_bilinear, texel_indices
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
@@ -47,7 +47,7 @@ class VertexFeatures:
     dropped_reads: Int[Array, ""] | None = None
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class PixelAlignedReader:
     """What vertices read.
 
@@ -56,9 +56,9 @@ class PixelAlignedReader:
     shells: ascending distances along the vertex normals, normalised units, at which the photos are read too; (): none.
     """
 
-    output_width: int | None = 768
+    output_width: Width | None = 768
     sample_rgb: bool = False
-    shells: tuple[float, ...] = ()
+    shells: tuple[Spread, ...] = ()
 
     def __post_init__(self):
         """Raises ValueError for distances that are not ascending."""

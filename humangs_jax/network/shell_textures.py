@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, Key
+from humangs_jax.core.configuration import Patch, Spread, Width, configuration
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry import quaternion
@@ -48,11 +49,11 @@ class ShellTextures:
     seen: Bool[Array, "s h w"]
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class PlainPhotos:
     """The encoder of systems that read the photos themselves: its maps are their colours."""
 
-    patch_size: int = 1
+    patch_size: Patch = 1
 
     def init(self, key: Key, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{}: nothing is learned."""
@@ -63,12 +64,12 @@ class PlainPhotos:
         return Encoding(inputs.images, None, jnp.zeros((), jnp.int32)), {}
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class ShellTextureReader:
     """The textures. shells: ascending distances from the surface, normalised units, the first 0."""
 
     surface_map: SurfaceMap = dataclasses.field(default_factory=lambda: SurfaceMap("atlas", 1024))
-    shells: tuple[float, ...] = DISTANCES
+    shells: tuple[Spread, ...] = DISTANCES
 
     def __post_init__(self):
         """Raises ValueError unless the shells begin at the surface and ascend."""
@@ -141,12 +142,12 @@ def _filled(sums, weights):
     return jnp.where(weights > 0, mean, coarse)
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class ShellDecoder:
     """The U-Net. widths: its features, the finest scale first. largest_scale: of a Gaussian, normalised units."""
 
-    widths: tuple[int, ...] = (32, 48, 96)
-    largest_scale: float = 0.01
+    widths: tuple[Width, ...] = (32, 48, 96)
+    largest_scale: Spread = 0.01
 
     def __post_init__(self):
         """Raises ValueError for widths that no U-Net has."""

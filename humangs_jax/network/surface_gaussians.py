@@ -28,6 +28,7 @@ import jax.numpy as jnp
 
 from humangs_jax.body.model import BodyPose, Texels
 from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.configuration import Few, Spread, Weight, Width, configuration
 from humangs_jax.core.numerics import safe_divide, safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
@@ -67,12 +68,12 @@ class Surface:
     texels: Texels
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class TextureReader:
     """Photos -> the texture of the body. sharpness: of the softmax over the cosines of visible views; larger: the best view."""
 
     surface_map: SurfaceMap = dataclasses.field(default_factory=SurfaceMap)
-    sharpness: float = 5.0
+    sharpness: Weight = 5.0
 
     def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{}: nothing is learned."""
@@ -104,7 +105,7 @@ class TextureReader:
         return SurfaceTexture(colors.reshape(*shape, 3), seen.reshape(shape).astype(colors.dtype))
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class SurfaceDecoder:
     """A flat Gaussian on the surface for every texel, row-major, with the texture's colour: what drivers correct.
 
@@ -146,7 +147,7 @@ def _texels(inputs: HumanGSInputs) -> Texels:
     return inputs.texels
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class TextureDriver:
     """GIGA-style: one U-Net on the texture, seen or not, and positions; its coarsest maps attend to the pose.
 
@@ -154,11 +155,11 @@ class TextureDriver:
     the offsets.
     """
 
-    widths: tuple[int, ...] = (64, 128, 256, 512)
-    pose_width: int = 1024
-    pose_tokens: int = 16
-    joints: int = 55
-    offset_scale: float = 0.1
+    widths: tuple[Width, ...] = (64, 128, 256, 512)
+    pose_width: Width = 1024
+    pose_tokens: Few = 16
+    joints: Few = 55
+    offset_scale: Spread = 0.1
 
     def __post_init__(self):
         """Raises ValueError for a number of scales that no map has."""
@@ -187,15 +188,15 @@ class TextureDriver:
         return UNet(self.widths, CHANNELS, PoseAttention(self.pose_width, self.pose_tokens, parent=None))
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class PoseMapDriver:
     """Animatable-Gaussians-style: three U-Nets on the map of posed positions, for offsets, shapes and colours.
 
     widths: of each U-Net. offset_scale: metres, bound of the offsets.
     """
 
-    widths: tuple[int, ...] = (64, 128, 256, 512)
-    offset_scale: float = 0.05
+    widths: tuple[Width, ...] = (64, 128, 256, 512)
+    offset_scale: Spread = 0.05
 
     def __post_init__(self):
         """Raises ValueError for a number of scales that no map has."""

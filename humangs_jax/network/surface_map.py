@@ -12,17 +12,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body.model import BodyModel, Texels
+from humangs_jax.core.configuration import Side, configuration
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.mesh.atlas import CELLS, Atlas, texels, unwrap
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 MARGIN = 0.95
 """Share of the side of a view from the front or back that the body takes."""
-MOST_TEXELS = 4096
-"""A side; a file that says more would fill the memory."""
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class SurfaceMap:
     """A map of the surface.
 
@@ -32,12 +31,7 @@ class SurfaceMap:
     """
 
     kind: Literal["atlas", "front_back"] = "atlas"
-    size: int = 512
-
-    def __post_init__(self):
-        """Raises ValueError for a size that no map has."""
-        if not 1 <= self.size <= MOST_TEXELS:
-            raise ValueError(f"surface_map.size {self.size}: expected 1 to {MOST_TEXELS} texels a side")
+    size: Side = 512
 
     @property
     def shape(self) -> tuple[int, int]:

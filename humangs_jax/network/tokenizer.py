@@ -8,13 +8,13 @@ is the horizontal texture coordinate. Positions in [-1, 1] span a plane from the
 last one (`align_corners=True`); outside are zeros.
 """
 
-import dataclasses
 from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int
+from humangs_jax.core.configuration import Side, Width, configuration
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.network.bilinear import sample_bilinear
 from humangs_jax.network.transformer import INIT_STD
@@ -23,12 +23,12 @@ TEXTURE_STD = 0.1
 PLANES = ((0, 1), (0, 2), (1, 2))
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class TriplaneConfig:
     """Size of the neural texture. resolution: texels along each side of a plane. channels: features per texel."""
 
-    resolution: int = 128
-    channels: int = 16
+    resolution: Side = 128
+    channels: Width = 16
 
 
 def sample_triplane(texture: Float[Array, "3 r r c"], positions: Float[Array, "*p 3"]) -> Float[Array, "*p 3*c"]:

@@ -6,7 +6,6 @@ LayerNorms of the blocks have a weight and no bias, the final one has both (eps 
 at least, and so does the residual stream; products run in `dtype`.
 """
 
-import dataclasses
 from typing import Any
 
 import flax.linen as nn
@@ -15,16 +14,15 @@ import jax.numpy as jnp
 from jax.ad_checkpoint import checkpoint_name
 
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.configuration import Layers, Ratio, Width, configuration
 from humangs_jax.network.attention import NORM_EPSILON, PRODUCT, Attention
 from humangs_jax.network.execution import Execution
 
 INIT_STD = 0.02
-MOST_LAYERS = 256
-"""Every layer is traced: a file that says 100,000 would keep a machine busy for hours."""
 _POLICIES = {"full": None, "dots": jax.checkpoint_policies.save_only_these_names(PRODUCT)}
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class TransformerConfig:
     """Sizes of the transformer.
 
@@ -32,19 +30,15 @@ class TransformerConfig:
     token in front of all others. head_width: features per attention head. qk_norm: RMSNorm over the head on q and k.
     """
 
-    width: int = 768
-    layers: int = 12
-    mlp_ratio: int = 4
+    width: Width = 768
+    layers: Layers = 12
+    mlp_ratio: Ratio = 4
     class_token: bool = True
-    head_width: int = 64
+    head_width: Width = 64
     qk_norm: bool = True
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
-        if not 1 <= self.layers <= MOST_LAYERS:
-            raise ValueError(f"layers {self.layers}: expected 1 to {MOST_LAYERS}")
-        if self.head_width < 1 or self.width < 1:
-            raise ValueError(f"width {self.width}, head_width {self.head_width}: expected at least 1")
         if self.width % self.head_width:
             raise ValueError(f"width {self.width} is not a multiple of head_width {self.head_width}")
 

@@ -11,7 +11,6 @@ curve, as Point Transformer V3 does (https://arxiv.org/abs/2312.10035), once and
 are, not as features for a second network. The cost grows with (points + tokens)^2.
 """
 
-import dataclasses
 from typing import cast
 
 import flax.linen as nn
@@ -19,9 +18,10 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.core.configuration import Few, Layers, Ratio, Vertices, Width, configuration
 from humangs_jax.geometry.curve import along_curve
 from humangs_jax.network.attention import NORM_EPSILON, attention
-from humangs_jax.network.cross_attention import INIT, check_layers, image_tokens
+from humangs_jax.network.cross_attention import INIT, check_heads, image_tokens
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, Pass, Variables
@@ -33,7 +33,7 @@ CURVE_REACH = 1.2
 """Normalised units: half the side of the curve's cube; canonical bodies are 1.8 high and less than 2 wide."""
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class TwoStreamReader:
     """Joint attention of points and tokens.
 
@@ -41,18 +41,16 @@ class TwoStreamReader:
     point; 1: every vertex is one. most_views: more photos than this are refused, None: none are (LHM takes 1).
     """
 
-    width: int = 1024
-    blocks: int = 5
-    mlp_ratio: int = 4
-    head_width: int = 64
-    pooling: int = 1
-    most_views: int | None = None
+    width: Width = 1024
+    blocks: Layers = 5
+    mlp_ratio: Ratio = 4
+    head_width: Width = 64
+    pooling: Vertices = 1
+    most_views: Few | None = None
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
-        check_layers("reader", self.width, self.head_width, self.blocks)
-        if self.pooling < 1:
-            raise ValueError(f"reader: pooling {self.pooling}: expected at least 1")
+        check_heads("reader", self.width, self.head_width)
 
     def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params"} of `TwoStreams`."""

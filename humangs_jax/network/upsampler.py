@@ -9,8 +9,7 @@ its pixels. So it is a module of its own, `OutputConvolution`, that the reader a
 its input.
 """
 
-import dataclasses
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import flax.linen as nn
 import jax
@@ -18,6 +17,7 @@ import jax.numpy as jnp
 from flax.linen.dtypes import promote_dtype
 
 from humangs_jax.core.array_types import Array, Bool, Float
+from humangs_jax.core.configuration import Range, configuration
 from humangs_jax.network.convolution import Convolution
 from humangs_jax.network.neighborhoods import KERNEL
 
@@ -29,11 +29,11 @@ KAIMING_TRANSPOSED = nn.initializers.variance_scaling(2.0, "fan_in", "normal")
 """torch counts the fan-out of a transposed convolution over its input channels."""
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class UpsamplerConfig:
     """hidden: width, see the module. features: "intermediate" aggregates four depths, "final" upsamples the last (ablation)."""
 
-    hidden: int = 256
+    hidden: Annotated[int, Range(2, 16_384)] = 256
     features: Literal["intermediate", "final"] = "intermediate"
 
 

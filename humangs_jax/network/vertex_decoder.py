@@ -5,8 +5,7 @@ photo colour, the fraction of views that see it, and what the photos show at dis
 `tight` Gaussians of a vertex are those whose offsets a loss keeps small.
 """
 
-import dataclasses
-from typing import Literal, cast
+from typing import Annotated, Literal, cast
 
 import flax.linen as nn
 import jax
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Key
-from humangs_jax.core.configuration import knob
+from humangs_jax.core.configuration import Bias, Few, Range, Spread, Width, configuration, knob
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
@@ -42,7 +41,7 @@ INITIAL_SHELL = 4.0
 """Logit of the nearest shell, of 0 elsewhere: Gaussians start near the surface."""
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class VertexDecoder:
     """The paper's decoder: a light MLP from the features of a vertex to its Gaussians.
 
@@ -55,12 +54,14 @@ class VertexDecoder:
     `THINNER`. residual_color: colours are predicted relative to the photo colour.
     """
 
-    hidden: int = 256
-    tight: int = 1
-    free: int = knob(4, cost="detail: K = tight + free", gain="drawing in proportion to K", measured="evaluation.md")
-    skinning_joints: int | None = None
-    offset_scale: float | None = None
-    initial_log_scale: float = -3.0
+    hidden: Width = 256
+    tight: Annotated[int, Range(0, 256)] = 1
+    free: Annotated[int, Range(0, 256)] = knob(
+        4, cost="detail: K = tight + free", gain="drawing in proportion to K", measured="evaluation.md"
+    )
+    skinning_joints: Few | None = None
+    offset_scale: Spread | None = None
+    initial_log_scale: Bias = -3.0
     frame: Literal["canonical", "normal"] = "canonical"
     residual_color: bool = False
 

@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import math
 from collections.abc import Callable, Mapping
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ from jax import lax
 from humangs_jax.body.skinning import joint_transforms
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.compiler_options import compiler_options
-from humangs_jax.core.configuration import knob
+from humangs_jax.core.configuration import Few, Range, Share, Side, Slots, Spread, configuration, knob
 from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.loading.examples import Example
@@ -44,7 +45,7 @@ MIXING = 0.5
 BACKGROUND, DARKEST_ALBEDO = 1.0, 0.01
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class OnTheFlyConfig:
     """What an example shows.
 
@@ -56,23 +57,23 @@ class OnTheFlyConfig:
     coloured at a time: few for CPUs, whole images for accelerators.
     """
 
-    input_views: int = 4
-    target_views: int = 3
-    input_size: int = 256
-    target_size: int = 256
-    poses: int = 2
-    mixed_pose_share: float = 0.3
-    jitter: float = 0.7
-    scattered_share: float = 0.2
-    close_share: float = 0.2
-    mirrored_share: float = 0.5
-    dyed_share: float = 0.7
-    supersampling: int = 2
+    input_views: Few = 4
+    target_views: Few = 3
+    input_size: Side = 256
+    target_size: Side = 256
+    poses: Few = 2
+    mixed_pose_share: Share = 0.3
+    jitter: Spread = 0.7
+    scattered_share: Share = 0.2
+    close_share: Share = 0.2
+    mirrored_share: Share = 0.5
+    dyed_share: Share = 0.7
+    supersampling: Annotated[int, Range(1, 16)] = 2
     depths: bool = False
-    views_at_once: int = knob(
+    views_at_once: Few = knob(
         1, cost="memory", gain="accelerators: all views of an example at once", measured="data.md"
     )
-    pixels_per_step: int = knob(
+    pixels_per_step: Slots = knob(
         1 << 14, cost="memory", gain="accelerators: whole images at once, 2^30", measured="data.md"
     )
 

@@ -20,6 +20,7 @@ import numpy as np
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.progress import bar as progress_bar
+from humangs_jax.core.progress import say
 from humangs_jax.core.workers import in_processes
 from humangs_jax.data.capture import Capture, save_capture
 from humangs_jax.data.loading.captures import find_captures
@@ -179,7 +180,7 @@ def write_set(
             for seed, error in _make(missing, folders, layout, body, workers):
                 if error is not None:
                     failed[seed] = error
-                    bar.write(f"seed {seed}: {error}")
+                    say(f"seed {seed}: {error}", lines=False)
                 bar.update(1)
                 if time.monotonic() - written > MANIFEST_EVERY:
                     write_manifest(out, split, settings)

@@ -1,8 +1,22 @@
 """Settings of refinement: how long, what is compared, how fast each parameter moves, what holds it back."""
 
 import dataclasses
+from typing import Annotated
 
-from humangs_jax.core.configuration import check_fields, knob
+from humangs_jax.core.configuration import (
+    Few,
+    PhotoSide,
+    Range,
+    RefineSteps,
+    Rounds,
+    Seed,
+    Share,
+    Spread,
+    Steps,
+    Weight,
+    configuration,
+    knob,
+)
 
 MEASURED = "refinement.md"
 SPLITS = (0.0, 0.2, 0.4)
@@ -12,7 +26,7 @@ ROUNDS = 4
 MAX_GROWTH = 16.0
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class LearningRates:
     """Change of each parameter in a step of Adam, in the space in which it is optimised; `refine` lowers all by a cosine
     and, after rounds, in long runs (`RefineConfig.full_steps`).
@@ -21,16 +35,16 @@ class LearningRates:
     unit. rotations: radians of the pose's axis-angles, translations: metres; both only with `RefineConfig.poses`.
     """
 
-    means: float = 2e-4
-    quats: float = 2e-3
-    log_scales: float = 1e-2
-    opacity_logits: float = 3e-2
-    color_logits: float = 4e-2
-    rotations: float = 1e-3
-    translations: float = 2e-4
+    means: Spread = 2e-4
+    quats: Spread = 2e-3
+    log_scales: Spread = 1e-2
+    opacity_logits: Spread = 3e-2
+    color_logits: Spread = 4e-2
+    rotations: Spread = 1e-3
+    translations: Spread = 2e-4
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class RefineConfig:
     """How `refine` fits an avatar to its photos.
 
@@ -57,42 +71,31 @@ class RefineConfig:
     seed: of the order of the photos and of the blocks.
     """
 
-    rounds: int = knob(ROUNDS, cost="blur without them", gain="0.25 to 0.5 s each with 4 photos", measured=MEASURED)
-    steps: int | None = knob(None, cost="blur at few", gain="time in proportion", measured=MEASURED)
-    seconds: float | None = knob(5.0, cost="blur at few", gain="time", measured=MEASURED)
-    image_size: int | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
-    views_per_step: int = knob(
+    rounds: Rounds = knob(ROUNDS, cost="blur without them", gain="0.25 to 0.5 s each with 4 photos", measured=MEASURED)
+    steps: RefineSteps | None = knob(None, cost="blur at few", gain="time in proportion", measured=MEASURED)
+    seconds: Annotated[float, Range(1e-6, 1e6)] | None = knob(5.0, cost="blur at few", gain="time", measured=MEASURED)
+    image_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
+    views_per_step: Few = knob(
         1, cost="fewer steps in the same time; less noise", gain="one photo for each device", measured=MEASURED
     )
-    structural: float = 0.2
-    silhouette: float = 0.1
+    structural: Weight = 0.2
+    silhouette: Weight = 0.1
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
-    final_rate: float = 0.1
-    full_steps: int = 100
-    decay: float = 2e-3
-    visible: float = 0.02
+    final_rate: Share = 0.1
+    full_steps: Steps = 100
+    decay: Share = 2e-3
+    visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
     poses: bool = False
-    growth: float = knob(1.0, cost="time of a step", gain="detail", measured=MEASURED)
-    held_out: float = 0.05
-    checks: int = 5
-    seed: int = 0
+    growth: Annotated[float, Range(1, MAX_GROWTH)] = knob(1.0, cost="time of a step", gain="detail", measured=MEASURED)
+    held_out: Share = 0.05
+    checks: Few = 5
+    seed: Seed = 0
 
     def __post_init__(self):
-        check_fields(self)
-        """Raises ValueError for settings out of range, naming them."""
+        """Raises ValueError for settings that do not fit together, naming them."""
         if self.steps is None and self.seconds is None:
             raise ValueError("RefineConfig: expected steps, seconds or both; without either a run would not end")
-        if self.rounds < 0 or (self.steps is not None and self.steps < 0) or self.rounds == self.steps == 0:
-            raise ValueError(f"RefineConfig: rounds {self.rounds}, steps {self.steps}: expected one of them above 0")
-        counts = {"image_size": self.image_size, "views_per_step": self.views_per_step}
-        if wrong := [name for name, value in counts.items() if value is not None and value < 1]:
-            raise ValueError(f"RefineConfig: {', '.join(wrong)} must be at least 1")
-        if self.seconds is not None and not self.seconds > 0:
-            raise ValueError(f"RefineConfig: seconds must be positive, got {self.seconds}")
-        shares = {name: getattr(self, name) for name in ("final_rate", "decay", "held_out")}
-        if wrong := [name for name, value in shares.items() if not 0 <= value <= 1]:
-            raise ValueError(f"RefineConfig: {', '.join(wrong)} must be in [0, 1]")
-        if not 1 <= self.growth <= MAX_GROWTH:
-            raise ValueError(f"RefineConfig: growth must be between 1 and {MAX_GROWTH:g}, got {self.growth}")
-        if not self.held_out < 1 or not self.visible > 0 or min(self.checks, self.full_steps) < 1:
-            raise ValueError("RefineConfig: need held_out < 1, visible > 0, checks >= 1 and full_steps >= 1")
+        if self.rounds == self.steps == 0:
+            raise ValueError("RefineConfig: rounds 0, steps 0: expected one of them above 0")
+        if not self.held_out < 1:
+            raise ValueError(f"RefineConfig.held_out {self.held_out:g}: expected less than 1")

@@ -6,6 +6,7 @@ import numpy as np
 from humangs_jax.core.array_types import Array, Bool
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.views import SubjectViews
 
 MARGIN = 8
@@ -21,10 +22,12 @@ BLOCK = 8
 def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectViews:
     """The photos, cut to the person by windows of one size, with the cameras that see the windows.
 
-    Photos whose longer side exceeds `image_size` are reduced to it. Raises: ValueError without masks.
+    Photos whose longer side exceeds `image_size` are reduced to it. Views whose mask does not show the person are left out, see
+    `usable_views`. Raises: ValueError without masks; CaptureError if no view is left.
     """
     if capture.masks is None:
         raise ValueError("crop_to_person: the capture has no masks")
+    capture = usable_views(capture)
     if image_size is not None and max(capture.images.shape[1:3]) > image_size:
         capture = capture.resized(image_size)
     images, cameras, masks = capture.images, capture.cameras, capture.masks

@@ -120,8 +120,10 @@ def refine_with_report(
 
     Ctrl-C ends the run; the best state until then is returned.
 
-    Raises: ValueError if the capture has no view or no masks, its poses have another number of joints than the avatar, or
-    the devices of the mesh do not divide `views_per_step`.
+    Views whose mask does not show the person are left out, see `usable_views`.
+
+    Raises: ValueError if the capture has no view or no masks or no view that shows the person, its poses have another number of
+    joints than the avatar, or the devices of the mesh do not divide `views_per_step`.
     """
     config = config or RefineConfig()
     _check(avatar, capture, config, mesh)

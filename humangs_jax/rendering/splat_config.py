@@ -1,18 +1,18 @@
 """Every knob of the splatting renderer, in one frozen dataclass, and its presets. For JAX it is a pytree without leaves."""
 
 import dataclasses
-from typing import Literal
+from typing import Annotated, Literal
 
 import jax
 
-from humangs_jax.core.configuration import Presets, check_fields, knob
+from humangs_jax.core.configuration import Chunk, Presets, Range, Share, Slots, Spread, configuration, knob
 from humangs_jax.rendering import constants
 
 MEASURED = "performance.md"
 
 
 @jax.tree_util.register_static
-@dataclasses.dataclass(frozen=True)
+@configuration
 class SplatConfig:
     """What is drawn, in which buffers, on which schedule. docs/performance.md gives what each knob costs and gains.
 
@@ -46,27 +46,27 @@ class SplatConfig:
         matmul_precision: "bfloat16" rounds the factors of the gradient's sums over pixels to 8 bits.
     """
 
-    near: float = constants.NEAR
-    eps2d: float = constants.EPS2D
-    alpha_min: float = constants.ALPHA_MIN
-    alpha_max: float = constants.ALPHA_MAX
-    transmittance_stop: float = knob(
+    near: Annotated[float, Range(0, 1e6)] = constants.NEAR
+    eps2d: Annotated[float, Range(0, 1e6)] = constants.EPS2D
+    alpha_min: Annotated[float, Range(1e-12, 1)] = constants.ALPHA_MIN
+    alpha_max: Share = constants.ALPHA_MAX
+    transmittance_stop: Share = knob(
         constants.TRANSMITTANCE_STOP,
         cost="65 dB at 0.001, 45 dB at 0.01",
         gain="5 % of the time with gradients at 0.001, 13 % at 0.01",
         measured=MEASURED,
     )
-    jacobian_margin: float | None = None
+    jacobian_margin: Spread | None = None
     normalize_quats: bool = True
-    opacity_min: float = knob(0.0, cost="61 dB at 0.1, 38 dB at 0.4", gain="8 % of the time at 0.4", measured=MEASURED)
-    radius_sigma: float | None = knob(
+    opacity_min: Share = knob(0.0, cost="61 dB at 0.1, 38 dB at 0.4", gain="8 % of the time at 0.4", measured=MEASURED)
+    radius_sigma: Annotated[float, Range(1e-6, 100)] | None = knob(
         None,
         cost="54 dB at 2.5, 44 dB at 2, 36 dB at 1.5; splats are cut at tile borders",
         gain="16 %, 28 %, 39 % of the time",
         measured=MEASURED,
     )
     square: bool = False
-    scale: float = knob(
+    scale: Annotated[float, Range(1e-3, 16)] = knob(
         1.0, cost="36 dB at 0.5", gain="a fifth of the time at 0.5 (not of projection and sorting)", measured=MEASURED
     )
     visibility: bool = knob(
@@ -75,19 +75,19 @@ class SplatConfig:
         gain="`seen_from(threshold=0.03)` with radius_sigma 2.5 and transmittance_stop 0.001: 0.51 of the time at 52.6 dB",
         measured=MEASURED,
     )
-    max_pairs: int | None = knob(
+    max_pairs: Slots | None = knob(
         None,
         cost="pairs beyond it are not drawn, counted and reported",
         gain="memory, one compilation",
         measured=MEASURED,
     )
-    max_rows: int | None = knob(None, cost="as max_pairs", gain="a little time", measured=MEASURED)
-    tile_size: int = knob(
+    max_rows: Slots | None = knob(None, cost="as max_pairs", gain="a little time", measured=MEASURED)
+    tile_size: Annotated[int, Range(1, 4096)] = knob(
         8, cost="none", gain="8 is best on CPUs: 4 takes 2.3 x, 16 takes 1.3 x the time", measured=MEASURED
     )
-    block: int = knob(32, cost="none", gain="within 4 % from 16 to 64 on CPUs", measured=MEASURED)
-    chunk: int = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
-    chunk_backward: int = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
+    block: Chunk = knob(32, cost="none", gain="within 4 % from 16 to 64 on CPUs", measured=MEASURED)
+    chunk: Chunk = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
+    chunk_backward: Chunk = knob(8, cost="none", gain="within 6 % from 4 to 16 on CPUs", measured=MEASURED)
     matmul_precision: Literal["float32", "bfloat16"] = knob(
         "float32",
         cost="8e-4 of the gradient",
@@ -96,18 +96,10 @@ class SplatConfig:
     )
 
     def __post_init__(self):
-        check_fields(self)
-        positive = ("alpha_min", "scale", "tile_size", "block", "chunk", "chunk_backward")
-        if wrong := [name for name in positive if not getattr(self, name) > 0]:
-            raise ValueError(f"SplatConfig: {', '.join(wrong)} must be positive")
         if not self.alpha_min < self.alpha_max < 1:
             raise ValueError(f"SplatConfig: need alpha_min < alpha_max < 1, got {self.alpha_min}, {self.alpha_max}")
-        if not (self.near >= 0 and self.eps2d >= 0 and 0 <= self.transmittance_stop < 1):
-            raise ValueError("SplatConfig: near and eps2d must not be negative, transmittance_stop in [0, 1)")
-        if any(size is not None and size < 1 for size in (self.max_pairs, self.max_rows)):
-            raise ValueError("SplatConfig: max_pairs and max_rows must be at least 1")
-        if self.radius_sigma is not None and not self.radius_sigma > 0:
-            raise ValueError(f"SplatConfig: radius_sigma must be positive or None, got {self.radius_sigma}")
+        if not self.transmittance_stop < 1:
+            raise ValueError(f"SplatConfig.transmittance_stop {self.transmittance_stop:g}: expected less than 1")
         if self.square and self.radius_sigma is None:
             raise ValueError("SplatConfig: a square footprint needs a radius_sigma")
 

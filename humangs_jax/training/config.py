@@ -4,8 +4,22 @@ import dataclasses
 import itertools
 import logging
 from pathlib import Path
+from typing import Annotated
 
-from humangs_jax.core.configuration import Presets, check_fields, knob
+from humangs_jax.core.configuration import (
+    Few,
+    InputSide,
+    Presets,
+    Range,
+    Room,
+    Seed,
+    Share,
+    Side,
+    Steps,
+    Weight,
+    configuration,
+    knob,
+)
 from humangs_jax.data.loader import ViewSampling
 from humangs_jax.io.text import read_configuration
 from humangs_jax.network import presets
@@ -18,7 +32,7 @@ from humangs_jax.training.optimizer import OptimizerConfig
 logger = logging.getLogger(__name__)
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class LossConfig:
     """Weights of the terms, each a mean over pixels or vertices and over the targets.
 
@@ -35,34 +49,34 @@ class LossConfig:
     white Gaussians differ from missing ones.
     """
 
-    squared: float = 1.0
-    structural: float = 0.2
-    structural_scales: int = 3
-    silhouette: float = 0.1
-    tightness: float = 0.1
-    perceptual: float = 0.0
-    lpips: float = 0.0
-    absolute: float = 0.0
-    outline: float = 0.0
-    depth: float = 0.0
-    distortion: float = 0.0
-    opaque: float = 0.0
-    shells: float = 0.0
-    random_background: float = 0.5
+    squared: Weight = 1.0
+    structural: Weight = 0.2
+    structural_scales: Annotated[int, Range(1, 16)] = 3
+    silhouette: Weight = 0.1
+    tightness: Weight = 0.1
+    perceptual: Weight = 0.0
+    lpips: Weight = 0.0
+    absolute: Weight = 0.0
+    outline: Weight = 0.0
+    depth: Weight = 0.0
+    distortion: Weight = 0.0
+    opaque: Weight = 0.0
+    shells: Weight = 0.0
+    random_background: Share = 0.5
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class Stage:
     """What changes at step `start` of a run and holds until the next stage; None: as the run's own configuration says."""
 
-    start: int
-    image_size: int | None = None
-    token_capacity: int | None = None
-    target_size: int | None = None
-    batch_size: int | None = None
+    start: Steps
+    image_size: InputSide | None = None
+    token_capacity: Room | None = None
+    target_size: Side | None = None
+    batch_size: Few | None = None
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class TrainConfig:
     """One run. Photos enter at `model.conventions.image_size` pixels, targets are learned at `target_size`.
 
@@ -82,32 +96,27 @@ class TrainConfig:
     disturbances: Disturbances = dataclasses.field(default_factory=Disturbances)
     optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
     splat: SplatConfig = dataclasses.field(default_factory=SplatConfig)
-    target_size: int = 128
-    steps: int = 20_000
-    batch_size: int = 1
-    microbatch_size: int = knob(
+    target_size: Side = 128
+    steps: Steps = 20_000
+    batch_size: Few = 1
+    microbatch_size: Few = knob(
         1, cost="memory in proportion", gain="fewer, larger steps on accelerators", measured="performance_training.md"
     )
     stages: tuple[Stage, ...] = ()
-    ema_decay: float | None = None
-    seed: int = 0
-    log_every: int = 20
-    validate_every: int = 1000
-    checkpoint_every: int = 1000
-    keep_checkpoints: int = 2
+    ema_decay: Share | None = None
+    seed: Seed = 0
+    log_every: Steps = 20
+    validate_every: Steps = 1000
+    checkpoint_every: Steps = 1000
+    keep_checkpoints: Steps = 2
 
     def __post_init__(self):
-        check_fields(self)
-        counts = ("steps", "batch_size", "microbatch_size", "target_size", "log_every", "validate_every")
-        for name in (*counts, "checkpoint_every", "keep_checkpoints"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} {getattr(self, name)}: expected at least 1")
         if self.model.execution.dtype == "float16":
             raise ValueError(
                 "model.execution.dtype float16: gradients underflow; expected float32 or bfloat16 for training"
             )
         starts = [stage.start for stage in self.stages]
-        if starts and (starts[0] < 1 or starts != sorted(set(starts)) or starts[-1] >= self.steps):
+        if starts and (starts != sorted(set(starts)) or starts[-1] >= self.steps):
             raise ValueError(f"stages start at {starts}: expected ascending steps between 1 and {self.steps - 1}")
         for start in starts:
             self.at(start)

@@ -4,14 +4,15 @@ The targets stay true. The network learns to place Gaussians well although its p
 `humangs fit` leaves them.
 """
 
-import dataclasses
 import math
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
 
 from humangs_jax.body.model import BodyModel, shape_body
 from humangs_jax.core.array_types import Array, Float, Key
+from humangs_jax.core.configuration import Range, Share, Spread, configuration
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
@@ -19,7 +20,7 @@ from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import Camera
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class Disturbances:
     """Standard deviations of normal distributions, unless said otherwise; one draw for each photo, or for each example.
 
@@ -30,20 +31,15 @@ class Disturbances:
     body_metres: each axis of the translation. betas: each shape coefficient; the wrong shape is also that of the targets.
     """
 
-    share: float = 0.0
-    exposure: float = 0.08
-    tint: float = 0.03
-    mask_pixels: int = 2
-    camera_degrees: float = 0.25
-    camera_metres: float = 0.002
-    pose_degrees: float = 0.15
-    body_metres: float = 0.002
-    betas: float = 0.1
-
-    def __post_init__(self):
-        """Raises ValueError for a share outside of [0, 1]."""
-        if not 0 <= self.share <= 1:
-            raise ValueError(f"disturbances.share {self.share}: expected 0 to 1")
+    share: Share = 0.0
+    exposure: Spread = 0.08
+    tint: Spread = 0.03
+    mask_pixels: Annotated[int, Range(0, 64)] = 2
+    camera_degrees: Annotated[float, Range(0, 360)] = 0.25
+    camera_metres: Spread = 0.002
+    pose_degrees: Annotated[float, Range(0, 360)] = 0.15
+    body_metres: Spread = 0.002
+    betas: Spread = 0.1
 
 
 def disturb(key: Key, example: Example, body: BodyModel, config: Disturbances) -> Example:

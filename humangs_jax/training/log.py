@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from humangs_jax.core.progress import bar
+from humangs_jax.core.progress import bar, say
 from humangs_jax.data.loader import Waiting
 from humangs_jax.io.atomic import write_text
 from humangs_jax.io.reading import Refused, reading
@@ -94,7 +94,7 @@ class RunLog:
         """Something worth knowing, as a line and beside the progress bar."""
         self._write({"step": done, "event": event} | details)
         if self._recording:
-            self.bar.write(f"step {done}: {message}")
+            say(f"step {done}: {message}")
 
     def _write(self, record):
         if self._lines is not None:  # JSON has no NaN

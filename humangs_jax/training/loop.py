@@ -22,7 +22,7 @@ import jax
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.arguments import checked_arguments
-from humangs_jax.core.progress import stage
+from humangs_jax.core.progress import say, stage
 from humangs_jax.data.loader import Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import only_writer
@@ -161,7 +161,7 @@ def _report(log, out, done, numbers, image):
     log.numbers(done, {f"val_{name}": value for name, value in numbers.items()}, "validation")
     write_png(out / "sheets" / f"{done:07d}.png", image)
     log.image(done, "validation/sheet", image)
-    log.bar.write(f"step {done}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
+    say(f"step {done}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
 
 
 @contextlib.contextmanager

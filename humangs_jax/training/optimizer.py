@@ -5,19 +5,23 @@ A gradient is made finite entry by entry first (NaN becomes 0, infinities +-1e-6
 counted, and so is every step that had anything to make finite.
 """
 
-import dataclasses
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int, PyTree, Scalar
+from humangs_jax.core.configuration import Range, Spread, configuration
 
 INFINITY_STAND_IN = 1e-6
 
 
-@dataclasses.dataclass(frozen=True)
+Below = Annotated[float, Range(0, 0.999_999)]
+"""Of a running mean that forgets."""
+
+
+@configuration
 class OptimizerConfig:
     """learning_rate: the peak, reached after `warmup_steps` from 0, then a cosine to 0 at the end of the run.
 
@@ -25,12 +29,12 @@ class OptimizerConfig:
     clip_norm: gradients longer than this are scaled down to it. skip_norm: above it the step is skipped.
     """
 
-    learning_rate: float = 4e-4
-    warmup_steps: int = 3000
-    betas: tuple[float, float] = (0.9, 0.95)
-    weight_decay: float = 0.05
-    clip_norm: float = 1.0
-    skip_norm: float = 100.0
+    learning_rate: Spread = 4e-4
+    warmup_steps: Annotated[int, Range(0, 100_000_000)] = 3000
+    betas: tuple[Below, Below] = (0.9, 0.95)
+    weight_decay: Spread = 0.05
+    clip_norm: Annotated[float, Range(0, 1e12)] = 1.0
+    skip_norm: Annotated[float, Range(0, 1e12)] = 100.0
 
 
 class GuardState(NamedTuple):

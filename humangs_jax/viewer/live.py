@@ -29,6 +29,7 @@ from humangs_jax.avatar.frames import a_pose_of, rest_pose_of
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.core.progress import say
 from humangs_jax.data.capture import Capture, load_capture
 from humangs_jax.data.motion import Motion, load_motion
 from humangs_jax.data.photos import DEMO_CAPTURE
@@ -153,7 +154,7 @@ def follow(
     elif capture is not None:
         raise ValueError(f"--capture {capture}: only for the folder of a training run; {path} is an avatar file")
     with LiveView(motion, port) as view, contextlib.suppress(KeyboardInterrupt):
-        print(f"{view.url} shows {path} as it changes; Ctrl-C ends.", flush=True)
+        say(f"{view.url} shows {path} as it changes; Ctrl-C ends.")
         if open_browser:
             webbrowser.open(view.url)
         shown = None

@@ -76,8 +76,9 @@ def pack(
     joints = len(avatar.parents)
     if joints > 256:
         raise ValueError(f"the page draws avatars of up to 256 joints, got {joints}")
-    if len(avatar.gaussians.means) == 0:
-        raise ValueError("the page: the avatar has no Gaussians")
+    for what, count in (("Gaussians", len(avatar.gaussians.means)), ("vertices", len(avatar.rest_vertices))):
+        if not count:
+            raise ValueError(f"the page: the avatar has no {what}")
     if motion is not None and motion.rotations.shape[1] != joints:
         raise ValueError(f"the motion has {motion.rotations.shape[1]} joints, the avatar has {joints}")
     how = SPLAT_PRESETS[avatar.rendering]

@@ -23,6 +23,8 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyModel, RestBody
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.configuration import config_from_json
+from humangs_jax.core.printable import printable
+from humangs_jax.core.progress import say
 from humangs_jax.data.motion import Motion, grounded, load_motion
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import write_text
@@ -58,7 +60,7 @@ def page_html(
     packed = pack(avatar, motion, known_body(avatar), name)
     header = json.dumps(packed.header, separators=(",", ":"))
     parts = {
-        "title": html.escape(title),
+        "title": html.escape(printable(title)),
         "header": header.replace("<", "\\u003c"),  # a joint's name may not end the script
         "data": base64.b64encode(gzip.compress(packed.data, 9, mtime=0)).decode(),
     }
@@ -113,7 +115,7 @@ def serve(text: str, port: int = 0, open_browser: bool = True) -> None:
         raise OSError(f"--port {port}: {error}") from error
     with server:
         url = f"http://127.0.0.1:{server.server_address[1]}/"
-        print(f"{url} shows the avatar; Ctrl-C ends.", flush=True)
+        say(f"{url} shows the avatar; Ctrl-C ends.")
         if open_browser:
             webbrowser.open(url)
         with contextlib.suppress(KeyboardInterrupt):

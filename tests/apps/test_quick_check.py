@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.apps import quick_check
 from humangs_jax.apps.quick_check import likely_mistakes
 from humangs_jax.body.model import person_vertices
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import load_capture
+from humangs_jax.data.surface_points import surface_points
 
 SECONDS = 0.5
 """Of the processor, for four photos: 0.07 measured. Less than the import of a library or a compilation would take."""
@@ -90,7 +90,7 @@ def test_the_points_lie_on_the_body(right):
     """Skinning by numpy is that of the body model, up to its corrections of poses."""
     frame = int(right.frames[0])
     rotations, translations = np.asarray(right.poses.rotations, float), np.asarray(right.poses.translation, float)
-    points = quick_check._surface_points(right.body, np.asarray(right.betas), rotations, translations, [frame])[frame]
+    points = surface_points(right.body, np.asarray(right.betas), rotations, translations, [frame], 6000)[frame]
     vertices = np.asarray(person_vertices(right.body, jnp.asarray(right.betas), right.pose(frame)))
     nearest = np.array([np.linalg.norm(vertices - point, axis=1).min() for point in points[::60]])
     assert np.median(nearest) < 0.02 and nearest.max() < 0.06  # half an edge, and what bends at a joint

@@ -39,7 +39,7 @@ def test_settings_come_back_from_their_file(name, tmp_path):
         ('{"kind": "humangs_jax settings"}', "config: expected an object, got None"),
         ('{"kind": "humangs_jax settings", "settings": {"speed": 9}}', "config.speed: Settings has no such field"),
         ('{"kind": "humangs_jax settings", "settings": {"views": "two"}}', "config.views"),
-        ('{"kind": "humangs_jax settings", "settings": {"views": 0}}', "views must be at least 1"),
+        ('{"kind": "humangs_jax settings", "settings": {"views": 0}}', "config.views 0: expected 1 to 1,024"),
         ('{"kind": "humangs_jax settings", "settings": {"splat": "blurred"}}', "config.splat"),
     ],
 )

@@ -10,6 +10,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.export import SH_C0, write_ply
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
+from humangs_jax.io.reading import FileError
 from humangs_jax.rendering.gaussians import Gaussians, covariances
 
 COVARIANCE_TOLERANCE = 2e-5  # relative to the largest entry: a float32 SVD and its squares
@@ -81,9 +82,35 @@ def test_what_a_file_cannot_hold_is_refused_and_short_numbers_become_float32(tmp
     loaded = Avatar.load(tmp_path / "a.npz")
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(np.asarray(a, np.float32), b), short, loaded)
     assert loaded.gaussians.means.dtype == jnp.float32
-    avatar.select(np.zeros(0, int)).save(tmp_path / "nobody.npz")
-    with pytest.raises(ValueError, match=r"nobody\.npz: means: expected at least one Gaussian"):
-        Avatar.load(tmp_path / "nobody.npz")
+
+
+def unlike(avatar, **changes):
+    """The avatar with other arrays, of its Gaussians or its own."""
+    own = {name: value for name, value in changes.items() if hasattr(avatar, name)}
+    drawn = {name: value for name, value in changes.items() if name not in own}
+    return replace(avatar, gaussians=replace(avatar.gaussians, **drawn), **own)
+
+
+def test_no_avatar_is_written_that_could_not_be_read(tmp_path):
+    avatar = make_avatar()
+    drawn = avatar.gaussians
+    path = tmp_path / "nobody.npz"
+    for wrong, said in (
+        (avatar.select(np.zeros(0, int)), "means: expected at least one Gaussian"),
+        (unlike(avatar, rest_vertices=jnp.zeros((0, 3))), "rest_vertices: expected at least one vertex"),
+        (unlike(avatar, means=drawn.means.at[3, 1].set(jnp.nan)), "means: expected numbers in"),
+        (unlike(avatar, means=drawn.means.at[3, 1].set(3e38)), "means: expected numbers in"),
+        (unlike(avatar, scales=drawn.scales.at[3, 1].set(jnp.inf)), "scales: expected numbers in"),
+        (unlike(avatar, colors=drawn.colors.at[3, 1].set(-3e38)), "colors: expected numbers in"),
+        (unlike(avatar, rest_joints=avatar.rest_joints.at[0].set(jnp.inf)), "rest_joints: expected numbers in"),
+        (
+            unlike(avatar, skinning_weights=0 * avatar.skinning_weights),
+            "skinning_weights: expected rows with the sum 1",
+        ),
+    ):
+        with pytest.raises(FileError, match=said) as caught:
+            wrong.save(path)
+        assert str(caught.value).startswith(f"{path}: ") and not any(tmp_path.iterdir())
 
 
 def test_a_file_may_have_any_name(tmp_path):

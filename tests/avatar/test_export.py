@@ -315,6 +315,23 @@ def test_the_function_checks_as_the_command_does(tmp_path):
     assert not list(tmp_path.glob("x*"))
 
 
+@pytest.mark.parametrize("name", ["x.ply", "x.splat", "x.spz", "x.glb", "mesh.glb", "mesh.obj"])
+def test_numbers_that_files_cannot_hold_are_not_written(name, tmp_path):
+    small_file(tmp_path)
+    avatar = Avatar.load(tmp_path / "me.npz")
+    own = avatar.gaussians
+    for value in (3e38, np.nan, -np.inf):
+        means, scales, colors = (x.at[1, 0].set(value) for x in (own.means, own.scales, own.colors))
+        wrong = [replace(own, means=means), replace(own, scales=scales), replace(own, colors=colors)]
+        people = [replace(avatar, gaussians=gaussians) for gaussians in wrong]
+        if mesh := name.startswith("mesh"):
+            people = [people[2], replace(avatar, rest_vertices=avatar.rest_vertices.at[0, 0].set(value))]
+        for person_ in people:
+            with pytest.raises(ValueError, match=r"export: .*expected finite numbers"):
+                export(tmp_path / name, person_, mesh=mesh)
+    assert [file.name for file in tmp_path.iterdir()] == ["me.npz"]
+
+
 MISUSES = {
     "--frame 1: expected --motion and --out": ["--out", "x.ply", "--frame", "1"],
     "--frames :: expected --motion and --out": ["--html", "x.html", "--motion", "jump.npz", "--frames", ":"],

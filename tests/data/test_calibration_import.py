@@ -1,6 +1,7 @@
 """What is written, what is refused, and what is warned of when cameras are imported."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -495,3 +496,178 @@ def test_coefficients_of_a_lens_may_be_tiny_or_huge():
     for k3 in (1e-310, -1e-310):
         assert _squared_reach([-0.3, 0, 0, 0, k3]) == pytest.approx(1 / 0.9, rel=1e-9)
     assert 0 < _squared_reach(np.full(5, -1e308)) < 1e-30
+
+
+# Masks -------------------------------------------------------------------------------------------------------------
+
+PERSON = np.zeros((written.HEIGHT, written.WIDTH), np.uint8)
+PERSON[8:40, 20:40] = 255
+
+
+def write_masks(folder, masks):
+    folder.mkdir(exist_ok=True)
+    for file, mask in zip(FILES, masks, strict=True):
+        Image.fromarray(mask).save(folder / file)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("mask", "warning"),
+    [
+        (0 * PERSON, r"the mask is empty, the photo will be left out: b\.png"),
+        (PERSON // 3, r"the mask is empty, .*: b\.png"),
+        (255 + 0 * PERSON, r"the mask covers the whole photo.*: b\.png"),
+        (255 - PERSON, r"the mask covers the border.* is it inverted\?.*: b\.png"),
+    ],
+)
+def test_masks_that_are_likely_wrong_are_named(rig, tmp_path, mask, warning):
+    if (mask == PERSON // 3).all():
+        mask = mask + (PERSON > 0).astype(np.uint8) * (np.arange(written.WIDTH) % 3).astype(np.uint8)  # soft, no label
+    masks = write_masks(tmp_path / "masks", [PERSON, mask, PERSON, PERSON])
+    report = import_rig(rig, masks=masks)
+    (found,) = report.warnings
+    assert re.match(warning, found) and report.masks
+
+
+@pytest.mark.parametrize(
+    ("mask", "problem"),
+    [
+        (PERSON // 255, r"masks/a\.png: values: the largest is 1 of 255: expected 0 \(background\) to 255"),
+        (
+            PERSON // 255 * (1 + np.arange(written.WIDTH) % 18).astype(np.uint8),
+            r"a\.png: values: the largest is 18 of 255",
+        ),
+        (PERSON // 2, r"a\.png: values: the largest is 127 of 255"),
+        ((PERSON > 0).astype(np.uint16) * 255, r"a\.png: values: the largest is 0.992 of 255"),
+        (np.dstack([PERSON, np.roll(PERSON, 4, axis=0), 0 * PERSON]), r"a\.png: 3 colours: which is the person\?"),
+        (PERSON[:, :10], r"a\.png: size: 10 x 48, but its photo has 64 x 48"),
+        (0 * PERSON, r"a\.png: mask: empty, as are all of them"),
+    ],
+)
+def test_masks_that_no_capture_may_have_are_refused_before_writing(rig, tmp_path, mask, problem):
+    with pytest.raises(CaptureError, match=problem):
+        import_rig(rig, masks=write_masks(tmp_path / "masks", [mask] * 4))
+    assert not rig[2].exists()
+
+
+def test_alpha_in_some_photos_is_refused_and_an_empty_one_is_named(rig):
+    for file in FILES:
+        Image.fromarray(np.dstack([PERSON] * 3 + [PERSON if file != "b.png" else 0 * PERSON])).save(rig[1] / file)
+    assert import_rig(rig).warnings == ("the mask is empty, the photo will be left out: b.png",)
+    written.write_photos(rig[1], ["c.png"])
+    with pytest.raises(CaptureError, match=r"c\.png: alpha: expected an alpha channel in all images or in none"):
+        import_rig(rig, overwrite=True)
+
+
+def named_masks(tmp_path, key, names):
+    """A transforms.json that names masks, and its photos."""
+    written.write_transforms(tmp_path / "transforms.json", *written.scene(), [f"images/{file}" for file in FILES])
+    written.write_photos(tmp_path / "images", FILES)
+
+    def edit(values):
+        for frame, name in zip(values["frames"], names, strict=True):
+            if name is not None:
+                frame[key] = name
+
+    change(tmp_path / "transforms.json", edit)
+    return tmp_path / "transforms.json", tmp_path / "images", tmp_path / "out"
+
+
+@pytest.mark.parametrize("key", ["fg_mask_path", "mask_path"])
+def test_masks_that_a_transforms_json_names_are_used(tmp_path, key):
+    source = named_masks(tmp_path, key, [f"./fg/{file}" for file in FILES])
+    (warning,) = import_cameras(*source, up="+y").warnings
+    assert warning == f"{key} of transforms.json: no such mask, ./fg/a.png: imported without masks"
+    masks = write_masks(tmp_path / "fg", [PERSON] * 4)
+    report = import_cameras(*source, up="+y", overwrite=True)
+    assert report.masks and report.warnings == () and f"masks: those that transforms.json names ({key})" in str(report)
+    assert [view["mask"] for view in views_of(tmp_path / "out")] == [f"masks/{file}" for file in FILES]
+    report = import_cameras(*source, masks=masks, up="+y", overwrite=True)
+    assert report.warnings == (f"{key} of transforms.json: not used, the masks are those in {masks}",)
+    (masks / "c.png").unlink()
+    with pytest.raises(
+        CaptureError, match=rf"images/c\.png: {key}: \./fg/c\.png: no such mask, but other images have one"
+    ):
+        import_cameras(*source, up="+y", overwrite=True)
+
+
+def test_masks_named_for_some_or_outside_are_refused(tmp_path):
+    write_masks(tmp_path / "fg", [PERSON] * 4)
+    source = named_masks(tmp_path, "mask_path", ["fg/a.png", None, "fg/c.png", "fg/d.png"])
+    with pytest.raises(CaptureError, match=r"images/b\.png: mask_path: missing, but other images have one"):
+        import_cameras(*source)
+    source = named_masks(tmp_path, "mask_path", [7, None, None, None])
+    with pytest.raises(CaptureError, match=r"frames\[0\]\.mask_path: expected the path of a mask, got 7"):
+        import_cameras(*source)
+    (tmp_path / "inner").mkdir()
+    for name in ("images", "transforms.json"):
+        (tmp_path / name).rename(tmp_path / "inner" / name)
+    source = named_masks(tmp_path / "inner", "mask_path", [f"../fg/{file}" for file in FILES])
+    with pytest.raises(CaptureError, match="lies outside of"):
+        import_cameras(*source)
+
+
+# Moments -----------------------------------------------------------------------------------------------------------
+
+
+def at_moments(tmp_path, keys, poses=None):
+    """Six photos in a transforms.json, each with its own of `keys`. poses: which camera each has; default: three, twice."""
+    names = [f"{i}.png" for i in range(6)]
+    K, all_poses = written.scene(3 if poses is None else 6)
+    which = [0, 1, 2, 0, 1, 2] if poses is None else poses
+    written.write_transforms(tmp_path / "transforms.json", K[which], all_poses[which], names)
+    written.write_photos(tmp_path / "images", names)
+    change(tmp_path / "transforms.json", lambda v: [f.update(own) for f, own in zip(v["frames"], keys, strict=True)])
+    return import_cameras(tmp_path / "transforms.json", tmp_path / "images", tmp_path / "out", up="+y")
+
+
+ALL = range(6)
+FLOAT_TIMES = [0.1 + 0.2, 0.3, 0.3, 1 / 3, 0.33333333, 0.3333333333]
+MOMENTS = {
+    "VHAP": ([{"timestep_index": i // 3, "camera_index": i % 3} for i in ALL], None, 3, [0, 0, 0, 1, 1, 1]),
+    "sparse steps, mixed up": ([{"timestep_index": (9, 3)[i // 3]} for i in ALL], None, 3, [1, 1, 1, 0, 0, 0]),
+    "seconds": ([{"time": t, "camera_index": i % 3} for i, t in enumerate(FLOAT_TIMES)], None, 3, [0, 0, 0, 1, 1, 1]),
+    "names": ([{"timestep_id": f"frame_{i // 3}", "camera_id": f"{i % 3}"} for i in ALL], None, 3, [0, 0, 0, 1, 1, 1]),
+    "D-NeRF: one camera that moves": ([{"time": i / 5} for i in ALL], list(ALL), 6, list(ALL)),
+    "one moment": ([{"time": 0.0, "camera_index": i} for i in ALL], list(ALL), 6, [0] * 6),
+    "one camera, by index": ([{"camera_index": 0}] * 6, list(ALL), 1, list(ALL)),
+    "one camera, by pose": ([{}] * 6, [2] * 6, 1, list(ALL)),
+    "a scene that stands still": ([{}] * 6, list(ALL), 6, [0] * 6),
+}
+
+
+@pytest.mark.parametrize("kind", MOMENTS)
+def test_photos_of_one_moment_are_one_frame(tmp_path, kind):
+    keys, poses, cameras, frames = MOMENTS[kind]
+    report = at_moments(tmp_path, keys, poses)
+    assert {view["image"]: view["frame"] for view in views_of(tmp_path / "out")} == {
+        f"images/{i}.png": frame for i, frame in enumerate(frames)
+    }
+    assert [view["frame"] for view in views_of(tmp_path / "out")] == sorted(frames)
+    assert (report.cameras, report.frames) == (cameras, max(frames) + 1)
+    assert any("no two photos show the same moment" in w for w in report.warnings) == (kind.startswith("D-NeRF"))
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ([{"camera_index": i % 3} for i in ALL], r"frames\[0\] and frames\[3\] have the camera_index 0, so they show"),
+        (
+            [{"camera_id": f"c{i % 2}"} for i in ALL],
+            r"frames\[0\] and frames\[2\] have the camera_id c0, so .*: expected timest",
+        ),
+        ([{}] * 6, r"frames\[0\] and frames\[3\] have the same camera pose, so they show different moments"),
+        ([{"time": 0.0} if i else {} for i in ALL], r"frames\[0\]\.time: missing, but other frames have it"),
+        ([{"time": None} for i in ALL], r"frames\[0\]\.time: expected a number or a name, got None"),
+        ([{"time": float("nan")} for i in ALL], r"frames\[0\]\.time: expected finite numbers"),
+        ([{"time": str(i) if i else 0} for i in ALL], r"time: expected numbers or names, got both"),
+        (
+            [{"timestep_index": 0, "camera_index": i % 3} for i in ALL],
+            r"frames\[3\]: the camera_index and timestep_index of frames\[0\]: expected one photo of a camera",
+        ),
+    ],
+)
+def test_moments_that_cannot_be_told_apart_are_refused(tmp_path, keys, problem):
+    with pytest.raises(CaptureError, match=problem):
+        at_moments(tmp_path, keys)
+    assert not (tmp_path / "out").exists()

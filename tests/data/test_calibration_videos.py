@@ -75,3 +75,20 @@ def test_what_is_wrong_with_a_video_is_one_line(tmp_path):
     with pytest.raises(CaptureError, match="frames can be chosen of videos only"):
         import_cameras(rig[0], tmp_path / "photos", rig[2], up="+y", every=2)
     assert not videos.find_videos(tmp_path / "photos")
+
+
+@pytest.mark.parametrize("name", ["a%03d", "50% %s"])
+def test_signs_of_patterns_in_a_name_mean_themselves(name, tmp_path):
+    video = tmp_path / f"{name}.mp4"
+    write_video(video, [np.full((16, 16, 3), level) for level in (0.2, 0.5, 0.8)], 10)
+    assert video.is_file()
+    folder = tmp_path / "frames%d" / name
+    assert videos.split_video(video, folder) == 3
+    assert sorted(file.name for file in folder.iterdir()) == [f"{i:08d}.png" for i in range(3)]
+
+
+def test_a_list_of_files_is_no_video(tmp_path):
+    write_video(tmp_path / "secret.mp4", [np.full((16, 16, 3), 0.5)] * 2, 10)
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile 'secret.mp4'\n")
+    with pytest.raises(CaptureError, match=r"list\.mp4: not a readable video"):
+        videos.split_video(tmp_path / "list.mp4", tmp_path / "frames")

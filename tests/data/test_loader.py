@@ -294,6 +294,16 @@ def test_an_image_that_only_decoding_finds_broken_costs_its_examples_alone(folde
     assert all(same(examples[i], new().source.example(0, i, 2)) for i in range(0, 40, 3))
 
 
+def test_views_whose_mask_is_empty_are_targets_but_no_inputs(folder, tmp_path):
+    write_subject(tmp_path / "s2", 2)
+    write_png(tmp_path / "s2/masks/003.png", np.zeros((SIZE, SIZE)))
+    source = loader_of(CaptureCache((folder / "s0", tmp_path / "s2"), small_body()), SAMPLING, SIZE, SIZE).source
+    examples = [source.example(0, i, 2) for i in range(60)]
+    assert (2, 3) not in {view for example in examples for view in greys(example.inputs)}
+    assert (2, 3) in {view for example in examples for view in greys(example.targets)}
+    assert source.broken[str(tmp_path / "s2")] == "views[3]: mask: empty: no photo to reconstruct the person from"
+
+
 def test_outlines_find_every_fault_without_decoding(folder, tmp_path, monkeypatch):
     monkeypatch.setattr("humangs_jax.data.photos.read_view", None)
     whole = read_outline(folder / "s1", small_body())

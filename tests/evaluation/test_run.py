@@ -131,6 +131,17 @@ def test_predictions_are_found_by_file_name(people, folders, tmp_path):
     assert "1 prediction missing:" in found.summary()
 
 
+def test_views_whose_true_mask_is_empty_are_not_compared(people, folders, tmp_path, caplog):
+    write_predictions(tmp_path / "theirs", people)
+    all_views = hg.evaluate(folders / "bob", predictions=tmp_path / "theirs" / "bob")
+    write_png(folders / "bob/masks/left.png", np.zeros(people["bob"][0].masks.shape[1:]))
+    found = hg.evaluate(folders / "bob", predictions=tmp_path / "theirs" / "bob")
+    assert [row.view for row in found.rows] == ["front", "back", "right"]
+    kept = [row.scores for row in all_views.rows if row.view != "left"]
+    assert [row.scores["psnr"] for row in found.rows] == [scores["psnr"] for scores in kept]
+    assert "bob: 1 view is not compared, its mask is empty: left" in caplog.text
+
+
 def test_what_is_wrong_is_one_line(people, folders, tmp_path):
     theirs = tmp_path / "theirs"
     with pytest.raises(FileNotFoundError, match="no such folder of predictions"):

@@ -77,3 +77,41 @@ def test_the_csv_reads_back():
     found = list(csv.DictReader(io.StringIO(csv_text(rows))))
     assert [row["person"] for row in found] == ["a", "a", "a", "b", 'c, "d"']
     assert float(found[-1]["psnr"]) == 1 / 3 and found[-1]["patch_psnr"] == "" and found[2]["frame"] == "1"
+
+
+HOSTILE = (
+    "=1+1",
+    "@SUM(A1)",
+    "+cmd",
+    "-2",
+    " =1",
+    "\uff1d1",
+    "\t=1",
+    "<img src=x onerror=alert(1)>",
+    "[here](javascript:alert(1))",
+    "a|b",
+    "a\nb\x1b[2J",
+    "\\|`x`",
+    "\\input{secret}",
+)
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_names_are_names_in_every_table(name):
+    text = csv_text([Scored(name, 0, name, {"psnr": -1.0})])
+    rows = list(csv.reader(io.StringIO(text)))
+    assert len(rows) == 2 == text.count("\n") and rows[1][3] == "-1.0"
+    for cell in (rows[1][0], rows[1][2]):
+        assert cell.isprintable() and cell.lstrip()[0] not in "=+-@\uff1d"
+    lines = markdown_table(["person", "PSNR"], [[name, "1.00"]]).splitlines()
+    assert len(lines) == 3 and lines[2].isprintable() and "<" not in lines[2] and "](" not in lines[2]
+    unescaped = lines[2].replace("\\\\", "").replace("\\|", "")
+    assert unescaped.count("|") == 3 and "`" not in unescaped.replace("\\`", "")
+    (row,) = [line for line in latex_table(["person", "PSNR"], [[name, "1.00"]]).splitlines() if "1.00" in line]
+    assert "\\input" not in row and row.isprintable()
+
+
+@pytest.mark.parametrize("name", ["0012", "front", "a_b", "naïve 写真"])
+def test_usual_names_stay(name):
+    assert csv_text([Scored(name, 0, name, {"psnr": 1.0})]).splitlines()[1] == f"{name},0,{name},1.0"
+    assert f"| {name} |" in markdown_table(["person"], [[name]])

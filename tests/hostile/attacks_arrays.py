@@ -10,7 +10,7 @@ from hostile_cases import case
 
 from humangs_jax.body.library import save_body
 
-# Avatars and other arrays ----------------------------------------------------------------------------------------------------
+# Avatars and other arrays ---------------------------------------------------------------------------------------------
 
 
 def arrays_case(kind, reader, arrays, change, item=7, expect="refused"):
@@ -154,3 +154,62 @@ BANKS = {
 }
 for kind, change in BANKS.items():
     arrays_case(kind, "bank", readers.bank_arrays, change, 7)
+
+
+# Numbers that no body has, and what float32 does not hold -------------------------------------------------------------
+
+for kind, change in {
+    "means of 3e38": put("means", 3e38),
+    "colours of 3e38": put("colors", 3e38),
+    "scales of 1e30": put("scales", 1e30),
+    "quaternions of 1e30": put("quats", 1e30),
+    "joints a light year away": put("rest_joints", 1e16),
+    "weights of 0": lambda arrays: arrays.update(skinning_weights=np.zeros_like(arrays["skinning_weights"])),
+    "weights of 1 each": lambda arrays: arrays.update(skinning_weights=np.ones_like(arrays["skinning_weights"])),
+    "no vertices": lambda arrays: arrays.update(
+        rest_vertices=np.zeros((0, 3), np.float32), faces=np.zeros((0, 3), np.int32)
+    ),
+    "no joints": lambda arrays: arrays.update(rest_joints=np.zeros((0, 3), np.float32)),
+}.items():
+    arrays_case(kind, "avatar", readers.avatar_file, change)
+for kind, change in {
+    "a template of 1e38": put("template", 1e38),
+    "directions of 1e38": lambda arrays: arrays.update(shape_directions=np.full((3, 4, 3), 1e38, np.float32)),
+    "a regressor of 1e38": put("regressor_values", 1e38),
+}.items():
+    arrays_case(kind, "body", body_file, change)
+for kind, change in {
+    "a template of 1e38": put("v_template", 1e38),
+    "directions of 1e300": lambda arrays: arrays.update(shapedirs=np.full((9, 3, 20), 1e300)),
+    "weights of 0": lambda arrays: arrays.update(weights=np.zeros((9, 55))),
+    "weights of 1e38": put("weights", 1e38),
+    "a regressor of 1e38": put("J_regressor", 1e38),
+}.items():
+    arrays_case(kind, "smplx npz", readers.smplx_arrays, change)
+own_motion = lambda: {"rotations": np.zeros((3, 55, 3)), "translations": np.zeros((3, 3)), "fps": 30.0}
+amass = lambda: {"poses": np.zeros((3, 156)), "trans": np.zeros((3, 3)), "mocap_framerate": 120.0}
+for value in (1e38, 1e300, 1e9):
+    for key in ("rotations", "translations"):
+        arrays_case(f"{key} of {value:g}", "motion npz", own_motion, put(key, value))
+    for key in ("poses", "trans"):
+        arrays_case(f"{key} of {value:g}", "amass", amass, put(key, value))
+
+
+def capture_of(key, value):
+    def make(folder):
+        readers.write_capture(folder)
+        arrays = readers.body_parameters()
+        arrays[key] = np.full(arrays[key].shape, value)
+        np.savez(folder / "body.npz", **arrays)
+        return folder
+
+    return make
+
+
+for value in (1e38, 1e300, -1e20, 1e6):
+    for key in ("betas", "rotations", "translations"):
+        case(f"{key} of {value:g}", "capture", capture_of(key, value))
+
+
+for kind, name in {"a title": "\x1b]0;OWNED\x07", "a new line": "a\nb", "half a surrogate": "\ud800"}.items():
+    arrays_case(f"{kind} for a joint", "avatar", readers.avatar_file, header(joint_names=["a", "b", name]))

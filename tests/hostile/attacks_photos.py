@@ -104,3 +104,32 @@ def capture_with_photo(data):
 for kind in ("EPS", "13,000 x 13,000", "WEBP", "16 bits, cut"):
     for reader in ("capture", "photos", "outline"):
         case(f"a photo that is {kind}", reader, capture_with_photo(PHOTOS[kind][0]), item=PHOTOS[kind][1])
+
+
+# Pillow decodes these -------------------------------------------------------------------------------------------------
+
+
+def damaged(data, name):
+    """The checksum of one chunk is another one."""
+    at = data.index(name)
+    end = at + 4 + struct.unpack(">I", data[at - 4 : at])[0]
+    return data[:end] + bytes([data[end] ^ 1]) + data[end + 1 :]
+
+
+ROWS = zlib.compress(bytes(4 * 5))
+BY_PALETTE = png(4, 4, colour=3, data=ROWS, extra=chunk(b"PLTE", bytes(range(48))))
+DECODED = {
+    "a palette that is not there": png(4, 4, colour=3, data=ROWS),
+    "a false checksum of the pixels": damaged(png(4, 4, data=zlib.compress(bytes(52))), b"IDAT"),
+    "a false checksum of the palette": damaged(BY_PALETTE, b"PLTE"),
+    "a false checksum of the end": damaged(png(4, 4, data=zlib.compress(bytes(52))), b"IEND"),
+    "a false checksum of a text": damaged(
+        png(4, 4, data=zlib.compress(bytes(52)), extra=chunk(b"tEXt", b"a\0b")), b"tEXt"
+    ),
+    "no end": png(4, 4, data=zlib.compress(bytes(52)))[:-12],
+}
+for kind, data in DECODED.items():
+    for reader in ("image", "mask", "depth"):
+        case(kind, reader, written("a.png", data), item=6)
+    case(f"a photo with {kind}", "capture", capture_with_photo(data), item=6)
+case("a palette", "mask", written("a.png", BY_PALETTE), "either", item=6)

@@ -6,10 +6,11 @@ import readers
 from hostile_cases import case, changed, setting, written
 from readers import SEEDS
 
+from humangs_jax.apps.settings import KIND, PRESETS
 from humangs_jax.core.configuration import config_to_json
 from humangs_jax.training.config import tiny
 
-# JSON and YAML ----------------------------------------------------------------------------------------------------------
+# JSON and YAML --------------------------------------------------------------------------------------------------------
 
 JSON_READERS = {
     **{"json": "a.json", "transforms": "transforms.json", "opencv json": "calibration_full.json", "openpose": "a.json"},
@@ -67,7 +68,7 @@ for kind, data in YAML.items():
     case(kind, "opencv yaml", written("cameras.yml", "%YAML:1.0\n---\n" + data), item=5 if "digits" not in kind else 6)
 
 
-# Numbers that are none --------------------------------------------------------------------------------------------------
+# Numbers that are none ------------------------------------------------------------------------------------------------
 
 
 def json_case(kind, reader, name, value, item=6, expect="refused"):
@@ -131,7 +132,7 @@ for kind, (name, old, new) in COLMAP.items():
     case(kind, "colmap", make, "either" if "place" in kind else "refused", 6)
 
 
-# Configurations and weights ------------------------------------------------------------------------------------------------
+# Configurations and weights -------------------------------------------------------------------------------------------
 
 
 def configuration(path, value):
@@ -203,3 +204,131 @@ for kind, line in {
     "no camera": b"00000001.jpg",
 }.items():
     case(f"a line of {kind}", "missing photos", changed("missing photos", lambda _, line=line: line), item=6)
+
+
+# Numbers out of every range -------------------------------------------------------------------------------------------
+
+
+def chosen(path, value):
+    """Settings of `reconstruct --config`."""
+
+    def data():
+        content = json.loads(config_to_json(PRESETS["best"]))
+        setting(path, value)(content)
+        return json.dumps({"kind": KIND, "settings": content})
+
+    return written("settings.json", data)
+
+
+OUT_OF_RANGE = {
+    "execution.image_size": (10**6, 0, -8, 1e300),
+    "execution.attention_chunk": (0, -1, 10**9),
+    "execution.token_capacity": (-5, 10**18),
+    "execution.vertex_capacity": (0, -1),
+    "execution.body_vertices": (0, -1, 10**12),
+    "execution.longest_edge": (0, -1, 1e-9, 1e300, float("nan")),
+    "execution.raster.rows_per_step": (0, -1, 10**12),
+    "execution.raster.near": (-1, float("inf")),
+    "refine_rounds": (10**6, -1),
+    "refine_steps": (10**9, -1),
+    "refine_size": (0, 10**9),
+    "views": (0, -1, 10**9, True),
+}
+for path, values in OUT_OF_RANGE.items():
+    for value in values:
+        case(f"{path} {value}", "settings", chosen(path, value))
+RUNS = {
+    "target_size": (0, 10**6),
+    "batch_size": (0, 10**9),
+    "steps": (0, 10**12),
+    "seed": (-1, 2**40),
+    "ema_decay": (-1, 2),
+    "views.input_counts": ([0], [10**9], [4] * 1000),
+    "views.target_count": (0, -1, 10**9),
+    "loss.squared": (-1, 1e300),
+    "loss.structural_scales": (0, 10**6),
+    "disturbances.mask_pixels": (-1, 10**9),
+    "optimizer.warmup_steps": (-1,),
+    "optimizer.betas": ([2, 2], [-1, 0]),
+    "splat.tile_size": (0, 10**9),
+    "splat.chunk": (-1, 10**9),
+    "splat.scale": (0, 1e9),
+    "model.conventions.image_size": (0, 10**6),
+    "model.conventions.longest_edge": (1e-9,),
+    f"{ENCODER}.transformer.width": (10**9,),
+    f"{ENCODER}.texture.resolution": (0, 10**9),
+    "model.architecture.decoder.free": (-1, 10**9),
+    "model.architecture.decoder.initial_log_scale": (1e9,),
+}
+for path, values in RUNS.items():
+    for value in values:
+        case(f"{path} {str(value)[:40]}", "configuration", configuration(path, value))
+for path, value in (
+    ("encoder.texture.resolution", 10**9),
+    ("decoder.free", 10**9),
+    ("encoder.transformer.width", 10**12),
+):
+    case(f"{path} {value}", "weights", weights_with(path, value))
+
+
+# Words that a terminal would act on -----------------------------------------------------------------------------------
+
+WORDS = {
+    "a title": "\x1b]0;OWNED\x07",
+    "a cleared screen": "\x1b[2J\x1b[1;1H",
+    "C1": "\x9b2J\x85",
+    "a new line": "a\nhumangs: error: forged",
+    "a carriage return": "a\rforged",
+    "marks of direction": "\u202egnp.\u2066\u2069",
+    "a line separator": "\u2028\u2029",
+    "a tag": "\U000e0041",
+    "half a surrogate": "\udc9b",
+}
+for kind, word in WORDS.items():
+    views = readers.capture_description()["views"]
+    for key in ("image", "mask"):
+        description = readers.capture_description(views=[{**views[0], key: f"images/{word}.png"}, views[1]])
+
+        def make(folder, description=description):
+            readers.write_capture(folder)
+            (folder / "capture.json").write_text(json.dumps(description))
+            return folder
+
+        for reader in ("capture", "photos"):
+            case(f"{kind} in {key}", reader, make)
+
+    def make(folder, word=word):
+        readers.write_colmap(folder)
+        text = (folder / "images.txt").read_text()
+        (folder / "images.txt").write_text(
+            text.replace("0.9 2.6 1 photos/000", f"x 2.6 1 photos/{word}", 1), errors="replace"
+        )
+        return folder
+
+    case(f"{kind} in a name", "colmap", make)
+
+    def make(folder, word=word):
+        path = SEEDS["bvh"](folder)
+        text = path.read_text()
+        path.write_text(text.replace("CHANNELS", word, 1), errors="replace")
+        return path
+
+    case(f"{kind} in a word", "bvh", make)
+    frames = [{"file_path": word, "transform_matrix": [1]}]
+    json_case(f"{kind} in a path", "transforms", "transforms.json", readers.transforms(frames=frames))
+    json_case(f"{kind} in a name", "coco", "a.json", [{"file_name": word, "keypoints": [1]}])
+    json_case(f"{kind} in a key", "joints json", "a.json", {word: [0, 0]})
+    json_case(f"{kind} in a field", "configuration", "config.json", {word: 1})
+    json_case(f"{kind} in a kind", "settings", "settings.json", {"kind": KIND, "settings": {"splat": word}})
+
+
+# Words for numbers ----------------------------------------------------------------------------------------------------
+
+for kind, bad in {"numbers in words": "0.5", "numbers in words beside none": None, "truth": True}.items():
+    mixed = lambda count, bad=bad: ["0.5" if bad is None else bad, None, *[1.5] * (count - 2)]
+    json_case(kind, "openpose", "000_keypoints.json", {"people": [{"pose_keypoints_2d": mixed(75)}]})
+    json_case(kind, "coco", "a.json", [{"file_name": "000.png", "keypoints": mixed(51)}])
+    json_case(kind, "mmpose", "a.json", [{"keypoints": [[1, 2]] * 17, "keypoint_scores": mixed(17)}])
+for bad in ("640", True, 1e300, -5):
+    image = {"id": 1, "file_name": "000.png", "width": bad, "height": 480}
+    json_case(f"a width of {bad!r}", "coco annotations", "a.json", {"images": [image], "annotations": []})

@@ -21,6 +21,7 @@ from safetensors.numpy import save_file
 from scipy.io import savemat
 from torch_writer import tensors, write_checkpoint, write_stream
 
+from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import load_body, save_body
@@ -162,6 +163,7 @@ READERS = {
     "avatar": Avatar.load,
     "weights": load_weights,
     "configuration": read_config,
+    "settings": load_settings,
     "capture": read_capture,
     "photos": load_photos,
     "outline": lambda path: read_outline(path, tiny_body()),
@@ -562,6 +564,7 @@ SEEDS = {
     "avatar": npz("me.npz", avatar_file),
     "weights": saved("w.safetensors", write_weights),
     "configuration": text("config.json", lambda: config_to_json(tiny(), indent=1)),
+    "settings": saved("settings.json", lambda path: save_settings(path, PRESETS["best"])),
     "capture": write_capture,
     "photos": write_capture,
     "outline": write_capture,

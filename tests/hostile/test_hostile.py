@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from humangs_jax.core.printable import printable
+
 HERE = Path(__file__).parent
 WORKER_SECONDS = 1800
 LONGEST_LINE = 1500
@@ -78,8 +80,8 @@ def fault(case, result: dict) -> str:
     if outcome == "refused":
         path = Path(result["path"])
         folder = path if path.is_dir() else path.parent
-        if "\n" in message or len(message) > LONGEST_LINE:
-            return f"{case.name}: not one line: {message!r}"
+        if message != printable(message) or len(message) > LONGEST_LINE:
+            return f"{case.name}: not one line, or with characters that a terminal acts on: {message!r}"
         if str(folder) not in message:
             return f"{case.name}: no file is named: {message}"
     return ""

@@ -327,3 +327,12 @@ def test_killed_at_any_moment_the_folder_is_whole_and_the_next_write_cleans_up(t
         with pytest.raises(OSError, match="disk full"):
             atomic.replace_folder(target, lambda temporary: (_ for _ in ()).throw(OSError("disk full")), mark=MARK)
         assert names(tmp_path) == ["folder"] and names(target) == ["a.txt", "b.txt"]
+
+
+def test_names_that_are_no_utf8_stay_what_they_are_in_text(tmp_path):
+    name = os.fsdecode(b"caf\xe9.png")
+    atomic.write_text(tmp_path / os.fsdecode(b"caf\xe9.mtl"), f"map_Kd {name}\n")
+    (file,) = tmp_path.iterdir()
+    assert os.fsencode(file.name) == b"caf\xe9.mtl" and file.read_bytes() == b"map_Kd caf\xe9.png\n"
+    atomic.write_text(tmp_path / "half.txt", "half \ud800, caf\u00e9")
+    assert (tmp_path / "half.txt").read_bytes().decode() == "half \\ud800, caf\u00e9"

@@ -132,7 +132,7 @@ def test_attention_needs_a_token_a_patch_and_whole_heads():
     for reader in (CrossAttentionReader, TwoStreamReader):
         with pytest.raises(ValueError, match="width 10 is not a multiple of head_width 8"):
             reader(width=10, head_width=8)
-    with pytest.raises(ValueError, match="0 layers: expected 1 to"):
+    with pytest.raises(ValueError, match="blocks 0: expected 1 to"):
         TwoStreamReader(blocks=0)
 
 

@@ -276,7 +276,7 @@ def test_parts_that_do_not_fit_are_refused():
         lambda: PoseMapDriver(widths=()),
         lambda: CorrectionMLP(layers=10**6),
     ):
-        with pytest.raises(ValueError, match=r"(surface_map.size|driver.widths|driver.layers).*expected 1 to"):
+        with pytest.raises(ValueError, match=r"(SurfaceMap.size|driver.widths|CorrectionMLP.layers).*expected 1 to"):
             wrong()
     many = small("lca").with_parts(driver=CorrectionMLP(8, 1, joints=5))
     with pytest.raises(ValueError, match=r"driver\.joints 5: the pose has 2 joints"):

@@ -112,5 +112,5 @@ def test_a_run_that_grows_returns_more_gaussians_and_a_better_image(person):
 
 
 def test_growth_out_of_range_is_an_error():
-    with pytest.raises(ValueError, match="growth must be between 1 and 16"):
+    with pytest.raises(ValueError, match=r"growth 0\.5: expected 1 to 16"):
         dataclasses.replace(STEPS, growth=0.5)

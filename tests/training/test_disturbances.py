@@ -116,5 +116,5 @@ def test_a_share_of_the_examples_is_disturbed_and_targets_keep_photos_and_camera
 
 
 def test_a_share_above_one_is_refused():
-    with pytest.raises(ValueError, match=r"disturbances.share 1.5"):
+    with pytest.raises(ValueError, match=r"Disturbances.share 1.5"):
         Disturbances(share=1.5)

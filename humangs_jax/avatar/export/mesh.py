@@ -15,6 +15,7 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.body.model import BodyPose
 from humangs_jax.body.skinning import blend_transforms, joint_transforms
 from humangs_jax.core.array_types import Float, Int, UInt8
+from humangs_jax.core.checks import BOUNDED, check_values
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.rendering.mesh.atlas import fill_gaps, texels, unwrap
 from humangs_jax.rendering.mesh.position_map import vertex_normals
@@ -59,11 +60,14 @@ class BodyMesh:
 def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
     """The body of an avatar in T-pose, with the colours of its Gaussians as a texture.
 
-    Raises: ValueError for an avatar without faces or Gaussians, or a size that is no multiple of 128.
+    Raises: ValueError for an avatar without faces or Gaussians, or with numbers that files cannot hold, or a size that is no
+    multiple of 128.
     """
     vertices, faces = np.asarray(avatar.rest_vertices, np.float32), np.asarray(avatar.faces, np.int32)
     if len(faces) == 0 or len(avatar.gaussians.means) == 0:
         raise ValueError("a body mesh needs an avatar with faces and Gaussians")
+    own = {name: (getattr(avatar, name), BOUNDED) for name in ("rest_vertices", "rest_joints", "skinning_weights")}
+    check_values("export", own | {"gaussians.colors": (avatar.gaussians.colors, BOUNDED)})
     normals = np.asarray(vertex_normals(avatar.rest_vertices, avatar.faces))
     ones = np.ones(len(faces), np.float32)
     atlas = unwrap(vertices, faces, np.zeros(len(faces), np.int64), texture_size, ones)

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.core.checks import BOUNDED, check_values
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
-from humangs_jax.rendering.gaussians import Gaussians, factored
+from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values
 
 Up = Literal["y", "-y", "z"]
 """The axis that points up in a file."""
@@ -85,7 +86,15 @@ def plain_arrays(
     Float[np.ndarray, " g"],
     Float[np.ndarray, "g 3"],
 ]:
-    """Means, unit quaternions (wxyz), scales, opacities and colours in float64, without deformations."""
+    """Means, unit quaternions (wxyz), scales, opacities and colours in float64, without deformations.
+
+    Raises: ValueError for numbers that files cannot hold: not finite, or of more than `checks.LARGEST`.
+    """
+    bounded = {
+        f"gaussians.{name}": (getattr(gaussians, name), BOUNDED) for name in ("means", "quats", "scales", "colors")
+    }
+    check_values("export", gaussian_values(gaussians))
+    check_values("export", bounded)
     if gaussians.deformations is not None:
         gaussians = factored(gaussians)
     means, quats, scales, opacities, colors = (

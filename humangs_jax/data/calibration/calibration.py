@@ -49,6 +49,7 @@ class CalibratedCamera:
 
     name: of the camera, or the image's path as the file has it. K: (3, 3) pixels. cam_from_world: (4, 4), OpenCV axes.
     width, height: pixels, None where the format does not say. distortion: (5,) k1 k2 p1 p2 k3 of OpenCV, or None.
+    frame: of the image, counted from 0, and mask: the path of its mask, where there is one camera for each image.
     """
 
     name: str
@@ -57,6 +58,8 @@ class CalibratedCamera:
     width: int | None = None
     height: int | None = None
     distortion: Float[np.ndarray, "5"] | None = None
+    frame: int = 0
+    mask: str | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -78,6 +81,8 @@ class Calibration:
     format: what it was read as. file: the one that errors name. cameras: at least one. per_image: one camera for each
     image, not one for each camera. pixel_centers, up: what the format means by default.
     observations: None where the format has none. convention: what the matrices in the file mean, of `CONVENTIONS`.
+    stations: how many cameras took the images, where the format says; None: one for each of `cameras`. mask_key: where the file
+    names masks, None if it does not.
     """
 
     format: str
@@ -88,6 +93,8 @@ class Calibration:
     up: str
     observations: Observations | None = None
     convention: str = CAM_FROM_WORLD
+    stations: int | None = None
+    mask_key: str | None = None
 
 
 def in_capture_convention(calibration: Calibration, scale: float, up: str, pixel_centers: str) -> Calibration:

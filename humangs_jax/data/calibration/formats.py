@@ -2,8 +2,9 @@
 
 transforms.json of NeRF, instant-ngp and nerfstudio: camera-to-world matrices with OpenGL axes.
 Intrinsics are the file's or, where a frame has its own, that frame's: fl_x fl_y cx cy w h, or camera_angle_x (the field of
-view in radians) about a centred axis. Pixel centres are at +0.5, z is up, lengths are arbitrary. `aabb_scale`, `scale`,
-`offset`, `applied_transform` and the like serve other programs and are ignored.
+view in radians) about a centred axis. Pixel centres are at +0.5, z is up, lengths are arbitrary. Of videos it says the moment and
+the camera of each image (`calibration.moments`), and it may name masks. `aabb_scale`, `scale`, `offset`, `applied_transform` and
+the like serve other programs and are ignored.
 
 K, R and T of each camera: OpenCV calibrations (FileStorage or JSON), EasyMocap's pair, AvatarReX and THuman4.0.
 A world point X is at R X + T in the camera, pixel centres are at whole numbers (OpenCV). The values of a camera stand
@@ -14,6 +15,7 @@ A world point X is at R X + T in the camera, pixel centres are at whole numbers 
   (https://chingswy.github.io/easymocap-public-doc/database/1_camera.html).
 """
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -34,6 +36,7 @@ from humangs_jax.data.calibration.calibration import (
 )
 from humangs_jax.data.calibration.colmap import read_colmap
 from humangs_jax.data.calibration.file_storage import parse_file_storage
+from humangs_jax.data.calibration.moments import find_moments
 from humangs_jax.data.capture_checks import CaptureError, checked_json, checked_text, floats, required
 from humangs_jax.io.reading import reading
 
@@ -94,6 +97,8 @@ def _read_file(file, photo_size):
 # transforms.json ------------------------------------------------------------------------------------------------------
 
 CAMERA_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE")
+MASK_KEYS = ("fg_mask_path", "mask_path")
+"""Of VHAP and of nerfstudio."""
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 
 
@@ -111,10 +116,28 @@ def _read_transforms(
         raise CaptureError(file, "frames", "expected a list of JSON objects")
     if not frames:
         raise CaptureError(file, "frames", "expected at least one")
+    moments, stations = find_moments(frames, file)
+    mask_key = next((key for key in MASK_KEYS if any(key in frame for frame in frames)), None)
     cameras = tuple(
-        _frame_camera({**values, **frame}, file, f"frames[{i}].", photo_size) for i, frame in enumerate(frames)
+        dataclasses.replace(
+            _frame_camera({**values, **frame}, file, f"frames[{i}].", photo_size),
+            frame=moments[i],
+            mask=_mask_path(frame, mask_key, file, i),
+        )
+        for i, frame in enumerate(frames)
     )
-    return Calibration("transforms.json", file, cameras, True, "half", "+z", convention=WORLD_FROM_CAM_OPENGL)
+    axes = WORLD_FROM_CAM_OPENGL
+    kind = Calibration("transforms.json", file, cameras, True, "half", "+z", convention=axes)
+    return dataclasses.replace(kind, stations=stations, mask_key=mask_key)
+
+
+def _mask_path(frame, key, file, i):
+    path = frame.get(key)
+    if key is None or path is None:
+        return None
+    if not isinstance(path, str) or not path:
+        raise CaptureError(file, f"frames[{i}].{key}", f"expected the path of a mask, got {path!r}")
+    return path
 
 
 def _frame_camera(values, file, prefix, photo_size):
@@ -126,6 +149,8 @@ def _frame_camera(values, file, prefix, photo_size):
     if "w" in values or "h" in values:
         size = [required(values, key, file, prefix) for key in ("w", "h")]
         width, height = image_size(size, file, f"{prefix}w, h")
+    elif {"fl_x", "cx", "cy"} <= values.keys():
+        width, height = None, None
     else:
         width, height = photo_size(name)
     K = _intrinsics(values, width, height, file, prefix)
@@ -162,7 +187,7 @@ def _intrinsics(values, width, height, file, prefix):
     for axis, side in (("x", width), ("y", height)):
         if f"fl_{axis}" in values:
             focal[axis] = _number(values, f"fl_{axis}", file, prefix)
-        elif f"camera_angle_{axis}" in values:
+        elif f"camera_angle_{axis}" in values and side is not None:
             focal[axis] = 0.5 * side / np.tan(0.5 * _number(values, f"camera_angle_{axis}", file, prefix))
     if not focal:
         raise CaptureError(file, f"{prefix}fl_x", "missing: expected fl_x or camera_angle_x")

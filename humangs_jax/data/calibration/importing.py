@@ -7,6 +7,7 @@ asks for it; capture.json names body.npz, which `humangs fit` makes.
 import dataclasses
 import os
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -14,7 +15,6 @@ import numpy as np
 
 from humangs_jax.data.calibration.calibration import (
     ROTATION_TO_Y_UP,
-    CalibratedCamera,
     Calibration,
     PixelCenters,
     in_capture_convention,
@@ -22,6 +22,8 @@ from humangs_jax.data.calibration.calibration import (
 )
 from humangs_jax.data.calibration.checks import Checks, check_calibration
 from humangs_jax.data.calibration.formats import read_calibration
+from humangs_jax.data.calibration.mask_checks import check_masks, has_alpha
+from humangs_jax.data.calibration.orientation import Turn, find_turns, turn_notes, turned_cameras
 from humangs_jax.data.calibration.photos import Photo, find_photo, find_photos, photo_size
 from humangs_jax.data.calibration.videos import photos_of_videos
 from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera
@@ -29,12 +31,16 @@ from humangs_jax.data.photos import names_from_paths, read_checked, write_descri
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import read_grey, read_image, write_png
 
+NO_COMMON_MOMENT = "no two photos show the same moment: each is a frame with a pose of its own"
 NO_COMMON_FRAME = "no two cameras have a photo of the same frame: photos of one frame must have the same file name"
 
 
 @dataclasses.dataclass(frozen=True)
 class ImportReport:
-    """What was imported and how it was read; `str(report)` is what the command line prints."""
+    """What was imported and how it was read; `str(report)` is what the command line prints.
+
+    notes: further lines about it. masks: whether it has mask files. turned: photos that were turned upright, see `orientation`.
+    """
 
     out: Path
     format: str
@@ -50,6 +56,9 @@ class ImportReport:
     convention: str
     undistorted: int
     checks: Checks
+    notes: tuple[str, ...] = ()
+    masks: bool = False
+    turned: int = 0
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -72,7 +81,7 @@ class ImportReport:
             lines.append(f"mean reprojection error: {error:.3g} px ({points})")
         if self.checks.distance is not None:
             lines.append(f"the cameras stand {self.checks.distance:.3g} m from where they look")
-        return "\n".join(lines + [f"warning: {warning}" for warning in self.warnings])
+        return "\n".join([*lines, *self.notes, *(f"warning: {warning}" for warning in self.warnings)])
 
 
 def import_cameras(
@@ -118,22 +127,27 @@ def _import(source, images, masks, out, scale, up, pixel_centers):
     calibration = read_calibration(source, lambda name: _size_by_name(images, name, source))
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
     photos = find_photos(calibration, images, masks)
-    calibration = _with_photo_sizes(calibration, photos)
-    converted = in_capture_convention(calibration, scale, up, pixel_centers)
+    turns = find_turns(calibration, photos)
+    _check_one_size(photos, turns)
+    about_masks = check_masks(photos)
+    converted = turned_cameras(in_capture_convention(calibration, scale, up, pixel_centers), photos, turns)
     for camera in converted.cameras:
         checked_camera(camera.K, camera.cam_from_world, *_size(camera), calibration.file, camera.name)
     checks = check_calibration(calibration, converted, up)
-    frames = 1 + max(photo.frame for photo in photos)
-    if len(converted.cameras) > 1 and frames == len(photos) > 1:
-        checks = dataclasses.replace(checks, warnings=(*checks.warnings, NO_COMMON_FRAME))
+    frames, cameras = 1 + max(photo.frame for photo in photos), calibration.stations or len(converted.cameras)
+    notes, about_turns = turn_notes(photos, turns)
+    more = [*about_turns, *about_masks, *_unused_masks(calibration, photos, masks)]
+    if cameras > 1 and frames == len(photos) > 1:
+        more.append(NO_COMMON_MOMENT if calibration.per_image else NO_COMMON_FRAME)
+    checks = dataclasses.replace(checks, warnings=(*checks.warnings, *more))
     names = names_from_paths([photo.key + ".png" for photo in photos])
     check_names(names, len(photos), images)
-    replace_folder(out, lambda folder: _write(folder, converted, photos, names), mark="capture.json")
+    replace_folder(out, lambda folder: _write(folder, converted, photos, turns, names), mark="capture.json")
     return ImportReport(
         out=out,
         format=calibration.format,
         source=calibration.file,
-        cameras=len(converted.cameras),
+        cameras=cameras,
         frames=frames,
         views=len(photos),
         width=_size(converted.cameras[0])[0],
@@ -144,7 +158,27 @@ def _import(source, images, masks, out, scale, up, pixel_centers):
         convention=calibration.convention,
         undistorted=sum(converted.cameras[photo.camera].distortion is not None for photo in photos),
         checks=checks,
+        notes=(*notes, *_named_masks(calibration, photos, masks)),
+        masks=photos[0].mask is not None,
+        turned=sum(turn.rewrites for turn in turns),
     )
+
+
+def _named_masks(calibration, photos, masks):
+    if masks is not None or photos[0].mask is None:
+        return ()
+    return (f"masks: those that {calibration.file.name} names ({calibration.mask_key})",)
+
+
+def _unused_masks(calibration, photos, masks):
+    """A warning about masks that the calibration names and the capture does not get."""
+    if calibration.mask_key is None or (masks is None and photos[0].mask is not None):
+        return ()
+    named = f"{calibration.mask_key} of {calibration.file.name}"
+    if masks is not None:
+        return (f"{named}: not used, the masks are those in {masks}",)
+    first = next(camera.mask for camera in calibration.cameras if camera.mask)
+    return (f"{named}: no such mask, {first}: imported without masks",)
 
 
 def _check_options(scale, up, pixel_centers):
@@ -181,41 +215,32 @@ def _size(camera):
     return camera.width, camera.height
 
 
-def _with_photo_sizes(calibration: Calibration, photos: tuple[Photo, ...]) -> Calibration:
-    """The calibration with all sizes known. Raises: CaptureError unless photos and masks have its size, and one size."""
-    cameras: list[CalibratedCamera] = list(calibration.cameras)
-    first = photo_size(photos[0].image)
-    for photo in photos:
-        camera, size = cameras[photo.camera], photo_size(photo.image)
-        if camera.width is not None and size != (camera.width, camera.height):
-            _refuse_size(photo.image, size, f"was calibrated with {camera.width} x {camera.height}: expected the same")
-        if size != first:
-            _refuse_size(
-                photo.image, size, f"but {photos[0].image.name} has {first[0]} x {first[1]}: expected one size"
-            )
-        if photo.mask is not None and (mask := photo_size(photo.mask)) != size:
-            _refuse_size(photo.mask, mask, f"but its photo has {size[0]} x {size[1]}: expected the same")
-        cameras[photo.camera] = dataclasses.replace(camera, width=size[0], height=size[1])
-    return dataclasses.replace(calibration, cameras=tuple(cameras))
-
-
-def _refuse_size(file, size, problem):
-    raise CaptureError(file, "size", f"{size[0]} x {size[1]}, {problem}")
+def _check_one_size(photos, turns):
+    """Raises: CaptureError unless all photos have one size when they are upright."""
+    for photo, turn in zip(photos, turns, strict=True):
+        if turn.size != turns[0].size:
+            own, first = (" x ".join(map(str, size)) for size in (turn.size, turns[0].size))
+            raise CaptureError(photo.image, "size", f"{own}, but {photos[0].image.name} has {first}: expected one size")
 
 
 # Writing -------------------------------------------------------------------------------------------------------------
 
 
-def _write(folder: Path, calibration: Calibration, photos: tuple[Photo, ...], names: tuple[str, ...]) -> None:
+def _write(
+    folder: Path, calibration: Calibration, photos: Sequence[Photo], turns: Sequence[Turn], names: Sequence[str]
+) -> None:
     (folder / "images").mkdir(parents=True)
     if photos[0].mask is not None:
         (folder / "masks").mkdir()
-    as_they_are = all(camera.distortion is None for camera in calibration.cameras)
-    transparent = not as_they_are and any(_is_transparent(photo.image) for photo in photos)
+    straight = all(camera.distortion is None for camera in calibration.cameras)
+    changed = not straight or any(turn.rewrites for turn in turns)
+    transparent = changed and any(_is_transparent(photo.image) for photo in photos)
+    straight = straight and not transparent
     views = []
-    for photo, name in zip(photos, names, strict=True):
+    for photo, turn, name in zip(photos, turns, names, strict=True):
         camera = calibration.cameras[photo.camera]
-        files = _copy(folder, photo, name) if as_they_are else _undistort(folder, photo, name, camera, transparent)
+        as_it_is = not changed or (straight and not turn.rewrites and not read_checked(has_alpha, photo.image))
+        files = _copy(folder, photo, name) if as_it_is else _rewrite(folder, photo, turn, name, camera, transparent)
         matrices = {"K": camera.K.tolist(), "cam_from_world": camera.cam_from_world.tolist()}
         views.append({**files, "frame": photo.frame, **matrices})
     write_description(folder, views)
@@ -237,14 +262,14 @@ def _is_transparent(photo):
     return alpha is not None and alpha.min() < 1
 
 
-def _undistort(folder, photo, name, camera, transparent):
-    """Photo and mask (or its alpha) as a pinhole sees them; pixels that it does not see are white and background.
+def _rewrite(folder, photo, turn, name, camera, transparent):
+    """Photo and mask (or its alpha) upright, and as a pinhole sees them; pixels that it does not see are white and background.
 
     A photo that has alpha besides its mask keeps it. Opaque alpha, where no photo is `transparent`, is left out.
     """
     image, alpha = read_checked(read_image, photo.image)
-    alpha = alpha if transparent else None
-    mask = alpha if photo.mask is None else read_checked(read_grey, photo.mask)
+    image, alpha = turn.image(image), turn.image(alpha) if transparent and alpha is not None else None
+    mask = alpha if photo.mask is None else turn.of_mask(read_checked(read_grey, photo.mask))
     if camera.distortion is not None:
         image = undistort(image, camera.K, camera.distortion, fill=1.0)
         mask, alpha = (x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0) for x in (mask, alpha))

@@ -33,18 +33,42 @@ class Photo:
 def find_photos(calibration: Calibration, images: Path, masks: Path | None) -> tuple[Photo, ...]:
     """The photos of a calibration, frame after frame.
 
-    Raises: CaptureError if an image of the calibration, or all of a camera, or a mask, is not there.
+    masks: a folder; None: where the calibration names masks that are there, these.
+    Raises: CaptureError if an image of the calibration, or all of a camera, or a mask, is not there, or some of the named ones.
     """
     if calibration.per_image:
         names = [camera.name for camera in calibration.cameras]
-        found = _of_images(images, names, calibration.file)
+        found = [(i, calibration.cameras[i].frame, photo) for i, photo in _of_images(images, names, calibration.file)]
+        found.sort(key=lambda entry: (entry[1], entry[0]))
     else:
         found = _of_cameras(calibration, images)
+    named = {} if masks is not None or calibration.mask_key is None else _named_masks(calibration, images)
     photos = []
     for camera, frame, image in found:
         key = image.relative_to(images).with_suffix("").as_posix()
-        photos.append(Photo(image, None if masks is None else _mask(masks, images, image), camera, frame, key))
+        mask = named.get(camera) if masks is None else _mask(masks, images, image)
+        photos.append(Photo(image, mask, camera, frame, key))
     return tuple(photos)
+
+
+def _named_masks(calibration, images):
+    """The masks that a calibration names, by camera: in its folder, in that of the photos or in the one around. All or none."""
+    found, missing = {}, None
+    for i, camera in enumerate(calibration.cameras):
+        path = None
+        for folder in (calibration.file.parent, images, images.parent) if camera.mask else ():
+            path = _any_suffix(folder / camera.mask.replace("\\", "/"))
+            if path is not None:
+                _check_inside(folder, path.absolute())
+                found[i] = path
+                break
+        if path is None and missing is None:
+            missing = camera
+    if found and missing is not None:
+        what = f"{missing.mask}: no such mask" if missing.mask else "missing"
+        problem = f"{what}, but other images have one: expected all or none, or --masks DIR"
+        raise CaptureError(calibration.file, f"{missing.name}: {calibration.mask_key}", problem)
+    return found
 
 
 def find_photo(folder: Path, name: str) -> Path | None:
@@ -80,7 +104,7 @@ def photo_size(path: Path) -> tuple[int, int]:
 
 
 def _of_images(images, names, file):
-    """(camera, frame 0, photo) where each image has a camera of its own."""
+    """(camera, photo) where each image has a camera of its own."""
     photos: dict[Path, str] = {}
     for name in names:
         photo = find_photo(images, name)
@@ -89,7 +113,7 @@ def _of_images(images, names, file):
         if photo in photos:
             raise CaptureError(file, name, f"{photo} is the photo of {photos[photo]} already: expected one for each")
         photos[photo] = name
-    return [(i, 0, photo) for i, photo in enumerate(photos)]
+    return list(enumerate(photos))
 
 
 def _mask(masks, images, image):

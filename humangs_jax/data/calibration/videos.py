@@ -15,6 +15,8 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.io.reading import limits, open_file, reading
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi")
+CONTAINERS = "mov,matroska,avi,mpegts"
+"""Formats that ffmpeg reads, whatever the name says: others are lists of files (ffconcat, playlists)."""
 LONGEST_SECONDS = 3600
 """After which ffmpeg is stopped."""
 
@@ -73,11 +75,13 @@ def split_video(path: Path, folder: Path, every: int = 1, most: int | None = Non
         folder.mkdir(parents=True)
         command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-xerror"]
         # a playlist in disguise may name other files and hosts; pictures may be larger than what is read later
-        command += ["-protocol_whitelist", "file", "-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
+        command += ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS]
+        command += ["-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
         command += ["-map", "0:v:0", "-vf", f"select=not(mod(n\\,{every}))", "-fps_mode", "passthrough"]
         command += [] if most is None else ["-frames:v", str(most)]
-        command += ["-start_number", "0", str(folder / "%08d.png")]
-        done = subprocess.run(command, capture_output=True, timeout=LONGEST_SECONDS, check=False)
+        command += ["-start_number", "0", "%08d.png"]
+        # in the folder: its path may hold a % of its own
+        done = subprocess.run(command, cwd=folder, capture_output=True, timeout=LONGEST_SECONDS, check=False)
         count = sum(1 for _ in folder.iterdir())
         if done.returncode or not count:
             said = " ".join(done.stderr.decode(errors="replace").split()) or "no frame"

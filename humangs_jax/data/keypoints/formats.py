@@ -29,7 +29,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, checked_json
 from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, OPENPOSE_67, KeypointSet
 from humangs_jax.io.npz import read_npz
-from humangs_jax.io.reading import reading
+from humangs_jax.io.reading import limits, reading
 
 UNDERSTOOD = (
     "OpenPose's people, MMPose's instances, COCO's results (AlphaPose's too), COCO's images and annotations, or our npz"
@@ -135,7 +135,10 @@ def _floats(value: Any, file: Path, field: str) -> Float[np.ndarray, "..."]:
     """Numbers in float64; null is NaN."""
     try:
         array = np.asarray(value)
-        if array.dtype.kind not in "fiuO":
+        numbers = array.dtype.kind in "fiu" or (
+            array.dtype.kind == "O" and all(x is None or type(x) in (int, float) for x in array.flat)
+        )
+        if not numbers:  # numpy would read numbers in words, too
             raise TypeError
         return array.astype(np.float64)
     except (ValueError, TypeError, OverflowError):
@@ -211,7 +214,10 @@ def _annotated_images(content: dict[str, Any], file: Path) -> list[DetectedImage
         images[image][1].append(_by_visibility(_coco_person(entry, file, field, whole), file, field))
     return [
         DetectedImage(
-            _image_label(image.get("file_name", key), file, f"image {key}"), file, tuple(people), _stated_size(image)
+            _image_label(image.get("file_name", key), file, f"image {key}"),
+            file,
+            tuple(people),
+            _stated_size(image, file),
         )
         for key, (image, people) in images.items()
     ]
@@ -250,10 +256,14 @@ def _by_visibility(person: Float[np.ndarray, "k 3"], file: Path, field: str) -> 
     return np.concatenate([person[:, :2], np.where(np.isnan(visibility), np.nan, confidence)[:, None]], axis=1)
 
 
-def _stated_size(image: dict[str, Any]) -> tuple[int, int] | None:
+def _stated_size(image: dict[str, Any], file: Path) -> tuple[int, int] | None:
     """Width and height that the file states; 0 means unknown."""
-    width, height = image.get("width"), image.get("height")
-    return (int(width), int(height)) if width and height else None
+    width, height = size = image.get("width"), image.get("height")
+    if not width or not height:
+        return None
+    if not all(isinstance(side, int | float) and 1 <= side <= limits().side for side in size):
+        raise CaptureError(file, "images", f"expected width and height in pixels, got {width!r} and {height!r}")
+    return int(width), int(height)
 
 
 # OpenPose -------------------------------------------------------------------------------------------------------------

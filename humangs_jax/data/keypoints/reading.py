@@ -27,6 +27,8 @@ ghosts. Hands, face and feet do not count: detectors leave them out where they a
 TRUNK_AND_LIMBS = frozenset(COCO_17.names)
 FAR_OUTSIDE = 0.5
 """Detectors extrapolate a little beyond the image. Points further out than this share of its size mean nothing."""
+LARGEST_PIXEL = 1e6
+"""Coordinates beyond it mean nothing, and are not to become inf in float32."""
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 
 
@@ -192,7 +194,7 @@ def _usable(
     if known.size and (known.min() < SMALLEST_CONFIDENCE or known.max() > LARGEST_CONFIDENCE):
         got = f"{known.min():.4g} to {known.max():.4g}"
         raise CaptureError(image.file, field, f"expected confidences in [0, 1], got {got}")
-    points = np.where(finite[:, None], values[:, :2], 0.0) + offset
+    points = np.where(finite[:, None], np.clip(values[:, :2], -LARGEST_PIXEL, LARGEST_PIXEL), 0.0) + offset
     confidences = np.where(finite, np.clip(confidences, 0.0, 1.0), 0.0)
     far = (np.abs(points / (width, height) - 0.5) > 0.5 + FAR_OUTSIDE).any(axis=1) & (confidences > 0)
     return Person(

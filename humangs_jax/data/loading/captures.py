@@ -16,6 +16,7 @@ from humangs_jax.data.capture_checks import CaptureError, body_parameters, check
 from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_views, shrink, subject_views
 from humangs_jax.data.loading.order import subject_order, view_generator
 from humangs_jax.data.photos import read_checked, read_description, read_frames_and_matrices
+from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.io.images import check_image, to_uint8
 
 logger = logging.getLogger("humangs_jax.data.loader")
@@ -94,6 +95,13 @@ def _same_body(name, folder, body_file):
 def _check_image(file):
     """((width, height), whether there is an alpha channel)."""
     return read_checked(check_image, file)
+
+
+def _check_inputs(seen, inputs):
+    """Whether the masks of the first views, the inputs, show somebody: a white photo would be read as the person."""
+    empty = [view for view, mask in zip(inputs, seen.masks, strict=False) if not (mask > MASK_THRESHOLD * 255).any()]
+    if empty:
+        raise CaptureError(f"views[{empty[0]}]", "mask", "empty: no photo to reconstruct the person from")
 
 
 @runtime_checkable
@@ -296,6 +304,7 @@ class CaptureSource:
                 continue
             try:
                 seen = self.cache.some_views(subject_index, [*inputs, *targets])
+                _check_inputs(seen, inputs)
             except (ValueError, OSError) as error:
                 # this example goes to the next subject; others, of other views, do not: the order depends on files alone
                 self.cache.note(subject_index, str(error))

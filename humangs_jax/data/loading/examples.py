@@ -1,12 +1,12 @@
 """Examples to learn from: some views of a subject are the input, others the targets. Everything here is numpy."""
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float, Int, UInt8
+from humangs_jax.core.configuration import Few, Share, Spread, configuration
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
@@ -16,7 +16,7 @@ WINDOW = (25, 59)
 WINDOW_OF = 60
 
 
-@dataclasses.dataclass(frozen=True)
+@configuration
 class ViewSampling:
     """Which views of a subject are input and which are targets.
 
@@ -30,11 +30,11 @@ class ViewSampling:
     mixed_pose_share: share of examples whose inputs may each show another pose (frame).
     """
 
-    input_counts: tuple[int, ...] = (4,)
-    target_count: int = 3
-    jitter: float = 0.7
-    scattered_share: float = 0.2
-    mixed_pose_share: float = 0.3
+    input_counts: tuple[Few, ...] = (4,)
+    target_count: Few = 3
+    jitter: Spread = 0.7
+    scattered_share: Share = 0.2
+    mixed_pose_share: Share = 0.3
     rule: Literal["random", "window"] = "random"
 
 

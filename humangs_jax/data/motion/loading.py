@@ -9,6 +9,7 @@ import numpy as np
 from humangs_jax.body.smplx import HandBasis
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float
+from humangs_jax.data.capture_checks import LARGEST_DISTANCE, LARGEST_TURN
 from humangs_jax.data.motion import arrays, skeleton, world
 from humangs_jax.data.motion.bvh import read_bvh
 from humangs_jax.data.motion.gltf import read_animation
@@ -16,8 +17,6 @@ from humangs_jax.data.motion.motion import Motion, MotionError
 from humangs_jax.io.reading import reading
 
 WALK = "walk.npz"
-LARGEST_DISTANCE = 1e4
-"""Metres from the origin: farther, float32 loses millimetres, and the numbers are no metres."""
 _SKELETONS = {".bvh": read_bvh, ".glb": read_animation}
 
 
@@ -81,6 +80,8 @@ def _load(path, up, fps, hands, flat_hand_mean, rest_joints):
         raise MotionError(path, "rotations", f"expected {len(rest_joints)} joints, got {rotations.shape[1]}")
     if not np.isfinite(rotations).all():
         raise MotionError(path, "", "expected a skeleton of finite size")
+    if (largest := np.abs(rotations).max()) > LARGEST_TURN:
+        raise MotionError(path, "rotations", f"expected radians, at most {LARGEST_TURN:g}, got {largest:.4g}")
     if not (farthest := np.abs(translations).max()) <= LARGEST_DISTANCE:
         raise MotionError(path, "", f"expected metres, at most {LARGEST_DISTANCE:g} from the origin, got {farthest:g}")
     rate = file_fps if fps is None else fps

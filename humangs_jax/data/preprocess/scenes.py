@@ -108,7 +108,7 @@ def scan_content(name: str, thuman: ThumanSet, body: FileBody, settings: Setting
     transform = scan_alignment(scan.vertices, fitted.joints[PELVIS], fitted.joints[NECK])
     vertices = moved(transform, scan.vertices)
     radius = bounding_radius(vertices)
-    number = int(name) if name.isdecimal() else zlib.crc32(name.encode())
+    number = int(name) if name.isdecimal() else zlib.crc32(os.fsencode(name))
     cameras = scan_cameras(number, radius, settings.views, settings.factors)
     renderer, K = ScanRenderer.of(scan, vertices), intrinsics(settings.size)
 

@@ -18,8 +18,8 @@ however the compiler contracts it, and close to a vertex the differences are exa
 Derivatives: fragments are constants (`stop_gradient`); `interpolate_attributes` is differentiable with respect to the attributes.
 """
 
-import dataclasses
 import functools
+from typing import Annotated
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ from jax import lax
 
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int
+from humangs_jax.core.configuration import Range, Spread, configuration
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.tiling import SUM_LIMIT, cumsum, owners
@@ -40,7 +41,10 @@ AREA_ROUNDING = 2
 NO_FACE = jnp.iinfo(jnp.int32).max
 
 
-@dataclasses.dataclass(frozen=True)
+Slice = Annotated[int, Range(64, 1 << 24)]
+
+
+@configuration
 class RasterConfig:
     """Settings of the rasterizer; the image depends on `near` alone.
 
@@ -49,9 +53,9 @@ class RasterConfig:
     time on empty slots, small ones on the overhead of more steps.
     """
 
-    near: float = 0.01
-    rows_per_step: int = 1 << 15
-    fragments_per_step: int = 1 << 16
+    near: Spread = 0.01
+    rows_per_step: Slice = 1 << 15
+    fragments_per_step: Slice = 1 << 16
 
 
 DEFAULT_CONFIG = RasterConfig()

@@ -1,0 +1,166 @@
+"""Every number of every configuration has a range, and every way to make one checks it."""
+
+import dataclasses
+import importlib
+import json
+import pkgutil
+import typing
+from typing import Annotated
+
+import numpy as np
+import pytest
+
+import humangs_jax.network
+from humangs_jax.apps import settings, tune
+from humangs_jax.core.configuration import Range, _ranges, config_from_json, config_to_json, configuration
+from humangs_jax.network.execution import Execution
+from humangs_jax.people.on_the_fly import OnTheFlyConfig
+from humangs_jax.training import config
+
+for module in pkgutil.iter_modules(humangs_jax.network.__path__):
+    importlib.import_module(f"humangs_jax.network.{module.name}")
+
+
+def parts():
+    """All parts that a weights file may name."""
+    for module in pkgutil.iter_modules(humangs_jax.network.__path__):
+        loaded = importlib.import_module(f"humangs_jax.network.{module.name}")
+        for value in vars(loaded).values():
+            part = isinstance(value, type) and dataclasses.is_dataclass(value) and hasattr(value, "init")
+            if part and value.__module__ == loaded.__name__ and not hasattr(value, "setup"):  # no module of Linen
+                yield value
+
+
+def reachable(cls, found):
+    if cls not in found:
+        found.add(cls)
+        waiting = list(typing.get_type_hints(cls).values())
+        while waiting:
+            annotation = waiting.pop()
+            if dataclasses.is_dataclass(annotation):
+                reachable(annotation, found)
+            waiting += typing.get_args(annotation)
+    return found
+
+
+ALL = set()
+for each in (settings.Settings, tune.FrontPoint, config.TrainConfig, settings.RefineConfig, OnTheFlyConfig, *parts()):
+    reachable(each, ALL)
+
+
+def is_number(annotation):
+    return annotation in (int, float) or any(is_number(part) for part in typing.get_args(annotation))
+
+
+@pytest.mark.parametrize("cls", sorted(ALL, key=lambda cls: cls.__name__), ids=lambda cls: cls.__name__)
+def test_every_number_has_a_range(cls):
+    numbers = {name for name, annotation in typing.get_type_hints(cls).items() if is_number(annotation)}
+    assert numbers == set(_ranges(cls))
+
+
+def test_the_list_is_not_empty():
+    assert len(ALL) > 30
+
+
+@configuration
+class Fit:
+    steps: Annotated[int, Range(1, 1000)] = 5
+    shares: tuple[Annotated[float, Range(0, 1)], ...] = (0.5,)
+    most: Annotated[int, Range(1, 9)] | None = None
+
+    def __post_init__(self):
+        if self.most == 7:
+            raise ValueError("seven")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"steps": 0}, "steps 0: expected 1 to 1,000"),
+        ({"steps": 10**6}, "steps 1000000: expected 1 to 1,000"),
+        ({"steps": np.int64(0)}, "steps 0: expected 1 to 1,000"),
+        ({"shares": (0.5, 1.5)}, "shares 1.5: expected 0 to 1"),
+        ({"shares": (float("nan"),)}, "shares nan: expected 0 to 1"),
+        ({"shares": (0.5,) * 1000}, "shares: expected at most 256"),
+        ({"most": -1}, "most -1: expected 1 to 9"),
+        ({"most": 7}, "seven"),
+    ],
+)
+def test_numbers_out_of_range_are_one_line(changes, said):
+    with pytest.raises(ValueError) as caught:
+        Fit(**changes)
+    assert str(caught.value) == said or str(caught.value).startswith(f"Fit.{said}")
+    with pytest.raises(ValueError) as caught:
+        dataclasses.replace(Fit(), **changes)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_names_the_path_of_the_field():
+    assert config_from_json(Fit, '{"steps": 9, "most": null}') == Fit(steps=9)
+    for text, said in (
+        ('{"steps": 0}', "config.steps 0: expected 1 to 1,000"),
+        ('{"shares": [2]}', "config.shares 2: expected 0 to 1"),
+        ('{"shares": ' + json.dumps([0] * 300) + "}", "config.shares: expected at most 256"),
+    ):
+        with pytest.raises(ValueError) as caught:
+            config_from_json(Fit, text)
+        assert str(caught.value).startswith(said)
+    nested = json.loads(config_to_json(settings.PRESETS["best"]))
+    nested["execution"]["attention_chunk"] = 0
+    with pytest.raises(ValueError, match=r"config\.execution\.attention_chunk 0: expected 1 to 65,536"):
+        config_from_json(settings.Settings, json.dumps(nested))
+
+
+def test_an_execution_is_checked_however_it_is_made():
+    for changes in ({"image_size": 10**6}, {"image_size": 0}, {"attention_chunk": 0}, {"token_capacity": -5}):
+        with pytest.raises(ValueError, match="Execution"):
+            Execution(**changes)
+
+
+HOSTILE = (
+    0,
+    -1,
+    1,
+    3,
+    10**6,
+    10**9,
+    2**63,
+    0.5,
+    -0.5,
+    1e-300,
+    1e300,
+    float("nan"),
+    float("inf"),
+    None,
+    True,
+    "x",
+    [],
+    {},
+)
+
+
+def leaves(value, path=()):
+    if isinstance(value, dict | list) and value:
+        for key, each in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from leaves(each, (*path, key))
+    else:
+        yield path
+
+
+@pytest.mark.parametrize("whole", [settings.PRESETS["best"], config.tiny()], ids=lambda x: type(x).__name__)
+def test_any_value_in_any_field_is_read_or_refused_in_one_line(whole):
+    text, refused = config_to_json(whole), 0
+    for path in leaves(json.loads(text)):
+        for value in HOSTILE:
+            content = json.loads(text)
+            *parents, last = path
+            place = content
+            for key in parents:
+                place = place[key]
+            place[last] = value
+            try:
+                config_from_json(type(whole), json.dumps(content))
+            except ValueError as error:
+                refused += 1
+                assert len(str(error).splitlines()) == 1
+    assert refused > 100

@@ -1,0 +1,112 @@
+"""Nothing that a file says acts on the terminal, and nothing but one module writes there."""
+
+import io
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import humangs_jax
+from humangs_jax.core import progress
+from humangs_jax.core.printable import printable
+from humangs_jax.io.reading import FileError
+
+PACKAGE = Path(humangs_jax.__file__).parent
+OWN = ("core/progress.py", "cli/interrupts.py")
+"""The door, and what is written while the process ends at once."""
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("\x1b]0;OWNED\x07", r"\x1b]0;OWNED\x07"),
+        ("\x1b[2J\x9b2J\x85", r"\x1b[2J\x9b2J\x85"),
+        ("a\r\nb\tc\x00\x7f", r"a\r\nb\tc\x00\x7f"),
+        ("\u202egnp.\u2066\u2069\u200e\ufeff", r"\u202egnp.\u2066\u2069\u200e\ufeff"),
+        ("\u2028\u2029", r"\u2028\u2029"),
+        ("caf\udce9 \udc9b2J \ud800", r"caf\xe9 \x9b2J \ud800"),
+        ("\U000e0041", r"\U000e0041"),
+    ],
+)
+def test_what_a_terminal_acts_on_is_escaped(text, shown):
+    assert printable(text) == shown and shown.isprintable()
+
+
+@pytest.mark.parametrize("text", ["photo_01.png", "naïve", "写真　三", "صورة", "می‌خواهم", "a\u00a0b", "👩‍🎤"])
+def test_words_of_all_languages_stay(text):
+    assert printable(text) == text
+
+
+def test_reports_keep_their_lines():
+    assert printable("a\n\tb\r\x1b[2J", lines=True) == "a\n\tb\\r\\x1b[2J"
+
+
+def test_errors_of_files_are_printable():
+    error = FileError("me\x1b[2J.npz", "views\u202e", "a\nb\x9b")
+    assert str(error) == r"me\x1b[2J.npz: views\u202e: a b\x9b"
+
+
+def test_one_module_writes_to_the_terminal():
+    """Else a call site could forget what `say` does."""
+    writes = re.compile(
+        r"\bprint\(|std(out|err)\.write|\bbar\.write|tqdm\.write|os\.write\([12],|logging\.StreamHandler"
+    )
+    found = {
+        f"{path.relative_to(PACKAGE)}: {line.strip()}"
+        for path in PACKAGE.rglob("*.py")
+        if str(path.relative_to(PACKAGE)) not in OWN
+        for line in path.read_text().splitlines()
+        if writes.search(line.split("#")[0]) and not re.search(r"(?:hg|jax)\.|diagnose_\w+\(", line)
+    }
+    assert not found
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_any_name_can_be_said_on_any_terminal(encoding, monkeypatch):
+    stream = io.TextIOWrapper(io.BytesIO(), encoding=encoding)
+    monkeypatch.setattr(sys, "stdout", stream)
+    progress.say("写真 caf\udce9.png: 3 × 4\nsecond")
+    stream.seek(0)
+    first, second = stream.buffer.getvalue().decode(encoding).splitlines()
+    assert "\\xe9.png: 3 " in first and second == "second"
+
+
+def test_help_can_be_shown_on_an_ascii_terminal():
+    environment = os.environ | {"PYTHONIOENCODING": "ascii", "LC_ALL": "C"}
+    command = [sys.executable, "-m", "humangs_jax.cli", "check", "--help"]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and done.stdout.isascii() and not done.stderr
+
+
+def lines_of(shown):
+    """What is left on a terminal: the last text of every line."""
+    return [line.rsplit("\r", 1)[-1].removeprefix("\033[K") for line in shown.split("\n")]
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_an_error_in_a_bar_is_a_line_of_its_own(terminal, monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    progress.begin()
+    try:
+        with progress.stage("rendering"):
+            for number in progress.bar(range(5), desc="render"):
+                assert number < 3
+    except AssertionError as error:
+        progress.end()
+        kept = error  # a traceback keeps the bar alive
+        progress.say("humangs: error: no", error=True)
+    assert kept
+    assert "humangs: error: no" in lines_of(capsys.readouterr().err)
+
+
+def test_what_is_said_beside_a_bar_is_a_line_of_its_own(capsys):
+    with progress.bar(total=3, desc="a\x1b[2J\nb") as shown:
+        shown.update(1)
+        shown.refresh()
+        progress.say("humangs: warning: odd", error=True)
+        shown.update(2)
+    captured = capsys.readouterr().err
+    assert "humangs: warning: odd" in lines_of(captured) and r"a\x1b[2J\nb" in captured and "\x1b[2J" not in captured

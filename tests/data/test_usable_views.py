@@ -1,0 +1,108 @@
+"""Views whose mask does not show the person are left out by name, wherever photos are read."""
+
+import dataclasses
+import logging
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from humangs_jax.apps.settings import Settings
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.usable_views import shares_on_masks, usable_indices, usable_views
+from humangs_jax.data.view_selection import select_views
+from humangs_jax.data.views import standardize
+from humangs_jax.refinement.crops import crop_to_person
+
+
+@pytest.fixture(scope="module")
+def demo():
+    return load_capture("demo_capture")
+
+
+def with_mask(capture, view, mask):
+    masks = capture.masks.copy()
+    masks[view] = mask
+    return dataclasses.replace(capture, masks=masks)
+
+
+def elsewhere(mask):
+    """A spot in the corner, where the body is not."""
+    spot = np.zeros_like(mask)
+    spot[:40, :40] = 1
+    return spot
+
+
+SPOILED = {
+    "empty": (lambda mask: 0 * mask, "the mask is empty"),
+    "faint": (lambda mask: 0.4 * mask, "the mask is empty"),
+    "inverted": (lambda mask: 1 - mask, "hardly meet"),
+    "a spot elsewhere": (elsewhere, "hardly meet"),
+}
+
+
+def head(mask):
+    """The top eighth of the person."""
+    rows = np.flatnonzero((mask > 0.5).any(axis=1))
+    return mask * (np.arange(len(mask)) < rows[0] + len(rows) // 8)[:, None]
+
+
+KEPT = {
+    "the head alone": head,
+    "half of the person": lambda mask: mask * (np.arange(len(mask)) < 256)[:, None],
+    "all of the photo": np.ones_like,
+    "soft": lambda mask: 0.6 * mask,
+}
+
+
+@pytest.mark.parametrize("spoiled", SPOILED)
+def test_a_spoiled_mask_leaves_its_view_out_by_name(demo, spoiled, caplog):
+    change, reason = SPOILED[spoiled]
+    capture = with_mask(demo, 1, change(demo.masks[1]))
+    with caplog.at_level(logging.WARNING):
+        left = usable_views(capture)
+    assert left.names == tuple(np.delete(demo.names, 1))
+    (record,) = caplog.records
+    assert f"1 of 4 views is left out: {demo.names[1]}: " in record.getMessage() and reason in record.getMessage()
+
+
+@pytest.mark.parametrize("mask", KEPT)
+def test_other_masks_are_kept(demo, mask):
+    capture = with_mask(demo, 1, KEPT[mask](demo.masks[1]))
+    assert usable_views(capture) is capture
+
+
+def test_without_masks_all_views_are_kept(demo):
+    assert usable_indices(dataclasses.replace(demo, masks=None)) == [0, 1, 2, 3]
+
+
+def test_exact_masks_hold_the_body(demo):
+    assert min(shares_on_masks(demo)) > 0.95
+
+
+def test_a_body_that_is_out_of_the_frame_meets_no_mask(demo):
+    poses = replace(demo.poses, translation=demo.poses.translation + jnp.asarray([50.0, 0, 0]))
+    with pytest.raises(CaptureError, match=r"no view is left that shows the person: .*hardly meet"):
+        usable_views(dataclasses.replace(demo, poses=poses))
+
+
+def test_all_that_reads_photos_leaves_it_out(demo):
+    capture, usable = with_mask(demo, 1, 0), [0, 2, 3]
+    expected = demo.select(usable)
+    assert select_views(capture, 3) == select_views(capture, 9) == usable
+    assert Settings().photos(capture).names == Settings(views=9).photos(capture).names == expected.names
+    for views in (standardize(capture, 64), standardize(capture, 64, crop=True), crop_to_person(capture)):
+        assert len(views.images) == 3
+    np.testing.assert_array_equal(standardize(capture, 64).images, standardize(expected, 64).images)
+    np.testing.assert_array_equal(crop_to_person(capture).images, crop_to_person(expected).images)
+
+
+def test_no_view_left_is_an_error_that_names_them(demo):
+    nobody = dataclasses.replace(demo, masks=0 * demo.masks)
+    for read in (usable_views, lambda c: select_views(c, 2), lambda c: standardize(c, 64), crop_to_person):
+        with pytest.raises(
+            CaptureError, match=f"capture: masks: no view is left .*{demo.names[0]}.*: the mask is empty"
+        ):
+            read(nobody)
