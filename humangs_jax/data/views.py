@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import logging
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from humangs_jax.body.subdivision import split_long_edges
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.motion.world import turned_upright, up_axis, upright_matrix
+from humangs_jax.data.motion.world import nearest_axis, standing_axis, turned_upright, upright_matrix
 from humangs_jax.data.usable_views import MASK_THRESHOLD, usable_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum
@@ -28,6 +29,8 @@ from humangs_jax.rendering.mesh.position_map import (
     plain_position_map,
     vertex_normals,
 )
+
+logger = logging.getLogger(__name__)
 
 
 @pytree_dataclass
@@ -207,14 +210,16 @@ def _window(image, left, top, side, fill):
 
 
 def upright(views: SubjectViews, body: BodyModel) -> SubjectViews:
-    """The views in a world whose y axis points up, as far as the pelvis tells; the same object if theirs does.
+    """The views in a world whose y axis points up; the same object if theirs does.
 
-    Captures are to have y up. One with z up is as consistent, but the network has seen no such world. On the host.
+    Captures are to have y up. One with z up is as consistent, but the network has seen no such world: it is turned, and a warning
+    logged, where the person and the cameras both stand along another axis. The person alone may lie. On the host.
     """
     rotations, translations = np.asarray(views.rotations), np.asarray(views.translations)
-    up = up_axis(rotations[:, 0], "y")
-    if up == "y":
+    up = standing_axis(rotations[:, 0])
+    if up in (None, "y") or nearest_axis(-np.asarray(views.cameras.cam_from_world)[:, 1, :3].mean(axis=0))[0] != up:
         return views
+    logger.warning("the world of these views has %s up, person and cameras say: expected y up, it is turned", up)
     pelvis, turn = np.asarray(shape_body(body, views.betas).joints[0]), upright_matrix(up)
     rotations, translations = turned_upright(rotations, translations, up, pelvis)
     back = np.eye(4)

@@ -22,15 +22,16 @@ VERTICES, INDICES = 34962, 34963
 """Targets of views of a buffer: what a graphics card reads it as."""
 
 
-def parse_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, Any], bytes]:
     """The JSON of a GLB file and the bytes that it describes.
 
+    Arguments: limit: of the JSON. That of scans is low, because trimesh, which loads them, is slow.
     Raises: Refused, KeyError, TypeError, ... for sizes that do not fit the file or are more than the limits allow.
     """
     start, _, _, length, kind = struct.unpack_from("<IIIII", data.ljust(20, b"\0"))
     if start != GLB_START or kind != JSON_CHUNK:
         raise Refused("not a mesh or skeleton that can be read: no GLB file")
-    check_limit("slow_text_bytes", length, "bytes of JSON in a GLB")
+    check_limit(limit, length, "bytes of JSON in a GLB")
     content = parse_json(data[20 : 20 + length].decode())
     binary = b""
     if len(data) >= 28 + length:

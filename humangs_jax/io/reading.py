@@ -32,8 +32,8 @@ LONGEST_LINE, LONGEST_REASON = 1000, 300
 class Limits:
     """What a file may cost. Each error line that a limit causes names it.
 
-    file_bytes: size of any file; text_bytes: of JSON and text; slow_text_bytes: of YAML and of the JSON in a GLB, whose readers
-        are slow. mesh_bytes: of a scan; image_bytes: of a photo before it is decoded.
+    file_bytes: size of any file; text_bytes: of JSON and text; slow_text_bytes: of YAML and of the JSON in a scan (GLB), whose
+        readers are slow. mesh_bytes: of a scan; image_bytes: of a photo before it is decoded.
     array_bytes: all arrays of an archive unpacked, or of an EXR file. Below it a file may always unpack to plain_bytes, and
         beyond that to `ratio` times its size. plain_bytes also bounds a sparse matrix made dense.
     members: entries of an archive. opcodes: instructions of a pickle. nesting: of JSON, YAML and MATLAB.

@@ -11,11 +11,10 @@ from humangs_jax.body import skinning
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
+from humangs_jax.data.motion.rules import DEFAULT_FPS
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.io.npz import write_npz
 from humangs_jax.io.reading import FileError
-
-DEFAULT_FPS = 30.0
 
 
 class MotionError(FileError):

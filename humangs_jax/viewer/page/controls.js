@@ -133,8 +133,9 @@ function makeControls(app) {
   async function openMotion(file) {
     if (!file) return;
     try {
-      app.setMotion(await readMotionFile(file, scene), file.name);
-      say(`${file.name}: ${scene.motion.quats.length} frames`);
+      const motion = await readMotionFile(file, scene);
+      app.setMotion(motion, file.name);
+      say(`${file.name}: ${scene.motion.quats.length} frames${motion.said ? `; ${motion.said}` : ""}`);
     } catch (error) {
       say(error.message, true);
     }
