@@ -187,6 +187,13 @@ def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
             np.testing.assert_allclose(got, expected, atol=100 * TURNED)
 
 
+def test_people_who_lie_before_upright_cameras_are_left_lying(body):
+    """The person alone says nothing about the world; that of captures has y up."""
+    views = standardize(capture(body, SIZE, SIZE), SIZE)
+    lying = replace(views, rotations=views.rotations.at[:, 0, 0].set(-np.pi / 2))
+    assert upright(lying, body) is lying
+
+
 def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
     """The masks say where the person is; the pixel at which a camera shows a point has the same colour before and after."""
     from humangs_jax.geometry.camera import project

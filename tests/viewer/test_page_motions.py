@@ -130,7 +130,7 @@ def array_files():
     }
     for kind, (rotations, translations) in motions().items():
         for up, turn in UP.items():
-            for heading in (20, 90):
+            for heading in (90,):
                 turned, moved = in_world(
                     rotations, translations, turn * Rotation.from_euler("y", heading, degrees=True)
                 )
@@ -188,7 +188,11 @@ BAD = {
         npz(smpl_poses=np.zeros((2, 72)), smpl_trans=np.zeros((2, 3)), smpl_scaling=0),
         "a positive number",
     ),
-    "huge": ("a.npz", npz(**(POSES | {"poses": np.full((2, 66), 1e308)}), fps=30), "finite size"),
+    "huge": (
+        "a.npz",
+        npz(**(POSES | {"poses": np.full((2, 66), 1e300)}), fps=30),
+        "key poses: expected finite numbers",
+    ),
     "keys": ("a.npz", npz(constructor=np.zeros((2, 3)), __proto__=np.zeros(2)), "expected one of the keys rotations, "),
     "odd type": ("a.npz", npz(poses=np.zeros((2, 66), "c16"), trans=np.zeros((2, 3)), fps=30), "key poses is missing"),
     "odd channel": ("a.bvh", HEAD.replace("Zrotation", "constructor").encode(), "expected up to 6 channels"),

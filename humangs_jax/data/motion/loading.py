@@ -66,22 +66,22 @@ def _load(path, up, fps, hands, flat_hand_mean, rest_joints):
     if not path.exists():
         raise MotionError(path, "", "no such file")
     read = _SKELETONS.get(path.suffix.lower())
-    body = skeleton.shipped_joints() if rest_joints is None else np.asarray(rest_joints, np.float64)
-    if read is None or path.is_dir():
-        rotations, translations, file_fps, form = arrays.read_arrays(path, hands, flat_hand_mean, fps)
-        said = ""
-        if up == "auto":
-            up, said = _up_of_arrays(form, rotations, translations, body, file_fps)
-        rotations, translations = world.turned_upright(rotations, translations, up)
-    else:
-        clip = read(path)
-        file_fps = skeleton.whole_rate(clip.fps)
-        with np.errstate(all="ignore"):  # of numbers without sense, which are refused below
-            rotations, translations, said = skeleton.retargeted(clip, body, up)
+    body = lambda: skeleton.shipped_joints() if rest_joints is None else np.asarray(rest_joints, np.float64)
+    with np.errstate(all="ignore"):  # of numbers without sense, which are refused below
+        if read is None or path.is_dir():
+            rotations, translations, file_fps, form = arrays.read_arrays(path, hands, flat_hand_mean, fps)
+            found = _up_of_arrays(form, rotations, translations, body, file_fps) if up == "auto" else (up, "")
+            rotations, translations = world.turned_upright(rotations, translations, found[0])
+            said = found[1]
+        else:
+            clip = read(path)
+            file_fps = skeleton.whole_rate(clip.fps)
+            rotations, translations, said = skeleton.retargeted(clip, body(), up)
+        rotations = np.asarray(rotations, np.float32)
     if rest_joints is not None and rotations.shape[1] != len(rest_joints):
         raise MotionError(path, "rotations", f"expected {len(rest_joints)} joints, got {rotations.shape[1]}")
     if not np.isfinite(rotations).all():
-        raise MotionError(path, "", "expected a skeleton of finite size")
+        raise MotionError(path, "", "expected rotations and a skeleton of finite size")
     if (largest := np.abs(rotations).max()) > LARGEST_TURN:
         raise MotionError(path, "rotations", f"expected radians, at most {LARGEST_TURN:g}, got {largest:.4g}")
     if not (farthest := np.abs(translations).max()) <= rules.LARGEST_DISTANCE:
@@ -90,15 +90,17 @@ def _load(path, up, fps, hands, flat_hand_mean, rest_joints):
     if said:
         logger.warning("%s: %s", path, said)
     rate = file_fps if fps is None else fps
-    return Motion(jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32), rate)
+    return Motion(jnp.asarray(rotations), jnp.asarray(translations, jnp.float32), rate)
 
 
-def _up_of_arrays(form, rotations, translations, joints, fps):
+def _up_of_arrays(form, rotations, translations, body, fps):
     """The axis that is up, and what is to be said about it."""
     stands = None if form.fixed else world.standing_axis(rotations[:, 0])
     if stands in (None, form.up):
         return form.up, ""
-    joints = joints if len(joints) == rotations.shape[1] else skeleton.shipped_joints()
     chosen = world.sampled_frames(len(rotations))
+    joints = body()
+    if len(joints) != rotations.shape[1]:  # refused later
+        return form.up, ""
     points = world.joint_places(joints, rotations[chosen], translations[chosen])
     return world.up_axis(points, stands, form.up, fps, form.also)

@@ -156,6 +156,8 @@ STILL = (0.1, 0.3)
 ON_THE_FLOOR = 0.5
 """Share of the frames with a joint on the floor from which on an axis has a floor; another axis has none at less than half of
 that axis's share."""
+TREADMILL = 0.8
+"""Share of the frames with the lowest joint at one height from which on an axis has a floor where nothing rests along either."""
 MOST_FRAMES = 1000
 """Of a motion, evenly spread, that are asked for a floor."""
 HANDS = tuple(i for i, name in enumerate(JOINT_NAMES) if any(x in name for x in ("elbow", "wrist", *FINGERS)))
@@ -167,7 +169,17 @@ def page_rules() -> dict[str, Any]:
     names = (
         *("DEFAULT_FPS", "LARGEST_DISTANCE", "BODY_NUMBERS", "HAND_NUMBERS", "MILLIMETRES", "SIDED", "MIDDLE", "SIDES"),
         *("NEXT", "NEEDED", "TOPS", "FEET", "EXPECTED_NAMES", "FEW", "STANDING", "BETTER_TILT", "LARGEST_BEND"),
-        *("RATE_ROUNDING", "UPRIGHT", "CLEARLY_UP", "FLOOR_BAND", "STILL", "ON_THE_FLOOR", "MOST_FRAMES", "HANDS"),
+        *(
+            "RATE_ROUNDING",
+            "UPRIGHT",
+            "CLEARLY_UP",
+            "FLOOR_BAND",
+            "STILL",
+            "ON_THE_FLOOR",
+            "TREADMILL",
+            "MOST_FRAMES",
+            "HANDS",
+        ),
     )
     rules = {name: globals()[name] for name in names}
     formats = [dataclasses.asdict(each) for each in FORMATS]

@@ -14,6 +14,7 @@ from humangs_jax.data.motion.rules import (
     ON_THE_FLOOR,
     PELVIS,
     STILL,
+    TREADMILL,
     UPRIGHT,
 )
 from humangs_jax.geometry import quaternion
@@ -85,9 +86,9 @@ def _floors(points, axes, fps):
         lowest, least = heights.argmin(axis=1), heights.min(axis=1)
         level.append(np.abs(least - np.median(least)) <= FLOOR_BAND)
         resting.append(level[-1] & (moves[np.arange(len(moves)), lowest] <= limit))
+    rests, stays = ([float(x.mean()) for x in shares] for shares in (resting, level))
     # on a treadmill nothing rests
-    found = resting if max(x.mean() for x in resting) >= ON_THE_FLOOR else level
-    return [float(x.mean()) for x in found]
+    return rests if max(rests) >= ON_THE_FLOOR else [share if share >= TREADMILL else 0.0 for share in stays]
 
 
 def _opposite(a, b):

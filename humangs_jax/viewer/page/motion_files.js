@@ -21,7 +21,7 @@ async function readMotionFile(file, scene) {
 function checkedMotion(motion) {
   if (!(motion.fps > 0 && Number.isFinite(motion.fps) && Number.isFinite(1 / motion.fps)))
     throw new Error(`expected a positive number of frames per second, got ${motion.fps}`);
-  if (!motion.quats.every((frame) => frame.every((q) => q.every(Number.isFinite)))) throw new Error("expected a skeleton of finite size");
+  if (!motion.quats.every((frame) => frame.every((q) => q.every(Number.isFinite)))) throw new Error("expected rotations and a skeleton of finite size");
   const farthest = largest(motion.translations.flat().map(Math.abs));
   if (!(farthest <= RULES.LARGEST_DISTANCE))
     throw new Error(`expected metres, at most ${RULES.LARGEST_DISTANCE} from the origin, got ${farthest}`);
@@ -104,7 +104,7 @@ function motionFromArrays(arrays, scene) {
     const frames = found.shape[0] || 0, width = found.data.length / Math.max(frames, 1);
     if (frames < 1 || !columns.includes(width))
       throw new Error(`key ${key}: expected frames of ${columns.join(" or ")} numbers, got shape (${found.shape})`);
-    const bad = found.data.findIndex((v) => !Number.isFinite(v));
+    const bad = found.data.findIndex((v) => !Number.isFinite(Math.fround(v)));
     if (bad >= 0) throw new Error(`key ${key}: expected finite numbers, got ${found.data[bad]} in frame ${Math.floor(bad / width)}`);
     return { frames, row: (f) => [...found.data.subarray(f * width, (f + 1) * width)] };
   };
@@ -221,7 +221,7 @@ function floorsOf(points, axes, fps) {
     return { level: mean(level.map(Number)), resting: mean(lowest.map(({ index }, i) => Number(level[i] && moves[i][index] <= limit))) };
   });
   const rests = found.some(({ resting }) => resting >= RULES.ON_THE_FLOOR);  // on a treadmill nothing rests
-  return found.map(({ level, resting }) => (rests ? resting : level));
+  return found.map(({ level, resting }) => (rests ? resting : level >= RULES.TREADMILL ? level : 0));
 }
 
 function median(values) {
