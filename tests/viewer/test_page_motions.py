@@ -194,7 +194,11 @@ BAD = {
         "key poses: expected finite numbers",
     ),
     "keys": ("a.npz", npz(constructor=np.zeros((2, 3)), __proto__=np.zeros(2)), "expected one of the keys rotations, "),
-    "odd type": ("a.npz", npz(poses=np.zeros((2, 66), "c16"), trans=np.zeros((2, 3)), fps=30), "key poses is missing"),
+    "odd type": (
+        "a.npz",
+        npz(poses=np.zeros((2, 66), "c16"), trans=np.zeros((2, 3)), fps=30),
+        "expected one of the keys",
+    ),
     "odd channel": ("a.bvh", HEAD.replace("Zrotation", "constructor").encode(), "expected up to 6 channels"),
     "odd joint": (
         "a.bvh",

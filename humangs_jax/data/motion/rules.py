@@ -157,7 +157,7 @@ ON_THE_FLOOR = 0.5
 """Share of the frames with a joint on the floor from which on an axis has a floor; another axis has none at less than half of
 that axis's share."""
 TREADMILL = 0.8
-"""Share of the frames with the lowest joint at one height from which on an axis has a floor where nothing rests along either."""
+"""Share of the frames with the lowest joint at one height from which on another axis has a floor where nothing rests."""
 MOST_FRAMES = 1000
 """Of a motion, evenly spread, that are asked for a floor."""
 HANDS = tuple(i for i, name in enumerate(JOINT_NAMES) if any(x in name for x in ("elbow", "wrist", *FINGERS)))

@@ -77,7 +77,7 @@ def up_axis(
 
 
 def _floors(points, axes, fps):
-    """Share of the frames in which something is on the floor, for each of two axes."""
+    """Share of the frames in which something is on the floor, for the usual axis and for another, which has to be surer."""
     moves = np.linalg.norm(points[1::2] - points[::2], axis=-1) * fps
     limit = max(STILL[0], STILL[1] * float(moves.mean()))
     level, resting = [], []
@@ -88,7 +88,7 @@ def _floors(points, axes, fps):
         resting.append(level[-1] & (moves[np.arange(len(moves)), lowest] <= limit))
     rests, stays = ([float(x.mean()) for x in shares] for shares in (resting, level))
     # on a treadmill nothing rests
-    return rests if max(rests) >= ON_THE_FLOOR else [share if share >= TREADMILL else 0.0 for share in stays]
+    return rests if max(rests) >= ON_THE_FLOOR else [stays[0], stays[1] if stays[1] >= TREADMILL else 0.0]
 
 
 def _opposite(a, b):

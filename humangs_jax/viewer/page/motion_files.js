@@ -210,7 +210,7 @@ function lowestPoints(points, axis) {
   });
 }
 
-// Share of the frames in which something is on the floor, for each of two axes.
+// Share of the frames in which something is on the floor, for the usual axis and for another, which has to be surer.
 function floorsOf(points, axes, fps) {
   const moves = [];
   for (let f = 0; f < points.length; f += 2) moves.push(points[f].map((p, j) => fps * Math.hypot(...subtract(points[f + 1][j], p))));
@@ -221,7 +221,7 @@ function floorsOf(points, axes, fps) {
     return { level: mean(level.map(Number)), resting: mean(lowest.map(({ index }, i) => Number(level[i] && moves[i][index] <= limit))) };
   });
   const rests = found.some(({ resting }) => resting >= RULES.ON_THE_FLOOR);  // on a treadmill nothing rests
-  return found.map(({ level, resting }) => (rests ? resting : level >= RULES.TREADMILL ? level : 0));
+  return found.map(({ level, resting }, i) => (rests ? resting : i === 0 || level >= RULES.TREADMILL ? level : 0));
 }
 
 function median(values) {
