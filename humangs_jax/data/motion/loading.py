@@ -9,7 +9,7 @@ import numpy as np
 
 from humangs_jax.body.smplx import HandBasis
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.data.capture_checks import LARGEST_TURN
+from humangs_jax.data.capture_checks import LARGEST_DISTANCE, LARGEST_TURN
 from humangs_jax.data.motion import arrays, rules, skeleton, world
 from humangs_jax.data.motion.bvh import read_bvh
 from humangs_jax.data.motion.gltf import read_animation
@@ -84,8 +84,8 @@ def _load(path, up, fps, hands, flat_hand_mean, rest_joints):
         raise MotionError(path, "", "expected rotations and a skeleton of finite size")
     if (largest := np.abs(rotations).max()) > LARGEST_TURN:
         raise MotionError(path, "rotations", f"expected radians, at most {LARGEST_TURN:g}, got {largest:.4g}")
-    if not (farthest := np.abs(translations).max()) <= rules.LARGEST_DISTANCE:
-        limit = f"at most {rules.LARGEST_DISTANCE:g} from the origin"
+    if not (farthest := np.abs(translations).max()) <= LARGEST_DISTANCE:
+        limit = f"at most {LARGEST_DISTANCE:g} from the origin"
         raise MotionError(path, "", f"expected metres, {limit}, got {farthest:g}")
     if said:
         logger.warning("%s: %s", path, said)

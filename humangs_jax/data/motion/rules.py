@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.body.joints import BODY_NAMES, FINGERS, JOINT_NAMES
+from humangs_jax.data.capture_checks import LARGEST_DISTANCE
 
 DEFAULT_FPS = 30.0
-LARGEST_DISTANCE = 1e4
-"""Metres from the origin: farther, float32 loses millimetres, and the numbers are no metres."""
 
 # Files of arrays --------------------------------------------------------------------------------------------------------
 
@@ -167,7 +166,7 @@ HANDS = tuple(i for i, name in enumerate(JOINT_NAMES) if any(x in name for x in 
 def page_rules() -> dict[str, Any]:
     """All of it as JSON has it, for the page."""
     names = (
-        *("DEFAULT_FPS", "LARGEST_DISTANCE", "BODY_NUMBERS", "HAND_NUMBERS", "MILLIMETRES", "SIDED", "MIDDLE", "SIDES"),
+        *("DEFAULT_FPS", "BODY_NUMBERS", "HAND_NUMBERS", "MILLIMETRES", "SIDED", "MIDDLE", "SIDES"),
         *("NEXT", "NEEDED", "TOPS", "FEET", "EXPECTED_NAMES", "FEW", "STANDING", "BETTER_TILT", "LARGEST_BEND"),
         *(
             "RATE_ROUNDING",
@@ -183,4 +182,5 @@ def page_rules() -> dict[str, Any]:
     )
     rules = {name: globals()[name] for name in names}
     formats = [dataclasses.asdict(each) for each in FORMATS]
+    rules["LARGEST_DISTANCE"] = LARGEST_DISTANCE
     return rules | {"PELVIS": PELVIS.tolist(), "COLUMNS": list(COLUMNS), "FORMATS": formats}
