@@ -8,7 +8,7 @@ outline: at which distance from it do the colours change most, on average over t
 import numpy as np
 from scipy import ndimage
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.io.images import resized
 
 PERSON_HEIGHT = 200
@@ -23,6 +23,8 @@ LEAST_MOVE = 0.5
 """Parts of the outline that would move by less stay where they are."""
 MOST_PIXELS = 400
 """Height of the person at which the photo is searched; larger photos are reduced."""
+LEAST_PART = 0.005
+"""Connected parts of a mask that are smaller, as a share of the largest one's area, are specks and not the person."""
 WHITE = 0.98
 """A photo with nothing darker around the mask, beyond `REACH`, shows no background: there is nothing to find."""
 
@@ -80,6 +82,20 @@ def outline_moves(
         if everywhere > highest:
             highest, whole = everywhere, float(step)
     return whole, ndimage.gaussian_filter(moves, SMOOTHING * unit)
+
+
+def person_box(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
+    """`box_of` the person among the True pixels: the largest connected part, and others of at least `LEAST_PART` of its area."""
+    parts, _ = ndimage.label(inside, np.ones((3, 3)))
+    areas = np.bincount(parts.ravel())
+    areas[0] = 0
+    return box_of(inside & (areas >= LEAST_PART * areas.max())[parts])
+
+
+def box_of(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
+    """First row and the one after the last, then columns, of the True pixels; zeros if there are none."""
+    lines = [np.flatnonzero(inside.any(axis)) for axis in (1, 0)]
+    return np.asarray([(line[0], line[-1] + 1) if len(line) else (0, 0) for line in lines])
 
 
 def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

@@ -14,6 +14,7 @@ from humangs_jax.body.subdivision import split_long_edges
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.masks import person_box
 from humangs_jax.data.motion.world import nearest_axis, standing_axis, turned_upright, upright_matrix
 from humangs_jax.data.usable_views import MASK_THRESHOLD, usable_views
 from humangs_jax.geometry.camera import Camera
@@ -172,7 +173,7 @@ CROP_MARGIN = 0.04
 
 
 def cropped(capture: Capture, size: int) -> Capture:
-    """The photos, each cut to a square around its mask and resized to `size` pixels.
+    """The photos, each cut to a square around the person in its mask and resized to `size` pixels.
 
     All stay as they are if there are no masks, if one is empty, or if no crop is smaller than its photo.
     """
@@ -181,10 +182,9 @@ def cropped(capture: Capture, size: int) -> Capture:
     height, width = capture.masks.shape[1:]
     boxes = []
     for mask in capture.masks > MASK_THRESHOLD:
-        rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
-        if not len(rows):
+        low, high = person_box(mask)[::-1].T
+        if not high.any():
             return capture
-        low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]]) + 1
         side = int(np.ceil((high - low).max() / (1 - 2 * CROP_MARGIN)))
         boxes.append((*((low + high - side) // 2), side))
     if min(side for *_, side in boxes) >= max(height, width):
@@ -246,10 +246,7 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
     images = np.pad(images, (*pad, (0, 0)), constant_values=1.0)
     masks = np.pad(masks, pad)
     if side != size:
-        from skimage.transform import resize
-
-        images = np.stack([resize(x, (size, size, 3), anti_aliasing=size < side) for x in images])
-        masks = np.stack([resize(x, (size, size), anti_aliasing=size < side) for x in masks])
+        images, masks = (np.stack([resized(x, size, size) for x in stack]) for stack in (images, masks))
     shift = jnp.asarray([[0, 0, left], [0, 0, top], [0, 0, 0]], jnp.float32)
     square = replace(capture.cameras, K=capture.cameras.K + shift, width=side, height=side)
     frames = np.asarray(capture.frames)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from humangs_jax.data.capture import capture_from_arrays, load_capture
-from humangs_jax.data.masks import PERSON_HEIGHT, fit_mask, outline_moves, signed_distance
+from humangs_jax.data.masks import PERSON_HEIGHT, box_of, fit_mask, outline_moves, person_box, signed_distance
 from humangs_jax.io.images import read_grey, read_image, write_png
 
 HEIGHT, WIDTH = 240, 160
@@ -112,6 +112,19 @@ def test_a_person_cut_at_the_frame_and_one_of_few_pixels():
         small[8 : 8 + rows, 8:11] = 1
         fitted, _ = fit_mask(photo_of(small), small)
         assert np.isfinite(fitted).all()
+
+
+def test_boxes_of_a_mask_and_of_the_person_in_it():
+    inside = np.zeros((40, 30), bool)
+    assert not box_of(inside).any() and not person_box(inside).any()
+    inside[5:35, 10:20] = True
+    inside[36:39, 21] = True  # a foot, seen apart: 3 pixels of 300
+    assert box_of(inside).tolist() == person_box(inside).tolist() == [[5, 39], [10, 22]]
+    inside[0, 29] = True
+    assert box_of(inside).tolist() == [[0, 39], [10, 30]]
+    assert person_box(inside).tolist() == [[5, 39], [10, 22]]
+    assert person_box(np.eye(7, dtype=bool)).tolist() == [[0, 7], [0, 7]]  # diagonals hang together
+    assert person_box(np.ones((1, 1), bool)).tolist() == [[0, 1], [0, 1]]
 
 
 def test_moves_are_positive_inside():
