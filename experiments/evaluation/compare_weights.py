@@ -3,7 +3,8 @@
     python experiments/evaluation/refinement.py --split validation --seconds 5 --sizes 256 --rounds 0 --weights A --json a.json
     python experiments/evaluation/compare_weights.py first=a.json trained=b.json --page docs/evaluation.md [--table NAME]
 
-The scores are those of `refinement.py`, means over its people. Results may differ in --weights, --tokens and --skinning-reach.
+The scores are those of `refinement.py`, means over its people. Results may differ in --weights, --tokens, --crop and
+--skinning-reach.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import add_outputs, check_section, markdown_table, write_outputs
 
-COMPARED = ("weights", "tokens", "skinning_reach")
+COMPARED = ("weights", "tokens", "crop", "skinning_reach")
 """Settings that may differ."""
 SCORES = {"psnr": ("PSNR", 2), "psnr_foreground": ("on the person", 2), "ssim": ("SSIM", 4), "fog": ("fog", 3)}
 TASKS = {"novel": "same pose", "animation": "unseen poses"}
