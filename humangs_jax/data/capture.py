@@ -30,7 +30,7 @@ from humangs_jax.data.capture_checks import (
     checked_frame,
     numbers,
 )
-from humangs_jax.data.masks import fit_mask
+from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.data.photos import (
     Photos,
     capture_folder,
@@ -165,7 +165,7 @@ def capture_from_arrays(
     check_background(background, source)
     if masks is not None and background == "photo":
         if fit_masks:
-            masks = np.stack([fit_mask(image, mask)[0] for image, mask in zip(images, masks, strict=True)])
+            masks = np.stack([mask for mask, _ in masks_at_edges(list(images), list(masks))])
         images = on_white_background(images, masks)
     photos = Photos(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names)
     return _assemble(photos, body, betas, rotations, translations, body_file)

@@ -16,7 +16,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_frame, checked_json, numbers
-from humangs_jax.data.masks import fit_mask
+from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import orientation, read_grey, read_image
 from humangs_jax.io.reading import FileError, inside, reading
@@ -216,8 +216,14 @@ def _check_orientations(folder, views, K, width, height, warns):
 
 def _read_images(folder, views, on_white, fit_masks):
     """Images and masks (or None), all of one size."""
-    images, masks, excesses = zip(*[read_view(folder, view, on_white, fit_masks) for view in views], strict=True)
-    if moved := [excess for excess in excesses if excess]:
+    read = [read_view(folder, view, on_white) for view in views]
+    images, masks, shown = (list(column) for column in zip(*read, strict=True))
+    searched = [i for i, background in enumerate(shown) if background]
+    photos, own = [images[i] for i in searched], [masks[i] for i in searched]
+    fitted = masks_at_edges(photos, own) if fit_masks else [(mask, 0.0) for mask in own]
+    for i, photo, (mask, _) in zip(searched, photos, fitted, strict=True):
+        images[i], masks[i] = on_white_background(photo, mask), mask
+    if moved := [excess for _, excess in fitted if excess]:
         off = float(np.median(moved))
         wrong = f"{abs(off):.1f} pixels too {'large' if off > 0 else 'small'}"
         count = f"{len(moved)} of {len(views)} masks"
@@ -236,19 +242,18 @@ def _read_images(folder, views, on_white, fit_masks):
 
 
 def read_view(
-    folder: Path, view: dict[str, Any], on_white: bool, fit_masks: bool = False
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, float]:
-    """Image on white where a mask or alpha is known, the mask or None, and by how many pixels `fit_mask` found it too large."""
+    folder: Path, view: dict[str, Any], on_white: bool
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, bool]:
+    """Image, mask or None, and whether the image still has its background although a mask is known; else it is on white."""
     image, alpha = read_checked(read_image, folder / view["image"])
     if alpha is not None:
         image = on_white_background(image, alpha)
     if "mask" not in view:
-        return image, alpha, 0.0
+        return image, alpha, False
     mask = read_mask(folder / view["mask"], "its image", image.shape[1], image.shape[0])
     if on_white or alpha is not None:  # composited already: the mask file only says what the person is
-        return image, mask, 0.0
-    mask, excess = fit_mask(image, mask) if fit_masks else (mask, 0.0)
-    return on_white_background(image, mask), mask, excess
+        return image, mask, False
+    return image, mask, True
 
 
 def read_mask(file: Path, owner: str, width: int, height: int) -> Float[np.ndarray, "h w"]:
