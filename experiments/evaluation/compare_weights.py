@@ -32,8 +32,9 @@ def main() -> None:
     if arguments.page:
         check_section(arguments.page, arguments.table)
     named = dict(pair.split("=", 1) for pair in arguments.results)
-    means = compare({name: json.loads(Path(path).read_text()) for name, path in named.items()})
-    write_outputs(arguments, arguments.table, section(means), means)
+    results = {name: json.loads(Path(path).read_text()) for name, path in named.items()}
+    means = compare(results)
+    write_outputs(arguments, arguments.table, section(means), {"means": means, "people": by_person(results)})
 
 
 def compare(results: dict[str, Any]) -> dict[str, Any]:
@@ -57,6 +58,16 @@ def compare(results: dict[str, Any]) -> dict[str, Any]:
         name: {run: {task: {key: tasks[task][key] for key in SCORES} for task in TASKS} for run, tasks in runs.items()}
         for name, result in results.items()
         for runs in result["means"].values()
+    }
+
+
+def by_person(results: dict[str, Any]) -> dict[str, Any]:
+    """{name: {seconds: PSNR on the person in the pose of the photos, of each person}}."""
+    score = lambda subject, cell, run: subject["cells"][cell][run]["novel"]["psnr_foreground"]
+    return {
+        name: {run: [score(subject, cell, run) for subject in result["subjects"]] for run in runs}
+        for name, result in results.items()
+        for cell, runs in result["means"].items()
     }
 
 
