@@ -12,7 +12,7 @@ import numpy as np
 
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
-from humangs_jax.data.views import MASK_THRESHOLD
+from humangs_jax.data.usable_views import MASK_THRESHOLD
 
 LIMITS = "assets/limits.json"
 PHOTO_SIZE = 256
