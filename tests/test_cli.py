@@ -60,6 +60,14 @@ def test_every_command_explains_itself(command, monkeypatch, capsys):
     assert code == 0 and ("--out" in out or command in ("view", "evaluate")) and "docstring" not in out
 
 
+@pytest.mark.parametrize(
+    ("words", "usage"), [("import cameras", "import cameras [-h] [OPTIONS] PATH"), ("import", "import [-h] [OPTIONS] {cameras}")]
+)
+def test_the_usage_of_an_import_can_be_typed_as_it_stands(words, usage, monkeypatch, capsys):
+    _, out, _ = run(monkeypatch, capsys, *words.split(), "--help")
+    assert out.startswith(f"usage: humangs {usage}")
+
+
 def spoil_json(change):
     def spoil(path):
         file = path / "capture.json"

@@ -277,10 +277,11 @@ def write_sheet(path: Path, folder: Path, address: str, browser, shots) -> None:
     import numpy as np
 
     images = []
-    for title, page, values in shots:
+    for number, (title, page, values) in enumerate(shots):
         frame = {"imports": json.dumps(IMPORTS), "width": WIDTH, "height": HEIGHT, "script": page % values}
-        (folder / "page.html").write_text(PAGE % frame)
-        browser.open(f"{address}/page.html")
+        name = f"{path.stem}_{number}.html"  # each its own: the browser may keep a page of the same address
+        (folder / name).write_text(PAGE % frame)
+        browser.open(f"{address}/{name}")
         image = browser.screenshot()
         problems = [line for line in browser.problems() if "favicon" not in line]
         person = float((np.abs(image - 1).max(axis=-1) > 0.1).mean())
