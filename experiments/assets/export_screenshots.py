@@ -198,7 +198,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder for the images")
     parser.add_argument("--only", choices=("viewer", *sorted(SHEETS)), nargs="*", help="default: all")
     arguments = parser.parse_args()
-    wanted = arguments.only if arguments.only is not None else ["viewer", *(sorted(SHEETS) if arguments.modules else ())]
+    wanted = (
+        arguments.only if arguments.only is not None else ["viewer", *(sorted(SHEETS) if arguments.modules else ())]
+    )
     sheets = [name for name in wanted if name in SHEETS]
     if sheets and arguments.modules is None:
         parser.error(f"{sheets[0]} needs --modules")

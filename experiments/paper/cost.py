@@ -48,7 +48,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--width", type=int, default=128, help="features of maps, vertices and attention")
     parser.add_argument("--repeats", type=int, default=3, help="timed rounds")
-    parser.add_argument("--networks", action="store_true", help="count the networks alone; readers: as docs/results has them")
+    parser.add_argument(
+        "--networks", action="store_true", help="count the networks alone; readers: as docs/results has them"
+    )
     parser.add_argument("--quick", action="store_true", help="the smallest sizes alone, no whole networks: for tests")
     add_outputs(parser, TABLE)
     parser.add_argument("--image", type=Path, help="draw them here (.png)")

@@ -13,8 +13,9 @@ gaussians        1 against 1 + 4 and 1 + 8 Gaussians a vertex
 
 PSNR / SSIM / LPIPS by the protocol of the paper; LPIPS needs weights (--lpips). Printed rows say so and are of the paper's data
 and training: they are no measure of ours. Systems are those whose training is finished in --runs, and the shipped weights;
-those that take one photo get the first; those that docs/paper.md calls not trained are marked. People of another kind are any other folder: captures of `humangs synth` with other
-settings, or a data set. --json is written after every measurement; the same command goes on there.
+those that take one photo get the first; those that docs/paper.md calls not trained are marked. People of another kind are any
+other folder: captures of `humangs synth` with other settings, or a data set. --json is written after every measurement; the same
+command goes on there.
 """
 
 import argparse
@@ -187,7 +188,9 @@ def reconstruction(names: list[str], measure: Measure, arguments: argparse.Names
     for name in names:
         found = measure(name, arguments.people, PHOTOS)
         if found is not None:
-            rows.append([name, photos_of(found, name, arguments.gray), of(found, "reconstruction"), of(found, "animation")])
+            rows.append(
+                [name, photos_of(found, name, arguments.gray), of(found, "reconstruction"), of(found, "animation")]
+            )
     return markdown_table(["method", "", "reconstruction", "reconstruction + animation"], rows, "llrr")
 
 
@@ -200,7 +203,9 @@ def domains(names: list[str], measure: Measure, arguments: argparse.Namespace) -
         if found[0] is not None:
             rows.append([name, photos_of(found[0], name, arguments.gray), *(of(x, "reconstruction") for x in found)])
         if arguments.split and (x := measure(f"{name}{SPLIT}", arguments.split[1], PHOTOS)) is not None:
-            rows.append([f"{name}{SPLIT}", photos_of(x, name, arguments.gray), of(x, "reconstruction"), *["-" for _ in others]])
+            rows.append(
+                [f"{name}{SPLIT}", photos_of(x, name, arguments.gray), of(x, "reconstruction"), *["-" for _ in others]]
+            )
     heads = [f"cross-domain: {people.name}" if people else "cross-domain" for people in others]
     return markdown_table(["method", "", "in domain", *heads], rows, "llr" + "r" * len(heads))
 

@@ -33,6 +33,7 @@ from experiments.paper.bench import (
     PAGE,
     PAINTED,
     PAINTED_TABLE,
+    PHOTOS,
     SCORES,
     folder_of,
     headline,
@@ -167,7 +168,10 @@ def kept(path: Path, settings: Mapping[str, Any], parser: Any) -> dict[str, Any]
 
 
 def table(
-    rows: Mapping[str, Any], queue: Mapping[str, Any], settings: Mapping[str, Any], painted: Mapping[str, Any] | None = None
+    rows: Mapping[str, Any],
+    queue: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    painted: Mapping[str, Any] | None = None,
 ) -> str:
     """A row a variant, with its difference to what it is compared with; below, what another seed changes.
 
@@ -196,7 +200,7 @@ def table(
     if interval is not None:
         said += f" 95 % interval of a difference by the seeds of training alone: +-{interval:.2f} dB; within it: noise."
     if painted:
-        said += f' "{NOT_TRAINED}": less than {MARGIN:g} dB of foreground PSNR over the {PAINTED} of as many photos.'
+        said += f' "{NOT_TRAINED}": less than {MARGIN:g} dB of foreground PSNR over the {PAINTED} of {PHOTOS} photos.'
     texts = [text, said]
     counted = {name: row["by_views"] for name, row in rows.items() if len(row["by_views"]) > 1}
     if counted:

@@ -3,7 +3,7 @@
     python experiments/splatting/tradeoff.py --scene S.npz --size 512 [--json OUT] [--image OUT.png]
         [--page docs/performance.md]
     python experiments/splatting/tradeoff.py --scene demo --image docs/images/splatting_tradeoff.png
-    python experiments/splatting/tradeoff.py --measured docs/results/splatting_tradeoff.json --image docs/images/splatting_tradeoff.png
+    python experiments/splatting/tradeoff.py --measured docs/results/splatting_tradeoff.json --image IMAGE
 
 Every setting takes turns with the exact one, call by call, in one process; its time is the median of the quotients. Its
 error is that of the image to the exact one, drawn in float64, on black; of gradients (mean squared error against noise)
@@ -263,7 +263,7 @@ def of_table(blocks: Sequence[Any]) -> dict[str, Any]:
         knob = "preset" if preset else "combined" if "," in label else label.split()[0]
         relative = {f"{name}_cpu": float(x) for name, x in zip(DIRECTIONS, times, strict=True)}
         settings.append({"knob": knob, "label": preset or label} | relative | errors(psnr_, largest_, gradients_))
-    scene, gaussians, size = re.fullmatch(r"(\w+), ([\d,]+) Gaussians at (\d+);.*", title).groups()
+    ((scene, gaussians, size),) = re.findall(r"^(\w+), ([\d,]+) Gaussians at (\d+);", title)
     counts = {"scene": scene, "gaussians": int(gaussians.replace(",", "")), "size": int(size)}
     return counts | {"exact": exact | errors(psnr, largest, gradients), "settings": settings}
 
