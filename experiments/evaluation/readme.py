@@ -45,7 +45,9 @@ def quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any
     Raises: ValueError if the demo was not refined, or the people or the weights of the two tables are not the same.
     """
     if "refined" not in demo:
-        raise ValueError("the report of the refined demo has no refined scores: expected `humangs demo` without --refine 0")
+        raise ValueError(
+            "the report of the refined demo has no refined scores: expected `humangs demo` without --refine 0"
+        )
     count = len(people["subjects"])
     if refined["people"] != count:
         raise ValueError(f"{refined['people']} people were refined: expected the same {count}")
