@@ -1,6 +1,7 @@
 """Every `humangs` and `python` line of README, docs and notebooks is one that the real parser takes; quick ones are run."""
 
 import contextlib
+import functools
 import io
 import json
 import shutil
@@ -90,7 +91,8 @@ json.dump(problems, sys.__stdout__)
 """
 
 
-def parsed(words):
+@functools.cache
+def parsed(*words):
     """None, or what the parser of `humangs` says."""
     printed = io.StringIO()
     words = [word for word in words if word not in ("--quiet", "--verbose", "--version")]
@@ -106,12 +108,12 @@ def refused(command):
     """None, or why a line of a page cannot be typed."""
     words = filled(command.words[1:])
     if command.whole:
-        return parsed(words)
+        return parsed(*words)
     lines = [words]
     if words[-1].startswith("--"):  # it may be named without its value
         lines.append([*words[:-1], f"{words[-1]}=1"])
-    problems = [parsed([*line, *more]) for line in lines for more in MORE]
-    return None if None in problems else problems[0]
+    tried = (parsed(*line, *more) for line in lines for more in MORE)
+    return None if None in tried else parsed(*words)
 
 
 @pytest.mark.parametrize("command", OURS, ids=str)
