@@ -45,7 +45,7 @@ from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import resized, write_png
 from humangs_jax.io.npz import read_npz, write_npz
-from humangs_jax.io.reading import FileError, reading
+from humangs_jax.io.reading import FileError, check_limit, reading
 
 DEFAULT_BODY = "makehuman"
 """Name of the body that comes with the package; any other `body` in body.npz is the path of a model file."""
@@ -197,6 +197,7 @@ def load_capture(
         if body is None:
             body = _load_model(parameter_file, body_file, folder)
         betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
+        check_limit("frames", len(rotations), f"frames in {parameter_file}")
         photos = read_photos(folder, description, views, len(rotations), fit_masks)
         if body_file != DEFAULT_BODY:
             body_file = str(folder / body_file)

@@ -311,6 +311,12 @@ def test_no_photos_are_an_error(body, network):
         reconstruct(*network, capture(body, SIZE, SIZE).select([]))
 
 
+def test_more_photos_than_the_limit_are_an_error(body, network):
+    photos = capture(body, SIZE, SIZE).select([0] * 513)
+    with pytest.raises(ValueError, match=r"513 photos in capture: the limit network_views is 512 \(HUMANGS"):
+        reconstruct(*network, photos)
+
+
 def test_photos_that_are_not_numbers_are_an_error(body, network):
     variables, config = network
     photos = capture(body, SIZE, SIZE)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from humangs_jax.data.motion.rules import DEFAULT_FPS
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
 from humangs_jax.io.glb import parse_glb, read_accessor
-from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_bytes
+from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_bytes, shown
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 
@@ -49,7 +49,7 @@ def _parents(nodes):
     for i, node in enumerate(nodes):
         for child in node.get("children", []):
             if type(child) is not int or not 0 <= child < len(nodes) or parents[child] != -1:
-                raise Refused(f"nodes: {child!r} is no node, or has two parents")
+                raise Refused(f"nodes: {shown(child)} is no node, or has two parents")
             parents[child] = i
     return parents
 

@@ -14,11 +14,13 @@ from humangs_jax.data.motion import arrays, rules, skeleton, world
 from humangs_jax.data.motion.bvh import read_bvh
 from humangs_jax.data.motion.gltf import read_animation
 from humangs_jax.data.motion.motion import Motion, MotionError
-from humangs_jax.io.reading import reading
+from humangs_jax.io.reading import check_limit, reading
 
 logger = logging.getLogger(__name__)
 
 WALK = "walk.npz"
+SLOWEST = 0.01
+"""Frames per second: one in more than a minute and a half is no motion."""
 _SKELETONS = {".bvh": read_bvh, ".glb": read_animation}
 
 
@@ -77,9 +79,10 @@ def _load(path, up, fps, hands, flat_hand_mean, rest_joints):
             clip = read(path)
             file_fps = skeleton.whole_rate(clip.fps)
             rotations, translations, said = skeleton.retargeted(clip, body(), up)
-        rotations = np.asarray(rotations, np.float32)
     if rest_joints is not None and rotations.shape[1] != len(rest_joints):
         raise MotionError(path, "rotations", f"expected {len(rest_joints)} joints, got {rotations.shape[1]}")
+    with np.errstate(over="ignore"):  # what is no float32 is infinite from here on
+        rotations, translations = rotations.astype(np.float32), translations.astype(np.float32)
     if not np.isfinite(rotations).all():
         raise MotionError(path, "", "expected rotations and a skeleton of finite size")
     if (largest := np.abs(rotations).max()) > LARGEST_TURN:
@@ -87,10 +90,14 @@ def _load(path, up, fps, hands, flat_hand_mean, rest_joints):
     if not (farthest := np.abs(translations).max()) <= LARGEST_DISTANCE:
         limit = f"at most {LARGEST_DISTANCE:g} from the origin"
         raise MotionError(path, "", f"expected metres, {limit}, got {farthest:g}")
+    check_limit("frames", len(rotations), "frames")
+    rate = file_fps if fps is None else fps
+    check_limit("rate", rate, "frames per second")
+    if rate < SLOWEST:
+        raise MotionError(path, "", f"{rate:g} frames per second: expected at least {SLOWEST:g}")
     if said:
         logger.warning("%s: %s", path, said)
-    rate = file_fps if fps is None else fps
-    return Motion(jnp.asarray(rotations), jnp.asarray(translations, jnp.float32), rate)
+    return Motion(jnp.asarray(rotations), jnp.asarray(translations), rate)
 
 
 def _up_of_arrays(form, rotations, translations, body, fps):
