@@ -91,11 +91,12 @@ def bone_directions(places):
     return bones / np.linalg.norm(bones, axis=-1, keepdims=True)
 
 
-def write_bvh(rest, poses, names, frames_of=None, moves=None, order="ZYX", unit=100.0, up=None):
+def write_bvh(rest, poses, names, frames_of=None, moves=None, order="ZYX", unit=100.0, up=None, pelvis=None):
     """The text of a BVH file of a body with the joints `rest` (55, 3) in T-pose, in centimetres.
 
     poses: (m, 55, 3). names: ours -> the file's; other joints are left out. frames_of: see above. moves: (m, 3), where the
-    pelvis is. up: a rotation of the whole world.
+    pelvis is. up: a rotation of the whole world. pelvis: (m) rotations by which the pelvis's joint is turned as well; joints
+    at its place turn back: its children there, and for the others Carrier0 and so on.
     """
     frames_of = frames_of or rest_frames()
     moves = np.tile([0.1, 0.9, -0.2], (len(poses), 1)) if moves is None else moves
@@ -104,6 +105,7 @@ def write_bvh(rest, poses, names, frames_of=None, moves=None, order="ZYX", unit=
     above = {name: JOINT_NAMES[PARENTS[INDEX[name]]] for name in body[1:]}
     children = {name: [other for other in body[1:] if above[other] == name] for name in body}
     written: list = []
+    carried: set = set()
 
     def lines(name, depth):
         written.append(name)
@@ -117,20 +119,36 @@ def write_bvh(rest, poses, names, frames_of=None, moves=None, order="ZYX", unit=
         yield f"{tab}\tOFFSET {' '.join(f'{unit * x:.8f}' for x in offset)}"
         yield f"{tab}\tCHANNELS {move} {' '.join(f'{axis}rotation' for axis in order)}"
         for child in children[name]:
-            yield from lines(child, depth + 1)
+            if name not in above and pelvis is not None and np.any(rest[INDEX[child]] != rest[INDEX[name]]):
+                carried.add(child)
+                written.append(None)
+                yield f"{tab}\tJOINT Carrier{len(written)}\n{tab}\t{{\n{tab}\tOFFSET 0 0 0"
+                yield f"{tab}\tCHANNELS 3 {' '.join(f'{axis}rotation' for axis in order)}"
+                yield from lines(child, depth + 2)
+                yield f"{tab}\t}}"
+            else:
+                yield from lines(child, depth + 1)
         if not children[name]:
             yield f"{tab}\tEnd Site\n{tab}\t{{\n{tab}\t\tOFFSET 0 1 0\n{tab}\t}}"
         yield f"{tab}}}"
 
     text = ["HIERARCHY", *lines("pelvis", 0), "MOTION", f"Frames: {len(poses)}", "Frame Time: 0.0083333"]
-    for pose, move in zip(poses, moves, strict=True):
+    for frame, (pose, move) in enumerate(zip(poses, moves, strict=True)):
         world, numbers = {}, list(unit * up.apply(move))
         for name in written:
+            if name is None:
+                numbers += list(pelvis[frame].inv().as_euler(order, degrees=True))
+                continue
             own = Rotation.from_rotvec(pose[INDEX[name]])
             world[name] = own if name not in above else world[above[name]] * own
             theirs = up * world[name] * (up * frames_of[name]).inv()
             if name in above:
-                theirs = (up * world[above[name]] * (up * frames_of[above[name]]).inv()).inv() * theirs
+                holder = up * world[above[name]] * (up * frames_of[above[name]]).inv()
+                if pelvis is not None and above[name] not in above and name not in carried:
+                    holder = holder * pelvis[frame]
+                theirs = holder.inv() * theirs
+            elif pelvis is not None:
+                theirs = theirs * pelvis[frame]
             numbers += list(theirs.as_euler(order, degrees=True))
         text.append(" ".join(f"{x:.8f}" for x in numbers))
     return "\n".join(text) + "\n"

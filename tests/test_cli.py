@@ -11,14 +11,11 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from command_line import run
+from command_line import run, save_tiny_avatar
 
 from humangs_jax import __version__, cli
-from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.cli import fit, interrupts, screen
 from humangs_jax.cli.interrupts import PATIENCE
 from humangs_jax.cli.options import UsageError
@@ -26,7 +23,6 @@ from humangs_jax.core import progress
 from humangs_jax.core.progress import stage
 from humangs_jax.data.capture import load_capture, save_capture
 from humangs_jax.io.images import read_image, write_png
-from humangs_jax.rendering.gaussians import Gaussians
 
 COMMANDS = tuple(cli.COMMANDS)
 
@@ -58,6 +54,15 @@ def test_help_names_every_command_and_imports_nothing_heavy():
 def test_every_command_explains_itself(command, monkeypatch, capsys):
     code, out, _ = run(monkeypatch, capsys, command, "--help")
     assert code == 0 and ("--out" in out or command in ("view", "evaluate")) and "docstring" not in out
+
+
+@pytest.mark.parametrize(
+    ("words", "usage"),
+    [("import cameras", "import cameras [-h] [OPTIONS] PATH"), ("import", "import [-h] [OPTIONS] {cameras}")],
+)
+def test_the_usage_of_an_import_can_be_typed_as_it_stands(words, usage, monkeypatch, capsys):
+    _, out, _ = run(monkeypatch, capsys, *words.split(), "--help")
+    assert out.startswith(f"usage: humangs {usage}")
 
 
 def spoil_json(change):
@@ -634,25 +639,8 @@ def test_what_a_command_reads_is_not_replaced(tiny_avatar, folder, monkeypatch, 
 
 @pytest.fixture(scope="module")
 def tiny_avatar(tmp_path_factory):
-    """An avatar of SMPL-X's joints and three Gaussians."""
-    joints = np.cumsum(np.full((55, 3), 0.01), axis=0)
-    gaussians = Gaussians(
-        jnp.asarray([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0], [0.2, 1.7, 0.0]]),
-        jnp.asarray([[1.0, 0, 0, 0]] * 3),
-        jnp.full((3, 3), 0.1),
-        jnp.full(3, 0.9),
-        jnp.full((3, 3), 0.5),
-    )
     path = tmp_path_factory.mktemp("avatars") / "me.npz"
-    Avatar(
-        gaussians,
-        jnp.zeros((3, 55)).at[:, 0].set(1.0),
-        gaussians.means,
-        jnp.asarray(joints, jnp.float32),
-        jnp.asarray([[0, 1, 2]]),
-        parents=PARENTS,
-        joint_names=JOINT_NAMES,
-    ).save(path)
+    save_tiny_avatar(path)
     return path
 
 

@@ -1,8 +1,11 @@
-"""Screenshots of exported files in programs that are not ours, for docs/export.md: in Chromium with software WebGL.
+"""Screenshots of an avatar's page (docs/viewer.md) and of exported files in programs that are not ours (docs/export.md).
 
+    python experiments/assets/export_screenshots.py AVATAR --only viewer
     npm install --prefix FOLDER playcanvas @sparkjsdev/spark three
     python -m venv BLENDER && BLENDER/bin/pip install bpy
     python experiments/assets/export_screenshots.py AVATAR --modules FOLDER/node_modules --blender BLENDER/bin/python
+
+Browser: Chromium with software WebGL. viewer: our page, as `humangs export --html` writes it, in a window of 1280 x 800.
 
 Gaussians: the PlayCanvas engine (SuperSplat's) opens .ply and .glb, Spark .splat and .spz. The mesh: three.js opens .glb, at four
 times of the shipped walk, and .obj. Every page gets files and modules from a server on this machine; nothing else is loaded.
@@ -24,6 +27,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 WIDTH, HEIGHT = 320, 480
+WINDOW, WAIT = (1280, 800), 4.0
+"""Of our page: CSS pixels, and seconds of the walk before the picture is taken."""
 PAGE = """<!doctype html><meta charset="utf-8"><style>body { margin: 0; background: #fff } canvas { display: block }</style>
 <script type="importmap">%(imports)s</script><canvas id="canvas" width="%(width)d" height="%(height)d"></canvas>
 <script type="module">%(script)s</script>"""
@@ -188,24 +193,56 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("avatar", type=Path, help="file written by humangs reconstruct")
-    parser.add_argument("--modules", type=Path, required=True, help="folder node_modules with the programs")
+    parser.add_argument("--modules", type=Path, help="folder node_modules with the programs; without it: viewer alone")
     parser.add_argument("--blender", type=Path, help="a Python that has Blender's module bpy")
     parser.add_argument("--out", type=Path, default=Path("docs/images"), help="folder for the images")
-    parser.add_argument("--only", choices=sorted(SHEETS), nargs="*", default=sorted(SHEETS))
+    parser.add_argument("--only", choices=("viewer", *sorted(SHEETS)), nargs="*", help="default: all")
     arguments = parser.parse_args()
+    wanted = (
+        arguments.only if arguments.only is not None else ["viewer", *(sorted(SHEETS) if arguments.modules else ())]
+    )
+    sheets = [name for name in wanted if name in SHEETS]
+    if sheets and arguments.modules is None:
+        parser.error(f"{sheets[0]} needs --modules")
     from experiments.common import chromium
 
     if (reason := chromium.missing()) is not None:
         parser.error(reason)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        write_files(folder, arguments.avatar)
+        if "viewer" in wanted:
+            write_viewer(arguments.out / "viewer.png", folder, arguments.avatar)
+        if sheets or arguments.blender:
+            write_files(folder, arguments.avatar)
         if arguments.blender is not None:
             write_blender_sheet(arguments.out / "export_blender.jpg", folder, arguments.blender)
+        if not sheets:
+            return
         (folder / "node_modules").symlink_to(arguments.modules.resolve())
         with served(folder) as address, chromium.Chromium(WIDTH, HEIGHT) as browser:
-            for sheet in arguments.only:
+            for sheet in sheets:
                 write_sheet(arguments.out / f"{sheet}.jpg", folder, address, browser, SHEETS[sheet])
+
+
+def write_viewer(path: Path, folder: Path, avatar: Path) -> None:
+    """The page of an avatar a moment after it was opened. Raises: RuntimeError for a page that shows nothing."""
+    import time
+
+    import numpy as np
+    from PIL import Image
+
+    from experiments.common import chromium
+    from humangs_jax.avatar.avatar import Avatar
+    from humangs_jax.viewer.page import write_page
+
+    write_page(folder / "avatar.html", Avatar.load(avatar))
+    with chromium.Chromium(*WINDOW) as browser:
+        browser.open(folder / "avatar.html")
+        time.sleep(WAIT)
+        image = browser.screenshot()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.rint(255 * image).astype(np.uint8)).save(path, optimize=True)
+    print(f"{path}: {path.stat().st_size / 1000:.0f} kB")
 
 
 def write_files(folder: Path, path: Path) -> None:
@@ -242,10 +279,11 @@ def write_sheet(path: Path, folder: Path, address: str, browser, shots) -> None:
     import numpy as np
 
     images = []
-    for title, page, values in shots:
+    for number, (title, page, values) in enumerate(shots):
         frame = {"imports": json.dumps(IMPORTS), "width": WIDTH, "height": HEIGHT, "script": page % values}
-        (folder / "page.html").write_text(PAGE % frame)
-        browser.open(f"{address}/page.html")
+        name = f"{path.stem}_{number}.html"  # each its own: the browser may keep a page of the same address
+        (folder / name).write_text(PAGE % frame)
+        browser.open(f"{address}/{name}")
         image = browser.screenshot()
         problems = [line for line in browser.problems() if "favicon" not in line]
         person = float((np.abs(image - 1).max(axis=-1) > 0.1).mean())

@@ -133,8 +133,8 @@ def zoom(factor: float) -> Change:
             start = (side - cut) // 2
             return resized(image[start : start + cut, start : start + cut], side, side)
 
-        images = np.clip([zoomed(image, 1.0) for image in capture.images], 0, 1).astype(np.float32)
-        shapes = np.clip([zoomed(mask, 0.0) for mask in capture.masks], 0, 1).astype(np.float32)
+        images = np.stack([zoomed(image, 1.0) for image in capture.images])
+        shapes = np.stack([zoomed(mask, 0.0) for mask in capture.masks])
         about = np.array([[factor, 0, side / 2 * (1 - factor)], [0, factor, side / 2 * (1 - factor)], [0, 0, 1]])
         moved = cameras(lambda K: about @ K)(capture)
         return dataclasses.replace(moved, images=images, masks=shapes)

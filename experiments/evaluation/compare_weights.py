@@ -3,7 +3,8 @@
     python experiments/evaluation/refinement.py --split validation --seconds 5 --sizes 256 --rounds 0 --weights A --json a.json
     python experiments/evaluation/compare_weights.py first=a.json trained=b.json --page docs/evaluation.md [--table NAME]
 
-The scores are those of `refinement.py`, means over its people. Results may differ in --weights, --tokens and --skinning-reach.
+The scores are those of `refinement.py`, means over its people. Results may differ in --weights, --tokens, --crop and
+--skinning-reach.
 """
 
 import argparse
@@ -15,7 +16,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import add_outputs, check_section, markdown_table, write_outputs
 
-COMPARED = ("weights", "tokens", "skinning_reach")
+COMPARED = ("weights", "tokens", "crop", "skinning_reach")
 """Settings that may differ."""
 SCORES = {"psnr": ("PSNR", 2), "psnr_foreground": ("on the person", 2), "ssim": ("SSIM", 4), "fog": ("fog", 3)}
 TASKS = {"novel": "same pose", "animation": "unseen poses"}
@@ -31,8 +32,9 @@ def main() -> None:
     if arguments.page:
         check_section(arguments.page, arguments.table)
     named = dict(pair.split("=", 1) for pair in arguments.results)
-    means = compare({name: json.loads(Path(path).read_text()) for name, path in named.items()})
-    write_outputs(arguments, arguments.table, section(means), means)
+    results = {name: json.loads(Path(path).read_text()) for name, path in named.items()}
+    means = compare(results)
+    write_outputs(arguments, arguments.table, section(means), {"means": means, "people": by_person(results)})
 
 
 def compare(results: dict[str, Any]) -> dict[str, Any]:
@@ -56,6 +58,16 @@ def compare(results: dict[str, Any]) -> dict[str, Any]:
         name: {run: {task: {key: tasks[task][key] for key in SCORES} for task in TASKS} for run, tasks in runs.items()}
         for name, result in results.items()
         for runs in result["means"].values()
+    }
+
+
+def by_person(results: dict[str, Any]) -> dict[str, Any]:
+    """{name: {seconds: PSNR on the person in the pose of the photos, of each person}}."""
+    score = lambda subject, cell, run: subject["cells"][cell][run]["novel"]["psnr_foreground"]
+    return {
+        name: {run: [score(subject, cell, run) for subject in result["subjects"]] for run in runs}
+        for name, result in results.items()
+        for cell, runs in result["means"].items()
     }
 
 

@@ -80,7 +80,7 @@ def measure(variables, config, subject):
     from experiments.evaluation.pictures import frontal_view
     from experiments.evaluation.subjects import score_tasks
     from humangs_jax.avatar.reconstruct import reconstruct
-    from humangs_jax.data.masks import fit_mask
+    from humangs_jax.data.masks import masks_at_edges
     from humangs_jax.data.photos import on_white_background
     from humangs_jax.evaluation.cases import draw_views
     from humangs_jax.refinement.config import RefineConfig
@@ -102,7 +102,7 @@ def measure(variables, config, subject):
     photos = in_a_room(inputs.images, inputs.masks, subject.seed)
     for error in ERRORS:
         masks = [grown(mask, round(error * mask.shape[0] / 256)) for mask in inputs.masks]
-        moved = [fit_mask(*pair)[0] for pair in zip(photos, masks, strict=True)]
+        moved = [mask for mask, _ in masks_at_edges(list(photos), masks)]
         for how, used in (("as they are", masks), ("moved", moved)):
             used = np.stack(used).astype(np.float32)
             changed = dataclasses.replace(inputs, images=on_white_background(photos, used), masks=used)

@@ -27,6 +27,7 @@ def add_people_options(parser: argparse.ArgumentParser, subjects: int) -> None:
         choices=("all", "foreground"),
         help="patches that the network looks at; as it was trained if not given",
     )
+    parser.add_argument("--crop", action="store_true", help="photos are cut to the person first")
     parser.add_argument("--loosest-of", type=int, metavar="N", help="of N people, those in the loosest clothes")
     parser.add_argument(
         "--skinning-reach",
@@ -96,7 +97,7 @@ def load_network(arguments: argparse.Namespace) -> tuple[Any, Any, str]:
         digest = file_digest(path)
     if (reach := arguments.skinning_reach) is not None:
         config = replace(config, conventions=replace(config.conventions, skinning_reach=reach or None))
-    return variables, config.with_execution(tokens=arguments.tokens), digest
+    return variables, config.with_execution(tokens=arguments.tokens, crop=arguments.crop), digest
 
 
 def settings_of(arguments: argparse.Namespace, digest: str, tokens: str, lpips: Any) -> dict[str, Any]:
@@ -105,6 +106,7 @@ def settings_of(arguments: argparse.Namespace, digest: str, tokens: str, lpips: 
     from humangs_jax.people.seeds import GENERATOR_VERSION
 
     given = {name: getattr(arguments, name) for name in ("loosest_of", "skinning_reach")}
+    given["crop"] = arguments.crop or None
     return {name: value for name, value in given.items() if value is not None} | {
         "weights": digest,
         "tokens": tokens,

@@ -5,6 +5,8 @@ in the same order, have the same losses and number of steps, and are compared on
 """
 
 import dataclasses
+import json
+import math
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +14,7 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "paper.md"
-SCORES = {"psnr": ("PSNR, dB", 2), "psnr_mask": ("on the person, dB", 2), "ssim": ("SSIM", 4)}
+SCORES = {"psnr": ("PSNR, dB", 2), "psnr_mask": ("foreground PSNR, dB", 2), "ssim": ("SSIM", 4)}
 PHOTOS, TARGETS = 4, 6
 """Photos that a network is trained with, unless it takes one; views of each person that all are compared on."""
 VIEW_COUNTS = (1, 2, 4, 6, 8)
@@ -27,6 +29,11 @@ NOISE = "noise"
 
 SHIPPED = "HumanGS, shipped"
 """Name of the weights that come with the package."""
+PAINTED, PAINTED_TABLE = "painted body mesh", "paper_painted"
+"""The baseline without a network, and its table (`painted.py`)."""
+MARGIN = 3.0
+"""dB of foreground PSNR over the painted body mesh. With less all systems of the bench showed grey bodies, with more clothes."""
+NOT_TRAINED = "not trained"
 PAPER = "paper"
 """Marks a row of the printed paper in every table."""
 HUMANRAM, LVSM, GHG, OURS = "HumanRAM", "LVSM", "GHG", "HumanGS"
@@ -167,8 +174,6 @@ def train_variant(
     people: a `sources.MakeSource`; body: the model of theirs and of `validation`, a `CaptureCache`. Returns scores by number of
     photos, steps, parameters, CPU and wall seconds of all calls.
     """
-    import json
-
     import jax
 
     from experiments.common.results import write_json
@@ -222,26 +227,45 @@ def headline(row: Mapping[str, Any]) -> dict[str, float]:
     return row["by_views"][str(row["photos"])]
 
 
-def noise(rows: Mapping[str, Any]) -> float | None:
-    """The largest difference in dB between two runs that differ in their seed alone; None without such a pair.
+def seed_interval(rows: Mapping[str, Any], score: str = "psnr_mask") -> float | None:
+    """Half of the 95 % interval, in dB, of a difference between two runs, by their seeds alone; None without a pair of seeds.
 
-    Of either PSNR: two pairs are few, and one number of a pair may be equal by chance.
+    From the pairs of runs that differ in their seed alone: Student's t with as many degrees of freedom as pairs, which takes
+    into account that they are few. It says nothing about other people.
     """
     pairs = [(name, name.removesuffix(", another seed")) for name in rows if name.endswith(", another seed")]
-    found = [
-        abs(headline(rows[a])[score] - headline(rows[b])[score])
-        for a, b in pairs
-        if b in rows
-        for score in ("psnr", "psnr_mask")
-    ]
-    return max(found, default=None)
+    found = [headline(rows[a])[score] - headline(rows[b])[score] for a, b in pairs if b in rows]
+    if not found:
+        return None
+    from scipy.stats import t
+
+    return float(t.ppf(0.975, len(found))) * math.sqrt(sum(x * x for x in found) / len(found))
 
 
-def verdict(difference: float, noise: float | None) -> str:
-    """What a difference is worth beside that of another seed."""
-    if noise is None:
+def verdict(difference: float, interval: float | None) -> str:
+    """What a difference is worth beside its interval."""
+    if interval is None:
         return "noise unknown"
-    return "within noise" if abs(difference) <= noise else "better" if difference > 0 else "worse"
+    return "within noise" if abs(difference) <= interval else "better" if difference > 0 else "worse"
+
+
+def untrained(rows: Mapping[str, Any], painted: Mapping[str, Mapping[str, float]]) -> list[str]:
+    """Names of the runs that have learned too little for a comparison: `MARGIN` over the painted body mesh is not reached.
+
+    painted: its scores by number of photos, of the same people and views. That of `PHOTOS` counts for all.
+    """
+    least = painted[str(PHOTOS)]["psnr_mask"] + MARGIN
+    return [name for name, row in rows.items() if headline(row)["psnr_mask"] < least]
+
+
+def results(name: str) -> Any:
+    """The unrounded numbers of docs/results/NAME.json."""
+    return json.loads((PAGE.parent / "results" / f"{name}.json").read_text())["numbers"]
+
+
+def untrained_on_the_page() -> list[str]:
+    """`untrained` of what docs/paper.md shows."""
+    return untrained(results("paper")["runs"], results(PAINTED_TABLE)["validation"])
 
 
 # Trained systems on people of a folder -----------------------------------------------------------------------------------
@@ -282,8 +306,6 @@ def folder_of(name: str) -> str:
 
 def trained(runs: Path | None, names: Any = None) -> dict[str, tuple[Any, Any]]:
     """(variables, configuration) by name: the variants whose training is finished, and the shipped weights."""
-    import json
-
     from humangs_jax.network.weights import load_weights
 
     found = {}

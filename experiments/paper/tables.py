@@ -4,7 +4,7 @@
     python experiments/paper/tables.py --runs runs/paper --people PEOPLE --other OTHER --near NEAR --split RUNS PEOPLE
     python experiments/paper/tables.py ... --table animation --json tables.json
 
-animation        table 1: unseen poses and views, with the seconds to model a person and to draw a frame
+animation        table 1: unseen poses and views; of the printed rows also the seconds to model a person and to draw a frame
 reconstruction   table 2: views in the pose of the photos, and in others
 domains          table 3: reconstruction of people like those of training (--people), and of other kinds (--other); systems that
                  were trained on another division of the people (--split: their runs, and people that they have not seen)
@@ -13,14 +13,15 @@ gaussians        1 against 1 + 4 and 1 + 8 Gaussians a vertex
 
 PSNR / SSIM / LPIPS by the protocol of the paper; LPIPS needs weights (--lpips). Printed rows say so and are of the paper's data
 and training: they are no measure of ours. Systems are those whose training is finished in --runs, and the shipped weights;
-those that take one photo get the first. People of another kind are any other folder: captures of `humangs synth` with other
-settings, or a data set. --json is written after every measurement; the same command goes on there.
+those that take one photo get the first; those that docs/paper.md calls not trained are marked. People of another kind are any
+other folder: captures of `humangs synth` with other settings, or a data set. --json is written after every measurement; the same
+command goes on there.
 """
 
 import argparse
 import sys
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from experiments.paper.bench import (
     ANIMATION,
     DOMAINS,
     GAUSSIANS,
+    NOT_TRAINED,
     ONE_PHOTO,
     PAGE,
     PAPER,
@@ -46,6 +48,7 @@ from experiments.paper.bench import (
     takes_one,
     trained,
     triple,
+    untrained_on_the_page,
 )
 from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.io.text import read_json
@@ -70,6 +73,7 @@ def main() -> None:
     parser.add_argument("--page", type=Path, nargs="?", const=PAGE, help=f"write the table {PAGE_TABLE} of this page")
     parser.add_argument("--table", nargs="+", default=["all"], choices=(*TABLES, "all"), help="which ones")
     arguments = parser.parse_args()
+    arguments.gray = untrained_on_the_page()
     if not (arguments.people or arguments.quick):
         parser.error("--people is needed, or --quick")
     try:
@@ -149,9 +153,10 @@ def of(found: Mapping[str, Any] | None, task: str) -> str:
     return "-" if found is None else triple(found[task])
 
 
-def photos_of(found: Mapping[str, Any]) -> str:
-    """How many a system got."""
-    return "1 photo" if found["photos"] == 1 else f"{found['photos']} photos"
+def photos_of(found: Mapping[str, Any], name: str, gray: Collection[str]) -> str:
+    """How many a system got, and whether it is one of those that are not trained."""
+    count = "1 photo" if found["photos"] == 1 else f"{found['photos']} photos"
+    return f"{count}, {NOT_TRAINED}" if name in gray else count
 
 
 def seconds(value: float | None) -> str:
@@ -165,14 +170,16 @@ def animation(names: list[str], measure: Measure, arguments: argparse.Namespace)
     for name in names:
         found = measure(name, arguments.people, PHOTOS)
         if found is not None:
-            times = (seconds(found["model_s"]), seconds(found["frame_s"]))
-            rows.append([name, photos_of(found), of(found, "animation"), *times])
-    if arguments.fits:
-        fits = list(read_json(arguments.fits).values())
-        times = [seconds(sum(fit[key] for fit in fits) / len(fits)) for key in ("fit_s", "frame_s")]
-        scores = triple(mean_scores(fit["animation"] for fit in fits))
-        rows.append(["animatable", f"fitted to each of {len(fits)} people", scores, *times])
-    return markdown_table(["method", "", "PSNR / SSIM / LPIPS", "modelling s", "synthesis s"], rows, "llrrr")
+            rows.append([name, photos_of(found, name, arguments.gray), of(found, "animation"), "", ""])
+    text = markdown_table(["method", "", "PSNR / SSIM / LPIPS", "modelling s", "synthesis s"], rows, "llrrr")
+    return f"{text}\n\n{fitted(read_json(arguments.fits).values())}" if arguments.fits else text
+
+
+def fitted(fits: Collection[Mapping[str, Any]]) -> str:
+    """The system that is fitted to one person: other people and many more photos, so no row among the others."""
+    scores = triple(mean_scores(fit["animation"] for fit in fits))
+    row = ["animatable", f"fitted to each of {len(fits)} other people", scores]
+    return markdown_table(["fitted to one person", "", "PSNR / SSIM / LPIPS"], [row], "llr")
 
 
 def reconstruction(names: list[str], measure: Measure, arguments: argparse.Namespace) -> str:
@@ -181,7 +188,9 @@ def reconstruction(names: list[str], measure: Measure, arguments: argparse.Names
     for name in names:
         found = measure(name, arguments.people, PHOTOS)
         if found is not None:
-            rows.append([name, photos_of(found), of(found, "reconstruction"), of(found, "animation")])
+            rows.append(
+                [name, photos_of(found, name, arguments.gray), of(found, "reconstruction"), of(found, "animation")]
+            )
     return markdown_table(["method", "", "reconstruction", "reconstruction + animation"], rows, "llrr")
 
 
@@ -192,9 +201,11 @@ def domains(names: list[str], measure: Measure, arguments: argparse.Namespace) -
     for name in names:
         found = [measure(name, people, PHOTOS) for people in (arguments.people, *others)]
         if found[0] is not None:
-            rows.append([name, photos_of(found[0]), *(of(x, "reconstruction") for x in found)])
+            rows.append([name, photos_of(found[0], name, arguments.gray), *(of(x, "reconstruction") for x in found)])
         if arguments.split and (x := measure(f"{name}{SPLIT}", arguments.split[1], PHOTOS)) is not None:
-            rows.append([f"{name}{SPLIT}", photos_of(x), of(x, "reconstruction"), *["-" for _ in others]])
+            rows.append(
+                [f"{name}{SPLIT}", photos_of(x, name, arguments.gray), of(x, "reconstruction"), *["-" for _ in others]]
+            )
     heads = [f"cross-domain: {people.name}" if people else "cross-domain" for people in others]
     return markdown_table(["method", "", "in domain", *heads], rows, "llr" + "r" * len(heads))
 
@@ -212,7 +223,8 @@ def views(names: list[str], measure: Measure, arguments: argparse.Namespace) -> 
                 for count, row in zip(COUNTS, each, strict=True)
             ]
             if set(found) != {"-"}:
-                rows.append([name, kind, *found])
+                mark = f", {NOT_TRAINED}" if name in arguments.gray else ""
+                rows.append([name, f"{kind}{mark}", *found])
     return markdown_table(["method", "cameras", *map(str, COUNTS)], rows, "ll" + "r" * len(COUNTS))
 
 
@@ -223,7 +235,7 @@ def gaussians(names: list[str], measure: Measure, arguments: argparse.Namespace)
     for name in K_VARIANTS:
         found = measure(name, arguments.people, PHOTOS)
         if found is not None:
-            rows.append([name, photos_of(found), of(found, "reconstruction")])
+            rows.append([name, photos_of(found, name, arguments.gray), of(found, "reconstruction")])
     return markdown_table(["Gaussians a vertex", "", "PSNR / SSIM / LPIPS"], rows, "llr")
 
 

@@ -8,7 +8,7 @@
 Each variant of `bench.variants` has the same number of steps, people, views and losses; the learning rate ends at 0. What is done
 stays in OUT: finished variants are not repeated, an unfinished one goes on from its last checkpoint, also after Ctrl-C or a kill.
 --budget ends the call in time. Another --steps is another OUT. The default of 3,000 steps takes some 30 minutes of two cores a
-variant, and two seeds of two of them say how large noise is: a difference that is no larger is called so.
+variant, and two seeds of two of them say how large noise is: a difference inside its 95 % interval is called so.
 
 People are rendered on the fly from a bank of training seeds, the same ones for all; scores are of validation people: captures
 with at least 4 + 6 views of one pose. Both are made once in OUT unless given. --quick trains the first two variants for 20 steps,
@@ -27,13 +27,20 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.paper.bench import (
+    MARGIN,
     NOISE,
+    NOT_TRAINED,
     PAGE,
+    PAINTED,
+    PAINTED_TABLE,
+    PHOTOS,
     SCORES,
     folder_of,
     headline,
-    noise,
+    results,
+    seed_interval,
     train_variant,
+    untrained,
     variants,
     verdict,
     view_counts,
@@ -123,7 +130,7 @@ def run(arguments: argparse.Namespace, queue: Mapping[str, Any], names: list[str
         print(f"{name}: " + ", ".join(f"{key} {value:.4g}" for key, value in headline(row).items()), flush=True)
         jax.clear_caches()
     if rows:
-        print(text := table(rows, queue, settings))
+        print(text := table(rows, queue, settings, results(PAINTED_TABLE)["validation"] if arguments.page else None))
         if arguments.page:
             publish(arguments.page, TABLE, text, {"settings": settings, "runs": rows})
 
@@ -160,11 +167,20 @@ def kept(path: Path, settings: Mapping[str, Any], parser: Any) -> dict[str, Any]
     return report["runs"]
 
 
-def table(rows: Mapping[str, Any], queue: Mapping[str, Any], settings: Mapping[str, Any]) -> str:
-    """A row a variant, with its difference to what it is compared with, and what another seed changes below."""
+def table(
+    rows: Mapping[str, Any],
+    queue: Mapping[str, Any],
+    settings: Mapping[str, Any],
+    painted: Mapping[str, Any] | None = None,
+) -> str:
+    """A row a variant, with its difference to what it is compared with; below, what another seed changes.
+
+    painted: scores of the painted body mesh by number of photos; runs that hardly beat it are marked as not trained.
+    """
     from experiments.common.results import markdown_table
 
-    lines = []
+    lines, interval = [], seed_interval(rows)
+    gray = untrained(rows, painted) if painted else ()
     for name in (name for name in queue if name in rows):
         row, against = rows[name], queue[name].against
         scores = headline(row)
@@ -172,15 +188,20 @@ def table(rows: Mapping[str, Any], queue: Mapping[str, Any], settings: Mapping[s
         cells += [f"{scores[key]:.{digits}f}" for key, (_, digits) in SCORES.items()]
         if against in rows:
             change = scores["psnr_mask"] - headline(rows[against])["psnr_mask"]
-            said = NOISE if queue[name].claim == NOISE else verdict(change, noise(rows))
-            cells += [against, f"{change:+.2f}", said]
+            said = NOISE if queue[name].claim == NOISE else verdict(change, interval)
+            cells += [against, f"{change:+.2f}", NOT_TRAINED if name in gray or against in gray else said]
         else:
-            cells += ["", "", ""]
+            cells += ["", "", NOT_TRAINED if name in gray else ""]
         lines.append([*cells, f"{row['parameters'] / 1e6:.2f}", row["steps"], f"{row['cpu_seconds']:.0f}"])
     header = ["variant", "photos", *(heading for heading, _ in SCORES.values())]
-    header += ["against", "difference on the person, dB", "", "M parameters", "steps", "CPU s"]
+    header += ["against", "difference of foreground PSNR, dB", "", "M parameters", "steps", "CPU s"]
     text = markdown_table(header, lines, "lr" + "r" * len(SCORES) + "lrlrrr")
-    texts = [text, f"Means over {len(settings['validation'])} unseen people."]
+    said = f"Means over {len(settings['validation'])} unseen people."
+    if interval is not None:
+        said += f" 95 % interval of a difference by the seeds of training alone: +-{interval:.2f} dB; within it: noise."
+    if painted:
+        said += f' "{NOT_TRAINED}": less than {MARGIN:g} dB of foreground PSNR over the {PAINTED} of {PHOTOS} photos.'
+    texts = [text, said]
     counted = {name: row["by_views"] for name, row in rows.items() if len(row["by_views"]) > 1}
     if counted:
         counts = sorted({int(count) for own in counted.values() for count in own})
@@ -188,7 +209,7 @@ def table(rows: Mapping[str, Any], queue: Mapping[str, Any], settings: Mapping[s
             [name, *(f"{own[str(c)]['psnr_mask']:.2f}" if str(c) in own else "" for c in counts)]
             for name, own in counted.items()
         ]
-        texts.append(markdown_table(["on the person, dB, by photos", *map(str, counts)], shown))
+        texts.append(markdown_table(["foreground PSNR, dB, by photos", *map(str, counts)], shown))
     return "\n\n".join(texts)
 
 

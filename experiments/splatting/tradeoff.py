@@ -3,6 +3,7 @@
     python experiments/splatting/tradeoff.py --scene S.npz --size 512 [--json OUT] [--image OUT.png]
         [--page docs/performance.md]
     python experiments/splatting/tradeoff.py --scene demo --image docs/images/splatting_tradeoff.png
+    python experiments/splatting/tradeoff.py --measured docs/results/splatting_tradeoff.json --image IMAGE
 
 Every setting takes turns with the exact one, call by call, in one process; its time is the median of the quotients. Its
 error is that of the image to the exact one, drawn in float64, on black; of gradients (mean squared error against noise)
@@ -18,6 +19,7 @@ import argparse
 import dataclasses
 import gc
 import json
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -93,7 +95,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", help="npz of a scene, or 'demo'")
-    parser.add_argument("--measured", type=Path, help="JSON of an earlier run, instead of a scene")
+    parser.add_argument("--measured", type=Path, help="JSON of an earlier run, or in docs/results, instead of a scene")
     parser.add_argument("--size", type=int, default=512, help="side of the image, pixels")
     parser.add_argument("--repeats", type=int, default=9, help="timed rounds")
     parser.add_argument("--only", nargs="+", help="knobs to measure (also: hidden, combined, preset)")
@@ -105,6 +107,8 @@ def main() -> None:
         parser.error("give either --scene or --measured")
     if arguments.measured:
         result = json.loads(arguments.measured.read_text())
+        if "blocks" in result:
+            result = result["numbers"] or of_table(result["blocks"])
     else:
         prepare_process()
         result = measure(load_scene(arguments.scene, arguments.size), arguments.repeats, arguments.only)
@@ -247,6 +251,23 @@ def table(result: dict[str, Any]) -> str:
     return f"{title}\n\n{markdown_table(header, rows)}"
 
 
+def of_table(blocks: Sequence[Any]) -> dict[str, Any]:
+    """The result behind a section of a page, as exact as its digits: for runs of which no other numbers were kept."""
+    title, shown = blocks
+    (_, *times, psnr, largest, gradients), *rows = shown["rows"]
+    errors = lambda *cells: dict(zip(("psnr", "max_abs_error", "gradient_relative_l2"), map(float, cells), strict=True))
+    exact = {name: {"cpu_ms": float(x.split()[0])} for name, x in zip(DIRECTIONS, times, strict=True)}
+    settings = []
+    for label, *times, psnr_, largest_, gradients_ in rows:
+        preset = label.strip("*") if label.startswith("*") else None
+        knob = "preset" if preset else "combined" if "," in label else label.split()[0]
+        relative = {f"{name}_cpu": float(x) for name, x in zip(DIRECTIONS, times, strict=True)}
+        settings.append({"knob": knob, "label": preset or label} | relative | errors(psnr_, largest_, gradients_))
+    ((scene, gaussians, size),) = re.findall(r"^(\w+), ([\d,]+) Gaussians at (\d+);", title)
+    counts = {"scene": scene, "gaussians": int(gaussians.replace(",", "")), "size": int(size)}
+    return counts | {"exact": exact | errors(psnr, largest, gradients), "settings": settings}
+
+
 def draw(result: dict[str, Any], path: Path) -> None:
     """Time relative to exact against PSNR, forward and forward+backward, with the front."""
     import matplotlib
@@ -280,7 +301,6 @@ def _draw_panel(axis, rows, time):
     for some, color in ((rows, "0.85"), (whole, "0.65")):
         steps = zip(*((r[time], r["psnr"]) for r in pareto(some, time)), strict=True)
         axis.step(*steps, where="post", color=color, lw=2.5)
-    labelled = pareto(rows, time) + pareto(whole, time)
     knobs = dict.fromkeys(row["knob"] for row in rows if row["knob"] != "preset")
     for i, knob in enumerate(knobs):
         points = [(row[time], row["psnr"]) for row in rows if row["knob"] == knob]
@@ -291,7 +311,7 @@ def _draw_panel(axis, rows, time):
         if row["knob"] == "preset":
             axis.plot(*point, "*", ms=14, color="black", zorder=3)
             axis.annotate(row["label"], point, (8, 4), textcoords="offset points", weight="bold")
-        elif row in labelled or row["knob"] != "combined":
+        elif row["knob"] != "combined":  # what is combined: see the table
             text = row["label"].removeprefix(row["knob"]).strip()
             axis.annotate(text, point, (5, -8), textcoords="offset points", fontsize=6.5, color="0.35")
 

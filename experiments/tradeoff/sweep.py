@@ -210,7 +210,7 @@ class Bench:
         cameras = cameras.resized(point.size, point.size)
         drawn = [np.clip(np.asarray(r.rgb), 0, 1) for r in draw(avatar, poses, cameras, how=self.how(point, avatar))]
         if point.size != TRUE_SIZE:
-            drawn = [np.clip(resized(image, TRUE_SIZE, TRUE_SIZE), 0, 1) for image in drawn]
+            drawn = [resized(image, TRUE_SIZE, TRUE_SIZE) for image in drawn]
         return score_tasks(np.stack(drawn), truth)
 
     def pruned(self, point, avatar, held_out):

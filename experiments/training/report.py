@@ -3,7 +3,7 @@
     python experiments/training/report.py --out runs/report
 
 Makes 64 synthetic people of the training seeds and 8 of the validation seeds in runs/report, trains the preset `small` for 500
-steps and writes the tables of docs/training_run.md and its images in docs/images. Ctrl-C saves; the same command continues, and
+steps and writes OUT/report.md with its tables, and images in OUT/images. Ctrl-C saves; the same command continues, and
 after the end it writes tables and images again. On 2 CPU cores about 5 minutes for the people and 15 for the run; expected: 22 dB
 on the validation people, no step skipped. Needs matplotlib (the `notebooks` extra).
 
@@ -22,7 +22,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.interleaved import peak_rss_mb, prepare_process
-from experiments.common.results import check_section, markdown_table, publish, write_json
+from experiments.common.results import check_section, markdown_table, publish, write_json, write_text
 from experiments.training.plot import draw_curve, read_lines, steps_of, validations_of
 
 TABLES = ("training_run_steps", "training_run_facts")
@@ -43,18 +43,22 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=64, help="people to train on")
     parser.add_argument("--validation", type=int, default=8, help="people to look at")
     parser.add_argument(
-        "--page", type=Path, default=Path("docs/training_run.md"), help="page of the tables training_run_*"
+        "--page", type=Path, help="page of the tables training_run_*; default: OUT/report.md, which is made"
     )
-    parser.add_argument("--images", type=Path, default=Path("docs/images"), help="folder for its pictures")
+    parser.add_argument("--images", type=Path, help="folder for its pictures; default: OUT/images")
     arguments = parser.parse_args()
     if min(arguments.steps, arguments.people, arguments.validation) < 1:
         parser.error("--steps, --people and --validation must be at least 1")
+    images, page = arguments.images or arguments.out / "images", arguments.page or arguments.out / "report.md"
+    if arguments.page is None and not page.is_file():
+        sections = (f"<!-- table: {name} -->\n<!-- end -->\n" for name in TABLES)
+        write_text(page, "\n".join(["# A training run\n", *sections]))
     for name in TABLES:
-        check_section(arguments.page, name)
+        check_section(page, name)
     prepare_process()
     if train(arguments):
-        write_report(arguments.out, arguments.page, arguments.images)
-        print(f"{arguments.page}: written")
+        write_report(arguments.out, page, images)
+        print(f"{page}: written")
     else:
         print("interrupted: the same command goes on")
 

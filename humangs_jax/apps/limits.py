@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.masks import person_box
+from humangs_jax.data.usable_views import MASK_THRESHOLD
 
 LIMITS = "assets/limits.json"
 PHOTO_SIZE = 256
@@ -35,9 +37,8 @@ def quantities(capture: Capture) -> dict[str, tuple[float, float]]:
         "distance of the cameras": (float(distances.min()), float(distances.max())),
     }
     if capture.masks is not None:
-        rows = [np.flatnonzero((mask > 0.5).any(axis=1)) for mask in capture.masks]
         scale = PHOTO_SIZE / max(capture.masks.shape[1:])  # the network reduces larger photos
-        heights = [float(np.ptp(row) + 1) * scale if len(row) else 0.0 for row in rows]
+        heights = [float(np.ptp(person_box(mask > MASK_THRESHOLD)[0])) * scale for mask in capture.masks]
         found["height of the person"] = (min(heights), max(heights))
     return found
 

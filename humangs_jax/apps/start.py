@@ -11,6 +11,7 @@ from humangs_jax.data.calibration.formats import EASYMOCAP_FILES, FILES
 from humangs_jax.data.calibration.photos import SUFFIXES
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.io.images import image_size, open_image
+from humangs_jax.io.reading import reading, walk
 
 PHOTO_FOLDERS = ("images", "photos", "imgs", "rgb")
 MASK_FOLDERS = ("masks", "mask", "mattes", "matte", "silhouettes")
@@ -156,16 +157,11 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
 
 def _photos(folder: Path) -> Iterator[Path]:
     """The photos of a folder and of those in it, except for masks, captures, and what other programs have made of photos."""
-    if not folder.is_dir():
-        return
-    for path in folder.iterdir():
-        if path.name.startswith("."):
-            continue
-        if path.is_dir():
-            if path.name not in (*MASK_FOLDERS, *KEYPOINT_FILES, "colmap") and not (path / "capture.json").exists():
-                yield from _photos(path)
-        elif path.suffix in SUFFIXES:
-            yield path
+    others = (*MASK_FOLDERS, *KEYPOINT_FILES, "colmap")
+    if folder.is_dir():
+        with reading(folder, "folder of photos", CaptureError):
+            found = walk(folder, lambda path: path.name in others or (path / "capture.json").exists())
+            yield from (path for path in found if path.suffix in SUFFIXES)
 
 
 def _has_cameras(place):

@@ -21,6 +21,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov
+from humangs_jax.io.reading import check_limit
 from humangs_jax.rendering.constants import ALPHA_MIN
 from humangs_jax.rendering.drawing import Background
 from humangs_jax.rendering.gaussians import Gaussians
@@ -32,8 +33,12 @@ MARGIN = 1.12
 FOLLOWING = 0.5
 """Seconds: standard deviation of the Gaussian that smooths the path of the camera. Steps and swinging arms, of about a second,
 do not reach it; a walk does."""
+WIDEST = 2
+"""Of the Gaussian that smooths, over the length of the path: wider ones leave less than 1e-8 of anything but a straight line."""
 TRACKED, TRACKED_OPACITY = 1024, 0.5
 """A person's extent is measured on this number of Gaussians, evenly spread, of at least this opacity."""
+MOST_TRACKED = 1 << 25
+"""In all frames together, 400 MB: a motion of more than 32,768 frames is measured on fewer Gaussians."""
 A_POSE = 48.0
 """Degrees that the arms hang down in the A-pose, as in the page."""
 
@@ -116,7 +121,8 @@ def tracked_points(avatar: Avatar, poses: BodyPose) -> Float[np.ndarray, "m p 3"
     """Where opaque Gaussians of the avatar are in each pose of a batch, metres: what a frame has to show."""
     opacities = np.asarray(avatar.gaussians.opacities)
     opaque = np.flatnonzero(opacities >= min(TRACKED_OPACITY, opacities.max()))
-    chosen = opaque[np.linspace(0, len(opaque) - 1, min(TRACKED, len(opaque))).astype(int)]
+    count = min(TRACKED, len(opaque), max(MOST_TRACKED // len(poses.translation), 1))
+    chosen = opaque[np.linspace(0, len(opaque) - 1, count).astype(int)]
     means, weights = avatar.gaussians.means[chosen], avatar.skinning_weights[chosen]
     return np.asarray(_paths(means, weights, avatar.rest_joints, avatar.parents, poses))
 
@@ -157,6 +163,7 @@ def shot_cameras(
 
 def smoothed_path(path: Float[np.ndarray, "m 3"], frames: float) -> Float[np.ndarray, "m 3"]:
     """A path smoothed by a Gaussian of this standard deviation; at its ends it is taken to go on as it came (point mirrored)."""
+    frames = min(frames, WIDEST * len(path))
     reach = int(np.ceil(3 * frames))
     if reach == 0 or len(path) == 1:
         return path
@@ -205,6 +212,8 @@ def excerpt(
         )
     if loop < 1:
         raise ValueError(f"loop {loop}: expected at least 1")
+    rate = motion.fps if fps is None else fps
+    check_limit("frames", loop * (stop - start) * rate, f"frames in {loop * (stop - start):g} seconds")
     first = min(int(start * motion.fps), count - 1)
     last = max(first + 1, min(round(stop * motion.fps), count))
     part = replace(motion, rotations=motion.rotations[first:last], translations=motion.translations[first:last])
@@ -245,6 +254,7 @@ def turntable_views(avatar: Avatar, pose: BodyPose, views: int, shot: Shot) -> t
     """One pose, and cameras on a circle that starts at the azimuth of the shot. Raises: ValueError for no view."""
     if views < 1:
         raise ValueError(f"views {views}: expected at least 1")
+    check_limit("frames", views, "views")
     points = tracked_points(avatar, jax.tree.map(lambda x: x[None], pose))
     cameras = shot_cameras(shot, points, np.linspace(0, 360, views, endpoint=False), None)
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (views, *x.shape)), pose), cameras

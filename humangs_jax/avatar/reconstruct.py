@@ -24,6 +24,7 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.views import SubjectViews, fits, gaussian_body, pad_views, prepare_inputs, standardize, upright
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import camera_values
+from humangs_jax.io.reading import check_limit
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs, needed_tokens
 from humangs_jax.network.inputs import HumanGSInputs
@@ -266,6 +267,7 @@ def _most_needed(inputs, config):
 def _check(capture, name):
     if capture.view_count == 0:
         raise ValueError(f"{name}: 0 views; at least one photo is needed")
+    check_limit("network_views", capture.view_count, f"photos in {name}")
     views, height, width = (*np.shape(capture.images), 0, 0, 0)[:3]
     shapes = {
         "images": (views, height, width, 3),

@@ -124,7 +124,9 @@ def _parsed(arguments: list[str]) -> Command:
     import tyro
 
     if arguments and arguments[0] in COMMANDS:
-        return tyro.cli(_command(arguments[0]), prog=f"humangs {arguments[0]}", args=arguments[1:])
+        words = 2 if arguments[:2] == ["import", "cameras"] else 1  # tyro's usage has no word that is given already
+        prog = " ".join(["humangs", *arguments[:words]])
+        return tyro.cli(_command(arguments[0]), prog=prog, args=arguments[1:])
     every = {name: _command(name) for name in COMMANDS}
     return tyro.extras.subcommand_cli_from_dict(every, prog="humangs", description=DESCRIPTION, args=arguments)
 

@@ -77,7 +77,7 @@ class Animate:
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
             motion = load_motion(self.motion, rest_joints=avatar.rest_joints)
-            with _options():
+            with _options(self.motion):
                 motion = excerpt(motion, self.start, self.stop, self.fps, self.loop)
             check_video(self.out, len(motion.translations), *self.shot.resolution)
             poses, cameras = motion_views(avatar, motion, shot, self.turn, self.follow)
@@ -220,10 +220,14 @@ class View:
 
 
 @contextlib.contextmanager
-def _options():
-    """Errors of the library that begin with the name of an option are errors of the command line."""
+def _options(file=None):
+    """Errors of the library that begin with the name of an option are errors of the command line. file: whose limits are hit."""
+    from humangs_jax.io.reading import Refused
+
     try:
         yield
+    except Refused as error:
+        raise ValueError(f"{'the motion' if file is None else file}: {error}") from error
     except ValueError as error:
         raise UsageError(f"--{error}") from error
 

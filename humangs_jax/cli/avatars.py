@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from humangs_jax.data.motion import Motion
 
 
-DEMO_SECONDS = 10.0
+DEMO_SECONDS = 15.0
 """Of refinement."""
 
 
@@ -44,7 +44,7 @@ class Demo:
     size: int = 256
     """Side of the animation's frames in pixels."""
     refine: float | None = None
-    """Seconds for which the avatar is fitted to its photos; 0 for none. Default: 10, or as long as --preset says."""
+    """Seconds for which the avatar is fitted to its photos; 0 for none. Default: 15, or as long as --preset says."""
     preset: Preset | None = None
     """Speed against accuracy (docs/tradeoff.md): photos, network, drawing, and refinement where --refine does not say."""
 

@@ -15,9 +15,9 @@ class LossNetworkFiles:
     """Networks under perceptual losses (docs/loss_networks.md)."""
 
     vgg19: Path | None = None
-    """Weights of VGG-19 for the perceptual loss. Default: the loss is left out."""
+    """Weights of VGG-19 for the perceptual loss. Default: structural dissimilarity (SSIM) takes its place."""
     lpips_backbone: Path | None = None
-    """Weights of the network under LPIPS, for the loss and for validation. Default: LPIPS is left out."""
+    """Weights of the network under LPIPS. Default: no LPIPS in validation; in the loss SSIM takes its place."""
     lpips_heads: Path | None = None
     """The linear heads of LPIPS, if the backbone's file does not have them."""
     lpips_net: Literal["vgg", "alex", "squeeze"] = "vgg"

@@ -31,7 +31,7 @@ from humangs_jax.data.capture_checks import (
     checked_frame,
     numbers,
 )
-from humangs_jax.data.masks import fit_mask
+from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.data.photos import (
     Photos,
     capture_folder,
@@ -46,7 +46,7 @@ from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import resized, write_png
 from humangs_jax.io.npz import read_npz, write_npz
-from humangs_jax.io.reading import FileError, reading
+from humangs_jax.io.reading import FileError, check_limit, reading
 
 DEFAULT_BODY = "makehuman"
 """Name of the body that comes with the package; any other `body` in body.npz is the path of a model file."""
@@ -167,7 +167,7 @@ def capture_from_arrays(
     check_background(background, source)
     if masks is not None and background == "photo":
         if fit_masks:
-            masks = np.stack([fit_mask(image, mask)[0] for image, mask in zip(images, masks, strict=True)])
+            masks = np.stack([mask for mask, _ in masks_at_edges(list(images), list(masks))])
         images = on_white_background(images, masks)
     photos = Photos(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names)
     return _assemble(photos, body, betas, rotations, translations, body_file)
@@ -200,6 +200,7 @@ def load_capture(
         if body is None:
             body = _load_model(parameter_file, body_file, folder)
         betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
+        check_limit("frames", len(rotations), f"frames in {parameter_file}")
         photos = read_photos(folder, description, views, len(rotations), fit_masks)
         if body_file != DEFAULT_BODY:
             body_file = str(folder / body_file)

@@ -11,7 +11,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Float
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import check_replaceable
-from humangs_jax.io.reading import FileError, reading
+from humangs_jax.io.reading import FileError, reading, shown
 from humangs_jax.io.text import parse_json, read_text
 
 COLOUR_SLACK = 1e-3
@@ -115,7 +115,7 @@ def checked_camera(
 def checked_frame(frame: Any, count: int, file: object, field: str) -> int:
     """An integer that counts one of the poses."""
     if isinstance(frame, bool) or not isinstance(frame, int):
-        raise CaptureError(file, field, f"expected an integer, got {frame!r}")
+        raise CaptureError(file, field, f"expected an integer, got {shown(frame)}")
     if not 0 <= frame < count:
         raise CaptureError(file, field, f"expected 0 to {count - 1} (there are {count} poses), got {frame}")
     return frame
@@ -151,4 +151,4 @@ def check_names(names: Sequence[str], count: int, file: object) -> None:
         raise CaptureError(file, "names", f"expected {count} different names, got {list(names)}")
     for name in names:
         if not isinstance(name, str) or not re.fullmatch(r"[\w-][\w.-]*", name):
-            raise CaptureError(file, "names", f"expected letters, digits, '.', '_' and '-' only, got {name!r}")
+            raise CaptureError(file, "names", f"expected letters, digits, '.', '_' and '-' only, got {shown(name)}")

@@ -1,14 +1,21 @@
 """Masks that are too large or too small, moved to where the photo has its edges.
 
-Segmentation leaves outlines that are some pixels off. A pixel too much shows the background at the person's rim, a pixel too
+Segmentation leaves silhouettes that are some pixels off. A pixel too much shows the background at the person's rim, a pixel too
 little cuts the person, in all photos alike, so no later stage can find it. Here the photo is searched along the normals of the
-outline: at which distance from it do the colours change most, on average over the outline, and near each of its points?
+silhouette: at which distance from it do the colours change most, on average over the silhouette, and near each of its points?
+
+A stripe along the rim that looks like the background (rim light before a bright wall, piping) has a stronger edge on its other
+side. So a mask is moved only where sectors of the silhouette agree, and views do, that there is no edge where it ends now.
 """
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
 
-from humangs_jax.core.array_types import Float
+from humangs_jax.core.array_types import Bool, Float, Int
 from humangs_jax.io.images import resized
 
 PERSON_HEIGHT = 200
@@ -23,39 +30,99 @@ LEAST_MOVE = 0.5
 """Parts of the outline that would move by less stay where they are."""
 MOST_PIXELS = 400
 """Height of the person at which the photo is searched; larger photos are reduced."""
+LEAST_PART = 0.005
+"""Connected parts of a mask that are smaller, as a share of the largest one's area, are specks and not the person."""
 WHITE = 0.98
 """A photo with nothing darker around the mask, beyond `REACH`, shows no background: there is nothing to find."""
+SECTORS, SECTOR_POINTS = 16, 8
+"""Parts of the silhouette, of equal numbers of points, by the angle about its middle; fewer where points are few."""
+AGREE, AGREE_ALONE = 0.7, 0.5
+"""Shares of the sectors that must find the edge at one distance: of all views that would be moved alike, and of the view."""
+EDGE, OF_TEXTURE = 0.06, 1.0
+"""There is an edge where colours change more than beside it, by these shares of the strongest change and of that beside it."""
+SEEN_APART, CLEAR = 1.5, 1.3
+"""Pixels: an edge that is nearer than the first to the mask's is not told from it; a blurred edge ends within the second."""
+THIN = 0.0007
+"""Area of the parts of a mask that are too thin for one that is too large, over the area that it would lose."""
+
+
+class _Shift(NamedTuple):
+    """What the photo says about a mask: it is too large by `excess` pixels (0: it stays), in `window` by `moves` at each pixel.
+
+    votes: sectors for it and against it. thin: see `THIN`.
+    """
+
+    excess: float
+    window: tuple[slice, ...] = ()
+    moves: np.ndarray = np.zeros((0, 0), np.float32)
+    unit: float = 1.0
+    votes: tuple[int, int] = (0, 0)
+    thin: float = 0.0
 
 
 def fit_mask(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w"], float]:
-    """The mask with its outline at the photo's edges, and by how many pixels of the photo it was too large (negative: small).
+    """`masks_at_edges` of one view."""
+    return masks_at_edges([image], [mask])[0]
 
-    Arguments: image: the photo with its background, values in [0, 1]. mask: coverage in [0, 1].
-    A mask that is empty, full or a line, off by less than `LEAST`, or of a photo without a background is kept, with 0.
+
+def masks_at_edges(
+    images: Sequence[Float[np.ndarray, "h w 3"]], masks: Sequence[Float[np.ndarray, "h w"]]
+) -> list[tuple[Float[np.ndarray, "h w"], float]]:
+    """Each mask with its outline at the photo's edges, and by how many pixels of the photo it was too large (negative: small).
+
+    Arguments: images: the photos of one person with their background, values in [0, 1]. masks: coverage in [0, 1].
+    A mask is kept, with 0, if it is empty, full or a line, off by less than `LEAST`, or of a photo without a background; and if
+    the silhouette has an edge where the mask ends, if its sectors do not agree, or if most views are right as they are.
     """
-    rows, columns = (np.flatnonzero((mask >= 0.5).any(axis)) for axis in (1, 0))
-    if not len(rows) or mask.min() >= 0.5 or min(mask.shape) < 2:
-        return mask, 0.0
-    unit = (rows[-1] + 1 - rows[0]) / PERSON_HEIGHT
+    found = [_shift(image, mask) for image, mask in zip(images, masks, strict=True)]
+    seen = [shift for shift in found if shift is not None]
+    return [
+        (mask, 0.0) if shift is None or not _believed(shift, seen) else (_moved(mask, shift), shift.excess)
+        for mask, shift in zip(masks, found, strict=True)
+    ]
+
+
+def _believed(shift, seen):
+    """Whether a shift is one of the mask and not of the person's colours."""
+    alike = [other for other in seen if other.excess * shift.excess > 0]
+    if not alike or 2 * len(alike) < len(seen) or np.mean([other.thin for other in alike]) > THIN:
+        return False
+    share = lambda votes: votes[0] / max(sum(votes), 1)
+    return share(shift.votes) >= AGREE_ALONE and share(np.sum([other.votes for other in alike], axis=0)) >= AGREE
+
+
+def _moved(mask, shift):
+    """The mask with its outline where the photo has its edges."""
+    own = mask[shift.window].astype(np.float32)
+    moved = np.clip(signed_distance(own) - shift.moves + 0.5, 0, 1)
+    fitted = mask.copy()
+    fitted[shift.window] = np.where(np.abs(shift.moves) > LEAST_MOVE * shift.unit, moved, own)
+    return fitted
+
+
+def _shift(image, mask):
+    """The `_Shift` of one view; None where nothing can be found."""
+    (top, bottom), _ = box = person_box(mask >= 0.5)
+    if not bottom or mask.min() >= 0.5 or min(mask.shape) < 2:
+        return None
+    unit = (bottom - top) / PERSON_HEIGHT
     margin = int(np.ceil((REACH + 3 * STEP) * unit)) + 1
-    window = tuple(slice(max(line[0] - margin, 0), line[-1] + 1 + margin) for line in (rows, columns))
+    window = tuple(slice(max(first - margin, 0), end + margin) for first, end in box.tolist())
     photo, own = image[window].astype(np.float32), mask[window].astype(np.float32)
     if photo[signed_distance(own) < -REACH * unit].min(initial=1.0) >= WHITE:
-        return mask, 0.0
-    reduced = min(1.0, MOST_PIXELS / (rows[-1] + 1 - rows[0]))
+        return None
+    reduced = min(1.0, MOST_PIXELS / (bottom - top))
     height, width = own.shape
     size = max(1, round(reduced * width)), max(1, round(reduced * height))
     small = (resized(photo, *size), resized(own, *size)) if reduced < 1 else (photo, own)
     whole, moves = outline_moves(*small, reduced * unit)
     if abs(whole) < LEAST * reduced * unit:
-        return mask, 0.0
+        return _Shift(0.0)
     moves = resized(moves.astype(np.float32), width, height) / reduced
-    moved = np.clip(signed_distance(own) - moves + 0.5, 0, 1)
-    fitted = mask.copy()
-    fitted[window] = np.where(np.abs(moves) > LEAST_MOVE * unit, moved, own)
-    return fitted, whole / reduced
+    votes = sector_votes(*small, whole, reduced * unit)
+    return _Shift(whole / reduced, window, moves, unit, votes, _thin_parts(own, whole / reduced / unit))
 
 
 def outline_moves(
@@ -80,6 +147,91 @@ def outline_moves(
         if everywhere > highest:
             highest, whole = everywhere, float(step)
     return whole, ndimage.gaussian_filter(moves, SMOOTHING * unit)
+
+
+def sector_votes(
+    image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], whole: float, unit: float
+) -> tuple[int, int]:
+    """How many sectors of the silhouette have their edge about `whole` pixels inside of it, and how many do not, or have one
+    where the mask ends. Sectors whose edge is not clear say nothing; nor do those where both sides of it are white.
+    """
+    distances = signed_distance(mask)
+    normal = np.stack(np.gradient(ndimage.gaussian_filter(distances, 1.0)))
+    pixels = np.nonzero(np.abs(distances) < 0.5)
+    if not len(pixels[0]):
+        return 0, 0
+    normal = normal[:, *pixels] / np.maximum(np.linalg.norm(normal[:, *pixels], axis=0), 1e-6)
+    points = np.stack(pixels) - distances[pixels] * normal
+    angles = np.arctan2(*(points - points.mean(axis=1, keepdims=True)))
+    count = max(1, min(SECTORS, len(angles) // SECTOR_POINTS))
+    sectors = np.argsort(np.argsort(angles)) * count // len(angles)
+
+    def colours(depth):
+        """At that distance inside of the points; not beyond the middle of a limb or the frame."""
+        at = points + depth * normal
+        sample = lambda values: ndimage.map_coordinates(values, at, order=1, mode="nearest")
+        seen = (np.abs(sample(distances) - depth) < 0.75) & (at >= 0).all(axis=0)
+        seen &= (at <= np.subtract(mask.shape, 1)[:, None]).all(axis=0)
+        return np.stack([sample(image[..., c]) for c in range(3)], axis=-1), seen
+
+    def change(one, other):
+        return np.linalg.norm(one[0] - other[0], axis=-1), one[1] & other[1]
+
+    steps = np.arange(-REACH, REACH + STEP / 2, STEP) * unit
+    line = [colours(depth) for depth in [steps[0] - STEP * unit, *steps, steps[-1] + STEP * unit]]
+    profile = np.zeros((count, len(steps)))
+    for i, (one, other) in enumerate(zip(line, line[2:], strict=False)):
+        size, seen = change(one, other)
+        total = np.bincount(sectors[seen], size[seen], count)
+        profile[:, i] = total / np.maximum(np.bincount(sectors[seen], minlength=count), 1)
+    best, highest = steps[np.argmax(profile, axis=1)], profile.max(axis=1)
+    clear = highest >= 2 * np.median(profile, axis=1)
+
+    # across the mask's end, and twice beside it on the side where there is no edge if the mask is off
+    lag = min(unit, max(abs(whole) - CLEAR, 0.5))
+    beside = [colours(-np.sign(whole) * lag * i) for i in (-1, 1, 3, 5)]
+    (across, over), *textures = [change(one, other) for one, other in itertools.pairwise(beside)]
+    votes = [0, 0]
+    for sector in range(count):
+        chosen = over & (sectors == sector)
+        if 2 * chosen.sum() < SECTOR_POINTS or all(np.median(x[chosen].min(axis=-1)) >= WHITE for x, _ in beside[:2]):
+            continue
+        texture = np.concatenate([size[seen & (sectors == sector)] for size, seen in textures])
+        least = (1 + OF_TEXTURE) * np.median(texture) + EDGE * highest[sector] if len(texture) else np.inf
+        ends = abs(whole) >= SEEN_APART and np.median(across[chosen]) > least
+        if ends or clear[sector]:
+            votes[bool(ends or abs(best[sector] - whole) > SEEN_APART * unit or abs(best[sector]) <= LEAST)] += 1
+    return votes[0], votes[1]
+
+
+def _thin_parts(mask, excess):
+    """Area of the parts of a mask that it could not have if it were that much too large (in units), over the area of the excess.
+
+    A silhouette that has grown by some distance has no part thinner than twice that; one with fingers has not grown.
+    """
+    if excess <= 0:
+        return 0.0
+    top, bottom = person_box(mask >= 0.5)[0]
+    scale = MOST_PIXELS / (bottom - top)
+    inside = resized(mask, *(max(1, round(scale * side)) for side in mask.shape[::-1])) >= 0.5
+    radius = excess * MOST_PIXELS / PERSON_HEIGHT
+    depth = ndimage.distance_transform_edt(inside)
+    grown = ndimage.distance_transform_edt(depth <= 0.65 * radius) <= 0.65 * radius + 2
+    return float((inside & ~grown).sum() / max(1.0, radius * (inside & (depth <= 1)).sum()))
+
+
+def person_box(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
+    """`box_of` the person among the True pixels: the largest connected part, and others of at least `LEAST_PART` of its area."""
+    parts, _ = ndimage.label(inside, np.ones((3, 3)))
+    areas = np.bincount(parts.ravel())
+    areas[0] = 0
+    return box_of(inside & (areas >= LEAST_PART * areas.max())[parts])
+
+
+def box_of(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
+    """First row and the one after the last, then columns, of the True pixels; zeros if there are none."""
+    lines = [np.flatnonzero(inside.any(axis)) for axis in (1, 0)]
+    return np.asarray([(line[0], line[-1] + 1) if len(line) else (0, 0) for line in lines])
 
 
 def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:

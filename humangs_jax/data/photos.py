@@ -4,8 +4,10 @@ No body is needed for these: it is what `humangs import cameras` writes and `hum
 is a `CaptureError`, one line with file and field. docs/capture_format.md describes the format.
 """
 
+import contextlib
 import dataclasses
 import logging
+import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from importlib import resources
@@ -16,10 +18,10 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_frame, checked_json, numbers
-from humangs_jax.data.masks import fit_mask
+from humangs_jax.data.masks import masks_at_edges
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.io.images import orientation, read_grey, read_image
-from humangs_jax.io.reading import FileError, inside, reading
+from humangs_jax.io.images import image_size, orientation, read_grey, read_image
+from humangs_jax.io.reading import FileError, check_limit, inside, reading, shown
 from humangs_jax.io.text import write_json
 
 logger = logging.getLogger(__name__)
@@ -85,13 +87,13 @@ def read_description(file: Path) -> dict[str, Any]:
     if not isinstance(description, dict):
         raise CaptureError(file, "", f"expected a JSON object, got {type(description).__name__}")
     if description.get("format") != FORMAT:
-        raise CaptureError(file, "format", f"expected {FORMAT!r}, got {description.get('format')!r}")
+        raise CaptureError(file, "format", f"expected {FORMAT!r}, got {shown(description.get('format'))}")
     if description.get("version") != VERSION:
-        raise CaptureError(file, "version", f"expected {VERSION}, got {description.get('version')!r}")
+        raise CaptureError(file, "version", f"expected {VERSION}, got {shown(description.get('version'))}")
     check_keys(description, TOP_KEYS, TOP_KEYS - {"background"}, file)
     body = description["body"]
     if not isinstance(body, str) or Path(body).suffix != ".npz":  # fits write it: it must not be a photo
-        raise CaptureError(file, "body", f"expected the name of an npz file, got {body!r}")
+        raise CaptureError(file, "body", f"expected the name of an npz file, got {shown(body)}")
     check_inside(file, "body", body)
     check_background(description.get("background", "photo"), file)
     views = description["views"]
@@ -99,11 +101,11 @@ def read_description(file: Path) -> dict[str, Any]:
         raise CaptureError(file, "views", "expected a list of at least one view")
     for i, view in enumerate(views):
         if not isinstance(view, dict):
-            raise CaptureError(file, f"views[{i}]", f"expected a JSON object, got {view!r}")
+            raise CaptureError(file, f"views[{i}]", f"expected a JSON object, got {shown(view)}")
         check_keys(view, VIEW_KEYS, VIEW_KEYS - {"mask", "frame"}, file, f"views[{i}].")
         for key in ("image", "mask"):
             if key in view and not (isinstance(view[key], str) and view[key]):
-                raise CaptureError(file, f"views[{i}].{key}", f"expected the path of a file, got {view[key]!r}")
+                raise CaptureError(file, f"views[{i}].{key}", f"expected the path of a file, got {shown(view[key])}")
             if key in view:
                 check_inside(file, f"views[{i}].{key}", view[key], photo=True)
     return description
@@ -134,7 +136,9 @@ def check_keys(mapping: Iterable[str], known: set[str], required: set[str], file
 def check_background(background: Any, file: object) -> None:
     """One of `Background`."""
     if background not in get_args(Background):
-        raise CaptureError(file, "background", f"expected one of {', '.join(get_args(Background))}, got {background!r}")
+        raise CaptureError(
+            file, "background", f"expected one of {', '.join(get_args(Background))}, got {shown(background)}"
+        )
 
 
 def read_frames_and_matrices(
@@ -179,13 +183,17 @@ def read_photos(
         frames = [view.get("frame", 0) for view in views]
         for i, frame in enumerate(frames):
             if isinstance(frame, bool) or not isinstance(frame, int) or frame < 0:
-                raise CaptureError(file, f"views[{i}].frame", f"expected an integer of at least 0, got {frame!r}")
+                raise CaptureError(file, f"views[{i}].frame", f"expected an integer of at least 0, got {shown(frame)}")
         poses = 1 + max(frames)
+        with reading(file, "capture", CaptureError):
+            check_limit("frames", poses, "frames")
+            check_limit("frames_per_photo", math.ceil(poses / len(views)), f"frames for each of {len(views)} photos")
     views = views if chosen is None else [views[i] for i in chosen]
     with_mask = ["mask" in view for view in views]
     if any(with_mask) and not all(with_mask):
         first = with_mask.index(False)
         raise CaptureError(file, f"views[{first}].mask", "missing, but other views have one: give all or none")
+    check_photos(folder, views, together=True)
     frames, K, cam_from_world = read_frames_and_matrices(views, poses, file)
     images, masks = _read_images(folder, views, description.get("background", "photo") == "white", fit_masks)
     height, width = images.shape[1:3]
@@ -214,41 +222,84 @@ def _check_orientations(folder, views, K, width, height, warns):
         logger.warning("%s: EXIF orientation of %s is ignored: %s", folder, names, told)
 
 
+def check_photos(folder: Path, views: Sequence[dict[str, Any]], together: bool) -> None:
+    """Whether views of a description cost no more than the limits allow, before their photos are read.
+
+    Arguments: together: they are to be in memory at one time. Then the size of the first one is looked at, which all must have.
+    Raises: CaptureError.
+    """
+    file = folder / "capture.json"
+    check_repeats(file, [folder / view["image"] for view in views])
+    with reading(file, "capture", CaptureError):
+        if together:
+            check_limit("views", len(views), "photos")
+            width, height = read_checked(image_size, folder / views[0]["image"])
+            what = f"pixels in {len(views):,} photos of {width} x {height}"
+            check_limit("capture_pixels", width * height * len(views), what)
+
+
+def check_repeats(file: Path, photos: Sequence[Path]) -> None:
+    """Whether the views of a file name about as many photos; links to one photo are that photo. Raises: CaptureError."""
+    found = set()
+    for photo in photos:
+        with contextlib.suppress(OSError, ValueError):  # whoever reads it says what is wrong
+            status = photo.stat()
+            found.add((status.st_dev, status.st_ino))
+    with reading(file, "capture", CaptureError):
+        each = math.ceil(len(photos) / max(len(found), 1))
+        check_limit("views_per_photo", each, f"views of each photo ({len(photos):,} of {len(found):,})")
+
+
 def _read_images(folder, views, on_white, fit_masks):
     """Images and masks (or None), all of one size."""
-    images, masks, excesses = zip(*[read_view(folder, view, on_white, fit_masks) for view in views], strict=True)
-    if moved := [excess for excess in excesses if excess]:
+    images, masks, searched = None, None, []
+    for i, view in enumerate(views):
+        image, mask, on_background = read_view(folder, view, on_white)
+        searched += [i] if on_background else []
+        if images is None:  # in place: a list of photos and an array of them are twice the memory
+            height, width = image.shape[:2]
+            images = np.empty((len(views), height, width, 3), np.float32)
+            masks = None if mask is None else np.empty((len(views), height, width), np.float32)
+        file = folder / view["image"]
+        if image.shape != images.shape[1:]:
+            size = f"{image.shape[1]} x {image.shape[0]}"
+            raise CaptureError(file, "size", f"{size}, but the first view has {width} x {height}: expected one size")
+        if (mask is None) != (masks is None):
+            raise CaptureError(file, "alpha", "expected an alpha channel in all images or in none")
+        images[i] = image
+        if masks is not None:
+            masks[i] = mask
+    assert images is not None  # a description has views
+    moved = []
+    if masks is not None and searched:
+        photos, own = [images[i] for i in searched], [masks[i] for i in searched]
+        fitted = masks_at_edges(photos, own) if fit_masks else [(mask, 0.0) for mask in own]
+        for i, (mask, excess) in zip(searched, fitted, strict=True):
+            images[i], masks[i] = on_white_background(images[i], mask), mask
+            moved += [excess] if excess else []
+    if moved:
         off = float(np.median(moved))
         wrong = f"{abs(off):.1f} pixels too {'large' if off > 0 else 'small'}"
         count = f"{len(moved)} of {len(views)} masks"
         logger.warning("%s: %s were off, the median %s: moved to the edges in the photos", folder, count, wrong)
-    height, width = images[0].shape[:2]
-    for view, image, mask in zip(views, images, masks, strict=True):
-        file = folder / view["image"]
-        if image.shape != images[0].shape:
-            size = f"{image.shape[1]} x {image.shape[0]}"
-            raise CaptureError(file, "size", f"{size}, but the first view has {width} x {height}: expected one size")
-        if (mask is None) != (masks[0] is None):
-            raise CaptureError(file, "alpha", "expected an alpha channel in all images or in none")
-    if "mask" not in views[0] and masks[0] is not None and all(mask.min() == 1 for mask in masks):
-        masks = (None,)  # many programs write an opaque alpha channel: it says nothing
-    return np.stack(images), None if masks[0] is None else np.stack(masks)
+    if "mask" not in views[0] and masks is not None and masks.min() == 1:
+        masks = None  # many programs write an opaque alpha channel: it says nothing
+    return images, masks
 
 
 def read_view(
-    folder: Path, view: dict[str, Any], on_white: bool, fit_masks: bool = False
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, float]:
-    """Image on white where a mask or alpha is known, the mask or None, and by how many pixels `fit_mask` found it too large."""
+    folder: Path, view: dict[str, Any], on_white: bool
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, bool]:
+    """Image, mask or None, and whether the image still has its background although a mask is known; else it is on white."""
     image, alpha = read_checked(read_image, folder / view["image"])
     if alpha is not None:
         image = on_white_background(image, alpha)
     if "mask" not in view:
-        return image, alpha, 0.0
+        return image, alpha, False
     mask = read_mask(folder / view["mask"], "its image", image.shape[1], image.shape[0])
     if on_white or alpha is not None:  # composited already: the mask file only says what the person is
-        return image, mask, 0.0
-    mask, excess = fit_mask(image, mask) if fit_masks else (mask, 0.0)
-    return on_white_background(image, mask), mask, excess
+        return image, mask, False
+    return image, mask, True
 
 
 def read_mask(file: Path, owner: str, width: int, height: int) -> Float[np.ndarray, "h w"]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import logging
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,8 @@ from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.motion.world import turned_upright, up_axis, upright_matrix
+from humangs_jax.data.masks import person_box
+from humangs_jax.data.motion.world import nearest_axis, standing_axis, turned_upright, upright_matrix
 from humangs_jax.data.usable_views import MASK_THRESHOLD, usable_views
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.arrays import checksum
@@ -29,6 +31,8 @@ from humangs_jax.rendering.mesh.position_map import (
     plain_position_map,
     vertex_normals,
 )
+
+logger = logging.getLogger(__name__)
 
 
 @pytree_dataclass
@@ -182,7 +186,7 @@ CROP_MARGIN = 0.04
 
 
 def cropped(capture: Capture, size: int) -> Capture:
-    """The photos, each cut to a square around its mask and resized to `size` pixels.
+    """The photos, each cut to a square around the person in its mask and resized to `size` pixels.
 
     All stay as they are if there are no masks, if one is empty, or if no crop is smaller than its photo.
     """
@@ -191,10 +195,9 @@ def cropped(capture: Capture, size: int) -> Capture:
     height, width = capture.masks.shape[1:]
     boxes = []
     for mask in capture.masks > MASK_THRESHOLD:
-        rows, columns = (np.flatnonzero(mask.any(axis)) for axis in (1, 0))
-        if not len(rows):
+        low, high = person_box(mask)[::-1].T
+        if not high.any():
             return capture
-        low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]]) + 1
         side = int(np.ceil((high - low).max() / (1 - 2 * CROP_MARGIN)))
         boxes.append((*((low + high - side) // 2), side))
     if min(side for *_, side in boxes) >= max(height, width):
@@ -220,14 +223,16 @@ def _window(image, left, top, side, fill):
 
 
 def upright(views: SubjectViews, body: BodyModel) -> SubjectViews:
-    """The views in a world whose y axis points up, as far as the pelvis tells; the same object if theirs does.
+    """The views in a world whose y axis points up; the same object if theirs does.
 
-    Captures are to have y up. One with z up is as consistent, but the network has seen no such world. On the host.
+    Captures are to have y up. One with z up is as consistent, but the network has seen no such world: it is turned, and a warning
+    logged, where the person and the cameras both stand along another axis. The person alone may lie. On the host.
     """
     rotations, translations = np.asarray(views.rotations), np.asarray(views.translations)
-    up = up_axis(rotations[:, 0], "y")
-    if up == "y":
+    up = standing_axis(rotations[:, 0])
+    if up in (None, "y") or nearest_axis(-np.asarray(views.cameras.cam_from_world)[:, 1, :3].mean(axis=0))[0] != up:
         return views
+    logger.warning("the world of these views has %s up, person and cameras say: expected y up, it is turned", up)
     pelvis, turn = np.asarray(shape_body(body, views.betas).joints[0]), upright_matrix(up)
     rotations, translations = turned_upright(rotations, translations, up, pelvis)
     back = np.eye(4)
@@ -254,10 +259,7 @@ def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews
     images = np.pad(images, (*pad, (0, 0)), constant_values=1.0)
     masks = np.pad(masks, pad)
     if side != size:
-        from skimage.transform import resize
-
-        images = np.stack([resize(x, (size, size, 3), anti_aliasing=size < side) for x in images])
-        masks = np.stack([resize(x, (size, size), anti_aliasing=size < side) for x in masks])
+        images, masks = (np.stack([resized(x, size, size) for x in stack]) for stack in (images, masks))
     shift = jnp.asarray([[0, 0, left], [0, 0, top], [0, 0, 0]], jnp.float32)
     square = replace(capture.cameras, K=capture.cameras.K + shift, width=side, height=side)
     frames = np.asarray(capture.frames)

@@ -11,6 +11,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import Presets
+from humangs_jax.data.masks import box_of
 from humangs_jax.io.images import resized
 from humangs_jax.objectives.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM, SsimWindow
 
@@ -44,7 +45,7 @@ class MaskBox:
     def cut(self, image: Image, mask: Float[np.ndarray, "h w"], background: float) -> Float[np.ndarray, "y x 3"]:
         """See `Crop`."""
         (top, bottom), (left, right) = box_of(mask > 0.5)
-        return image[top : bottom + 1, left : right + 1]
+        return image[top:bottom, left:right]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,8 +66,8 @@ class SquareBox:
 
         rows, columns = box_of(mask > 0)
         (top, bottom), (left, right) = (
-            np.clip([low - self.margin, high + self.margin], 0, side)
-            for (low, high), side in zip((rows, columns), mask.shape, strict=True)
+            np.clip([first - self.margin, end - 1 + self.margin], 0, side)
+            for (first, end), side in zip((rows, columns), mask.shape, strict=True)
         )
         part = image[top:bottom, left:right]
         largest = max(part.shape[:2])
@@ -92,19 +93,12 @@ class CentredWindow:
         factor = self.side / max(mask.shape)
         height, width = (max(1, round(factor * side)) for side in mask.shape)
         if factor != 1:
-            image = np.clip(resized(np.asarray(image, np.float32), width, height), 0, 1)
-            mask = resized(np.asarray(mask, np.float32), width, height)
+            image, mask = resized(image, width, height), resized(mask, width, height)
         corner = []
-        for (first, last), size, side in zip(box_of(mask > 0), (self.height, self.width), mask.shape, strict=True):
-            start = first - (size - (last + 1 - first)) // 2
+        for (first, end), size, side in zip(box_of(mask > 0), (self.height, self.width), mask.shape, strict=True):
+            start = first - (size - (end - first)) // 2
             corner.append(int(np.clip(start, 0, max(0, side - size))))
         return image[corner[0] : corner[0] + self.height, corner[1] : corner[1] + self.width]
-
-
-def box_of(inside: np.ndarray) -> tuple[tuple[int, int], tuple[int, int]]:
-    """First and last row, first and last column of the True pixels (h, w), of which there is at least one."""
-    rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-    return (int(rows[0]), int(rows[-1])), (int(columns[0]), int(columns[-1]))
 
 
 @dataclasses.dataclass(frozen=True)

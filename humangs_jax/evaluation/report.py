@@ -69,7 +69,7 @@ def _data_url(image, side):
     height, width = image.shape[:2]
     factor = min(1.0, side / max(height, width))
     if factor < 1:
-        image = resized(np.asarray(image, np.float32), max(1, round(factor * width)), max(1, round(factor * height)))
+        image = resized(image, max(1, round(factor * width)), max(1, round(factor * height)))
     file = io.BytesIO()
     Image.fromarray(to_uint8(image)).save(file, format="JPEG", quality=QUALITY)
     return f"data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}"

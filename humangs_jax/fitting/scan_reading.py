@@ -45,10 +45,10 @@ class Scan:
     hidden: float
 
 
-def read_mesh(path: str | Path, textures: bool = False) -> Any:
+def read_mesh(path: str | Path, colors: bool = False) -> Any:
     """A trimesh.Trimesh with all geometry of the file.
 
-    Arguments: textures: read them, too; without those that are not there.
+    Arguments: colors: give it colours of the vertices, see `read_meshes`.
     Raises: ValueError, naming the file, if it cannot be read, has no faces or corners that are not finite.
     """
     import trimesh
@@ -56,7 +56,7 @@ def read_mesh(path: str | Path, textures: bool = False) -> Any:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path}: no such file: expected a mesh (OBJ, PLY, GLB, ...)")
-    parts = read_meshes(path, textures)
+    parts = read_meshes(path, colors=colors)
     if not parts:
         raise ValueError(f"{path}: no faces: expected a triangle mesh (a point cloud has to be meshed before)")
     mesh: Any = parts[0] if len(parts) == 1 else trimesh.util.concatenate(parts)

@@ -5,13 +5,13 @@ joints = joints_from_views("views", keypoints)  then fit_scan("scan.obj", joints
 """
 
 from pathlib import Path
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Float
+from humangs_jax.data.capture_checks import floats
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import load_photos, write_description
 from humangs_jax.fitting.residuals.keypoints import group_by_frame
@@ -21,12 +21,14 @@ from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov, orbit
 from humangs_jax.io.atomic import check_replaceable, replace_folder
 from humangs_jax.io.images import write_png
-from humangs_jax.io.reading import reading
+from humangs_jax.io.reading import Refused, reading
 from humangs_jax.io.text import read_json, write_json
 from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
-SCAN_FILE = "scan.json"
-"""Beside capture.json: where the scan is in the world of the images."""
+SCAN_FILE, PLACEMENT = "scan.json", "world_from_scan"
+"""Beside capture.json, and its key: where the scan is in the world of the images."""
+ROUNDING = 1e-3
+"""How far a rotation may be off: people shorten numbers."""
 HEIGHT = 1.7
 """Metres: the scan's longest side in that world (arbitrary)."""
 DISTANCE, FIELD_OF_VIEW = 4.0, np.radians(36.0)
@@ -48,13 +50,14 @@ def render_scan_views(
     check_replaceable(out)
     if out.is_dir() and any(out.iterdir()):
         raise ValueError(f"{out}: the folder is not empty: expected a new one")
-    mesh = read_mesh(mesh_path, textures=True)
+    mesh = read_mesh(mesh_path, colors=True)
     vertices = np.asarray(mesh.vertices, np.float64)
     align = _into_world(vertices[np.unique(mesh.faces)], up)
     angles = jnp.arange(views) * (2 * jnp.pi / views)
     K = intrinsics_from_fov(FIELD_OF_VIEW, size, size)
     cameras = orbit(jnp.zeros(3), DISTANCE, angles, 0.1, K, size, size)
-    drawn = _draw(align(vertices), np.asarray(mesh.faces), _colors(mesh), cameras, views)
+    colors = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255
+    drawn = _draw(align(vertices), np.asarray(mesh.faces), colors, cameras, views)
     replace_folder(out, lambda folder: _write(folder, drawn, cameras, align), mark=SCAN_FILE)
     return out
 
@@ -66,10 +69,7 @@ def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Flo
     Raises: ValueError if the folder is not one of these, or fewer than three landmarks are found.
     """
     folder = Path(folder)
-    with reading(folder / SCAN_FILE, "file of render_scan_views"):
-        matrix = np.asarray(read_json(folder / SCAN_FILE)["world_from_scan"], np.float64).reshape(4, 4)
-    scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    align = Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
+    align = read_placement(folder / SCAN_FILE)
     observations, _ = group_by_frame(load_photos(folder), keypoints)
     points, counts, _ = triangulate_robustly(jax.tree.map(lambda leaf: leaf[0], observations))
     points = align.inverse()(np.asarray(points, np.float64))
@@ -78,6 +78,20 @@ def joints_from_views(folder: str | Path, keypoints: Keypoints) -> dict[str, Flo
     if len(found) < 3:
         raise ValueError(f"{folder}: views agree on {len(found)} landmarks: expected at least three")
     return found
+
+
+def read_placement(file):
+    """The similarity from a scan to the world of its images. Raises: FileError unless it is one."""
+    with reading(file, "file of render_scan_views"):
+        content = read_json(file)
+        if not isinstance(content, dict) or PLACEMENT not in content:
+            raise Refused(f"{PLACEMENT}: missing: expected a file that render_scan_views wrote")
+        matrix = floats(content[PLACEMENT], file, PLACEMENT, (4, 4))
+        scale = float(np.cbrt(max(np.linalg.det(matrix[:3, :3]), 0.0)))
+        rigid = scale > 0 and np.abs(matrix[:3, :3] @ matrix[:3, :3].T / scale**2 - np.eye(3)).max() < ROUNDING
+        if not rigid or (matrix[3] != (0, 0, 0, 1)).any():
+            raise Refused(f"{PLACEMENT}: expected a rotation times a scale above 0, a translation, and 0 0 0 1")
+        return Similarity(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 
 
 def _into_world(vertices, up):
@@ -91,14 +105,6 @@ def _into_world(vertices, up):
     rotation = np.stack([np.cross(above, forward), above, forward])
     scale = HEIGHT / float((high - low).max())
     return Similarity(scale, rotation, -scale * rotation @ (low + high) / 2)
-
-
-def _colors(mesh: Any) -> Float[np.ndarray, "n 3"]:
-    """(n, 3) colours of the vertices in [0, 1]: painted, from the texture, or grey."""
-    colors = getattr(mesh.visual.to_color() if mesh.visual.kind == "texture" else mesh.visual, "vertex_colors", None)
-    if colors is None or np.shape(colors)[:1] != (len(mesh.vertices),):
-        return np.full((len(mesh.vertices), 3), 0.6)
-    return np.asarray(colors, np.float64)[:, :3] / 255
 
 
 def _draw(vertices, faces, colors, cameras: Camera, views):

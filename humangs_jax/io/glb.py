@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from humangs_jax.io.atomic import write_bytes
-from humangs_jax.io.reading import Refused, check_limit, check_unpacked
+from humangs_jax.io.reading import Refused, check_limit, check_unpacked, shown
 from humangs_jax.io.text import parse_json
 
 GLB_START, JSON_CHUNK, BINARY_CHUNK = 0x46546C67, 0x4E4F534A, 0x004E4942
@@ -22,15 +22,16 @@ VERTICES, INDICES = 34962, 34963
 """Targets of views of a buffer: what a graphics card reads it as."""
 
 
-def parse_glb(data: bytes) -> tuple[dict[str, Any], bytes]:
+def parse_glb(data: bytes, limit: str = "slow_text_bytes") -> tuple[dict[str, Any], bytes]:
     """The JSON of a GLB file and the bytes that it describes.
 
+    Arguments: limit: of the JSON. That of scans is low, because trimesh, which loads them, is slow.
     Raises: Refused, KeyError, TypeError, ... for sizes that do not fit the file or are more than the limits allow.
     """
     start, _, _, length, kind = struct.unpack_from("<IIIII", data.ljust(20, b"\0"))
     if start != GLB_START or kind != JSON_CHUNK:
         raise Refused("not a mesh or skeleton that can be read: no GLB file")
-    check_limit("slow_text_bytes", length, "bytes of JSON in a GLB")
+    check_limit(limit, length, "bytes of JSON in a GLB")
     content = parse_json(data[20 : 20 + length].decode())
     binary = b""
     if len(data) >= 28 + length:
@@ -59,7 +60,7 @@ def count_of(accessor: dict[str, Any]) -> int:
     """How many elements an accessor says that it has. Raises: Refused."""
     count, start = accessor["count"], accessor.get("byteOffset", 0)
     if not all(type(n) is int and n >= 0 for n in (count, start)):
-        raise Refused(f"{count!r} numbers from {start!r}")
+        raise Refused(f"{shown(count)} numbers from {shown(start)}")
     return count
 
 
@@ -87,7 +88,7 @@ def read_accessor(content: dict[str, Any], binary: bytes, index: int) -> np.ndar
 def _index(value):
     """An index as JSON should have it: Python would count negative ones from the end."""
     if type(value) is not int or value < 0:
-        raise Refused(f"{value!r} is no index")
+        raise Refused(f"{shown(value)} is no index")
     return value
 
 

@@ -155,14 +155,40 @@ def named_color(name: str) -> tuple[float, float, float]:
     return red / 255, green / 255, blue / 255
 
 
-def resized(image: Float[np.ndarray, "h w *c"], width: int, height: int) -> Float[np.ndarray, "height width *c"]:
-    """A float32 image at another size: box-averaged where it becomes narrower, else bicubic."""
-    from PIL import Image
+def resized(
+    image: Float[np.ndarray, "h w *c"] | UInt[np.ndarray, "h w *c"], width: int, height: int
+) -> Float[np.ndarray, "height width *c"]:
+    """A float32 image at another size: an axis that becomes shorter is averaged by area, one that becomes longer is bicubic.
 
-    method = Image.Resampling.BOX if width < image.shape[1] else Image.Resampling.BICUBIC
-    channels = np.moveaxis(image.reshape(*image.shape[:2], -1), -1, 0)
-    planes = [np.asarray(Image.fromarray(channel).resize((width, height), method)) for channel in channels]
-    return np.stack(planes, axis=-1).reshape(height, width, *image.shape[2:])
+    The average is exact for every ratio; it is how the photos that the shipped weights have seen were made. No value leaves the
+    range of the image's own.
+    """
+    h, w, *rest = image.shape
+    found = image.astype(np.float32, copy=False)
+    for old, new in ((h, height), (w, width)):  # one axis, which goes to the end; then the other
+        along = found.reshape(old, -1)
+        along = _axis_weights(old, new) @ along if new != old else along
+        found = along.reshape(new, *found.shape[1:]).swapaxes(0, 1)
+    return np.clip(found, image.min(), image.max(), order="C").reshape(height, width, *rest)
+
+
+def _axis_weights(old, new):
+    """(new, old) sparse: what each pixel of an axis takes from those it had."""
+    from scipy.sparse import csr_array
+
+    edges = np.arange(new + 1) * (old / new)
+    if new < old:
+        taps = np.floor(edges[:-1, None]) + np.arange(int(np.ceil(old / new)) + 1)
+        shared = np.minimum(edges[1:, None], taps + 1) - np.maximum(edges[:-1, None], taps)
+        weights = np.maximum(shared, 0) * (new / old)
+    else:  # Keys' cubic convolution, a = -1/2; the rim goes on as it is
+        places = (edges[:-1, None] + edges[1:, None]) / 2 - 0.5
+        taps = np.floor(places) + np.arange(-1, 3)
+        x = np.abs(places - taps)
+        weights = np.where(x < 1, (1.5 * x - 2.5) * x**2 + 1, ((2.5 - 0.5 * x) * x - 4) * x + 2)
+    columns = np.clip(taps, 0, old - 1).astype(np.int32)
+    rows = np.arange(new + 1) * taps.shape[1]
+    return csr_array((weights.astype(np.float32).ravel(), columns.ravel(), rows), shape=(new, old))
 
 
 @contextlib.contextmanager

@@ -11,17 +11,23 @@ that does not know the file raises `Refused`, whose text follows the name of the
 
 import contextlib
 import dataclasses
+import logging
+import math
 import os
 import re
+import reprlib
 import stat
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from humangs_jax.core.printable import printable
 
+logger = logging.getLogger(__name__)
+
 ENVIRONMENT = "HUMANGS_LIMITS"
 """Variable with other limits, such as "pixels=2e8,photos_outside=1"."""
+OUTSIDE = f"{ENVIRONMENT}=photos_outside=1 allows it"
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029]")
 """No path in a file needs these."""
 LONGEST_LINE, LONGEST_REASON = 1000, 300
@@ -32,14 +38,21 @@ LONGEST_LINE, LONGEST_REASON = 1000, 300
 class Limits:
     """What a file may cost. Each error line that a limit causes names it.
 
-    file_bytes: size of any file; text_bytes: of JSON and text; slow_text_bytes: of YAML and of the JSON in a GLB, whose readers
-        are slow. mesh_bytes: of a scan; image_bytes: of a photo before it is decoded.
+    file_bytes: size of any file; text_bytes: of JSON and text; slow_text_bytes: of YAML and of the JSON in a scan (GLB), whose
+        readers are slow. mesh_bytes: of a scan; image_bytes: of a photo before it is decoded.
     array_bytes: all arrays of an archive unpacked, or of an EXR file. Below it a file may always unpack to plain_bytes, and
         beyond that to `ratio` times its size. plain_bytes also bounds a sparse matrix made dense.
     members: entries of an archive. opcodes: instructions of a pickle. nesting: of JSON, YAML and MATLAB.
     pixels, side: of a photo, and along one of its sides. scans: passes of a progressive JPEG.
     corners: of the triangles of a scan, every instance counted. joints: of a body.
     photos_outside: whether photos and masks of a capture may lie outside of its folder.
+
+    What a command may cost, checked before it begins:
+    capture_pixels: of all photos that are read together, or textures of a scan. video_pixels: of the frames of videos.
+    views: photos that are read together; network_views: that the network looks at together; views_per_photo: that name it.
+    frames: of a motion or a capture, read or written; frames_per_photo: of a capture that has no poses yet, shown or not.
+    rate: frames per second of a motion. people: in keypoint files, and their images.
+    parts: materials of an OBJ file, solids of an STL file, parts of meshes of a GLB file. entries: of a folder that is searched.
     """
 
     file_bytes: int = 16 << 30
@@ -59,6 +72,17 @@ class Limits:
     corners: int = 60_000_000
     joints: int = 1024
     photos_outside: bool = False
+    capture_pixels: int = 1_000_000_000
+    video_pixels: int = 50_000_000_000
+    views: int = 4096
+    network_views: int = 512
+    views_per_photo: int = 16
+    frames: int = 250_000
+    rate: int = 1000
+    frames_per_photo: int = 100
+    people: int = 100_000
+    parts: int = 2000
+    entries: int = 1_000_000
 
 
 _current: Limits | None = None
@@ -94,6 +118,35 @@ def _limits_of_text(text):
 
 
 # Errors --------------------------------------------------------------------------------------------------------------
+
+
+class _Shown(reprlib.Repr):
+    """As `repr`, but short, whatever the value holds and however often, itself included."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel, self.maxdict, self.maxstring, self.maxother = 2, 4, 100, 100
+        self.maxlist = self.maxtuple = self.maxset = self.maxfrozenset = self.maxdeque = self.maxarray = 4
+
+    def repr_int(self, x: int, level: int) -> str:
+        """Python refuses to write integers of thousands of digits."""
+        return repr(x) if abs(x) < SHOWN_INTEGER else f"an integer of {x.bit_length():,} bits"
+
+    def repr_instance(self, x: object, level: int) -> str:
+        """Of other types: those of numpy that are Python's too as these, else the name of the type."""
+        if isinstance(x, str):
+            return self.repr_str(str(x), level)
+        return repr(x)[: self.maxother] if x is None or isinstance(x, bool | float) else f"a {type(x).__name__}"
+
+
+def shown(value: object) -> str:
+    """A value of a file for an error line: its beginning. The parts of a list may be the list itself, or a million others."""
+    return _SHOWN.repr(value)
+
+
+LARGEST_AMOUNT, SHOWN_INTEGER = 10**15, 10**40
+"""Larger ones are not written out."""
+_SHOWN = _Shown()
 
 
 def _one_line(text: object, longest: int = LONGEST_LINE) -> str:
@@ -149,10 +202,13 @@ def _why(kind, error):
     return f"not a readable {kind}: {_one_line(reason, LONGEST_REASON)}"
 
 
-def check_limit(name: str, amount: int, unit: str) -> None:
-    """Raises: Refused, naming the limit, if that much is more than it allows."""
+def check_limit(name: str, amount: float | int, unit: str) -> None:
+    """Raises: Refused, naming the limit and how it is raised, if that much is more than it allows."""
     if amount > (most := getattr(limits(), name)):
-        raise Refused(f"{amount:,} {unit}: the limit {name} is {most:,} (docs/security.md)")
+        raised, found = "", f"more than {LARGEST_AMOUNT:,}"
+        if amount <= LARGEST_AMOUNT:
+            raised, found = f"{ENVIRONMENT}={name}={math.ceil(amount)} raises it; ", f"{math.ceil(amount):,}"
+        raise Refused(f"{found} {unit}: the limit {name} is {most:,} ({raised}docs/security.md)")
 
 
 # Opening -------------------------------------------------------------------------------------------------------------
@@ -176,6 +232,39 @@ def read_bytes(path: str | os.PathLike, limit: str = "file_bytes") -> bytes:
     """The bytes of a file. Raises: as `open_file`."""
     with open_file(path, limit) as file:
         return file.read()
+
+
+def walk(folder: str | os.PathLike, skip: Callable[[Path], bool] = lambda folder: False) -> Generator[Path]:
+    """The files in a folder and in the folders in it, but for names that begin with a dot and folders to `skip`.
+
+    Each folder is looked at once, however many links lead to it. Links that lead out are not followed, unless the limit
+    `photos_outside` allows it; the first of them is logged. Raises: Refused beyond the limit `entries`; OSError.
+    """
+    seen: set[tuple[int, int]] = set()
+    waiting, links, count, told = [Path(folder)], [], 0, False
+    while waiting or links:
+        place = waiting.pop() if waiting else links.pop()
+        status = place.stat()
+        if (status.st_dev, status.st_ino) in seen:
+            continue
+        seen.add((status.st_dev, status.st_ino))
+        with os.scandir(place) as entries:
+            for entry in entries:
+                count += 1
+                check_limit("entries", count, "files and folders")
+                path = place / entry.name
+                if entry.name.startswith("."):
+                    continue
+                if not path.is_dir():
+                    yield path
+                elif not skip(path):
+                    if not entry.is_symlink():
+                        waiting.append(path)
+                    elif limits().photos_outside or path.resolve().is_relative_to(Path(folder).resolve()):
+                        links.append(path)
+                    elif not told:
+                        told = True
+                        logger.warning("%s: leads out of %s: not followed (%s)", path, folder, OUTSIDE)
 
 
 def check_unpacked(size: int, unpacked: int) -> None:
@@ -205,6 +294,6 @@ def inside(folder: str | os.PathLike, name: str, photo: bool = False) -> Path:
     except (OSError, ValueError, RuntimeError) as error:  # too long, a null character, a loop of links
         raise Refused(f"{name!r} is no path: {error}") from error
     if not contained:
-        how = f" ({ENVIRONMENT}=photos_outside=1 allows it)" if photo else ""
+        how = f" ({OUTSIDE})" if photo else ""
         raise Refused(f"{name!r} lies outside of {folder}: expected a path in that folder{how}")
     return path

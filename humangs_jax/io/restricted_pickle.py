@@ -332,7 +332,7 @@ def as_array(value: Any) -> np.ndarray:
             return value.to_array()
         except (KeyError, TypeError, IndexError, AttributeError) as error:
             name = type(value).__name__.strip("_")
-            raise ValueError(f"a {name} object without readable contents ({error!r})") from error
+            raise ValueError(f"a {name} object without readable contents ({type(error).__name__})") from error
     if isinstance(value, list | tuple):
         _check_leaves(value)
     if isinstance(value, np.ndarray | np.generic | int | float | list | tuple):

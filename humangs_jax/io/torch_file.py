@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from humangs_jax.io.npz import open_archive
-from humangs_jax.io.reading import Refused, check_limit, open_file, reading
+from humangs_jax.io.reading import Refused, check_limit, open_file, reading, shown
 from humangs_jax.io.restricted_pickle import Call, RestrictedUnpickler
 
 ZIP_START = b"PK\x03\x04"
@@ -165,7 +165,7 @@ def _state_dict_tensors(content: Any, wanted: Callable[[str], bool]) -> tuple[di
     chosen = {key: x for key, x in model.items() if wanted(key)}
     for key, value in chosen.items():
         if not isinstance(value, _Tensor):
-            raise Refused(f"{label or 'state_dict'}[{key!r}] is no tensor but {type(value).__name__}")
+            raise Refused(f"{label or 'state_dict'}[{shown(key)}] is no tensor but {type(value).__name__}")
     return chosen, len(model) - len(chosen)
 
 
@@ -240,7 +240,7 @@ def _read_stream(file: Any, size: int, wanted: Wanted) -> tuple[Tensors, int]:
     if _StateDictUnpickler(file).load() != MAGIC_NUMBER:
         raise Refused("a pickle, but neither of the formats that torch.save writes")
     if (version := _StateDictUnpickler(file).load()) != STREAM_VERSION:
-        raise Refused(f"version {version!r} of the older format, expected {STREAM_VERSION}")
+        raise Refused(f"version {shown(version)} of the older format, expected {STREAM_VERSION}")
     machine = _StateDictUnpickler(file).load()
     if not (isinstance(machine, dict) and machine.get("little_endian") is True):
         raise Refused("only little-endian checkpoints are supported")

@@ -28,6 +28,7 @@ from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.data.preprocess.run import FORMAT as OF_A_DATA_SET
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import check_writable, replace_folder
+from humangs_jax.io.reading import shown
 from humangs_jax.io.text import read_json, write_json
 from humangs_jax.people.baking import export_scan
 from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
@@ -251,7 +252,9 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"{file}: format: expected a manifest of {FORMAT!r}")
     if content.get("version") not in (1, VERSION):
-        raise ValueError(f"{file}: version: expected {VERSION}, got {content.get('version')!r}")
+        raise ValueError(f"{file}: version: expected {VERSION}, got {shown(content.get('version'))}")
+    if not isinstance(content.get("settings"), dict):
+        raise ValueError(f"{file}: settings: expected an object, got {shown(content.get('settings'))}")
     return {"generator_version": 1, "split": None} | content
 
 
@@ -267,12 +270,12 @@ def begin_set(folder: str | Path, split: str, settings: dict[str, Any]) -> None:
         return
     earlier, file = read_manifest(folder), folder / MANIFEST
     pairs = {name: (earlier["settings"].get(name), settings.get(name)) for name in {**settings, **earlier["settings"]}}
-    changed = [f"{name} {old} -> {new}" for name, (old, new) in sorted(pairs.items()) if old != new]
+    changed = [f"{name} {shown(old)} -> {shown(new)}" for name, (old, new) in sorted(pairs.items()) if old != new]
     version, problem = earlier["generator_version"], ""
     if version != GENERATOR_VERSION:
-        problem = f"written by version {version} of the generator, this is version {GENERATOR_VERSION}"
+        problem = f"written by version {shown(version)} of the generator, this is version {GENERATOR_VERSION}"
     elif earlier["split"] != split:
-        problem = f"people of the split '{earlier['split']}', now asked for '{split}'"
+        problem = f"people of the split {shown(earlier['split'])}, now asked for '{split}'"
     elif changed:
         problem = f"written with settings other than asked for now ({', '.join(changed)})"
     if problem:

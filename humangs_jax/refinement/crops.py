@@ -6,6 +6,7 @@ import numpy as np
 from humangs_jax.core.array_types import Array, Bool
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.masks import person_box
 from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.views import SubjectViews
 
@@ -62,10 +63,8 @@ def held_out_blocks(views: SubjectViews, share: float, seed: int) -> Bool[Array,
 
 def _bounds(mask):
     """((top, bottom), (left, right)) of the person; the whole image if nobody is in it."""
-    lines = [np.flatnonzero((mask > COVERED).any(axis)) for axis in (1, 0)]
-    if not len(lines[0]):
-        return tuple((0, size) for size in mask.shape)
-    return tuple((int(line[0]), int(line[-1]) + 1) for line in lines)
+    box = person_box(mask > COVERED).tolist()
+    return box if any(box[0]) else [(0, size) for size in mask.shape]
 
 
 def _window(bounds, size):

@@ -26,6 +26,7 @@ from humangs_jax.core.configuration import config_from_json
 from humangs_jax.core.printable import printable
 from humangs_jax.core.progress import say
 from humangs_jax.data.motion import Motion, grounded, load_motion
+from humangs_jax.data.motion.rules import page_rules
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import write_text
 from humangs_jax.io.tensor_file import read_safetensors
@@ -33,7 +34,7 @@ from humangs_jax.network.config import Conventions, HumanGSConfig
 from humangs_jax.network.weights import SHIPPED, config_of_version_1
 from humangs_jax.viewer.packing import fitted_shape, pack
 
-SCRIPTS = ("kinematics", "scene", "camera", "splatting", "motion_files", "controls", "main")
+SCRIPTS = ("kinematics", "scene", "camera", "splatting", "motion_files", "skeletons", "controls", "main")
 SHADERS = ("whole.vert", "project.frag", "splat.vert", "splat.frag", "background.frag")
 LARGEST_FPS = 60.0
 """Motions of more frames per second are thinned out: the page interpolates between frames."""
@@ -166,14 +167,22 @@ def _shipped_network() -> HumanGSConfig:
     return HumanGSConfig(conventions=config_from_json(Conventions, metadata.get("conventions", "{}")))
 
 
+def page_script(*names: str) -> str:
+    """The text of some of the page's scripts, below the tables that they share with the readers of motions in Python."""
+    rules = json.dumps(page_rules(), separators=(",", ":")).replace("<", "\\u003c")
+    return "\n".join([f"const RULES = {rules};", *(_read(f"{name}.js") for name in names)])
+
+
+def _read(name: str) -> str:
+    return (resources.files("humangs_jax") / "viewer" / "page" / name).read_text(encoding="utf-8").strip()
+
+
 def _template() -> str:
     """index.html with styles, shaders and scripts in their places; the avatar's are still marked."""
-    folder = resources.files("humangs_jax") / "viewer" / "page"
-    read = lambda name: (folder / name).read_text(encoding="utf-8").strip()
     parts = {
-        "style": read("style.css"),
-        "shaders": "\n".join(f'<script type="x-shader" id="{name}">\n{read(name)}\n</script>' for name in SHADERS),
-        "sorting": read("sorting.js"),  # runs twice: in the page, and as the text of a worker
-        "scripts": "\n".join(read(f"{name}.js") for name in SCRIPTS),
+        "style": _read("style.css"),
+        "shaders": "\n".join(f'<script type="x-shader" id="{name}">\n{_read(name)}\n</script>' for name in SHADERS),
+        "sorting": _read("sorting.js"),  # runs twice: in the page, and as the text of a worker
+        "scripts": page_script(*SCRIPTS),
     }
-    return _MARK.sub(lambda mark: parts.get(mark[1], mark[0]), read("index.html"))
+    return _MARK.sub(lambda mark: parts.get(mark[1], mark[0]), _read("index.html"))

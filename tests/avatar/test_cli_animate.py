@@ -51,6 +51,8 @@ BAD = {
     "--views -1: expected at least 1": ("render", "--views", "-1"),
     "--start 3, stop 1: expected": ("animate", "--motion", "motion.npz", "--start", "3"),
     "--loop 0: expected": ("animate", "--motion", "motion.npz", "--loop", "0"),
+    "motion.npz: 999,999,996 frames": ("animate", "--motion", "motion.npz", "--loop", "83333333"),
+    "the limit frames is 250,000": ("render", "--views", "1000000000"),
     "--channels 'depth': expected some of": ("render", "--exr", "--channels", "rgba,depth"),
     "--exr: b.mp4 is a video": ("render", "--exr", "--out", "b.mp4"),
     "--azimuth: not with --capture": ("render", "--capture", "demo_capture", "--azimuth", "3"),

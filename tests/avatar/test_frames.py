@@ -124,6 +124,7 @@ def test_smoothing_keeps_straight_paths_and_short_ones():
     assert frames.smoothed_path(line[:1], 5.0).shape == (1, 3)
     wave = np.sin(np.arange(200))[:, None] * [1.0, 1.0, 1.0]
     assert np.abs(frames.smoothed_path(wave, 6.0)[30:-30]).max() < 1e-3
+    np.testing.assert_allclose(frames.smoothed_path(wave, 1e12), frames.smoothed_path(wave, 500.0), atol=1e-6)
 
 
 def test_a_turntable_shows_the_person_from_all_sides():

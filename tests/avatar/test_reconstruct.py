@@ -22,6 +22,7 @@ from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays
+from humangs_jax.data.loading.examples import shrink
 from humangs_jax.data.views import SubjectViews, cropped, gaussian_body, pad_views, prepare_inputs, standardize, upright
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.humangs import init_humangs
@@ -169,6 +170,23 @@ def test_photos_of_any_size_become_squares_with_cameras_that_follow(body):
     np.testing.assert_allclose(after, (np.asarray(before) + np.asarray([6, 0])) * SIZE / 48, atol=1e-3)
 
 
+def test_photos_reach_the_network_as_in_training(body):
+    photos = capture(body, 2 * SIZE, 2 * SIZE)
+    levels = np.rint(255 * photos.images).astype(np.uint8)
+    photos.images[:], photos.masks[:, :, SIZE:] = levels / np.float32(255), 0
+    views = standardize(photos, SIZE)
+    np.testing.assert_allclose(views.images, shrink(levels, SIZE), atol=1e-6)
+    np.testing.assert_array_equal(views.masks, photos.masks[:, ::2, ::2])
+
+
+def test_small_people_that_are_enlarged_stay_within_the_range(body):
+    photos = capture(body, 48, 36)
+    photos.masks[:, :, 9:] = photos.masks[:, :12] = 0  # 36 x 9 pixels, which the body meets
+    for larger in (photos.resized(101), standardize(photos, 60, crop=True)):
+        for values in (larger.images, larger.masks):
+            assert values.min() >= 0 and values.max() <= 1
+
+
 def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
     photos, pelvis = capture(body, SIZE, SIZE), np.asarray(shape_body(body, jnp.zeros(2)).joints[0])
     turn = np.asarray([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # y becomes z
@@ -190,6 +208,13 @@ def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
             np.testing.assert_allclose(got, expected, atol=100 * TURNED)
 
 
+def test_people_who_lie_before_upright_cameras_are_left_lying(body):
+    """The person alone says nothing about the world; that of captures has y up."""
+    views = standardize(capture(body, SIZE, SIZE), SIZE)
+    lying = replace(views, rotations=views.rotations.at[:, 0, 0].set(-np.pi / 2))
+    assert upright(lying, body) is lying
+
+
 def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
     """The masks say where the person is; the pixel at which a camera shows a point has the same colour before and after."""
     from humangs_jax.geometry.camera import project
@@ -208,6 +233,9 @@ def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
     np.testing.assert_allclose(
         cut.images[0, 16 - 9 : 20 - 9, 6 + 1 : 10 + 1].reshape(-1, 3), [[0.2, 0.4, 0.6]] * 16, atol=1e-6
     )
+    specks = photos.masks.copy()
+    specks[1, 0, 0] = 1  # of less than a half percent of the person
+    np.testing.assert_array_equal(cropped(dataclasses.replace(photos, masks=specks), 18).images, cut.images)
     assert cropped(dataclasses.replace(photos, masks=None), SIZE).images is photos.images
     empty = dataclasses.replace(photos, masks=0 * photos.masks)
     assert cropped(empty, SIZE) is empty
@@ -284,6 +312,12 @@ def test_the_token_capacity_follows_the_photos(body, network):
 def test_no_photos_are_an_error(body, network):
     with pytest.raises(ValueError, match="0 views"):
         reconstruct(*network, capture(body, SIZE, SIZE).select([]))
+
+
+def test_more_photos_than_the_limit_are_an_error(body, network):
+    photos = capture(body, SIZE, SIZE).select([0] * 513)
+    with pytest.raises(ValueError, match=r"513 photos in capture: the limit network_views is 512 \(HUMANGS"):
+        reconstruct(*network, photos)
 
 
 def test_photos_that_are_not_numbers_are_an_error(body, network):

@@ -17,7 +17,7 @@ from humangs_jax.data.calibration.calibration import (
 )
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.data.photos import read_description, read_view
+from humangs_jax.data.photos import on_white_background, read_description, read_view
 from humangs_jax.io.images import read_grey, read_image
 from tests.data import calibration_files as written
 
@@ -221,8 +221,9 @@ def test_alpha_becomes_a_mask_when_undistorted(rig):
         Image.fromarray(pixels).save(rig[1] / file)
     assert import_rig(rig).undistorted == 3
     for view in views_of(rig[2]):
-        image, mask, _ = read_view(rig[2], view, on_white=False)
+        photo, mask, _ = read_view(rig[2], view, on_white=False)
         assert mask is not None and mask[20, 30] == 1 and mask[2, 2] == 0
+        image = on_white_background(photo, mask)
         np.testing.assert_allclose(image[20, 30], [1, 0, 0])
         np.testing.assert_allclose(image[2, 2], 1)
 

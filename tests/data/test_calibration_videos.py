@@ -8,6 +8,7 @@ from humangs_jax.data.calibration import videos
 from humangs_jax.data.calibration.importing import import_cameras
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.photos import load_photos
+from humangs_jax.io.reading import Limits, set_limits
 from tests.data import calibration_files as written
 
 NAMES, FRAMES = ("a", "b"), 5
@@ -83,7 +84,7 @@ def test_signs_of_patterns_in_a_name_mean_themselves(name, tmp_path):
     write_video(video, [np.full((16, 16, 3), level) for level in (0.2, 0.5, 0.8)], 10)
     assert video.is_file()
     folder = tmp_path / "frames%d" / name
-    assert videos.split_video(video, folder) == 3
+    videos.split_video(video, folder)
     assert sorted(file.name for file in folder.iterdir()) == [f"{i:08d}.png" for i in range(3)]
 
 
@@ -92,3 +93,15 @@ def test_a_list_of_files_is_no_video(tmp_path):
     (tmp_path / "list.mp4").write_text("ffconcat version 1.0\nfile 'secret.mp4'\n")
     with pytest.raises(CaptureError, match=r"list\.mp4: not a readable video"):
         videos.split_video(tmp_path / "list.mp4", tmp_path / "frames")
+
+
+def test_frames_of_videos_have_a_budget_of_pixels(tmp_path):
+    rig, size = write_rig(tmp_path), written.WIDTH * written.HEIGHT
+    try:
+        set_limits(Limits(video_pixels=7 * size))
+        with pytest.raises(CaptureError, match=r"b.mp4: .* pixels in the frames .*: the limit video_pixels is"):
+            import_cameras(*rig, up="+y")
+        assert not rig[2].exists() and not list(rig[2].parent.glob("*"))
+        assert import_cameras(*rig, up="+y", frames=3).views == 6
+    finally:
+        set_limits(None)

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from humangs_jax.body.model import BodyModel
+from humangs_jax.data import photos as photos_module
 from humangs_jax.data.capture import CaptureError, capture_from_arrays, load_capture, save_capture
-from humangs_jax.data.photos import names_from_paths
+from humangs_jax.data.photos import check_photos, names_from_paths
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.images import read_image, write_png
 
@@ -91,6 +92,24 @@ def test_round_trip_without_masks(tmp_path):
     save_capture(tmp_path / "me", capture)
     assert load(tmp_path / "me").masks is None
     np.testing.assert_allclose(capture.images, arrays()["images"], atol=1e-7)
+
+
+TOO_MANY = "capture.json: 1,008,000,000 pixels in 84 photos of 4000 x 3000: the limit capture_pixels is 1,000,000,000"
+
+
+def test_large_captures_are_read_and_endless_ones_refused_before_their_photos_are(folder, monkeypatch):
+    """60 photos of 12 megapixels are honest work."""
+    monkeypatch.setattr(photos_module, "image_size", lambda path: (4000, 3000))
+    (folder / "photos").mkdir()
+    views = [{"image": f"photos/{i}.png"} for i in range(84)]
+    for view in views:
+        (folder / view["image"]).touch()
+    check_photos(folder, views[:60], together=True)
+    check_photos(folder, views, together=False)  # one after the other, as training does
+    with pytest.raises(CaptureError, match=TOO_MANY):
+        check_photos(folder, views, together=True)
+    with pytest.raises(CaptureError, match=r"17 views of each photo \(17 of 1\): the limit views_per_photo is 16"):
+        check_photos(folder, views[:1] * 17, together=False)
 
 
 def test_masks_put_photos_on_white_once(tmp_path):

@@ -187,8 +187,14 @@ def test_nearest_view_wraps_around():
 def test_shrinking_averages_boxes():
     images = np.random.default_rng(0).integers(0, 256, (2, 8, 8, 3)).astype(np.uint8)
     np.testing.assert_allclose(shrink(images, 2)[1, 0, 1], images[1, :4, 4:].mean(axis=(0, 1)) / 255, rtol=1e-5)
-    with pytest.raises(ValueError, match="8 x 8 cannot be box-averaged to 3 x 3"):
-        shrink(images, 3)
+    np.testing.assert_allclose(
+        shrink(images, 3)[..., 1].mean(axis=(1, 2)), images[..., 1].mean(axis=(1, 2)) / 255, rtol=1e-5
+    )
+    np.testing.assert_array_equal(shrink(images, 8), images.astype(np.float32) / np.float32(255))
+    assert shrink(images[:0], 2).shape == (0, 2, 2, 3)
+    for wrong, size in ((images, 9), (images[:, :6], 3)):
+        with pytest.raises(ValueError, match=f"8 x {wrong.shape[1]} cannot be averaged to {size} x {size}"):
+            shrink(wrong, size)
 
 
 def test_a_broken_folder_is_skipped_counted_and_named(folder, tmp_path, caplog):

@@ -5,6 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from motion_cases import FPS, UP, in_world, motions
+from scipy.spatial.transform import Rotation
 
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import BodyPose, RestBody
@@ -49,7 +51,8 @@ def test_our_own_format_round_trips(tmp_path):
 
 def test_amass_with_all_joints(tmp_path):
     poses, trans = upright_poses(165), random((FRAMES, 3))
-    motion = load_motion(write(tmp_path / "a.npz", poses=poses, trans=trans, mocap_framerate=120.0, betas=np.zeros(16)))
+    path = write(tmp_path / "a.npz", poses=poses, trans=trans, mocap_framerate=120.0, betas=np.zeros(16))
+    motion = load_motion(path, up="y")
     np.testing.assert_allclose(motion.rotations, poses.reshape(FRAMES, 55, 3), atol=FLOAT32)
     np.testing.assert_allclose(motion.translations, trans, atol=FLOAT32)
     assert motion.fps == 120.0
@@ -58,7 +61,7 @@ def test_amass_with_all_joints(tmp_path):
 def test_amass_without_face_puts_the_hands_where_they_belong(tmp_path):
     poses = upright_poses(156)
     arrays = dict(poses=poses, trans=np.zeros((FRAMES, 3)), mocap_frame_rate=np.array(60), gender=np.array("male"))
-    motion = load_motion(write(tmp_path / "a.npz", **arrays, labels=np.array([{"pickled": 1}], object)))
+    motion = load_motion(write(tmp_path / "a.npz", **arrays, labels=np.array([{"pickled": 1}], object)), up="y")
     flat = np.asarray(motion.rotations).reshape(FRAMES, -1)
     np.testing.assert_allclose(flat[:, :66], poses[:, :66], atol=FLOAT32)
     assert (flat[:, 66:75] == 0).all()
@@ -191,8 +194,6 @@ def test_lhm(tmp_path):
 
 
 def rotation_vector(matrix):
-    from scipy.spatial.transform import Rotation
-
     return Rotation.from_matrix(matrix).as_rotvec()
 
 
@@ -207,14 +208,71 @@ def test_any_world_is_turned_upright(tmp_path, axis):
         turned[i, :3] = rotation_vector(turn.T @ root)
     turned_trans = (trans + PELVIS) @ turn - PELVIS  # the pelvis moves with the world
     path = write(tmp_path / "a.npz", poses=turned, trans=turned_trans, mocap_framerate=30)
-    asked = load_motion(path) if axis != "y" else load_motion(path, up="y")
-    for motion in (asked, load_motion(path, up=axis)):
-        back = quaternion.matrix_from_axis_angle(motion.rotations)
-        expected = quaternion.matrix_from_axis_angle(jnp.asarray(poses.reshape(FRAMES, 55, 3), jnp.float32))
-        np.testing.assert_allclose(back, expected, atol=FLOAT32)
-        np.testing.assert_allclose(motion.translations, trans, atol=FLOAT32)
+    motion = load_motion(path, up=axis)
+    back = quaternion.matrix_from_axis_angle(motion.rotations)
+    expected = quaternion.matrix_from_axis_angle(jnp.asarray(poses.reshape(FRAMES, 55, 3), jnp.float32))
+    np.testing.assert_allclose(back, expected, atol=FLOAT32)
+    np.testing.assert_allclose(motion.translations, trans, atol=FLOAT32)
     untouched = load_motion(path, up="y")
     np.testing.assert_allclose(untouched.translations, turned_trans, atol=FLOAT32)
+
+
+def amass(rotations, translations):
+    return dict(poses=rotations.reshape(len(rotations), -1), trans=translations, mocap_framerate=FPS)
+
+
+def parts(rotations, translations):
+    flat = rotations.reshape(len(rotations), -1)
+    return dict(global_orient=flat[:, :3], body_pose=flat[:, 3:66], transl=translations, fps=FPS)
+
+
+@pytest.mark.parametrize("heading", [0, 90, 215])
+@pytest.mark.parametrize("kind", motions())
+def test_people_on_the_floor_stay_there(tmp_path, caplog, kind, heading):
+    """AMASS has z up and the others y, also when people crawl along an axis, lie, or stand on their hands."""
+    facing = Rotation.from_euler("y", heading, degrees=True)
+    for up, arrays in (("z", amass), ("y", parts)):
+        path = write(tmp_path / f"{up}.npz", **arrays(*in_world(*motions()[kind], UP[up] * facing)))
+        motion, (rotations, translations) = load_motion(path), in_world(*motions()[kind], facing)
+        matrices = lambda x: Rotation.from_rotvec(np.reshape(x, (-1, 3))).as_matrix()
+        np.testing.assert_allclose(matrices(motion.rotations), matrices(rotations), atol=FLOAT32)
+        np.testing.assert_allclose(motion.translations, translations, atol=2 * FLOAT32)
+    assert not [line for line in caplog.messages if " is up, not " in line]
+
+
+@pytest.mark.parametrize(("arrays", "usual"), [(amass, "z"), (parts, "y")])
+@pytest.mark.parametrize("up", ["y", "z", "-y"])
+def test_where_the_floor_agrees_another_axis_is_up_and_it_is_said(tmp_path, caplog, arrays, usual, up):
+    expected, translations = motions()["walking"]
+    motion = load_motion(write(tmp_path / "a.npz", **arrays(*in_world(expected, translations, UP[up]))))
+    np.testing.assert_allclose(motion.translations, translations, atol=2 * FLOAT32)
+    said = f"{tmp_path / 'a.npz'}: {up} is up, not {usual}"
+    assert [line.startswith(said) for line in caplog.messages] == ([] if up == usual else [True])
+
+
+def test_who_stands_still_may_lie_and_that_is_said(tmp_path, caplog):
+    still = np.zeros((4, 55, 3)), np.zeros((4, 3))
+    motion = load_motion(write(tmp_path / "a.npz", **amass(*still)))
+    assert motion.rotations[0, 0, 0] == pytest.approx(-np.pi / 2)
+    (line,) = caplog.messages
+    assert (
+        line
+        == f"{tmp_path / 'a.npz'}: z is up, as usual in such files, and people lie along y; if they should stand: up=y"
+    )
+    caplog.clear()
+    beat = amass(*still) | {"expressions": np.zeros((4, 100))}  # BEAT2's has y up
+    assert not np.any(load_motion(write(tmp_path / "b.npz", **beat)).rotations) and not caplog.messages
+    camera = parts(*in_world(*still, UP["-y"]))  # estimators: y points down
+    np.testing.assert_allclose(load_motion(write(tmp_path / "c.npz", **camera)).rotations, 0, atol=FLOAT32)
+    assert "c.npz: -y is up, not y: people stand along it" in caplog.text
+
+
+def test_a_tilt_is_no_other_axis(tmp_path):
+    tilted = np.zeros((4, 55, 3))
+    tilted[:, 0, 0] = 0.8  # radians: nearer to z than to y
+    np.testing.assert_allclose(
+        load_motion(write(tmp_path / "a.npz", **parts(tilted, np.zeros((4, 3))))).rotations, tilted
+    )
 
 
 def test_where_no_axis_is_clear_the_format_decides(tmp_path):
@@ -249,6 +307,10 @@ BAD = {
     ),
     "no frames": ({**AMASS, "poses": np.zeros((0, 165))}, ": poses: expected at least one number"),
     "NaN": ({**AMASS, "poses": NAN}, ": poses: expected finite numbers, got nan at index [2, 7]"),
+    "beyond float32": (
+        {**AMASS, "poses": np.full((FRAMES, 165), 1e300)},
+        ": expected rotations and a skeleton of finite size",
+    ),
     "infinite": ({**AMASS, "trans": np.full((FRAMES, 3), np.inf)}, ": trans: expected finite"),
     "counts": ({**AMASS, "trans": np.zeros((FRAMES + 1, 3))}, ": trans: expected shape (6, 3), got (7, 3)"),
     "no trans": (without(AMASS, "trans"), ": trans: missing"),

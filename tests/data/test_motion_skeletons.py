@@ -1,10 +1,10 @@
-"""Skeletons of other programs: bones, feet and names, in files as CMU, Mixamo and LaFAN write them; and the page's reader."""
+"""Skeletons of other programs: bones, feet and names, in files as CMU, Mixamo and LaFAN write them. The page: tests/viewer."""
 
+import dataclasses
 import functools
 import json
-import shutil
-import subprocess
-from pathlib import Path
+import logging
+import struct
 
 import numpy as np
 import pytest
@@ -20,18 +20,17 @@ from bvh_files import (
     without_twist,
     write_bvh,
 )
+from motion_cases import UP, in_world, motions
 from scipy.spatial.transform import Rotation
 
-import humangs_jax
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.data.motion import MotionError, load_motion
-from humangs_jax.data.motion.skeleton import shipped_joints
+from humangs_jax.data.motion.bvh import read_bvh
+from humangs_jax.data.motion.skeleton import retargeted, shipped_joints
 from humangs_jax.io.glb import GlbWriter
 
 EXACT = 1e-5
 """Radians and metres: float32, and BVH's eight decimals."""
-PAGE = Path(humangs_jax.__file__).parent / "viewer" / "page"
-NODE = shutil.which("node")
 
 
 @functools.cache
@@ -91,6 +90,71 @@ def test_bones_point_where_the_files_bones_point(tmp_path, scheme):
     np.testing.assert_allclose((translations + rest[0] - moves)[:, [0, 2]], 0, atol=EXACT)
 
 
+TURNS = {
+    "about x": Rotation.from_euler("x", [[90]] * 4, degrees=True),
+    "about y": Rotation.from_euler("y", [[-120]] * 4, degrees=True),
+    "about z": Rotation.from_euler("z", [[90]] * 4, degrees=True),
+    "half a turn": Rotation.from_euler("y", [[180]] * 4, degrees=True),
+    "any": Rotation.random(4, random_state=3),
+    "now and then": Rotation.from_rotvec([[0, 0, 0], [2, 1, 0], [0, 0, 0], [0, 0, 1.5]]),
+}
+
+
+@pytest.mark.parametrize("turns", TURNS)
+@pytest.mark.parametrize("names", [CMU, LAFAN, CMU | {"spine1": "Waist", "spine2": "Chest", "spine3": "Thorax"}])
+def test_a_pelvis_with_a_rotation_of_its_own(tmp_path, names, turns):
+    """The joints that carry hips and spine turn back: the people are where they were."""
+    rest, poses = person().copy(), dance(4, names=names)
+    rest[INDEX["spine1"]] = rest[0]
+    moves = np.random.default_rng(1).normal(size=(4, 3))
+    text = write_bvh(rest, poses, names, moves=moves, pelvis=TURNS[turns])
+    assert text.count("JOINT Carrier") == 2
+    rotations, translations, _ = loaded(tmp_path, text, rest_joints=rest)
+    np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+    np.testing.assert_allclose((translations + rest[0] - moves)[:, [0, 2]], 0, atol=EXACT)
+
+
+def test_hips_that_hang_on_a_turned_pelvis_itself(tmp_path):
+    """The spine alone tells where the pelvis is."""
+    rest = person().copy()
+    rest[INDEX["spine1"]] = rest[0]
+    (tmp_path / "a.bvh").write_text(write_bvh(rest, np.zeros((4, 55, 3)), CMU, pelvis=TURNS["about x"]))
+    clip = read_bvh(tmp_path / "a.bvh")
+    parents = tuple(0 if name.endswith("UpLeg") else p for name, p in zip(clip.names, clip.parents, strict=True))
+    rotations, _, _ = retargeted(dataclasses.replace(clip, parents=parents), rest)
+    np.testing.assert_allclose(rotations, 0, atol=EXACT)
+
+
+def test_joints_between_those_we_know_turn_bones_too(tmp_path):
+    """A joint of no length above the elbow that turns by itself, as some rigs have: the forearm starts where the file's does."""
+    rest, poses = person(), dance(3, names=CMU)
+    text = write_bvh(rest, poses, CMU)
+    bend = Rotation.from_euler("ZYX", [[40, 20, 0]] * 3, degrees=True)
+    lines, depth = text.splitlines(), 0
+    start = next(i for i, line in enumerate(lines) if line.strip() == "JOINT LeftForeArm")
+    for end in range(start + 1, len(lines)):
+        depth += lines[end].count("{") - lines[end].count("}")
+        if depth == 0:
+            break
+    channels = "CHANNELS 3 Zrotation Yrotation Xrotation"
+    lines[start:end] = ["JOINT Roll", "{", "OFFSET 0 0 0", channels, *lines[start:end], "}"]
+    before = sum(3 * (1 + ("ROOT" in line)) for line in lines[:start] if "ROOT" in line or "JOINT" in line)
+    at = next(i for i, line in enumerate(lines) if line.startswith("Frame Time")) + 1
+    for frame in range(3):
+        numbers = lines[at + frame].split()
+        numbers[before:before] = [f"{x:.8f}" for x in bend[frame].as_euler("ZYX", degrees=True)]
+        lines[at + frame] = " ".join(numbers)
+    rotations, translations, _ = loaded(tmp_path, "\n".join(lines), rest_joints=rest)
+    expected = poses.copy()
+    arm, elbow = INDEX["left_shoulder"], INDEX["left_elbow"]
+    ours = places_of(rest, rotations, translations + rest[0])
+    turned = Rotation.from_rotvec(poses[:, arm]) * bend
+    expected[:, arm] = turned.as_rotvec()
+    theirs = places_of(rest, expected, translations + rest[0])
+    direction = lambda places: (places[:, elbow] - places[:, arm]) / np.linalg.norm(rest[elbow] - rest[arm])
+    np.testing.assert_allclose(direction(ours), direction(theirs), atol=EXACT)
+
+
 def test_a_rest_pose_in_which_nobody_stands_gets_its_twists_from_the_motion(tmp_path):
     rest = person().copy()
     for name in ("spine1", "spine2", "spine3"):  # a straight spine: as the file's is
@@ -145,6 +209,22 @@ def test_names_of_other_schemes(tmp_path):
         np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
 
 
+@pytest.mark.parametrize("gap", [" ", "   ", "\t", " \t "])
+@pytest.mark.parametrize("brace", ["\n{", "{", " {"])
+def test_names_with_spaces(tmp_path, gap, brace):
+    """As Biped and Rocketbox have them: a name ends with its line, or before a brace."""
+    limbs = {"shoulder": "UpperArm", "elbow": "Forearm", "wrist": "Hand", "collar": "Clavicle"}
+    limbs |= {"hip": "Thigh", "knee": "Calf", "ankle": "Foot", "foot": "Toe0"}
+    names = {
+        o: gap.join(["Bip01", o[0].upper(), limbs[o.split("_")[1]]] if "_" in o else ["Bip01", o.title()]) for o in CMU
+    }
+    rest, poses = person(), dance(3, names=CMU)
+    text = "\n".join(line.strip(" \t") for line in write_bvh(rest, poses, names).splitlines()).replace("\n{", brace)
+    for ending in ("\n", "\r\n"):
+        rotations, _, _ = loaded(tmp_path, text.replace("\n", ending), rest_joints=rest)
+        np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+
+
 def test_few_spine_joints(tmp_path):
     rest, poses = person(), np.zeros((2, 55, 3))
     names = {ours: theirs for ours, theirs in CMU.items()}
@@ -167,6 +247,7 @@ BAD = {
     "nan": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 nan 0\n", "expected finite numbers, got nan"),
     "letters": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0.1\n0 x 0\n", "frames: expected numbers"),
     "time": (HEAD + "MOTION\nFrames: 1\nFrame Time: 0\n0 0 0\n", "a positive Frame Time, got 1 and 0"),
+    "instant": (HEAD + "MOTION\nFrames: 1\nFrame Time: 5e-324\n0 0 0\n", "a positive Frame Time, got 1 and 5e-324"),
     "channels": (HEAD.replace("Zrot", "Wrot"), "expected up to 6 channels"),
     "word": (HEAD.replace("CHANNELS", "CHANELS"), "unknown word CHANELS"),
 }
@@ -193,36 +274,6 @@ def test_a_body_of_other_joints_is_refused_by_name(tmp_path):
     (tmp_path / "walk.fbx").write_text("Kaydara")
     with pytest.raises(MotionError, match=r"expected a file .npz, .pkl, .json, .bvh or .glb, got .fbx"):
         load_motion(tmp_path / "walk.fbx")
-
-
-# The page ---------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.skipif(NODE is None, reason="needs node (nodejs.org)")
-@pytest.mark.parametrize("scheme", ["CMU, A-pose", "Mixamo, turned", "z up", "LaFAN"])
-def test_the_page_reads_a_file_as_python_does(tmp_path, scheme):
-    source, target = other_person(), person()
-    moves = np.random.default_rng(2).normal(size=(4, 3))
-    if scheme == "LaFAN":
-        text = write_bvh(source, dance(4, names=LAFAN), LAFAN, frames_along_bones(source), moves)
-    else:
-        names, frame, options = SCHEMES[scheme]
-        text = write_bvh(source, dance(4, names=names), names, rest_frames(**frame), moves, **options)
-    rotations, translations, motion = loaded(tmp_path, text, rest_joints=target)
-    scripts = "\n".join((PAGE / f"{name}.js").read_text() for name in ("kinematics", "motion_files"))
-    body = json.dumps({"rest": target.tolist(), "parents": PARENTS, "names": JOINT_NAMES})
-    program = f"""{scripts}
-    const scene = {body};
-    scene.order = jointOrder(scene.parents);
-    const text = require("fs").readFileSync({json.dumps(str(tmp_path / "dance.bvh"))}, "utf8");
-    process.stdout.write(JSON.stringify(retargetBvh(parseBvh(text), scene)));"""
-    done = subprocess.run([str(NODE), "-e", program], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    page = json.loads(done.stdout)
-    theirs = Rotation.from_quat(np.reshape(page["quats"], (-1, 4))[:, [1, 2, 3, 0]]).as_matrix()
-    np.testing.assert_allclose(theirs, matrices(rotations), atol=EXACT)
-    np.testing.assert_allclose(page["translations"], translations, atol=EXACT)
-    assert page["fps"] == motion.fps == 120
 
 
 # GLB --------------------------------------------------------------------------------------------------------------------
@@ -320,3 +371,49 @@ def test_glb_files_that_are_no_motion(tmp_path):
     (tmp_path / "a.glb").write_text("hello")
     with pytest.raises(MotionError, match="no GLB file"):
         load_motion(tmp_path / "a.glb")
+    times, turns = (writer := GlbWriter()).array("SCALAR", np.arange(2.0)), writer.array("VEC4", np.ones((2, 4)))
+    twice = track()["animations"][0]
+    twice["channels"] *= 2
+    assert "two tracks for the rotation of node 0" in message({"nodes": [{}], "animations": [twice]}, writer)
+
+
+def test_the_text_of_a_glb_may_be_as_long_as_other_json(tmp_path):
+    """A character of many clips has a megabyte of it; a scan, which another library loads, may not."""
+    write_glb(tmp_path / "a.glb", person(), dance(2), np.zeros((2, 3)), MIXAMO)
+    data = (tmp_path / "a.glb").read_bytes()
+    (length,) = struct.unpack_from("<I", data, 12)
+    text = json.loads(data[20 : 20 + length]) | {"extras": ["clip"] * 150_000}
+    text = json.dumps(text, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + data[20 + length :]
+    (tmp_path / "b.glb").write_bytes(struct.pack("<III", 0x46546C67, 2, 12 + len(chunks)) + chunks)
+    assert len(text) > 1_000_000
+    one, other = (load_motion(tmp_path / name) for name in ("a.glb", "b.glb"))
+    np.testing.assert_array_equal(one.rotations, other.rotations)
+
+
+# The world's up ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("up", ["y", "z"])
+@pytest.mark.parametrize("kind", motions())
+def test_people_on_the_floor_stay_there(tmp_path, caplog, kind, up):
+    """Whatever they do, the rest pose tells which way is up."""
+    poses, translations = motions()[kind]
+    poses = poses.copy()
+    poses[:, [i for i, name in enumerate(JOINT_NAMES) if name not in CMU]] = 0
+    text = write_bvh(person(), poses, CMU, moves=translations + person()[0], up=UP[up])
+    rotations, _, _ = loaded(tmp_path, text, rest_joints=person())
+    np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+    assert not [line for line in caplog.messages if " is up, not " in line]
+
+
+def test_people_who_walk_along_another_axis_than_the_rest_pose_are_turned_and_it_is_said(tmp_path, caplog):
+    poses, translations = motions()["walking"]
+    turned, moved = in_world(poses, translations, UP["z"])
+    with caplog.at_level(logging.WARNING):
+        rotations, _, _ = loaded(
+            tmp_path, write_bvh(person(), turned, CMU, moves=moved + person()[0]), rest_joints=person()
+        )
+    np.testing.assert_allclose(matrices(rotations), matrices(poses), atol=EXACT)
+    assert "dance.bvh: z is up, not y as usual" in caplog.text

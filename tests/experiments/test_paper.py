@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from experiments.paper import bench, cost, figures, tables, train_all
+from experiments.paper import bench, claims, cost, figures, tables, train_all
 
 
 @pytest.fixture(scope="module")
@@ -42,20 +42,46 @@ def test_variants_are_compared_with_variants_and_differ_from_them(queue):
     assert bench.view_counts("no global token", queue["no global token"].config) == (1, 2, 4, 6)
 
 
-def test_a_difference_no_larger_than_that_of_another_seed_is_noise(queue):
+def test_differences_inside_the_interval_of_the_seeds_are_noise(queue):
     rows = {"humangs": run(20.0), "humangs, another seed": run(20.3), "no shells": run(19.8)}
-    assert bench.noise(rows) == pytest.approx(0.3)
-    assert bench.noise({"humangs": run(20.0)}) is None
+    # one pair: Student's t with one degree of freedom, 12.706
+    assert bench.seed_interval(rows) == pytest.approx(12.706 * 0.3, rel=1e-3)
+    pairs = rows | {"back-projection": run(19.0), "back-projection, another seed": run(19.4)}
+    assert bench.seed_interval(pairs) == pytest.approx(4.303 * 0.125**0.5, rel=1e-3)
+    assert bench.seed_interval({"humangs": run(20.0)}) is None
     words = [bench.verdict(difference, 0.3) for difference in (0.2, -0.3, 0.4, -0.4)]
     assert words == ["within noise", "within noise", "better", "worse"] and bench.verdict(1.0, None) == "noise unknown"
-    rows["pooling over all views"] = run(19.0)
-    text = train_all.table(rows, queue, {"validation": ["a", "b"]})
+    rows |= {"pooling over all views": run(15.0), "lhm": run(12.5, photos=1), "humangs, 1 photo": run(18.0, photos=1)}
+    painted = {"1": {"psnr_mask": 8.0}, "4": {"psnr_mask": 9.7}}
+    text = train_all.table(rows, queue, {"validation": ["a", "b"]}, painted)
     lines = {cells[0].strip(): cells for line in text.splitlines() if (cells := line.strip("| ").split("|"))}
     assert [lines["no shells"][i].strip() for i in (5, 6, 7)] == ["humangs", "-0.20", "within noise"]
-    assert (
-        lines["pooling over all views"][7].strip() == "worse" and lines["humangs, another seed"][7].strip() == "noise"
+    said = {"pooling over all views": "worse", "humangs, another seed": "noise", "lhm": "not trained"}
+    assert {name: lines[name][7].strip() for name in said} == said
+    assert "2 unseen people" in text and "+-3.81 dB" in text
+    assert bench.untrained(rows, painted) == ["lhm"]
+
+
+def test_verdicts_of_claims_need_trained_systems_and_intervals_on_one_side():
+    numbers = claims.Numbers()
+    numbers.interval, numbers.gray = {"psnr": 0.1}, ["lhm"]
+    assert numbers.judge(0.2, 0.3) == (claims.CONSISTENT, "")
+    assert numbers.judge(0.2, 0.05) == (claims.NOT_TESTED, "the interval contains 0")
+    assert numbers.judge(0.2, -0.3) == (claims.CONTRADICTED, "")
+    assert numbers.judge(0.2, needs=["lhm", "humangs"]) == (claims.NOT_TESTED, "`lhm` is not trained")
+    assert numbers.judge(-0.2, needs=["lhm"]) == (claims.CONTRADICTED, "`lhm` is not trained")
+
+
+def test_the_page_of_the_paper_says_what_the_results_say():
+    numbers = claims.Numbers()
+    said = {row.claim: row.verdict for row in claims.claims(numbers)}
+    assert set(said.values()) == set(claims.VERDICTS)
+    assert said == bench.results(claims.TABLE)["verdicts"] and numbers.gray == bench.results(claims.TABLE)["untrained"]
+    page = bench.PAGE.read_text()
+    assert page.index(claims.CONTRADICTED, page.index("| holds? |")) < page.index(
+        claims.CONSISTENT, page.index("| holds? |")
     )
-    assert "2 unseen people" in text
+    assert not any(line.rstrip(" |").endswith("yes") for line in page.splitlines() if line.startswith("|"))
 
 
 def test_runs_of_other_settings_are_not_mixed(tmp_path):
@@ -76,12 +102,16 @@ def test_tables_have_the_printed_rows_and_ours_beside_them(tmp_path):
         return found if people and name == "humangs" else None
 
     arguments = argparse.Namespace(people=tmp_path, other=[], near=None, split=None, fits=tmp_path / "fits.json")
+    arguments.gray = []
     fit = {"animation": {"psnr": 21.0, "ssim": 0.9, "lpips_vgg": None}, "fit_s": 300.0, "frame_s": 0.5}
     arguments.fits.write_text(json.dumps({"a": fit, "b": fit | {"fit_s": 500.0}}))
     texts = {name: table(["humangs", "lhm"], measure, arguments) for name, table in tables.TABLES.items()}
-    assert "| humangs | 4 photos | 24.00 / 0.900 / - | 0.50 | 0.010 |" in texts["animation"]
+    assert "| humangs | 4 photos | 24.00 / 0.900 / - |  |  |" in texts["animation"]
     assert "| HumanGS | paper | 25.24 / 0.960 / 0.040 | 0.29 | 0.048 |" in texts["animation"]
-    assert "| animatable | fitted to each of 2 people | 21.00 / 0.900 / - | 400 | 0.50 |" in texts["animation"]
+    others, alone = texts["animation"].split("\n\n")
+    assert (
+        "animatable" not in others and "| animatable | fitted to each of 2 other people | 21.00 / 0.900 / - |" in alone
+    )
     assert "| humangs | standard | 21.00 / 0.900 / - |" in texts["views"]
     assert "| LVSM | paper | 24.38 / 0.960 / 0.036 | - |" in texts["reconstruction"]
     assert "| humangs | 4 photos | 24.00 / 0.900 / - | - |" in texts["domains"]
@@ -94,7 +124,8 @@ def test_other_kinds_of_people_are_columns_and_another_split_a_row(tmp_path):
         return {"photos": photos, "reconstruction": scores}
 
     people, other, third, unseen = (tmp_path / name for name in ("p", "walking", "hats", "unseen"))
-    arguments = argparse.Namespace(people=people, other=[other, third], split=[tmp_path, unseen])
+    arguments = argparse.Namespace(people=people, other=[other, third], split=[tmp_path, unseen], gray=["lhm"])
+    assert "| lhm | 4 photos, not trained | 21.00" in tables.domains(["lhm"], measure, arguments)
     text = tables.domains(["humangs"], measure, arguments)
     assert "in domain | cross-domain: walking | cross-domain: hats |" in text
     assert "| humangs | 4 photos | 21.00 / 0.900 / - | 27.00 / 0.900 / - | 24.00 / 0.900 / - |" in text
@@ -125,7 +156,7 @@ def test_a_cost_table_has_the_ratio_of_the_readers():
     text = cost.text_of(result)
     assert "| 4 | 10000 | 256 | 2.0 | 30 | 15 | 10 | 9000 | 900 | 1.0 | 44 |" in text
     assert (
-        "| lhm | 4 | 10 | 100 | 8.00 | 4.0 |" in text
+        "| lhm, joint attention alone | 4 | 10 | 100 | 8.00 | 4.0 |" in text
         and "| LHM (single view), printed seconds |  |  |  | 4.6 | 16 |" in text
     )
 

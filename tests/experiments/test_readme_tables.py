@@ -30,11 +30,11 @@ def test_quality():
     demo = DEMO | {"refined": SCORES | {"psnr": 29.16, "seconds": 15.2}}
     rows = quality(demo, people, refined).splitlines()[2:]
     assert rows[0] == "| the shipped person, 256 px (6 views) | 27.4 | 0.946 | 18.8 | 20.7 | 11.3 |"
-    assert rows[1] == "| the same, refined for 15 s | 29.2 | 0.946 | 18.8 |  |  |"
+    assert rows[1] == "| the same, refined as `humangs demo` does (15 s) | 29.2 | 0.946 | 18.8 |  |  |"
     assert rows[2].startswith("| 3 people of the test seeds, 256 px, other cameras | 27.4 |")
     assert rows[4] == "| these 3, 256 px, refined for 1 s, other cameras | 27.4 | 0.946 | 18.8 |  |  |"
     assert rows[7] == "| 512 px, in poses that no photo shows | 27.4 | 0.946 | 18.8 |  |  |" and len(rows) == 10
-    with pytest.raises(ValueError, match="expected `humangs demo --refine 15`"):
+    with pytest.raises(ValueError, match="expected `humangs demo` without"):
         quality(DEMO, people, refined)
     with pytest.raises(ValueError, match="2 people were refined: expected the same 3"):
         quality(demo, people, refined | {"people": 2})

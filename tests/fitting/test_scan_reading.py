@@ -1,8 +1,10 @@
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from humangs_jax.fitting.scan_reading import directions_around, read_mesh, read_scan, sample_scan
+from humangs_jax.io.mesh import GREY
 
 
 def sphere(radius=1.0, subdivisions=3):
@@ -60,6 +62,53 @@ def test_parts_of_a_scene_are_where_the_scene_has_them(tmp_path):
     scene.add_geometry(sphere(), node_name="there", transform=move)
     scene.export(tmp_path / "two.glb")
     assert np.ptp(read_mesh(tmp_path / "two.glb").vertices[:, 0]) == pytest.approx(12, abs=0.1)
+
+
+def boxes(folder):
+    """Objects and materials in turn, each with its own vertices, quads among triangles; as (vertices, faces) and as a file."""
+    vertices, faces, lines = [], [], ["mtllib boxes.mtl"]
+    for i in range(6):
+        box = trimesh.creation.box((1, 1, 1)).subdivide()
+        box.apply_translation([2.0 * i, 0, 0])
+        start = sum(map(len, vertices))
+        lines += [f"o box{i}", f"g part{i}", *(f"v {x} {y} {z}" for x, y, z in box.vertices), f"usemtl paint{i % 2}"]
+        lines += ["f " + " ".join(f"{start + corner + 1}" for corner in face) for face in box.faces[:40]]
+        lines += ["s off", f"usemtl paint{(i + 1) % 2}"]
+        lines += ["f " + " ".join(f"{start + corner + 1}" for corner in face) for face in box.faces[40:]]
+        vertices.append(box.vertices)
+        faces.append(box.faces + start)
+    (folder / "boxes.mtl").write_text("newmtl paint0\nKd 1 0 0\nnewmtl paint1\nKd 0 1 0\n")
+    (folder / "boxes.obj").write_text("\n".join(lines))
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+@pytest.mark.parametrize("colors", [False, True])
+def test_objects_and_materials_in_turn_keep_every_face(tmp_path, colors):
+    vertices, faces = boxes(tmp_path)
+    mesh = read_mesh(tmp_path / "boxes.obj", colors=colors)
+    triangles = lambda corners: np.sort(np.round(corners.reshape(len(corners), -1), 6), axis=0)
+    np.testing.assert_allclose(triangles(mesh.vertices[mesh.faces]), triangles(vertices[faces]), atol=1e-6)
+
+
+def textured(folder, name="skin.png"):
+    """A sphere whose texture is red, and named `name` in its material."""
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(folder / "skin.png")
+    ball = sphere()
+    (folder / "ball.mtl").write_text(f"newmtl skin\nmap_Kd {name}\n")
+    lines = ["mtllib ball.mtl", "usemtl skin", *(f"v {x} {y} {z}" for x, y, z in ball.vertices)]
+    lines += [f"vt {x / 2 + 0.5} {y / 2 + 0.5}" for x, y, _ in ball.vertices]
+    lines += ["f " + " ".join(f"{corner + 1}/{corner + 1}" for corner in face) for face in ball.faces]
+    (folder / "ball.obj").write_text("\n".join(lines))
+    return folder / "ball.obj"
+
+
+def test_a_scan_has_the_colours_of_its_texture_and_is_grey_with_a_warning_without_it(tmp_path, caplog):
+    red = read_mesh(textured(tmp_path), colors=True).visual.vertex_colors
+    assert (red == [255, 0, 0, 255]).all() and not caplog.records
+    grey = read_mesh(textured(tmp_path, "moved.png"), colors=True).visual.vertex_colors
+    assert (grey[:, :3] == GREY).all()
+    (record,) = caplog.records
+    assert "ball.obj: left out 'moved.png':" in record.getMessage() and "no such file" in record.getMessage()
 
 
 def bad_files(folder):

@@ -213,3 +213,27 @@ for value in (1e38, 1e300, -1e20, 1e6):
 
 for kind, name in {"a title": "\x1b]0;OWNED\x07", "a new line": "a\nb", "half a surrogate": "\ud800"}.items():
     arrays_case(f"{kind} for a joint", "avatar", readers.avatar_file, header(joint_names=["a", "b", name]))
+
+
+RATES = {"10^9": 1e9, "10^-9": 1e-9, "10^300": 1e300, "10^-300": 1e-300, "1,001": 1001.0}
+for kind, rate in RATES.items():
+    for reader in ("filmed", "motion npz"):
+        arrays_case(
+            f"a rate of {kind}", reader, readers.motion_arrays, lambda a, r=rate: a.update(fps=np.asarray(r)), 5
+        )
+arrays_case(
+    "300,000 frames",
+    "filmed",
+    lambda: readers.motion_arrays(
+        rotations=np.zeros((300_000, 55, 3), np.float32), translations=np.zeros((300_000, 3), np.float32)
+    ),
+    lambda arrays: None,
+    5,
+)
+arrays_case(
+    "9,000 frames of 100 seconds each",
+    "filmed",
+    lambda: readers.motion_arrays(rotations=np.zeros((9000, 55, 3)), translations=np.zeros((9000, 3)), fps=0.01),
+    lambda arrays: None,
+    5,
+)

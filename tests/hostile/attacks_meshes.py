@@ -1,11 +1,13 @@
 """Scans: accessors, instances, textures, and formats that are not read."""
 
+import os
 import re
 import struct
 
 import readers
 from attacks_photos import EPS, PHOTOS
-from hostile_cases import case, changed, setting, written
+from hostile_cases import case, changed, huge, setting, written
+from PIL import Image
 
 # Scans --------------------------------------------------------------------------------------------------------------------
 
@@ -131,3 +133,88 @@ for kind, (name, data) in MESHES.items():
     case(kind, name.split(".")[1], written(name, data), expect, 5 if "10^" in kind or "2^" in kind else 6)
 for suffix in ("dae", "3mf", "gltf", "zip", "xyz", "dxf", "svg", "step", "urdf", "json", "pkl", ""):
     case(f"a file named .{suffix}", "obj", written(f"scan.{suffix}", "<?xml version='1.0'?><a/>"), item=4)
+
+
+# Parts and textures -------------------------------------------------------------------------------------------------------
+
+
+def many_changes(word, count):
+    vertices = "".join(f"v {i} {i % 7} {i % 3}\n" for i in range(3 * count))
+    return vertices + "".join(f"{word} a{i}\nf {3 * i + 1} {3 * i + 2} {3 * i + 3}\n" for i in range(count))
+
+
+for word in ("o", "g", "s"):
+    case(
+        f"{word} for each of 30,000 faces",
+        "obj",
+        written("scan.obj", lambda w=word: many_changes(w, 30_000)),
+        "read",
+        5,
+    )
+for kind, line in {
+    "in comments": "# usemtl a{0}\nf {1}\n",
+    "in faces": "f {1} usemtl a{0}\n",
+    "in a name": "usemtl " + "usemtl " * 1000 + "\nf {1}\n",
+}.items():
+
+    def disguised(line=line):
+        vertices = "".join(f"v {i} {i % 7} {i % 3}\n" for i in range(90_000))
+        return vertices + "".join(
+            line.format(i, f"{3 * i + 1} {3 * i + 2} {3 * i + 3}") for i in range(30_000 // line.count("u"))
+        )
+
+    case(f"usemtl {kind}, 30,000", "obj", written("scan.obj", disguised), "either", 5)
+case("usemtl for each of 30,000 faces", "obj", written("scan.obj", lambda: many_changes("usemtl", 30_000)), item=5)
+case(
+    "two materials, 30,000 changes",
+    "obj",
+    written("scan.obj", lambda: re.sub(r"usemtl a\d*(\d)", r"usemtl \1", many_changes("usemtl", 30_000))),
+    "read",
+    5,
+)
+SOLID = "solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 {}\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid a\n"
+case("30,000 solids", "stl", written("scan.stl", lambda: "".join(SOLID.format(i) for i in range(30_000))), item=5)
+case(
+    "30,000 SOLIDS", "stl", written("scan.stl", lambda: "".join(SOLID.format(i) for i in range(30_000)).upper()), item=5
+)
+
+
+def repeated(count):
+    return lambda content: content["meshes"][0].update(primitives=content["meshes"][0]["primitives"] * count)
+
+
+WHITE = Image.new("RGB", (3000, 3000), "white")
+case("3,000 parts of a mesh", "glb", glb(repeated(3000)), item=5)
+case("1,000 parts with a texture of 9 million pixels", "glb", glb(repeated(1000), image=WHITE), item=5)
+
+
+def obj_with_texture(place, texture="texture.png"):
+    def make(folder):
+        place(folder / texture)
+        return readers.textured_obj(folder, texture)
+
+    return make
+
+
+TEXTURES = {
+    "a pipe": os.mkfifo,
+    "a folder": lambda path: path.mkdir(),
+    "an endless device": lambda path: path.symlink_to("/dev/zero"),
+    "a link to itself": lambda path: path.symlink_to(path),
+    "nothing": lambda path: path.touch(),
+    "cut off": lambda path: path.write_bytes(readers.photo_bytes()[:200]),
+    "a terabyte": huge,
+}
+for kind, place in TEXTURES.items():
+    case(f"a texture that is {kind}", "obj", obj_with_texture(place), "read", 6)
+case("a texture without a name", "obj", lambda folder: readers.textured_obj(folder, ""), "read", 6)
+case("a texture that is cut off", "glb", glb(images=readers.photo_bytes()[:200]), item=6)
+
+
+def nine_thousand_textures(folder):
+    path = readers.write_obj(folder)
+    (folder / "scan.mtl").write_text("".join(f"newmtl m{i}\nmap_Kd texture.png\n" for i in range(9000)))
+    return path
+
+
+case("9,000 materials of one texture", "obj", nine_thousand_textures, "read", 5)

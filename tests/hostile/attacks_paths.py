@@ -1,6 +1,7 @@
 """Captures and calibrations that name files outside of their folder."""
 
 import json
+import os
 
 import numpy as np
 import readers
@@ -106,3 +107,113 @@ def camera_named(name):
 
 for name in ("..", "../..", "/", "/tmp", "x\0y"):
     case(f"a camera {name!r}", "import", camera_named(name), item=2)
+
+
+# Captures and folders of photos that cost more than they weigh ------------------------------------------------------------------
+
+
+def capture_of(count, prepare=lambda folder: None, image="images/000.png", **changes):
+    """Views that name a photo each: `image` with the number of the view, if it has a place for it."""
+
+    def make(folder):
+        readers.write_capture(folder)
+        prepare(folder)
+        description = readers.capture_description()
+        view = {**description["views"][0], "frame": 0, **changes}
+        del view["mask"]
+        description["views"] = [view | {"image": image.format(i)} for i in range(count)]
+        (folder / "capture.json").write_text(json.dumps(description))
+        return folder
+
+    return make
+
+
+def large_photo(folder, size=1024):
+    Image.fromarray(np.zeros((size, size, 3), np.uint8)).save(folder / "images" / "000.png")
+
+
+def copies(count, link):
+    """Of the large photo, hard or symbolic links."""
+
+    def prepare(folder):
+        large_photo(folder)
+        for i in range(count):
+            link(folder / "images" / "000.png", folder / f"{i}.png")
+
+    return prepare
+
+
+def white_photos(folder):
+    large_photo(folder, 7000)
+    for i in range(21):
+        (folder / f"{i}.png").write_bytes((folder / "images" / "000.png").read_bytes())
+
+
+def five_thousand_photos(folder):
+    for i in range(5000):
+        (folder / f"{i}.png").write_bytes((folder / "images" / "000.png").read_bytes())
+
+
+for reader in ("capture", "photos", "outline"):
+    case("one photo 4,000 times", reader, capture_of(4000, large_photo), item=5)
+    case("one photo 100 times", reader, capture_of(100, large_photo), item=5)
+    for kind, link in {"links": lambda old, new: new.symlink_to(old), "hard links": os.link}.items():
+        case(f"400 {kind} to a photo", reader, capture_of(400, copies(400, link), "{}.png"), item=5)
+    if reader != "outline":  # which reads one after the other
+        case("21 white photos of 49 million pixels", reader, capture_of(21, white_photos, "{}.png"), item=5)
+case("5,000 photos", "photos", capture_of(5000, five_thousand_photos, "{}.png"), item=5)
+for frame in (2_000_000_000, 10**30, 100_000, 1000):
+    case(f"frame {frame}", "photos", capture_of(4, frame=frame), item=5)
+
+
+def folders(prepare):
+    def make(folder):
+        place = readers.write_import_folder(folder)
+        prepare(place / "photos")
+        return place
+
+    return make
+
+
+def keypoint_folder(prepare):
+    def make(folder):
+        (folder / "keypoints").mkdir()
+        for name in readers.VIEWS:
+            (folder / "keypoints" / f"{name}_keypoints.json").write_text(readers.openpose())
+        prepare(folder / "keypoints")
+        return folder / "keypoints"
+
+    return make
+
+
+def nested(folder):
+    for _ in range(900):
+        folder = folder / "a"
+        folder.mkdir()
+
+
+def two_links_to_itself(folder):
+    for name in ("a", "b"):
+        (folder / name).symlink_to(folder)
+
+
+def forty_pairs(folder):
+    """Each folder of a chain has two links to the next."""
+    for i in range(40):
+        (folder / f"p{i}").mkdir()
+        for name in ("a", "b"):
+            (folder / f"p{i}" / name).symlink_to(folder / f"p{i + 1}")
+
+
+FOLDERS = {
+    "two links to itself": two_links_to_itself,
+    "a link to the root": lambda folder: (folder / "all").symlink_to("/"),
+    "a link to the folder above": lambda folder: (folder / "up").symlink_to(folder.parent),
+    "40 pairs of links": forty_pairs,
+    "a link to nothing": lambda folder: (folder / "x.png").symlink_to(folder / "no"),
+    "a link in a circle": lambda folder: (folder / "x").symlink_to(folder / "x"),
+    "900 folders in folders": nested,
+}
+for kind, prepare in FOLDERS.items():
+    case(kind, "start", folders(prepare), "either", 5)
+    case(f"{kind}, of keypoints", "openpose", keypoint_folder(prepare), "either", 5)

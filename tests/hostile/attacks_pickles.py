@@ -282,3 +282,18 @@ for kind, content in {
     case(kind, "vgg", torch_of(content))
 case("of another network", "released checkpoint", torch_of({"model": {"w": FakeTensor(NUMBERS)}}))
 case("of another network", "vgg", torch_of({"model": {"w": FakeTensor(NUMBERS)}}))
+
+
+def within_itself(instructions=b""):
+    """A list that holds itself five times."""
+    return EMPTY_LIST + b"q\x01" + MARK + b"h\x01" * 5 + b"e" + instructions
+
+
+MAGIC = PROTO + b"\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19" + STOP
+for kind, version in {
+    "a version within itself": within_itself(),
+    "a version of 2^64 lists": doubled_list(64),
+    "a version of 2^64 tuples": doubled(64),
+    "a version of 10^6 digits": b"I" + b"9" * 4000 + b"\n",
+}.items():
+    case(kind, "torch stream", written("a.pt", MAGIC + PROTO + b"\x02" + version + STOP), item=5)

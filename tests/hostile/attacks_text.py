@@ -1,7 +1,9 @@
 """JSON, YAML, COLMAP and configurations: nesting, length, numbers that are none, parts that do not exist."""
 
 import json
+import re
 
+import numpy as np
 import readers
 from hostile_cases import case, changed, setting, written
 from readers import SEEDS
@@ -332,3 +334,55 @@ for kind, bad in {"numbers in words": "0.5", "numbers in words beside none": Non
 for bad in ("640", True, 1e300, -5):
     image = {"id": 1, "file_name": "000.png", "width": bad, "height": 480}
     json_case(f"a width of {bad!r}", "coco annotations", "a.json", {"images": [image], "annotations": []})
+
+
+# Amounts, of which each file has few bytes -------------------------------------------------------------------------------------
+
+PLACEMENTS = {
+    "zeros": np.zeros((4, 4)),
+    "NaN": np.full((4, 4), np.nan),
+    "a mirror": np.diag([-1.0, 1, 1, 1]),
+    "a scale for each axis": np.diag([1.0, 2, 3, 1]),
+    "1e200": np.eye(4) * 1e200,
+    "1e-200": np.diag([1e-200, 1e-200, 1e-200, 1]),
+    "another last row": np.eye(4)[::-1],
+    "too few numbers": np.eye(3),
+}
+for kind, matrix in PLACEMENTS.items():
+    json_case(f"a placement of {kind}", "scan views", "scan.json", {"world_from_scan": matrix.tolist()})
+json_case("a placement of words", "scan views", "scan.json", {"world_from_scan": "x"})
+json_case("a list", "scan views", "scan.json", [])
+json_case("no placement", "scan views", "scan.json", {})
+for key, values in {
+    "settings": ([], "x", None, 3),
+    "split": ([], {}, 10**400),
+    "generator_version": ([1], {}, "1"),
+    "version": ([2], {}, 10**400),
+    "format": ([], {}, None),
+}.items():
+    for value in values:
+        named = "10^400" if isinstance(value, int) and value > 9 else repr(value)
+        json_case(f"{key} {named}", "manifest", "manifest.json", readers.MANIFEST | {key: value})
+without = {key: value for key, value in readers.MANIFEST.items() if key != "settings"}
+json_case("no settings", "manifest", "manifest.json", without)
+
+NOBODY = '{"pose_keypoints_2d":[]}'
+FEW_BYTES = {
+    "a million people without points": ("openpose", lambda: '{"people":[' + ",".join([NOBODY] * 1_000_000) + "]}"),
+    "110,000 people without points": ("openpose", lambda: '{"people":[' + ",".join([NOBODY] * 110_000) + "]}"),
+    "a million images": (
+        "coco annotations",
+        lambda: '{"annotations":[],"images":[' + ",".join(["0"] * 1_000_000) + "]}",
+    ),
+    "a million frames": ("mmpose", lambda: "[" + ",".join(['{"frame_id":0,"instances":[]}'] * 1_000_000) + "]"),
+    "200,000 instances": ("mmpose", lambda: '[{"frame_id":0,"instances":[' + ",".join(["0"] * 200_000) + "]}]"),
+    "200,000 results": ("coco", lambda: "[" + ",".join(['{"image_id":0}'] * 200_000) + "]"),
+}
+for kind, (reader, data) in FEW_BYTES.items():
+    case(kind, reader, written("000_keypoints.json", data), item=5)
+for seconds in (b"1e-9", b"1e9", b"1e-300"):
+
+    def of_seconds(data, seconds=seconds):
+        return re.sub(rb"Frame Time: \S+", b"Frame Time: " + seconds, data)
+
+    case(f"frames of {seconds.decode()} s", "bvh", changed("bvh", of_seconds), item=5)

@@ -114,7 +114,7 @@ PLACES = {
     "a link to itself": lambda file: file.symlink_to(file),
     "of a terabyte": huge,
 }
-NOT_NOTICED = {"log", "missing photos", "scene arrays", "preprocessed scene", "skipped subject"}
+NOT_NOTICED = {"log", "missing photos", "scene arrays", "preprocessed scene", "skipped subject", "start"}
 """Files that need not be there: a missing log is that of a run without trouble; what preprocessing lacks is made again."""
 
 for seed in (name for name, make in SEEDS.items() if make is not None):

@@ -5,6 +5,7 @@
 
 import functools
 import importlib.util
+import io
 import json
 import pickle
 import struct
@@ -22,7 +23,9 @@ from scipy.io import savemat
 from torch_writer import tensors, write_checkpoint, write_stream
 
 from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
+from humangs_jax.apps.start import look
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import FOLLOWING, excerpt, smoothed_path
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import load_body, save_body
 from humangs_jax.body.model import BodyModel
@@ -44,6 +47,7 @@ from humangs_jax.data.preprocess.run import preprocess
 from humangs_jax.data.preprocess.scenes import Settings, scan_content
 from humangs_jax.fitting.files import KEYS, read_fit_record
 from humangs_jax.fitting.scan_reading import read_joints, read_mesh
+from humangs_jax.fitting.scan_views import read_placement
 from humangs_jax.io.exr import ExrView, read_exr, write_exr
 from humangs_jax.io.glb import GlbWriter
 from humangs_jax.io.images import check_image, image_size, read_grey, read_image
@@ -57,7 +61,8 @@ from humangs_jax.network.weights import expected_variables, load_weights, save_w
 from humangs_jax.objectives.loss_networks import load_vgg19
 from humangs_jax.people.bank import load_bank
 from humangs_jax.people.rendering import read_depth
-from humangs_jax.people.writer import read_manifest
+from humangs_jax.people.seeds import GENERATOR_VERSION
+from humangs_jax.people.writer import begin_set, read_manifest
 from humangs_jax.training.config import read_config, tiny
 from humangs_jax.training.diagnose import first_failed_step
 
@@ -140,6 +145,19 @@ def continue_preprocessing(folder):
     preprocess(folder / "raw", folder / "out", body, PREPROCESSED, progress=False)
 
 
+def continue_synthetic_set(path):
+    """What `synth` does before it makes anybody."""
+    read_manifest(path.parent)
+    begin_set(path.parent, "train", {})
+
+
+def film(path):
+    """The frames of a video of a motion, and the path of its camera."""
+    with reading(path, "motion"):
+        motion = excerpt(load_motion(path), fps=30.0)
+        return smoothed_path(np.asarray(motion.translations), FOLLOWING * motion.fps)
+
+
 SIDE = 16
 PREPROCESSED = Settings("avatarrex", size=SIDE)
 READERS = {
@@ -185,17 +203,20 @@ READERS = {
     "lhm": load_motion,
     "bvh": load_motion,
     "glb motion": load_motion,
-    "obj": lambda path: read_mesh(path, textures=True),
-    "ply": lambda path: read_mesh(path, textures=True),
-    "glb": lambda path: read_mesh(path, textures=True),
+    "obj": lambda path: read_mesh(path, colors=True),
+    "ply": lambda path: read_mesh(path, colors=True),
+    "glb": lambda path: read_mesh(path, colors=True),
     "stl": read_mesh,
     "off": read_mesh,
     "joints json": read_joints,
     "joints npz": read_joints,
     "fit record": read_fit_record,
     "bank": load_bank,
-    "manifest": lambda path: read_manifest(path.parent),
+    "manifest": continue_synthetic_set,
     "log": first_failed_step,
+    "filmed": film,
+    "scan views": read_placement,
+    "start": look,
     "avatarrex": read_data_set,
     "video poses": read_data_set,
     "missing photos": read_data_set,
@@ -354,6 +375,15 @@ def write_import(folder):
     return folder / "transforms.json"
 
 
+def write_import_folder(folder):
+    write_import(folder)
+    return folder
+
+
+def motion_arrays(**changes):
+    return {"rotations": np.zeros((3, 55, 3)), "translations": np.zeros((3, 3)), "fps": 30.0} | changes
+
+
 def person(count, numbers=3):
     return np.random.default_rng(2).uniform(10, 400, (count, numbers))
 
@@ -443,6 +473,12 @@ def write_mesh(path):
 
 def as_bytes(data):
     return data.encode() if isinstance(data, str) else data
+
+
+def photo_bytes():
+    stream = io.BytesIO()
+    Image.fromarray(pixels(64, 64, 3)).save(stream, format="PNG")
+    return stream.getvalue()
 
 
 def textured_glb(image=None, images=None, change=lambda content: None):
@@ -541,7 +577,12 @@ def write_preprocessed(folder):
 
 STATE = {"a.weight": np.arange(6, dtype=np.float32).reshape(2, 3), "b": np.asarray([1, 2], np.int64)}
 MODEL = dataset_files.model_arrays()
-MANIFEST = {"format": "humangs-synthetic", "version": 2, "generator_version": 1, "split": "train", "settings": {}}
+MANIFEST = {"generator_version": GENERATOR_VERSION} | {
+    "format": "humangs-synthetic",
+    "version": 2,
+    "split": "train",
+    "settings": {},
+}
 
 SEEDS = {
     "npz": npz("a.npz", lambda: {"x": np.arange(40.0).reshape(5, 8), "s": np.asarray("word")}),
@@ -584,9 +625,7 @@ SEEDS = {
     "coco annotations": text("annotations.json", coco_annotations),
     "mmpose": text("walk.json", mmpose),
     "keypoints npz": npz("k.npz", keypoint_arrays),
-    "motion npz": npz(
-        "m.npz", lambda: {"rotations": np.zeros((3, 55, 3)), "translations": np.zeros((3, 3)), "fps": 30.0}
-    ),
+    "motion npz": npz("m.npz", motion_arrays),
     "amass": npz("m.npz", lambda: {"poses": np.zeros((3, 156)), "trans": np.zeros((3, 3)), "mocap_framerate": 120.0}),
     "aist": saved(
         "m.pkl",
@@ -610,6 +649,9 @@ SEEDS = {
     "fit record": npz("fit.npz", fit_arrays),
     "bank": npz("bank.npz", bank_arrays),
     "manifest": text("manifest.json", json.dumps(MANIFEST)),
+    "filmed": npz("m.npz", motion_arrays),
+    "scan views": text("scan.json", json.dumps({"world_from_scan": (np.eye(4) * [2.0, 2, 2, 1]).tolist()})),
+    "start": write_import_folder,
     "log": text("log.jsonl", '{"step": 1, "loss": 2.0}\n{"step": 2, "event": "skipped"}\n'),
     **dict.fromkeys(("avatarrex", "video poses"), data_set(dataset_files.write_avatarrex, frames=2)),
     "missing photos": data_set(dataset_files.write_thuman4, frames=2),
@@ -633,6 +675,7 @@ def damaged_file(name: str, path: Path) -> Path:
         **{"dna photos": "main/0001_01.smc", "dna notes": "annotations/0001_01_annots.smc"},
         **{"thuman fit": "smplx/0000/smplx_param.pkl", "thuman mesh": "smplx/0000/mesh_smplx.obj"},
         **{"thuman scan": "model/0000/0000.obj", "preprocessed set": "out/manifest.json"},
+        "start": "photos/000.png",
         **{"preprocessed scene": "out/a/scene.json", "skipped subject": "out/skipped/b.json"},
     }
     return path / inside.get(name, "capture.json") if path.is_dir() else path

@@ -20,6 +20,8 @@ from humangs_jax.io.reading import (
     read_bytes,
     reading,
     set_limits,
+    shown,
+    walk,
 )
 from humangs_jax.io.text import parse_json, read_json
 
@@ -49,11 +51,16 @@ def test_limits_are_those_of_the_environment(monkeypatch):
             limits()
 
 
+TOO_LONG = (
+    r"a\.json: 203 bytes: the limit text_bytes is 100 \(HUMANGS_LIMITS=text_bytes=203 raises it; docs/security\.md\)$"
+)
+
+
 def test_a_limit_is_named_and_can_be_changed(tmp_path):
     (tmp_path / "a.json").write_text("[" + "1," * 100 + "1]")
     assert len(read_json(tmp_path / "a.json")) == 101
     set_limits(Limits(text_bytes=100))
-    with pytest.raises(FileError, match=r"a\.json: 203 bytes: the limit text_bytes is 100 \(docs/security\.md\)$"):
+    with pytest.raises(FileError, match=TOO_LONG):
         read_json(tmp_path / "a.json")
     set_limits(Limits(nesting=2))
     assert parse_json("[[1], {}]") == [[1], {}]
@@ -167,3 +174,38 @@ def test_a_linked_folder_is_its_own_folder(tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "me").symlink_to(tmp_path / "real")
     assert inside(tmp_path / "me", "a.png") == tmp_path / "me" / "a.png"
+
+
+def doubled(times):
+    value = ()
+    for _ in range(times):
+        value = (value, value)
+    return value
+
+
+def test_values_of_files_are_shown_in_few_words_whatever_they_hold():
+    within = []
+    within += [within] * 5
+    for value in (within, doubled(80), {"a": within}, "x" * 10**6, 10**5000, [{}] * 10**6, 1.5, None, object()):
+        assert len(shown(value)) < 300
+    assert (shown("a\x1b"), shown(3), shown([1, "b"]), shown(None)) == (r"'a\x1b'", "3", "[1, 'b']", "None")
+
+
+def test_a_folder_is_searched_once_however_many_links_lead_to_it(tmp_path, caplog):
+    for name in ("a", "b"):
+        (tmp_path / "in" / name).mkdir(parents=True)
+        (tmp_path / "in" / name / "x.png").touch()
+    (tmp_path / "in" / ".hidden").touch()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "y.png").touch()
+    for name, target in {"up": "in", "again": "in/a", "out": "out"}.items():
+        (tmp_path / "in" / name).symlink_to(tmp_path / target)
+    found = [path.relative_to(tmp_path).as_posix() for path in sorted(walk(tmp_path / "in"))]
+    assert found == ["in/a/x.png", "in/b/x.png"]
+    assert "in/out: leads out of" in caplog.text
+    assert [path.parent.name for path in walk(tmp_path / "in", lambda folder: folder.name != "b")] == ["b"]
+    set_limits(Limits(photos_outside=True))
+    assert len(list(walk(tmp_path / "in"))) == 3
+    set_limits(Limits(entries=3))
+    with pytest.raises(Refused, match="4 files and folders: the limit entries is 3"):
+        list(walk(tmp_path / "in"))

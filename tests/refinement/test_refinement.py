@@ -18,6 +18,7 @@ from humangs_jax.avatar.low_pass import pixel_sizes, with_low_pass, with_low_pas
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
 from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import load_capture
 from humangs_jax.refinement import refine as refinement
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.crops import BLOCK, crop_to_person
@@ -188,6 +189,16 @@ def test_crops_show_the_same_pixels(person):
     rows, columns = (np.asarray(cameras.K[1] - views.cameras.K[1])[i, 2].astype(int) for i in (1, 0))
     height, width = drawn.alpha.shape
     np.testing.assert_allclose(drawn.rgb, whole.rgb[rows : rows + height, columns : columns + width], atol=1e-5)
+
+
+def test_specks_of_a_mask_do_not_widen_the_crops():
+    capture = load_capture("demo_capture")
+    masks = capture.masks.copy()
+    masks[2, :2, :3] = masks[3, -1, -1] = 1
+    crops, specked = crop_to_person(capture), crop_to_person(dataclasses.replace(capture, masks=masks))
+    assert crops.images.shape[1:3] != capture.images.shape[1:3]
+    np.testing.assert_array_equal(specked.images, crops.images)
+    np.testing.assert_array_equal(specked.cameras.K, crops.cameras.K)
 
 
 @pytest.mark.parametrize(

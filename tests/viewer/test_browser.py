@@ -296,7 +296,7 @@ BAD_FILES = {
         npz(poses=np.zeros((2, 165)), trans=np.zeros((2, 3)), fps=30)[:-60],
         "not an npz archive, or cut short",
     ),
-    "keys.npz": (npz(joints=np.zeros((2, 3))), "expected the keys rotations (ours), poses (AMASS)"),
+    "keys.npz": (npz(joints=np.zeros((2, 3))), "expected one of the keys rotations, smpl_poses, poses"),
     "width.npz": (
         npz(poses=np.zeros((2, 30)), trans=np.zeros((2, 3)), fps=30),
         "poses: expected frames of 165 or 156",
@@ -306,7 +306,7 @@ BAD_FILES = {
         "key poses: expected finite numbers",
     ),
     "rate.npz": (
-        npz(poses=np.zeros((2, 66)), trans=np.zeros((2, 3))),
+        npz(poses=np.zeros((2, 66)), trans=np.zeros((2, 3)), fps=np.inf),
         "expected a positive number of frames per second",
     ),
     "notes.txt": (b"hello", "expected a motion as .npz (ours, AMASS) or .bvh"),

@@ -38,7 +38,7 @@ from humangs_jax.data.calibration.colmap import read_colmap
 from humangs_jax.data.calibration.file_storage import parse_file_storage
 from humangs_jax.data.calibration.moments import find_moments
 from humangs_jax.data.capture_checks import CaptureError, checked_json, checked_text, floats, required
-from humangs_jax.io.reading import reading
+from humangs_jax.io.reading import reading, shown
 
 EASYMOCAP_FILES = ("intri.yml", "extri.yml")
 FILES = ("transforms.json", "calibration_full.json", "calibration.json")
@@ -143,7 +143,7 @@ def _mask_path(frame, key, file, i):
 def _frame_camera(values, file, prefix, photo_size):
     name = required(values, "file_path", file, prefix)
     if not isinstance(name, str) or not name:
-        raise CaptureError(file, f"{prefix}file_path", f"expected the path of a photo, got {name!r}")
+        raise CaptureError(file, f"{prefix}file_path", f"expected the path of a photo, got {shown(name)}")
     pose = floats(required(values, "transform_matrix", file, prefix), file, f"{prefix}transform_matrix", (4, 4))
     _check_model(values, file, prefix)
     if "w" in values or "h" in values:
@@ -170,7 +170,7 @@ def _check_model(values, file, prefix):
     model = values.get("camera_model", "OPENCV")
     if model not in CAMERA_MODELS:
         expected = f"expected {', '.join(CAMERA_MODELS)}; else {UNDISTORT_BEFORE}"
-        raise CaptureError(file, f"{prefix}camera_model", f"{model!r}: {expected}")
+        raise CaptureError(file, f"{prefix}camera_model", f"{shown(model)}: {expected}")
     if values.get("is_fisheye"):
         raise CaptureError(file, f"{prefix}is_fisheye", f"fisheye lenses are not supported: {UNDISTORT_BEFORE}")
     if values.get("k4"):

@@ -27,7 +27,7 @@ from humangs_jax.data.calibration.orientation import Turn, find_turns, turn_note
 from humangs_jax.data.calibration.photos import Photo, find_photo, find_photos, photo_size
 from humangs_jax.data.calibration.videos import photos_of_videos
 from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera
-from humangs_jax.data.photos import names_from_paths, read_checked, write_description
+from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
 from humangs_jax.io.atomic import replace_folder
 from humangs_jax.io.images import read_grey, read_image, write_png
 
@@ -127,6 +127,7 @@ def _import(source, images, masks, out, scale, up, pixel_centers):
     calibration = read_calibration(source, lambda name: _size_by_name(images, name, source))
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
     photos = find_photos(calibration, images, masks)
+    check_repeats(calibration.file, [photo.image for photo in photos])
     turns = find_turns(calibration, photos)
     _check_one_size(photos, turns)
     about_masks = check_masks(photos)

@@ -12,7 +12,8 @@ from collections.abc import Generator
 from pathlib import Path
 
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.io.reading import limits, open_file, reading
+from humangs_jax.io.images import image_size
+from humangs_jax.io.reading import Refused, check_limit, limits, open_file, reading
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi")
 CONTAINERS = "mov,matroska,avi,mpegts"
@@ -59,31 +60,49 @@ def photos_of_videos(
     with tempfile.TemporaryDirectory(dir=beside, prefix=f".{place.name}.video-") as temporary:
         folders: dict[str, Path | None] = {"images": images, "masks": masks}
         for kind, found in videos.items():
-            folders[kind] = Path(temporary) / kind
+            folders[kind], pixels = Path(temporary) / kind, 0
             for camera, path in found.items():
-                split_video(path, Path(temporary) / kind / camera, every, most)
+                pixels = split_video(path, Path(temporary) / kind / camera, every, most, pixels)
         assert folders["images"] is not None
         yield folders["images"], folders["masks"]
 
 
-def split_video(path: Path, folder: Path, every: int = 1, most: int | None = None) -> int:
-    """Write frames of a video as 00000000.png, ... into a new folder; returns how many. Raises: CaptureError naming the video."""
-    import imageio_ffmpeg
+def split_video(path: Path, folder: Path, every: int = 1, most: int | None = None, before: int = 0) -> int:
+    """Write frames of a video as 00000000.png, ... into a new folder.
 
+    Arguments: before: pixels of the frames of other videos, which count towards the limit `video_pixels`.
+    Returns: pixels of all frames so far. The first frame is written twice: its size tells how many the others may be.
+    Raises: CaptureError naming the video.
+    """
     with reading(path, "video", CaptureError):
         open_file(path).close()  # no devices, no pipes, not too large
         folder.mkdir(parents=True)
-        command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-xerror"]
-        # a playlist in disguise may name other files and hosts; pictures may be larger than what is read later
-        command += ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS]
-        command += ["-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
-        command += ["-map", "0:v:0", "-vf", f"select=not(mod(n\\,{every}))", "-fps_mode", "passthrough"]
-        command += [] if most is None else ["-frames:v", str(most)]
-        command += ["-start_number", "0", "%08d.png"]
+        first = _run(path, folder, every, 1)
+        width, height = image_size(next(folder.iterdir()))
+        size, room = width * height, max(0, limits().video_pixels - before) // (width * height)
+        count = first if most == 1 else _run(path, folder, every, room + 1 if most is None else min(most, room + 1))
+        what = f"pixels in the frames of the videos, {count:,} or more of {width} x {height} in this one"
+        check_limit("video_pixels", before + count * size, what)
+        return before + count * size
+
+
+def _run(path, folder, every, most):
+    """Write at most that many frames; returns how many there are."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-xerror"]
+    # a playlist in disguise may name other files and hosts; pictures may be larger than what is read later
+    command += ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS]
+    command += ["-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
+    command += ["-map", "0:v:0", "-vf", f"select=not(mod(n\\,{every}))", "-fps_mode", "passthrough"]
+    command += ["-frames:v", str(most), "-y", "-start_number", "0", "%08d.png"]
+    try:
         # in the folder: its path may hold a % of its own
         done = subprocess.run(command, cwd=folder, capture_output=True, timeout=LONGEST_SECONDS, check=False)
-        count = sum(1 for _ in folder.iterdir())
-        if done.returncode or not count:
-            said = " ".join(done.stderr.decode(errors="replace").split()) or "no frame"
-            raise ValueError(said.replace(f"file:{path.resolve()}", path.name))
-        return count
+    except subprocess.TimeoutExpired:
+        raise Refused(f"its frames take more than {LONGEST_SECONDS:,} seconds: expected a shorter video") from None
+    count = sum(1 for _ in folder.iterdir())
+    if done.returncode or not count:
+        said = " ".join(done.stderr.decode(errors="replace").split()) or "no frame"
+        raise ValueError(said.replace(f"file:{path.resolve()}", path.name))
+    return count

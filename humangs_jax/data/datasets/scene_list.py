@@ -25,7 +25,7 @@ from humangs_jax.data.datasets.values import checked_numbers, open_arrays
 from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import image_size, read_grey, read_image
 from humangs_jax.io.npz import write_npz
-from humangs_jax.io.reading import inside, reading
+from humangs_jax.io.reading import inside, reading, shown
 from humangs_jax.io.text import write_json
 
 LISTS = ("train.json", "test.json")
@@ -70,7 +70,7 @@ def read_scene_list(path: str | Path) -> dict[str, dict[str, Any]]:
             raise CaptureError(file, f"[{i}]", f"expected a JSON object, got {type(scene).__name__}")
         name = required(scene, "scene_name", file, f"[{i}].")
         if not isinstance(name, str) or not name or name in scenes:
-            raise CaptureError(file, f"[{i}].scene_name", f"expected a name of its own, got {name!r}")
+            raise CaptureError(file, f"[{i}].scene_name", f"expected a name of its own, got {shown(name)}")
         scenes[name] = scene
     return scenes
 
@@ -153,7 +153,7 @@ def scene_frames(file: Path, name: str, scene: Mapping[str, Any]) -> list[SceneF
         texts = [required(frame, key, file, at) for key in ("image_path", "smpl_path")]
         for key, text in zip(("image_path", "smpl_path"), texts, strict=True):
             if not isinstance(text, str) or not text:
-                raise CaptureError(file, at + key, f"expected the path of a file, got {text!r}")
+                raise CaptureError(file, at + key, f"expected the path of a file, got {shown(text)}")
         pose = checked_numbers(_array(frame, "w2c", file, at), file, f"{at}w2c", (4, 4))
         fx, fy, cx, cy = checked_numbers(_array(frame, "fxfycxcy", file, at), file, f"{at}fxfycxcy", (4,))
         K = np.asarray([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

@@ -29,7 +29,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, checked_json
 from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, OPENPOSE_67, KeypointSet
 from humangs_jax.io.npz import read_npz
-from humangs_jax.io.reading import limits, reading
+from humangs_jax.io.reading import check_limit, limits, reading, shown, walk
 
 UNDERSTOOD = (
     "OpenPose's people, MMPose's instances, COCO's results (AlphaPose's too), COCO's images and annotations, or our npz"
@@ -73,7 +73,7 @@ def read_detections(path: Path) -> Detections:
     Raises: CaptureError.
     """
     if path.is_dir():
-        files = sorted(file for file in path.rglob("*.json") if not file.name.startswith("."))
+        files = sorted(file for file in walk(path) if file.suffix == ".json")
         if not files:
             raise CaptureError(path, "", f"no JSON file in this folder: expected {UNDERSTOOD}")
         names = [file.relative_to(path).with_suffix("").as_posix() for file in files]
@@ -83,7 +83,12 @@ def read_detections(path: Path) -> Detections:
         return _saved_detections(path)
     else:
         files, names = [path], [path.stem]
-    read = [_images_of_file(file, name, len(files) == 1) for file, name in zip(files, names, strict=True)]
+    read, amount = [], 0
+    for file, name in zip(files, names, strict=True):
+        content = checked_json(file)
+        amount += _amount(content)
+        check_limit("people", amount, "people and images")
+        read.append(_images_of_file(content, file, name, len(files) == 1))
     images = [image for _, each in read for image in each]
     openpose = [is_openpose for is_openpose, _ in read]
     if any(openpose) and not all(openpose):
@@ -93,9 +98,18 @@ def read_detections(path: Path) -> Detections:
     return Detections((OPENPOSE_67 if anybody else None) if all(openpose) else _common_set(images), tuple(images))
 
 
-def _images_of_file(file: Path, name: str, alone: bool) -> tuple[bool, list[DetectedImage]]:
+def _amount(content: Any) -> int:
+    """How many people and images a JSON file has, before any is looked at."""
+    lists = [content]
+    if isinstance(content, dict):
+        lists = [content.get(key) for key in ("people", "images", "annotations", "instance_info")]
+    entries = [entry for each in lists if isinstance(each, list) for entry in each]
+    inside = [entry["instances"] for entry in entries if isinstance(entry, dict) and "instances" in entry]
+    return 1 + len(entries) + sum(len(each) for each in inside if isinstance(each, list))
+
+
+def _images_of_file(content: Any, file: Path, name: str, alone: bool) -> tuple[bool, list[DetectedImage]]:
     """Whether a JSON file is OpenPose's, and its images."""
-    content = checked_json(file)
     if isinstance(content, dict):
         if "people" in content:
             return True, [_openpose_image(content, file, name)]
@@ -210,7 +224,7 @@ def _annotated_images(content: dict[str, Any], file: Path) -> list[DetectedImage
             continue
         image = _image_label(entry.get("image_id"), file, f"{field}.image_id")
         if image not in images:
-            raise CaptureError(file, f"{field}.image_id", f"expected the id of one of the images, got {image!r}")
+            raise CaptureError(file, f"{field}.image_id", f"expected the id of one of the images, got {shown(image)}")
         images[image][1].append(_by_visibility(_coco_person(entry, file, field, whole), file, field))
     return [
         DetectedImage(
@@ -225,7 +239,7 @@ def _annotated_images(content: dict[str, Any], file: Path) -> list[DetectedImage
 
 def _image_label(value: Any, file: Path, field: str) -> str | int:
     if isinstance(value, bool) or not isinstance(value, str | int):
-        raise CaptureError(file, field, f"expected the name or number of an image, got {value!r}")
+        raise CaptureError(file, field, f"expected the name or number of an image, got {shown(value)}")
     return value
 
 
@@ -336,7 +350,7 @@ def _mmpose_images(entries: list[Any], file: Path, name: str, alone: bool) -> li
 def _video_frame(entry: Any, file: Path, field: str) -> tuple[int, list[Any]]:
     frame = _expect(entry, dict, file, field).get("frame_id")
     if isinstance(frame, bool) or not isinstance(frame, int):
-        raise CaptureError(file, f"{field}.frame_id", f"expected an integer, got {frame!r}")
+        raise CaptureError(file, f"{field}.frame_id", f"expected an integer, got {shown(frame)}")
     return frame, _expect(entry.get("instances"), list, file, f"{field}.instances")
 
 
@@ -375,6 +389,7 @@ def _saved_detections(file: Path) -> Detections:
     name = str(values["set"])
     if name not in KEYPOINT_SETS:
         raise CaptureError(file, "set", f"expected one of {', '.join(KEYPOINT_SETS)}, got {name!r}")
+    check_limit("people", values["names"].size, "people")
     views, k = [str(view) for view in values["names"].reshape(-1)], len(KEYPOINT_SETS[name].names)
     points, confidences = (_floats(values[key], file, key) for key in ("points", "confidences"))
     for key, array, shape in (("points", points, (len(views), k, 2)), ("confidences", confidences, (len(views), k))):

@@ -15,7 +15,7 @@ from humangs_jax.data.capture import DEFAULT_BODY, load_capture, read_parameters
 from humangs_jax.data.capture_checks import CaptureError, body_parameters, checked_camera
 from humangs_jax.data.loading.examples import Example, StoredSubject, ViewSampling, draw_views, shrink, subject_views
 from humangs_jax.data.loading.order import subject_order, view_generator
-from humangs_jax.data.photos import read_checked, read_description, read_frames_and_matrices
+from humangs_jax.data.photos import check_photos, read_checked, read_description, read_frames_and_matrices
 from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.io.images import check_image, to_uint8
 
@@ -54,6 +54,7 @@ def read_outline(path: str | Path, body: BodyModel, body_file: str | Path = DEFA
         raise CaptureError(parameter_file, "body", problem)
     betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
     views, size = description["views"], None
+    check_photos(folder, views, together=False)
     for view in views:
         image, mask = folder / view["image"], folder / view.get("mask", "")
         shape, has_alpha = _check_image(image)

@@ -10,6 +10,7 @@ from humangs_jax.core.configuration import Few, Share, Spread, configuration
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.images import resized
 
 WINDOW = (25, 59)
 """Rule "window": least and greatest distance of the two ends of a window, in views of a subject that has `WINDOW_OF`."""
@@ -142,19 +143,14 @@ def _draw_from_window(generator, count, wanted):
 
 
 def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray, "v size size *c"]:
-    """Bytes box-averaged to size x size, in [0, 1]. Raises: ValueError unless both sides are one multiple of it."""
+    """Bytes averaged by area to size x size, in [0, 1]. Raises: ValueError unless they are squares of at least that size."""
     height, width = images.shape[1:3]
-    factor = height // size
-    if factor < 1 or (height, width) != (factor * size, factor * size):
-        raise ValueError(f"images of {width} x {height} cannot be box-averaged to {size} x {size}")
-    if factor == 1:
-        return images.astype(np.float32) / np.float32(255)
-    # sums of strided bytes, exact in 32 bits: several times as fast as means over axes
-    total = np.zeros((len(images), size, size, *images.shape[3:]), np.uint32 if factor > 16 else np.uint16)
-    for row in range(factor):
-        for column in range(factor):
-            total += images[:, row::factor, column::factor]
-    return total.astype(np.float32) / np.float32(factor**2) / np.float32(255)
+    if not size <= height == width:
+        raise ValueError(f"images of {width} x {height} cannot be averaged to {size} x {size}")
+    found = np.empty((len(images), size, size, *images.shape[3:]), np.float32)
+    for small, image in zip(found, images, strict=True):
+        small[:] = resized(image, size, size)
+    return found / np.float32(255)
 
 
 def subject_views(subject: StoredSubject, indices: Sequence[int], size: int) -> SubjectViews:

@@ -7,7 +7,7 @@ ours (.npz)        rotations (m, j, 3), translations (m, 3)                     
 AMASS and other    poses, fullpose or pose (m, 165 | 156 | 72 | 66), or (m, joints, 3);   mocap_framerate, fps
 SMPL (.npz, .pkl)  trans or transl (m, 3)
 AIST++ (.pkl|npz)  smpl_poses (m, 72), smpl_trans (m, 3); smpl_scaling (1,) or millimetres  60
-THuman4.0,         global_orient (m, 3), body_pose (m, 63 | 69), transl (m, 3), and if    30
+THuman4.0,         global_orient (m, 3), body_pose (m, 63 | 69), transl (m, 3), and if    fps, else 30
 AvatarReX (.npz)   there are any jaw_pose, leye_pose, reye_pose (m, 3), *_hand_pose (m, 45)
 LHM (.json, or a   root_pose (3,), body_pose (21, 3), trans (3,), and if there are any    30
 folder of them)    jaw_pose, leye_pose, reye_pose (3,), lhand_pose, rhand_pose (15, 3)
@@ -23,54 +23,41 @@ from typing import Any
 
 import numpy as np
 
-from humangs_jax.body.joints import BODY_NAMES, JOINT_NAMES
+from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.smplx import HandBasis
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.motion.motion import DEFAULT_FPS, MotionError
+from humangs_jax.data.motion.motion import MotionError
+from humangs_jax.data.motion.rules import BODY_NUMBERS, COLUMNS, FORMATS, HAND_NUMBERS, MILLIMETRES
 from humangs_jax.io.array_file import ArrayFile
 from humangs_jax.io.reading import open_file
 from humangs_jax.io.text import read_json
 
-BODY_NUMBERS = 3 * len(BODY_NAMES)  # 66
-HAND_NUMBERS = 45
-COLUMNS = {
-    3 * len(JOINT_NAMES): "SMPL-X",
-    BODY_NUMBERS + 2 * HAND_NUMBERS: "SMPL-H",
-    72: "SMPL",
-    BODY_NUMBERS: "the body",
-}
-"""Numbers of a pose, by whose joints they are."""
-AIST_FPS = 60.0
-AMASS_RATES = ("mocap_framerate", "mocap_frame_rate", "fps")
-MILLIMETRES = 1000.0
-
 
 def read_arrays(path: Path, hands: HandBasis | None, flat_hand_mean: bool, fps: float | None):
-    """Rotations (m, 55, 3), translations (m, 3), frames per second, and the axis that is up where the poses do not tell.
-
-    That axis is None where y is up whatever the poses tell. Raises: MotionError.
-    """
+    """Rotations (m, 55, 3), translations (m, 3), frames per second, and the format (`rules.Format`). Raises: MotionError."""
     file = _MotionFile(path, hands, flat_hand_mean, fps)
-    for key, read in _FORMATS.items():
-        if key in file.values:
-            return read(file)
+    for form in FORMATS:
+        if all(key in file.values for key in form.keys):
+            rotations, translations = _READERS[form.kind](file, form)
+            return rotations, translations, file.rate(form.rates, form.fps), form
+    expected = ", ".join(dict.fromkeys(form.keys[0] for form in FORMATS))
     keys = ", ".join(sorted(file.values)) or "none"
-    raise MotionError(path, "", f"no motion: expected one of the keys {', '.join(_FORMATS)}, got {keys}")
+    raise MotionError(path, "", f"no motion: expected one of the keys {expected}, got {keys}")
 
 
 # Formats ---------------------------------------------------------------------------------------------------------------
 
 
-def _ours(file):
+def _ours(file, form):
+    key = form.poses[0]
     if not file.flat_hand_mean:
-        raise MotionError(file.path, "rotations", "our own format holds whole rotations: expected flat_hand_mean=True")
-    rotations = file.numbers("rotations", (None, None, 3))
-    translations = file.numbers("translations", (len(rotations), 3))
-    return rotations, translations, file.rate(("fps",), None), None
+        raise MotionError(file.path, key, "our own format holds whole rotations: expected flat_hand_mean=True")
+    rotations = file.numbers(key, (None, None, 3))
+    return rotations, file.numbers(form.moves[0], (len(rotations), 3))
 
 
-def _amass(file):
-    key = next(key for key in ("poses", "fullpose", "pose") if key in file.values)
+def _whole(file, form):
+    key = form.poses[0]
     poses = file.numbers(key, None)
     count, columns = len(poses), poses[0].size
     if poses.ndim not in (2, 3) or columns not in COLUMNS:
@@ -87,58 +74,40 @@ def _amass(file):
         hands = np.split(poses[:, BODY_NUMBERS:], 2, axis=1) if columns == BODY_NUMBERS + 2 * HAND_NUMBERS else None
         hands = hands and [file.with_mean(hand, side) for side, hand in enumerate(hands)]
         rotations = file.assemble(poses[:, :BODY_NUMBERS], hands=hands)
-    trans = "transl" if "transl" in file.values and "trans" not in file.values else "trans"
-    return rotations, file.numbers(trans, (count, 3)), file.rate(AMASS_RATES, None), "z"
+    return rotations, file.numbers(file.first(form.moves), (count, 3))
 
 
-def _aist(file):
-    poses = file.numbers("smpl_poses", None)
+def _scaled(file, form):
+    key = form.poses[0]
+    poses = file.numbers(key, None)
     poses = poses.reshape(len(poses), -1) if poses.ndim == 3 else poses
     if poses.ndim != 2 or poses.shape[1] != 72:
-        raise MotionError(file.path, "smpl_poses", f"expected shape (frames, 72), got {poses.shape}")
+        raise MotionError(file.path, key, f"expected shape (frames, 72), got {poses.shape}")
     scale = MILLIMETRES
-    if "smpl_scaling" in file.values:
-        scale = float(file.numbers("smpl_scaling", None).reshape(-1)[0])
+    if form.scaling in file.values:
+        scale = float(file.numbers(form.scaling, None).reshape(-1)[0])
         if not scale > 0:
-            raise MotionError(file.path, "smpl_scaling", f"expected a positive number, got {scale}")
-    translations = file.numbers("smpl_trans", (len(poses), 3)) / scale
-    return file.assemble(poses[:, :BODY_NUMBERS]), translations, file.rate(("fps",), AIST_FPS), None
+            raise MotionError(file.path, form.scaling, f"expected a positive number, got {scale}")
+    return file.assemble(poses[:, :BODY_NUMBERS]), file.numbers(form.moves[0], (len(poses), 3)) / scale
 
 
-def _smpl_params(file):
-    orient = file.numbers("global_orient", (None, 3))
+def _parts(file, form):
+    root, body, *others = form.poses
+    orient = file.numbers(root, None)
     count = len(orient)
-    body = file.numbers("body_pose", None).reshape(count if len(file.values["body_pose"]) == count else -1, -1)
-    if body.shape not in ((count, BODY_NUMBERS - 3), (count, 69)):  # 69: SMPL, whose last two joints are whole hands
+    orient = file.numbers(root, (count, 3))
+    given = file.numbers(body, None)
+    pose = given.reshape(len(given), -1)
+    if pose.shape not in ((count, BODY_NUMBERS - 3), (count, 69)):  # 69: SMPL, whose last two joints are whole hands
         expected = f"expected shape ({count}, {BODY_NUMBERS - 3}), or ({count}, 69) of SMPL"
-        raise MotionError(file.path, "body_pose", f"{expected}, got {np.shape(file.values['body_pose'])}")
-    body = np.concatenate([orient, body[:, : BODY_NUMBERS - 3]], axis=1)
-    face = [file.optional(key, (count, 3)) for key in ("jaw_pose", "leye_pose", "reye_pose")]
-    hands = [file.hand(f"{side}_hand_pose", count, i) for i, side in enumerate(("left", "right"))]
-    translations = file.numbers("transl", (count, 3))
-    return file.assemble(body, face, hands), translations, file.rate(("fps", *AMASS_RATES), DEFAULT_FPS), "y"
+        raise MotionError(file.path, body, f"{expected}, got {given.shape}")
+    pose = np.concatenate([orient, pose[:, : BODY_NUMBERS - 3]], axis=1)
+    face = [file.optional(key, (count, 3)) for key in others[:3]]
+    hands = [file.hand(key, count, side) for side, key in enumerate(others[3:])]
+    return file.assemble(pose, face, hands), file.numbers(form.moves[0], (count, 3))
 
 
-def _lhm(file):
-    root = file.numbers("root_pose", None)
-    count = len(root)
-    root = file.numbers("root_pose", (count, 3))
-    body = np.concatenate([root, file.numbers("body_pose", (count, 21, 3)).reshape(count, -1)], axis=1)
-    face = [file.optional(key, (count, 3)) for key in ("jaw_pose", "leye_pose", "reye_pose")]
-    hands = [file.hand(key, count, i) for i, key in enumerate(("lhand_pose", "rhand_pose"))]
-    return file.assemble(body, face, hands), file.numbers("trans", (count, 3)), DEFAULT_FPS, "y"
-
-
-_FORMATS = {
-    "rotations": _ours,
-    "smpl_poses": _aist,
-    "poses": _amass,
-    "root_pose": _lhm,
-    "body_pose": _smpl_params,
-    "fullpose": _amass,
-    "pose": _amass,
-}
-"""Readers by a key that only their format has; the first that fits is used."""
+_READERS = {"ours": _ours, "whole": _whole, "scaled": _scaled, "parts": _parts}
 
 
 class _MotionFile(ArrayFile):
@@ -157,18 +126,22 @@ class _MotionFile(ArrayFile):
         """As `numbers`; None if the file has no such key."""
         return self.numbers(key, shape) if key in self.values else None
 
+    def first(self, keys: tuple[str, ...]) -> str:
+        """The first key that the file has; the first of all if it has none."""
+        return next((key for key in keys if key in self.values), keys[0])
+
     def rate(self, keys: tuple[str, ...], default: float | None) -> float:
         """Frames per second: those asked for, or under the first of the keys that is there."""
         if self.fps is not None:
             return self.fps
-        for key in keys:
-            if key in self.values:
-                rate = float(self.numbers(key, None).reshape(-1)[0])
-                if not rate > 0:
-                    raise MotionError(self.path, key, f"expected a positive number of frames per second, got {rate}")
-                return rate
+        key = self.first(keys) if keys else ""
+        if key in self.values:
+            rate = float(self.numbers(key, None).reshape(-1)[0])
+            if not (rate > 0 and np.isfinite(1 / rate)):
+                raise MotionError(self.path, key, f"expected a positive number of frames per second, got {rate}")
+            return rate
         if default is None:
-            raise MotionError(self.path, keys[0], "missing: how many frames are a second?")
+            raise MotionError(self.path, key, "missing: how many frames are a second?")
         return default
 
     def hand(self, key: str, count: int, side: int) -> Any:

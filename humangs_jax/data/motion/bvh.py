@@ -1,7 +1,8 @@
 """BVH files: a tree of joints with offsets and channels, then one line of numbers per frame.
 
 https://research.cs.wisc.edu/graphics/Courses/cs-838-1999/Jeff/BVH.html. Rotations are degrees about the axes of the channels, in
-their order: R = R_first R_second R_third. Position channels replace the offset. In the rest pose all rotations are 0.
+their order: R = R_first R_second R_third. Position channels replace the offset. In the rest pose all rotations are 0. A joint's
+name may have spaces: it ends with its line or before a brace.
 """
 
 import re
@@ -15,7 +16,8 @@ from humangs_jax.io.reading import Refused, check_limit, check_unpacked
 from humangs_jax.io.text import read_text
 
 CHANNELS = ("xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation")
-_MOTION = re.compile(r"^\s*MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)", re.MULTILINE)
+_WORD = re.compile(r"(ROOT|JOINT|End)\s+([^\r\n{}]*)|[{}]|[^\s{}]+")
+_MOTION = re.compile(r"(?<!\S)MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)")
 
 
 def read_bvh(path: Path) -> Clip:
@@ -28,7 +30,7 @@ def read_bvh(path: Path) -> Clip:
     if found is None:
         raise Refused("cut short, or damaged: expected MOTION, Frames: and Frame Time: after the joints")
     count, seconds = _number(found[1]), _number(found[2])
-    if not (count >= 1 and count == int(count) and 0 < seconds < np.inf):
+    if not (count >= 1 and count == int(count) and seconds > 0 and np.isfinite(1 / seconds)):
         raise Refused(f"expected at least one frame and a positive Frame Time, got {found[1]} and {found[2]}")
     width = sum(len(each) for each in channels)
     numbers = _numbers(text[found.end() :])
@@ -41,14 +43,16 @@ def read_bvh(path: Path) -> Clip:
 
 def _tree(text):
     """Names, parents, offsets and channels of the joints, parents first; the ends of limbs are left out."""
-    words = iter(text.split()[1:])
+    found = _WORD.finditer(text, len("HIERARCHY") + text.index("HIERARCHY"))
+    words = ((match[1] or match[0], match[2]) for match in found)  # and the name that follows
+    number = lambda: _number(next(words)[0])
     names, parents, offsets, channels = [], [], [], []
     open_joints, waiting = [], None  # of the braces that are open; None for the end of a limb
     try:
-        for word in words:
+        for word, name in words:
             here = open_joints[-1] if open_joints else None
-            if word in ("ROOT", "JOINT", "End"):
-                waiting = (word, next(words))
+            if name is not None:
+                waiting = (word, " ".join(name.split()))
             elif word == "{" and waiting is not None:
                 if waiting[0] == "End":
                     open_joints.append(None)
@@ -63,12 +67,12 @@ def _tree(text):
             elif word == "}" and open_joints:
                 open_joints.pop()
             elif word == "OFFSET" and open_joints:
-                offset = np.asarray([_number(next(words)) for _ in range(3)])
+                offset = np.asarray([number() for _ in range(3)])
                 if here is not None:
                     offsets[here] = offset
             elif word == "CHANNELS" and here is not None:
-                amount = _number(next(words))
-                channels[here] = [next(words).lower() for _ in range(int(min(max(amount, 0), 7)))]
+                amount = number()
+                channels[here] = [next(words)[0].lower() for _ in range(int(min(max(amount, 0), 7)))]
                 if amount != len(channels[here]) or any(name not in CHANNELS for name in channels[here]):
                     raise Refused(f"joint {names[here]}: expected up to 6 channels such as Xrotation")
             else:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from humangs_jax.data.motion.motion import DEFAULT_FPS
+from humangs_jax.data.motion.rules import DEFAULT_FPS
 from humangs_jax.data.motion.skeleton import Clip, bytes_of_clip
 from humangs_jax.io.glb import parse_glb, read_accessor
-from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_bytes
+from humangs_jax.io.reading import Refused, check_limit, check_unpacked, read_bytes, shown
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 
@@ -21,7 +21,7 @@ PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 def read_animation(path: Path) -> Clip:
     """The skeleton of a GLB file in motion. Raises: OSError; Refused and what damaged numbers raise."""
     data = read_bytes(path, "mesh_bytes")
-    content, binary = parse_glb(data)
+    content, binary = parse_glb(data, "text_bytes")
     nodes, animations = content.get("nodes", []), content.get("animations", [])
     if not animations:
         raise Refused("a GLB file without an animation: expected a skeleton in motion")
@@ -49,7 +49,7 @@ def _parents(nodes):
     for i, node in enumerate(nodes):
         for child in node.get("children", []):
             if type(child) is not int or not 0 <= child < len(nodes) or parents[child] != -1:
-                raise Refused(f"nodes: {child!r} is no node, or has two parents")
+                raise Refused(f"nodes: {shown(child)} is no node, or has two parents")
             parents[child] = i
     return parents
 
@@ -101,6 +101,8 @@ def _tracks(content, binary, animation, wanted):
         node, path = channel["target"].get("node"), channel["target"]["path"]
         if node not in wanted or path not in PATHS:
             continue
+        if (node, path) in tracks:
+            raise Refused(f"animation: two tracks for the {path} of node {node}")
         sampler = animation["samplers"][channel["sampler"]]
         times = read_accessor(content, binary, sampler["input"])[:, 0]
         values = read_accessor(content, binary, sampler["output"])

@@ -11,11 +11,10 @@ from humangs_jax.body import skinning
 from humangs_jax.body.model import BodyPose, RestBody
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
+from humangs_jax.data.motion.rules import DEFAULT_FPS
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.io.npz import write_npz
-from humangs_jax.io.reading import FileError
-
-DEFAULT_FPS = 30.0
+from humangs_jax.io.reading import FileError, check_limit
 
 
 class MotionError(FileError):
@@ -37,12 +36,13 @@ class Motion:
     def at_rate(self, fps: float | int) -> "Motion":
         """The motion at another frame rate, between two frames interpolated: rotations on the shortest way, positions linearly.
 
-        Raises: ValueError for a rate that is not positive.
+        Raises: ValueError for a rate that is not positive, or more frames than the limit.
         """
         if not (np.isfinite(fps) and fps > 0):
             raise ValueError(f"fps: expected a positive number of frames per second, got {fps}")
         last = len(self.translations) - 1
-        count = max(1, round((last + 1) * fps / self.fps))
+        count = max(1, round(min((last + 1) * fps / self.fps, 1e18)))
+        check_limit("frames", count, "frames")
         times = np.minimum(np.arange(count) * self.fps / fps, last)
         low = np.floor(times).astype(int)
         frames = self.rotations[low], self.translations[low]

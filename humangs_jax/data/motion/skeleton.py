@@ -4,7 +4,11 @@ Bones point where the file's bones point. Every joint of ours has a rotation A_j
 bone into the file's bone of the rest pose, and is the smallest such turn after that of the parent. With D_j(t) the rotation of
 the file's joint j from its rest pose to frame t, in the world, ours is
 
-    G_j(t) = D_j(t) A_j,    R_j = G_parent(j)^T G_j.
+    G_j(t) = C_j(t) D_j(t) A_j,    R_j = G_parent(j)^T G_j.
+
+C_j(t) is the smallest turn that makes the bone point where the file's points in the frame: none as long as the file's child hangs
+on the joint itself, but files have joints in between that turn on their own. The pelvis has a line, that of the hips, and the
+trunk for the turn about it: some files turn the pelvis's joint by any rotation and the joints that carry hips and spine back.
 
 Twists about a bone are therefore relative to the file's rest pose. Where nobody can stand like that (in LaFAN's files all offsets
 lie along one axis, the legs folded onto the spine), the smallest turn says nothing about twists. A_j is then turned about the
@@ -23,52 +27,27 @@ from importlib import resources
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from humangs_jax.body.joints import FINGERS, JOINT_NAMES, PARENTS
+from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.library import read_body
 from humangs_jax.core.array_types import Float
-from humangs_jax.data.motion.world import nearest_axis, upright_matrix
-from humangs_jax.io.reading import Refused
-
-_SIDED = {
-    "hip": ("upleg", "thigh", "hip"),
-    "knee": ("leg", "shin", "lowleg", "lowerleg", "calf", "knee"),
-    "ankle": ("ankle", "foot"),
-    "foot": ("toebase", "toe", "ball", "foot"),
-    "shoulder": ("arm", "uparm", "upperarm", "shldr", "shoulder"),
-    "collar": ("collar", "clavicle", "shoulder"),
-    "elbow": ("forearm", "lowarm", "lowerarm", "elbow"),
-    "wrist": ("hand", "wrist"),
-    "eye": ("eye",),
-    **{f"{finger}{i}": (f"hand{finger}{i}", f"{finger}{i}", f"{finger}0{i}") for finger in FINGERS for i in (1, 2, 3)},
-}
-"""Joints with a side by the names of others, without it, lower case, letters and digits alone: CMU (cgspeed), Mixamo, LaFAN,
-MotionBuilder, Biovision, SMPL, Unreal. A joint of the file is taken once, by the first that wants it: "shoulder" is the upper arm
-where there is no other and else the collar bone."""
-_MIDDLE = {
-    **{"pelvis": ("hips", "hip", "pelvis", "root"), "neck": ("neck", "neck1", "neck01")},
-    **{"head": ("head",), "jaw": ("jaw",)},
-}
-_CHAINS = (
-    ("pelvis", "spine1", "spine2", "spine3", "neck", "head"),
-    *(
-        chain
-        for side in ("left", "right")
-        for chain in (
-            tuple(f"{side}_{name}" for name in ("collar", "shoulder", "elbow", "wrist", "middle1")),
-            tuple(f"{side}_{name}" for name in ("hip", "knee", "ankle", "foot")),
-            *(tuple(f"{side}_{finger}{i}" for i in (1, 2, 3)) for finger in FINGERS),
-        )
-    ),
+from humangs_jax.data.motion.rules import (
+    BETTER_TILT,
+    CLEARLY_UP,
+    EXPECTED_NAMES,
+    FEET,
+    FEW,
+    LARGEST_BEND,
+    MIDDLE,
+    NEEDED,
+    NEXT,
+    RATE_ROUNDING,
+    SIDED,
+    SIDES,
+    STANDING,
+    TOPS,
 )
-"""Bones: each joint points to the next of its last chain that the file has. Others are moved as their parents are."""
-_NEXT = {name: chain[i + 1 :] for chain in _CHAINS for i, name in enumerate(chain)}
-_NEEDED = ("pelvis", *(f"{s}_{n}" for n in ("hip", "knee", "ankle", "shoulder", "elbow") for s in ("left", "right")))
-STANDING = -0.5
-"""Cosine between legs and spine below which a person can stand in a rest pose."""
-RATE_ROUNDING = 1e-4
-"""Relative error of a frame rate: BVH files have as few as four digits of the time of a frame."""
-FEW = 5
-"""Joints that have to share the beginning of their names for it to be no part of them."""
+from humangs_jax.data.motion.world import nearest_axis, sampled_frames, up_axis, upright_matrix
+from humangs_jax.io.reading import Refused
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,8 +88,8 @@ def shipped_joints() -> Float[np.ndarray, "j 3"]:
 
 def retargeted(
     clip: Clip, joints: Float[np.ndarray, "j 3"], up: str = "auto"
-) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]:
-    """Rotations (axis-angle) and translations of a body of SMPL-X's joints that moves as the clip.
+) -> tuple[Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"], str]:
+    """Rotations (axis-angle) and translations of a body of SMPL-X's joints that moves as the clip, and what to say about up.
 
     Arguments: joints: of the body in T-pose, metres. up: as in `load_motion`.
     Raises: Refused if joints of the clip that are needed have no name we know, or the body is no body of SMPL-X's joints.
@@ -118,24 +97,34 @@ def retargeted(
     if joints.shape != (len(JOINT_NAMES), 3):
         raise Refused(f"skeletons are brought to bodies of {len(JOINT_NAMES)} joints, this one has {len(joints)}")
     source = _matched(clip)
-    if missing := [name for name in _NEEDED if name not in source]:
+    if missing := [name for name in NEEDED if name not in source]:
         found = ", ".join(clip.names[:12])
-        raise Refused(f"no joint for {', '.join(missing)}: expected the names of CMU, Mixamo or LaFAN, got {found}")
-    standing = _stands(clip, source)
+        raise Refused(f"no joint for {', '.join(missing)}: {EXPECTED_NAMES}, got {found}")
+    standing, said = _stands(clip, source), ""
+    scale = _leg_length(joints, _INDEX) / max(_leg_length(clip.places[0], source), 1e-9)
     if up == "auto":
-        up = clip.up or (nearest_axis(_spine(clip, source))[0] if standing else "y")
+        up, said = (clip.up, "") if clip.up else _up_of(clip, source, scale, standing)
     turn = upright_matrix(up)
     turns, places = turn @ clip.turns, clip.places @ turn.T
-    world = _body_turns(clip, source, joints, turns, by_motion=not standing)
+    world = _body_turns(clip, source, joints, turns, places, by_motion=not standing)
     rotations = np.stack(
         [_rotation(own if p < 0 else _transposed(world[p]) @ own) for p, own in zip(PARENTS, world, strict=True)],
         axis=1,
     )
-    scale = _leg_length(joints, _INDEX) / max(_leg_length(places[0], source), 1e-9)
     moves = scale * places[:, source["pelvis"]]
     soles = _soles(clip, source, joints) if standing else None
     moves[:, 1] += _steps(scale * places[..., 1], source, soles) - _steps_of_body(world, joints, moves, source)
-    return rotations, moves - joints[0]
+    return rotations, moves - joints[0], said
+
+
+def _up_of(clip, source, scale, standing):
+    """The axis that is up and what is to be said: BVH does not tell, a rest pose in which people stand does."""
+    usual = nearest_axis(_spine(clip, source))[0] if standing else "y"
+    trunk = clip.places[:, source[_top(source)]] - clip.places[:, source["pelvis"]]
+    axis, cosine = nearest_axis(_unit(trunk).mean(axis=0))
+    chosen = sampled_frames(len(clip.places))
+    points = scale * clip.places[chosen][:, sorted(source.values())]
+    return up_axis(points, axis if cosine >= CLEARLY_UP else None, usual, clip.fps)
 
 
 _INDEX = {name: i for i, name in enumerate(JOINT_NAMES)}
@@ -159,10 +148,10 @@ def _matched(clip):
                 source[ours] = index
                 return
 
-    for ours, theirs in _MIDDLE.items():
+    for ours, theirs in MIDDLE.items():
         find(ours, theirs)
-    for ours, theirs in _SIDED.items():
-        for side in ("left", "right"):
+    for ours, theirs in SIDED.items():
+        for side in SIDES:
             find(f"{side}_{ours}", [form for x in theirs for form in (side + x, side[0] + x, x + side[0])])
     _match_spine(clip, source)
     return source
@@ -190,7 +179,7 @@ def _match_spine(clip, source):
 
 
 def _top(source):
-    return next(name for name in ("spine3", "neck", "left_shoulder") if name in source)
+    return next(name for name in TOPS if name in source)
 
 
 def _spine(clip, source):
@@ -198,24 +187,67 @@ def _spine(clip, source):
 
 
 def _stands(clip, source):
-    legs = sum(clip.rest[source[f"{s}_ankle"]] - clip.rest[source[f"{s}_hip"]] for s in ("left", "right"))
+    legs = sum(clip.rest[source[f"{s}_ankle"]] - clip.rest[source[f"{s}_hip"]] for s in SIDES)
     return float(_unit(legs) @ _spine(clip, source)) < STANDING
 
 
-def _body_turns(clip, source, joints, turns, by_motion):
+def _body_turns(clip, source, joints, turns, places, by_motion):
     """G_j (m, 3, 3) of our joints in the world."""
     frames_of, world = [], []
     for j, (name, parent) in enumerate(zip(JOINT_NAMES, PARENTS, strict=True)):
         align = _pelvis_frame(clip, source, joints) if parent < 0 else frames_of[parent]
-        child = next((other for other in _NEXT.get(name, ()) if other in source), None)
-        if parent >= 0 and name in source and child is not None:
+        child = next((other for other in NEXT.get(name, ()) if other in source), None)
+        if parent < 0:
+            world.append(_pelvis_turns(clip, source, turns, places) @ align)
+        elif name not in source:
+            world.append(world[parent])
+        elif child is None:
+            world.append(turns[:, source[name]] @ align)
+        else:
             bone = _unit(joints[_INDEX[child]] - joints[j])
-            align = _smallest_turn(align @ bone, _unit(clip.rest[source[child]] - clip.rest[source[name]])) @ align
+            align = _smallest_turns(align @ bone, _unit(clip.rest[source[child]] - clip.rest[source[name]])) @ align
             if by_motion:
                 align = align @ _untwist(_transposed(world[parent]) @ turns[:, source[name]] @ align, bone)
+            own = turns[:, source[name]] @ align
+            world.append(_smallest_turns(own @ bone, _unit(places[:, source[child]] - places[:, source[name]])) @ own)
         frames_of.append(align)
-        world.append(turns[:, source[name]] @ align if name in source else world[parent])
     return world
+
+
+def _pelvis_turns(clip, source, turns, places):
+    """(m, 3, 3) from the rest pose to the frames: of the joint, or of those that carry the hips if these agree better with the
+    trunk, turned so that the line of the hips is the file's.
+    """
+    pelvis, left, right = (source[name] for name in ("pelvis", "left_hip", "right_hip"))
+    rest_line, line = clip.rest[left] - clip.rest[right], places[:, left] - places[:, right]
+
+    def meeting(candidate):
+        return _smallest_turns(_unit(candidate @ rest_line), _unit(line)) @ candidate
+
+    def tilts(candidate, top):
+        """(m,) angle about the line of the hips from the rest pose's direction of a joint above to the frame's."""
+        axis = _unit(line)
+        across = lambda v: v - np.sum(v * axis, axis=-1, keepdims=True) * axis
+        a = across(candidate @ (clip.rest[top] - clip.rest[pelvis]))
+        b = across(places[:, top] - places[:, pelvis])
+        return np.arctan2(np.sum(np.cross(a, b) * axis, axis=-1), np.sum(a * b, axis=-1))
+
+    own, top = meeting(turns[:, pelvis]), source[_top(source)]
+    carriers = {clip.parents[left], clip.parents[right]}
+    if min(carriers) >= 0 and carriers != {pelvis}:
+        a, b = (Rotation.from_matrix(turns[:, joint]) for joint in (clip.parents[left], clip.parents[right]))
+        other = meeting((a * Rotation.from_rotvec(0.5 * (a.inv() * b).as_rotvec())).as_matrix())
+        own_tilt, tilt = (np.abs(tilts(x, top)).mean() for x in (own, other))
+        return other if tilt < own_tilt - BETTER_TILT else own
+    spine = [top]
+    while clip.parents[spine[0]] not in (-1, pelvis):
+        spine.insert(0, clip.parents[spine[0]])
+    apart = 0.01 * np.linalg.norm(clip.rest[top] - clip.rest[pelvis])
+    lowest = next((j for j in spine if np.linalg.norm(clip.rest[j] - clip.rest[pelvis]) > apart), top)
+    tilt = tilts(own, lowest)
+    if np.abs(tilt).mean() <= LARGEST_BEND:
+        return own
+    return Rotation.from_rotvec(tilt[:, None] * _unit(line)).as_matrix() @ own
 
 
 def _pelvis_frame(clip, source, joints):
@@ -232,13 +264,14 @@ def _frame(right, up):
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def _smallest_turn(a, b):
-    """The rotation matrix that turns the unit vector a into b by the smallest angle; none where b is zero."""
-    cosine = float(a @ b)
-    if cosine < -0.999999:
-        side = _unit(np.cross(a, [1.0, 0, 0] if abs(a[0]) < 0.9 else [0, 1.0, 0]))
-        return 2 * np.outer(side, side) - np.eye(3)
-    return Rotation.from_quat([*np.cross(a, b), 1 + cosine]).as_matrix()
+def _smallest_turns(a, b):
+    """The rotation matrices (..., 3, 3) that turn unit vectors a into b by the smallest angle; none where b is zero."""
+    a, b = np.broadcast_arrays(a, b)
+    cosine = np.sum(a * b, axis=-1, keepdims=True)
+    side = _unit(np.cross(a, np.where(np.abs(a[..., :1]) < 0.9, [1.0, 0, 0], [0, 1.0, 0])))
+    opposite = np.concatenate([side, np.zeros_like(cosine)], axis=-1)
+    turn = np.where(cosine < -0.999999, opposite, np.concatenate([np.cross(a, b), 1 + cosine], axis=-1))
+    return Rotation.from_quat(turn.reshape(-1, 4)).as_matrix().reshape(*a.shape, 3)
 
 
 def _untwist(turns, bone):
@@ -261,8 +294,7 @@ def _leg_length(places, index):
 
 def _feet(source):
     """Our names of the joints that may touch the floor: of both sides by kind."""
-    kinds = [[f"{side}_{name}" for side in ("left", "right")] for name in ("ankle", "foot")]
-    return [found for kind in kinds if (found := [name for name in kind if name in source])]
+    return [found for kind in FEET if (found := [name for name in kind if name in source])]
 
 
 def _soles(clip, source, joints):
@@ -300,8 +332,8 @@ def _steps_of_body(world, joints, moves, source):
     return np.min([place(j)[:, 1] - (joints[j, 1] - joints[feet, 1].min()) for j in feet], axis=0)
 
 
-def _unit(vector):
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+def _unit(vectors):
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
 
 
 def _transposed(matrices):

@@ -23,6 +23,7 @@ from humangs_jax.data.datasets.scene_list import write_list
 from humangs_jax.data.datasets.thuman import ThumanSet, open_thuman
 from humangs_jax.data.preprocess.protocol import INPUT_COUNTS, TARGETS, evaluation_indices, split_ids
 from humangs_jax.data.preprocess.scenes import SCENE, Settings, write_scan, write_video
+from humangs_jax.io.reading import shown
 from humangs_jax.io.text import write_json
 
 MANIFEST, SKIPPED = "manifest.json", "skipped"
@@ -171,7 +172,11 @@ def _begin(out, settings):
     ):
         raise CaptureError(file, "format", f"expected a manifest of {FORMAT!r}")
     earlier = content["settings"]
-    changed = [f"{key} {earlier.get(key)} -> {value}" for key, value in asked.items() if earlier.get(key) != value]
+    changed = [
+        f"{key} {shown(earlier.get(key))} -> {shown(value)}"
+        for key, value in asked.items()
+        if earlier.get(key) != value
+    ]
     if changed:
         problem = f"written with settings other than asked for now ({', '.join(changed)}): choose another folder"
         raise CaptureError(file, "settings", problem)

@@ -133,8 +133,9 @@ function makeControls(app) {
   async function openMotion(file) {
     if (!file) return;
     try {
-      app.setMotion(await readMotionFile(file, scene), file.name);
-      say(`${file.name}: ${scene.motion.quats.length} frames`);
+      const motion = await readMotionFile(file, scene);
+      app.setMotion(motion, file.name);
+      say(`${file.name}: ${scene.motion.quats.length} frames${motion.said ? `; ${motion.said}` : ""}`);
     } catch (error) {
       say(error.message, true);
     }
@@ -159,14 +160,14 @@ function makeControls(app) {
     else if (key === "+" || key === "=") app.steer.zoom(0.9);
     else if (key === "-") app.steer.zoom(1 / 0.9);
     else {
-      const act = {
+      const act = new Map(Object.entries({
         " ": () => app.setPlaying(!app.playing), t: () => app.setMode("rest"), a: () => app.setMode("a"), m: () => app.setMode("motion"),
         f: () => app.framePerson(), r: () => { resetJoints(); if (shape) resetShape(); },
         g: () => element("ground").click(), p: () => element("toggle-panel").click(),
         h: () => { document.body.classList.toggle("hidden"); app.invalidate(); },
         b: () => { const at = BACKGROUNDS.indexOf(anyColor.value); setBackground(BACKGROUNDS[(at + 1) % BACKGROUNDS.length]); },
         "[": () => changeSpeed(-1), "]": () => changeSpeed(1), "?": () => element("help").showModal(),
-      }[key.toLowerCase()];
+      })).get(key.toLowerCase());
       if (!act) return;
       act();
     }

@@ -1,0 +1,279 @@
+// Skeletons of other programs in motion, brought to the scene's joints: as humangs_jax/data/motion/bvh.py and skeleton.py.
+
+const CHANNELS = ["xposition", "yposition", "zposition", "xrotation", "yrotation", "zrotation"];
+
+// Joints with offsets, parents and channels, and the frames' numbers. A joint's name ends with its line or before a brace.
+function parseBvh(text) {
+  text = text.replace(/^\ufeff/, "");
+  if (!/^\s*HIERARCHY(?!\S)/.test(text)) throw new Error("not a BVH file: expected HIERARCHY first");
+  const found = /(?<!\S)MOTION\s+Frames:\s*(\S+)\s+Frame\s+Time:\s*(\S+)/.exec(text);
+  const joints = bvhJoints(text.slice(text.indexOf("HIERARCHY") + 9, found ? found.index : text.length));
+  if (!found) throw new Error("cut short, or damaged: expected MOTION, Frames: and Frame Time: after the joints");
+  const count = bvhNumber(found[1]), seconds = bvhNumber(found[2]), width = joints.reduce((sum, j) => sum + j.channels.length, 0);
+  if (!(count >= 1 && Number.isInteger(count) && seconds > 0 && Number.isFinite(1 / seconds)))
+    throw new Error(`expected at least one frame and a positive Frame Time, got ${found[1]} and ${found[2]}`);
+  const words = text.slice(found.index + found[0].length).split(/\s+/).filter(Boolean);
+  if (width === 0 || words.length !== count * width)
+    throw new Error(`expected ${count} frames of ${width} numbers, got ${words.length} numbers: cut short?`);
+  const frames = Array.from({ length: count }, (_, f) => words.slice(f * width, (f + 1) * width).map(bvhNumber));
+  return { joints, frames, fps: 1 / seconds };
+}
+
+function bvhNumber(word) {
+  const value = /^[-+.\deE]+$/.test(word) ? Number(word) : NaN;
+  if (!Number.isFinite(value)) throw new Error(`expected a number, got ${word}`);
+  return value;
+}
+
+// Parents first; the ends of limbs are left out.
+function bvhJoints(text) {
+  const words = text.matchAll(/(ROOT|JOINT|End)\s+([^\r\n{}]*)|[{}]|[^\s{}]+/g), joints = [], open = [];
+  let waiting = null;
+  const word = () => {
+    const { value, done } = words.next();
+    if (done) throw new Error("cut short");
+    return value[0];
+  };
+  for (const [whole, kind, name] of words) {
+    const here = open.at(-1) ?? null;  // null for the end of a limb
+    if (kind) waiting = { end: kind === "End", name: name.split(/\s+/).filter(Boolean).join(" ") };
+    else if (whole === "{" && waiting) {
+      open.push(waiting.end ? null : joints.length);
+      if (!waiting.end) joints.push({ name: waiting.name, parent: here ?? -1, channels: [], offset: [0, 0, 0] });
+      waiting = null;
+    } else if (whole === "}" && open.length) open.pop();
+    else if (whole === "OFFSET" && open.length) {
+      const offset = [0, 1, 2].map(() => bvhNumber(word()));
+      if (here !== null) joints[here].offset = offset;
+    } else if (whole === "CHANNELS" && here !== null) {
+      const amount = bvhNumber(word()), channels = Array.from({ length: Math.min(Math.max(amount, 0), 7) }, () => word().toLowerCase());
+      if (channels.length !== amount || !channels.every((channel) => CHANNELS.includes(channel)))
+        throw new Error(`joint ${joints[here].name}: expected up to 6 channels such as Xrotation`);
+      joints[here].channels = channels;
+    } else throw new Error(`unknown word ${whole}`);
+  }
+  if (open.length || waiting || !joints.length) throw new Error(joints.length ? "cut short: a brace of the joints is open" : "cut short: no joints");
+  if (joints.filter(({ parent }) => parent < 0).length !== 1) throw new Error("expected one ROOT");
+  return joints;
+}
+
+// A Map from each joint of ours that the file has to the index of the file's.
+function matchBvh({ joints }, scene) {
+  let plain = joints.map((j) => j.name.replace(/^.*[:|]/, "").toLowerCase().replace(/[^a-z0-9]/g, ""));
+  let start = 0;
+  while (plain.length >= RULES.FEW && plain[0][start] !== undefined && plain.every((name) => name[start] === plain[0][start])) start++;
+  plain = plain.map((name) => name.slice(start).replace(/^mixamorig\d*/, ""));
+  const source = new Map(), taken = new Set();
+  const find = (ours, theirs) => {
+    if (!scene.names.includes(ours)) return;
+    const found = theirs.map((name) => plain.indexOf(name)).find((i) => i >= 0 && !taken.has(i));
+    if (found !== undefined) taken.add(found) && source.set(ours, found);
+  };
+  for (const [ours, theirs] of Object.entries(RULES.MIDDLE)) find(ours, theirs);
+  for (const [ours, theirs] of Object.entries(RULES.SIDED))
+    for (const side of RULES.SIDES) find(`${side}_${ours}`, theirs.flatMap((x) => [side + x, side[0] + x, x + side[0]]));
+  matchSpine(joints, scene, source);
+  const missing = RULES.NEEDED.filter((name) => !source.has(name));
+  if (missing.length) throw new Error(`no joint for ${missing.join(", ")}: ${RULES.EXPECTED_NAMES}, got ${joints.slice(0, 12).map((j) => j.name).join(", ")}`);
+  return source;
+}
+
+// Spines have one to five joints, called differently everywhere: ours are the first, the middle and the last of the file's.
+function matchSpine(joints, scene, source) {
+  const found = [];
+  let at = joints[source.get("neck") ?? source.get("head")]?.parent ?? -1;
+  for (; at >= 0 && at !== source.get("pelvis"); at = joints[at].parent) found.unshift(at);
+  const last = found.length - 1, ours = { spine3: last, spine1: last > 0 ? 0 : -1, spine2: last > 1 ? last >> 1 : -1 };
+  for (const [name, i] of Object.entries(ours)) if (at >= 0 && i >= 0 && scene.names.includes(name)) source.set(name, found[i]);
+}
+
+const transposed = (m) => [0, 3, 6, 1, 4, 7, 2, 5, 8].map((i) => m[i]);
+
+// Bones point where the file's bones point. A joint's rest frames are related by the rotation that turns our rest direction into the
+// file's, carried down from the pelvis, whose is fixed by the hips' line and the up direction of the spine. Where nobody can stand
+// like the rest pose, twists are 0 on average over the frames.
+function retargetBvh(bvh, scene) {
+  const source = matchBvh(bvh, scene);
+  const place = bvh.joints.map(() => [0, 0, 0]);  // rest positions: parents stand before their children
+  bvh.joints.forEach((joint, i) => { place[i] = joint.parent < 0 ? [0, 0, 0] : add(place[joint.parent], joint.offset); });
+  const between = (a, b) => subtract(place[source.get(b)], place[source.get(a)]), theirs = (a, b) => normalized(between(a, b));
+  const rest = (name) => scene.rest[scene.names.indexOf(name)];
+  const top = RULES.TOPS.find((name) => source.has(name)), spine = theirs("pelvis", top), tall = nearestAxis(spine).axis;
+  const standing = dot(normalized(add(between("left_hip", "left_ankle"), between("right_hip", "right_ankle"))), spine) < RULES.STANDING;
+  const legs = (at) => ["left_hip>left_knee", "left_knee>left_ankle"].reduce((sum, pair) => {
+    const [a, b] = pair.split(">");
+    return sum + Math.hypot(...subtract(at(b), at(a)));
+  }, 0);
+  const own = bvh.frames.map((numbers) => poseBvh(bvh, numbers));
+  const scale = legs(rest) / Math.max(legs((name) => own[0].position[source.get(name)]), 1e-9);  // units, and the length of the steps
+  const { up, said } = upOfBvh(own, source, top, scale, standing ? tall : "y", bvh.fps), upright = uprightMatrix(up);
+  const posed = own.map(({ world, position }) => (
+    { world: world.map((m) => matrixMultiply(upright, m)), position: position.map((p) => matrixApply(upright, p)) }
+  ));
+
+  const frameOf = (right, up) => {
+    const x = normalized(right), z = normalized(cross(x, up)), y = cross(z, x);
+    return [x[0], y[0], z[0], x[1], y[1], z[1], x[2], y[2], z[2]];
+  };
+  const root = matrixMultiply(
+    frameOf(theirs("right_hip", "left_hip"), spine),
+    transposed(frameOf(subtract(rest("left_hip"), rest("right_hip")), subtract(rest(top), rest("pelvis")))),
+  );
+  const pelvis = pelvisTurns(bvh.joints, source, place, posed, top);
+  const align = [], global = posed.map(() => []);  // our rest frame -> the file's rest frame; our joints in the world
+  for (const j of scene.order) {
+    const name = scene.names[j], p = scene.parents[j], at = source.get(name);
+    const child = p < 0 ? undefined : (NEXT.get(name) || []).find((other) => source.has(other));
+    align[j] = p < 0 ? root : align[p];
+    if (at === undefined || child === undefined) {  // joints that the file does not have go with their parents
+      posed.forEach(({ world }, f) => {
+        global[f][j] = p < 0 ? matrixMultiply(pelvis[f], root) : at === undefined ? global[f][p] : matrixMultiply(world[at], align[j]);
+      });
+      continue;
+    }
+    const bone = normalized(subtract(rest(child), rest(name)));
+    align[j] = matrixMultiply(smallestTurn(matrixApply(align[j], bone), theirs(name, child)), align[j]);
+    if (!standing) {
+      const turns = posed.map(({ world }, f) => matrixMultiply(transposed(global[f][p]), matrixMultiply(world[at], align[j])));
+      align[j] = matrixMultiply(align[j], untwist(turns, bone));
+    }
+    posed.forEach(({ world, position }, f) => {
+      const turned = matrixMultiply(world[at], align[j]), direction = normalized(subtract(position[source.get(child)], position[at]));
+      global[f][j] = matrixMultiply(smallestTurn(matrixApply(turned, bone), direction), turned);
+    });
+  }
+
+  const quats = global.map((frame) => frame.map((m, j) => quatFromMatrix(scene.parents[j] < 0 ? m : matrixMultiply(transposed(frame[scene.parents[j]]), m))));
+  const moves = posed.map(({ position }) => scaled(position[source.get("pelvis")], scale));
+  const restScale = legs(rest) / Math.max(legs((name) => place[source.get(name)]), 1e-9);
+  const low = standing ? soles(place, source, uprightMatrix(tall), restScale) : null;
+  const steps = stepsOf(posed, source, scale, low), ofBody = stepsOfBody(global, scene, source, moves);
+  const translations = moves.map((move, f) => subtract(add(move, [0, steps[f] - ofBody[f], 0]), rest("pelvis")));
+  const whole = Math.round(bvh.fps);  // BVH has 0.0083333 for 120
+  return { quats, translations, fps: Math.abs(bvh.fps - whole) < RULES.RATE_ROUNDING * bvh.fps ? whole : bvh.fps, said };
+}
+
+const NEXT = new Map(Object.entries(RULES.NEXT));
+
+// { up, said }: BVH does not tell which axis is up, a rest pose in which people stand does.
+function upOfBvh(posed, source, top, scale, usual, fps) {
+  const trunks = posed.map(({ position }) => normalized(subtract(position[source.get(top)], position[source.get("pelvis")])));
+  const { axis, cosine } = nearestAxis([0, 1, 2].map((i) => mean(trunks.map((v) => v[i]))));
+  if (!(cosine >= RULES.CLEARLY_UP) || axis === usual) return { up: usual, said: "" };
+  const used = [...source.values()].sort((a, b) => a - b);
+  const points = sampledFrames(posed.length).map((f) => used.map((i) => scaled(posed[f].position[i], scale)));
+  return upAxis(points, axis, usual, fps, []);
+}
+
+// From the rest pose to the frames: of the joint, or of those that carry the hips if these agree better with the trunk, turned so
+// that the line of the hips is the file's.
+function pelvisTurns(joints, source, place, posed, top) {
+  const [pelvis, left, right] = ["pelvis", "left_hip", "right_hip"].map((name) => source.get(name)), end = source.get(top);
+  const restLine = subtract(place[left], place[right]), above = joints[left].parent, beside = joints[right].parent;
+  const lines = posed.map(({ position }) => normalized(subtract(position[left], position[right])));
+  const meeting = (turn, f) => matrixMultiply(smallestTurn(normalized(matrixApply(turn, restLine)), lines[f]), turn);
+  // angles about the line of the hips from the rest pose's direction of a joint above to the frame's
+  const tilts = (turns, joint) => turns.map((turn, f) => {
+    const across = (v) => subtract(v, scaled(lines[f], dot(v, lines[f])));
+    const a = across(matrixApply(turn, subtract(place[joint], place[pelvis])));
+    const b = across(subtract(posed[f].position[joint], posed[f].position[pelvis]));
+    return Math.atan2(dot(cross(a, b), lines[f]), dot(a, b));
+  });
+  const size = (angles) => mean(angles.map(Math.abs)), own = posed.map(({ world }, f) => meeting(world[pelvis], f));
+  if (above >= 0 && beside >= 0 && !(above === pelvis && beside === pelvis)) {
+    const halfway = ({ world }) => matrixFromQuat(quatSlerp(quatFromMatrix(world[above]), quatFromMatrix(world[beside]), 0.5));
+    const other = posed.map((frame, f) => meeting(halfway(frame), f));
+    return size(tilts(other, end)) < size(tilts(own, end)) - RULES.BETTER_TILT ? other : own;
+  }
+  const chain = [end];
+  while (joints[chain[0]].parent >= 0 && joints[chain[0]].parent !== pelvis) chain.unshift(joints[chain[0]].parent);
+  const far = (joint) => Math.hypot(...subtract(place[joint], place[pelvis]));
+  const tilt = tilts(own, chain.find((joint) => far(joint) > 0.01 * far(end)) ?? end);
+  if (size(tilt) <= RULES.LARGEST_BEND) return own;
+  return own.map((turn, f) => matrixMultiply(matrixFromQuat(quatFromAxisAngle(...scaled(lines[f], tilt[f]))), turn));
+}
+
+// The rotation about a bone that takes the mean twist about it out of rotations. The twist of (w, v) about b is 2 arg(w + i v.b).
+function untwist(turns, bone) {
+  let real = 0, imaginary = 0;
+  for (const m of turns) {
+    const [w, ...v] = quatFromMatrix(m), along = dot(v, bone);
+    real += w * w - along * along;
+    imaginary += 2 * w * along;
+  }
+  return matrixFromQuat(quatFromAxisAngle(...scaled(bone, -Math.atan2(imaginary, real))));
+}
+
+const feetOf = (source) => RULES.FEET.map((kind) => kind.filter((name) => source.has(name))).filter((kind) => kind.length);
+
+// How high the joints of the file's feet are above the lowest of them in a rest pose that stands.
+function soles(place, source, upright, scale) {
+  const names = feetOf(source).flat(), heights = names.map((name) => scale * matrixApply(upright, place[source.get(name)])[1]);
+  return new Map(names.map((name, i) => [name, heights[i] - Math.min(...heights)]));
+}
+
+// How high the feet are above the floor in each frame, which is where they are lowest. low: of each joint of the feet, how high it
+// is when the foot stands; null: each kind as high as in its lowest frame.
+function stepsOf(posed, source, scale, low) {
+  const height = ({ position }, name) => scale * position[source.get(name)][1];
+  if (!low) {
+    low = new Map();
+    for (const kind of feetOf(source)) {
+      const lowest = least(posed.map((frame) => Math.min(...kind.map((name) => height(frame, name)))));
+      for (const name of kind) low.set(name, lowest);
+    }
+  }
+  const feet = posed.map((frame) => Math.min(...[...low].map(([name, sole]) => height(frame, name) - sole)));
+  const floor = least(feet);
+  return feet.map((y) => y - floor);
+}
+
+// The same of our body, above a floor at the height of its lowest joint in T-pose.
+function stepsOfBody(global, scene, source, moves) {
+  const feet = feetOf(source).flat().map((name) => scene.names.indexOf(name));
+  const floor = Math.min(...feet.map((j) => scene.rest[j][1]));
+  return global.map((frame, f) => {
+    const place = (j) => {
+      const p = scene.parents[j];
+      return p < 0 ? moves[f] : add(place(p), matrixApply(frame[p], subtract(scene.rest[j], scene.rest[p])));
+    };
+    return Math.min(...feet.map((j) => place(j)[1] - (scene.rest[j][1] - floor)));
+  });
+}
+
+// Rotations and places of all joints in the world.
+function poseBvh({ joints }, numbers) {
+  const axes = { x: [1, 0, 0], y: [0, 1, 0], z: [0, 0, 1] }, world = [], position = [];
+  let at = 0;
+  joints.forEach((joint, i) => {
+    let local = [1, 0, 0, 0];
+    const move = [...joint.offset];
+    for (const channel of joint.channels) {
+      const value = numbers[at++], axis = channel[0];
+      if (channel.endsWith("position")) move["xyz".indexOf(axis)] = value;
+      else local = quatMultiply(local, quatFromAxisAngle(...scaled(axes[axis], value * Math.PI / 180)));
+    }
+    const m = matrixFromQuat(local), p = joint.parent;
+    world[i] = p < 0 ? m : matrixMultiply(world[p], m);
+    position[i] = p < 0 ? move : add(position[p], matrixApply(world[p], move));
+  });
+  return { world, position };
+}
+
+// The matrix that turns a unit vector into another by the smallest angle; none where that is zero.
+function smallestTurn(from, to) {
+  const c = dot(from, to), side = () => normalized(cross(from, Math.abs(from[0]) < 0.9 ? [1, 0, 0] : [0, 1, 0]));
+  return matrixFromQuat(c < -0.999999 ? [0, ...side()] : quatNormalize([1 + c, ...cross(from, to)]));
+}
+
+function quatFromMatrix(m) {
+  const [xx, xy, xz, yx, yy, yz, zx, zy, zz] = m;
+  const all = [1 + xx + yy + zz, 1 + xx - yy - zz, 1 + yy - xx - zz, 1 + zz - xx - yy];
+  const best = all.indexOf(Math.max(...all));
+  return quatNormalize([
+    [all[0], zy - yz, xz - zx, yx - xy],
+    [zy - yz, all[1], yx + xy, xz + zx],
+    [xz - zx, yx + xy, all[2], zy + yz],
+    [yx - xy, zx + xz, zy + yz, all[3]],
+  ][best]);
+}

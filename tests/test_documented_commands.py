@@ -1,0 +1,242 @@
+"""Every `humangs` and `python` line of README, docs and notebooks is one that the real parser takes; quick ones are run."""
+
+import contextlib
+import functools
+import io
+import json
+import shutil
+import subprocess
+import sys
+
+import documented
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from bvh_files import CMU, write_bvh
+from command_line import run, save_tiny_avatar
+from documented import PAGES, ROOT, Command, commands_in, commands_of, filled, split_shell
+
+from humangs_jax import cli
+from humangs_jax.body.library import load_body
+from humangs_jax.body.model import shape_body
+from humangs_jax.data.capture import load_capture, save_capture
+
+COMMANDS = [command for page in PAGES for command in commands_of(page)]
+OURS = [command for command in COMMANDS if command.words[0] == "humangs" and len(command.words) > 1]
+SCRIPTS = [command for command in COMMANDS if command.words[0] == "python" and command.words[1:2] != ("-m",)]
+FOREIGN = ("demo/inferencer_demo.py",)
+"""Scripts of other projects that pages name."""
+QUICK = (
+    "export avatar.npz --out person.ply",
+    "export avatar.npz --out person.spz --motion dance.bvh --frame 40",
+    "export avatar.npz --out dance.ply --motion dance.bvh --frames 0:200:5",
+    "export avatar.npz --html avatar.html",
+    "export avatar.npz --html dance.html --motion dance.npz",
+)
+"""Commands that are run as documented on an avatar of three Gaussians."""
+SLOW = (
+    "check me --out check.png",
+    "reconstruct CAPTURE --out avatar.npz",
+    "refine avatar.npz CAPTURE --limit 15s --out sharp.npz",
+    "export avatar.npz --out person.glb --mesh --motion dance.bvh",
+    "export avatar.npz --out person.obj",
+    "render avatar.npz --out views --views 8 --exr --channels rgba,z,position,normal,part",
+    "render avatar.npz --out views --capture CAPTURE",
+    "animate avatar.npz",
+    "evaluate me --avatar avatar.npz --protocol lhm",
+)
+"""And on the demo's photos, in this order: the first ones make what the others read."""
+HEAVY = ("tests/", "experiments/training/train_shipped.py")
+MORE = (
+    [],
+    ["1"],
+    ["--out", "1"],
+    ["1", "--out", "1"],
+    ["1", "1"],
+    ["1", "1", "--out", "1"],
+    ["1", "--images", "1", "--out", "1"],
+)
+"""What may be missing in the middle of a sentence."""
+
+PARSE = """
+import argparse, contextlib, functools, io, json, os, runpy, sys
+class Parsed(BaseException): pass
+original = argparse.ArgumentParser.parse_args
+def parse(self, args=None, namespace=None):
+    original(self, args, namespace)
+    raise Parsed
+argparse.ArgumentParser.parse_args = parse
+import tyro
+real = tyro.cli
+def typed(function, *given, **named):
+    def stub(*_, **__):
+        raise Parsed
+    return real(functools.update_wrapper(stub, function), *given, **named)  # it would call the function
+tyro.cli = typed
+problems = []
+for script, *arguments in json.load(sys.stdin):
+    printed, path = io.StringIO(), list(sys.path)
+    sys.argv = [script, *arguments]
+    sys.path.insert(0, os.path.dirname(script))
+    try:
+        with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(printed):
+            runpy.run_path(script, run_name="__main__")
+        problems.append("it ran without parsing its options")
+    except Parsed:
+        problems.append(None)
+    except SystemExit:
+        problems.append(printed.getvalue()[-600:])
+    sys.path[:] = path
+json.dump(problems, sys.__stdout__)
+"""
+
+
+@functools.cache
+def parsed(*words):
+    """None, or what the parser of `humangs` says."""
+    printed = io.StringIO()
+    words = [word for word in words if word not in ("--quiet", "--verbose", "--version")]
+    try:
+        with contextlib.redirect_stderr(printed), contextlib.redirect_stdout(printed):
+            cli._parsed(words)
+    except SystemExit as exit_:
+        return None if exit_.code in (0, None) else printed.getvalue()
+    return None
+
+
+def refused(command):
+    """None, or why a line of a page cannot be typed."""
+    words = filled(command.words[1:])
+    if command.whole:
+        return parsed(*words)
+    lines = [words]
+    if words[-1].startswith("--"):  # it may be named without its value
+        lines.append([*words[:-1], f"{words[-1]}=1"])
+    tried = (parsed(*line, *more) for line in lines for more in MORE)
+    return None if None in tried else parsed(*words)
+
+
+@pytest.mark.parametrize("command", OURS, ids=str)
+def test_a_documented_command_is_one_that_the_parser_takes(command):
+    assert refused(command) is None, f"{command}\n{refused(command)}"
+
+
+def wrong_scripts(commands, folder):
+    """Lines whose script does not take its options, and what it says: all are asked in one process."""
+    given = [[str(ROOT / command.words[1]), *filled(command.words[2:])] for command in commands]
+    run = [sys.executable, "-c", PARSE]
+    done = subprocess.run(run, input=json.dumps(given), capture_output=True, text=True, cwd=folder, check=False)
+    assert done.returncode == 0, done.stderr
+    said = json.loads(done.stdout)
+    return [f"{command}\n{problem}" for command, problem in zip(commands, said, strict=True) if problem]
+
+
+def with_options():
+    """Lines of scripts with a parser, but names without options in the middle of a sentence."""
+    found = [x for x in SCRIPTS if x.words[1] not in FOREIGN and (x.whole or len(x.words) > 2)]
+    return [x for x in found if "parse_args" in (text := (ROOT / x.words[1]).read_text()) or "import tyro" in text]
+
+
+def test_documented_scripts_exist_and_take_their_options(tmp_path):
+    ours = [command for command in SCRIPTS if command.words[1] not in FOREIGN]
+    assert [str(command) for command in ours if not (ROOT / command.words[1]).is_file()] == []
+    asked = [command for command in with_options() if not command.words[1].startswith(HEAVY)]
+    assert len(asked) > 15 and wrong_scripts(asked, tmp_path) == []
+
+
+@pytest.mark.slow  # they import jax before they look at their options
+def test_documented_scripts_that_import_much_take_their_options(tmp_path):
+    asked = [command for command in with_options() if command.words[1].startswith(HEAVY)]
+    assert len(asked) > 3 and wrong_scripts(asked, tmp_path) == []
+    assert list(tmp_path.iterdir()) == []  # none has begun its work
+
+
+def test_documented_runs_of_the_tests_name_what_exists():
+    runs = [command for command in COMMANDS if command.words[1:3] == ("-m", "pytest")]
+    named = [word for command in runs for word in command.words if word.startswith("tests/")]
+    assert runs and [word for word in named if not (ROOT / word).exists()] == []
+
+
+def test_the_collection_misses_no_line_that_names_a_command():
+    for page in PAGES:
+        text = page.read_text()
+        if page.suffix == ".md":
+            lines = [line for block in documented.FENCE.finditer(text) for line in block["text"].splitlines()]
+            found = {" ".join(command.words[:2]) for command in commands_of(page)}
+            for line in lines:
+                for name in cli.COMMANDS:
+                    assert not line.startswith(f"humangs {name}") or f"humangs {name}" in found, line
+    assert {command.words[1] for command in OURS} >= set(cli.COMMANDS)  # every command is shown somewhere
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("$ humangs check me   # look", ["humangs check me"]),
+        ("humangs train a \\\n    --out b \\\n    --fsdp 8", ["humangs train a --out b --fsdp 8"]),
+        ("python3 -m venv .venv && .venv/bin/humangs demo --out o", ["python -m venv .venv", "humangs demo --out o"]),
+        ("X=1 humangs demo; humangs view a &", ["humangs demo", "humangs view a"]),
+        ('ssh NAME --command "humangs train p --out o"', ["humangs train p --out o"]),
+        ("srun humangs train p --background '#1' # 2", ["humangs train p --background #1"]),
+        ("# humangs is not a command here\nit's humangs", []),
+        ("humangs preprocess thuman|thuman4 SRC | tee log", ["humangs preprocess thuman|thuman4 SRC"]),
+    ],
+)
+def test_lines_of_a_shell_are_read_as_a_shell_reads_them(text, expected):
+    assert [" ".join(words) for words in split_shell(text)] == expected
+
+
+def test_blocks_are_whole_and_spans_are_not():
+    text = "See `humangs fit\nme --scan S`.\n```sh\nhumangs fit me\n```\n```python\nhumangs = 1\n```\n~~~\nhumangs view x\n~~~\n"
+    found = commands_in(text, "page")
+    assert found == [
+        Command("page", ("humangs", "fit", "me"), True),
+        Command("page", ("humangs", "view", "x"), True),
+        Command("page", ("humangs", "fit", "me", "--scan", "S"), False),
+    ]
+    words = ["import", "cameras", "SOURCE", "[--scale", "S]", "[--up=+z]", "integer|half", "$A/x.npz", "..."]
+    assert filled(words) == ["import", "cameras", "1", "--scale", "1", "--up=+z", "integer", "1/x.npz"]
+
+
+@pytest.mark.parametrize(
+    "words", ["train DATA --out RUN --vgg-19 F", "export a.npz --out b.ply --frame", "import photos"]
+)
+def test_a_wrong_line_is_noticed(words):
+    command = Command("page", ("humangs", *words.split()), True)
+    assert refused(command) is not None
+
+
+@pytest.fixture
+def workspace(tmp_path, monkeypatch):
+    """The files that the commands above name: a capture, an avatar, two motions."""
+    rest = np.asarray(shape_body(load_body(), jnp.zeros(0)).joints)
+    save_tiny_avatar(tmp_path / "avatar.npz", rest)
+    (tmp_path / "dance.bvh").write_text(write_bvh(rest, np.zeros((201, len(rest), 3)), CMU))
+    shutil.copyfile(ROOT / "humangs_jax/assets/walk.npz", tmp_path / "dance.npz")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run_all(lines, monkeypatch, capsys):
+    """The exit codes; every line must stand on a page."""
+    shown = {" ".join(command.words[1:]) for command in OURS if command.whole}
+    assert [line for line in lines if line not in shown] == []
+    for line in lines:
+        words = line.replace("CAPTURE", "me").split()
+        code, _, err = run(monkeypatch, capsys, *words)
+        assert code == 0, f"{line}: {err}"
+
+
+def test_documented_exports_run(workspace, monkeypatch, capsys):
+    run_all(QUICK, monkeypatch, capsys)
+    made = {path.name for path in workspace.iterdir()}
+    assert made >= {"person.ply", "person.spz", "avatar.html", "dance.html", "dance_0000.ply", "dance_0195.ply"}
+
+
+@pytest.mark.slow
+def test_documented_commands_run_on_the_photos_of_the_demo(workspace, monkeypatch, capsys):
+    save_capture(workspace / "me", load_capture("demo_capture"))
+    save_capture(workspace / "me" / "held_out", load_capture("demo_capture/held_out"))
+    run_all(SLOW, monkeypatch, capsys)
+    made = {path.name for path in workspace.iterdir()}
+    assert made >= {"check.png", "sharp.npz", "person.glb", "person.obj", "animation.mp4", "views"}
