@@ -178,12 +178,15 @@ def train_variant(
 
     from experiments.common.results import write_json
     from humangs_jax.data.views import gaussian_body
-    from humangs_jax.training.loop import train
+    from humangs_jax.training.loop import TrainingInterrupted, train
 
     clock = out / "seconds.json"
     before = json.loads(clock.read_text()) if clock.exists() else {"cpu": 0.0, "wall": 0.0}
     cpu, wall = time.process_time(), time.perf_counter()
-    state = train(config, body, people, out, progress=False)
+    try:
+        state = train(config, body, people, out, progress=False)
+    except TrainingInterrupted as stopped:
+        state = stopped.state
     spent = {
         "cpu": before["cpu"] + time.process_time() - cpu,
         "wall": before["wall"] + time.perf_counter() - wall,

@@ -64,7 +64,7 @@ def main(
     from humangs_jax.network.weights import fit_variables, load_weights
     from humangs_jax.people.bank import load_bank
     from humangs_jax.people.writer import Layout, write_set
-    from humangs_jax.training.loop import train
+    from humangs_jax.training.loop import TrainingInterrupted, train
     from humangs_jax.training.sources import on_the_fly_people, training_people
 
     logging.basicConfig(level=logging.WARNING, format="%(message)s")
@@ -80,7 +80,12 @@ def main(
         validation = out / "validation"
         write_set(validation, VALIDATION_SUBJECTS, Layout(256, poses=2, views=12), "validation")
     training = training_people(None, people, out, body) if bank is None else on_the_fly_people(load_bank(bank))
-    state = train(config, body, training, out, validation=find_captures(validation), variables=variables)
+    try:
+        state = train(config, body, training, out, validation=find_captures(validation), variables=variables)
+    except TrainingInterrupted as stopped:
+        if hours is None or timer.is_alive():  # it was not the timer
+            raise
+        state = stopped.state
     if start_share and int(state.step) == config.steps:
         write_mean(out, variables, start_share)
 

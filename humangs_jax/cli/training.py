@@ -88,7 +88,7 @@ class Train:
             from humangs_jax.rendering.splat_config import drawn_as
             from humangs_jax.training.config import fitting_losses, read_config
             from humangs_jax.training.diagnose import diagnose_run
-            from humangs_jax.training.loop import train
+            from humangs_jax.training.loop import TrainingInterrupted, train
             from humangs_jax.training.sources import people_on_disk, training_people
 
             files = self.networks
@@ -112,15 +112,19 @@ class Train:
                 diagnosis = diagnose_run(self.out, body, people, networks=networks, variables=variables)
             tell(diagnosis)
             return
-        fsdp = self.fsdp
+        interrupted = None
         with stage("training"):
-            state = train(
-                settings, body, people, self.out, validation=others, variables=variables, networks=networks, fsdp=fsdp
-            )
+            fsdp, out = self.fsdp, self.out
+            try:
+                state = train(
+                    settings, body, people, out, validation=others, variables=variables, networks=networks, fsdp=fsdp
+                )
+            except TrainingInterrupted as stopped:  # all is saved, the same command goes on
+                state, interrupted = stopped.state, stopped
         done = None if state is None else int(state.step)
         wrote(self.out, f"{done} of {settings.steps} steps; weights.safetensors, log.jsonl")
-        if done is not None and done < settings.steps:  # Ctrl-C: all is saved, the same command goes on
-            raise KeyboardInterrupt
+        if interrupted is not None and done != settings.steps:
+            raise interrupted
         suggest("humangs reconstruct CAPTURE --weights", self.out / "weights.safetensors")
 
 

@@ -42,7 +42,7 @@ class SubjectViews:
     images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) coverage in [0, 1]. cameras: a batch of v, metric.
     rotations: (v, j, 3) axis-angle, translations: (v, 3) metres, betas: (s,) shape coefficients. view_count: how many are
     views, those after them are padding (see `pad_views`); None: all are. depths: (v, h, w) mean z of the person in a pixel,
-    metres, where the mask is not 0; None: unknown.
+    metres, where the mask is not 0; 0: unknown there. None: unknown everywhere.
     """
 
     images: Float[Array, "v h w 3"]

@@ -32,6 +32,16 @@ from humangs_jax.training.optimizer import OptimizerConfig
 logger = logging.getLogger(__name__)
 
 
+HOST_SETTINGS = {
+    "seed": 0,
+    "log_every": 1,
+    "validate_every": 1,
+    "checkpoint_every": 1,
+    "keep_checkpoints": 1,
+}
+"""Settings of a run that no compiled program depends on, with the values that programs are compiled for."""
+
+
 @configuration
 class LossConfig:
     """Weights of the terms, each a mean over pixels or vertices and over the targets.
@@ -42,9 +52,9 @@ class LossConfig:
     `objectives.loss_networks`.
 
     Against fog, which squared errors cause where the network is in doubt: absolute, outline: absolute errors of colours and
-    of coverage. depth: distance between the surfaces seen, metres; needs on-the-fly people. distortion: spread of the weights
-    along the rays. opaque: 4 o (1 - o) of the opacities o. shells: spread of the distances that a Gaussian mixes, normalised
-    units. Perceptual terms and those against fog are computed only where their weight is not 0.
+    of coverage. depth: distance between the surfaces seen, metres; 0 for people on disk, whose depths are unknown. distortion:
+    spread of the weights along the rays. opaque: 4 o (1 - o) of the opacities o. shells: spread of the distances that a Gaussian
+    mixes, normalised units. Perceptual terms and those against fog are computed only where their weight is not 0.
     random_background: share of the targets that are seen against one random colour instead of white, so that
     white Gaussians differ from missing ones.
     """
@@ -138,6 +148,11 @@ class TrainConfig:
     def examples_before(self, step: int) -> int:
         """Subjects that the steps before this one have taken, over all stages."""
         return sum((end - first) * self.at(first).batch_size for first, end in self.spans(0, step))
+
+
+def compiled_for(config: TrainConfig) -> TrainConfig:
+    """The same for all runs that share compiled programs: without what only the loop and the loader read."""
+    return dataclasses.replace(config, **HOST_SETTINGS)
 
 
 def _changed(config, stage):

@@ -31,14 +31,19 @@ from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.diagnosis import Diagnosis, StageReport, leaves
 from humangs_jax.training.sources import MakeSource, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
-from humangs_jax.training.step import NO_NETWORKS, subject_keys, subject_loss, train_step
+from humangs_jax.training.step import NO_NETWORKS, seed_numbers, subject_keys, subject_loss, train_step
 
 FAILED = ("skipped", "nonfinite")
 """Events of a run's log that a diagnosis looks for."""
 
 
-NEAREST = {"encoder": "encoding", "reader": "vertex features", "decoder": "posed Gaussians"}
-"""Stages for the parameters of parts that have no stages of their own."""
+NEAREST = {
+    "encoder": ("encoding",),
+    "reader": ("vertex features",),
+    "decoder": ("posed Gaussians", "images"),
+    "driver": ("posed Gaussians",),
+}
+"""Stages for the parameters of parts that have no stages of their own: the first that the network has."""
 
 
 @pytree_dataclass
@@ -80,9 +85,8 @@ def observe_subject(
     (value, given), (gradients, cotangents) = differentiated(params, dry.probes())
     own: dict[str, Named] = {}
     for name, gradient in inexact_leaves(gradients):
-        stage = parameter_stage(name)
-        stage = stage if stage in dry.given else NEAREST[name.split(".")[0]]
-        own.setdefault(stage, {})[name] = gradient
+        stages = (parameter_stage(name), *NEAREST[name.split(".")[0]])
+        own.setdefault(next(stage for stage in stages if stage in dry.given), {})[name] = gradient
     stages = [ObservedStage(name, given[name], cotangents.get(name, {}), own.get(name, {})) for name in dry.given]
     return value, stages
 
@@ -91,7 +95,7 @@ def parameter_stage(name: str) -> str:
     """The stage that uses a parameter, by the parameter's path, as decoder.trunk_0.kernel."""
     part, *inner = name.split(".")
     if part != "encoder":
-        return {"reader": "vertex features", "decoder": "raw heads"}[part]
+        return {"reader": "vertex features", "decoder": "raw heads", "driver": "posed Gaussians"}[part]
     if inner[0] == "transformer":
         return {"input_norm": "input norm", "norm": "final norm"}.get(inner[1], inner[1].replace("_", " "))
     return {"tokenizer": "tokens", "class_token": "tokens", "upsampler": "maps"}.get(inner[0], "encoding")
@@ -113,7 +117,7 @@ def diagnose_step(
         "loss networks": networks,
     }
     stored = [StageReport(name, leaves(tree)) for name, tree in parts.items() if jax.tree.leaves(tree)]
-    keys = subject_keys(config.seed, state.step, len(batch.inputs.betas))
+    keys = subject_keys(seed_numbers(config.seed), state.step, len(batch.inputs.betas))
     found = []
     for subject, key in enumerate(bar(keys, desc="diagnose", unit="subject", shown=watched())):
         example = jax.tree.map(lambda x, i=subject: x[i], batch)

@@ -31,12 +31,12 @@ from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import save_weights
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training.checkpoint import Checkpoints, save_config
-from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.log import RunLog, Watch
 from humangs_jax.training.sharding import place, replicated, state_shardings, training_mesh, whole
 from humangs_jax.training.sources import MakeSource, bad_samples, captured_people, stage_loader
 from humangs_jax.training.state import TrainState, init_state
-from humangs_jax.training.step import NO_NETWORKS, jitted_train_step, train_step
+from humangs_jax.training.step import NO_NETWORKS, jitted_train_step, seed_numbers, train_step
 from humangs_jax.training.validation import sheet, validate, validation_examples
 
 logger = logging.getLogger(__name__)
@@ -45,6 +45,23 @@ VALIDATED = 8
 """Subjects that a validation looks at."""
 SHOWN = 4
 """Validation subjects on the sheet."""
+DROPPED = {
+    "dropped_tokens": "patches without room, mean: model.execution.token_capacity is too small for these photos",
+    "dropped_reads": "vertices without room, mean: model.execution.vertex_capacity is too small for these photos",
+    "overflow": "(splat, tile) pairs without room, mean: they were not drawn",
+}
+"""What the numbers of a validation say that should be 0."""
+
+
+class TrainingInterrupted(KeyboardInterrupt):
+    """`train` was asked to stop before its end, by Ctrl-C, SIGTERM or the loss of a machine. All is saved: the same call goes on.
+
+    A KeyboardInterrupt, so that a loop of runs stops, too. state: the one that was saved.
+    """
+
+    def __init__(self, state: TrainState, steps: int):
+        super().__init__(f"after {int(state.step)} of {steps} steps, which are saved: the same call goes on")
+        self.state = state
 
 
 @checked_arguments
@@ -73,9 +90,11 @@ def train(
         stop_at: end after this step as if interrupted.
         progress: show a progress bar.
 
-    Ctrl-C and SIGTERM finish the step, save and return; a second Ctrl-C interrupts at once.
-    Raises: ValueError if `out` belongs to a run of another configuration, no capture can be used, devices and batch do not
-    divide each other, or the sizes of a later stage do not fit; OSError if another process trains into `out`.
+    Ctrl-C and SIGTERM finish the step, save and raise `TrainingInterrupted`; a second Ctrl-C interrupts at once.
+
+    Raises: TrainingInterrupted, a KeyboardInterrupt, as said; ValueError if `out` belongs to a run of another configuration, no
+    capture can be used, devices and batch do not divide each other, or the sizes of a later stage do not fit; OSError if another
+    process trains into `out`.
     """
     out, leading = Path(out), jax.process_index() == 0
     (out / "sheets").mkdir(parents=True, exist_ok=True)
@@ -148,20 +167,28 @@ def _train(config, body, training, out, leading, validation, variables, networks
                 break
         watch.look()
         checkpoints.close()
+        # a single process may have been told after its last step; several agree only on steps
+        stop = stop or (jax.process_count() == 1 and stopping(end))
+    if stop:
+        raise TrainingInterrupted(state, config.steps)
     return state
 
 
 def _rehearse(make_source, config, step, state, body, networks, mesh):
     """Trace a step of a later stage: sizes that do not fit raise before the run, not in the middle of it."""
     batch = stage_loader(make_source, config, step, mesh).batch_at(step)
-    jitted_train_step().eval_shape(state, batch, body, networks, config=config.at(step), mesh=mesh)
+    part = config.at(step)
+    jitted_train_step().eval_shape(
+        state, batch, body, networks, seed_numbers(part.seed), config=compiled_for(part), mesh=mesh
+    )
 
 
 def _report(log, out, done, numbers, image):
     log.numbers(done, {f"val_{name}": value for name, value in numbers.items()}, "validation")
     write_png(out / "sheets" / f"{done:07d}.png", image)
     log.image(done, "validation/sheet", image)
-    say(f"step {done}: " + ", ".join(f"{name} {value:.4g}" for name, value in numbers.items()))
+    why = lambda name, value: f" ({DROPPED[name]})" if value and name in DROPPED else ""
+    say(f"step {done}: " + ", ".join(f"{name} {x:.4g}{why(name, x)}" for name, x in numbers.items()))
 
 
 @contextlib.contextmanager

@@ -72,8 +72,15 @@ def captured_people(folders: Sequence[str | Path], body: BodyModel, body_file: s
 
 
 def cached_people(cache: PeopleCache) -> MakeSource:
-    """People on disk; images that are decoded once serve all stages."""
-    return lambda config: CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size)
+    """People on disk; images that are decoded once serve all stages. Their depths are unknown."""
+
+    def make(config: TrainConfig) -> Source:
+        depths = config.loss.depth > 0  # all examples of a mixture have the same arrays
+        if depths:
+            logger.warning("people on disk have no depths: loss.depth (weight %g) is 0 for them", config.loss.depth)
+        return CaptureSource(cache, config.views, config.model.conventions.image_size, config.target_size, depths)
+
+    return make
 
 
 def on_the_fly_people(bank: PeopleBank, settings: OnTheFlyConfig = ON_THE_FLY) -> MakeSource:

@@ -6,6 +6,7 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jax.sharding import Mesh, PartitionSpec
 
@@ -24,7 +25,7 @@ from humangs_jax.objectives.metrics import psnr
 from humangs_jax.objectives.perceptual import perceptual_loss
 from humangs_jax.objectives.ssim import multiscale_structural_dissimilarity
 from humangs_jax.training import sharding
-from humangs_jax.training.config import LossConfig, TrainConfig
+from humangs_jax.training.config import LossConfig, TrainConfig, compiled_for
 from humangs_jax.training.disturbances import disturb
 from humangs_jax.training.forward import DrawnTargets, draw_targets, reconstruct_example
 from humangs_jax.training.optimizer import GuardState, learning_rate, make_optimizer
@@ -123,9 +124,15 @@ def _each(compare, predicted, targets):
     return jax.lax.map(jax.checkpoint(lambda pair: compare(*pair)), (predicted, targets))
 
 
-def subject_keys(seed: int, step: Int[Array, ""], count: int) -> Array:
-    """One key per subject of a step."""
-    return jax.random.split(jax.random.fold_in(jax.random.key(seed), step), count)
+@functools.cache
+def seed_numbers(seed: int) -> Shaped[np.ndarray, " n"]:
+    """The key of a run as numbers on the host: an argument of a step's program, so that all seeds share it."""
+    return np.asarray(jax.random.key_data(jax.random.key(seed)))
+
+
+def subject_keys(seed: Shaped[Array, " n"] | Shaped[np.ndarray, " n"], step: Int[Array, ""], count: int) -> Array:
+    """One key per subject of a step. seed: `seed_numbers`."""
+    return jax.random.split(jax.random.fold_in(jax.random.wrap_key_data(jnp.asarray(seed)), step), count)
 
 
 def subject_loss(
@@ -259,25 +266,30 @@ def train_step(
     batch, body and networks lie on it, see `sharding`.
     Raises: ValueError for parameters of fewer than 32 bits.
     """
-    return jitted_train_step()(state, batch, body, networks, config=config, mesh=mesh)
+    seed = seed_numbers(config.seed)
+    return jitted_train_step()(state, batch, body, networks, seed, config=compiled_for(config), mesh=mesh)
 
 
 @functools.cache
 def jitted_train_step() -> Any:
-    """The jitted function behind `train_step`, called as f(state, batch, body, networks, config=, mesh=)."""
+    """The jitted function behind `train_step`, called as f(state, batch, body, networks, seed, config=, mesh=).
+
+    seed: `seed_numbers`; without it that of the configuration is a constant of the program.
+    """
     return jax.jit(
         _train_step, static_argnames=("config", "mesh"), donate_argnames="state", compiler_options=compiler_options()
     )
 
 
-def _train_step(state, batch, body, networks, config, mesh):
+def _train_step(state, batch, body, networks, seed=None, *, config, mesh):
     for name, leaf in inexact_leaves(state.params):
         if jnp.finfo(leaf.dtype).bits < 32:
             raise ValueError(
                 f"train_step: params.{name}: expected float32, got {leaf.dtype}: small updates would be rounded away; to "
                 'compute in bfloat16, keep the parameters and set model.execution.dtype to "bfloat16"'
             )
-    keys = subject_keys(config.seed, state.step, batch.inputs.betas.shape[0])
+    seed = seed_numbers(config.seed) if seed is None else seed
+    keys = subject_keys(seed, state.step, batch.inputs.betas.shape[0])
     loss, gradients, batch_stats, metrics = batch_gradients(
         state.params, state.batch_stats, body, batch, keys, config, networks, mesh
     )

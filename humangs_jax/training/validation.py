@@ -19,7 +19,7 @@ from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import lpips
 from humangs_jax.objectives.metrics import fog, masked_psnr, psnr
 from humangs_jax.objectives.ssim import similarity_map
-from humangs_jax.training.config import TrainConfig
+from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.forward import predict
 from humangs_jax.training.sources import MakeSource
 
@@ -39,7 +39,9 @@ def validation_examples(make_source: MakeSource, config: TrainConfig, count: int
         scattered_share=0.0,
         mixed_pose_share=0.0,
     )
-    source = make_source(dataclasses.replace(config, views=views, target_size=config.model.conventions.image_size))
+    without = dataclasses.replace(config.loss, depth=0.0)  # no loss is computed, so no depths are needed
+    size = config.model.conventions.image_size
+    source = make_source(dataclasses.replace(config, views=views, loss=without, target_size=size))
     own = range(jax.process_index(), min(count, len(source)), jax.process_count())
     return [jax.tree.map(jnp.asarray, source.example(0, i, views.input_counts[0])) for i in own]
 
@@ -78,7 +80,8 @@ def validate(
 ) -> tuple[dict[str, float], list[np.ndarray]]:
     """Means over the examples of all processes, and the images of this process's. All arguments are local arrays."""
     # buffers of another size than in training: as many pairs as the larger images may need
-    config = dataclasses.replace(config, splat=dataclasses.replace(config.splat, max_pairs=None, max_rows=None))
+    unlimited = dataclasses.replace(config.splat, max_pairs=None, max_rows=None)
+    config = dataclasses.replace(compiled_for(config), splat=unlimited)
     images, rows = [], []
     for example in examples:
         shown, metrics = evaluate(variables, body, example, config, networks)

@@ -79,9 +79,9 @@ def test_the_spread_of_a_ray_is_the_sum_over_pairs():
 
 
 def test_surfaces_are_compared_where_both_are_the_persons():
-    depth, alpha, target, mask = jnp.asarray([[2.05, 2.05, 2.05, 5.0], [1, 0, 0.5, 1], [2, 2, 2, 2], [1, 1, 0, 1]])
-    distance = surface_distance(depth, alpha, target, mask)
-    np.testing.assert_allclose(distance, [0.05, 0, 0, FAR_SURFACE], atol=FLOAT32)
+    rows = [[2.05, 2.05, 2.05, 5.0, 2.05], [1, 0, 0.5, 1, 1], [2, 2, 2, 2, 0], [1, 1, 0, 1, 1]]
+    distance = surface_distance(*jnp.asarray(rows))
+    np.testing.assert_allclose(distance, [0.05, 0, 0, FAR_SURFACE, 0], atol=FLOAT32)  # a depth of 0 is unknown
 
 
 def test_translucency_vanishes_for_opacities_of_0_and_1():

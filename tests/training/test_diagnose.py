@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rounding import bound
+from target_cases import DRIVEN, PIXELS, SIZE, mapped_tube, small, views
 from training_cases import without_upsampler
 
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader
+from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, Loader
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import PRESETS
 from humangs_jax.network.reader import PixelAlignedReader
@@ -170,6 +171,22 @@ def test_every_parameter_of_every_preset_has_a_stage():
         variables = jax.eval_shape(lambda preset=preset: init_humangs(jax.random.key(0), preset()))
         names = {diagnose.parameter_stage(name) for name, _ in inexact_leaves(variables["params"])}
         assert {"tokens", "block 0", "final norm", "raw heads"} <= names
+
+
+@pytest.mark.parametrize(
+    "name", ["lca", *(pytest.param(name, marks=pytest.mark.slow) for name in (*PIXELS, *DRIVEN) if name != "lca")]
+)
+def test_networks_that_run_again_for_every_target_are_diagnosed(name):
+    """Traced only: every parameter's gradient belongs to a stage."""
+    config = dataclasses.replace(CONFIG, model=small(name), target_size=SIZE)
+    shapes = jax.eval_shape(lambda: init_state(config))
+    example = Example(views(), views(seed=1))
+    traced = functools.partial(inspect.unwrap(diagnose.observe_subject), config=config, networks=LossNetworks())
+    observed = jax.eval_shape(
+        traced, shapes.params, shapes.batch_stats, mapped_tube(small(name)), example, jax.random.key(0)
+    )[1]
+    found = {parameter for stage in observed for parameter in stage.gradients}
+    assert found == {parameter for parameter, _ in inexact_leaves(shapes.params)}
 
 
 @jax.custom_vjp

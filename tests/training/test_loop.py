@@ -6,15 +6,19 @@ import logging
 import signal
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from humangs_jax.core.pytree import replace
 from humangs_jax.network.weights import load_weights
-from humangs_jax.training import loop
+from humangs_jax.training import loop, step
 from humangs_jax.training.checkpoint import Checkpoints
 from humangs_jax.training.config import Stage, tiny
 from humangs_jax.training.loop import train
-from humangs_jax.training.sources import captured_people
+from humangs_jax.training.sources import captured_people, stage_loader
+from humangs_jax.training.state import init_state
+from humangs_jax.training.step import train_step
 
 CONFIG = tiny()
 
@@ -82,19 +86,79 @@ def test_what_a_run_leaves_behind(whole):
 @pytest.mark.slow
 def test_a_signal_saves_and_ends_the_run(body, captures, variables, tmp_path, monkeypatch, caplog):
     def interrupted(*arguments):
-        result = step(*arguments)
+        result = train_step(*arguments)
         signal.raise_signal(signal.SIGTERM)
         return result
 
-    step, handler = loop.train_step, signal.getsignal(signal.SIGTERM)
+    handler = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(loop, "train_step", interrupted)
-    with caplog.at_level(logging.WARNING):
-        state = train(CONFIG, body, captures[:2], tmp_path, variables=variables, progress=False)
-    assert int(state.step) == 1 and "stopping after this step" in caplog.text
+    with (
+        caplog.at_level(logging.WARNING),
+        pytest.raises(loop.TrainingInterrupted, match="after 1 of 60 steps") as stopped,
+    ):
+        train(CONFIG, body, captures[:2], tmp_path, variables=variables, progress=False)
+    assert int(stopped.value.state.step) == 1 and "stopping after this step" in caplog.text
+    assert isinstance(stopped.value, KeyboardInterrupt)  # a loop of runs ends
     assert signal.getsignal(signal.SIGTERM) is handler
     checkpoints = Checkpoints(tmp_path / "checkpoints")
     assert checkpoints.steps == [1]
     checkpoints.close()
+
+
+def quick(step=None):
+    """A step that computes nothing, and then does something else."""
+
+    def made(state, batch, body, config, networks, mesh):
+        if step is not None:
+            step(int(state.step) + 1)
+        names = ("loss", "psnr", "grad_norm", "skipped", "nonfinite")
+        return replace(state, step=state.step + 1), dict.fromkeys(names, jnp.ones(()) * 0)
+
+    return made
+
+
+@pytest.mark.parametrize(("at", "number"), [(1, signal.SIGINT), (2, signal.SIGTERM), (3, signal.SIGINT)])
+def test_a_signal_ends_a_loop_of_runs_when_all_is_saved(at, number, body, captures, variables, tmp_path, monkeypatch):
+    """Also one that comes in the last step, which is then done."""
+    monkeypatch.setattr(loop, "train_step", quick(lambda done: done == at and signal.raise_signal(number)))
+    options = {"variables": variables, "progress": False}
+    begun = []
+    with pytest.raises(KeyboardInterrupt):
+        for name in ("a", "b"):
+            begun.append(name)
+            train(dataclasses.replace(CONFIG, steps=3), body, captures[:2], tmp_path / name, **options)
+    assert begun == ["a"]
+    checkpoints = Checkpoints(tmp_path / "a" / "checkpoints")
+    assert checkpoints.steps[-1] == at and (tmp_path / "a" / "weights.safetensors").is_file()
+    checkpoints.close()
+
+
+def test_what_was_dropped_is_explained(body, captures, variables, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(loop, "train_step", quick())
+    numbers = {"psnr": 20.0, "dropped_tokens": 1.0, "overflow": 0.0}
+    monkeypatch.setattr(loop, "validate", lambda *_: (numbers, [np.zeros((2, 32, 32, 3))]))
+    options = {"variables": variables, "validation": captures[2:], "stop_at": 2}
+    train(CONFIG, body, captures[:2], tmp_path, **options)
+    assert f"dropped_tokens 1 ({loop.DROPPED['dropped_tokens']}), overflow 0" in " ".join(
+        "".join(capsys.readouterr()).split()
+    )
+
+
+def test_runs_of_other_seeds_share_a_program(body, captures, variables, monkeypatch):
+    batch = stage_loader(captured_people(captures, body), CONFIG, 0).batch_at(0)
+    asked = []
+    monkeypatch.setattr(
+        step,
+        "jitted_train_step",
+        lambda: lambda *arrays, **static: asked.append((arrays[-1], static)) or (arrays[0], {}),
+    )
+    for config in (CONFIG, dataclasses.replace(CONFIG, seed=7, log_every=9, keep_checkpoints=5)):
+        train_step(init_state(config, variables), batch, body, config)
+    assert asked[0][1] == asked[1][1] and hash(asked[0][1]["config"]) == hash(asked[1][1]["config"])
+    assert (asked[0][0] != asked[1][0]).any()
+    of = lambda seed: step.subject_keys(jnp.asarray(step.seed_numbers(seed)), jnp.asarray(3), 2)
+    expected = jax.random.split(jax.random.fold_in(jax.random.key(7), 3), 2)
+    assert (jax.random.key_data(of(7)) == jax.random.key_data(expected)).all()
 
 
 @pytest.mark.slow

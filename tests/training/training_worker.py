@@ -4,6 +4,7 @@ python training_worker.py OUT CAPTURES --stop-at 4 [--devices 4] [--coordinator 
 """
 
 import argparse
+import contextlib
 import dataclasses
 import logging
 from pathlib import Path
@@ -59,21 +60,22 @@ def main():
     from training_cases import tube
 
     from humangs_jax.data.loader import find_captures
-    from humangs_jax.training.loop import train
+    from humangs_jax.training.loop import TrainingInterrupted, train
 
     logging.basicConfig(level=logging.WARNING)
     folders = find_captures(arguments.captures)
     print("ready", flush=True)
-    train(
-        configuration(arguments.checkpoint_every, arguments.batch, arguments.at_once),
-        tube(),
-        folders[:2],
-        arguments.out,
-        validation=() if arguments.no_validation else folders[2:],
-        fsdp=arguments.fsdp,
-        stop_at=arguments.stop_at,
-        progress=False,
-    )
+    with contextlib.suppress(TrainingInterrupted):
+        train(
+            configuration(arguments.checkpoint_every, arguments.batch, arguments.at_once),
+            tube(),
+            folders[:2],
+            arguments.out,
+            validation=() if arguments.no_validation else folders[2:],
+            fsdp=arguments.fsdp,
+            stop_at=arguments.stop_at,
+            progress=False,
+        )
     print("done", flush=True)
 
 

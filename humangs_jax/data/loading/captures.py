@@ -259,13 +259,15 @@ class CaptureCache(PeopleCache):
 class CaptureSource:
     """People on disk as a `Source`. Example e shows subject e mod n of a permutation drawn for each pass over the n people.
 
-    input_size, target_size: pixels a side of the square views. A broken person is replaced by the next one in the order.
+    input_size, target_size: pixels a side of the square views. depths: examples have depths, all unknown, to be mixed with others
+    that are known. A broken person is replaced by the next one in the order.
     """
 
     cache: PeopleCache
     sampling: ViewSampling
     input_size: int
     target_size: int
+    depths: bool = False
 
     @property
     def input_counts(self) -> tuple[int, ...]:
@@ -311,6 +313,8 @@ class CaptureSource:
                 self.cache.note(subject_index, str(error))
                 continue
             shown, asked = range(len(inputs)), range(len(inputs), len(inputs) + len(targets))
-            example = Example(subject_views(seen, shown, self.input_size), subject_views(seen, asked, self.target_size))
-            return self.cache.name(subject_index), example
+            views = lambda indices, size: subject_views(seen, indices, size, self.depths)  # noqa: B023 (called at once)
+            return self.cache.name(subject_index), Example(
+                views(shown, self.input_size), views(asked, self.target_size)
+            )
         raise ValueError(f"none of the {len(self.cache)} capture folders can be used")

@@ -153,8 +153,11 @@ def shrink(images: UInt8[np.ndarray, "v h w *c"], size: int) -> Float[np.ndarray
     return found / np.float32(255)
 
 
-def subject_views(subject: StoredSubject, indices: Sequence[int], size: int) -> SubjectViews:
-    """Some views of a stored subject at size x size pixels, numpy leaves. Raises: ValueError, see `shrink`."""
+def subject_views(subject: StoredSubject, indices: Sequence[int], size: int, depths: bool = False) -> SubjectViews:
+    """Some views of a stored subject at size x size pixels, numpy leaves. depths: whether they have any, all unknown.
+
+    Raises: ValueError, see `shrink`.
+    """
     chosen = np.asarray(indices)
     height, width = subject.images.shape[1:3]
     scale = np.asarray([size / width, size / height, 1.0], np.float32)
@@ -173,6 +176,7 @@ def subject_views(subject: StoredSubject, indices: Sequence[int], size: int) -> 
         rotations=subject.rotations[frames],
         translations=subject.translations[frames],
         betas=subject.betas,
+        depths=np.zeros((len(chosen), size, size), np.float32) if depths else None,
     )
 
 
