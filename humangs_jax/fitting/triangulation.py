@@ -17,6 +17,8 @@ RIDGE = 1e-6
 """Share of the weights that pulls towards the cameras: parallel rays leave the distance open."""
 REWEIGHTED = 3
 """Rounds of weighting the rays by the distance of the last point."""
+PAIRS_AT_ONCE = 8
+"""Pairs of views whose proposals are compared with all views at once: memory does not grow with the number of pairs."""
 MARGIN = 6.0
 """A view agrees with a point within this many standard deviations of the noise."""
 
@@ -55,13 +57,19 @@ def triangulate_robustly(
     pairs = np.stack(np.triu_indices(views, 1), axis=1)
     chosen = np.zeros((len(pairs), views, 1), np.float32)
     chosen[np.arange(len(pairs))[:, None], pairs] = 1
-    propose = lambda pair: triangulate(observations, observations.confidences * pair)[0]
-    proposals = jax.vmap(propose)(jnp.asarray(chosen))
-    errors = jax.vmap(lambda points: reprojection_errors(observations, points))(proposals)
-    limit = MARGIN * observations.noise
-    agreement = observations.confidences * jnp.maximum(1 - jnp.square(errors / limit), 0.0)
-    best = jnp.argmax(jnp.sum(agreement, axis=1), axis=0)
-    weights = jax.vmap(lambda a, i: a[i], in_axes=(-1, 0), out_axes=-1)(agreement, best)
+
+    def agreement(points):
+        errors = reprojection_errors(observations, points)
+        return observations.confidences * jnp.maximum(1 - jnp.square(errors / (MARGIN * observations.noise)), 0.0)
+
+    def propose(pair):
+        points = triangulate(observations, observations.confidences * pair)[0]
+        return points, jnp.sum(agreement(points), axis=0)
+
+    # of all pairs only their points are kept: with 48 views there are 1128 pairs, each with an agreement of every view
+    proposals, agreed = jax.lax.map(propose, jnp.asarray(chosen), batch_size=PAIRS_AT_ONCE)
+    best = jnp.argmax(agreed, axis=0)
+    weights = agreement(jnp.take_along_axis(proposals, best[None, :, None], axis=0)[0])
     agreeing = jnp.sum(weights > 0, axis=0)
     weights = jnp.where(agreeing >= 2, weights, 0.0)
     points, count = triangulate(observations, weights)

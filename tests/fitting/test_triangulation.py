@@ -5,6 +5,7 @@ import pytest
 from fit_people import model_of, observe
 
 from humangs_jax.core.pytree import replace
+from humangs_jax.fitting import triangulation
 from humangs_jax.fitting.triangulation import reprojection_errors, triangulate, triangulate_robustly
 
 EXACT = 2e-4  # metres: float32 pixels of 512 at 3 metres
@@ -75,3 +76,16 @@ def test_a_point_behind_a_camera_is_no_match():
     behind = -rotation.T @ translation - 3 * rotation[2]
     errors = reprojection_errors(one, jnp.asarray(np.broadcast_to(behind, (133, 3)), jnp.float32))
     assert (np.asarray(errors)[0] > 1e5).all()
+
+
+@pytest.mark.slow
+def test_pairs_of_views_are_compared_a_few_at_a_time_with_the_same_result(monkeypatch):
+    _, seen = scene(views=12)
+    found, bytes_ = {}, {}
+    for pairs in (4, 66):  # all 66: at once
+        monkeypatch.setattr(triangulation, "PAIRS_AT_ONCE", pairs)
+        program = jax.jit(jax.vmap(lambda seen: triangulate_robustly(seen))).lower(seen).compile()
+        found[pairs], bytes_[pairs] = program(seen), program.memory_analysis().temp_size_in_bytes
+    assert bytes_[4] < bytes_[66] / 4
+    np.testing.assert_array_equal(found[4][1], found[66][1])
+    np.testing.assert_allclose(found[4][0][:, KNOWN], found[66][0][:, KNOWN], atol=EXACT)
