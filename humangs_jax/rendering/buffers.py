@@ -7,6 +7,7 @@ calls raise `BufferOverflowError`.
 
 import dataclasses
 import functools
+import logging
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,8 @@ from humangs_jax.rendering.projection import drawn_camera, project_gaussians
 from humangs_jax.rendering.sharing import device_count
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig, splat_config
 from humangs_jax.rendering.tiling import TileGrid
+
+logger = logging.getLogger(__name__)
 
 PAIRS_PER_GAUSSIAN, PAIRS_PER_TILE = 12, 16
 """Default capacity of traced calls. A person of 50,000 Gaussians needs 6 tiles per Gaussian at 512 x 512 and 15 at 1024
@@ -73,6 +76,9 @@ def plan_buffers(
 
     Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. Measures concrete arrays:
     call it outside of transformations. mesh: the one that `render` will be given, if any.
+
+    No margin is enough for Gaussians that are optimised for long: they grow. `Rendering.overflow` above 0 tells, and
+    `SplatConfig.warn_overflow` logs it. Then plan again from the Gaussians as they are; the program compiles again.
     """
     config = splat_config(config)
     rows, pairs = (round_up(int(most * margin)) for most in _needed(gaussians, cameras, config, mesh))
@@ -88,6 +94,24 @@ def raise_on_overflow(
         raise BufferOverflowError(
             f"{missing} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs} "
             f"and max_rows >= {rows}, got max_pairs = {config.max_pairs}, max_rows = {config.max_rows}"
+        )
+
+
+def warn_of_overflow(overflow: Int[Array, "*v"], config: SplatConfig) -> None:
+    """Log a warning when a traced program runs and a view has overflowed, if the configuration asks for it."""
+    if config.warn_overflow:  # else nothing is added to the program
+        warn = functools.partial(_warn, max_pairs=config.max_pairs, max_rows=config.max_rows)
+        jax.debug.callback(warn, jnp.max(overflow, initial=0))
+
+
+def _warn(missing, max_pairs, max_rows):
+    if missing > 0:
+        logger.warning(
+            "%d (splat, tile) pairs of a view did not fit and were not drawn: max_pairs = %s, max_rows = %s. Larger buffers: "
+            "plan_buffers with the Gaussians as they are now",
+            missing,
+            max_pairs,
+            max_rows,
         )
 
 

@@ -20,7 +20,7 @@ from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import named_color
 from humangs_jax.rendering import binning
-from humangs_jax.rendering.buffers import with_default_buffers
+from humangs_jax.rendering.buffers import warn_of_overflow, with_default_buffers
 from humangs_jax.rendering.compositing import composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import ProjectedGaussians, drawn_camera, project_gaussians
@@ -89,7 +89,9 @@ def draw_projected(
     """
     gaussians, camera, background = with_background(gaussians, camera, background)
     config = with_default_buffers(gaussians, camera, config)
-    return _draw(projected, gaussians, camera, background, config, None)
+    rendering = _draw(projected, gaussians, camera, background, config, None)
+    warn_of_overflow(rendering.overflow, config)
+    return rendering
 
 
 def draw(

@@ -39,6 +39,7 @@ class SplatConfig:
         `buffers.default_pairs(g, width, height)`; what does not fit is counted in `Rendering.overflow`, and
         `buffers.plan_buffers` measures a capacity for such calls. `max_rows` None: as many as pairs, always enough in
         practice; smaller is a little faster.
+        warn_overflow: traced calls log a warning whenever something did not fit. It adds a callback to the program.
 
     Schedule: changes the time, not the image (but for rounding).
         tile_size: pixels. block: tiles that are composited together. chunk, chunk_backward: splats of a list taken at
@@ -82,6 +83,7 @@ class SplatConfig:
         measured=MEASURED,
     )
     max_rows: Slots | None = knob(None, cost="as max_pairs", gain="a little time", measured=MEASURED)
+    warn_overflow: bool = False
     tile_size: Annotated[int, Range(1, 4096)] = knob(
         8, cost="none", gain="8 is best on CPUs: 4 takes 2.3 x, 16 takes 1.3 x the time", measured=MEASURED
     )

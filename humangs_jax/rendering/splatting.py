@@ -21,7 +21,13 @@ from humangs_jax.core.checks import FINITE, check_values
 from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.geometry.camera import Camera, camera_values
 from humangs_jax.rendering import constants
-from humangs_jax.rendering.buffers import BufferOverflowError, plan_buffers, raise_on_overflow, with_default_buffers
+from humangs_jax.rendering.buffers import (
+    BufferOverflowError,
+    plan_buffers,
+    raise_on_overflow,
+    warn_of_overflow,
+    with_default_buffers,
+)
 from humangs_jax.rendering.drawing import Background, Rendering, draw, draw_views, with_background
 from humangs_jax.rendering.gaussians import Gaussians, gaussian_values
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig, splat_config
@@ -40,7 +46,8 @@ def render(
     """Draws Gaussians as one camera sees them.
 
         rendering = render(gaussians, camera)             # eager: inputs are checked, buffers sized to the scene
-        config = plan_buffers(gaussians, cameras)         # for calls inside jit, vmap and grad: sized once
+        config = SplatConfig(warn_overflow=True)          # for calls inside jit, vmap and grad: buffers are sized once,
+        config = plan_buffers(gaussians, cameras, config) # and a warning is logged should they ever be too small
         loss = lambda gaussians: jnp.mean((render(gaussians, camera, config).rgb - photo) ** 2)
         gradient = jax.jit(jax.grad(loss), compiler_options=compiler_options())(gaussians)
 
@@ -53,7 +60,8 @@ def render(
     Raises: TypeError for arguments of other classes; ValueError for a batch of cameras or of sets, for shapes that do not fit
     each other, a background that is no colour, values that are not finite, opacities outside of [0, 1] and negative scales or
     focal lengths; BufferOverflowError if `config.max_pairs` or `max_rows` is too small. Inside a transformation values are not
-    checked, and missing pairs are counted in `Rendering.overflow`: loops that draw often jit `render`, which saves both checks.
+    checked. Pairs that do not fit are not drawn there, and are counted in `Rendering.overflow`; `SplatConfig.warn_overflow` logs
+    them. Loops that draw often jit `render`, which saves both checks.
 
     After Kerbl et al. 2023 (https://arxiv.org/abs/2308.04079), with gsplat's conventions (see `constants`).
     """
@@ -114,7 +122,10 @@ def _render(
     config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gaussians, cameras, background))):
-        return draw(gaussians, cameras, background, with_default_buffers(gaussians, cameras, config), mesh, *more)
+        config = with_default_buffers(gaussians, cameras, config)
+        rendering = draw(gaussians, cameras, background, config, mesh, *more)
+        warn_of_overflow(rendering.overflow, config)
+        return rendering
     check_values("render", gaussian_values(gaussians) | camera_values(cameras) | {"background": (background, FINITE)})
     if config.max_pairs is None:
         config = plan_buffers(gaussians, cameras, config, margin=1.0, mesh=mesh)

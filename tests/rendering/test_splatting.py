@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import logging
 
 import jax
 import jax.export
@@ -235,6 +236,25 @@ def test_overflow_is_counted_under_jit_and_refused_eagerly():
     assert jax.jit(render, static_argnums=2)(gaussians, view, config).overflow == 20
     with pytest.raises(ValueError, match=rf"20 .*max_pairs >= {pairs} .*got max_pairs = {pairs - 20}"):
         render(gaussians, view, config)
+
+
+@pytest.mark.parametrize("draw", [render, pytest.param(render_views, marks=pytest.mark.slow)])
+def test_traced_calls_warn_of_what_did_not_fit_where_asked(draw, caplog):
+    gaussians, cameras = random_gaussians(0, np.float32), camera(np.float32) if draw is render else views()
+    small = dataclasses.replace(CHUNKS, max_pairs=64)
+    asking = dataclasses.replace(small, warn_overflow=True)
+    loss = lambda opacities, config: draw(replace(gaussians, opacities=opacities), cameras, config).rgb.sum()
+    program = lambda config: str(jax.make_jaxpr(jax.grad(loss), static_argnums=1)(gaussians.opacities, config))
+    assert "callback" not in program(small) and "debug_callback" in program(asking)
+    drawn = jax.jit(loss, static_argnums=1)
+    with caplog.at_level(logging.WARNING):
+        jax.block_until_ready(drawn(0 * gaussians.opacities, asking))  # nothing to draw: all fits
+        jax.effects_barrier()
+        assert not caplog.records
+        jax.block_until_ready(drawn(gaussians.opacities, asking))
+        jax.effects_barrier()
+    (record,) = caplog.records
+    assert "pairs of a view did not fit and were not drawn: max_pairs = 64" in record.message
 
 
 def test_fitted_buffers_hold_every_view():
