@@ -95,6 +95,7 @@ def levenberg_marquardt(avatar, capture, seconds):
     import jax.numpy as jnp
 
     from humangs_jax.avatar.low_pass import with_low_pass_of
+    from humangs_jax.refinement import operations
     from humangs_jax.refinement import refine as refinement
     from humangs_jax.refinement.config import RefineConfig
     from humangs_jax.refinement.crops import crop_to_person
@@ -102,8 +103,8 @@ def levenberg_marquardt(avatar, capture, seconds):
 
     views, config = crop_to_person(capture), RefineConfig()
     avatar = with_low_pass_of(avatar, views)
-    photos, splat = photos_of(views, jnp.ones(views.masks.shape, bool)), refinement._planned(avatar, views)
-    state = refinement._compiled(refinement.start)(avatar, photos, config, splat)
+    photos, splat = photos_of(views, jnp.ones(views.masks.shape, bool)), operations.planned(avatar, views)
+    state = operations.compiled(refinement.start)(avatar, photos, config, splat)
     step = compiled_step()
     damping, began = jnp.float32(DAMPING), None
     parameters = state.parameters

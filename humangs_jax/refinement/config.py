@@ -50,8 +50,9 @@ class RefineConfig:
 
     rounds: of the learned update (see `learned.py`), before the first step. 0: none.
 
-    steps, seconds: limits of the run; it ends at the first that is reached, but not before the rounds are done. None: no limit.
-    Compilation does not count. 0 steps: only rounds.
+    steps, seconds: limits of the run; the smaller number of steps counts. None: no limit. Compilation does not count. 0 steps:
+    rounds alone, which are always finished. seconds become a number of steps before the first step, by the time that a few take;
+    that number, `Refinement.planned`, repeats the run exactly.
     image_size: photos whose longer side is larger are reduced to it, pixels; None: photos as they are. views_per_step: photos
     drawn in a step.
 
@@ -65,9 +66,10 @@ class RefineConfig:
 
     growth: the number of Gaussians may grow by this factor: at `SPLITS` of the run those with the largest errors are split.
 
-    held_out: share of the pixels, in square blocks, that no step sees; with `HELD_OUT_PHOTOS` photos or more, one whole photo
-    instead; 0: nothing. The state with the highest PSNR on these pixels is returned. Rounds alone hold them out, too, so that
-    a later run can go on from the result. checks: how often this PSNR is measured.
+    held_out: with fewer photos than `HELD_OUT_PHOTOS` the share of the pixels, in square blocks, that no round and no step sees:
+    the state with the highest PSNR on them is returned. With as many or more, any share above 0 holds one whole photo out of a
+    trial, a third of the steps, which decides by its PSNR whether the rounds and how many of the steps are kept; then all photos
+    are fitted. 0: nothing is held out, and the last state is returned. checks: how often the PSNR is measured.
     seed: of the order of the photos and of the blocks.
     """
 

@@ -9,10 +9,11 @@ from humangs_jax.avatar.avatar import Avatar
 class Refinement:
     """What `refine_with_report` returns.
 
-    avatar: the best state of the run. rounds, steps: how many of the learned update (0 if they were not kept) and of Adam.
-    seconds: of the run, without compilation (compile_seconds). loss: before and after, over all photos. psnr: before and after,
-    dB over the crops. kept: whether the loss has fallen; if not, the avatar is unchanged. interrupted: whether Ctrl-C ended the
-    run.
+    avatar: the best state of the run. rounds, steps: how many of the learned update (0 if they were not kept) and of Adam, with
+    those of the trial. seconds: of the run, without compilation (compile_seconds). loss: before and after, over the photos that
+    were fitted. psnr: likewise, dB over the crops. kept: whether the avatar has become better; if not, it is unchanged.
+    interrupted: whether Ctrl-C ended the run. planned: `RefineConfig(steps=planned, seconds=None)` repeats the run exactly; None:
+    it was cut short. left_out: photos that contradict the others, and were not fitted.
     """
 
     avatar: Avatar
@@ -24,11 +25,16 @@ class Refinement:
     psnr: tuple[float, float]
     kept: bool
     interrupted: bool = False
+    planned: int | None = None
+    left_out: tuple[int, ...] = ()
 
     def summary(self) -> str:
         """One line."""
         gain = f"{self.psnr[0]:.1f} -> {self.psnr[1]:.1f} dB on the photos"
-        verdict = gain if self.kept else "no improvement on the photos: the avatar is unchanged"
+        verdict = gain if self.kept else "no improvement: the avatar is unchanged"
+        if self.left_out:
+            verdict += f"; without photo {', '.join(map(str, self.left_out))} (from 0), which contradicts the others"
         ended = ", interrupted" if self.interrupted else ""
         took = f"{self.rounds} rounds and {self.steps} steps in {self.seconds:.1f} s (compiled in {self.compile_seconds:.1f} s)"
-        return f"refined by {took}{ended}: {verdict}"
+        again = f" (the same again: {self.planned}steps)" if self.planned else ""
+        return f"refined by {took}{ended}: {verdict}{again}"

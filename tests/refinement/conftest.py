@@ -2,11 +2,14 @@
 
 import pytest
 
-from humangs_jax.refinement import refine
+from humangs_jax.refinement import operations, refine
 from humangs_jax.rendering.splat_config import SplatConfig
 
 
 @pytest.fixture(autouse=True)
 def same_buffers(request, monkeypatch):
     if request.node.get_closest_marker("slow") is None:
-        monkeypatch.setattr(refine, "_planned", lambda avatar, photos: SplatConfig(max_pairs=1 << 14, max_rows=1 << 13))
+        for module in (operations, refine):
+            monkeypatch.setattr(
+                module, "planned", lambda avatar, photos: SplatConfig(max_pairs=1 << 14, max_rows=1 << 13)
+            )

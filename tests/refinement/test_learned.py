@@ -29,8 +29,9 @@ from humangs_jax.refinement.learned import (
     stacked,
     unstacked,
 )
-from humangs_jax.refinement.objective import photos_of, posed_gaussians
+from humangs_jax.refinement.objective import comparison_of, photos_of, posed_gaussians
 from humangs_jax.refinement.parameters import parameters_of
+from humangs_jax.refinement.run import Run
 from humangs_jax.rendering.splatting import plan_buffers, render
 
 DIFFERENCE, DIFFERENCES = 1e-3, 2e-2  # of a colour; float32 sums over some thousand pixels
@@ -164,7 +165,7 @@ def test_gradients_are_those_of_the_squared_error(scene):
 def test_a_run_sees_the_signals_of_training(scene):
     avatar, _, parameters, splat = scene
     body = decimate(load_body(), 400)
-    run = refinement._Run(avatar, crop_to_person(toy_capture(body, toy_avatar(body, 0.15))), STEPS, None, splat)
+    run = Run(avatar, crop_to_person(toy_capture(body, toy_avatar(body, 0.15))), STEPS, None, splat)
     expected = signals_of(scene, jax.tree.map(lambda x: x[1], run.seen))
     for got, wanted in zip(jax.tree.leaves(run.signals(parameters, 1)), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(got, wanted, atol=ROUNDING * np.abs(wanted).max())
@@ -214,7 +215,7 @@ def test_rounds_move_gaussians_and_leave_empty_slots_empty(scene):
     avatar, _, _, splat = scene
     views = crop_to_person(toy_capture(decimate(load_body(), 400), toy_avatar(decimate(load_body(), 400), 0.15)))
     config = dataclasses.replace(STEPS, rounds=2, steps=0, growth=1.5)
-    run = refinement._Run(avatar, views, config, None, splat)
+    run = Run(avatar, views, config, None, splat)
     count = len(avatar.gaussians.means)
     before = refinement.start(run.avatar, run.all, config, splat)
     was, now = stacked(before.parameters), stacked(run.learned(before.parameters, 2))
@@ -231,7 +232,7 @@ def test_rounds_look_at_a_few_evenly_spaced_photos_and_buffers_grow(scene, monke
     capture = toy_capture(decimate(load_body(), 400), toy_avatar(decimate(load_body(), 400), 0.15), views=9)
     config = dataclasses.replace(STEPS, rounds=1, steps=0)
     small = dataclasses.replace(splat, max_pairs=64)
-    run = refinement._Run(avatar, crop_to_person(capture), config, None, small)
+    run = Run(avatar, crop_to_person(capture), config, None, small)
     looked, signals = [], run.signals
     monkeypatch.setattr(run, "signals", lambda parameters, view: looked.append(int(view)) or signals(parameters, view))
     before = refinement.start(run.avatar, run.all, config, splat)
@@ -251,8 +252,8 @@ def test_what_only_the_avatar_after_the_rounds_shows_moves_in_steps(scene, monke
     shown = lambda self, parameters, rounds: replace(
         parameters, opacity_logits=jnp.full_like(parameters.opacity_logits, 4.0)
     )
-    monkeypatch.setattr(refinement._Run, "learned", shown)
-    run = refinement._Run(
+    monkeypatch.setattr(Run, "learned", shown)
+    run = Run(
         hidden,
         crop_to_person(toy_capture(body, toy_avatar(body, 0.15))),
         dataclasses.replace(STEPS, rounds=1),
@@ -260,7 +261,7 @@ def test_what_only_the_avatar_after_the_rounds_shows_moves_in_steps(scene, monke
         scene[3],
     )
     before = refinement.start(run.avatar, run.all, run.compiled_for, run.splat)
-    found = run.compared(run.learned(before.parameters, 1), run.held)
+    found = comparison_of(run.compared(run.learned(before.parameters, 1), run.held), run.held)
     after = run.state(run.learned(before.parameters, 1), found)
     assert before.trust[0] == 0 and after.trust[0] > 0
     jax.tree.map(np.testing.assert_array_equal, after.parameters, after.start)
@@ -271,7 +272,7 @@ def test_interrupted_in_the_rounds_the_start_is_returned(scene, monkeypatch):
         raise KeyboardInterrupt
 
     body = decimate(load_body(), 400)
-    monkeypatch.setattr(refinement._Run, "learned", interrupted)
+    monkeypatch.setattr(Run, "learned", interrupted)
     config = dataclasses.replace(STEPS, rounds=2, steps=0)
     report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
     assert report.interrupted and (report.rounds, report.steps) == (0, 0)
@@ -284,7 +285,7 @@ def test_rounds_that_make_the_photos_worse_are_not_kept(steps, scene, monkeypatc
         return replace(parameters, means=parameters.means + 0.3)
 
     body = decimate(load_body(), 400)
-    monkeypatch.setattr(refinement._Run, "learned", worse)
+    monkeypatch.setattr(Run, "learned", worse)
     config = dataclasses.replace(STEPS, rounds=2, steps=steps, held_out=0.3)
     report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
     assert report.rounds == 0
