@@ -240,6 +240,8 @@ def refinement_parts(settings: Settings) -> list[tuple[RefineConfig, float]]:
     few = min(settings.refine_steps, STEPS)
     rounds = dataclasses.replace(settings, refine_steps=0).refinement
     steps = dataclasses.replace(settings, refine_rounds=0, refine_steps=few).refinement
+    if steps is not None:
+        steps = dataclasses.replace(steps, held_out=0.0)  # a trial may find that no more steps are worth it
     return [(c, times) for c, times in ((rounds, 1.0), (steps, settings.refine_steps / max(few, 1))) if c is not None]
 
 

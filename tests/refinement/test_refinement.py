@@ -301,7 +301,7 @@ def clock(monkeypatch):
     return clock
 
 
-@pytest.mark.parametrize("views", [3, 4])
+@pytest.mark.parametrize("views", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_run_by_the_clock_is_repeated_by_its_steps(views, body, clock):
     avatar, capture = toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), views=views)
     config = dataclasses.replace(STEPS, rounds=1, steps=None, seconds=2.0, held_out=0.05)
@@ -377,6 +377,7 @@ def test_the_best_explained_photo_is_held_out_of_the_trial_and_then_fitted(four,
     assert set(fit) == {0, 1, 2, 3}
 
 
+@pytest.mark.slow
 def test_a_trial_that_loses_leaves_the_avatar_alone(four, monkeypatch):
     """Steps and rounds that fit the photos they see and spoil the one that they do not."""
     avatar, capture = four
@@ -387,6 +388,7 @@ def test_a_trial_that_loses_leaves_the_avatar_alone(four, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, report.avatar, avatar)
 
 
+@pytest.mark.slow
 def test_a_photo_that_contradicts_the_others_is_left_out_and_named(four, monkeypatch):
     avatar, capture = four
     images = np.array(capture.images)
