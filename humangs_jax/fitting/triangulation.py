@@ -17,7 +17,7 @@ RIDGE = 1e-6
 """Share of the weights that pulls towards the cameras: parallel rays leave the distance open."""
 REWEIGHTED = 3
 """Rounds of weighting the rays by the distance of the last point."""
-PAIRS_AT_ONCE = 8
+PAIRS_AT_ONCE = 16
 """Pairs of views whose proposals are compared with all views at once: memory does not grow with the number of pairs."""
 MARGIN = 6.0
 """A view agrees with a point within this many standard deviations of the noise."""

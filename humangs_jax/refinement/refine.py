@@ -18,6 +18,7 @@ from humangs_jax.avatar.low_pass import with_low_pass, with_low_pass_of, without
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.crops import crop_to_person
@@ -91,10 +92,11 @@ def refine_with_report(
     if seconds is not None or steps is not None:
         config = dataclasses.replace(config, seconds=seconds, steps=steps)
     _check(avatar, capture, config, mesh)
+    capture = usable_views(capture)
     views = crop_to_person(capture, config.image_size)
     start = with_low_pass_of(avatar, views)
     fresh = with_low_pass(without_low_pass(avatar), cast(Array, start.gaussians.low_pass))
-    report = Run(start, views, config, mesh, planned(start, views), fresh).go(progress, watch)
+    report = Run(start, views, config, mesh, planned(start, views), fresh).go(progress, watch, capture.names)
     return report if report.kept else dataclasses.replace(report, avatar=avatar)
 
 

@@ -13,7 +13,7 @@ class Refinement:
     those of the trial. seconds: of the run, without compilation (compile_seconds). loss: before and after, over the photos that
     were fitted. psnr: likewise, dB over the crops. kept: whether the avatar has become better; if not, it is unchanged.
     interrupted: whether Ctrl-C ended the run. planned: `RefineConfig(steps=planned, seconds=None)` repeats the run exactly; None:
-    it was cut short. left_out: photos that contradict the others, and were not fitted.
+    it was cut short. left_out: names of photos that contradict the others, and were not fitted.
     """
 
     avatar: Avatar
@@ -26,14 +26,14 @@ class Refinement:
     kept: bool
     interrupted: bool = False
     planned: int | None = None
-    left_out: tuple[int, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def summary(self) -> str:
         """One line."""
         gain = f"{self.psnr[0]:.1f} -> {self.psnr[1]:.1f} dB on the photos"
         verdict = gain if self.kept else "no improvement: the avatar is unchanged"
         if self.left_out:
-            verdict += f"; without photo {', '.join(map(str, self.left_out))} (from 0), which contradicts the others"
+            verdict += f"; without {', '.join(self.left_out)}, which contradicts the others"
         ended = ", interrupted" if self.interrupted else ""
         took = f"{self.rounds} rounds and {self.steps} steps in {self.seconds:.1f} s (compiled in {self.compile_seconds:.1f} s)"
         again = f" (the same again: {self.planned}steps)" if self.planned else ""

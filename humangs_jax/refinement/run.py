@@ -8,7 +8,7 @@ With fewer photos, blocks of pixels are held out instead, and one run is made.
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import jax
@@ -55,7 +55,10 @@ class Trial(NamedTuple):
 class Run(Operations):
     """One call of `refine`. best: what it would return now."""
 
-    def go(self, progress: bool, watch: Callable[[Avatar], None] | None) -> Refinement:
+    def go(
+        self, progress: bool, watch: Callable[[Avatar], None] | None, names: Sequence[str] | None = None
+    ) -> Refinement:
+        """Make the run. names: of the photos; None: numbers."""
         self.began, self.watch, self.done, self.late = time.perf_counter(), watch, 0, False
         self.bar = progress_bar(
             total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}"
@@ -79,7 +82,7 @@ class Run(Operations):
         self.bar.close()
         seconds = self.elapsed()
         state, self.avatar, rounds = self.best
-        fitted = only(self.all, trial.used)
+        fitted, everybody = only(self.all, trial.used), [str(i) for i in range(len(self.all.images))]
         before, after = (
             comparison_of(x, fitted) for x in (only(each, trial.used), self.compared(state.parameters, fitted))
         )
@@ -102,7 +105,7 @@ class Run(Operations):
             kept=kept,
             interrupted=interrupted,
             planned=None if interrupted or self.late else steps,
-            left_out=tuple(int(i) for i in np.setdiff1d(np.arange(len(self.all.images)), trial.used)),
+            left_out=tuple((names or everybody)[i] for i in range(len(everybody)) if i not in trial.used),
         )
 
     def run_with_blocks(self, loss: float) -> int:

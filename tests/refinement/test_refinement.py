@@ -403,7 +403,7 @@ def test_a_photo_that_contradicts_the_others_is_left_out_and_named(four, monkeyp
     seen = seen_by_steps(monkeypatch)
     misleading = dataclasses.replace(capture, images=images)
     report = refinement.refine_with_report(avatar, misleading, dataclasses.replace(STEPS, rounds=1, held_out=0.05))
-    assert report.left_out == (2,) and "without photo 2" in report.summary()
+    assert report.left_out == (misleading.names[2],) and f"without {misleading.names[2]}, which" in report.summary()
     assert report.rounds == 1 and 2 not in seen[1:]
 
 
