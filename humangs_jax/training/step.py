@@ -127,7 +127,8 @@ def _each(compare, predicted, targets):
 @functools.cache
 def seed_numbers(seed: int) -> Shaped[np.ndarray, " n"]:
     """The key of a run as numbers on the host: an argument of a step's program, so that all seeds share it."""
-    return np.asarray(jax.random.key_data(jax.random.key(seed)))
+    with jax.ensure_compile_time_eval():  # may be asked while a step is traced
+        return np.asarray(jax.random.key_data(jax.random.key(seed)))
 
 
 def subject_keys(seed: Shaped[Array, " n"] | Shaped[np.ndarray, " n"], step: Int[Array, ""], count: int) -> Array:
