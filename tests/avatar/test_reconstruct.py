@@ -187,15 +187,21 @@ def test_small_people_that_are_enlarged_stay_within_the_range(body):
             assert values.min() >= 0 and values.max() <= 1
 
 
-def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
-    photos, pelvis = capture(body, SIZE, SIZE), np.asarray(shape_body(body, jnp.zeros(2)).joints[0])
+def with_z_up(photos):
+    """The same capture in a world whose z axis points up."""
+    pelvis = np.asarray(shape_body(photos.body, jnp.asarray(photos.betas)).joints[0])
     turn = np.asarray([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # y becomes z
     rotations = np.asarray(photos.poses.rotations)
     rotations = np.concatenate([rotations[:, :1] + [np.pi / 2, 0, 0], rotations[:, 1:]], axis=1)
     shift = jnp.asarray([turn[:3, :3] @ pelvis - pelvis], jnp.float32)
     poses = replace(photos.poses, rotations=jnp.asarray(rotations, jnp.float32), translation=shift)
     cameras = replace(photos.cameras, cam_from_world=photos.cameras.cam_from_world @ jnp.asarray(turn.T, jnp.float32))
-    turned = dataclasses.replace(photos, cameras=cameras, poses=poses)
+    return dataclasses.replace(photos, cameras=cameras, poses=poses)
+
+
+def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
+    photos = capture(body, SIZE, SIZE)
+    turned = with_z_up(photos)
     own, views = standardize(photos, SIZE), upright(standardize(turned, SIZE), body)
     assert upright(own, body) is own
     for got, expected in zip(jax.tree.leaves(views), jax.tree.leaves(own), strict=True):
@@ -445,8 +451,7 @@ def test_worlds_with_and_without_light_are_no_batch(body, network, monkeypatch):
     monkeypatch.setattr(module, "_check_posed", lambda *_: None)
     monkeypatch.setattr(module, "fit_buffers", lambda _, config: config)
     photos, config = capture(body, SIZE, SIZE), network[1].with_conventions(light=True)
-    lying = np.asarray(photos.poses.rotations) + np.eye(55, 3)[None] * [np.pi / 2, 0, 0]
-    turned = dataclasses.replace(photos, poses=replace(photos.poses, rotations=jnp.asarray(lying, jnp.float32)))
+    turned = with_z_up(photos)
     with pytest.raises(ValueError, match=r"captures\[1\]: its world is not y-up, .*: stack them apart"):
         stack_captures(config, [photos, turned])
     assert not stack_captures(config, [turned, turned])[2].conventions.light

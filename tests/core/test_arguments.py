@@ -58,8 +58,8 @@ WRONG = {
         r"it is a field of SplatConfig, config=SplatConfig\(tile",
     ),
     "a field of refinement": (
-        lambda: hg.refine(AVATAR, CAPTURE, steps=10),
-        r"^refine\(avatar, capture, ...\): no argument 'steps': it is a field of RefineConfig, config=RefineConfig",
+        lambda: hg.refine(AVATAR, CAPTURE, rounds=10),
+        r"^refine\(avatar, capture, ...\): no argument 'rounds': it is a field of RefineConfig, config=RefineConfig",
     ),
     "an unknown name": (
         lambda: hg.render(GAUSSIANS, CAMERA, colour=1),
