@@ -4,7 +4,6 @@ Everything is checked before the work begins, and written after it.
 """
 
 import dataclasses
-import os
 from pathlib import Path
 from typing import Any, Literal
 
@@ -235,7 +234,7 @@ class Fit:
             body = load_body(self.body)
         with stage("fitting"):
             fitted = fit_scan(scan.scan, body=body, joints=joints, clothed=not scan.bare, height=scan.height)
-        body_file = DEFAULT_BODY if self.body is None else os.path.relpath(self.body.resolve(), self.out.resolve())
+        body_file = DEFAULT_BODY if self.body is None else str(self.body)
         with stage("writing"):
             save_scan_fit(self.out, fitted, body_file, overwrite=self.overwrite)
         tell(fitted.report)

@@ -1,7 +1,7 @@
 """A capture: photos of one person, their calibrated cameras, and the body pose of each frame; a folder on disk.
 
     me/capture.json       {"format": "humangs-capture", "version": 1, "body": "body.npz", "views": [...]}
-    me/body.npz           body (name or file of the model), betas (s,), rotations (m, j, 3), translations (m, 3)
+    me/body.npz           body (name or file of the model), betas and shape_names (s,), rotations (m, j, 3), translations (m, 3)
     me/images/*.png ...   one photo per view, all of one size; masks likewise
 
 docs/capture_format.md describes the format in full. Whatever is wrong in a folder is a `CaptureError`: one line that names
@@ -51,6 +51,7 @@ from humangs_jax.io.reading import FileError, check_limit, reading
 DEFAULT_BODY = "makehuman"
 """Name of the body that comes with the package; any other `body` in body.npz is the path of a model file."""
 BODY_KEYS = {"body", "betas", "rotations", "translations"}
+OPTIONAL_BODY_KEYS = {"shape_names"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -116,6 +117,7 @@ def capture_from_arrays(
     translations: Any,
     *,
     betas: Any = (),
+    shape_names: Sequence[str] | None = None,
     masks: Any | None = None,
     frames: Any | None = None,
     names: Sequence[str] | None = None,
@@ -131,6 +133,7 @@ def capture_from_arrays(
         images: (v, h, w, 3) in [0, 1]. masks: (v, h, w) in [0, 1] or None.
         K: (v, 3, 3) or (3, 3) for all; pixels. cam_from_world: (v, 4, 4), OpenCV, metres.
         rotations: (m, j, 3) axis-angle in the body's joint order. translations: (m, 3) metres. betas: (s,).
+        shape_names: (s,) the body's directions that betas belong to; None: all of them, or the first of SMPL-X's shape.
         frames: (v,) which of the m poses each view shows; may be left out when m is 1.
         names: (v,) file names without suffix; "000", "001", ... if left out.
         background: "photo": the masks are used to put the images on white; "white": they are on white already.
@@ -153,7 +156,7 @@ def capture_from_arrays(
     cam_from_world = numbers(cam_from_world, source, "cam_from_world", (v, 4, 4))
     cameras = [checked_camera(K[i], cam_from_world[i], width, height, source, f"view {i}") for i in range(v)]
     body = _load_model(source, str(body_file)) if body is None else body
-    betas, rotations, translations = body_parameters(body, betas, rotations, translations, source)
+    betas, rotations, translations = body_parameters(body, betas, rotations, translations, source, shape_names)
     if frames is None:
         if len(rotations) > 1:
             raise CaptureError(
@@ -196,10 +199,10 @@ def load_capture(
     with reading(folder / "capture.json", "capture", CaptureError):
         description = read_description(folder / "capture.json")
         parameter_file = folder / description["body"]
-        body_file, betas, rotations, translations = read_parameters(parameter_file)
+        body_file, parameters = read_parameters(parameter_file)
         if body is None:
             body = _load_model(parameter_file, body_file, folder)
-        betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
+        betas, rotations, translations = body_parameters(body, **parameters, file=parameter_file)
         check_limit("frames", len(rotations), f"frames in {parameter_file}")
         photos = read_photos(folder, description, views, len(rotations), fit_masks)
         if body_file != DEFAULT_BODY:
@@ -246,8 +249,8 @@ def _load_model(file, name, folder=None):
         raise CaptureError(file, "body", f"{model_file} cannot be used as a body: {error}") from error
 
 
-def read_parameters(file: Path) -> tuple[str, np.ndarray, np.ndarray, np.ndarray]:
-    """Model name, betas, rotations and translations of body.npz, unchecked but for their presence."""
+def read_parameters(file: Path) -> tuple[str, dict[str, Any]]:
+    """Model name of body.npz, and what `body_parameters` checks, as it is in the file."""
     try:
         values, pickled = read_npz(file)
     except FileNotFoundError:
@@ -256,12 +259,17 @@ def read_parameters(file: Path) -> tuple[str, np.ndarray, np.ndarray, np.ndarray
         raise CaptureError("", "", error) from error
     if pickled:
         raise CaptureError(file, pickled[0], "expected numbers, got a pickled object")
-    check_keys(values, BODY_KEYS, BODY_KEYS, file)
+    check_keys(values, BODY_KEYS | OPTIONAL_BODY_KEYS, BODY_KEYS, file)
     name = values["body"]
     if name.shape != () or name.dtype.kind not in "US" or not str(name.item()):
         problem = f"expected the string {DEFAULT_BODY!r} or the path of a model file, got {name!r}"
         raise CaptureError(file, "body", problem)
-    return str(name.astype(str)), values["betas"], values["rotations"], values["translations"]
+    parameters: dict[str, Any] = {key: values[key] for key in ("betas", "rotations", "translations")}
+    if (names := values.get("shape_names")) is not None:
+        if names.ndim != 1 or names.dtype.kind not in "US":
+            raise CaptureError(file, "shape_names", f"expected one name for each of betas, got shape {names.shape}")
+        parameters["shape_names"] = names.astype(str).tolist()
+    return str(name.astype(str)), parameters
 
 
 # Writing -------------------------------------------------------------------------------------------------------------
@@ -283,6 +291,7 @@ def _check_before_writing(capture):
         np.asarray(poses.rotations),
         np.asarray(poses.translation),
         betas=capture.betas,
+        shape_names=capture.body.shape_names[: len(capture.betas)] or None,
         masks=capture.masks,
         frames=capture.frames,
         names=capture.names,
@@ -308,18 +317,22 @@ def _write_folder(folder, capture, target):
         view["cam_from_world"] = np.asarray(capture.cameras.cam_from_world[i], float).tolist()
         views.append(view)
     background = "photo" if capture.masks is None else "white"
-    write_npz(folder / "body.npz", parameter_arrays(capture, target), compressed=False)
+    poses = capture.poses
+    arrays = parameter_arrays(
+        target, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation
+    )
+    write_npz(folder / "body.npz", arrays, compressed=False)
     write_description(folder, views, background)
 
 
-def parameter_arrays(capture: Capture, folder: Path) -> dict[str, np.ndarray]:
-    """The arrays of body.npz of a capture in `folder`; the model file is named relative to it."""
-    body_file = capture.body_file
+def parameter_arrays(
+    folder: Path, body: BodyModel, body_file: str | Path, betas: Any, rotations: Any, translations: Any
+) -> dict[str, np.ndarray]:
+    """The arrays of body.npz of a capture that will be in `folder`; a model file is named relative to it."""
     if body_file != DEFAULT_BODY:
         body_file = Path(os.path.relpath(Path(body_file).resolve(), folder.resolve())).as_posix()
-    return {
-        "body": np.asarray(body_file),
-        "betas": np.asarray(capture.betas),
-        "rotations": np.asarray(capture.poses.rotations),
-        "translations": np.asarray(capture.poses.translation),
-    }
+    numbers = {"betas": betas, "rotations": rotations, "translations": translations}
+    arrays = {"body": np.asarray(body_file)} | {name: np.asarray(x, np.float32) for name, x in numbers.items()}
+    if body.shape_names:
+        arrays["shape_names"] = np.asarray(body.shape_names[: len(betas)], str)
+    return arrays

@@ -122,10 +122,15 @@ def checked_frame(frame: Any, count: int, file: object, field: str) -> int:
 
 
 def body_parameters(
-    body: BodyModel, betas: Any, rotations: Any, translations: Any, file: object
+    body: BodyModel,
+    betas: Any,
+    rotations: Any,
+    translations: Any,
+    file: object,
+    shape_names: Sequence[str] | None = None,
 ) -> tuple[Float[np.ndarray, " s"], Float[np.ndarray, "m j 3"], Float[np.ndarray, "m 3"]]:
-    """betas, rotations and translations in float32, of the sizes that the body has."""
-    joints, shapes = len(body.parents), body.shape_directions.shape[-1]
+    """betas, rotations and translations in float32, of the sizes that the body has. shape_names: see `shape_coefficients`."""
+    joints = len(body.parents)
     rotations = numbers(rotations, file, "rotations")
     if rotations.ndim != 3 or rotations.shape[1:] != (joints, 3) or len(rotations) == 0:
         raise CaptureError(
@@ -140,9 +145,43 @@ def body_parameters(
     ):
         if (most := np.abs(array).max(initial=0)) > largest:
             raise CaptureError(file, field, f"expected numbers of at most {largest:g} in magnitude, got {most:.4g}")
-    if betas.ndim != 1 or len(betas) > shapes:
-        raise CaptureError(file, "betas", f"expected at most {shapes} numbers for this body, got shape {betas.shape}")
-    return betas, rotations, translations
+    if betas.ndim != 1:
+        raise CaptureError(file, "betas", f"expected a list of numbers, got shape {betas.shape}")
+    return shape_coefficients(body, betas, shape_names, file), rotations, translations
+
+
+def shape_coefficients(
+    body: BodyModel, betas: Float[np.ndarray, " s"], names: Sequence[str] | None, file: object
+) -> Float[np.ndarray, " used"]:
+    """Coefficients of the body's first directions, from numbers whose kind is known.
+
+    Arguments: names: of the directions that the numbers belong to, as in `BodyModel.shape_names`. None: the numbers are those of
+    SMPL-X's shape, without expressions, or of all of the body's own directions.
+    Raises: CaptureError for coefficients that the body has no direction for, unless they are 0.
+    """
+    directions = body.shape_names or tuple(f"shape_{i}" for i in range(body.shape_directions.shape[-1]))
+    places = {name: i for i, name in enumerate(directions)}
+    if names is None:
+        own = [name for name in directions if not name.startswith("expression_")]
+        if betas[len(own) :].any():
+            problem = f"{len(betas)} coefficients, but body '{body.name}' has {len(own)} such directions"
+            raise CaptureError(file, "betas", problem)
+        if "shape_0" in places or len(betas) == len(own) or not betas.any():
+            return betas[: len(own)]
+        names = [f"shape_{i}" for i in range(len(betas))]
+    if len(names) != len(betas) or len(set(names)) < len(names):
+        raise CaptureError(file, "shape_names", f"expected {len(betas)} different names, one for each of betas")
+    unknown = [name for name, value in zip(names, betas, strict=True) if value and name not in places]
+    if unknown:
+        known = f"{len(places)}, from {directions[0]!r} to {directions[-1]!r}" if places else "none"
+        problem = (
+            f"{unknown[0]!r} is no shape direction of body '{body.name}': expected coefficients of its own ({known})"
+        )
+        raise CaptureError(file, "betas", problem)
+    used = [places[name] for name in names if name in places]
+    ordered = np.zeros(max(used, default=-1) + 1, betas.dtype)
+    ordered[used] = [value for name, value in zip(names, betas, strict=True) if name in places]
+    return ordered
 
 
 def check_names(names: Sequence[str], count: int, file: object) -> None:

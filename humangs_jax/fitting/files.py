@@ -136,7 +136,10 @@ def write_fitted(
     source, target = capture_folder(source), Path(target)
     description = read_description(source / "capture.json")
     contents = {"capture.json": _with_cameras(description, capture), REPORT_FILE: report.to_json()}
-    name, arrays = description["body"], parameter_arrays(capture, target)
+    name, poses = description["body"], capture.poses
+    arrays = parameter_arrays(
+        target, capture.body, capture.body_file, capture.betas, poses.rotations, poses.translation
+    )
 
     def write_fit(folder: Path):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -185,12 +188,12 @@ def _copy(source, folder, file):
 def save_scan_fit(folder: str | Path, fit: ScanFit, body_file: str = DEFAULT_BODY, *, overwrite: bool = False) -> None:
     """Write body.npz (as in captures), scan_fit.json and body_in_scan.ply; all or nothing.
 
-    Arguments: body_file: what body.npz calls the model. Raises: see `check_scan_folder`.
+    Arguments: body_file: where the model comes from, see `Capture`. Raises: see `check_scan_folder`.
     """
     check_scan_folder(Path(folder), overwrite)
     pose, align = fit.pose, fit.world_from_scan
-    arrays = {"body": body_file, "betas": fit.betas, "rotations": np.asarray(pose.rotations)[None]}
-    arrays["translations"] = np.asarray(pose.translation)[None]
+    poses = np.asarray(pose.rotations)[None], np.asarray(pose.translation)[None]
+    arrays = parameter_arrays(Path(folder), fit.body, body_file, fit.betas, *poses)
     place = {"world_from_scan": align.matrix().tolist(), "scale": align.scale, "rotation": align.rotation.tolist()}
     place |= {"translation": align.translation.tolist(), "up": fit.up}
 

@@ -347,8 +347,8 @@ BAD = {
     "pose NaN": (parameters(rotations=with_nan((FRAMES, JOINTS, 3), (1, 2, 0))), "body.npz: rotations", "[1, 2, 0]"),
     "translation NaN": (parameters(translations=with_nan((FRAMES, 3), (0, 1))), "body.npz: translations", "finite"),
     "translation count": (parameters(translations=np.zeros((5, 3))), "body.npz: translations", "(2, 3)"),
-    "betas too long": (parameters(betas=np.zeros(4)), "body.npz: betas", "at most 3"),
-    "betas 2D": (parameters(betas=np.zeros((1, 3))), "body.npz: betas", "at most 3"),
+    "betas too long": (parameters(betas=np.ones(4)), "body.npz: betas", "has 3 such directions"),
+    "betas 2D": (parameters(betas=np.zeros((1, 3))), "body.npz: betas", "a list of numbers, got shape (1, 3)"),
     "betas words": (parameters(betas=np.array(["a"])), "body.npz: betas", "numbers"),
     "betas complex": (parameters(betas=np.zeros(2, complex)), "body.npz: betas", "numbers"),
 }
@@ -394,7 +394,7 @@ BAD_ARRAYS = {
     "names": (dict(names=["a", "a", "b"]), "names: expected 3 different names"),
     "name with slash": (dict(names=["a", "../b", "c"]), "names: expected letters"),
     "background": (dict(background="black"), "background: expected one of"),
-    "betas": (dict(betas=np.zeros(9)), "betas: expected at most 3"),
+    "betas": (dict(betas=np.ones(9)), "betas: 9 coefficients, but body 'tiny' has 3"),
     "rotations": (dict(rotations=np.full((FRAMES, JOINTS, 3), np.inf)), "rotations: expected finite"),
 }
 
@@ -405,6 +405,61 @@ def test_bad_arrays_are_one_line(case):
     with pytest.raises(CaptureError) as caught:
         capture_from_arrays(**{**arrays(), **changes})
     assert str(caught.value).startswith(f"arrays: {expected}") and "\n" not in str(caught.value)
+
+
+# The kind of the shape coefficients ----------------------------------------------------------------------------------
+
+SMPLX_NAMES = (*(f"shape_{i}" for i in range(2)), "expression_0")
+OWN_NAMES = ("sex", "age", "height")
+
+
+def named(names):
+    import dataclasses
+
+    return dataclasses.replace(tiny_body(), shape_names=names)
+
+
+KINDS = {
+    "fewer of SMPL-X's": (SMPLX_NAMES, [0.5], None, [0.5]),
+    "SMPL-X's shape, more than the model has, but 0": (SMPLX_NAMES, [0.5, -1, 0, 0], None, [0.5, -1]),
+    "an expression by name": (SMPLX_NAMES, [2, 0.5], ["expression_0", "shape_1"], [0, 0.5, 2]),
+    "all of the body's own": (OWN_NAMES, [1, 2, 3], None, [1, 2, 3]),
+    "some of the body's own": (OWN_NAMES, [1, 2], ["height", "sex"], [2, 0, 1]),
+    "names that it has not, but 0": (OWN_NAMES, [0, 2], ["shape_0", "age"], [0, 2]),
+    "no shape at all": (OWN_NAMES, np.zeros(10), None, [0, 0, 0]),
+}
+"""Names of the body's directions, betas, their names, what they mean in the order of the body."""
+WRONG_KINDS = {
+    "SMPL-X's shape on expressions": (SMPLX_NAMES, [1, 1, 1], None, "betas: 3 coefficients, but body 'tiny' has 2"),
+    "SMPL-X's shape for another body": (
+        OWN_NAMES,
+        [1, 1],
+        None,
+        "betas: 'shape_0' is no shape direction of body 'tiny'",
+    ),
+    "another body's": (SMPLX_NAMES, [1, 1], ["age", "sex"], "betas: 'age' is no shape direction"),
+    "a name too few": (OWN_NAMES, [1, 1], ["age"], "shape_names: expected 2 different names"),
+    "a name twice": (OWN_NAMES, [1, 1], ["age", "age"], "shape_names: expected 2 different names"),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_betas_are_of_a_known_kind(kind, tmp_path):
+    names, betas, their_names, expected = KINDS[kind]
+    given = {**arrays(), "betas": betas, "shape_names": their_names, "body": named(names)}
+    capture = capture_from_arrays(**given)
+    np.testing.assert_array_equal(capture.betas, expected)
+    save_capture(tmp_path / "me", capture)
+    again = load_capture(tmp_path / "me", body=named(names[::-1]))  # the file names them: their order is free
+    full = np.pad(capture.betas, (0, len(names) - len(capture.betas)))
+    np.testing.assert_array_equal(np.pad(again.betas, (0, len(names) - len(again.betas))), full[::-1])
+
+
+@pytest.mark.parametrize("kind", WRONG_KINDS)
+def test_betas_of_another_kind_are_refused(kind):
+    names, betas, their_names, expected = WRONG_KINDS[kind]
+    with pytest.raises(CaptureError, match=expected):
+        capture_from_arrays(**{**arrays(), "betas": betas, "shape_names": their_names, "body": named(names)})
 
 
 # Nothing is written when something is wrong --------------------------------------------------------------------------
@@ -428,7 +483,7 @@ def bad_captures():
         "rotations": spoiled(poses=poses),
         "frames[0]": spoiled(frames=np.full(VIEWS, 7)),
         "names": spoiled(names=("a", "b", "c/d")),
-        "betas": spoiled(betas=np.zeros(7, np.float32)),
+        "betas": spoiled(betas=np.ones(7, np.float32)),
     }
 
 

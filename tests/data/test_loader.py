@@ -66,6 +66,7 @@ def write_subject(path, seed, views=VIEWS, masks=True):
         generator.normal(size=(POSES, 2, 3)) * 0.1,
         generator.normal(size=(POSES, 3)) * 0.1,
         betas=[0.5, -0.5],
+        shape_names=("a", "b"),
         masks=np.ones((views, SIZE, SIZE)) if masks else None,
         frames=np.arange(views) % POSES,
         background="white",

@@ -109,6 +109,7 @@ class Subject:
             rotations,
             translations,
             betas=betas,
+            shape_names=body.model.shape_names[: len(betas)] or None,
             masks=masks / np.float32(255),
             frames=frames,
             names=[self.view_name(int(view)) for view in views],

@@ -48,11 +48,11 @@ def read_outline(path: str | Path, body: BodyModel, body_file: str | Path = DEFA
     file = folder / "capture.json"
     description = read_description(file)
     parameter_file = folder / description["body"]
-    name, betas, rotations, translations = read_parameters(parameter_file)
+    name, parameters = read_parameters(parameter_file)
     if not _same_body(name, folder, body_file):
         problem = f"{name!r}, but all captures of a run have one body, {str(body_file)!r}: expected parameters of that"
         raise CaptureError(parameter_file, "body", problem)
-    betas, rotations, translations = body_parameters(body, betas, rotations, translations, parameter_file)
+    betas, rotations, translations = body_parameters(body, **parameters, file=parameter_file)
     views, size = description["views"], None
     check_photos(folder, views, together=False)
     for view in views:

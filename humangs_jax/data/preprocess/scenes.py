@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt8
-from humangs_jax.data.capture import DEFAULT_BODY
+from humangs_jax.data.capture import parameter_arrays
 from humangs_jax.data.datasets.bodies import BodyParameters, FileBody, PosedPerson, posed_people, turned
 from humangs_jax.data.datasets.scene_list import SceneFrame, scene_entry, write_arrays
 from humangs_jax.data.datasets.subject import Subject
@@ -241,12 +241,7 @@ def _write_capture(folder, target, name, content, body, settings):
         described.append({"image": image, "mask": mask, "frame": view.frame, **matrices})
     if not described:
         raise ValueError(f"{name}: no photo can be read: {next(iter(content.known['unreadable'].values()), '')}")
-    file = body.file
-    if file != DEFAULT_BODY:
-        file = Path(os.path.relpath(Path(file).resolve(), target.resolve())).as_posix()
-    numbers = {"betas": betas, "rotations": rotations, "translations": translations}
-    arrays = {"body": np.asarray(file)} | {key: value.astype(np.float32) for key, value in numbers.items()}
-    write_npz(folder / "body.npz", arrays)
+    write_npz(folder / "body.npz", parameter_arrays(target, body.model, body.file, betas, rotations, translations))
     known = {"views": len(described), "frames": len(rotations), **content.known}
     write_json(folder / SCENE, {"known": known}, indent=None)
     write_description(folder, described, "white")
