@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 
-from humangs_jax.avatar.export.world import plain_arrays, sh_of
+from humangs_jax.avatar.export.world import linear_of, plain_arrays, sh_of
 from humangs_jax.io.glb import VERTICES, GlbWriter
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -17,12 +17,12 @@ EXTENSION = "KHR_gaussian_splatting"
 def write_glb(path: str | os.PathLike, gaussians: Gaussians) -> None:
     """Write a `.glb` with KHR_gaussian_splatting; the file appears whole or not at all.
 
-    Viewers that do not know the extension draw coloured points.
+    Viewers that do not know the extension draw coloured points: glTF's COLOR_0 is linear, unlike the extension's coefficients.
     """
     means, quats, scales, opacities, colors = plain_arrays(gaussians)
     arrays = {
         "POSITION": ("VEC3", means),
-        "COLOR_0": ("VEC4", np.clip(np.concatenate([colors, opacities[:, None]], axis=1), 0, 1)),
+        "COLOR_0": ("VEC4", np.column_stack([linear_of(colors), np.clip(opacities, 0, 1)])),
         f"{EXTENSION}:ROTATION": ("VEC4", quats[:, [1, 2, 3, 0]]),
         f"{EXTENSION}:SCALE": ("VEC3", scales),
         f"{EXTENSION}:OPACITY": ("SCALAR", np.clip(opacities, 0, 1)),

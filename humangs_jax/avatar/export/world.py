@@ -18,7 +18,7 @@ from humangs_jax.core.checks import BOUNDED, check_values
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
-from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values
+from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values, widened
 
 Up = Literal["y", "-y", "z"]
 """The axis that points up in a file."""
@@ -86,7 +86,10 @@ def plain_arrays(
     Float[np.ndarray, " g"],
     Float[np.ndarray, "g 3"],
 ]:
-    """Means, unit quaternions (wxyz), scales, opacities and colours in float64, without deformations.
+    """Means, unit quaternions (wxyz), scales, opacities and colours in float64, without deformations and without low-pass.
+
+    Viewers add `EPS2D` pixels^2, as 3DGS does, where our renderer adds less to scales that contain a low-pass
+    (`Gaussians.low_pass`). It is taken out, so that both draw the same in images of the size that the Gaussians were fitted to.
 
     Raises: ValueError for numbers that files cannot hold: not finite, or of more than `checks.LARGEST`.
     """
@@ -95,6 +98,7 @@ def plain_arrays(
     }
     check_values("export", gaussian_values(gaussians))
     check_values("export", bounded)
+    gaussians = replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1), low_pass=None)
     if gaussians.deformations is not None:
         gaussians = factored(gaussians)
     means, quats, scales, opacities, colors = (
@@ -109,3 +113,9 @@ def plain_arrays(
 def sh_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
     """Coefficients of the constant spherical harmonic: files of Gaussians hold rgb = 1/2 + Y00 f."""
     return (colors - 0.5) / SH_C0
+
+
+def linear_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
+    """Linear colours in [0, 1] of sRGB-encoded ones (IEC 61966-2-1)."""
+    encoded = np.clip(colors, 0, 1)
+    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
