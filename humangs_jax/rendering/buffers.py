@@ -127,7 +127,7 @@ def _count(gaussians, cameras, config, shares):
     def one(camera):
         projected = project_gaussians(gaussians, camera, config)
         camera = drawn_camera(camera, config)
-        footprints = binning.footprints_by(projected, gaussians.opacities, config)
+        footprints = binning.footprints_by(projected, projected.dimmed(gaussians.opacities), config)
         grid = TileGrid(camera.width, camera.height, config.tile_size)
         counts = (binning.count_pairs(footprints, grid, binning.Share(i, shares)) for i in range(shares))
         return [jnp.max(jnp.stack(most)) for most in zip(*counts, strict=True)]

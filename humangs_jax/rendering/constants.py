@@ -20,6 +20,9 @@ MIP_EPS2D = 0.1
 """Pixels^2, for Gaussians whose scales contain the low-pass of the images that they were fitted to: about the footprint of a
 pixel, so that images of other sizes show them as wide as those did (Mip-Splatting, https://arxiv.org/abs/2311.16493)."""
 
+LEAST_DIMMING = 1e-4
+"""Of opacities, by the variance that is added: a factor too small to be seen, which keeps gradients finite."""
+
 ALPHA_MIN = 1 / 255
 """A smaller alpha is skipped: it could not change an 8-bit image by itself. The same everywhere."""
 

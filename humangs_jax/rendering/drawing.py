@@ -127,7 +127,8 @@ def _draw(projected, gaussians, camera, background, config: SplatConfig, mesh: M
 
     depths = jnp.where(projected.visible, lax.stop_gradient(projected.depths), jnp.inf)
     order = binning.depth_order(depths)
-    footprints = binning.footprints_by(projected, gaussians.opacities, config)
+    opacities = projected.dimmed(gaussians.opacities)
+    footprints = binning.footprints_by(projected, opacities, config)
     footprints = jax.tree.map(lambda plane: take(plane, order), footprints)
 
     # Depths are blended relative to the nearest: their gradient is a difference of depths, which must not drown in the
@@ -136,7 +137,7 @@ def _draw(projected, gaussians, camera, background, config: SplatConfig, mesh: M
     nearest = jnp.where(nearest < jnp.inf, nearest, 0.0)
     behind = jnp.where(projected.visible, projected.depths - nearest, 0.0)
     seen = jnp.concatenate([gaussians.colors, behind[:, None]], axis=-1)
-    splats = pack_splats(projected, gaussians.opacities, seen, config.alpha_min)
+    splats = pack_splats(projected, opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
     features, transmittance, peaks, overflow = draw_shared(_draw_tiles, mesh, footprints, splats, grid, config)
     visibility = jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True) if config.visibility else None

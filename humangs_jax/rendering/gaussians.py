@@ -28,7 +28,7 @@ class Gaussians(Batchable):
     opacities: (g,) in [0, 1]. colors: (g, 3) RGB in [0, 1], as images have them (sRGB-encoded).
     deformations: (g, 3, 3) or None; applied to the covariance after the rotation, never to the mean.
     low_pass: (g,) or None; metres: side of the pixels of the images whose low-pass the scales contain (`avatar.low_pass`).
-    Renderers add no more than `MIP_EPS2D` pixels^2 then.
+    Renderers add no more than `MIP_EPS2D` pixels^2 then, and dim what this makes larger in images of larger pixels.
     """
 
     means: Float[Array, "g 3"]

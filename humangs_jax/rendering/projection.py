@@ -11,6 +11,11 @@ gradient, into a few loops. Its determinant is not taken from the entries of cov
 but as a sum of squares: |m0 x m1|^2 + eps2d (|m0|^2 + |m1|^2) + eps2d^2 for the rows m0, m1 of M. What is drawn is
 the upper triangular r with r^T r = cov2d^-1 / 2, whose gradient is written by hand for the same reason.
 
+The added variance makes small Gaussians larger. Those whose scales contain the low-pass of pixels of s metres
+(`Gaussians.low_pass`) have their opacity times sqrt(det(M M^T + e I) / det cov2d), where e = eps2d (s fx/Z)^2 <= eps2d is what
+was added in images of such pixels: what they weigh together stays the same in smaller images (Mip-Splatting's 2D filter,
+https://arxiv.org/abs/2311.16493, equation 9, which has e = 0).
+
 Gaussians that are not drawn (centre nearer than `near` or behind, footprint beyond `LARGEST_FOOTPRINT`) have finite
 values and pass zero gradients. K's skew is taken as 0.
 """
@@ -36,7 +41,7 @@ class ProjectedGaussians(NamedTuple):
 
     x, y: centre, pixels. depths: z in the camera's frame, metres. xx, xy, yy: covariance, pixels^2, eps2d included.
     determinant: of the covariance, pixels^4. r00, r01, r11: the upper triangular r of r^T r = conic / 2, 1 / pixels,
-    finite where not drawn. visible: whether it is drawn.
+    finite where not drawn. visible: whether it is drawn. dimming: factor of the opacity in (0, 1], None without low-pass.
     """
 
     x: Float[Array, " g"]
@@ -50,6 +55,11 @@ class ProjectedGaussians(NamedTuple):
     r01: Float[Array, " g"]
     r11: Float[Array, " g"]
     visible: Bool[Array, " g"]
+    dimming: Float[Array, " g"] | None = None
+
+    def dimmed(self, opacities: Float[Array, " g"]) -> Float[Array, " g"]:
+        """Opacities as they are drawn."""
+        return opacities if self.dimming is None else opacities * self.dimming
 
     @property
     def means2d(self) -> Float[Array, "g 2"]:
@@ -101,6 +111,9 @@ def project(
     small = _all([jnp.abs(entry) < constants.LARGEST_FOOTPRINT for row in m for entry in row])
     m0, m1 = ([jnp.where(small, entry, 0.0) for entry in row] for row in m)
     xx, xy, yy, determinant = _covariance(m0, m1, eps2d)
+    dimming = None
+    if gaussians.low_pass is not None and eps2d > 0:
+        dimming = _dimming(m0, m1, determinant, eps2d, gaussians.low_pass * zx)
     r00, r01, r11 = _conic_factor(m0, m1, eps2d)
     return ProjectedGaussians(
         x=fx * u + cx,
@@ -114,6 +127,7 @@ def project(
         r01=r01,
         r11=r11,
         visible=in_front & small & (determinant > 0),
+        dimming=dimming,
     )
 
 
@@ -145,6 +159,15 @@ def _covariance(m0, m1, eps2d):
     normal = [_cross(m0, m1, 1, 2), _cross(m0, m1, 2, 0), _cross(m0, m1, 0, 1)]
     determinant = _dot(normal, normal) + eps2d * (xx + yy) + eps2d * eps2d
     return xx + eps2d, xy, yy + eps2d, determinant
+
+
+def _dimming(m0, m1, determinant, eps2d, low_pass):
+    """Factor of the opacity; low_pass in pixels. 1 for footprints whose determinant overflows."""
+    finite = determinant < jnp.inf
+    m0, m1 = ([jnp.where(finite, entry, 0.0) for entry in row] for row in (m0, m1))
+    contained = _covariance(m0, m1, eps2d * jnp.minimum(jnp.square(low_pass), 1.0))[3]
+    share = jnp.where(finite, contained / jnp.where(finite, determinant, 1.0), 1.0)
+    return jnp.sqrt(jnp.maximum(share, constants.LEAST_DIMMING**2))
 
 
 def _cross(m0, m1, j, i):

@@ -42,7 +42,11 @@ def render_reference(
 def _reference(gaussians, camera, background, config):
     centers, axes, depths, visible = _project(gaussians, camera, config)
     eps2d = added_variance(gaussians, config.eps2d)
-    determinants = _determinant(axes, eps2d)
+    determinants, opacities = _determinant(axes, eps2d), gaussians.opacities
+    if gaussians.low_pass is not None and eps2d > 0:  # dimmed as `projection` says
+        contained = eps2d * jnp.minimum((gaussians.low_pass * camera.K[0, 0] / depths) ** 2, 1)
+        opacities = opacities * jnp.sqrt(_determinant(axes, contained) / determinants)
+    visible = visible & (opacities >= config.opacity_min)
     order = jnp.argsort(jnp.where(visible, depths, jnp.inf), stable=True)
     y, x = jnp.mgrid[: camera.height, : camera.width] + 0.5
     pixels = jnp.stack([x, y], axis=-1).astype(centers.dtype)
@@ -63,7 +67,7 @@ def _reference(gaussians, camera, background, config):
 
     blank = jnp.zeros((camera.height, camera.width), centers.dtype)
     state = jnp.zeros((*blank.shape, 3), blank.dtype), blank, blank + 1, blank > 0
-    splats = centers, axes, determinants, depths, visible, gaussians.opacities, gaussians.colors
+    splats = centers, axes, determinants, depths, visible, opacities, gaussians.colors
     (color, distance, transmittance, _), _ = lax.scan(draw, state, jax.tree.map(lambda leaf: leaf[order], splats))
     alpha = 1 - transmittance
     some = alpha > 0
@@ -81,7 +85,7 @@ def _project(gaussians, camera, config):
     Column j of the axes is the image of the Gaussian's axis j, pixels: cov2d = axes axes^T + eps2d I.
     """
     p = transform.apply(camera.cam_from_world, gaussians.means)
-    visible = (p[:, 2] > config.near) & (gaussians.opacities >= config.opacity_min)
+    visible = p[:, 2] > config.near
     depths = jnp.where(visible, p[:, 2], 1.0)
     slopes = jnp.where(visible[:, None], p[:, :2], 0.0) / depths[:, None]
     focal, center = jnp.stack([camera.K[0, 0], camera.K[1, 1]]), camera.K[:2, 2]

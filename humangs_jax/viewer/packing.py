@@ -90,7 +90,7 @@ def pack(
         "joint_names": avatar.joint_names,
         "skinning": avatar.skinning,
         "splatting": {name: getattr(how, name) for name in DRAWN_FIELDS}
-        | {"eps2d": added_variance(avatar.gaussians, how.eps2d)},
+        | {"eps2d": added_variance(avatar.gaussians, how.eps2d), "low_pass": _low_pass(avatar)},
         "rest_bounds": [vertices.min(0).tolist(), vertices.max(0).tolist()],
     }
     arrays: dict[str, np.ndarray] = {}
@@ -111,6 +111,11 @@ def unpack(packed: Packed) -> dict[str, np.ndarray]:
     entries = packed.header["arrays"].items()
     read = lambda e: np.frombuffer(packed.data, e["type"], int(np.prod(e["shape"])), e["offset"]).reshape(e["shape"])
     return {name: read(entry) for name, entry in entries}
+
+
+def _low_pass(avatar):
+    """Metres; one for all Gaussians, whose photos were taken from similar distances. 0: none."""
+    return 0.0 if avatar.gaussians.low_pass is None else float(np.median(avatar.gaussians.low_pass))
 
 
 def largest_weights(weights: Float[np.ndarray, "g j"]) -> tuple[Int[np.ndarray, "g 8"], Int[np.ndarray, "g 8"]]:

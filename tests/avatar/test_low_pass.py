@@ -12,6 +12,8 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.io.reading import FileError
 from humangs_jax.rendering.constants import EPS2D, MIP_EPS2D
+from humangs_jax.rendering.gaussians import Gaussians, widened
+from humangs_jax.rendering.projection import project
 from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import render
@@ -45,7 +47,8 @@ def test_renderers_add_what_the_scales_do_not_contain(draw):
     gaussians = skin(with_low_pass(two_balls(1), PIXEL), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)))
     camera = orbit(jnp.asarray([0.0, 0.9, 0.0]), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, 48, 48), 48, 48)[0]
     plain, less = replace(gaussians, low_pass=None), SplatConfig(eps2d=MIP_EPS2D)
-    np.testing.assert_array_equal(draw(gaussians, camera).rgb, draw(plain, camera, less).rgb)
+    of_larger_pixels = replace(gaussians, low_pass=jnp.full_like(gaussians.opacities, 1.0))  # nothing is dimmed
+    np.testing.assert_allclose(draw(of_larger_pixels, camera).rgb, draw(plain, camera, less).rgb, atol=1e-6)  # float32
     assert jnp.abs(draw(gaussians, camera).rgb - draw(plain, camera).rgb).max() > 0.01
     none = SplatConfig(eps2d=0.0)
     np.testing.assert_array_equal(draw(gaussians, camera, none).rgb, draw(plain, camera, none).rgb)
@@ -69,3 +72,58 @@ def test_files_keep_the_size_of_the_pixels(tmp_path):
     np.savez(tmp_path / "b.npz", **spoiled)
     with pytest.raises(FileError, match="low_pass"):
         Avatar.load(tmp_path / "b.npz")
+
+
+def test_fine_things_weigh_the_same_in_small_images():
+    """A Gaussian thinner than a pixel: its opacity times its area, in metres, is that of the images that it was fitted to."""
+    fine = 0.002
+    one = Gaussians(
+        jnp.zeros((1, 3)), jnp.asarray([[1.0, 0, 0, 0]]), jnp.full((1, 3), fine), jnp.asarray([0.5]), jnp.ones((1, 3))
+    )
+    wide = replace(one, scales=widened(one.scales, jnp.full(1, fine)), low_pass=jnp.full(1, fine))
+
+    def weight(gaussians, size):
+        camera = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, size, size), size, size)[0]
+        seen = project(gaussians, camera)
+        pixel = 3.0 / float(camera.K[0, 0])
+        return float(seen.dimmed(gaussians.opacities)[0] * jnp.sqrt(seen.determinant[0])) * pixel**2, pixel
+
+    fitted = 3.0 / float(intrinsics_from_fov(0.7, 1, 1)[0, 0]) / fine
+    exact, pixel = weight(wide, int(np.ceil(fitted)))
+    assert pixel == pytest.approx(fine, rel=1e-3)
+    for size in (512, 64, 8):
+        assert weight(wide, size)[0] == pytest.approx(exact, rel=1e-3)
+    larger, _ = weight(wide, 4096)
+    assert larger < exact  # nothing becomes more opaque than it is
+    assert weight(replace(wide, low_pass=jnp.full(1, 1.0)), 32)[0] > 20 * exact
+
+
+def test_dimmed_splats_are_drawn_as_defined():
+    gaussians = skin(with_low_pass(flat_avatar(), PIXEL / 10), BodyPose(jnp.zeros((3, 3)), jnp.zeros(3)))
+    camera = orbit(jnp.asarray([0.0, 0.9, 0.0]), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, 48, 48), 48, 48)[0]
+    for config in (SplatConfig(), SplatConfig(opacity_min=0.05)):
+        drawn, exact = render(gaussians, camera, config), render_reference(gaussians, camera, config)
+        np.testing.assert_allclose(drawn.rgb, exact.rgb, atol=1e-4)  # float32; another order of operations
+    undimmed = replace(gaussians, low_pass=jnp.ones_like(gaussians.opacities))
+    assert jnp.abs(render(undimmed, camera).alpha - drawn.alpha).max() > 0.05
+
+
+@pytest.fixture
+def float64():
+    with jax.enable_x64():
+        yield
+
+
+def test_dimming_is_differentiable_at_any_size(float64):
+    """Needles, points without extent, and footprints that overflow."""
+    camera = orbit(jnp.zeros(3), 3.0, jnp.zeros(1), 0.0, intrinsics_from_fov(0.7, 32, 32), 32, 32)[0]
+    quats = jnp.asarray([[1.0, 0.2, 0.1, 0]] * 4)
+    scales = jnp.asarray([[1e-9, 1e-9, 0.1], [0, 0, 0], [0.01, 0.02, 0.03], [1e7, 1e7, 1e7]])
+    gaussians = Gaussians(jnp.zeros((4, 3)), quats, scales, jnp.ones(4), jnp.ones((4, 3)), low_pass=jnp.full(4, 1e-3))
+    dimming = lambda scales: jnp.sum(project(replace(gaussians, scales=scales), camera).dimming)
+    assert jnp.all(jnp.isfinite(jax.grad(dimming)(scales)))
+    singles = replace(gaussians, scales=scales.astype(jnp.float32))
+    assert jnp.all((project(singles, camera).dimming > 0) & (project(singles, camera).dimming <= 1))
+    step = jnp.zeros((4, 3)).at[2].set(1e-6)
+    along = (dimming(scales + step) - dimming(scales - step)) / 2
+    assert float(along) == pytest.approx(float(jnp.sum(jax.grad(dimming)(scales) * step)), rel=1e-5)

@@ -26,6 +26,7 @@ uniform vec2 last_light;       // of zz - xx, 3 yy - 1
 uniform vec2 shading_range;
 uniform float near;
 uniform float eps2d;
+uniform float low_pass;                              // metres, 0: none
 uniform float alpha_min;
 uniform float jacobian_margin; // negative: none
 uniform bool rotation_only;    // "rotation" skinning: the published network's
@@ -113,6 +114,11 @@ void main() {
   float s00 = dot(m0, m0), s01 = dot(m0, m1), s11 = dot(m1, m1);
   vec3 across = cross(m0, m1);                       // a determinant without cancellation
   float determinant = dot(across, across) + eps2d * (s00 + s11) + eps2d * eps2d;
+  if (low_pass > 0.0) {                              // as `rendering.projection` dims what the added variance makes larger
+    float contained = eps2d * min(pow(low_pass * K.x / p.z, 2.0), 1.0);
+    opacity *= sqrt((dot(across, across) + contained * (s00 + s11) + contained * contained) / determinant);
+    if (opacity <= alpha_min) return;
+  }
   s00 += eps2d;
   s11 += eps2d;
   float half_difference = 0.5 * (s00 - s11);

@@ -69,7 +69,7 @@ function makeRenderer(canvas, scene) {
     project.set({
       order: 0, gaussians: 1, means: 2, count, camera_rotation: camera.rotation, camera_offset: camera.translation, K: camera.K,
       size: [width, height], log_scale: [header.scales.low, header.scales.high],
-      color_range: [header.colors.low, header.colors.high], near: how.near, eps2d: how.eps2d, alpha_min: how.alpha_min,
+      color_range: [header.colors.low, header.colors.high], near: how.near, eps2d: how.eps2d, low_pass: how.low_pass, alpha_min: how.alpha_min,
       first_light: light.slice(0, 3), more_light: light.slice(3, 6), last_light: light.slice(6), shading_range: [shading.low, shading.high],
       jacobian_margin: how.jacobian_margin ?? -1, rotation_only: header.skinning === "rotation" ? 1 : 0,
     });
