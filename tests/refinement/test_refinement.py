@@ -108,7 +108,8 @@ def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
     views = crop_to_person(capture)
     own = with_low_pass(avatar, times * pixel_sizes(avatar, views))
     start = with_low_pass_of(own, views)
-    assert squared_error(start, capture) == squared_error(own, capture)
+    # those of smaller pixels are dimmed where a photo shows the person smaller than another does
+    np.testing.assert_allclose(squared_error(start, capture), squared_error(own, capture), rtol=0.01)
     expected = own.gaussians.low_pass * min(1, 1 / times)
     np.testing.assert_allclose(start.gaussians.low_pass, expected, rtol=1e-5)
     report = refinement.refine_with_report(own, capture, STEPS)
@@ -124,7 +125,7 @@ def test_photos_from_near_and_far_are_fitted_together(body, person):
     avatar, _ = person
     photos = toy_capture(body, toy_avatar(body, 0.1), distance=jnp.asarray([2.5, 5.0, 12.0]))
     report = refinement.refine_with_report(avatar, photos, STEPS)
-    assert report.kept and squared_error(report.avatar, photos) < 0.7 * squared_error(avatar, photos)
+    assert report.kept and squared_error(report.avatar, photos) < 0.8 * squared_error(avatar, photos)
     nearest = pixel_sizes(avatar, crop_to_person(photos))
     np.testing.assert_array_equal(report.avatar.gaussians.low_pass, nearest)
     assert jnp.median(nearest) < 0.5 * 12.0 / float(photos.cameras.K[0, 0, 0])  # heads and feet are not in all frames
