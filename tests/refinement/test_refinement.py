@@ -117,7 +117,7 @@ def test_steps_start_from_what_the_photos_show_of_an_avatar(person, times):
     np.testing.assert_allclose(np.diff(report.psnr), -10 * np.diff(np.log10(errors)), atol=SAME_GAIN)
     assert report.kept and errors[1] < errors[0]
     views_alone, _ = refinement.refine_views(own, views, STEPS, SplatConfig(max_pairs=1 << 14, max_rows=1 << 13), 0)
-    np.testing.assert_allclose(squared_error(views_alone, capture), errors[0], rtol=1e-3)
+    np.testing.assert_allclose(squared_error(views_alone, capture), errors[0], rtol=0.01)  # dimmed, as above
 
 
 def test_photos_from_near_and_far_are_fitted_together(body, person):
