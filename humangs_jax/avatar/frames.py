@@ -19,6 +19,7 @@ from humangs_jax.core.progress import bar
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.motion import Motion, grounded
+from humangs_jax.data.views import upright_world
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera, intrinsics_from_fov
 from humangs_jax.io.reading import check_limit
@@ -261,14 +262,15 @@ def turntable_views(avatar: Avatar, pose: BodyPose, views: int, shot: Shot) -> t
 
 
 def capture_views(avatar: Avatar, capture: Capture) -> tuple[BodyPose, Camera]:
-    """The pose and the camera of each view of a capture.
+    """The pose and the camera of each view of a capture, in a world with y up: an avatar's light is that of such a world.
 
     Raises: ValueError if the capture's body has another number of joints than the avatar.
     """
     joints = capture.poses.rotations.shape[1]
     if joints != len(avatar.parents):
         raise ValueError(f"the capture's poses have {joints} joints, the avatar has {len(avatar.parents)}")
-    return jax.tree.map(lambda x: x[np.asarray(capture.frames)], capture.poses), capture.cameras
+    poses = jax.tree.map(lambda x: x[np.asarray(capture.frames)], capture.poses)
+    return upright_world(poses, capture.cameras, lambda: np.asarray(avatar.rest_joints)[avatar.parents.index(-1)])
 
 
 def capture_renderings(

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import logging
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -223,23 +224,35 @@ def _window(image, left, top, side, fill):
 
 
 def upright(views: SubjectViews, body: BodyModel) -> SubjectViews:
-    """The views in a world whose y axis points up; the same object if theirs does.
-
-    Captures are to have y up. One with z up is as consistent, but the network has seen no such world: it is turned, and a warning
-    logged, where the person and the cameras both stand along another axis. The person alone may lie. On the host.
-    """
-    rotations, translations = np.asarray(views.rotations), np.asarray(views.translations)
-    up = standing_axis(rotations[:, 0])
-    if up in (None, "y") or nearest_axis(-np.asarray(views.cameras.cam_from_world)[:, 1, :3].mean(axis=0))[0] != up:
+    """The views in a world whose y axis points up; the same object if theirs does. See `upright_world`. On the host."""
+    pelvis = lambda: np.asarray(shape_body(body, views.betas).joints[0])
+    poses, cameras = upright_world(jax.vmap(BodyPose)(views.rotations, views.translations), views.cameras, pelvis)
+    if cameras is views.cameras:
         return views
+    return replace(views, cameras=cameras, rotations=poses.rotations, translations=poses.translation)
+
+
+def upright_world(
+    poses: BodyPose, cameras: Camera, pelvis: Callable[[], Float[np.ndarray, "3"]]
+) -> tuple[BodyPose, Camera]:
+    """Poses and cameras of some views in a world whose y axis points up; the same objects if theirs does.
+
+    Captures are to have y up. One with z up is as consistent, but the network has seen no such world, and an avatar's light is
+    that of a world with y up: it is turned, and a warning logged, where the person and the cameras both stand along another axis.
+    The person alone may lie. On the host.
+
+    Arguments: poses, cameras: batches of one length. pelvis: the root joint in T-pose, metres, where it is needed.
+    """
+    rotations, translations = np.asarray(poses.rotations), np.asarray(poses.translation)
+    up = standing_axis(rotations[:, 0])
+    if up in (None, "y") or nearest_axis(-np.asarray(cameras.cam_from_world)[:, 1, :3].mean(axis=0))[0] != up:
+        return poses, cameras
     logger.warning("the world of these views has %s up, person and cameras say: expected y up, it is turned", up)
-    pelvis, turn = np.asarray(shape_body(body, views.betas).joints[0]), upright_matrix(up)
-    rotations, translations = turned_upright(rotations, translations, up, pelvis)
+    rotations, translations = turned_upright(rotations, translations, up, pelvis())
     back = np.eye(4)
-    back[:3, :3] = turn.T
-    cameras = replace(views.cameras, cam_from_world=jnp.asarray(views.cameras.cam_from_world @ back, jnp.float32))
-    moved = {"rotations": rotations, "translations": translations}
-    return replace(views, cameras=cameras, **{name: jnp.asarray(x, jnp.float32) for name, x in moved.items()})
+    back[:3, :3] = upright_matrix(up).T
+    turned = jax.vmap(BodyPose)(jnp.asarray(rotations, jnp.float32), jnp.asarray(translations, jnp.float32))
+    return turned, replace(cameras, cam_from_world=jnp.asarray(cameras.cam_from_world @ back, jnp.float32))
 
 
 def standardize(capture: Capture, size: int, crop: bool = False) -> SubjectViews:

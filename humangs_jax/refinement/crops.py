@@ -8,7 +8,7 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.usable_views import usable_views
-from humangs_jax.data.views import SubjectViews
+from humangs_jax.data.views import SubjectViews, upright
 
 MARGIN = 8
 """Pixels around the mask: the window of structural similarity has 11, and Gaussians beyond the outline cost alpha there."""
@@ -23,8 +23,10 @@ BLOCK = 8
 def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectViews:
     """The photos, cut to the person by windows of one size, with the cameras that see the windows.
 
-    Photos whose longer side exceeds `image_size` are reduced to it. Views whose mask does not show the person are left out, see
-    `usable_views`. Raises: ValueError without masks; CaptureError if no view is left.
+    In a world with y up (`data.views.upright_world`). Photos whose longer side exceeds `image_size` are reduced to it. Views
+    whose mask does not show the person are left out, see `usable_views`.
+
+    Raises: ValueError without masks; CaptureError if no view is left.
     """
     if capture.masks is None:
         raise ValueError("crop_to_person: the capture has no masks")
@@ -43,7 +45,7 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
     shift = np.zeros((len(images), 3, 3), np.float32)
     shift[:, 1, 2], shift[:, 0, 2] = np.transpose(corners)
     frames = np.asarray(capture.frames)
-    return SubjectViews(
+    views = SubjectViews(
         images=jnp.asarray(crop(images), jnp.float32),
         masks=jnp.asarray(crop(masks), jnp.float32),
         cameras=replace(cameras, K=cameras.K - shift, width=columns, height=rows),
@@ -51,6 +53,7 @@ def crop_to_person(capture: Capture, image_size: int | None = None) -> SubjectVi
         translations=jnp.asarray(capture.poses.translation)[frames],
         betas=jnp.asarray(capture.betas),
     )
+    return upright(views, capture.body)
 
 
 def held_out_blocks(views: SubjectViews, share: float, seed: int) -> Bool[Array, "v h w"]:

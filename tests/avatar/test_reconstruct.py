@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.avatar.animate import skin
+from humangs_jax.avatar.frames import capture_renderings
 from humangs_jax.avatar.reconstruct import (
     _assemble_compiled,
     make_avatar,
@@ -28,6 +29,7 @@ from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.presets import tiny
+from humangs_jax.refinement.crops import crop_to_person
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splatting import SplatConfig, render
 
@@ -212,6 +214,23 @@ def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
     for second, first in (avatars, (lit.gaussians, unlit.gaussians)):
         for got, expected in zip(jax.tree.leaves(second), jax.tree.leaves(first), strict=True):
             np.testing.assert_allclose(got, expected, atol=100 * TURNED)
+
+
+def test_light_shines_from_above_in_a_capture_of_another_world(body, network):
+    """Drawing and fitting an avatar with light give the same in a capture whose z axis points up."""
+    photos = capture(body, SIZE, SIZE)
+    bent = replace(photos.poses, rotations=photos.poses.rotations.at[:, 16].set(jnp.asarray([0.0, 0.0, -1.2])))
+    photos = dataclasses.replace(photos, poses=bent)
+    avatar = reconstruct(network[0], network[1].with_conventions(light=True), photos)
+    count = len(avatar.gaussians.means)
+    shining = replace(avatar.light, coefficients=jnp.arange(8.0) / 8, shading=jnp.zeros(count))
+    avatar, turned = replace(avatar, light=shining), with_z_up(photos)
+    own, others = (np.asarray([r.rgb for r in capture_renderings(avatar, x)[1]]) for x in (photos, turned))
+    np.testing.assert_allclose(own, others, atol=100 * TURNED)
+    unlit = np.asarray([r.rgb for r in capture_renderings(replace(avatar, light=None), photos)[1]])
+    assert np.abs(own - unlit).max() > 0.05
+    for got, expected in zip(*map(jax.tree.leaves, map(crop_to_person, (turned, photos))), strict=True):
+        np.testing.assert_allclose(got, expected, atol=TURNED)
 
 
 def test_people_who_lie_before_upright_cameras_are_left_lying(body):
