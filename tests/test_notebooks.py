@@ -1,9 +1,240 @@
+"""The committed notebooks say what they show, show whole people, and run.
+
+What a notebook keeps to, so that these tests can look:
+
+- A number in digits in the prose stands in an output of the notebook or in its code. With a unit it is a result: it
+  stands with that unit in an output. "Some", "about" allow zeros at its end. Results are not written in words ("two fifths").
+- The first cell ends with how long the notebook takes, a key of `DURATIONS`; the last output has the seconds.
+- Pictures of people are drawn by `pictures`, which frames each in `FRAME`: the whole person lies inside of the frame.
+- What it reads of docs/ is part of the package.
+"""
+
+import base64
+import io
+import json
+import re
+import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
-NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.ipynb"))
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 TIMEOUT_SECONDS = 600
+MOST_BYTES = 1_500_000
+"""Of a notebook: no page of the viewer is in it."""
+
+UNITS = ("dB", "%", "MiB", "MB", "ms", "s", "mm", "m", "times")
+NUMBER = r"\d{1,3}(?:,\d{3})+|\d+(?:\.\d+)?(?:e[+-]?\d+)?"
+STATED = re.compile(
+    rf"(?:\b(some|about) +)?(?<![\w.,/^])({NUMBER})(?![\w/]|[.,]\d)(?: ?({'|'.join(UNITS)})(?![\w^]))?", re.I
+)
+IN_WORDS = re.compile(
+    r"\b(halves|thirds|quarters?|fifths|sixths|eighths|tenths|twice|thrice|percent|half (?:of|as)|"
+    r"a (?:half|third|fifth|tenth) of|(?:two|three|four|five|six|seven|eight|nine|ten|twenty|hundred|thousand) times)\b",
+    re.IGNORECASE,
+)
+DURATIONS = {"About a minute on a CPU with two cores.": (20, 140), "A few minutes on a CPU with two cores.": (60, 600)}
+"""Seconds of CPU time, between which the committed run lies: two cores take between one and half of them."""
+
+PICTURES = {
+    "ablations": 3,
+    "batched_reconstruction": 10,
+    "numerical_stability": 9,
+    "quickstart": 27,
+    "speed_and_accuracy": 12,
+    "splatting_from_the_inside": 1,
+    "systems_compared": 0,
+    "training": 4,
+    "write_your_own_part": 3,
+    "your_own_photos": 16,
+}
+"""Framed pictures of each notebook."""
+FRAME, SMALLEST = 204, 40
+"""Grey level of a frame; its least side, pixels."""
+BACKGROUND, BORDER = 24, 60
+"""Grey levels by which a person differs from the background at least; at the border more, where filters may blur a foot."""
+LEAST, MOST = 0.01, 0.7
+"""Share of a picture that a person covers."""
+
+
+def cells(notebook, kind):
+    """Sources of the cells of one kind."""
+    return ["".join(cell["source"]) for cell in notebook["cells"] if cell["cell_type"] == kind]
+
+
+def outputs(notebook):
+    """All outputs, in order."""
+    return [out for cell in notebook["cells"] if cell["cell_type"] == "code" for out in cell["outputs"]]
+
+
+def printed(notebook):
+    """The text of all outputs."""
+    return "\n".join("".join(out["text"]) for out in outputs(notebook) if out["output_type"] == "stream")
+
+
+def images(notebook):
+    """Arrays (h, w, 3) of all figures, levels 0 to 255."""
+    found = [out["data"]["image/png"] for out in outputs(notebook) if "image/png" in out.get("data", {})]
+    return [np.asarray(Image.open(io.BytesIO(base64.b64decode(x))).convert("RGB"), np.int32) for x in found]
+
+
+def prose(notebook):
+    """The text without code and the targets of links."""
+    text = "\n\n".join(cells(notebook, "markdown"))
+    return re.sub(r"`[^`]*`|\]\([^)]*\)", " ", text)
+
+
+def rounds_to(value, stated, zeros):
+    """Whether a number is the stated one, given its decimals, or zeros at its end."""
+    plain = stated.replace(",", "")
+    decimals = len(plain.partition(".")[2])
+    if zeros and "." not in plain:
+        decimals = -(len(plain) - len(plain.rstrip("0")))
+    return round(abs(value), decimals) == float(plain)
+
+
+def unfounded(notebook):
+    """What the prose states that neither outputs nor code have."""
+    text, shown, code = prose(notebook), printed(notebook), "\n".join(cells(notebook, "code"))
+    numbers = lambda where, unit="": [
+        float(found.replace(",", "")) for found in re.findall(rf"(?<![\w.,])({NUMBER}){unit}", where)
+    ]
+    wrong = [found[0] for found in IN_WORDS.finditer(text)]
+    for found in STATED.finditer(text):
+        zeros, number, unit = found.groups()
+        known = numbers(shown, rf" ?{re.escape(unit)}(?!\w)") if unit else numbers(shown) + numbers(code)
+        if not any(rounds_to(value, number, zeros) for value in known):
+            wrong.append(" ".join(found[0].split()))
+    return wrong
+
+
+def runs(line):
+    """First and last index of the runs of true values of at least `SMALLEST`."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(np.int8), [0]])))
+    return [(a, b - 1) for a, b in edges.reshape(-1, 2).tolist() if b - a >= SMALLEST]
+
+
+def framed(image):
+    """What lies inside of each frame of a figure."""
+    line = np.all(abs(image - FRAME) <= 4, axis=-1)
+    rows, found = {i: runs(row) for i, row in enumerate(line) if row.sum() >= SMALLEST}, []
+    for top in rows:
+        for left, right in rows[top]:
+            for bottom in (i for i in rows if i >= top + SMALLEST and (left, right) in rows[i]):
+                if line[top:bottom, [left, right]].all():
+                    found.append(image[top + 1 : bottom, left + 1 : right])
+                    break
+    return found
+
+
+def fault(picture):
+    """Why a picture does not show a whole person, or None."""
+    border = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])
+    background = np.median(border, axis=0)
+    difference = lambda pixels: np.abs(pixels - background).max(-1)
+    if (difference(border) > BORDER).any():
+        return "something reaches the border"
+    share = (difference(picture) > BACKGROUND).mean()
+    return None if LEAST <= share <= MOST else f"a person on {share:.1%} of the picture"
+
+
+@pytest.fixture(params=NOTEBOOKS, ids=lambda path: path.stem)
+def committed(request):
+    """Name and content of a notebook."""
+    return request.param.stem, json.loads(request.param.read_text())
+
+
+def test_cells_are_executed_in_order(committed):
+    _, notebook = committed
+    counts = [cell["execution_count"] for cell in notebook["cells"] if cell["cell_type"] == "code"]
+    assert counts == list(range(1, len(counts) + 1))
+    assert not [out for out in outputs(notebook) if out["output_type"] == "error" or out.get("name") == "stderr"]
+    assert images(notebook)
+    assert len(json.dumps(notebook)) < MOST_BYTES
+    assert not re.search(r"/(?:tmp|home|root|work|Users)/", printed(notebook)), "a path of the machine"
+
+
+def test_numbers_of_the_prose_are_in_the_outputs(committed):
+    assert not unfounded(committed[1])
+
+
+def test_time_of_the_prose_is_the_time_of_the_run(committed):
+    _, notebook = committed
+    first = " ".join(cells(notebook, "markdown")[0].split())
+    least, most = next(bounds for said, bounds in DURATIONS.items() if first.endswith(said))
+    took = re.search(r"this notebook took \d+ s, (\d+) s of CPU", "".join(outputs(notebook)[-1]["text"]))
+    assert took and least <= int(took[1]) <= most
+
+
+def test_people_lie_inside_of_their_pictures(committed):
+    name, notebook = committed
+    pictures = [picture for image in images(notebook) for picture in framed(image)]
+    assert len(pictures) == PICTURES[name]
+    assert not [why for picture in pictures if (why := fault(picture))]
+
+
+def test_links_lead_somewhere(committed):
+    text = "\n".join(cells(committed[1], "markdown"))
+    links = [target for target in re.findall(r"\]\(([^)#]+)", text) if not target.startswith("http")]
+    pages = re.findall(r"`(docs/[\w/]+\.md)`", text)
+    gone = [x for x in links if not (ROOT / "notebooks" / x).exists()] + [x for x in pages if not (ROOT / x).exists()]
+    assert not gone
+
+
+def test_what_notebooks_need_is_installed_with_the_package():
+    code = "\n".join(source for path in NOTEBOOKS for source in cells(json.loads(path.read_text()), "code"))
+    read = {f"docs/{name}" for name in re.findall(r'docs / "([\w./]+)"', code)}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    shipped = project["tool"]["hatch"]["build"]["targets"]["wheel"]["force-include"]
+    assert read
+    assert {name: shipped.get(name) for name in read} == {name: f"humangs_jax/assets/{name}" for name in read}
+    assert all((ROOT / name).is_file() for name in read)
+    assert any(name.startswith("jupyterlab") for name in project["project"]["optional-dependencies"]["notebooks"])
+
+
+def test_the_helper_that_frames_people_is_the_same_everywhere():
+    sources = [source for path in NOTEBOOKS for source in cells(json.loads(path.read_text()), "code")]
+    helpers = {found for source in sources for found in re.findall(r"def pictures.*?plt\.show\(\)", source, re.DOTALL)}
+    assert len(helpers) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "shown", "wrong"),
+    [
+        ("It gains 1.5 dB in 9.2 times the time.", "best: +1.48 dB in 9.17 times", []),
+        ("It gains 1.5 dB in 10 times the time.", "best: +1.48 dB in 9.17 times", ["10 times"]),
+        ("It gains 1.5 dB.", "1.5 is no gain; 12.5 dB, 1.6 dB", ["1.5 dB"]),
+        ("Some 20,000 Gaussians, about 50 % of them seen.", "20,376 Gaussians, 51% seen", []),
+        ("20,000 Gaussians, 50 % of them seen.", "20,376 Gaussians, 51% seen", ["20,000", "50 %"]),
+        ("Two fifths are hidden, a third of them twice.", "", ["fifths", "a third of", "twice"]),
+        ("Images of 64 pixels, `K of 512`, 3D, float32, [8](a9.md).", "", ["8"]),
+    ],
+)
+def test_stale_numbers_are_found(text, shown, wrong):
+    code = {"cell_type": "code", "source": "size = 64", "outputs": [{"output_type": "stream", "text": [shown]}]}
+    assert unfounded({"cells": [{"cell_type": "markdown", "source": [text]}, code]}) == wrong
+
+
+@pytest.mark.parametrize(
+    ("top", "left", "expected"),
+    [(40, 60, None), (-30, 60, "border"), (40, 120, "border"), (200, 60, "0.0%")],
+    ids=["whole", "no head", "half", "nobody"],
+)
+@pytest.mark.parametrize("background", [255, 178, 0])
+def test_people_who_are_cut_are_found(top, left, expected, background):
+    """A figure of two framed pictures; the person of the second is moved."""
+    image = np.full((200, 320, 3), 255)
+    for shift, (first, side) in ((0, (40, 60)), (160, (top, left))):
+        picture = np.full((180, 140, 3), background)
+        picture[max(first, 0) : first + 110, side : side + 30] = (120, 60, 20)
+        image[10:190, shift + 10 : shift + 150] = picture
+        image[[10, 189], shift + 10 : shift + 150] = image[10:190, [shift + 10, shift + 149]] = FRAME
+    whole, moved = map(fault, framed(image))
+    assert whole is None
+    assert moved is None if expected is None else expected in moved
 
 
 @pytest.mark.slow
@@ -14,9 +245,9 @@ def test_notebook_runs_from_top_to_bottom(path, tmp_path):
     from nbclient import NotebookClient
 
     notebook = nbformat.read(path, as_version=4)
-    committed = [cell for cell in notebook.cells if cell.cell_type == "code" and "image/png" in str(cell.outputs)]
-    assert committed, f"{path.name} is committed without its images"
+    before = len(images(notebook))
     NotebookClient(notebook, timeout=TIMEOUT_SECONDS, resources={"metadata": {"path": tmp_path}}).execute()
-    assert sum("image/png" in str(cell.outputs) for cell in notebook.cells if cell.cell_type == "code") >= len(
-        committed
-    )
+    assert len(images(notebook)) == before
+    pictures = [picture for image in images(notebook) for picture in framed(image)]
+    assert len(pictures) == PICTURES[path.stem]
+    assert not [why for picture in pictures if (why := fault(picture))]
