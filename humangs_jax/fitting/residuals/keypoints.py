@@ -8,7 +8,7 @@ import numpy as np
 
 from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
 from humangs_jax.core.array_types import Array, Bool, Float, Int
-from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.residuals.priors import PosePrior, limit_residuals
@@ -31,7 +31,7 @@ RAYLEIGH_MEDIAN = 1.1774
 
 
 @pytree_dataclass
-class Observations:
+class Observations(Batchable):
     """Keypoints of one frame in c views; a missing view has confidence 0.
 
     points: (c, k, 2) pixels, centres at +0.5. confidences: (c, k) in [0, 1]; 0: not seen. K: (c, 3, 3) pixels.
