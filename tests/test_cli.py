@@ -335,7 +335,8 @@ def test_what_a_file_says_does_not_act_on_the_terminal(verbose, monkeypatch, sam
         screen.warn(hostile)
         screen.tell(hostile)
         screen.wrote(Path(hostile), hostile)
-        logging.getLogger("humangs_jax.sample").warning("%s", hostile)
+        # pytest-xdist cannot send a captured log with half a surrogate
+        logging.getLogger("humangs_jax.sample").warning("%s", hostile[:-1])
         with stage(hostile):
             raise ValueError(hostile)
 

@@ -126,7 +126,7 @@ def project(camera: Camera, points: Float[Array, "*b 3"]) -> tuple[Float[Array, 
     return uv, depth
 
 
-def intrinsics_from_fov(vertical_fov: float, width: int, height: int) -> Matrix3:
+def intrinsics_from_fov(vertical_fov: float | Float[Array, ""], width: int, height: int) -> Matrix3:
     """K of a camera with square pixels and a centred axis; field of view in radians.
 
     Raises: ValueError for an angle that is not between 0 and pi.
@@ -136,7 +136,8 @@ def intrinsics_from_fov(vertical_fov: float, width: int, height: int) -> Matrix3
             f"intrinsics_from_fov: vertical_fov {float(vertical_fov):.6g}: expected radians between 0 and pi; "
             f"{float(vertical_fov):.6g} degrees are np.deg2rad({float(vertical_fov):.6g})"
         )
-    focal = 0.5 * height / np.tan(0.5 * vertical_fov)
+    tan = jnp.tan if isinstance(vertical_fov, Tracer) else np.tan
+    focal = 0.5 * height / tan(0.5 * vertical_fov)
     return jnp.asarray([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]], jnp.float32)
 
 

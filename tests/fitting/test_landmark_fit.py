@@ -7,6 +7,7 @@ import pytest
 from fit_people import POSES, model_of, observe
 
 from humangs_jax.core.pytree import replace
+from humangs_jax.fitting import landmark_fit
 from humangs_jax.fitting.landmark_fit import STAGES, FitConfig, fit_landmarks
 from humangs_jax.fitting.residuals.priors import pose_prior, violations
 from humangs_jax.fitting.uncertainty import fit_uncertainty
@@ -27,6 +28,15 @@ def mean_mm(fit, joints, rows=slice(None)):
 def noisy():
     joints, betas, seen = observe(NAMES, noise=2.0)
     return joints, betas, seen, fit_landmarks(model_of(), seen, CONFIG)
+
+
+def test_frames_are_a_batch(monkeypatch):
+    """Without the fit itself, which takes minutes: the fast tests know that its arguments pass."""
+    _, _, seen = observe(NAMES[:2])
+    monkeypatch.setattr(landmark_fit, "_fit_frames", lambda model, observations, config: observations)
+    assert fit_landmarks(model_of(), seen, CONFIG).batch_shape == (2,)
+    with pytest.raises(ValueError, match=r"observations.K: expected shape \(2, 4, 3, 3\), got \(2, 3, 3, 3\)"):
+        fit_landmarks(model_of(), replace(seen, K=seen.K[:, :3]), CONFIG)
 
 
 @pytest.mark.slow

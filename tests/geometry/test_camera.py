@@ -102,3 +102,11 @@ def test_stacking_needs_cameras_of_one_size():
         cameras.stack_cameras([c, c.resized(8, 8)])
     with pytest.raises(ValueError, match="no cameras"):
         cameras.stack_cameras([])
+
+
+def test_the_field_of_view_is_an_argument_of_transformations_too():
+    def focal(angle):
+        return cameras.intrinsics_from_fov(angle, 64, 48)[1, 1]
+
+    assert np.isclose(jax.jit(focal)(0.7), focal(0.7), rtol=1e-6)
+    assert np.isclose(jax.grad(focal)(0.7), (focal(0.701) - focal(0.699)) / 0.002, rtol=1e-2)  # of float32 differences
