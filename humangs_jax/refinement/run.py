@@ -31,7 +31,7 @@ TRIAL = 1 / 3
 ALLOWED_LOSS = 0.1
 """Decibels that steps may lose on the photo that is held out: it lacks what they learn from it when all photos are fitted."""
 ALLOWED_LOSS_OF_ROUNDS = 1.0
-"""Decibels, likewise, that the learned update may lose there: one of eight test people loses 0.2 and gains 2.1 from all photos."""
+"""Decibels, likewise, that the learned update may lose there: one of eight test people loses 0.2 and gains 2.1 by all."""
 TIMED_STEPS = 3
 """Steps that are timed to plan how many a run has."""
 OVERRUN = 1.5
