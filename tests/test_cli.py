@@ -256,11 +256,16 @@ def test_training_goes_on_from_weights_as_they_were_trained(tmp_path, monkeypatc
 
 @pytest.mark.parametrize(("done", "code"), [(3, cli.INTERRUPTED), (5, 0)])
 def test_training_that_was_stopped_says_how_far_it_came(done, code, tmp_path, monkeypatch, capsys):
-    """Ctrl-C: `train` saves and returns, and the exit code still tells that it was interrupted."""
+    """Ctrl-C: `train` saves and raises, and the exit code tells that it was interrupted, unless all steps were done."""
     from humangs_jax.training import loop, sources
 
+    def interrupted(*arguments, **options):
+        stopped = loop.TrainingInterrupted.__new__(loop.TrainingInterrupted)  # a whole state is not needed
+        stopped.state = SimpleNamespace(step=done)
+        raise stopped
+
     monkeypatch.setattr(sources, "training_people", lambda *arguments: None)
-    monkeypatch.setattr(loop, "train", lambda *arguments, **options: SimpleNamespace(step=done))
+    monkeypatch.setattr(loop, "train", interrupted)
     words = ["train", "--config", "tiny", "--steps", "5", "--on-the-fly", "1", "--out", str(tmp_path)]
     assert cli.execute(words) == code
     out, err = capsys.readouterr()

@@ -58,7 +58,9 @@ def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     Raises: as `read_image`; FileError for several labels or colours, for a label 0 that is not black, for no black, and for alpha
     and greys that differ: which is the person?
     """
-    with open_image(path) as (image, _):
+    with open_image(path) as (image, data):
+        if image.format == "PNG":
+            _checked_chunks(data)
         if image.mode == "P" and image.convert("RGBA").getchannel("A").getextrema()[0] == 255:
             colours = np.asarray(image.getpalette("RGB") or (), int).reshape(-1, 3)
             return _mask_of_labels(np.asarray(image), np.pad(colours, ((0, 256 - len(colours)), (0, 0))))
