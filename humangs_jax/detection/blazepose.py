@@ -10,6 +10,7 @@ Pixels in this file are mediapipe's: (x, y), the centre of the first at 0. `peop
 
 import contextlib
 import functools
+import importlib
 import os
 import sys
 from collections.abc import Generator
@@ -97,14 +98,15 @@ class Networks:
     def __init__(self) -> None:
         try:
             with _silent():
-                from ai_edge_litert.interpreter import Interpreter
+                # optional, and then unknown to type checkers
+                interpreter = importlib.import_module("ai_edge_litert.interpreter").Interpreter
         except ImportError as error:
             raise ImportError(
                 "finding people in photos needs LiteRT: pip install 'humangs_jax[photos]' (there is none for Macs with Intel "
                 "processors: give keypoints and masks of another program there, see docs/your_photos.md)"
             ) from error
         folder = resources.files("humangs_jax") / "assets" / "blazepose"
-        self._runs = [self._load(Interpreter, folder / name) for name in (DETECTOR, LANDMARKS)]
+        self._runs = [self._load(interpreter, folder / name) for name in (DETECTOR, LANDMARKS)]
 
     @staticmethod
     def _load(interpreter: Any, file: Any) -> Any:
@@ -198,7 +200,7 @@ def mask_in_photo(found: Landmarks, width: int, height: int) -> Float[np.ndarray
     left, top = np.floor(corners.min(0)).astype(int).clip(0, [width, height])
     right, bottom = np.ceil(corners.max(0) + 1).astype(int).clip(0, [width, height])
     if right > left and bottom > top:
-        grid = np.stack(np.meshgrid(np.arange(left, right), np.arange(top, bottom)), axis=-1)
+        grid = np.stack(np.meshgrid(np.arange(left, right), np.arange(top, bottom)), axis=-1).astype(float)
         mask[top:bottom, left:right] = bilinear(found.mask, found.crop.from_photo(grid) * LANDMARK_SIZE, outside=0.0)
     return mask
 
