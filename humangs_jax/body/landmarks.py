@@ -15,21 +15,26 @@ have SMPL-X's names has them. Sides are the person's. By name:
     face_27                                            root of the nose: vertex of the midline at the height of the eyes
     {side}_ear                                         outermost vertex of the head at the height of the ears
     {side}_big_toe, small_toe, heel                    vertices of the foot farthest forward and inward, forward and outward, back
+    {side}_foot_index                                  foremost vertex of the foot
+    jaw                                                the joint
 
-Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres): fits give them less weight. The
+Annotators put hips and shoulders a little elsewhere (hips higher and outwards, by centimetres): fits give them less weight. Where
+it is known at which places a detector sees its landmarks, they are moved there: `body.places`. The
 other 65 points of the face are not on this list: they follow expressions, which bodies without a face rig do not have.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.body import skinning
 from humangs_jax.body.joints import FINGERS
 from humangs_jax.body.model import BodyModel, BodyPose, pose_features
+from humangs_jax.body.places import Place
 from humangs_jax.body.surface_points import SurfacePoints, pose_points, shaped
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.core.pytree import pytree_dataclass, replace, static_field
 from humangs_jax.geometry import transform
 
 SIDES = {"left": 1.0, "right": -1.0}
@@ -63,42 +68,88 @@ class LandmarkModel:
 
 
 @checked_arguments
-def landmark_model(body: BodyModel, names: tuple[str, ...]) -> LandmarkModel:
+def landmark_model(body: BodyModel, names: tuple[str, ...], places: tuple[Place, ...] = ()) -> LandmarkModel:
     """The landmarks of a body by name; those that it does not have get rows of zeros. No names: the joints alone.
 
+    Arguments: places: of the landmarks that are elsewhere than the module says; ignored where the body lacks what they depend on.
     Raises: ValueError if it has none of them, which is so when its joints have other names than SMPL-X's.
     """
     finder = _Finder(body)
-    sources = [finder.find(name) for name in names]
-    if names and not any(sources):
+    moved = {place.name: place for place in places if finder.find(place.base) and finder.has(place.joints)}
+    sources = [[] if name in moved else finder.find(name) for name in names]
+    known = tuple(bool(found) or name in moved for name, found in zip(names, sources, strict=True))
+    if names and not any(known):
         raise ValueError(
             f"body '{body.name}' has none of these landmarks: are its joints named like SMPL-X's (left_hip, ...)? They are "
             f"{', '.join(body.joint_names[:4]) or 'not named'}"
         )
     vertices = sorted({source for found in sources for source in found if source >= 0})
-    joints = len(body.parents)
-    regressor = np.zeros((len(names), joints + len(vertices)), np.float32)
-    for row, found in zip(regressor, sources, strict=True):
+    joints, placed = len(body.parents), [moved[name] for name in names if name in moved]
+    regressor = np.zeros((len(names), joints + len(vertices) + len(placed)), np.float32)
+    for row, name, found in zip(regressor, names, sources, strict=True):
         for source in found:
             row[joints + vertices.index(source) if source >= 0 else -1 - source] += 1 / len(found)
-    chosen = np.asarray(vertices, np.int32)
-    product = lambda x: jnp.einsum("jn,n...->j...", body.joint_regressor, x, precision=skinning.EXACT)
+        if name in moved:
+            row[joints + len(vertices) + placed.index(moved[name])] = 1.0
+    points = _concatenated(
+        [_surface_points(body, np.asarray(vertices, np.int32)), *(_placed(body, finder, place) for place in placed)]
+    )
     return LandmarkModel(
-        joints=product(body.template),
-        joint_directions=product(body.shape_directions),
-        points=SurfacePoints(
-            body.template[chosen],
-            body.shape_directions[chosen],
-            None if body.pose_directions is None else body.pose_directions[chosen],
-            body.skinning_weights[chosen],
-        ),
+        joints=_regressed(body, body.template),
+        joint_directions=_regressed(body, body.shape_directions),
+        points=points,
         regressor=jnp.asarray(regressor),
         names=names,
-        known=tuple(bool(found) for found in sources),
+        known=known,
         parents=body.parents,
         joint_names=body.joint_names,
-        movers=_movers(body.parents, regressor[:, :joints].any(0), np.asarray(body.skinning_weights)[chosen]),
+        movers=_movers(body.parents, regressor[:, :joints].any(0), np.asarray(points.weights)),
     )
+
+
+def _regressed(body, values):
+    """Values of the joints from those of the vertices (n, ...)."""
+    return jnp.einsum("jn,n...->j...", body.joint_regressor, values, precision=skinning.EXACT)
+
+
+def _surface_points(body, vertices):
+    """Vertices (p,) as they are."""
+    return SurfacePoints(
+        body.template[vertices],
+        body.shape_directions[vertices],
+        None if body.pose_directions is None else body.pose_directions[vertices],
+        body.skinning_weights[vertices],
+    )
+
+
+def _joint_point(body, joint):
+    """A joint as a point that it carries itself."""
+    row = body.joint_regressor[joint : joint + 1]
+    product = lambda values: jnp.einsum("jn,n...->j...", row, values, precision=skinning.EXACT)
+    return SurfacePoints(
+        product(body.template),
+        product(body.shape_directions),
+        None if body.pose_directions is None else jnp.zeros_like(body.pose_directions[:1]),
+        jnp.zeros_like(body.skinning_weights[:1]).at[0, joint].set(1.0),
+    )
+
+
+def _placed(body, finder, place):
+    """One point beside the sources of a landmark: it grows with them, and turns with the joints of the place."""
+    sources = finder.find(place.base)
+    points = _concatenated(
+        [_surface_points(body, np.asarray([s])) if s >= 0 else _joint_point(body, -1 - s) for s in sources]
+    )
+    mean = jax.tree.map(lambda leaf: leaf.mean(axis=0, keepdims=True), points)
+    weights = mean.weights
+    if place.joints:
+        carriers = np.asarray([finder.index[joint] for joint in place.joints])
+        weights = jnp.zeros_like(weights).at[0, carriers].set(1 / len(carriers))
+    return replace(mean, rest=mean.rest + jnp.asarray(place.offset, jnp.float32), weights=weights)
+
+
+def _concatenated(points):
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *points)
 
 
 def pose_landmarks(
@@ -144,6 +195,10 @@ class _Finder:
         self.joints = np.asarray(body.joint_regressor, np.float64) @ self.template
         self.index = {name: j for j, name in enumerate(body.joint_names)}
 
+    def has(self, joints: tuple[str, ...]) -> bool:
+        """Whether the body has these joints."""
+        return all(name in self.index for name in joints)
+
     def find(self, name: str) -> list[int]:
         """The sources whose mean is the landmark; none if the body lacks it."""
         try:
@@ -163,6 +218,8 @@ class _Finder:
         if name == "face_27":
             height = self._eyes()[1]
             return [self._on_midline(lambda p: -np.abs(p[:, 1] - height) + p[:, 2])]
+        if name == "jaw":
+            return [joint(name)]
         side, _, part = name.partition("_")
         if side not in SIDES:
             raise KeyError(name)
@@ -172,7 +229,7 @@ class _Finder:
             return [joint(f"{side}_wrist")]
         if part == "ear":
             return [self._ear(SIDES[side])]
-        if part in ("big_toe", "small_toe", "heel"):
+        if part in ("foot_index", "big_toe", "small_toe", "heel"):
             return [self._foot(side, part)]
         finger, _, knuckle = part.partition("_")
         if finger not in FINGERS:
@@ -212,7 +269,7 @@ class _Finder:
         return self._best(head[(height > eyes - 0.06) & (height < eyes + 0.03)], lambda p: sign * p[:, 0])
 
     def _foot(self, side, part):
-        directions = {"big_toe": (-0.3, 1.0), "small_toe": (1.0, 1.0), "heel": (0.0, -1.0)}
+        directions = {"foot_index": (0.0, 1.0), "big_toe": (-0.3, 1.0), "small_toe": (1.0, 1.0), "heel": (0.0, -1.0)}
         outward, forward = directions[part]
         foot = self._segment(f"{side}_ankle", f"{side}_foot")
         return self._best(foot, lambda p: outward * SIDES[side] * p[:, 0] + forward * p[:, 2])

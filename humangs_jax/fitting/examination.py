@@ -68,7 +68,7 @@ def examine(
     photos = Photos(capture.images, capture.masks, capture.cameras, capture.frames, capture.names)
     observations, views = group_by_frame(photos, keypoints)
     expected, poses = np.asarray(observations.noise), jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
-    model = landmark_model(capture.body, keypoints.set.names)
+    model = landmark_model(capture.body, keypoints.set.names, keypoints.set.places)
     errors = np.asarray(_errors(model, jnp.asarray(capture.betas), poses, observations))
     compared = np.asarray(observations.confidences > 0) & np.asarray(model.known)
     lengths = np.where(compared, np.linalg.norm(errors, axis=-1), np.nan)

@@ -77,7 +77,7 @@ def fit_photos(
         raise ValueError(
             f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}"
         )
-    model = landmark_model(without_expression(body), keypoints.set.names)
+    model = landmark_model(without_expression(body), keypoints.set.names, keypoints.set.places)
     observations, _ = group_by_frame(photos, keypoints)
     if not (np.asarray(observations.confidences) * np.asarray(model.known) > 0).any():
         raise ValueError("no view has a keypoint that the body has: nothing to fit")

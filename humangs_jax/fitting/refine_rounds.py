@@ -214,7 +214,8 @@ class Scene:
         self.faces = np.asarray(capture.body.faces)
         self.edges = mesh_edges(self.faces)
         self.views = [MaskView(mask, mask_outline(mask, config.points)) for mask in self.masks]
-        self.model = landmark_model(capture.body, () if keypoints is None else keypoints.set.names)
+        names, places = ((), ()) if keypoints is None else (keypoints.set.names, keypoints.set.places)
+        self.model = landmark_model(capture.body, names, places)
         self.scale = self.cameras.width / capture.cameras.width
         self.keypoints = None if keypoints is None else _observations(capture.cameras, keypoints, 1.0)
         self.observations = None if keypoints is None else _observations(self.cameras, keypoints, self.scale)

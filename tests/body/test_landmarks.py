@@ -11,8 +11,9 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.library import load_body
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
+from humangs_jax.body.places import Place
 from humangs_jax.core.pytree import replace
-from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, OPENPOSE_67, mirrored_name
+from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, MEDIAPIPE_33, OPENPOSE_67, mirrored_name
 
 ATOL = 2e-6  # metres, float32
 SYMMETRY = 0.004  # metres: the shipped body's feet are not quite mirror images
@@ -36,6 +37,49 @@ def test_the_shipped_body_has_all_but_most_of_the_face(body, kind):
     assert missing == {n for n in kind.names if n.startswith("face_")} - {"face_8", "face_27", "face_30"}
     sums = np.asarray(model.regressor).sum(1)
     np.testing.assert_allclose(sums, np.asarray(model.known, float), atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def bent():
+    """A pose whose left elbow is bent by a right angle, to the front; the body stands where it stood."""
+    rotations = np.zeros((55, 3), np.float32)
+    rotations[JOINT_NAMES.index("left_elbow")] = 0, -np.pi / 2, 0
+    return BodyPose(jnp.asarray(rotations), jnp.zeros(3))
+
+
+@pytest.mark.parametrize(
+    ("joints", "turned"),
+    [(("left_shoulder",), (0.03, 0.02, 0.0)), (("left_elbow",), (0.0, 0.02, 0.03))],
+)
+def test_a_place_is_beside_its_joint_and_turns_with_its_bones(body, bent, joints, turned):
+    places = (Place("left_elbow", "left_elbow", (0.03, 0.02, 0.0), joints),)
+    plain, moved = landmark_model(body, ("left_elbow", "nose")), landmark_model(body, ("left_elbow", "nose"), places)
+    for betas in (jnp.zeros(0), jnp.asarray([2.0, -1.0])):
+        (a, nose), (b, same) = (pose_landmarks(model, betas, bent)[0] for model in (plain, moved))
+        np.testing.assert_allclose(b - a, turned, atol=ATOL)
+        np.testing.assert_array_equal(nose, same)
+
+
+def test_a_place_beside_a_vertex_is_carried_by_the_same_bones(body, bent):
+    wrist = landmark_model(body, ("left_index_tip",), (Place("left_index_tip", "left_index_tip", (0.0, 0.01, 0.0)),))
+    plain = landmark_model(body, ("left_index_tip",))
+    difference = pose_landmarks(wrist, jnp.zeros(0), bent)[0] - pose_landmarks(plain, jnp.zeros(0), bent)[0]
+    np.testing.assert_allclose(difference, [[0, 0.01, 0]], atol=ATOL)  # up stays up
+
+
+def test_places_of_a_body_that_lacks_their_joints_are_ignored(body):
+    strange = (Place("left_elbow", "left_elbow", (1.0, 0, 0), ("tail",)), Place("nose", "left_horn", (1.0, 0, 0)))
+    names = ("left_elbow", "nose")
+    plain, same = landmark_model(body, names), landmark_model(body, names, strange)
+    np.testing.assert_array_equal(at_rest(plain), at_rest(same))
+
+
+def test_the_shipped_body_has_every_landmark_of_our_detector(body):
+    model = landmark_model(body, MEDIAPIPE_33.names, MEDIAPIPE_33.places)
+    assert all(model.known)
+    points = dict(zip(MEDIAPIPE_33.names, at_rest(model), strict=True))
+    for name, point in points.items():
+        assert np.linalg.norm(point - points[mirrored_name(name)] * [-1, 1, 1]) < SYMMETRY, name
 
 
 @pytest.mark.slow

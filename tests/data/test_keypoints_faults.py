@@ -232,7 +232,10 @@ OWN = {
     [
         ({"points": None}, r"points: missing"),
         ({"names": np.array([{}, {}])}, r"names: a pickled object"),
-        ({"set": np.array("halpe26")}, r"set: expected one of coco17, wholebody133, openpose67, got 'halpe26'"),
+        (
+            {"set": np.array("halpe26")},
+            r"set: expected one of coco17, wholebody133, openpose67, mediapipe33, got 'halpe26'",
+        ),
         ({"points": np.ones((2, 133, 2))}, r"points: expected shape \(2, 17, 2\), views x points of coco17"),
         ({"confidences": np.ones((1, 17))}, r"confidences: expected shape \(2, 17\)"),
         ({"points": np.full((2, 17, 2), "a")}, r"points: expected numbers"),

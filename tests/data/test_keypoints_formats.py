@@ -5,9 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints, save_keypoints
+from humangs_jax.data.keypoints.people_file import ImagePeople, SeenPerson, read_people, write_people
 from humangs_jax.data.keypoints.reading import read_keypoints
-from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, OPENPOSE_67
+from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, MEDIAPIPE_33, OPENPOSE_67
 
 NAMES, SIZE = ("front", "back", "left"), (320, 240)
 CAMERA_NAMES = ("images_cam0_000000", "images_cam0_000001", "images_cam1_000000", "images_cam1_000001")
@@ -225,6 +227,76 @@ def test_our_own_file_round_trips_exactly(tmp_path, keypoint_set):
     assert [file.name for file in tmp_path.iterdir()] == ["k.npz"]  # nothing aside is left
     swapped = read(tmp_path / "k.npz", ("left", "front"))
     np.testing.assert_array_equal(swapped.points, points[[2, 0]])
+
+
+def people_file(path, *, people=2):
+    """A file of `humangs detect`: the second person is not in the second image."""
+    rng = np.random.default_rng(2)
+    person = lambda: SeenPerson(
+        np.concatenate([rng.integers(0, 800, (33, 2)) / 4, rng.integers(1, 17, (33, 1)) / 16], axis=1),
+        rng.integers(-8, 8, (33, 3)) / 8,
+        0.5,
+    )
+    images = [
+        ImagePeople(f"{name}.jpg", SIZE, tuple(None if (i, j) == (1, 1) else person() for j in range(people)))
+        for i, name in enumerate(NAMES)
+    ]
+    write_people(path, images)
+    return images
+
+
+def test_people_of_our_detector_round_trip_exactly(tmp_path):
+    images = people_file(tmp_path / "keypoints.json")
+    kind, back = read_people(tmp_path / "keypoints.json")
+    assert kind is MEDIAPIPE_33 and [(i.image, i.size) for i in back] == [(i.image, i.size) for i in images]
+    for image, again in zip(images, back, strict=True):
+        for a, b in zip(image.people, again.people, strict=True):
+            assert (a is None) == (b is None)
+            if a is not None and b is not None:
+                np.testing.assert_array_equal(a.points, b.points)
+                np.testing.assert_array_equal(a.world, b.world)
+                assert a.presence == b.presence
+
+
+@pytest.mark.parametrize("where", ["keypoints.json", "."])
+def test_a_person_of_our_detector_is_read_by_number(tmp_path, where):
+    images = people_file(tmp_path / "keypoints.json")
+    found = read(tmp_path / where, person=1)
+    assert found.set is MEDIAPIPE_33 and found.missing == ("back",)
+    np.testing.assert_array_equal(found.points[0], images[0].people[1].points[:, :2])  # no half pixel is added
+    np.testing.assert_array_equal(found.confidences[2], images[2].people[1].points[:, 2])
+
+
+def test_people_of_our_detector_are_not_mixed_in_silence(tmp_path):
+    people_file(tmp_path / "keypoints.json")
+    with pytest.raises(CaptureError, match=r"view front: 2 people: expected one\. --person I"):
+        read(tmp_path / "keypoints.json")
+    people_file(tmp_path / "one.json", people=1)
+    assert read(tmp_path / "one.json").missing == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda c: c.update(version=2), "version: expected 1, got 2"),
+        (lambda c: c.update(set="faces"), "set: expected one of .*mediapipe33, got 'faces'"),
+        (lambda c: c.update(images={}), "images: expected a list, got dict"),
+        (lambda c: c["images"][0].pop("people"), r"images\[0\]\.people: missing"),
+        (lambda c: c["images"][0].update(width=0.5), r"images\[0\]: expected width and height in pixels, got 0\.5"),
+        (lambda c: c["images"][0]["people"][0]["pixels"].pop(), r"people\[0\]\.pixels: .*\(33, 2\), got \(32, 2\)"),
+        (lambda c: c["images"][0]["people"][0].update(world="no"), r"people\[0\]\.world: expected numbers"),
+        (lambda c: c["images"][0].update(people=[[]]), r"people\[0\]: expected an object or null, got list"),
+    ],
+)
+def test_damaged_files_of_our_detector_are_one_line(tmp_path, change, said):
+    path = tmp_path / "keypoints.json"
+    people_file(path)
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+    with pytest.raises(CaptureError, match=said) as error:
+        read(path, person=0)
+    assert "\n" not in str(error.value)
 
 
 def test_saving_checks_its_arguments(tmp_path):

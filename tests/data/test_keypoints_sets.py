@@ -1,9 +1,18 @@
 import pytest
 
-from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, OPENPOSE_67, hand_names
+from humangs_jax.data.keypoints.sets import (
+    COCO_17,
+    COCO_WHOLEBODY_133,
+    KEYPOINT_SETS,
+    MEDIAPIPE_33,
+    OPENPOSE_67,
+    hand_names,
+)
 
 
-@pytest.mark.parametrize("keypoint_set, count", [(COCO_17, 17), (COCO_WHOLEBODY_133, 133), (OPENPOSE_67, 67)])
+@pytest.mark.parametrize(
+    "keypoint_set, count", [(COCO_17, 17), (COCO_WHOLEBODY_133, 133), (OPENPOSE_67, 67), (MEDIAPIPE_33, 33)]
+)
 def test_names_are_different_and_mirrors_are_mutual(keypoint_set, count):
     assert len(keypoint_set.names) == len(set(keypoint_set.names)) == len(keypoint_set.mirror) == count
     assert KEYPOINT_SETS[keypoint_set.name] is keypoint_set
@@ -31,6 +40,12 @@ def test_points_are_where_the_tools_have_them():
             {1: "neck", 2: "right_shoulder", 4: "right_wrist", 5: "left_shoulder", 8: "mid_hip", 9: "right_hip"}
             | {14: "left_ankle", 15: "right_eye", 18: "left_ear", 19: "left_big_toe", 24: "right_heel"}
             | {25: "left_hand_root", 46: "right_hand_root", 66: "right_pinky_tip"},
+        ),
+        (
+            MEDIAPIPE_33,
+            {0: "nose", 2: "left_eye", 5: "right_eye", 8: "right_ear", 11: "left_shoulder", 16: "right_wrist"}
+            | {17: "left_pinky_1", 20: "right_index_1", 22: "right_thumb_2", 24: "right_hip", 28: "right_ankle"}
+            | {1: "face_42", 6: "face_36", 9: "face_54", 30: "right_heel", 32: "right_foot_index"},
         ),
     ):
         for i, name in numbers.items():

@@ -8,6 +8,7 @@ MMPose, inferencer or demo scripts   NAME.json: a list of instances, or frames o
 COCO results, AlphaPose              one file: [{image_id or file_name, keypoints, ...}]         17 or 133
 COCO annotations, COCO-WholeBody     one file: {images, annotations}                             17 or 133
 ours, `save_keypoints`               one .npz                                                    any
+ours, `humangs detect`               one file, see `people_file`                                 33
 ===================================  ==========================================================  ====================
 
 A folder, with its sub-folders, is all of its JSON files together.
@@ -27,12 +28,13 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture_checks import CaptureError, checked_json
+from humangs_jax.data.keypoints.people_file import is_people_file, read_people
 from humangs_jax.data.keypoints.sets import COCO_17, COCO_WHOLEBODY_133, KEYPOINT_SETS, OPENPOSE_67, KeypointSet
 from humangs_jax.io.npz import read_npz
 from humangs_jax.io.reading import check_limit, limits, reading, shown, walk
 
 UNDERSTOOD = (
-    "OpenPose's people, MMPose's instances, COCO's results (AlphaPose's too), COCO's images and annotations, or our npz"
+    "OpenPose's people, MMPose's instances, COCO's results (AlphaPose's too), COCO's images and annotations, or ours"
 )
 HALF_PIXEL = 0.5
 """Every tool that we read counts pixels: the centre of the first one is at 0. Ours is at 0.5."""
@@ -88,6 +90,8 @@ def read_detections(path: Path) -> Detections:
         content = checked_json(file)
         amount += _amount(content)
         check_limit("people", amount, "people and images")
+        if len(files) == 1 and is_people_file(content):
+            return _people_detections(file, content)
         read.append(_images_of_file(content, file, name, len(files) == 1))
     images = [image for _, each in read for image in each]
     openpose = [is_openpose for is_openpose, _ in read]
@@ -398,3 +402,15 @@ def _saved_detections(file: Path) -> Detections:
     people = np.concatenate([points, confidences[..., None]], axis=-1)
     images = tuple(DetectedImage(view, file, (person,)) for view, person in zip(views, people, strict=True))
     return Detections(KEYPOINT_SETS[name], images, offset=0.0)
+
+
+def _people_detections(file: Path, content: Any) -> Detections:
+    """What `humangs detect` wrote. People who are not in an image have confidence 0 there.
+
+    Raises: CaptureError.
+    """
+    kind, images = read_people(file, content)
+    nobody = np.zeros((len(kind.names), 3))
+    found = (tuple(nobody if each is None else each.points for each in image.people) for image in images)
+    seen = tuple(DetectedImage(i.image, file, people, i.size) for i, people in zip(images, found, strict=True))
+    return Detections(kind if any(any(image.people) for image in images) else None, seen, offset=0.0)

@@ -4,15 +4,19 @@ The names, for `side` left or right (the person's own):
 
 nose, `side`_eye, _ear, _shoulder, _elbow, _wrist, _hip, _knee, _ankle, _big_toe, _small_toe, _heel; neck and mid_hip (the
     middle of the shoulders and of the hips, OpenPose only)
+`side`_foot_index: the tip of the foot, between big and second toe (BlazePose only)
 face_0 to face_67: 300-W's landmarks; 0 is the jaw under the person's right ear
 `side`_hand_root; `side`_thumb_, index_, middle_, ring_, pinky_ with 1, 2, 3, tip: 1 is nearest to the palm
 
 A point has the same name in every set that has it, though annotators of different sets do not mean quite the same by "hip".
 
-Sources: COCO's person_keypoints annotations; jin-s13/COCO-WholeBody's data format; OpenPose's "Demo - Output" page.
+Sources: COCO's person_keypoints annotations; jin-s13/COCO-WholeBody's data format; OpenPose's "Demo - Output" page; MediaPipe's
+"Pose landmark detection" page.
 """
 
 import dataclasses
+
+from humangs_jax.body.places import Place, both_sides, place
 
 SIDES = ("left", "right")
 FINGERS = ("thumb", "index", "middle", "ring", "pinky")
@@ -41,12 +45,14 @@ _FACE_EYES = {36: 45, 37: 44, 38: 43, 39: 42, 40: 47, 41: 46}
 class KeypointSet:
     """The points of a detector: their names in its order, and for each the index of its mirror image.
 
-    A point in the middle of the body is its own mirror image.
+    A point in the middle of the body is its own mirror image. places: on the body, of the points that the detector sees elsewhere
+    than `body.landmarks` has them.
     """
 
     name: str
     names: tuple[str, ...]
     mirror: tuple[int, ...]
+    places: tuple[Place, ...] = ()
 
 
 def hand_names(side: str) -> tuple[str, ...]:
@@ -70,8 +76,8 @@ def _mirrored_face(i: int) -> int:
     return (_FACE_EYES | {b: a for a, b in _FACE_EYES.items()}).get(i, i)
 
 
-def _keypoint_set(name: str, names: tuple[str, ...]) -> KeypointSet:
-    return KeypointSet(name, names, tuple(names.index(mirrored_name(each)) for each in names))
+def _keypoint_set(name: str, names: tuple[str, ...], places: tuple[Place, ...] = ()) -> KeypointSet:
+    return KeypointSet(name, names, tuple(names.index(mirrored_name(each)) for each in names), places)
 
 
 COCO_17 = _keypoint_set("coco17", _COCO)
@@ -86,5 +92,39 @@ COCO_WHOLEBODY_133 = _keypoint_set(
 OPENPOSE_67 = _keypoint_set("openpose67", (*_BODY_25, *hand_names("left"), *hand_names("right")))
 """OpenPose's BODY_25 with its left and right hand. Its 70 points of the face are ignored: they are not in this set."""
 
-KEYPOINT_SETS = {each.name: each for each in (COCO_17, COCO_WHOLEBODY_133, OPENPOSE_67)}
+_MIRRORED = lambda part: (f"left_{part}", f"right_{part}")
+_BLAZEPOSE_PLACES = (
+    place("nose", "nose", ("head",), (0, 0, 0)),
+    *both_sides(("face_42", "face_39"), "{side}_eye", ("head",), (0, 0, 0)),
+    *both_sides(_MIRRORED("eye"), "{side}_eye", ("head",), (0, 0, 0)),
+    *both_sides(("face_45", "face_36"), "{side}_eye", ("head",), (0, 0, 0)),
+    *both_sides(_MIRRORED("ear"), "{side}_ear", ("head",), (0, 0, 0)),
+    *both_sides(("face_54", "face_48"), "jaw", ("head",), (0, 0, 0)),
+    *both_sides(_MIRRORED("shoulder"), "{side}_shoulder", ("{side}_collar",), (0, 0, 0)),
+    *both_sides(_MIRRORED("elbow"), "{side}_elbow", ("{side}_shoulder", "{side}_elbow"), (0, 0, 0)),
+    *both_sides(_MIRRORED("wrist"), "{side}_wrist", ("{side}_elbow", "{side}_wrist"), (0, 0, 0)),
+    *both_sides(_MIRRORED("pinky_1"), "{side}_pinky_1", ("{side}_wrist",), (0, 0, 0)),
+    *both_sides(_MIRRORED("index_1"), "{side}_index_1", ("{side}_wrist",), (0, 0, 0)),
+    *both_sides(_MIRRORED("thumb_2"), "{side}_thumb_2", ("{side}_wrist",), (0, 0, 0)),
+    *both_sides(_MIRRORED("hip"), "{side}_hip", ("pelvis",), (0, 0, 0)),
+    *both_sides(_MIRRORED("knee"), "{side}_knee", ("{side}_hip", "{side}_knee"), (0, 0, 0)),
+    *both_sides(_MIRRORED("ankle"), "{side}_ankle", ("{side}_knee", "{side}_ankle"), (0, 0, 0)),
+    *both_sides(_MIRRORED("heel"), "{side}_heel", ("{side}_ankle",), (0, 0, 0)),
+    *both_sides(_MIRRORED("foot_index"), "{side}_foot_index", ("{side}_ankle",), (0, 0, 0)),
+)
+
+MEDIAPIPE_33 = _keypoint_set(
+    "mediapipe33",
+    (
+        *("nose", "face_42", "left_eye", "face_45", "face_39", "right_eye", "face_36", "left_ear", "right_ear"),
+        *("face_54", "face_48"),
+        *(f"{side}_{part}" for part in ("shoulder", "elbow", "wrist") for side in SIDES),
+        *(f"{side}_{part}" for part in ("pinky_1", "index_1", "thumb_2") for side in SIDES),
+        *(f"{side}_{part}" for part in ("hip", "knee", "ankle", "heel", "foot_index") for side in SIDES),
+    ),
+    _BLAZEPOSE_PLACES,
+)
+"""MediaPipe's 33 (BlazePose): the inner and outer corners of the eyes and the corners of the mouth are points of the face."""
+
+KEYPOINT_SETS = {each.name: each for each in (COCO_17, COCO_WHOLEBODY_133, OPENPOSE_67, MEDIAPIPE_33)}
 """The sets by name, as our npz files name them."""
