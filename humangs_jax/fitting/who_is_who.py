@@ -1,0 +1,131 @@
+"""Which of the people in several calibrated photos of one moment are the same person, and whose sides a view has exchanged.
+
+Landmarks of one person triangulate: seen from other cameras they fall on that person's landmarks, within a few hundredths of the
+person's size. Those of two people do not, nor do those of a person whose left and right one view takes for each other. Every pair
+of people in two views proposes points, as they are and with the sides of the second exchanged; the others join where they agree.
+"""
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from humangs_jax.core.array_types import Bool, Float
+
+AGREE = 0.06
+"""Median distance of landmarks from the triangulated points, a share of the person's size in the photo, up to which a view shows
+the same person. Cameras that are off by a degree make 0.02 of it."""
+SEEN, FEWEST = 0.3, 6
+"""Least visibility of a landmark that counts, and least number of those that two views share."""
+
+
+class Seen(NamedTuple):
+    """People of a view. K: (3, 3). cam_from_world: (4, 4). people: each (k, 3) pixels and visibility."""
+
+    K: Float[np.ndarray, "3 3"]
+    cam_from_world: Float[np.ndarray, "4 4"]
+    people: tuple[Float[np.ndarray, "k 3"], ...]
+
+
+class Match(NamedTuple):
+    """One person. members: for each view the index of its person, None where it has none. mirrored: for each view whether left
+    and right are exchanged. error: median distance of the landmarks from the triangulated points over the person's size.
+    """
+
+    members: tuple[int | None, ...]
+    mirrored: tuple[bool, ...]
+    error: float
+
+
+def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
+    """The people of some views of one moment, those seen by most views first; those whom no other view shows come last.
+
+    Arguments: mirror: for each landmark the index of its mirror image.
+    """
+    flipped_order = np.asarray(mirror)
+    left = {(v, p) for v, view in enumerate(views) for p in range(len(view.people))}
+    proposals = []
+    for (v, p), (w, q) in itertools.combinations(sorted(left), 2):
+        if v != w:
+            for flip in (False, True):
+                rows = {v: views[v].people[p], w: views[w].people[q][flipped_order] if flip else views[w].people[q]}
+                points, known = _triangulated(views, rows)
+                if known.sum() >= FEWEST:
+                    error = max(_error(views[i], row, points, known) for i, row in rows.items())
+                    if error < AGREE:
+                        proposals.append((error, (v, p), (w, q), flip, points, known))
+    groups = [_gathered(views, flipped_order, left, proposal) for proposal in proposals]
+    matches = []
+    # the group that most views agree with, and of these the one that agrees best
+    for group, error in sorted(groups, key=lambda each: (-len(each[0]), each[1])):
+        if all(key in left for key in group):
+            left -= set(group)
+            matches.append(_match(views, group, error))
+    for key in sorted(left):
+        matches.append(_match(views, {key: False}, float("inf")))
+    return matches
+
+
+def _gathered(views, mirror, available, proposal):
+    """The members of a proposal and of the other views where they agree: {(view, person): exchanged}, and the error."""
+    _, first, second, flip, points, known = proposal
+    group, errors = {first: False, second: flip}, [proposal[0]]
+    for v in range(len(views)):
+        if v in (first[0], second[0]):
+            continue
+        trials = [
+            (_error(views[v], row[mirror] if flipped else row, points, known), (v, p), flipped)
+            for p, row in enumerate(views[v].people)
+            if (v, p) in available
+            for flipped in (False, True)
+        ]
+        if not trials:
+            continue
+        error, key, flipped = min(trials)
+        if error < AGREE:
+            group[key] = flipped
+            errors.append(error)
+    return group, float(np.mean(errors))
+
+
+def _match(views, group, error):
+    members: list[int | None] = [None] * len(views)
+    mirrored = [False] * len(views)
+    for (v, p), flipped in group.items():
+        members[v], mirrored[v] = p, flipped
+    if 2 * sum(mirrored) > len(group):  # the exchanged ones are the fewer
+        mirrored = [member is not None and not flipped for member, flipped in zip(members, mirrored, strict=True)]
+    return Match(tuple(members), tuple(mirrored), error)
+
+
+def _triangulated(
+    views: Sequence[Seen], rows: dict[int, Float[np.ndarray, "k 3"]]
+) -> tuple[Float[np.ndarray, "k 3"], Bool[np.ndarray, " k"]]:
+    """Points by linear least squares, and which of them all views see."""
+    known = np.logical_and.reduce([row[:, 2] >= SEEN for row in rows.values()])
+    equations = []
+    for v, row in rows.items():
+        xy = (row[:, :2] - views[v].K[:2, 2]) / np.diag(views[v].K)[:2]
+        camera = views[v].cam_from_world[:3]
+        equations += [xy[:, i, None] * camera[2] - camera[i] for i in range(2)]
+    vectors = np.linalg.svd(np.stack(equations, axis=1))[2][:, -1]
+    scale = np.where(np.abs(vectors[:, 3]) > 1e-12, vectors[:, 3], np.nan)
+    points = vectors[:, :3] / scale[:, None]
+    return points, known & np.isfinite(points).all(-1)
+
+
+def _error(view, row, points, known):
+    """Median distance of landmarks from points over the size of the person; infinite behind the camera or with few in common."""
+    seen = known & (row[:, 2] >= SEEN)
+    if seen.sum() < FEWEST:
+        return float("inf")
+    local = points[seen] @ view.cam_from_world[:3, :3].T + view.cam_from_world[:3, 3]
+    if np.median(local[:, 2]) <= 0:
+        return float("inf")
+    pixels = local @ view.K.T
+    distances = np.linalg.norm(
+        pixels[:, :2] / np.where(local[:, 2:] > 0, local[:, 2:], np.nan) - row[seen, :2], axis=-1
+    )
+    size = np.ptp(row[row[:, 2] >= SEEN, :2], axis=0).max()
+    return float(np.median(np.nan_to_num(distances, nan=np.inf))) / max(float(size), 1e-9)
