@@ -73,20 +73,13 @@ def look(
 
     Raises: CaptureError, one line, if there is no photo, the folder is a capture already, or a named file does not exist.
     """
-    if not folder.is_dir():
-        wrong = "is a file" if folder.exists() else "no such folder"
-        raise CaptureError(folder, "", f"{wrong}: expected a folder of photos")
+    _expect_folder(folder)
     if (folder / "capture.json").is_file():
         raise CaptureError(folder, "", f"is a capture already: `humangs check {folder}` shows it")
     for path in (cameras, masks, keypoints):
         if path is not None and not path.exists():
             raise CaptureError(path, "", "no such file or folder")
-    images = next((place for name in PHOTO_FOLDERS if any(_photos(place := folder / name))), folder)
-    photos = sorted(_photos(images))
-    if not photos:
-        raise CaptureError(
-            folder, "", f"no photo: expected {', '.join(SUFFIXES[:3])} files in it or in {folder / 'images'}"
-        )
+    images, photos = photo_files(folder)
     named = (folder / name for name in KEYPOINT_FILES)
     others = sorted(path for path in folder.glob("*keypoint*") if path.suffix in ("", ".json", ".npz"))
     return Material(
@@ -99,6 +92,24 @@ def look(
         alpha=_has_alpha(photos[0]),
         keypoints=keypoints or next((path for path in (*named, *others) if path.exists()), None),
     )
+
+
+def photo_files(folder: Path) -> tuple[Path, list[Path]]:
+    """The folder that the photos are in, and their files in order. Raises: CaptureError, one line, if there is none."""
+    _expect_folder(folder)
+    images = next((place for name in PHOTO_FOLDERS if any(_photos(place := folder / name))), folder)
+    photos = sorted(_photos(images))
+    if not photos:
+        raise CaptureError(
+            folder, "", f"no photo: expected {', '.join(SUFFIXES[:3])} files in it or in {folder / 'images'}"
+        )
+    return images, photos
+
+
+def _expect_folder(folder):
+    if not folder.is_dir():
+        wrong = "is a file" if folder.exists() else "no such folder"
+        raise CaptureError(folder, "", f"{wrong}: expected a folder of photos")
 
 
 def missing(material: Material, images: Path | None = None) -> tuple[Missing, ...]:

@@ -30,6 +30,7 @@ class Command(Protocol):
 
 COMMANDS = {
     "start": "start.Start",
+    "detect": "detect.Detect",
     "import": "captures.ImportCameras",
     "fit": "fit.Fit",
     "check": "fit.Check",

@@ -16,6 +16,11 @@ from humangs_jax.core.array_types import Bool, Float
 AGREE = 0.06
 """Median distance of landmarks from the triangulated points, a share of the person's size in the photo, up to which a view shows
 the same person. Cameras that are off by a degree make 0.02 of it."""
+CLEARLY, RATHER = 0.5, 0.8
+"""Sides are exchanged if the distance is then less than this share of what it is without; the second where it does not agree
+without."""
+FARTHEST = 1.0
+"""Metres between a person's places in two frames that follow each other."""
 SEEN, FEWEST = 0.3, 6
 """Least visibility of a landmark that counts, and least number of those that two views share."""
 
@@ -30,12 +35,14 @@ class Seen(NamedTuple):
 
 class Match(NamedTuple):
     """One person. members: for each view the index of its person, None where it has none. mirrored: for each view whether left
-    and right are exchanged. error: median distance of the landmarks from the triangulated points over the person's size.
+    and right are exchanged. error: median distance of the landmarks from the triangulated points over the person's size; infinite
+    for a person of one view. center: the median of the points, metres; NaN for a person of one view.
     """
 
     members: tuple[int | None, ...]
     mirrored: tuple[bool, ...]
     error: float
+    center: Float[np.ndarray, "3"]
 
 
 def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
@@ -48,22 +55,25 @@ def match_people(views: Sequence[Seen], mirror: Sequence[int]) -> list[Match]:
     proposals = []
     for (v, p), (w, q) in itertools.combinations(sorted(left), 2):
         if v != w:
-            for flip in (False, True):
-                rows = {v: views[v].people[p], w: views[w].people[q][flipped_order] if flip else views[w].people[q]}
-                points, known = _triangulated(views, rows)
-                if known.sum() >= FEWEST:
-                    error = max(_error(views[i], row, points, known) for i, row in rows.items())
-                    if error < AGREE:
-                        proposals.append((error, (v, p), (w, q), flip, points, known))
+            first, second = views[v].people[p], views[w].people[q]
+            trials = []
+            for row in (second, second[flipped_order]):
+                points, known = _triangulated(views, {v: first, w: row})
+                errors = [_error(views[i], each, points, known) for i, each in ((v, first), (w, row))]
+                trials.append((max(errors), points, known))
+            flipped = _is_exchanged(trials[0][0], trials[1][0])
+            error, points, known = trials[flipped]
+            if error < AGREE:
+                proposals.append((error, (v, p), (w, q), flipped, points, known))
     groups = [_gathered(views, flipped_order, left, proposal) for proposal in proposals]
     matches = []
     # the group that most views agree with, and of these the one that agrees best
     for group, error in sorted(groups, key=lambda each: (-len(each[0]), each[1])):
         if all(key in left for key in group):
             left -= set(group)
-            matches.append(_match(views, group, error))
+            matches.append(_match(views, flipped_order, group, error))
     for key in sorted(left):
-        matches.append(_match(views, {key: False}, float("inf")))
+        matches.append(_match(views, flipped_order, {key: False}, float("inf")))
     return matches
 
 
@@ -74,12 +84,12 @@ def _gathered(views, mirror, available, proposal):
     for v in range(len(views)):
         if v in (first[0], second[0]):
             continue
-        trials = [
-            (_error(views[v], row[mirror] if flipped else row, points, known), (v, p), flipped)
-            for p, row in enumerate(views[v].people)
-            if (v, p) in available
-            for flipped in (False, True)
-        ]
+        trials = []
+        for p, row in enumerate(views[v].people):
+            if (v, p) in available:
+                plain, exchanged = (_error(views[v], each, points, known) for each in (row, row[mirror]))
+                flipped = _is_exchanged(plain, exchanged)
+                trials.append((exchanged if flipped else plain, (v, p), flipped))
         if not trials:
             continue
         error, key, flipped = min(trials)
@@ -89,14 +99,24 @@ def _gathered(views, mirror, available, proposal):
     return group, float(np.mean(errors))
 
 
-def _match(views, group, error):
+def _is_exchanged(plain, exchanged):
+    """From two errors. Of a small or thin person left and right hardly differ: then nothing is exchanged."""
+    return exchanged < (CLEARLY * plain if plain < AGREE else min(AGREE, RATHER * plain))
+
+
+def _match(views, mirror, group, error):
     members: list[int | None] = [None] * len(views)
     mirrored = [False] * len(views)
     for (v, p), flipped in group.items():
         members[v], mirrored[v] = p, flipped
+    rows = {v: views[v].people[p][mirror] if flipped else views[v].people[p] for (v, p), flipped in group.items()}
+    center = np.full(3, np.nan)
+    if len(rows) > 1:
+        points, known = _triangulated(views, rows)
+        center = np.median(points[known], axis=0) if known.any() else center
     if 2 * sum(mirrored) > len(group):  # the exchanged ones are the fewer
         mirrored = [member is not None and not flipped for member, flipped in zip(members, mirrored, strict=True)]
-    return Match(tuple(members), tuple(mirrored), error)
+    return Match(tuple(members), tuple(mirrored), error, center)
 
 
 def _triangulated(
@@ -129,3 +149,28 @@ def _error(view, row, points, known):
     )
     size = np.ptp(row[row[:, 2] >= SEEN, :2], axis=0).max()
     return float(np.median(np.nan_to_num(distances, nan=np.inf))) / max(float(size), 1e-9)
+
+
+def in_order_of_time(frames: Sequence[list[Match]]) -> list[list[Match | None]]:
+    """The matches of frames that follow each other, so that the i-th of each is one person: who is nearest to where he was.
+
+    People of later frames who are nobody's are added at the end; None where a frame does not have a person.
+    """
+    people: list[list[Match | None]] = []
+    for f, matches in enumerate(frames):
+        left = list(range(len(matches)))
+        last = [next(m.center for m in reversed(person) if m is not None) for person in people]
+        pairs = sorted(
+            (float(np.nan_to_num(np.linalg.norm(matches[i].center - center), nan=np.inf)), j, i)
+            for j, center in enumerate(last)
+            for i in left
+        )
+        chosen: dict[int, int] = {}
+        for distance, j, i in pairs:
+            if j not in chosen and i in left and distance < FARTHEST:
+                chosen[j] = i
+                left.remove(i)
+        for j, person in enumerate(people):
+            person.append(matches[chosen[j]] if j in chosen else None)
+        people += [[*[None] * f, matches[i]] for i in left]
+    return [[person[f] for person in people] for f in range(len(frames))]

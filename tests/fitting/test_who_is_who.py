@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.data.keypoints.sets import COCO_17
-from humangs_jax.fitting.who_is_who import Seen, match_people
+from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_people
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 
 SIZE, NOISE = 512, 4.0
@@ -72,3 +72,12 @@ def test_nobody_and_one_view():
     views, _ = seen(somebody(5)[None], views=1)
     assert [match.members for match in match_people(views, COCO_17.mirror)] == [(0,)]
     assert match_people([views[0]._replace(people=())], COCO_17.mirror) == []
+
+
+def test_people_are_followed_over_time_by_where_they_are():
+    at = lambda x: Match((0, 0), (False, False), 0.0, np.asarray([x, 0.0, 0.0]))
+    alone = Match((0, None), (False, False), float("inf"), np.full(3, np.nan))
+    a, b, later = in_order_of_time([[at(0.0), at(1.0)], [at(1.2), at(0.1)], [at(0.2), alone, at(5.0)]])
+    assert [m.center[0] for m in a if m] == [0.0, 1.0] and a[2:] == [None, None]
+    assert [m.center[0] for m in b if m] == [0.1, 1.2]
+    assert later[0].center[0] == 0.2 and later[1] is None and later[2] is alone and later[3].center[0] == 5.0

@@ -1,0 +1,299 @@
+"""People in photos: found, the same one in all of them chosen, and written as keypoints, masks and a numbered sheet.
+
+    keypoints.json   the chosen person, for `humangs fit`
+    people.json      everybody, numbered as on the sheet
+    people.png       the sheet
+    masks/NAME.png   of the chosen person
+
+With cameras people are matched by how well they triangulate, over time by where they are; without, by their size in the photo.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from humangs_jax.apps.start import photo_files
+from humangs_jax.core.array_types import Float, UInt
+from humangs_jax.core.progress import bar
+from humangs_jax.data.keypoints.people_file import ImagePeople, SeenPerson, seen_person, write_people
+from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
+from humangs_jax.data.photos import load_photos, read_description
+from humangs_jax.detection.blazepose import Networks
+from humangs_jax.detection.people import SEEN, DetectedPerson, detect_people
+from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_people
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.atomic import add_files
+from humangs_jax.io.images import orientation, oriented, read_image, resized, to_uint8, write_png
+
+KEYPOINTS_FILE, PEOPLE_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.json", "people.png", "masks"
+RIVAL = 0.35
+"""Somebody with this share of the pixels of the largest person may be meant as well as he."""
+LISTED = 3
+"""Names of photos in a line, at most."""
+THUMBNAIL = 480
+"""Pixels of the longest side of a photo on the sheet."""
+COLOURS = ((46, 160, 67), (31, 111, 235), (219, 109, 40), (163, 113, 247), (207, 34, 46))
+"""Of the people on the sheet, by number."""
+FAINT = 0.45
+"""Share of the colour over a person's pixels."""
+
+
+class Found(NamedTuple):
+    """A person in a photo. mask: 8 bits, the part of the photo that begins at corner (row, column). area: pixels of the person.
+    mirrored: left and right were exchanged, as other views show; it is repaired.
+    """
+
+    person: SeenPerson
+    mask: UInt[np.ndarray, "h w"]
+    corner: tuple[int, int]
+    area: float
+    mirrored: bool = False
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PhotoPeople:
+    """A photo. name: of the file. size: (width, height). thumbnail: (h, w, 3) for the sheet. people: None who is not in it."""
+
+    name: str
+    size: tuple[int, int]
+    thumbnail: Float[np.ndarray, "h w 3"]
+    people: tuple[Found | None, ...]
+
+
+def found_in_photos(folder: Path) -> list[PhotoPeople]:
+    """The people in the photos of a folder, or of a capture folder, whose cameras are used; see `same_people`.
+
+    Raises: CaptureError without photos; FileError, naming the file, for what is no photo; ValueError without LiteRT.
+    """
+    if (folder / "capture.json").is_file():
+        return found_in_capture(folder)
+    images, files = photo_files(folder)
+    names = [file.relative_to(images).as_posix() for file in files]
+    return same_people(detect_photos(names, (_upright(file) for file in files)))
+
+
+def found_in_capture(folder: Path) -> list[PhotoPeople]:
+    """The same for the photos of a capture folder; their names are the views'. Raises: see `found_in_photos`."""
+    photos = load_photos(folder)  # checked; these are on white where there are masks
+    views = read_description(folder / "capture.json")["views"]
+    found = detect_photos(
+        [f"{name}.png" for name in photos.names], (read_image(folder / view["image"])[0] for view in views)
+    )
+    return same_people(found, photos.cameras, photos.frames.tolist())
+
+
+def _upright(file):
+    return oriented(read_image(file)[0], orientation(file))
+
+
+def detect_photos(names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 3"]]) -> list[PhotoPeople]:
+    """The people of each photo with values in [0, 1], those with the most pixels first. Raises: ValueError without LiteRT."""
+    try:
+        networks = Networks()
+    except ImportError as error:
+        raise ValueError(str(error)) from error  # one line
+    found = []
+    for name, each in zip(names, bar(photos, desc="finding people", unit="photo", total=len(names)), strict=True):
+        photo = np.ascontiguousarray(each, np.float32)
+        people = sorted((_found(person) for person in detect_people(networks, photo)), key=lambda one: -one.area)
+        height, width = photo.shape[:2]
+        shrink = min(1.0, THUMBNAIL / max(height, width))
+        small = resized(photo, max(1, round(width * shrink)), max(1, round(height * shrink)))
+        found.append(PhotoPeople(name, (width, height), small, tuple(people)))
+    return found
+
+
+def _found(person: DetectedPerson) -> Found:
+    rows, columns = (np.flatnonzero((person.mask > 0).any(axis)) for axis in (1, 0))
+    top, left = (int(each[0]) if len(each) else 0 for each in (rows, columns))
+    bottom, right = (int(each[-1]) + 1 if len(each) else 0 for each in (rows, columns))
+    cut = to_uint8(person.mask[top:bottom, left:right])
+    return Found(seen_person(person), cut, (top, left), float((cut > 255 * SEEN).sum()))
+
+
+# Who is who ----------------------------------------------------------------------------------------------------------
+
+
+def same_people(
+    photos: Sequence[PhotoPeople], cameras: Camera | None = None, frames: Sequence[int] | None = None
+) -> list[PhotoPeople]:
+    """The photos with people in such an order that the i-th of each is the same person.
+
+    Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size. frames: the moment of each photo.
+    The person with the most pixels in all photos together is the first.
+    """
+    rows = [list(photo.people) for photo in photos]
+    if cameras is not None and len(photos) > 1:
+        rows = _matched(photos, cameras, np.asarray([0] * len(photos) if frames is None else frames))
+    most = max((len(row) for row in rows), default=0)
+    ordered = [
+        dataclasses.replace(photo, people=(*row, *[None] * (most - len(row))))
+        for photo, row in zip(photos, rows, strict=True)
+    ]
+    order = np.argsort([-area for area in _areas(ordered)], kind="stable")
+    return [dataclasses.replace(photo, people=tuple(photo.people[i] for i in order)) for photo in ordered]
+
+
+def _areas(photos):
+    """Pixels of each person in all photos together."""
+    people = zip(*(photo.people for photo in photos), strict=True)
+    return [sum(found.area for found in person if found is not None) for person in people]
+
+
+def _matched(photos, cameras, frames):
+    """The people of each photo in a common order."""
+    times = [np.flatnonzero(frames == frame) for frame in np.unique(frames)]
+    matches = [match_people([_seen(photos[v], cameras, v) for v in own], MEDIAPIPE_33.mirror) for own in times]
+    rows: list[list[Found | None]] = [[] for _ in photos]
+    for own, people in zip(times, in_order_of_time(matches), strict=True):
+        for match in people:
+            for i, v in enumerate(own):
+                rows[v].append(_member(photos[v], match, i))
+    return rows
+
+
+def _seen(photo, cameras, view):
+    K, transform = (np.asarray(x[view], np.float64) for x in (cameras.K, cameras.cam_from_world))
+    return Seen(K, transform, tuple(each.person.points for each in photo.people))
+
+
+def _member(photo: PhotoPeople, match: Match | None, i: int) -> Found | None:
+    if match is None or (member := match.members[i]) is None:
+        return None
+    found = photo.people[member]
+    if found is None or not match.mirrored[i]:
+        return found
+    order = np.asarray(MEDIAPIPE_33.mirror)
+    person = dataclasses.replace(found.person, points=found.person.points[order], world=found.person.world[order])
+    return found._replace(person=person, mirrored=True)
+
+
+def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> int:
+    """The number of the person that is meant: the one asked for, or the only one who is large.
+
+    Arguments: sheet: where the numbers can be looked up.
+    Raises: ValueError if no photo has a person, or not so many, or if several may be meant.
+    """
+    count = len(photos[0].people)
+    if not count:
+        raise ValueError(f"no person in {_few([photo.name for photo in photos])}: expected one who is seen as a whole")
+    if person is not None:
+        if not 0 <= person < count:
+            raise ValueError(f"--person {person}: expected 0 to {count - 1}, as on {sheet}")
+        return person
+    areas = _areas(photos)
+    rivals = [i for i in range(1, count) if areas[i] > RIVAL * areas[0]]
+    if rivals:
+        where = _few([photo.name for photo in photos if any(photo.people[i] is not None for i in rivals)])
+        raise ValueError(
+            f"{len(rivals) + 1} people in {where}: expected one. --person 0 to {len(rivals)}: numbers on {sheet}"
+        )
+    return 0
+
+
+def absent(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
+    """Names of the photos without the person."""
+    return tuple(photo.name for photo in photos if photo.people[person] is None)
+
+
+def repaired(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
+    """Names of the photos in which left and right of the person were exchanged."""
+    return tuple(photo.name for photo in photos if (found := photo.people[person]) is not None and found.mirrored)
+
+
+def chosen(photos: Sequence[PhotoPeople], person: int | None, folder: Path) -> int:
+    """As `choose`; where it cannot be decided, the sheet is in the folder."""
+    try:
+        return choose(photos, person, folder / SHEET_FILE)
+    except ValueError:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_sheet(folder / SHEET_FILE, photos)
+        raise
+
+
+def _few(names: Sequence[str]) -> str:
+    return ", ".join(names[:LISTED]) + (f", ... ({len(names)} photos)" if len(names) > LISTED else "")
+
+
+# Writing -------------------------------------------------------------------------------------------------------------
+
+
+def write_found(folder: Path, photos: Sequence[PhotoPeople], person: int) -> None:
+    """Keypoints and masks of a person, everybody's file and the sheet, into a folder; all or nothing.
+
+    Raises: ValueError if two photos have the same name but for the suffix.
+    """
+    owners: dict[Path, str] = {}
+    for photo in photos:
+        file = mask_file(Path(), photo.name)
+        if file in owners:
+            raise ValueError(f"{owners[file]} and {photo.name}: both masks would be {file.as_posix()}: rename one")
+        owners[file] = photo.name
+
+    def write(temporary: Path):
+        write_people(temporary / KEYPOINTS_FILE, _images(photos, [person]))
+        write_people(temporary / PEOPLE_FILE, _images(photos, range(len(photos[0].people))))
+        write_sheet(temporary / SHEET_FILE, photos, person)
+        for photo in photos:
+            file = mask_file(temporary, photo.name)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            write_png(file, person_mask(photo, person))
+
+    add_files(folder, write)
+
+
+def mask_file(folder: Path, name: str) -> Path:
+    """Where the mask of a photo is."""
+    return folder / MASKS / Path(name).with_suffix(".png")
+
+
+def person_mask(photo: PhotoPeople, person: int) -> Float[np.ndarray, "h w"]:
+    """The mask of a person at the size of the photo; black if the person is not in it."""
+    mask = np.zeros(photo.size[::-1], np.float32)
+    if (found := photo.people[person]) is not None:
+        (top, left), (height, width) = found.corner, found.mask.shape
+        mask[top : top + height, left : left + width] = found.mask / np.float32(255)
+    return mask
+
+
+def _images(photos, numbers):
+    """The photos with some of the people, as the file has them."""
+    people = lambda photo: tuple(None if (found := photo.people[i]) is None else found.person for i in numbers)
+    return [ImagePeople(photo.name, photo.size, people(photo)) for photo in photos]
+
+
+def write_sheet(path: Path, photos: Sequence[PhotoPeople], person: int | None = None) -> None:
+    """The photos side by side, everybody in a colour and with a number. person: the one who was chosen."""
+    from humangs_jax.avatar.sheets import contact_sheet
+
+    pictures = [_picture(photo, person) for photo in photos]
+    height, width = (max(picture.shape[axis] for picture in pictures) for axis in (0, 1))
+    padded = [
+        np.pad(each, ((0, height - each.shape[0]), (0, width - each.shape[1]), (0, 0)), constant_values=1.0)
+        for each in pictures
+    ]
+    contact_sheet(np.stack(padded), path, labels=[photo.name for photo in photos])
+
+
+def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3"]:
+    from PIL import Image, ImageDraw, ImageFont
+
+    picture = np.asarray(photo.thumbnail, np.float64).copy()
+    height, width = picture.shape[:2]
+    heads = []
+    for i, found in enumerate(photo.people):
+        if found is None:
+            continue
+        colour = np.asarray(COLOURS[i % len(COLOURS)]) / 255
+        mask = resized(person_mask(photo, i), width, height)[..., None] * (FAINT if chosen in (None, i) else FAINT / 2)
+        picture = picture * (1 - mask) + colour * mask
+        x, y = found.person.points[0, :2] * width / photo.size[0]
+        heads.append((float(np.clip(x, 8, width - 24)), float(np.clip(y - 30, 2, height - 26)), i))
+    canvas = Image.fromarray(to_uint8(picture))
+    pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(22)
+    for x, y, i in heads:
+        pen.text((x, y), str(i), fill="white", stroke_width=3, stroke_fill=COLOURS[i % len(COLOURS)], font=font)
+    return np.asarray(canvas) / 255

@@ -1,0 +1,56 @@
+"""`humangs detect`: keypoints and masks of the person in photos."""
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tyro.conf import Positional
+
+from humangs_jax.cli.options import require_at_least, require_folder
+from humangs_jax.cli.screen import stage, suggest, warn, wrote
+
+if TYPE_CHECKING:
+    from humangs_jax.apps.detect import PhotoPeople
+
+
+def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
+    """Say which photos are without the person, and what was repaired."""
+    from humangs_jax.apps.detect import absent, repaired
+
+    for name in absent(photos, person):
+        warn(f"{name}: the person was not found in it")
+    for name in repaired(photos, person):
+        warn(f"{name}: left and right of the person were exchanged, as the other views show: repaired")
+
+
+@dataclasses.dataclass(frozen=True)
+class Detect:
+    """Find the person in photos: 33 keypoints and a mask for each, and a sheet on which everybody has a number.
+
+    Needs `pip install 'humangs_jax[photos]'`. In a capture folder, whose cameras are known, people are matched by how well they
+    triangulate; in other photos by their size. docs/your_photos.md shows the way.
+    """
+
+    photos: Positional[Path]
+    """Folder of the photos, or a capture folder that has no body yet."""
+    out: Path
+    """Folder for keypoints.json, masks/, people.png (the sheet) and people.json (everybody)."""
+    person: int | None = None
+    """Which person, by the number on the sheet, where several are of nearly one size."""
+
+    def run(self) -> None:
+        require_at_least(0, person=self.person)
+        require_folder(self.out)
+        with stage("starting"):
+            from humangs_jax.apps import detect
+
+        with stage("finding people"):
+            photos = detect.found_in_photos(self.photos)
+        person = detect.chosen(photos, self.person, self.out)
+        with stage("writing"):
+            detect.write_found(self.out, photos, person)
+        tell_found(photos, person)
+        wrote(self.out / detect.KEYPOINTS_FILE, f"keypoints of the person in {len(photos)} photos")
+        wrote(self.out / detect.MASKS, "what of each photo is the person")
+        wrote(self.out / detect.SHEET_FILE, "look at it")
+        suggest("humangs fit CAPTURE --keypoints", self.out / detect.KEYPOINTS_FILE)
