@@ -72,14 +72,14 @@ def write_material(folder: Path, capture, points: np.ndarray) -> None:
     write_json(folder / "calibration.json", calibration)
 
 
-def landmarks_in(capture) -> np.ndarray:
-    """Where COCO-WholeBody's points are in each photo, (v, 133, 2) pixels; NaN for those that the body does not have."""
+def landmarks_in(capture, names: tuple[str, ...] | None = None) -> np.ndarray:
+    """Where points are in each photo, (v, k, 2) pixels; NaN for those that the body does not have. Default: COCO-WholeBody's."""
     import jax.numpy as jnp
 
     from humangs_jax.body.landmarks import landmark_model, pose_landmarks
     from humangs_jax.data.keypoints.sets import COCO_WHOLEBODY_133
 
-    model, betas = landmark_model(capture.body, COCO_WHOLEBODY_133.names), jnp.asarray(capture.betas)
+    model, betas = landmark_model(capture.body, names or COCO_WHOLEBODY_133.names), jnp.asarray(capture.betas)
     points = []
     for i, frame in enumerate(capture.frames):
         landmarks = np.asarray(pose_landmarks(model, betas, capture.pose(int(frame)))[0])

@@ -18,6 +18,7 @@ import numpy as np
 from humangs_jax.apps.start import photo_files
 from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.core.progress import bar
+from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.people_file import ImagePeople, SeenPerson, seen_person, write_people
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos, read_description
@@ -27,6 +28,7 @@ from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import orientation, oriented, read_image, resized, to_uint8, write_png
+from humangs_jax.io.text import write_json
 
 KEYPOINTS_FILE, PEOPLE_FILE, SHEET_FILE, MASKS = "keypoints.json", "people.json", "people.png", "masks"
 RIVAL = 0.35
@@ -194,6 +196,36 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
     return 0
 
 
+def person_on(photos: Sequence[PhotoPeople], masks: Float[np.ndarray, "v h w"], folder: Path) -> int:
+    """The number of the person whom masks of the photos show. Raises: ValueError if they show none of the people."""
+    return _best(photos, lambda v, mask: float(np.sum(masks[v] * mask)), "masks", folder)
+
+
+def person_of(photos: Sequence[PhotoPeople], keypoints: Keypoints, folder: Path) -> int:
+    """The number of the person on whom keypoints of the photos lie. Raises: ValueError if they lie on none of the people."""
+
+    def inside(v: int, mask: Float[np.ndarray, "h w"]) -> float:
+        height, width = mask.shape
+        x, y = np.floor(keypoints.points[v]).astype(int).T
+        seen = (keypoints.confidences[v] > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+        return float(np.sum(mask[y[seen], x[seen]]))
+
+    return _best(photos, inside, "keypoints", folder)
+
+
+def _best(photos, agreement, given, folder):
+    """The person with the most agreement over all photos."""
+    count = len(photos[0].people)
+    sums = [
+        sum(agreement(v, person_mask(p, i)) for v, p in enumerate(photos) if p.people[i] is not None)
+        for i in range(count)
+    ]
+    if max(sums, default=0.0) <= 0:
+        write_sheet(folder / SHEET_FILE, photos)
+        raise ValueError(f"the {given} are of nobody who was found in the photos: see {folder / SHEET_FILE}")
+    return int(np.argmax(sums))
+
+
 def absent(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
     """Names of the photos without the person."""
     return tuple(photo.name for photo in photos if photo.people[person] is None)
@@ -234,15 +266,36 @@ def write_found(folder: Path, photos: Sequence[PhotoPeople], person: int) -> Non
         owners[file] = photo.name
 
     def write(temporary: Path):
-        write_people(temporary / KEYPOINTS_FILE, _images(photos, [person]))
-        write_people(temporary / PEOPLE_FILE, _images(photos, range(len(photos[0].people))))
-        write_sheet(temporary / SHEET_FILE, photos, person)
+        _write_people(temporary, photos, person)
         for photo in photos:
             file = mask_file(temporary, photo.name)
             file.parent.mkdir(parents=True, exist_ok=True)
             write_png(file, person_mask(photo, person))
 
     add_files(folder, write)
+
+
+def add_to_capture(folder: Path, photos: Sequence[PhotoPeople], person: int, *, masks: bool) -> None:
+    """Keypoints, everybody's file and the sheet into the capture folder whose photos these are; masks: the masks, too."""
+    description = read_description(folder / "capture.json")
+    files = [mask_file(Path(), photo.name).as_posix() for photo in photos]
+    views = [view | {"mask": file} for view, file in zip(description["views"], files, strict=True)]
+
+    def write(temporary: Path):
+        _write_people(temporary, photos, person)
+        if masks:
+            (temporary / MASKS).mkdir()
+            for photo, file in zip(photos, files, strict=True):
+                write_png(temporary / file, person_mask(photo, person))
+            write_json(temporary / "capture.json", description | {"views": views})
+
+    add_files(folder, write)
+
+
+def _write_people(folder, photos, person):
+    write_people(folder / KEYPOINTS_FILE, _images(photos, [person]))
+    write_people(folder / PEOPLE_FILE, _images(photos, range(len(photos[0].people))))
+    write_sheet(folder / SHEET_FILE, photos, person)
 
 
 def mask_file(folder: Path, name: str) -> Path:

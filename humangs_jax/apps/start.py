@@ -22,6 +22,8 @@ KEYPOINT_FILES = (
     *("alphapose-results.json", "alphapose.json"),
 )
 """Names that are looked for in the folder of photos, in this order."""
+OWN_DETECTOR = ("pip install 'humangs_jax[photos]', and the same command finds them; or with another program:",)
+"""For masks and keypoints: said where LiteRT is not installed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,6 +144,7 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
                 "masks",
                 "what of each photo is the person",
                 (
+                    *OWN_DETECTOR,
                     'rembg: pip install "rembg[cpu,cli]"',
                     f"  rembg p -m u2net_human_seg -om {material.images} {folder / 'masks'}",
                     "where it takes something else for the person: SAM 2 (https://github.com/facebookresearch/sam2)",
@@ -156,6 +159,7 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
                 "keypoints",
                 "where shoulders, knees and fingers are, for `humangs fit`",
                 (
+                    *OWN_DETECTOR,
                     "RTMPose, in a checkout of MMPose (https://github.com/open-mmlab/mmpose):",
                     f"  python demo/inferencer_demo.py {source} --pose2d wholebody --pred-out-dir {target}",
                     "or OpenPose (https://github.com/CMU-Perceptual-Computing-Lab/openpose):",

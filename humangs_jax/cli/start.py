@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from tyro.conf import Positional
 
+from humangs_jax.cli.detect import tell_found
 from humangs_jax.cli.options import UsageError, first_refinement, require_at_least, require_replaceable, tell_deleted
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 
@@ -38,7 +39,7 @@ class Start:
     keypoints: Path | None = None
     """Keypoint file or folder, if it is elsewhere; formats: docs/fitting.md."""
     person: int | None = None
-    """Which person of the keypoint file, from 0, if a view has several."""
+    """Which person of the keypoint file, from 0, if a view has several; without such a file, of those on people.png."""
     scale: float | None = None
     """Metres per unit of the calibration. Default: 1."""
     up: str | None = None
@@ -77,6 +78,7 @@ class Start:
     def _go_on(self, material: "Material", limits: dict[str, Any] | None) -> None:
         """From where an earlier run came to an end, if there was one."""
         from humangs_jax.apps.start import missing
+        from humangs_jax.detection.blazepose import available
 
         if self._resumes():
             with stage("reading the fit of an earlier run"):
@@ -93,12 +95,43 @@ class Start:
         masked = self.without_masks or (report is not None and report.masks)
         needed = missing(material, self.out / "images" if changed else None)
         needed = [each for each in needed if not (masked and each.name == "masks")]
+        detected = [each.name for each in needed if each.name in ("masks", "keypoints") and available()]
+        needed = [each for each in needed if each.name not in detected]
         if needed:
             tell("\nto be made:\n" + "\n".join(map(str, needed)))
+            if detected:
+                tell(f"{' and '.join(detected)}: found in the photos, once the rest is there")
             suggest("humangs start", self.photos, "--out", self.out)
             names = " and ".join(", ".join(each.name for each in needed).rsplit(", ", 1))
             raise ValueError(f"{self.photos}: {names} missing: make them as above and run the same command again")
+        if detected:
+            material = self._detect(material, detected)
         self._finish(self._fit(material), limits)
+
+    def _detect(self, material: "Material", wanted: list[str]) -> "Material":
+        """Masks and keypoints of the imported photos where there are none."""
+        with stage("finding the person"):
+            from humangs_jax.apps import detect
+            from humangs_jax.data.keypoints.reading import read_keypoints
+            from humangs_jax.data.photos import load_photos
+
+            people = detect.found_in_capture(self.out)
+            photos = load_photos(self.out)
+        if material.keypoints is not None:
+            height, width = photos.images.shape[1:3]
+            given = read_keypoints(material.keypoints, photos.names, width, height, person=self.person)
+            person = detect.person_of(people, given, self.out)
+        elif photos.masks is not None and self.person is None and len(people[0].people):
+            person = detect.person_on(people, photos.masks, self.out)
+        else:
+            person = detect.chosen(people, self.person, self.out)
+        with stage("writing what was found"):
+            detect.add_to_capture(self.out, people, person, masks="masks" in wanted)
+        tell_found(people, person)
+        tell(f"{' and '.join(wanted)} found in the photos: {self.out / detect.SHEET_FILE} shows them")
+        if material.keypoints is not None:
+            return material
+        return dataclasses.replace(material, keypoints=self.out / detect.KEYPOINTS_FILE)
 
     def _resumes(self) -> bool:
         """Whether an earlier run left a body to go on from. Raises: UsageError if --out may not be replaced."""
@@ -152,7 +185,9 @@ class Start:
             assert material.keypoints is not None
             photos = load_photos(self.out)
             height, width = photos.images.shape[1:3]
-            keypoints = read_keypoints(material.keypoints, photos.names, width, height, person=self.person)
+            found_here = material.keypoints.parent == self.out  # of the one person who was chosen
+            person = None if found_here else self.person
+            keypoints = read_keypoints(material.keypoints, photos.names, width, height, person=person)
             fitted = fit_photos(photos, keypoints, load_body())
         with stage("examining the fit"):
             report = fitted.report

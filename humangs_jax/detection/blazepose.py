@@ -11,6 +11,7 @@ Pixels in this file are mediapipe's: (x, y), the centre of the first at 0. `peop
 import contextlib
 import functools
 import importlib
+import importlib.util
 import os
 import sys
 from collections.abc import Generator
@@ -90,6 +91,11 @@ class Landmarks(NamedTuple):
     mask: Float[np.ndarray, "256 256"]
     crop: Crop
     again: Detection
+
+
+def available() -> bool:
+    """Whether LiteRT is installed."""
+    return importlib.util.find_spec("ai_edge_litert") is not None
 
 
 class Networks:

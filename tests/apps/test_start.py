@@ -9,12 +9,18 @@ import pytest
 
 from experiments.fitting.your_photos import landmarks_in, write_material
 from humangs_jax import cli
+from humangs_jax.apps import detect
+from humangs_jax.apps.detect import Found, PhotoPeople
 from humangs_jax.apps.start import look, missing
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.cli.start import Start
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.capture_checks import CaptureError
+from humangs_jax.data.keypoints.people_file import SeenPerson
+from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos
-from humangs_jax.io.images import write_png
+from humangs_jax.detection import blazepose
+from humangs_jax.io.images import to_uint8, write_png
 
 NEEDED = ("cameras", "masks", "keypoints")
 
@@ -29,7 +35,8 @@ def photos(tmp_path_factory):
 
 @pytest.fixture
 def mine(photos, tmp_path, monkeypatch):
-    """A copy that a test may change, in the working folder."""
+    """A copy that a test may change, in the working folder; without the package's own detector."""
+    monkeypatch.setattr(blazepose, "available", lambda: False)
     shutil.copytree(photos, tmp_path / "photos")
     monkeypatch.chdir(tmp_path)
     return Path("photos")
@@ -132,6 +139,73 @@ def test_keypoints_have_to_be_of_photos_without_lens_distortion(mine, capsys):
     (mine / "calibration.json").write_text(json.dumps(calibration))
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     assert "inferencer_demo.py me/images --pose2d" in capsys.readouterr().out
+
+
+@pytest.fixture
+def detected(mine, monkeypatch):
+    """What the detector finds is known, and the run ends before the fit: its material."""
+    capture, told = load_capture("demo_capture"), []
+    points = np.nan_to_num(landmarks_in(capture, MEDIAPIPE_33.names))
+    shown = []
+    for v, name in enumerate(capture.names):
+        person = SeenPerson(np.concatenate([points[v], np.ones((33, 1))], axis=1), np.zeros((33, 3)), 1.0)
+        mask = to_uint8(capture.masks[v])
+        bystander = Found(person, mask[:60, :20], (0, 0), 2e5)  # larger, but nobody's masks or keypoints are there
+        shown.append(
+            PhotoPeople(f"{name}.png", (512, 512), np.ones((48, 48, 3)), (bystander, Found(person, mask, (0, 0), 1e5)))
+        )
+
+    def stop(self, material):
+        told.append(material)
+        raise ValueError("the fit")
+
+    monkeypatch.setattr(blazepose, "available", lambda: True)
+    monkeypatch.setattr(detect, "found_in_capture", lambda folder: shown)
+    monkeypatch.setattr(Start, "_fit", stop)
+    return told
+
+
+@pytest.mark.parametrize("without", [("keypoints",), ("masks",), ("masks", "keypoints")])
+def test_what_is_missing_is_found_in_the_photos_and_what_is_given_wins(without, mine, detected, capsys):
+    shutil.rmtree(mine)
+    write_material(mine, truth := load_capture("demo_capture"), landmarks_in(truth))
+    for name in without:
+        shutil.rmtree(mine / name)
+    options = ["--person", "1"] if len(without) == 2 else []  # what is given says who is meant
+    assert cli.execute(["start", str(mine), "--out", "me", *options]) == cli.BAD_DATA
+    out, err = capsys.readouterr()
+    assert err == "humangs: error: the fit\n" and f"{' and '.join(without)} found in the photos: me/people.png" in out
+    (material,) = detected
+    assert material.keypoints == (Path("me/keypoints.json") if "keypoints" in without else mine / "keypoints")
+    imported = load_photos("me")
+    np.testing.assert_allclose(imported.masks, truth.masks, atol=1 / 255)
+
+
+def test_two_people_are_refused_with_the_sheet_that_numbers_them(mine, detected, capsys):
+    for name in ("masks", "keypoints"):
+        shutil.rmtree(mine / name)
+    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
+    assert (
+        "2 people in 0_00.png, 0_01.png, 0_02.png, ... (4 photos): expected one. --person 0 to 1: numbers on me/people.png"
+        in (capsys.readouterr().err)
+    )
+    assert Path("me/people.png").is_file() and not detected and load_photos("me").masks is None
+
+
+def test_with_the_detector_cameras_alone_are_missing(mine, detected, capsys):
+    for name in ("masks", "keypoints"):
+        shutil.rmtree(mine / name)
+    (mine / "calibration.json").unlink()
+    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
+    out, err = capsys.readouterr()
+    assert "masks and keypoints: found in the photos, once the rest is there" in out
+    assert "photos: cameras missing: make them" in err and "rembg" not in out
+
+
+def test_without_the_detector_its_extra_is_named_first(mine):
+    for name in ("masks", "keypoints"):
+        shutil.rmtree(mine / name)
+    assert all("pip install 'humangs_jax[photos]'" in each.how[0] for each in missing(look(mine)))
 
 
 def test_folders_without_photos_and_captures_are_refused(mine, tmp_path):

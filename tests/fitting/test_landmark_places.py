@@ -10,8 +10,8 @@ from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.fitting.landmark_fit import FitConfig, fit_landmarks
 
 NEAR_MM, BIASED = 10.0, 2.0
-"""Mean joint error of a fit that knows the places, as of other keypoints with noise (5 mm measured); and how many times larger it is
-without them (3.3 measured)."""
+"""Mean joint error of a fit that knows the places, as of other keypoints with noise (5 mm measured); and how many times larger it
+is without them (3.3 measured)."""
 
 
 @pytest.mark.slow

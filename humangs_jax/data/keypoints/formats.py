@@ -108,7 +108,8 @@ def _amount(content: Any) -> int:
     if isinstance(content, dict):
         lists = [content.get(key) for key in ("people", "images", "annotations", "instance_info")]
     entries = [entry for each in lists if isinstance(each, list) for entry in each]
-    inside = [entry["instances"] for entry in entries if isinstance(entry, dict) and "instances" in entry]
+    keys = ("instances", "people")
+    inside = [entry[key] for entry in entries if isinstance(entry, dict) for key in keys if key in entry]
     return 1 + len(entries) + sum(len(each) for each in inside if isinstance(each, list))
 
 
