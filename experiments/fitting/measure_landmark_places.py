@@ -1,6 +1,6 @@
 """Where a detector puts its landmarks on bodies that are known: the places of `KeypointSet.places`, measured.
 
-    python experiments/fitting/measure_landmark_places.py CAPTURES... --out FILE.json
+    python experiments/fitting/measure_landmark_places.py CAPTURES... [--page docs/fitting.md]
 
 Every landmark is looked for in every view of the captures, whose bodies and cameras are taken for the truth. The offset from the
 base of its place, in the axes of the bones that carry it, is the one that explains all pixels best (robust least squares over all
@@ -8,10 +8,13 @@ people; left and right are one landmark and its mirror image). Synthetic people 
 """
 
 import argparse
-import json
+import sys
 from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from experiments.common.results import publish
 
 CLEAR, SCALE, ROUNDS, STEP = 0.5, 0.02, 15, 0.01
 """Least visibility; scale of the robust weights and step of the derivatives, metres; rounds of reweighting."""
@@ -25,14 +28,26 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("captures", type=Path, nargs="+", help="capture folders, or folders of them")
-    parser.add_argument("--out", type=Path, help="JSON file")
+    parser.add_argument("--page", type=Path, help="page of the docs whose table landmark_places is written")
     arguments = parser.parse_args()
     folders = [f.parent for each in arguments.captures for f in sorted(each.glob("**/capture.json"))]
     found = measure(folders)
     for name, row in found["places"].items():
         print(f"{name:<18} {row['millimetres']!s:<24} scatter {row['scatter']:5.1f} mm  n {row['count']}")
-    if arguments.out:
-        arguments.out.write_text(json.dumps(found, indent=1) + "\n")
+    if arguments.page:
+        publish(arguments.page, "landmark_places", table(found), found)
+
+
+def table(found: dict) -> str:
+    """The offsets as a table, for a page."""
+    rows = [
+        "| landmark, left or middle | to the left | up | forwards | scatter, mm |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for name, row in found["places"].items():
+        x, y, z = (f"{value:.0f}" for value in row["millimetres"])
+        rows.append(f"| {name.removeprefix('left_').replace('_', ' ')} | {x} | {y} | {z} | {row['scatter']:.0f} |")
+    return "\n".join(rows)
 
 
 def measure(folders: list[Path]) -> dict:

@@ -227,7 +227,7 @@ def test_expressions_are_not_fitted_as_shape(folder, monkeypatch):
     """Of SMPL-X, whose directions are those of the shape and then those of the face."""
     fitted_to, body = [], default_body()
     names = (*(f"shape_{i}" for i in range(body.shape_directions.shape[-1] - 1)), "expression_0")
-    monkeypatch.setattr(fit_capture, "landmark_model", lambda body, _: fitted_to.append(body) or 1 / 0)
+    monkeypatch.setattr(fit_capture, "landmark_model", lambda body, *_: fitted_to.append(body) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         fit_photos(load_photos(folder[0]), folder[1], replace(body, shape_names=names))
     assert fitted_to[0].shape_names == names[:-1] and fitted_to[0].shape_directions.shape[-1] == len(names) - 1
