@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from humangs_jax.data.calibration.formats import EASYMOCAP_FILES, FILES
-from humangs_jax.data.calibration.photos import SUFFIXES
+from humangs_jax.data.calibration.photos import SUFFIXES, is_photo
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.io.images import image_size, open_image
 from humangs_jax.io.reading import reading, walk
@@ -103,7 +103,7 @@ def photo_files(folder: Path) -> tuple[Path, list[Path]]:
     photos = sorted(_photos(images))
     if not photos:
         raise CaptureError(
-            folder, "", f"no photo: expected {', '.join(SUFFIXES[:3])} files in it or in {folder / 'images'}"
+            folder, "", f"no photo: expected {', '.join(SUFFIXES[:4])} files in it or in {folder / 'images'}"
         )
     return images, photos
 
@@ -176,7 +176,7 @@ def _photos(folder: Path) -> Iterator[Path]:
     if folder.is_dir():
         with reading(folder, "folder of photos", CaptureError):
             found = walk(folder, lambda path: path.name in others or (path / "capture.json").exists())
-            yield from (path for path in found if path.suffix in SUFFIXES)
+            yield from filter(is_photo, found)
 
 
 def _has_cameras(place):

@@ -1,10 +1,12 @@
 """Photos on disk <-> float32 arrays in [0, 1]: PNG (8 and 16 bits a channel) and JPEG, values as stored, no gamma.
 
-The content decides, not the name: no other format is looked at. Pixels come as stored, whatever the orientation flag says that
-phones write into JPEG files (EXIF): `orientation` reads it, `oriented` obeys it, and who imports photos decides.
+With the extra `heic`, HEIC photos of phones too (libheif, by pi-heif). The content decides, not the name: no other format is
+looked at. Pixels come as stored, whatever the orientation flag says that phones write into JPEG files (EXIF): `orientation` reads
+it, `oriented` obeys it, and who imports photos decides. HEIC photos come upright: their format turns them, not the flag.
 """
 
 import contextlib
+import importlib
 import io
 import struct
 import warnings
@@ -17,16 +19,20 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.io.atomic import replace_file
-from humangs_jax.io.reading import Refused, check_limit, read_bytes, reading
+from humangs_jax.io.reading import Refused, check_limit, open_file, read_bytes, reading
 
 FORMATS = ("PNG", "JPEG")
 """Pillow knows some forty more, one of which starts Ghostscript."""
+HEIC_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1", b"msf1")
+"""Of the box `ftyp` that such a file begins with (ISO/IEC 23008-12)."""
 GREY_SLACK = 16 / 255
 """Channels of a grey image that was compressed differ by less."""
 GREY_MASK = "grey from 0 (background) to 255 (person)"
-ORIENTATION_TAG = 0x0112
-ORIENTATION_MARKS = (b"Exif", b"eXIf", b"Raw profile type", b"adobe.com/xap", b"com.adobe.xmp")
-"""A file without any of these has no orientation; looking further would decode a PNG."""
+ORIENTATION_TAG, EXIF_TAGS, FOCAL_LENGTH_35MM_TAG = 0x0112, 0x8769, 0xA405
+DIAGONAL_35MM = 43.27
+"""Millimetres, of a frame of 36 x 24: the 35-mm equivalent of a focal length sees the same angle along the diagonal."""
+EXIF_MARKS = (b"Exif", b"eXIf", b"Raw profile type", b"adobe.com/xap", b"com.adobe.xmp")
+"""A file without any of these has no EXIF; looking further would decode a PNG."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_COLOUR_TYPES = {2: "rgb", 4: "grey and alpha", 6: "rgba"}
 """Colour types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
@@ -113,13 +119,30 @@ def _mask_of_alpha(colours, alpha):
 def orientation(path: str | Path) -> int:
     """The EXIF flag of a photo, 1 (none) to 8: how programs that obey it show it, see `oriented`. Raises: as `open_image`."""
     with open_image(path) as (image, data):
-        if not any(mark in data for mark in ORIENTATION_MARKS):
-            return 1
-        with warnings.catch_warnings(), contextlib.suppress(Exception):  # damaged: nobody obeys it
+        flag = _exif(image, data).get(ORIENTATION_TAG, 1)
+        return flag if flag in range(2, 9) else 1
+
+
+def focal_length(path: str | Path) -> float | None:
+    """Focal length in pixels, from EXIF's 35-mm equivalent and the diagonal of the photo; None where that is missing or 0.
+
+    equivalent / 43.27 mm = focal length / diagonal, as EXIF defines it. The photo must not be cropped. Raises: as `open_image`.
+    """
+    with open_image(path) as (image, data):
+        equivalent = _exif(image, data, EXIF_TAGS).get(FOCAL_LENGTH_35MM_TAG)
+        if not isinstance(equivalent, int) or equivalent <= 0:
+            return None
+        return equivalent / DIAGONAL_35MM * float(np.hypot(*image.size))
+
+
+def _exif(image, data, folder=None):
+    """EXIF tags, of the photo or of a folder in them; none where they are damaged: nobody obeys these."""
+    if any(mark in data for mark in EXIF_MARKS):
+        with warnings.catch_warnings(), contextlib.suppress(Exception):
             warnings.simplefilter("ignore")
-            flag = image.getexif().get(ORIENTATION_TAG, 1)
-            return flag if flag in range(2, 9) else 1
-    return 1
+            tags = image.getexif()
+            return dict(tags) if folder is None else dict(tags.get_ifd(folder))
+    return {}
 
 
 def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
@@ -201,24 +224,46 @@ def open_image(path: str | Path) -> Generator[tuple[Any, bytes]]:
     """
     with reading(path, "image"):
         data = read_bytes(path, "image_bytes")
-        with image_in(data) as image:
+        with image_in(data, _heic_formats() if _begins_heic(data) else FORMATS) as image:
             yield image, data
 
 
+def is_heic(path: str | Path) -> bool:
+    """Whether a file begins as a HEIC photo. Raises: FileNotFoundError; FileError."""
+    with reading(path, "image"), open_file(path, "image_bytes") as file:
+        return _begins_heic(file.read(12))
+
+
+def _begins_heic(data):
+    return data[4:8] == b"ftyp" and data[8:12] in HEIC_BRANDS
+
+
+def _heic_formats():
+    """Formats for Pillow, which knows this one from now on. Raises: Refused without the extra."""
+    try:
+        importlib.import_module("pi_heif").register_heif_opener()
+    except ImportError:
+        raise Refused('a HEIC photo: expected PNG or JPEG, or pip install "humangs_jax[heic]"') from None
+    return ("HEIF",)
+
+
 @contextlib.contextmanager
-def image_in(data: bytes) -> Generator[Any]:
-    """As `open_image`, of bytes. Raises: Refused; what Pillow raises for damaged images, which is of many types."""
+def image_in(data: bytes, formats: tuple[str, ...] = FORMATS) -> Generator[Any]:
+    """As `open_image`, of bytes in one of these formats of Pillow.
+
+    Raises: Refused; what Pillow raises for damaged images, which is of many types.
+    """
     from PIL import Image
 
     if data[:2] == b"\xff\xd8":  # each scan may cost as much as all the pixels
         check_limit("scans", data.count(b"\xff\xda"), "scans of a JPEG")
     try:
-        with Image.open(io.BytesIO(data), formats=FORMATS) as image:
+        with Image.open(io.BytesIO(data), formats=formats) as image:
             check_limit("pixels", image.width * image.height, f"pixels ({image.width} x {image.height})")
             check_limit("side", max(image.size), "pixels along a side")
             yield image
     except Image.UnidentifiedImageError as error:
-        raise ValueError(f"neither {' nor '.join(FORMATS)}") from error
+        raise ValueError("damaged HEIC" if formats != FORMATS else f"neither {' nor '.join(FORMATS)}") from error
 
 
 def check_image(path: str | Path) -> tuple[tuple[int, int], bool]:

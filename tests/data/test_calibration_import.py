@@ -360,8 +360,10 @@ def test_photos_that_do_not_fit_are_named(rig, tmp_path):
         import_rig(rig)
     for camera in NAMES:
         change(rig[0], lambda values, name=camera: values[name].pop("imgSize"))
-    written.write_photos(rig[1], ["a.png"], (32, 48))
-    with pytest.raises(CaptureError, match=r"b\.png: size: 64 x 48, but a\.png has 32 x 48: expected one size"):
+    for frame, size in enumerate(((32, 48), (64, 48))):
+        for camera in NAMES:
+            written.write_photos(rig[1] / camera, [f"{frame}.png"], size)
+    with pytest.raises(CaptureError, match=r"1\.png: size: 64 x 48, but 0\.png of the same camera has 32 x 48"):
         import_rig(rig)
 
 

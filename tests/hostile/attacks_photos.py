@@ -3,6 +3,7 @@
 import io
 import struct
 import zlib
+from pathlib import Path
 
 import readers
 from attacks_archives import deflated_zeros
@@ -53,6 +54,15 @@ def progressive(scans):
     return data[:start] + scan * scans + data[-2:]
 
 
+HEIC = (Path(__file__).parents[1] / "io" / "phone.heic").read_bytes()
+HEIC_SIZE = HEIC.index(b"ispe") + 8
+
+
+def heic(width, height):
+    """A HEIC photo that states this size of its 32 x 24 pixels."""
+    return HEIC[:HEIC_SIZE] + struct.pack(">II", width, height) + HEIC[HEIC_SIZE + 8 :]
+
+
 ROW16 = b"\0" + bytes(6 * 4)
 PHOTOS = {
     "13,000 x 13,000": (png(13_000, 13_000, data=zlib_zeros(1 << 20)), 5),
@@ -85,6 +95,14 @@ PHOTOS = {
     "a JPEG of 1,000 scans": (progressive(1000), 5),
     "a JPEG of 65,000 x 65,000": (as_format("JPEG")().replace(struct.pack(">HH", 8, 8), struct.pack(">HH", 65000, 65000)), 5),
     "a JPEG without pixels": (as_format("JPEG")()[:300], 6),
+    "a HEIC of 60,000 x 60,000": (heic(60_000, 60_000), 5),
+    "a HEIC of 7,000 x 7,000": (heic(7000, 7000), 5),
+    "a HEIC of no width": (heic(0, 24), 6),
+    "a HEIC without pixels": (HEIC[: HEIC.index(b"mdat") + 4], 6),
+    "a HEIC, cut": (HEIC[:-40], 6),
+    "a HEIC of zeros": (HEIC[: HEIC.index(b"mdat") + 4] + bytes(400), 6),
+    "a HEIC of which only the first box is there": (HEIC[:28], 6),
+    "a HEIC that is a video": (b"\0\0\0\x14ftypheic" + bytes(8) + b"\0\0\0\x08moov", 6),
 }  # fmt: skip
 for kind, (data, item) in PHOTOS.items():
     expect = "either" if kind in ("8 bits and a bomb", "16 bits and a bomb", "text of a gigabyte") else "refused"

@@ -1,12 +1,28 @@
 """Photos at other sizes. (Reading and writing them: tests/data.)"""
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from humangs_jax.io.images import resized
+from humangs_jax.io.images import (
+    FORMATS,
+    focal_length,
+    image_size,
+    is_heic,
+    open_image,
+    orientation,
+    read_image,
+    resized,
+)
+from humangs_jax.io.reading import FileError, Limits, set_limits
+
+HEIC = Path(__file__).parent / "phone.heic"
+"""Written by pillow-heif 1.8.1: 32 x 24, red, the upper left quarter blue; EXIF has orientation 6 and a focal length of 26 mm."""
 
 ROUNDING = 2e-6
 """Of sums of some hundred float32 products of numbers in [0, 1]."""
@@ -69,3 +85,61 @@ def test_a_ramp_stays_a_ramp():
 def test_bytes_are_averaged_as_numbers():
     image = np.full((4, 6, 3), 255, np.uint8)
     np.testing.assert_array_equal(resized(image, 4, 3), np.full((3, 4, 3), 255, np.float32))
+
+
+# EXIF and HEIC -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG"])
+@pytest.mark.parametrize(
+    ("value", "expected"), [(26, 26 * 50 / 43.27), (0, None), (None, None), ("26", None), ((26, 27), None)]
+)
+def test_focal_length_is_that_of_the_diagonal(kind, value, expected, tmp_path):
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    if value is not None:
+        exif.get_ifd(0x8769)[0xA405] = value
+    Image.new("RGB", (30, 40)).save(tmp_path / "a", kind, exif=exif)
+    assert focal_length(tmp_path / "a") == pytest.approx(expected)
+
+
+@pytest.mark.filterwarnings("ignore:Corrupt EXIF")
+def test_photos_without_exif_and_with_a_damaged_one_have_no_focal_length(tmp_path):
+    Image.new("RGB", (30, 40)).save(tmp_path / "a.png")
+    Image.new("RGB", (30, 40)).save(tmp_path / "b.jpg", exif=b"Exif\0\0MM\0*\xff\xff\xff\xff")
+    assert focal_length(tmp_path / "a.png") is None and focal_length(tmp_path / "b.jpg") is None
+
+
+def test_heic_is_read_upright(tmp_path):
+    pytest.importorskip("pi_heif")
+    colours, alpha = read_image(HEIC)
+    assert is_heic(HEIC) and colours.shape == (24, 32, 3) and alpha is None
+    np.testing.assert_allclose(colours[0, 0], np.asarray([20, 40, 220]) / 255, atol=0.03)  # compressed
+    np.testing.assert_allclose(colours[-1, -1], np.asarray([200, 120, 40]) / 255, atol=0.03)
+    assert orientation(HEIC) == 1 and focal_length(HEIC) == pytest.approx(26 * 40 / 43.27)
+    try:
+        set_limits(Limits(pixels=700))
+        with pytest.raises(FileError, match=r"768 pixels \(32 x 24\): the limit pixels is 700"):
+            read_image(HEIC)
+    finally:
+        set_limits(None)
+    for end in (20, 300, 600):
+        (tmp_path / "cut.heic").write_bytes(HEIC.read_bytes()[:end])
+        with pytest.raises(FileError, match=r"cut\.heic: not a readable image: ") as caught:
+            read_image(tmp_path / "cut.heic")
+        assert "\n" not in str(caught.value)
+
+
+def test_heic_without_its_extra_is_one_line_that_names_it(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pi_heif", None)
+    with pytest.raises(FileError, match=r'phone\.heic: a HEIC photo: .* pip install "humangs_jax\[heic\]"$'):
+        image_size(HEIC)
+
+
+def test_heic_needs_no_name_and_leaves_other_formats_alone(tmp_path):
+    pytest.importorskip("pi_heif")
+    (tmp_path / "a.jpg").write_bytes(HEIC.read_bytes())
+    assert image_size(tmp_path / "a.jpg") == (32, 24)
+    Image.new("RGB", (3, 4)).save(tmp_path / "b.heic", "PNG")
+    with open_image(tmp_path / "b.heic") as (image, _):
+        assert image.format in FORMATS and not is_heic(tmp_path / "b.heic")

@@ -7,6 +7,7 @@ asks for it; capture.json names body.npz, which `humangs fit` makes.
 import dataclasses
 import os
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
@@ -28,9 +29,13 @@ from humangs_jax.data.calibration.photos import Photo, find_photo, find_photos, 
 from humangs_jax.data.calibration.videos import photos_of_videos
 from humangs_jax.data.capture_checks import CaptureError, check_names, check_place, checked_camera
 from humangs_jax.data.photos import check_repeats, names_from_paths, read_checked, write_description
+from humangs_jax.data.usable_views import MASK_THRESHOLD
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.images import read_grey, read_image, write_png
+from humangs_jax.io.images import is_heic, read_grey, read_image, write_png
+from humangs_jax.io.reading import check_limit, reading
 
+SIZES_SHOWN = 5
+"""In a report."""
 NO_COMMON_MOMENT = "no two photos show the same moment: each is a frame with a pose of its own"
 NO_COMMON_FRAME = "no two cameras have a photo of the same frame: photos of one frame must have the same file name"
 
@@ -129,7 +134,7 @@ def _import(source, images, masks, out, scale, up, pixel_centers):
     photos = find_photos(calibration, images, masks)
     check_repeats(calibration.file, [photo.image for photo in photos])
     turns = find_turns(calibration, photos)
-    _check_one_size(photos, turns)
+    canvas = _canvas(images, photos, turns)
     about_masks = check_masks(photos)
     converted = turned_cameras(in_capture_convention(calibration, scale, up, pixel_centers), photos, turns)
     for camera in converted.cameras:
@@ -137,13 +142,22 @@ def _import(source, images, masks, out, scale, up, pixel_centers):
     checks = check_calibration(calibration, converted, up)
     frames, cameras = 1 + max(photo.frame for photo in photos), calibration.stations or len(converted.cameras)
     notes, about_turns = turn_notes(photos, turns)
+    if of_phones := sum(map(_of_phones, photos)):
+        notes = (*notes, f"written as PNG: {of_phones} HEIC photo{'' if of_phones == 1 else 's'}")
+    notes = (*notes, *_padding_notes(turns, canvas))
     more = [*about_turns, *about_masks, *_unused_masks(calibration, photos, masks)]
     if cameras > 1 and frames == len(photos) > 1:
         more.append(NO_COMMON_MOMENT if calibration.per_image else NO_COMMON_FRAME)
     checks = dataclasses.replace(checks, warnings=(*checks.warnings, *more))
     names = names_from_paths([photo.key + ".png" for photo in photos])
     check_names(names, len(photos), images)
-    replace_folder(out, lambda folder: _write(folder, converted, photos, turns, names), mark="capture.json")
+    cut: list[str] = []
+    write = lambda folder: cut.extend(_write(folder, converted, photos, turns, names, canvas))
+    replace_folder(out, write, mark="capture.json")
+    if cut:
+        which = f"{cut[0]} and {len(cut) - 1} more" if len(cut) > 1 else cut[0]
+        padded = f"the person is cut off where white was added to {which}: it is taken for background"
+        checks = dataclasses.replace(checks, warnings=(*checks.warnings, padded))
     return ImportReport(
         out=out,
         format=calibration.format,
@@ -151,8 +165,8 @@ def _import(source, images, masks, out, scale, up, pixel_centers):
         cameras=cameras,
         frames=frames,
         views=len(photos),
-        width=_size(converted.cameras[0])[0],
-        height=_size(converted.cameras[0])[1],
+        width=canvas[0],
+        height=canvas[1],
         scale=scale,
         up=up,
         pixel_centers=pixel_centers,
@@ -216,35 +230,83 @@ def _size(camera):
     return camera.width, camera.height
 
 
-def _check_one_size(photos, turns):
-    """Raises: CaptureError unless all photos have one size when they are upright."""
+def _canvas(images, photos, turns):
+    """Width and height of what is written: the largest of all photos, upright.
+
+    Raises: CaptureError if the photos of one camera have several sizes, or if so much may not be read together.
+    """
+    first = {}
     for photo, turn in zip(photos, turns, strict=True):
-        if turn.size != turns[0].size:
-            own, first = (" x ".join(map(str, size)) for size in (turn.size, turns[0].size))
-            raise CaptureError(photo.image, "size", f"{own}, but {photos[0].image.name} has {first}: expected one size")
+        other, size = first.setdefault(photo.camera, (photo, turn.size))
+        if turn.size != size:
+            own, known = (_by(*each) for each in (turn.size, size))
+            problem = f"{own}, but {other.image.name} of the same camera has {known}: expected one size of a camera"
+            raise CaptureError(photo.image, "size", problem)
+    width, height = (max(turn.size[axis] for turn in turns) for axis in (0, 1))
+    if any(turn.size != (width, height) for turn in turns):
+        with reading(images, "folder of photos", CaptureError):
+            what = f"pixels ({_by(width, height)}), to which photos of several sizes would be padded"
+            check_limit("pixels", width * height, what)
+            check_limit("capture_pixels", width * height * len(photos), f"{what}, {len(photos):,} of them")
+    return width, height
+
+
+def _by(width, height):
+    return f"{width} x {height}"
+
+
+def _padding_notes(turns, canvas):
+    """What was done to photos of several sizes, a line."""
+    counts = Counter(turn.size for turn in turns)
+    if set(counts) == {canvas}:
+        return ()
+    sizes = ", ".join(f"{count} of {_by(*size)}" for size, count in sorted(counts.items(), reverse=True)[:SIZES_SHOWN])
+    more = ", ..." if len(counts) > SIZES_SHOWN else ""
+    return (
+        f"photos of {len(counts)} sizes ({sizes}{more}): white was added on the right and below, so that all have "
+        f"{_by(*canvas)}; pixels keep their places: keypoints of the upright photos still fit",
+    )
 
 
 # Writing -------------------------------------------------------------------------------------------------------------
 
 
 def _write(
-    folder: Path, calibration: Calibration, photos: Sequence[Photo], turns: Sequence[Turn], names: Sequence[str]
-) -> None:
+    folder: Path,
+    calibration: Calibration,
+    photos: Sequence[Photo],
+    turns: Sequence[Turn],
+    names: Sequence[str],
+    canvas: tuple[int, int],
+) -> list[str]:
+    """Returns the names of photos whose person reaches a rim where the photo is padded."""
     (folder / "images").mkdir(parents=True)
     if photos[0].mask is not None:
         (folder / "masks").mkdir()
     straight = all(camera.distortion is None for camera in calibration.cameras)
-    changed = not straight or any(turn.rewrites for turn in turns)
+    rewrites = [
+        turn.rewrites or turn.size != canvas or _of_phones(photo) for photo, turn in zip(photos, turns, strict=True)
+    ]
+    changed = not straight or any(rewrites)
     transparent = changed and any(_is_transparent(photo.image) for photo in photos)
     straight = straight and not transparent
-    views = []
-    for photo, turn, name in zip(photos, turns, names, strict=True):
+    views, cut = [], []
+    for photo, turn, name, rewritten in zip(photos, turns, names, rewrites, strict=True):
         camera = calibration.cameras[photo.camera]
-        as_it_is = not changed or (straight and not turn.rewrites and not read_checked(has_alpha, photo.image))
-        files = _copy(folder, photo, name) if as_it_is else _rewrite(folder, photo, turn, name, camera, transparent)
+        if not changed or (straight and not rewritten and not read_checked(has_alpha, photo.image)):
+            files = _copy(folder, photo, name)
+        else:
+            files, at_rim = _rewrite(folder, photo, turn, name, camera, transparent, canvas)
+            cut += [photo.image.name] if at_rim else []
         matrices = {"K": camera.K.tolist(), "cam_from_world": camera.cam_from_world.tolist()}
         views.append({**files, "frame": photo.frame, **matrices})
     write_description(folder, views)
+    return cut
+
+
+def _of_phones(photo):
+    """Whether the photo or its mask is HEIC, which captures have none of: other programs cannot read it."""
+    return any(file is not None and read_checked(is_heic, file) for file in (photo.image, photo.mask))
 
 
 def _copy(folder, photo, name):
@@ -259,14 +321,18 @@ def _copy(folder, photo, name):
 
 def _is_transparent(photo):
     """Whether any pixel is."""
+    if not read_checked(has_alpha, photo):
+        return False
     alpha = read_checked(read_image, photo)[1]
     return alpha is not None and alpha.min() < 1
 
 
-def _rewrite(folder, photo, turn, name, camera, transparent):
-    """Photo and mask (or its alpha) upright, and as a pinhole sees them; pixels that it does not see are white and background.
+def _rewrite(folder, photo, turn, name, camera, transparent, canvas):
+    """Photo and mask (or its alpha) upright, as a pinhole sees them, and padded; pixels that it does not see are white and
+    background.
 
     A photo that has alpha besides its mask keeps it. Opaque alpha, where no photo is `transparent`, is left out.
+    Returns: the paths for capture.json, and whether the person reaches a rim where the photo is padded.
     """
     image, alpha = read_checked(read_image, photo.image)
     image, alpha = turn.image(image), turn.image(alpha) if transparent and alpha is not None else None
@@ -276,10 +342,25 @@ def _rewrite(folder, photo, turn, name, camera, transparent):
         mask, alpha = (x if x is None else undistort(x, camera.K, camera.distortion, fill=0.0) for x in (mask, alpha))
     if photo.mask is not None and alpha is not None:
         image = np.concatenate([image, alpha[..., None]], axis=-1)
+    at_rim = mask is not None and _reaches(mask > MASK_THRESHOLD, canvas)
+    image, mask = _padded(image, canvas, 1.0), None if mask is None else _padded(mask, canvas, 0.0)
     files = {"image": f"images/{name}.png"}
     write_png(folder / files["image"], image)
     if mask is not None:
         files["mask"] = f"masks/{name}.png"
         (folder / "masks").mkdir(exist_ok=True)
         write_png(folder / files["mask"], mask)
-    return files
+    return files, at_rim
+
+
+def _reaches(person, canvas):
+    """Whether there is anybody at the right or lower rim of (h, w), on the side where it is smaller than the canvas."""
+    height, width = person.shape
+    return bool((width < canvas[0] and person[:, -1].any()) or (height < canvas[1] and person[-1].any()))
+
+
+def _padded(pixels, canvas, fill):
+    """Pixels (h, w, ...) with more on the right and below; those of an alpha channel that are added are opaque white."""
+    (height, width), (right, below) = pixels.shape[:2], canvas
+    margins = ((0, below - height), (0, right - width), *((0, 0),) * (pixels.ndim - 2))
+    return pixels if pixels.shape[:2] == (below, right) else np.pad(pixels, margins, constant_values=fill)

@@ -11,8 +11,8 @@ from humangs_jax.data.photos import read_checked
 from humangs_jax.io.images import image_size
 from humangs_jax.io.reading import inside, reading
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
-"""File types of photos."""
+SUFFIXES = tuple(case(each) for case in (str.lower, str.upper) for each in (".png", ".jpg", ".jpeg", ".heic", ".heif"))
+"""File types of photos that are looked for by a name without one; with one, any mix of cases will do."""
 LAYOUTS = "CAMERA/FRAME.jpg, FRAME/CAMERA.jpg or CAMERA.jpg"
 
 
@@ -92,10 +92,15 @@ def _check_inside(folder, name):
 
 def _any_suffix(path):
     """The file, or the one of that name with another suffix of photos, or with one more."""
-    stems = [path.name, path.stem] if path.suffix in SUFFIXES else [path.name]
-    candidates = [path] if path.suffix in SUFFIXES else []
+    stems = [path.name, path.stem] if is_photo(path) else [path.name]
+    candidates = [path] if is_photo(path) else []
     candidates += [path.with_name(stem + suffix) for stem in stems for suffix in SUFFIXES]
     return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def is_photo(path: Path) -> bool:
+    """Whether a file is called like a photo."""
+    return path.suffix.lower() in SUFFIXES
 
 
 def photo_size(path: Path) -> tuple[int, int]:
@@ -165,7 +170,7 @@ def _single_photos(images, names):
 def _photos_in(folder):
     if not folder.is_dir():
         return []
-    return [Path(entry.path) for entry in os.scandir(folder) if Path(entry.name).suffix in SUFFIXES and entry.is_file()]
+    return [Path(entry.path) for entry in os.scandir(folder) if is_photo(Path(entry.name)) and entry.is_file()]
 
 
 def _in_order(names: Iterable[str]) -> list[str]:

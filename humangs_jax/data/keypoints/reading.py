@@ -29,7 +29,7 @@ FAR_OUTSIDE = 0.5
 """Detectors extrapolate a little beyond the image. Points further out than this share of its size mean nothing."""
 LARGEST_PIXEL = 1e6
 """Coordinates beyond it mean nothing, and are not to become inf in float32."""
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".heic", ".heif")
 
 
 class Person(NamedTuple):
@@ -50,7 +50,8 @@ def read_keypoints(
         path: a file or folder of one of the formats in `formats`.
         names: of the capture's views. Images of the file are matched by name, or by the number in the name where the file
             has only numbers; images of no view are ignored.
-        width, height: pixels of the capture's photos, which the keypoints have to be of.
+        width, height: pixels of the capture's photos, which the keypoints have to be of; or of the photos of several sizes that
+            were padded to these when they were imported.
         person: which one to take where several people are seen, counted from 0 in the order of the file.
 
     Returns: v views of k points. Views of which the file has nothing have confidence 0 and are in `missing`.
@@ -105,17 +106,21 @@ def _images_of_views(
     except ValueError as error:
         raise CaptureError(path, "", error) from error
     images: list[DetectedImage | None] = [None] * len(names)
+    seen = [image for image, view in zip(detections.images, views, strict=True) if view is not None]
+    sizes = [image.size for image in seen if image.size is not None]
+    # an import pads photos of several sizes, each at its right and below, to the largest: pixels keep their places
+    before_padding = bool(sizes) and tuple(max(side) for side in zip(*sizes, strict=True)) == (width, height)
     for image, view in zip(detections.images, views, strict=True):
         if view is None:
             continue
-        if image.size not in (None, (width, height)):
+        if not before_padding and image.size not in (None, (width, height)):
             size = " x ".join(map(str, image.size or ()))
             problem = f"{size}, but the capture's photos have {width} x {height}: expected keypoints of these"
             raise CaptureError(image.file, f"size of {image.image}", problem)
         images[view] = image
     if not any(images):
-        seen = [str(image.image) for image in detections.images]
-        problem = f"images {_few(seen)} are none of the views {_few(list(names))}: expected the same names"
+        named = _few([str(image.image) for image in detections.images])
+        problem = f"images {named} are none of the views {_few(list(names))}: expected the same names"
         raise CaptureError(path, "", problem)
     return images
 
