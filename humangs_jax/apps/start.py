@@ -9,6 +9,7 @@ from pathlib import Path
 
 from humangs_jax.data.calibration.formats import EASYMOCAP_FILES, FILES
 from humangs_jax.data.calibration.photos import SUFFIXES, is_photo
+from humangs_jax.data.calibration.videos import SUFFIXES as VIDEOS
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.io.images import image_size, open_image
 from humangs_jax.io.reading import reading, walk
@@ -90,7 +91,7 @@ def look(
         photos=len(photos),
         size=image_size(photos[0]),
         cameras=cameras or next((place for name in CAMERA_PLACES if _has_cameras(place := folder / name)), None),
-        masks=masks or next((place for name in MASK_FOLDERS if any(_photos(place := folder / name))), None),
+        masks=masks or next((place for name in MASK_FOLDERS if any(find_photos(place := folder / name))), None),
         alpha=_has_alpha(photos[0]),
         keypoints=keypoints or next((path for path in (*named, *others) if path.exists()), None),
     )
@@ -99,8 +100,8 @@ def look(
 def photo_files(folder: Path) -> tuple[Path, list[Path]]:
     """The folder that the photos are in, and their files in order. Raises: CaptureError, one line, if there is none."""
     _expect_folder(folder)
-    images = next((place for name in PHOTO_FOLDERS if any(_photos(place := folder / name))), folder)
-    photos = sorted(_photos(images))
+    images = next((place for name in PHOTO_FOLDERS if any(find_photos(place := folder / name))), folder)
+    photos = sorted(find_photos(images))
     if not photos:
         raise CaptureError(
             folder, "", f"no photo: expected {', '.join(SUFFIXES[:4])} files in it or in {folder / 'images'}"
@@ -111,7 +112,7 @@ def photo_files(folder: Path) -> tuple[Path, list[Path]]:
 def _expect_folder(folder):
     if not folder.is_dir():
         wrong = "is a file" if folder.exists() else "no such folder"
-        raise CaptureError(folder, "", f"{wrong}: expected a folder of photos")
+        raise CaptureError(folder, "", f"{wrong}: expected a folder of photos, or a video ({', '.join(VIDEOS)})")
 
 
 def missing(material: Material, images: Path | None = None) -> tuple[Missing, ...]:
@@ -170,7 +171,7 @@ def missing(material: Material, images: Path | None = None) -> tuple[Missing, ..
     return tuple(found)
 
 
-def _photos(folder: Path) -> Iterator[Path]:
+def find_photos(folder: Path) -> Iterator[Path]:
     """The photos of a folder and of those in it, except for masks, captures, and what other programs have made of photos."""
     others = (*MASK_FOLDERS, *KEYPOINT_FILES, "colmap")
     if folder.is_dir():

@@ -29,7 +29,8 @@ class Start:
     """
 
     photos: Positional[Path]
-    """Folder of the photos, or with a folder `images` in it; cameras, masks and keypoints are looked for in there."""
+    """Folder of the photos, or with a folder `images` in it; cameras, masks and keypoints are looked for in there. Or
+    a video, or a folder with one: its best frames become the photos in OUT_photos, where the rest is looked for."""
     out: Path
     """The capture folder to write, with avatar.npz, avatar.html and check.png in it."""
     cameras: Path | None = None
@@ -68,7 +69,7 @@ class Start:
             from humangs_jax.apps.start import look
             from humangs_jax.io.atomic import only_maker
 
-        material = look(self.photos, cameras=self.cameras, masks=self.masks, keypoints=self.keypoints)
+        material = look(self._photos(), cameras=self.cameras, masks=self.masks, keypoints=self.keypoints)
         if self.without_masks:
             material = dataclasses.replace(material, masks=None)
         tell(material)
@@ -91,7 +92,7 @@ class Start:
         if self.overwrite:
             tell_deleted(self.out)
         report = self._import(material) if material.cameras is not None else None
-        changed = report is not None and (report.undistorted or report.turned)
+        changed = report is not None and (report.undistorted or report.turned or report.heic)
         masked = self.without_masks or (report is not None and report.masks)
         needed = missing(material, self.out / "images" if changed else None)
         needed = [each for each in needed if not (masked and each.name == "masks")]
@@ -132,6 +133,18 @@ class Start:
         if material.keypoints is not None:
             return material
         return dataclasses.replace(material, keypoints=self.out / detect.KEYPOINTS_FILE)
+
+    def _photos(self) -> Path:
+        """The folder of photos; that of a video is beside --out."""
+        from humangs_jax.apps.video_photos import photos_of_video, video_of
+
+        if (video := video_of(self.photos)) is None:
+            return self.photos
+        out = self.out if self.out.name not in ("", "..") else self.out.resolve()
+        with stage("choosing frames of the video"):
+            frames = photos_of_video(video, out.with_name(f"{out.name}_photos"))
+        tell(frames)
+        return frames.folder
 
     def _resumes(self) -> bool:
         """Whether an earlier run left a body to go on from. Raises: UsageError if --out may not be replaced."""

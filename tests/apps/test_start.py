@@ -13,6 +13,7 @@ from humangs_jax.apps import detect
 from humangs_jax.apps.detect import Found, PhotoPeople
 from humangs_jax.apps.start import look, missing
 from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.video import write_video
 from humangs_jax.cli.start import Start
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.capture_checks import CaptureError
@@ -206,6 +207,48 @@ def test_without_the_detector_its_extra_is_named_first(mine):
     for name in ("masks", "keypoints"):
         shutil.rmtree(mine / name)
     assert all("pip install 'humangs_jax[photos]'" in each.how[0] for each in missing(look(mine)))
+
+
+@pytest.mark.parametrize("given", ["clips", "clips/me.MP4"])
+def test_a_video_becomes_photos_beside_the_capture(given, tmp_path, monkeypatch, capsys):
+    """Once: a second run goes on with these, and what was added to them; another video under that name is refused."""
+    monkeypatch.chdir(tmp_path)
+    Path("clips").mkdir()
+    scenes = np.random.default_rng(0).uniform(0.1, 0.9, (3, 4, 6, 3))
+    write_video(Path("v.mp4"), [np.kron(scenes[i // 5], np.ones((12, 12, 1))) for i in range(15)], 10)
+    Path("v.mp4").rename("clips/me.MP4")
+    command = ["start", given, "--out", "out/me", "--no-browser"]
+    assert cli.execute(command) == cli.BAD_DATA  # cameras are missing
+    assert "clips/me.MP4: 3 of 15 frames" in capsys.readouterr().out
+    photos = sorted(Path("out/me_photos/images").iterdir())
+    assert [int(path.stem[-8:]) // 5 for path in photos] == [0, 1, 2]
+    Path("out/me_photos/masks").mkdir()
+    shutil.copy(photos[0], "out/me_photos/masks")
+    before = {path: path.stat().st_mtime_ns for path in photos}
+    assert cli.execute(command) == cli.BAD_DATA
+    out = capsys.readouterr().out
+    assert "3 of 15 frames" in out and "masks:     out/me_photos/masks" in out
+    assert {path: path.stat().st_mtime_ns for path in photos} == before
+    with Path("clips/me.MP4").open("ab") as file:
+        file.write(bytes(8))
+    assert cli.execute(command) == cli.BAD_DATA
+    assert "out/me_photos: exists, and is not of me.MP4 as it is now" in capsys.readouterr().err
+
+
+def test_what_is_no_video_of_a_person_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("clips").mkdir()
+    write_video(Path("clips/black.mp4"), [np.zeros((16, 16, 3))] * 3, 10)
+    for files, problem in (
+        ({}, "black.mp4: none of its 3 frames shows anything"),
+        ({"black.mp4": b"no video"}, "black.mp4: not a readable video"),
+        ({"b.mov": b""}, "clips: 2 videos and no photo: expected photos or one video"),
+    ):
+        for name, content in files.items():
+            Path("clips", name).write_bytes(content)
+        assert cli.execute(["start", "clips", "--out", "me"]) == cli.BAD_DATA
+        assert problem in (said := capsys.readouterr().err) and said.count("\n") == 1
+        assert list(Path().iterdir()) == [Path("clips")]
 
 
 def test_folders_without_photos_and_captures_are_refused(mine, tmp_path):

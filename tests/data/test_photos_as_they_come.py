@@ -111,6 +111,6 @@ def test_heic_photos_become_png(tmp_path):
     written.write_photos(tmp_path / "photos", ["a.png"], (32, 24))
     shutil.copy(HEIC, tmp_path / "photos" / "b.HEIC")
     report = imported(tmp_path)
-    assert "written as PNG: 1 HEIC photo" in report.notes and report.turned == 0
+    assert "written as PNG: 1 HEIC photo" in report.notes and (report.turned, report.heic) == (0, 1)
     assert sorted(path.name for path in (tmp_path / "out" / "images").iterdir()) == ["a.png", "b.png"]
     np.testing.assert_allclose(load_photos(tmp_path / "out").images[1], read_image(HEIC)[0], atol=1e-6)

@@ -45,6 +45,7 @@ class ImportReport:
     """What was imported and how it was read; `str(report)` is what the command line prints.
 
     notes: further lines about it. masks: whether it has mask files. turned: photos that were turned upright, see `orientation`.
+    heic: photos that were HEIC, or their masks.
     """
 
     out: Path
@@ -64,6 +65,7 @@ class ImportReport:
     notes: tuple[str, ...] = ()
     masks: bool = False
     turned: int = 0
+    heic: int = 0
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -142,8 +144,8 @@ def _import(source, images, masks, out, scale, up, pixel_centers):
     checks = check_calibration(calibration, converted, up)
     frames, cameras = 1 + max(photo.frame for photo in photos), calibration.stations or len(converted.cameras)
     notes, about_turns = turn_notes(photos, turns)
-    if of_phones := sum(map(_of_phones, photos)):
-        notes = (*notes, f"written as PNG: {of_phones} HEIC photo{'' if of_phones == 1 else 's'}")
+    if heic := sum(map(_of_phones, photos)):
+        notes = (*notes, f"written as PNG: {heic} HEIC photo{'' if heic == 1 else 's'}")
     notes = (*notes, *_padding_notes(turns, canvas))
     more = [*about_turns, *about_masks, *_unused_masks(calibration, photos, masks)]
     if cameras > 1 and frames == len(photos) > 1:
@@ -176,6 +178,7 @@ def _import(source, images, masks, out, scale, up, pixel_centers):
         notes=(*notes, *_named_masks(calibration, photos, masks)),
         masks=photos[0].mask is not None,
         turned=sum(turn.rewrites for turn in turns),
+        heic=heic,
     )
 
 

@@ -8,11 +8,15 @@ All videos have to begin at the same moment and to have the same rate. Masks are
 import contextlib
 import subprocess
 import tempfile
-from collections.abc import Generator
+import threading
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
+
+from humangs_jax.core.array_types import UInt
 from humangs_jax.data.capture_checks import CaptureError
-from humangs_jax.io.images import image_size
+from humangs_jax.io.images import image_in, image_size
 from humangs_jax.io.reading import Refused, check_limit, limits, open_file, reading
 
 SUFFIXES = (".mp4", ".mov", ".mkv", ".avi")
@@ -77,32 +81,99 @@ def split_video(path: Path, folder: Path, every: int = 1, most: int | None = Non
     with reading(path, "video", CaptureError):
         open_file(path).close()  # no devices, no pipes, not too large
         folder.mkdir(parents=True)
-        first = _run(path, folder, every, 1)
+        select = f"not(mod(n\\,{every}))"
+        first = _run(path, folder, select, 1)
         width, height = image_size(next(folder.iterdir()))
         size, room = width * height, max(0, limits().video_pixels - before) // (width * height)
-        count = first if most == 1 else _run(path, folder, every, room + 1 if most is None else min(most, room + 1))
-        what = f"pixels in the frames of the videos, {count:,} or more of {width} x {height} in this one"
-        check_limit("video_pixels", before + count * size, what)
+        count = first if most == 1 else _run(path, folder, select, room + 1 if most is None else min(most, room + 1))
+        _check_pixels(before + count * size, count, width, height)
         return before + count * size
 
 
-def _run(path, folder, every, most):
-    """Write at most that many frames; returns how many there are."""
+def _check_pixels(pixels, count, width, height):
+    what = f"pixels in the frames of the videos, {count:,} or more of {width} x {height} in this one"
+    check_limit("video_pixels", pixels, what)
+
+
+def write_frames(path: Path, folder: Path, chosen: Sequence[int]) -> None:
+    """Write these frames of a video, counted from 0 and in order, as frame_00000017.png, ... into a new folder.
+
+    Raises: CaptureError naming the video.
+    """
+    with reading(path, "video", CaptureError):
+        folder.mkdir(parents=True)
+        if _run(path, folder, "+".join(f"eq(n\\,{i})" for i in chosen), len(chosen)) != len(chosen):
+            raise Refused("its frames are not the same when they are read again")
+        for i, frame in enumerate(chosen):
+            (folder / f"{i:08d}.png").rename(folder / f"frame_{frame:08d}.png")
+
+
+def grey_frames(path: Path, longer_side: int) -> Iterator[UInt[np.ndarray, "h w"]]:
+    """All frames of a video, one after the other, grey and no larger than that. Raises: CaptureError naming the video."""
+    with reading(path, "video", CaptureError):
+        open_file(path).close()
+        picture = ["-frames:v", "1", "-f", "image2pipe", "-c:v", "png", "pipe:1"]
+        first = _finished(path, [*_ffmpeg(path, "null"), *picture])
+        if not first:
+            raise _said(path, b"")
+        with image_in(first) as image:
+            width, height = image.size
+        room, scale = limits().video_pixels // (width * height), min(1.0, longer_side / max(width, height))
+        w, h = (max(1, round(side * scale)) for side in (width, height))
+        command = [*_ffmpeg(path, f"scale={w}:{h}:flags=area"), "-frames:v", str(room + 1)]
+        command += ["-f", "rawvideo", "-pix_fmt", "gray", "pipe:1"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+            assert process.stdout is not None and process.stderr is not None
+            said, errors, count = [], process.stderr, 0
+            listener = threading.Thread(target=lambda: said.append(errors.read()))
+            clock = threading.Timer(LONGEST_SECONDS, process.kill)
+            listener.start()
+            clock.start()
+            try:
+                while len(data := process.stdout.read(w * h)) == w * h:
+                    count += 1
+                    _check_pixels(count * width * height, count, width, height)
+                    yield np.frombuffer(data, np.uint8).reshape(h, w)
+                if process.wait():
+                    listener.join()
+                    raise _said(path, said[0])
+            finally:
+                clock.cancel()
+                process.kill()
+                listener.join()
+
+
+def _ffmpeg(path, filters):
     import imageio_ffmpeg
 
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-nostdin", "-xerror"]
     # a playlist in disguise may name other files and hosts; pictures may be larger than what is read later
     command += ["-protocol_whitelist", "file", "-format_whitelist", CONTAINERS]
     command += ["-max_pixels", str(limits().pixels), "-i", f"file:{path.resolve()}"]
-    command += ["-map", "0:v:0", "-vf", f"select=not(mod(n\\,{every}))", "-fps_mode", "passthrough"]
-    command += ["-frames:v", str(most), "-y", "-start_number", "0", "%08d.png"]
+    return [*command, "-map", "0:v:0", "-vf", filters, "-fps_mode", "passthrough"]
+
+
+def _run(path, folder, select, most):
+    """Write at most that many frames for which ffmpeg's expression is not 0; returns how many there are."""
+    command = [*_ffmpeg(path, f"select={select}"), "-frames:v", str(most), "-y", "-start_number", "0", "%08d.png"]
+    _finished(path, command, folder)  # in the folder: its path may hold a % of its own
+    if not (count := sum(1 for _ in folder.iterdir())):
+        raise _said(path, b"")
+    return count
+
+
+def _finished(path, command, folder=None):
+    """What ffmpeg writes to its standard output."""
     try:
-        # in the folder: its path may hold a % of its own
         done = subprocess.run(command, cwd=folder, capture_output=True, timeout=LONGEST_SECONDS, check=False)
     except subprocess.TimeoutExpired:
         raise Refused(f"its frames take more than {LONGEST_SECONDS:,} seconds: expected a shorter video") from None
-    count = sum(1 for _ in folder.iterdir())
-    if done.returncode or not count:
-        said = " ".join(done.stderr.decode(errors="replace").split()) or "no frame"
-        raise ValueError(said.replace(f"file:{path.resolve()}", path.name))
-    return count
+    if done.returncode:
+        raise _said(path, done.stderr)
+    return done.stdout
+
+
+def _said(path, text):
+    """The error that ffmpeg tells of."""
+    said = " ".join(text.decode(errors="replace").split()) or "no frame"
+    return ValueError(said.replace(f"file:{path.resolve()}", path.name))
