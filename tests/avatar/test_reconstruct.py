@@ -20,7 +20,7 @@ from humangs_jax.avatar.reconstruct import (
 )
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyPose, shape_body
+from humangs_jax.body.model import BodyPose, person_vertices, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays
 from humangs_jax.data.loading.examples import shrink
@@ -214,6 +214,23 @@ def test_worlds_with_z_up_are_turned_and_leave_no_light(body, network):
     for second, first in (avatars, (lit.gaussians, unlit.gaussians)):
         for got, expected in zip(jax.tree.leaves(second), jax.tree.leaves(first), strict=True):
             np.testing.assert_allclose(got, expected, atol=100 * TURNED)
+
+
+def test_pose_correctives_move_what_the_network_reads_and_not_gaussians(body, network):
+    """As in the release: vertices are sampled where the whole body model puts them, Gaussians move by blend skinning alone."""
+    _, config = network
+    directions = np.random.default_rng(0).normal(size=(*body.template.shape, 9 * (len(body.parents) - 1))) * 0.01
+    corrected, views = replace(body, pose_directions=jnp.asarray(directions, jnp.float32)), subject_views(1)
+    read, plain = (prepare_inputs(x, views, config).posed_vertices for x in (corrected, body))
+    assert np.abs(read - plain).max() > 0.01
+    for x, expected in ((corrected, read), (body, plain)):
+        own = jax.vmap(lambda r, t, x=x: person_vertices(x, views.betas, BodyPose(r, t)))
+        np.testing.assert_allclose(own(views.rotations, views.translations), expected, atol=1e-5)  # float32
+    count, pose = len(body.template), BodyPose(views.rotations[0], views.translations[0])
+    sizes, quats = ((count, 3), (count,), (count, 3)), jnp.tile(jnp.eye(4)[0], (count, 1))
+    outputs = HumanGSOutputs(Gaussians(body.template, quats, *(jnp.full(size, 0.01) for size in sizes)))
+    moved = [skin(make_avatar(outputs, x, views.betas, config), pose) for x in (corrected, body)]
+    np.testing.assert_array_equal(moved[0].means, moved[1].means)
 
 
 def test_light_shines_from_above_in_a_capture_of_another_world(body, network):
