@@ -378,6 +378,18 @@ def test_the_best_explained_photo_is_held_out_of_the_trial_and_then_fitted(four,
     assert set(fit) == {0, 1, 2, 3}
 
 
+@pytest.mark.parametrize("misleads", [False, True])
+def test_rounds_alone_are_tried_only_where_a_photo_fits_much_less_than_others(four, misleads, monkeypatch):
+    avatar, capture = four
+    images, asked = np.array(capture.images), []
+    images[2] = 1 - images[2] if misleads else images[2]
+    monkeypatch.setattr(Run, "learned", lambda self, parameters, rounds: parameters)
+    monkeypatch.setattr(Run, "held_psnr", lambda self, parameters: asked.append(parameters) or 20.0)
+    settings = dataclasses.replace(STEPS, rounds=1, steps=0, held_out=0.05)
+    report = refinement.refine_with_report(avatar, dataclasses.replace(capture, images=images), settings)
+    assert bool(asked) == misleads and report.steps == 0 and not report.left_out
+
+
 @pytest.mark.slow
 def test_a_trial_that_loses_leaves_the_avatar_alone(four, monkeypatch):
     """Steps and rounds that fit the photos they see and spoil the one that they do not."""
