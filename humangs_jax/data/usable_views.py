@@ -64,7 +64,10 @@ def empty_views(capture: Capture) -> list[int]:
 
 
 def shares_on_masks(capture: Capture) -> list[float]:
-    """For each view the share of the body in the frame that lies on the mask; 0 where none of it is in the frame."""
+    """For each view the share of the body in the frame that lies on the mask; 0 where none of it is in the frame.
+
+    1 for a body that is not finite: that is another fault, which whoever poses it names.
+    """
     assert capture.masks is not None
     rotations, translations = np.asarray(capture.poses.rotations), np.asarray(capture.poses.translation)
     frames = [int(frame) for frame in capture.frames]
@@ -74,6 +77,9 @@ def shares_on_masks(capture: Capture) -> list[float]:
     for i, frame in enumerate(frames):
         mask = np.asarray(capture.masks[i])
         height, width = mask.shape
+        if not np.isfinite(points[frame]).all():
+            shares.append(1.0)
+            continue
         x, y = points_in_image(points[frame], K[i], cam_from_world[i], width, height).astype(int).T
         shares.append(float((mask[y, x] > MASK_THRESHOLD).mean()) if len(x) else 0.0)
     return shares

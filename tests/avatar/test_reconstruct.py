@@ -406,6 +406,7 @@ def capture_of(body, seed, views):
         np.asarray(subject.rotations),
         np.asarray(subject.translations),
         betas=np.asarray(subject.betas)[: 4 - seed],
+        shape_names=body.shape_names[: 4 - seed],
         masks=np.asarray(subject.masks),
         frames=np.arange(views),
         body=body,
