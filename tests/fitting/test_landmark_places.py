@@ -10,8 +10,8 @@ from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.fitting.landmark_fit import FitConfig, fit_landmarks
 
 NEAR_MM, BIASED = 15.0, 1.5
-"""Mean joint error of a fit that knows the places, in one frame with noise (10 mm measured), and how many times larger it is without
-them (2.2 measured)."""
+"""Mean joint error of a fit that knows the places, in one frame with noise (10 mm measured), and how many times larger it is
+without them (2.2 measured)."""
 
 
 @pytest.mark.slow
