@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
+import numpy as np
 from jax.core import Tracer
 
 T = TypeVar("T")
@@ -30,7 +31,9 @@ def pytree_dataclass(cls: type[T]) -> type[T]:
 
     With `Batchable` as a base class, batches of it can be indexed and iterated over.
     """
-    cls = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    cls = dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
+    if cls.__repr__ is object.__repr__:
+        setattr(cls, "__repr__", short_repr)  # noqa: B010 (a class of any kind)
     fields = dataclasses.fields(cls)
     static = tuple(f.name for f in fields if f.metadata.get("static"))
     dynamic = tuple(f.name for f in fields if not f.metadata.get("static"))
@@ -53,6 +56,27 @@ def pytree_dataclass(cls: type[T]) -> type[T]:
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     _PYTREES.add(cls)
     return cls
+
+
+SHORT = 80
+"""Characters of a value that is no array, from which on it is left out of a printed pytree."""
+
+
+def short_repr(tree: Any) -> str:
+    """A dataclass on one line, arrays by type and shape, as equinox prints them: "Gaussians(means=f32[100,3], ...)"."""
+    shown = [f"{f.name}={_shortened(getattr(tree, f.name))}" for f in dataclasses.fields(tree)]
+    return f"{type(tree).__name__}({', '.join(shown)})"
+
+
+def _shortened(value):
+    if hasattr(value, "shape") and hasattr(value, "dtype"):
+        kind = np.dtype(value.dtype) if isinstance(value, np.ndarray) else value.dtype
+        name = kind.name.replace("bfloat", "bf").replace("float", "f").replace("uint", "u").replace("int", "i")
+        return f"{name}[{','.join(map(str, value.shape))}]"
+    text = repr(value)
+    if len(text) > SHORT and isinstance(value, tuple | list | dict):
+        return f"{type(value).__name__} of {len(value)}"
+    return text if dataclasses.is_dataclass(value) or len(text) <= SHORT else f"{type(value).__name__}(...)"
 
 
 class Batchable:

@@ -21,6 +21,7 @@ import numpy as np
 from humangs_jax.body.model import BodyModel, BodyPose
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Float, Int
+from humangs_jax.core.pytree import short_repr
 from humangs_jax.data.capture_checks import (
     CaptureError,
     body_parameters,
@@ -44,7 +45,7 @@ from humangs_jax.data.photos import (
 )
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.images import resized, write_png
+from humangs_jax.io.images import contact_sheet, png_bytes, resized, write_png
 from humangs_jax.io.npz import read_npz, write_npz
 from humangs_jax.io.reading import FileError, check_limit, reading
 
@@ -54,7 +55,7 @@ BODY_KEYS = {"body", "betas", "rotations", "translations"}
 OPTIONAL_BODY_KEYS = {"shape_names"}
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Capture:
     """A capture in memory (numpy on the host). `capture_from_arrays` makes a checked one.
 
@@ -74,6 +75,12 @@ class Capture:
     poses: BodyPose
     names: tuple[str, ...]
     body_file: str = DEFAULT_BODY
+
+    __repr__ = short_repr
+
+    def _repr_png_(self) -> bytes:
+        """The photos side by side, for notebooks."""
+        return png_bytes(contact_sheet(self.images))
 
     @property
     def view_count(self) -> int:

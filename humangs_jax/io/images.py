@@ -11,7 +11,7 @@ import io
 import struct
 import warnings
 import zlib
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -157,9 +157,21 @@ def write_png(path: str | Path, image: Float[np.ndarray, "h w c"] | Float[np.nda
 
     A fourth channel is alpha. The file appears whole or not at all. Raises: OSError if it cannot be written.
     """
+    replace_file(path, lambda temporary: temporary.write_bytes(png_bytes(image)))
+
+
+def png_bytes(image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"]) -> bytes:
+    """The content of the file that `write_png` writes."""
     from PIL import Image
 
-    replace_file(path, lambda temporary: Image.fromarray(to_uint8(image)).save(temporary, format="PNG"))
+    file = io.BytesIO()
+    Image.fromarray(to_uint8(image)).save(file, format="PNG")
+    return file.getvalue()
+
+
+def contact_sheet(images: Iterable[Float[np.ndarray, "h w c"]], height: int = 240) -> Float[np.ndarray, "height w c"]:
+    """Images side by side, reduced to one height, pixels."""
+    return np.concatenate([resized(i, max(1, round(i.shape[1] * height / i.shape[0])), height) for i in images], axis=1)
 
 
 def to_uint8(image: Float[np.ndarray, "*shape"]) -> np.ndarray:

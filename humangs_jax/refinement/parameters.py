@@ -6,21 +6,15 @@ Everything is a pure function of explicit state, for one person; batch with `jax
 import dataclasses
 from typing import Any, cast
 
-import jax
 import jax.numpy as jnp
 import optax
 
 from humangs_jax.core.array_types import Array, Float
-from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.rendering.gaussians import Gaussians, widened
+from humangs_jax.rendering.unconstrained import UnconstrainedGaussians, constrain, unconstrain
 
-SMALLEST_SCALE = 1e-6
-"""Metres; keeps the logarithm finite for flat Gaussians."""
-COLOR_MARGIN, OPACITY_MARGIN = 0.005, 0.001
-"""How far both are pulled inside (0, 1), where the gradient of the sigmoid does not vanish; opacities less than the smallest that
-is drawn, 1/255, so that what is hidden stays hidden."""
 PULLED = ("means", "log_scales")
 """Parameters that `RefineConfig.decay` draws back to the start."""
 ADAM = optax.scale_by_adam()
@@ -44,28 +38,16 @@ class Parameters:
 
 
 def parameters_of(gaussians: Gaussians, views: int, joints: int) -> Parameters:
-    """Inverse of `gaussians_of`, within `COLOR_MARGIN` and `OPACITY_MARGIN`; poses unchanged."""
-    return Parameters(
-        gaussians.means,
-        gaussians.quats,
-        jnp.log(jnp.maximum(widened(gaussians.scales, gaussians.low_pass, -1), SMALLEST_SCALE)),
-        inverse_sigmoid(gaussians.opacities, OPACITY_MARGIN),
-        inverse_sigmoid(gaussians.colors, COLOR_MARGIN),
-        jnp.zeros((views, joints, 3)),
-        jnp.zeros((views, 3)),
-    )
+    """Inverse of `gaussians_of`, as far as `unconstrain` is one; poses unchanged."""
+    free = unconstrain(replace(gaussians, scales=widened(gaussians.scales, gaussians.low_pass, -1)))
+    return Parameters(**vars(free), rotations=jnp.zeros((views, joints, 3)), translations=jnp.zeros((views, 3)))
 
 
 def gaussians_of(parameters: Parameters, low_pass: Float[Array, " g"] | None) -> Gaussians:
     """The Gaussians that the parameters stand for, with a low-pass on top of their scales."""
-    return Gaussians(
-        parameters.means,
-        parameters.quats,
-        widened(jnp.exp(parameters.log_scales), low_pass),
-        jax.nn.sigmoid(parameters.opacity_logits),
-        jax.nn.sigmoid(parameters.color_logits),
-        low_pass=low_pass,
-    )
+    names = [field.name for field in dataclasses.fields(UnconstrainedGaussians)]
+    gaussians = constrain(UnconstrainedGaussians(**{name: getattr(parameters, name) for name in names}))
+    return replace(gaussians, scales=widened(gaussians.scales, low_pass), low_pass=low_pass)
 
 
 @pytree_dataclass

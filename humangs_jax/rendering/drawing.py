@@ -18,7 +18,7 @@ from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.numerics import at_least_float32, safe_divide
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.io.images import named_color
+from humangs_jax.io.images import contact_sheet, named_color, png_bytes
 from humangs_jax.rendering import binning
 from humangs_jax.rendering.buffers import warn_of_overflow, with_default_buffers
 from humangs_jax.rendering.compositing import composite, pack_splats
@@ -45,6 +45,11 @@ class Rendering(Batchable):
     depth: Float[Array, "h w"]
     overflow: Int[Array, ""]
     visibility: Float[Array, " g"] | None = None
+
+    def _repr_png_(self) -> bytes:
+        """The image, or those of a batch side by side, for notebooks."""
+        images = np.asarray(self.rgb)
+        return png_bytes(contact_sheet(images.reshape(-1, *images.shape[-3:]), images.shape[-3]))
 
 
 Background = Float[Array, "3"] | Float[np.ndarray, "3"] | Sequence[float | int] | str | None

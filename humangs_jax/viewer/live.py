@@ -4,7 +4,7 @@
     humangs view --live refined.npz          # an avatar file, whenever it is replaced: `humangs refine --live` does so
 
     with LiveView() as view:                 # in Python
-        hg.refine_with_report(avatar, capture, watch=view.show)
+        hg.refine(avatar, capture, watch=view.show)
 
 For an avatar that is finished, the page of `viewer.page` is the better viewer: it needs no server and draws what `hg.render`
 draws. viser (https://viser.studio) has its own splatting in the browser, with 8 bits for colours and opacities.

@@ -83,10 +83,14 @@ def write_page(
 
 
 class NotebookPage:
-    """What `show` returns: notebooks draw it."""
+    """What `show` returns: notebooks draw it, `save` writes it."""
 
     def __init__(self, text: str, height: int):
         self._text, self._height = text, height
+
+    def save(self, path: str | os.PathLike) -> None:
+        """Write the page as one file that any browser opens. Raises: OSError."""
+        write_text(path, self._text)
 
     def _repr_html_(self) -> str:
         """An iframe that holds the whole page."""

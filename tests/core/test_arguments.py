@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 
 import humangs_jax as hg
+from humangs_jax.avatar.export import write_ply
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.configuration import Presets, check_fields
 from humangs_jax.core.pytree import replace
+from humangs_jax.geometry.camera import intrinsics_from_fov, stack_cameras
+from humangs_jax.network.execution import Execution
 
 COUNT = 7
 GAUSSIANS = hg.Gaussians(
@@ -84,7 +87,7 @@ WRONG = {
         "settings 'real': expected Settings or",
     ),
     "an image": (lambda: hg.show(IMAGE), "avatar: expected Avatar, got ndarray"),
-    "no path": (lambda: hg.write_ply(GAUSSIANS, "a.ply"), "path: expected str or PathLike, got Gaussians"),
+    "no path": (lambda: write_ply(GAUSSIANS, "a.ply"), "path: expected str or PathLike, got Gaussians"),
     "a batch of avatars": (
         lambda: hg.animate(AVATARS, POSE),
         r"avatar: expected one Avatar, got a batch \(2,\): take one",
@@ -119,13 +122,13 @@ WRONG = {
         lambda: hg.render(GAUSSIANS, CAMERA, background=(0, 0, 255)),
         r"background: expected 3 numbers in \[0, 1\]",
     ),
-    "degrees": (lambda: hg.intrinsics_from_fov(40.0, 8, 8), r"vertical_fov 40: expected radians .*np.deg2rad\(40\)"),
+    "degrees": (lambda: intrinsics_from_fov(40.0, 8, 8), r"vertical_fov 40: expected radians .*np.deg2rad\(40\)"),
     "degrees of an orbit": (
         lambda: hg.orbit(jnp.zeros(3), 2.0, jnp.zeros(1), 30.0, jnp.eye(3), 8, 8),
         "elevations 30.0: expected radians",
     ),
     "one camera": (
-        lambda: hg.stack_cameras(CAMERA),
+        lambda: stack_cameras(CAMERA),
         r"stack_cameras\(cameras\): cameras: expected Sequence, got Camera; a list of cameras",
     ),
     "as_trained": (lambda: hg.SPLAT_PRESETS["as_trained"], "no preset 'as_trained': .*SPLAT_PRESETS.avatar.rendering"),
@@ -145,8 +148,8 @@ def test_wrong_arguments_are_named(name):
     ("config", "change", "words"),
     [
         (hg.Settings(), {"splat": "fst"}, "Settings: splat: expected one of 'as_trained', .*, got 'fst'"),
-        (hg.Execution(), {"attention": "flash"}, "Execution: attention: expected one of 'auto', 'xla', "),
-        (hg.Execution(), {"crop": "yes"}, "Execution: crop: expected bool, got 'yes'"),
+        (Execution(), {"attention": "flash"}, "Execution: attention: expected one of 'auto', 'xla', "),
+        (Execution(), {"crop": "yes"}, "Execution: crop: expected bool, got 'yes'"),
         (hg.SplatConfig(), {"tile_size": 8.0}, "SplatConfig: tile_size: expected int, got 8.0"),
         (hg.SplatConfig(), {"matmul_precision": "float16"}, "matmul_precision: expected one of 'float32', 'bfloat16'"),
         (hg.RefineConfig(), {"steps": "10"}, "RefineConfig: steps: expected one of int, None, got '10'"),

@@ -12,7 +12,7 @@ import pytest
 
 import humangs_jax.network
 from humangs_jax.apps import settings, tune
-from humangs_jax.core.configuration import Range, _ranges, config_from_json, config_to_json, configuration
+from humangs_jax.core.configuration import Range, _ranges, config_from_json, config_to_json, configuration, vary
 from humangs_jax.network.execution import Execution
 from humangs_jax.people.on_the_fly import OnTheFlyConfig
 from humangs_jax.training import config
@@ -164,3 +164,16 @@ def test_any_value_in_any_field_is_read_or_refused_in_one_line(whole):
                 refused += 1
                 assert len(str(error).splitlines()) == 1
     assert refused > 100
+
+
+def test_fields_are_varied_by_their_paths():
+    run = config.PRESETS["tiny"]()
+    varied = vary(run, {"model.execution.crop": not run.model.execution.crop, "loss.squared": 0.25})
+    assert varied.loss.squared == 0.25 and varied.model.execution.crop != run.model.execution.crop
+    assert vary(varied, {"model.execution.crop": run.model.execution.crop, "loss.squared": run.loss.squared}) == run
+    with pytest.raises(ValueError, match=r"loss\.squard: LossConfig has no field 'squard'; its fields are \['squared'"):
+        vary(run, {"loss.squard": 1.0})
+    with pytest.raises(ValueError, match=r"steps\.a: int has no field 'a'"):
+        vary(run, {"steps.a": 1})
+    with pytest.raises(ValueError, match="squared"):
+        vary(run, {"loss.squared": -1.0})

@@ -104,3 +104,13 @@ def test_every_kind_of_batch_knows_its_axes():
         two = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), one)
         assert one.batch_shape == () and two.batch_shape == (2,)
         assert jax.tree.structure(two[1]) == jax.tree.structure(one) and two[1].batch_shape == ()
+
+
+def test_pytrees_print_on_one_short_line():
+    text = repr(camera())
+    assert text == "Camera(K=f32[3,3], cam_from_world=f32[4,4], width=4, height=3)"
+    body = repr(load_body())
+    assert "\n" not in body and len(body) < 1500 and "tuple of 55" in body
+    traced = []
+    jax.jit(lambda c: (traced.append(repr(c)), c.K)[1])(camera())
+    assert traced == [text]
