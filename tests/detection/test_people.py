@@ -6,6 +6,7 @@ import pytest
 
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.data.capture import load_capture
+from humangs_jax.detection.blazepose import ENLARGED, Detection, Landmarks, Networks
 from humangs_jax.detection.people import detect_people
 from humangs_jax.io.images import resized
 
@@ -72,3 +73,31 @@ def test_nobody_in_noise_and_in_the_dark(networks):
     noise = np.random.default_rng(0).uniform(size=(240, 320, 3)).astype(np.float32)
     assert detect_people(networks, noise) == []
     assert detect_people(networks, np.zeros_like(noise)) == []
+
+
+class Drifting(Networks):
+    """They see one person, well in a crop of the right size; larger crops far off drift towards it with wrong points."""
+
+    hips, side = np.asarray([200.0, 300.0]), 240.0
+
+    def __init__(self):
+        """Without files."""
+
+    def detect(self, photo, window):
+        if window.side < max(photo.shape):
+            return []
+        about = lambda score, hips, side: Detection(score, hips, hips - [0, side / 2 / ENLARGED])
+        return [about(0.9, self.hips, self.side), about(0.6, np.asarray([60.0, 180.0]), 600.0)]
+
+    def landmarks(self, photo, crop):
+        right = crop.side < 1.1 * self.side
+        points = self.hips + np.random.default_rng(0).uniform(-50, 50, (33, 2)) + (0 if right else 40)
+        center, side = (self.hips, self.side) if right else (0.5 * (crop.center + self.hips), 0.9 * crop.side)
+        again = Detection(1.0, center, center - np.asarray([0, side / 2 / ENLARGED]))
+        return Landmarks(points, np.ones(33), np.zeros((33, 3)), 1.0, np.ones((256, 256)), crop, again)
+
+
+def test_the_landmarks_of_a_crop_that_settled_are_taken():
+    (person,) = detect_people(Drifting(), np.zeros((600, 400, 3), np.float32))
+    assert person.side == pytest.approx(Drifting.side)
+    np.testing.assert_allclose(person.pixels.mean(0), Drifting.hips + 0.5, atol=20)
