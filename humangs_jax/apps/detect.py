@@ -74,7 +74,7 @@ def found_in_photos(folder: Path) -> list[PhotoPeople]:
         return found_in_capture(folder)
     images, files = photo_files(folder)
     names = [file.relative_to(images).as_posix() for file in files]
-    return same_people(detect_photos(names, (_upright(file) for file in files)))
+    return same_people(detect_photos(names, map(upright, files)))
 
 
 def found_in_capture(folder: Path) -> list[PhotoPeople]:
@@ -87,7 +87,8 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
     return same_people(found, photos.cameras, photos.frames.tolist())
 
 
-def _upright(file):
+def upright(file: Path) -> Float[np.ndarray, "h w 3"]:
+    """A photo as its EXIF orientation wants it shown."""
     return oriented(read_image(file)[0], orientation(file))
 
 
@@ -166,8 +167,11 @@ def _member(photo: PhotoPeople, match: Match | None, i: int) -> Found | None:
     if match is None or (member := match.members[i]) is None:
         return None
     found = photo.people[member]
-    if found is None or not match.mirrored[i]:
-        return found
+    return exchanged(found) if found is not None and match.mirrored[i] else found
+
+
+def exchanged(found: Found) -> Found:
+    """The person with left and right exchanged."""
     order = np.asarray(MEDIAPIPE_33.mirror)
     person = dataclasses.replace(found.person, points=found.person.points[order], world=found.person.world[order])
     return found._replace(person=person, mirrored=True)

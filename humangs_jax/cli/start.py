@@ -41,6 +41,9 @@ class Start:
     """Keypoint file or folder, if it is elsewhere; formats: docs/fitting.md."""
     person: int | None = None
     """Which person of the keypoint file, from 0, if a view has several; without such a file, of those on people.png."""
+    height: float | None = None
+    """Of the person without shoes, metres, like --height 1.78: the scale where there is no calibration. Default: that of an
+    average person, often 6 to 11 % too small."""
     scale: float | None = None
     """Metres per unit of the calibration. Default: 1."""
     up: str | None = None
@@ -91,6 +94,11 @@ class Start:
             return
         if self.overwrite:
             tell_deleted(self.out)
+        if material.cameras is None and available():
+            self._from_photos_alone(material, limits)
+            return
+        if self.height is not None:
+            raise UsageError("--height: is for photos without cameras: the calibration has a scale (--scale)")
         report = self._import(material) if material.cameras is not None else None
         changed = report is not None and (report.undistorted or report.turned or report.heic)
         masked = self.without_masks or (report is not None and report.masks)
@@ -107,6 +115,31 @@ class Start:
             raise ValueError(f"{self.photos}: {names} missing: make them as above and run the same command again")
         if detected:
             material = self._detect(material, detected)
+        self._finish(self._fit(material), limits)
+
+    def _from_photos_alone(self, material: "Material", limits: dict[str, Any] | None) -> None:
+        """Cameras, keypoints and masks from the person in the photos."""
+        with stage("finding the person and the cameras"):
+            from humangs_jax.apps.detect import KEYPOINTS_FILE, SHEET_FILE
+            from humangs_jax.apps.photos_alone import import_photos
+            from humangs_jax.io.text import write_json
+
+            own_masks = not (self.without_masks or material.alpha)
+            found = import_photos(
+                material.images,
+                self.out,
+                person=self.person,
+                height=self.height,
+                masks=material.masks,
+                own_masks=own_masks,
+            )
+            write_json(self.out / MARK, {"photos": str(self.photos.resolve())})
+        tell("\n".join(found.lines))
+        for warning in found.warnings:
+            warn(warning)
+        wrote(self.out / SHEET_FILE, "who was found in the photos")
+        keypoints = self.out / KEYPOINTS_FILE if material.keypoints is None else material.keypoints
+        material = dataclasses.replace(material, keypoints=keypoints)
         self._finish(self._fit(material), limits)
 
     def _detect(self, material: "Material", wanted: list[str]) -> "Material":

@@ -82,7 +82,7 @@ class Calibration:
     image, not one for each camera. pixel_centers, up: what the format means by default.
     observations: None where the format has none. convention: what the matrices in the file mean, of `CONVENTIONS`.
     stations: how many cameras took the images, where the format says; None: one for each of `cameras`. mask_key: where the file
-    names masks, None if it does not.
+    names masks, None if it does not. upright: whether cameras are of photos that obey their EXIF orientation; else sizes tell.
     """
 
     format: str
@@ -95,6 +95,7 @@ class Calibration:
     convention: str = CAM_FROM_WORLD
     stations: int | None = None
     mask_key: str | None = None
+    upright: bool = False
 
 
 def in_capture_convention(calibration: Calibration, scale: float, up: str, pixel_centers: str) -> Calibration:

@@ -127,11 +127,23 @@ def import_cameras(
             raise ValueError(f"--{name} {value}: expected at least 1")
     _check_folders(source, images, masks, out, overwrite)
     with photos_of_videos(images, masks, out, every, frames) as (images, masks):
-        return _import(source, images, masks, out, scale, up, pixel_centers)
+        calibration = read_calibration(source, lambda name: _size_by_name(images, name, source))
+        return import_calibration(
+            calibration, images, out, masks=masks, scale=scale, up=up, pixel_centers=pixel_centers
+        )
 
 
-def _import(source, images, masks, out, scale, up, pixel_centers):
-    calibration = read_calibration(source, lambda name: _size_by_name(images, name, source))
+def import_calibration(
+    calibration: Calibration,
+    images: Path,
+    out: Path,
+    *,
+    masks: Path | None = None,
+    scale: float = 1.0,
+    up: str | None = None,
+    pixel_centers: str | None = None,
+) -> ImportReport:
+    """`import_cameras` of a calibration in memory, which replaces a capture that is there."""
     up, pixel_centers = up or calibration.up, pixel_centers or calibration.pixel_centers
     photos = find_photos(calibration, images, masks)
     check_repeats(calibration.file, [photo.image for photo in photos])

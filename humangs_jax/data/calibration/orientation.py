@@ -61,7 +61,7 @@ def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn,
     Raises: CaptureError unless photos have the size that was calibrated, and masks that of their photo; and for a camera that was
     calibrated for pixels as stored, but whose photos have different flags.
     """
-    turns = tuple(_find_turn(calibration.cameras[photo.camera], photo) for photo in photos)
+    turns = tuple(_find_turn(calibration.cameras[photo.camera], photo, calibration.upright) for photo in photos)
     first: dict[int, tuple[Photo, Turn]] = {}
     for photo, turn in zip(photos, turns, strict=True):
         other, known = first.setdefault(photo.camera, (photo, turn))
@@ -71,7 +71,7 @@ def find_turns(calibration: Calibration, photos: Sequence[Photo]) -> tuple[Turn,
     return turns
 
 
-def _find_turn(camera, photo):
+def _find_turn(camera, photo, upright):
     flag, stored = read_checked(orientation, photo.image), photo_size(photo.image)
     shown = stored if flag < 5 else stored[::-1]
     calibrated = stored if camera.width is None else (camera.width, camera.height)
@@ -83,11 +83,11 @@ def _find_turn(camera, photo):
         if calibrated == stored[::-1]:
             problem += "; was it turned (an EXIF orientation that got lost)?"
         raise CaptureError(photo.image, "size", f"{stored[0]} x {stored[1]}{told}, {problem}")
-    as_stored = calibrated == stored
+    as_stored = calibrated == stored and not upright
     own = UNMIRRORED[flag] if as_stored else flag
     size = stored if own < 5 else stored[::-1]
     mask = () if photo.mask is None else _mask_flags(photo, flag, own, stored, shown, mirrored=own != flag)
-    return Turn(flag, own, mask, own if as_stored else 1, size, certain=flag == 1 or stored != shown)
+    return Turn(flag, own, mask, own if as_stored else 1, size, certain=flag == 1 or stored != shown or upright)
 
 
 def _mask_flags(photo, flag, own, stored, shown, mirrored):
