@@ -240,13 +240,14 @@ def repaired(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
     return tuple(photo.name for photo in photos if (found := photo.people[person]) is not None and found.mirrored)
 
 
-def chosen(photos: Sequence[PhotoPeople], person: int | None, folder: Path) -> int:
-    """As `choose`; where it cannot be decided, the sheet is in the folder."""
+def chosen(photos: Sequence[PhotoPeople], person: int | None, folder: Path, sheet: Path | None = None) -> int:
+    """As `choose`; where it cannot be decided, the sheet is in the folder, or where `sheet` says."""
+    sheet = folder / SHEET_FILE if sheet is None else sheet
     try:
-        return choose(photos, person, folder / SHEET_FILE)
+        return choose(photos, person, sheet)
     except ValueError:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_sheet(folder / SHEET_FILE, photos)
+        sheet.parent.mkdir(parents=True, exist_ok=True)
+        write_sheet(sheet, photos)
         raise
 
 

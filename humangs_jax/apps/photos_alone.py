@@ -46,7 +46,8 @@ def import_photos(
     images, files = photo_files(folder)
     names = [file.relative_to(images).as_posix() for file in files]
     photos = detect.same_people(detect.detect_photos(names, map(detect.upright, files)))
-    number = detect.chosen(photos, person, out)
+    # beside `out`, which a refusal leaves as it is
+    number = detect.chosen(photos, person, out, out.with_name(f"{out.resolve().name}_{detect.SHEET_FILE}"))
     without = detect.absent(photos, number)
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
     people = [found for i in shown if (found := photos[i].people[number]) is not None]

@@ -1,5 +1,6 @@
 """`humangs start`: what a folder has, what is said to be missing, and the way to the page."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -193,14 +194,43 @@ def test_two_people_are_refused_with_the_sheet_that_numbers_them(mine, detected,
     assert Path("me/people.png").is_file() and not detected and load_photos("me").masks is None
 
 
-def test_with_the_detector_cameras_alone_are_missing(mine, detected, capsys):
+def test_photos_alone_are_enough(mine, detected, capsys):
+    """Cameras, masks and keypoints are those of the person; only LiteRT is needed."""
     for name in ("masks", "keypoints"):
         shutil.rmtree(mine / name)
     (mine / "calibration.json").unlink()
-    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
+    assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.7"]) == cli.BAD_DATA
     out, err = capsys.readouterr()
-    assert "masks and keypoints: found in the photos, once the rest is there" in out
-    assert "photos: cameras missing: make them" in err and "rembg" not in out
+    assert err.endswith("humangs: error: the fit\n") and "cameras from the person: " in out
+    (material,) = detected
+    assert material.keypoints == Path("me/keypoints.json")
+    imported, truth = load_photos("me"), load_capture("demo_capture")
+    assert (imported.frames == 0).all()
+    centers, true = (np.asarray(capture.cameras.center) for capture in (imported, truth))
+    # of cameras without a common world: distances between them, over the first
+    apart = lambda points: np.linalg.norm(points[1:] - points[0], axis=-1)
+    np.testing.assert_allclose(apart(centers) / apart(centers)[0], apart(true) / apart(true)[0], rtol=0.2)
+
+
+def test_a_height_without_a_use_is_refused(mine, detected, capsys):
+    assert cli.execute(["start", str(mine), "--out", "me", "--height", "1.7"]) == cli.BAD_USAGE
+    assert "--height: is for photos without cameras" in capsys.readouterr().err
+
+
+def test_several_people_are_refused_and_the_next_run_may_choose(mine, detected, monkeypatch, capsys):
+    (mine / "calibration.json").unlink()
+    capture = load_capture("demo_capture")
+    found = detect.found_in_capture(Path("me"))
+    monkeypatch.setattr(
+        detect,
+        "detect_photos",
+        lambda names, photos: [dataclasses.replace(p, name=n) for n, p in zip(names, found, strict=True)],
+    )
+    assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
+    assert "numbers on me_people.png" in capsys.readouterr().err
+    assert Path("me_people.png").is_file() and not Path("me").exists()
+    assert cli.execute(["start", str(mine), "--out", "me", "--person", "1"]) == cli.BAD_DATA
+    assert capsys.readouterr().err.endswith("humangs: error: the fit\n") and capture.view_count == 4
 
 
 def test_without_the_detector_its_extra_is_named_first(mine):
@@ -218,7 +248,7 @@ def test_a_video_becomes_photos_beside_the_capture(given, tmp_path, monkeypatch,
     write_video(Path("v.mp4"), [np.kron(scenes[i // 5], np.ones((12, 12, 1))) for i in range(15)], 10)
     Path("v.mp4").rename("clips/me.MP4")
     command = ["start", given, "--out", "out/me", "--no-browser"]
-    assert cli.execute(command) == cli.BAD_DATA  # cameras are missing
+    assert cli.execute(command) == cli.BAD_DATA  # nobody is in it
     assert "clips/me.MP4: 3 of 15 frames" in capsys.readouterr().out
     photos = sorted(Path("out/me_photos/images").iterdir())
     assert [int(path.stem[-8:]) // 5 for path in photos] == [0, 1, 2]

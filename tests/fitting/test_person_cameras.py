@@ -97,14 +97,19 @@ def test_one_photo_is_enough_for_its_own_camera():
     assert np.linalg.norm(np.asarray(found.cameras[0].cam_from_world)[:3, 3]) == pytest.approx(true, rel=0.15)
 
 
-def test_photos_of_several_moments_are_told_and_stand_alone():
-    matrices = cameras_around(4)
+def several_moments():
     changes = (("standing", 0, 0.0), ("crouching", 0, 0.4), ("standing", 5, 0.5), ("crouching", 7, 0.5))
-    landmarks = np.stack([posed(*change) for change in changes])
-    seen = seen_by(landmarks, matrices)
+    return seen_by(np.stack([posed(*change) for change in changes]), cameras_around(4))
+
+
+def test_photos_of_several_moments_are_told():
     with pytest.raises(SeveralMomentsError, match="% of the person's size"):
-        cameras_of_moment(seen)
-    found = cameras_from_person(seen)
+        cameras_of_moment(several_moments())
+
+
+@pytest.mark.slow
+def test_photos_of_several_moments_stand_alone():
+    found = cameras_from_person(several_moments())
     assert found.moments == 4 and len(found.cameras) == 4 and found.landmarks.shape == (4, len(NAMES), 3)
 
 
