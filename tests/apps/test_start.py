@@ -217,9 +217,8 @@ def test_a_height_without_a_use_is_refused(mine, detected, capsys):
     assert "--height: is for photos without cameras" in capsys.readouterr().err
 
 
-def test_several_people_are_refused_and_the_next_run_may_choose(mine, detected, monkeypatch, capsys):
+def test_several_people_without_cameras_are_refused_with_a_sheet(mine, detected, monkeypatch, capsys):
     (mine / "calibration.json").unlink()
-    capture = load_capture("demo_capture")
     found = detect.found_in_capture(Path("me"))
     monkeypatch.setattr(
         detect,
@@ -229,8 +228,8 @@ def test_several_people_are_refused_and_the_next_run_may_choose(mine, detected, 
     assert cli.execute(["start", str(mine), "--out", "me"]) == cli.BAD_DATA
     assert "numbers on me_people.png" in capsys.readouterr().err
     assert Path("me_people.png").is_file() and not Path("me").exists()
-    assert cli.execute(["start", str(mine), "--out", "me", "--person", "1"]) == cli.BAD_DATA
-    assert capsys.readouterr().err.endswith("humangs: error: the fit\n") and capture.view_count == 4
+    assert cli.execute(["start", str(mine), "--out", "me", "--person", "5"]) == cli.BAD_USAGE
+    assert "--person 5: expected 0 to 1, as on me_people.png" in capsys.readouterr().err and not Path("me").exists()
 
 
 def test_without_the_detector_its_extra_is_named_first(mine):
