@@ -15,7 +15,7 @@ from jax import lax
 from humangs_jax.body.model import BodyModel, BodyPose, RestBody, pose_body, shape_body
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.usable_views import usable_views
+from humangs_jax.data.usable_views import unusable_views, usable_views
 from humangs_jax.data.views import standardize
 from humangs_jax.geometry.camera import Camera, project
 from humangs_jax.rendering.mesh.position_map import vertex_normals
@@ -50,6 +50,14 @@ def equal_exposure(capture: Capture) -> Capture:
     capture = usable_views(capture)
     gains = camera_gains(capture)
     return capture if (gains == 1).all() else with_gains(capture, gains)
+
+
+def exposures(capture: Capture) -> Float[np.ndarray, "v 3"]:
+    """By what to multiply the colours of an avatar of these photos, so that it is rendered as each camera exposed it."""
+    apart, found = unusable_views(capture), np.ones((capture.view_count, 3))
+    if usable := [i for i in range(capture.view_count) if i not in apart]:
+        found[usable] = 1 / camera_gains(capture.select(usable))
+    return found
 
 
 def camera_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:

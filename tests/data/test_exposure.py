@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from humangs_jax.data.capture import load_capture
-from humangs_jax.data.exposure import EXPECTED, camera_gains, equal_exposure, gains_of, multiplied, with_gains
+from humangs_jax.data.exposure import (
+    EXPECTED,
+    camera_gains,
+    equal_exposure,
+    exposures,
+    gains_of,
+    multiplied,
+    with_gains,
+)
 
 SHRINKING = 0.1
 """Share of a gain that the prior keeps back where many points are shared."""
@@ -81,6 +89,7 @@ def test_a_capture_in_different_exposures_is_made_equal_once(demo):
     gains = camera_gains(changed)
     left, before = (np.sqrt(np.mean(np.square(x))) for x in (np.log(gains) - logs, logs))
     assert left < 0.6 * before
+    np.testing.assert_allclose(exposures(changed) * gains, 1, rtol=1e-12)
     equal = equal_exposure(changed)
     assert equal_exposure(equal) is equal
     outside = demo.masks == 0
@@ -94,5 +103,8 @@ def test_a_capture_in_different_exposures_is_made_equal_once(demo):
 def test_without_masks_nothing_is_changed(demo):
     bare = dataclasses.replace(demo, masks=None)
     assert equal_exposure(bare) is bare
+    np.testing.assert_array_equal(exposures(bare), 1)
+    nobody = dataclasses.replace(demo, masks=np.zeros_like(demo.masks))
+    np.testing.assert_array_equal(exposures(nobody), 1)
     with pytest.raises(ValueError, match="masks"):
         with_gains(bare, np.ones((demo.view_count, 3)))
