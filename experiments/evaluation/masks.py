@@ -81,7 +81,7 @@ def measure(variables, config, subject):
     from experiments.evaluation.subjects import score_tasks
     from humangs_jax.avatar.reconstruct import reconstruct
     from humangs_jax.data.masks import masks_at_edges
-    from humangs_jax.data.photos import on_white_background
+    from humangs_jax.data.photos import cut_out
     from humangs_jax.evaluation.cases import draw_views
     from humangs_jax.refinement.config import RefineConfig
     from humangs_jax.refinement.refine import refine
@@ -105,7 +105,8 @@ def measure(variables, config, subject):
         moved = [mask for mask, _ in masks_at_edges(list(photos), masks)]
         for how, used in (("as they are", masks), ("moved", moved)):
             used = np.stack(used).astype(np.float32)
-            changed = dataclasses.replace(inputs, images=on_white_background(photos, used), masks=used)
+            cut = np.stack([cut_out(*pair) for pair in zip(photos, used, strict=True)])
+            changed = dataclasses.replace(inputs, images=cut, masks=used)
             image = score(f"{error}, {how}", changed)
             if error == max(ERRORS):
                 shown.append(image)

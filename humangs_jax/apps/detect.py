@@ -22,8 +22,9 @@ from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.people_file import ImagePeople, SeenPerson, seen_person, write_people
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos, read_description
-from humangs_jax.detection.blazepose import Networks
+from humangs_jax.detection.blazepose import LANDMARK_SIZE, Networks
 from humangs_jax.detection.people import SEEN, DetectedPerson, detect_people
+from humangs_jax.detection.sharpening import sharpened
 from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_people
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files
@@ -101,7 +102,7 @@ def detect_photos(names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 
     found = []
     for name, each in zip(names, bar(photos, desc="finding people", unit="photo", total=len(names)), strict=True):
         photo = np.ascontiguousarray(each, np.float32)
-        people = sorted((_found(person) for person in detect_people(networks, photo)), key=lambda one: -one.area)
+        people = sorted((_found(person, photo) for person in detect_people(networks, photo)), key=lambda one: -one.area)
         height, width = photo.shape[:2]
         shrink = min(1.0, THUMBNAIL / max(height, width))
         small = resized(photo, max(1, round(width * shrink)), max(1, round(height * shrink)))
@@ -109,11 +110,12 @@ def detect_photos(names: Sequence[str], photos: Iterable[Float[np.ndarray, "h w 
     return found
 
 
-def _found(person: DetectedPerson) -> Found:
-    rows, columns = (np.flatnonzero((person.mask > 0).any(axis)) for axis in (1, 0))
+def _found(person: DetectedPerson, photo: Float[np.ndarray, "h w 3"]) -> Found:
+    mask = sharpened(person.mask, photo, person.side / LANDMARK_SIZE)
+    rows, columns = (np.flatnonzero((mask > 0).any(axis)) for axis in (1, 0))
     top, left = (int(each[0]) if len(each) else 0 for each in (rows, columns))
     bottom, right = (int(each[-1]) + 1 if len(each) else 0 for each in (rows, columns))
-    cut = to_uint8(person.mask[top:bottom, left:right])
+    cut = to_uint8(mask[top:bottom, left:right])
     return Found(seen_person(person), cut, (top, left), float((cut > 255 * SEEN).sum()))
 
 

@@ -52,10 +52,16 @@ def draw(
     cameras: Iterable[Camera],
     background: Background = None,
     how: SplatConfig | None = None,
+    exposures: Float[np.ndarray, "v 3"] | None = None,
 ) -> Iterator[Rendering]:
-    """One rendering per pose and camera. how: None for what the avatar's weights were trained with."""
+    """One rendering per pose and camera. how: None for what the avatar's weights were trained with. exposures: of the
+    cameras, see `data.exposure`.
+    """
     how = SPLAT_PRESETS[avatar.rendering] if how is None else how
-    return draw_gaussians((posed(avatar, pose) for pose in poses), cameras, background, how)
+    gaussians = (posed(avatar, pose) for pose in poses)
+    if exposures is not None:
+        gaussians = (replace(g, colors=g.colors * e) for g, e in zip(gaussians, exposures, strict=True))
+    return draw_gaussians(gaussians, cameras, background, how)
 
 
 def draw_gaussians(

@@ -72,8 +72,11 @@ def write_views(
     shot: Shot,
     exr: ExrLayers | None = None,
     progress: bool = True,
+    exposures: Float[np.ndarray, "v 3"] | None = None,
 ) -> int:
     """Draw an avatar in each pose (batch v) from each camera into a folder: view_000.png ..., and views.exr if asked.
+
+    exposures: of the cameras, see `data.exposure`.
 
     The files appear together when all are drawn; other views of an earlier call are removed. Returns the number of views.
 
@@ -90,7 +93,7 @@ def write_views(
     how = splatting_of(shot, avatar)
 
     def write(folder: Path):
-        drawn = draw(avatar, poses, cameras, jnp.zeros(3), how)
+        drawn = draw(avatar, poses, cameras, jnp.zeros(3), how, exposures)
         views = []
         for i, rendering in enumerate(bar(drawn, total=count, desc="render", unit="view", shown=progress)):
             write_png(folder / f"view_{i:03d}.png", image_of(rendering, shot.color()))

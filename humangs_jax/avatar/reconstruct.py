@@ -21,6 +21,7 @@ from humangs_jax.core.array_types import Array, Float, Int, PyTree
 from humangs_jax.core.checks import FINITE, UNIT, check_values
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.views import SubjectViews, fits, gaussian_body, pad_views, prepare_inputs, standardize, upright
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import camera_values
@@ -47,14 +48,14 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     its own, beyond that at most a fifth of the views is padding. For a network with a driver this is the avatar before any
     correction of a frame, see `avatar.targets`. Worlds that are not y-up are turned for the network (`data.views.upright`); the
     avatar then has no light, whose directions would be those of another world. Views whose mask does not show the person are left
-    out (`data.usable_views`).
+    out (`data.usable_views`), and the exposure of the others is made equal (`data.exposure`).
 
     Raises: ValueError if the network makes no Gaussians, the capture has no view, none that shows the person, or values that are
     not finite or out of range, naming the array.
     """
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
-    photos = standardize(capture, config.image_size, config.execution.crop)
+    photos = standardize(equal_exposure(capture), config.image_size, config.execution.crop)
     views, count = upright(photos, capture.body), len(photos.images)
     turned, bucket = views is not photos, round_up(count, smallest=1)
     if bucket > count:
@@ -121,7 +122,7 @@ def _stacked(config, captures):
     coefficients = max(len(capture.betas) for capture in captures)
     subjects, turned = [], []
     for capture in captures:
-        photos = standardize(capture, config.image_size, config.execution.crop)
+        photos = standardize(equal_exposure(capture), config.image_size, config.execution.crop)
         turned.append((views := upright(photos, capture.body)) is not photos)
         views = pad_views(views, bucket)
         betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0

@@ -18,6 +18,7 @@ from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.views import SubjectViews, gaussian_body, prepare_inputs, standardize
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import HumanGSConfig
@@ -76,7 +77,7 @@ def show_targets(
     if config.architecture.draws_pixels and background != 1:
         raise ValueError(f"a network that draws pixels shows people on white; background {background:g} was asked for")
     body = gaussian_body(inputs.body, config)
-    views = standardize(inputs, config.image_size, config.execution.crop)
+    views = standardize(equal_exposure(inputs), config.image_size, config.execution.crop)
     prepared = _prepare(body, views, config)
     config = fit_buffers(prepared, config)
     outputs = _outputs(variables, prepared, config)

@@ -137,6 +137,7 @@ class Render:
             from humangs_jax.avatar.layers import ExrLayers, write_views
             from humangs_jax.avatar.video import check_video, write_video
             from humangs_jax.data.capture import load_capture
+            from humangs_jax.data.exposure import exposures
 
             check_video(self.out, views, *self.shot.resolution, transparent=video and self.shot.color() is None)
             layers = ExrLayers(tuple(self.channels.split(",")), half=self.exr_type == "half")
@@ -145,8 +146,10 @@ class Render:
             shot = _drawn_by(self.shot, self.preset, self.config)
         with stage("reading"):
             avatar = Avatar.load(self.avatar)
+            exposed = None
             if self.capture is not None:
-                poses, cameras = capture_views(avatar, load_capture(self.capture))
+                capture = load_capture(self.capture)
+                (poses, cameras), exposed = capture_views(avatar, capture), exposures(capture)
             else:
                 pose = rest_pose_of(avatar) if self.pose == "t" else a_pose_of(avatar)
                 poses, cameras = turntable_views(avatar, pose, views, shot)
@@ -156,7 +159,8 @@ class Render:
                 written = write_video(self.out, images(avatar, poses, cameras, shot, "render"), self.fps)
                 what = f"{written} frames of {_size(self.shot)} at {self.fps:g} frames per second"
             else:
-                written = write_views(self.out, avatar, poses, cameras, shot, layers if self.exr else None)
+                exr = layers if self.exr else None
+                written = write_views(self.out, avatar, poses, cameras, shot, exr, exposures=exposed)
                 what = f"{written} views of {cameras.width} x {cameras.height}{' and views.exr' * self.exr}"
         wrote(self.out, what)
         suggest("humangs animate", self.avatar)

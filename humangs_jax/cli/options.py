@@ -118,7 +118,7 @@ def require_between(least: float | int, most: float | int, **values: float | int
             raise UsageError(f"--{name.replace('_', '-')} {value}: expected {bounds}")
 
 
-ROUNDS_ALONE = {"steps": 0, "seconds": None, "image_size": 512}
+ROUNDS_ALONE: dict[str, Any] = {"steps": 0, "seconds": None, "image_size": 512}
 """Of refinement, where nothing is asked for: one to two seconds, however large the photos."""
 
 

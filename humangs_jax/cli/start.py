@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 from tyro.conf import Positional
 
 from humangs_jax.cli.detect import tell_found
-from humangs_jax.cli.options import UsageError, first_refinement, require_at_least, require_replaceable, tell_deleted
+from humangs_jax.cli.options import (
+    ROUNDS_ALONE,
+    UsageError,
+    first_refinement,
+    require_at_least,
+    require_replaceable,
+    tell_deleted,
+)
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 
 if TYPE_CHECKING:
@@ -260,7 +267,8 @@ class Start:
             from humangs_jax.viewer.page import write_page
 
             capture = usable_views(capture)
-            avatar = reconstruct(*load_weights(), capture)
+            weights = load_weights()
+            avatar = reconstruct(*weights, capture)
         if limits is not None and capture.masks is not None:
             with stage("refining"):
                 from humangs_jax.refinement.config import RefineConfig
@@ -271,6 +279,13 @@ class Start:
             tell(refinement.summary())
             if refinement.interrupted:
                 raise KeyboardInterrupt
+        with stage("holding one photo out"):
+            from humangs_jax.apps.held_out import held_out_psnr
+            from humangs_jax.refinement.config import RefineConfig
+
+            estimate = held_out_psnr(*weights, capture, None if limits is None else RefineConfig(**ROUNDS_ALONE))
+        if estimate is not None:
+            tell(estimate)
         with stage("writing the page"):
             avatar.save(self.out / "avatar.npz")
             page = self.out / "avatar.html"

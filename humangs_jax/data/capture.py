@@ -38,7 +38,7 @@ from humangs_jax.data.photos import (
     capture_folder,
     check_background,
     check_keys,
-    on_white_background,
+    cut_out,
     read_description,
     read_photos,
     write_description,
@@ -178,7 +178,7 @@ def capture_from_arrays(
     if masks is not None and background == "photo":
         if fit_masks:
             masks = np.stack([mask for mask, _ in masks_at_edges(list(images), list(masks))])
-        images = on_white_background(images, masks)
+        images = np.stack([cut_out(*pair) for pair in zip(images, masks, strict=True)])
     photos = Photos(images, masks, stack_cameras(cameras), np.asarray(frames, np.int32), names)
     return _assemble(photos, body, betas, rotations, translations, body_file)
 

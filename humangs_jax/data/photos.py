@@ -19,6 +19,7 @@ import numpy as np
 from humangs_jax.core.array_types import Float, Int
 from humangs_jax.data.capture_checks import CaptureError, checked_camera, checked_frame, checked_json, numbers
 from humangs_jax.data.masks import masks_at_edges
+from humangs_jax.data.rims import clean_rims
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import image_size, orientation, read_grey, read_image
 from humangs_jax.io.reading import FileError, check_limit, inside, reading, shown
@@ -275,7 +276,7 @@ def _read_images(folder, views, on_white, fit_masks):
         photos, own = [images[i] for i in searched], [masks[i] for i in searched]
         fitted = masks_at_edges(photos, own) if fit_masks else [(mask, 0.0) for mask in own]
         for i, (mask, excess) in zip(searched, fitted, strict=True):
-            images[i], masks[i] = on_white_background(images[i], mask), mask
+            images[i], masks[i] = cut_out(images[i], mask), mask
             moved += [excess] if excess else []
     if moved:
         off = float(np.median(moved))
@@ -337,6 +338,11 @@ def on_white_background(
 ) -> Float[np.ndarray, "*v h w 3"]:
     """The masked part over white."""
     return image * mask[..., None] + (1 - mask[..., None])
+
+
+def cut_out(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
+    """The person of a photo over white, without what the rim has of the background (`clean_rims`)."""
+    return on_white_background(clean_rims(image, mask), mask)
 
 
 def names_from_paths(paths: Sequence[str]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from humangs_jax.avatar.low_pass import with_low_pass, with_low_pass_of, without
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.data.capture import Capture
-from humangs_jax.data.usable_views import usable_views
+from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.crops import crop_to_person
@@ -83,7 +83,7 @@ def refine_with_report(
 
     Ctrl-C ends the run; the best state until then is returned.
 
-    Views whose mask does not show the person are left out, see `usable_views`.
+    Views whose mask does not show the person are left out, and exposure is made equal as in `reconstruct`.
 
     Raises: ValueError if the capture has no view or no masks or no view that shows the person, its poses have another number of
     joints than the avatar, or the devices of the mesh do not divide `views_per_step`.
@@ -92,7 +92,7 @@ def refine_with_report(
     if seconds is not None or steps is not None:
         config = dataclasses.replace(config, seconds=seconds, steps=steps)
     _check(avatar, capture, config, mesh)
-    capture = usable_views(capture)
+    capture = equal_exposure(capture)
     views = crop_to_person(capture, config.image_size)
     start = with_low_pass_of(avatar, views)
     fresh = with_low_pass(without_low_pass(avatar), cast(Array, start.gaussians.low_pass))

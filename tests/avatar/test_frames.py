@@ -48,6 +48,17 @@ def test_each_frame_needs_a_camera():
         list(frames.draw_gaussians(iter([blobs()]), iter([])))
 
 
+def test_each_camera_has_its_exposure(monkeypatch):
+    gaussians = blobs()
+    monkeypatch.setattr(frames, "posed", lambda avatar, pose: gaussians)
+    camera = Camera(jnp.asarray([[60.0, 0, 32], [0, 60, 32], [0, 0, 1]], jnp.float32), jnp.eye(4), 64, 64)
+    pose = BodyPose(jnp.zeros((2, 3)), jnp.zeros(3))
+    gains, how = np.asarray([[1.0, 1, 1], [0.5, 0.7, 0.9]]), SPLAT_PRESETS["exact"]
+    plain, darker = frames.draw(two_balls(), [pose] * 2, [camera] * 2, jnp.zeros(3), how, gains)
+    np.testing.assert_allclose(darker.rgb, plain.rgb * gains[1], atol=ROUNDING)
+    assert plain.rgb.max() > 0.1
+
+
 # Cameras -----------------------------------------------------------------------------------------------------------------
 
 

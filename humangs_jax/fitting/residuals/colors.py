@@ -18,6 +18,7 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, PyTree
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import equal_exposure
 from humangs_jax.data.views import MASK_THRESHOLD, SubjectViews, standardize
 from humangs_jax.fitting.solve import NORMAL_MAD, robust
 from humangs_jax.geometry.camera import Camera
@@ -51,6 +52,7 @@ class Likeness:
 
 def likeness(variables: PyTree, network: HumanGSConfig, capture: Capture) -> Likeness:
     """Reconstruct the person of a capture and compare with its photos."""
+    capture = equal_exposure(capture)
     avatar = reconstruct(variables, network, capture)
     views = standardize(capture, network.image_size, network.execution.crop)
     poses = jax.vmap(BodyPose)(views.rotations, views.translations)

@@ -1,0 +1,55 @@
+"""How like a person an avatar is where no photo was: reconstructed and refined without one photo, and compared with it."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.core.array_types import PyTree
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import equal_exposure
+from humangs_jax.data.views import cropped
+from humangs_jax.evaluation.cases import draw_views
+from humangs_jax.evaluation.scores import score
+from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.refinement.config import RefineConfig
+from humangs_jax.refinement.refine import refine
+
+LEAST_PHOTOS, SIZE = 4, 512
+
+
+class HeldOut(NamedTuple):
+    """Of the photo with that name. psnr: dB over the person."""
+
+    name: str
+    psnr: float
+
+    def __str__(self) -> str:
+        """One line."""
+        return f"a photo that was held out ({self.name}) is reproduced with {self.psnr:.1f} dB in the foreground"
+
+
+def held_out_psnr(
+    variables: PyTree, config: HumanGSConfig, capture: Capture, refinement: RefineConfig | None
+) -> HeldOut | None:
+    """How well the photo that has the nearest other one is reproduced by an avatar of the others, over the person, in a crop of
+    `SIZE` pixels; None for fewer than four photos or without masks. Body and cameras are those of all photos.
+    """
+    capture = equal_exposure(capture)
+    if capture.masks is None or capture.view_count < LEAST_PHOTOS:
+        return None
+    views = np.arange(capture.view_count)
+    view = int(_distances(capture).min(axis=1).argmin())
+    others = capture.select(views[views != view])
+    avatar = reconstruct(variables, config, others)
+    if refinement is not None:
+        avatar = refine(avatar, others, refinement)
+    photo = cropped(capture.select([view]), SIZE)
+    return HeldOut(capture.names[view], float(score(draw_views(avatar, photo).images, photo).psnr_foreground))
+
+
+def _distances(capture):
+    """Between the cameras, seen from the person; a photo is none of its own neighbours."""
+    towards = np.asarray(capture.cameras.center) - np.asarray(capture.poses.translation)[np.asarray(capture.frames)]
+    towards = towards / np.linalg.norm(towards, axis=-1, keepdims=True)
+    return np.linalg.norm(towards[:, None] - towards, axis=-1) + 9 * np.eye(len(towards))

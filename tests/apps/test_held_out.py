@@ -1,0 +1,33 @@
+"""The photo that an avatar has not seen."""
+
+import dataclasses
+
+import pytest
+
+from humangs_jax.apps import held_out
+from humangs_jax.apps.held_out import held_out_psnr
+from humangs_jax.body.decimation import decimate
+from humangs_jax.body.library import load_body
+from humangs_jax.network.presets import tiny
+from tests.refinement.refinement_cases import toy_avatar, toy_capture
+
+
+@pytest.fixture(scope="module")
+def body():
+    return decimate(load_body(), 400)
+
+
+def test_one_of_four_photos_is_kept_from_the_network_and_compared_with(body, monkeypatch):
+    avatar, capture, given = toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.0), views=4), []
+    monkeypatch.setattr(held_out, "reconstruct", lambda _, __, others: given.append(others.names) or avatar)
+    found = held_out_psnr({}, tiny(), capture, None)
+    assert set(capture.names) - set(given[0]) == {found.name} and len(given[0]) == 3
+    assert found.psnr > 25 and found.name in str(found)
+    monkeypatch.setattr(held_out, "reconstruct", lambda *_: toy_avatar(body, 0.15))
+    assert held_out_psnr({}, tiny(), capture, None).psnr < found.psnr - 3
+
+
+def test_few_photos_and_photos_without_masks_hold_none_out(body):
+    capture = toy_capture(body, toy_avatar(body, 0.0), views=4)
+    assert held_out_psnr({}, tiny(), capture.select([0, 1, 2]), None) is None
+    assert held_out_psnr({}, tiny(), dataclasses.replace(capture, masks=None), None) is None
