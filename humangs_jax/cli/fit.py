@@ -63,7 +63,7 @@ class Refinement:
     refine: bool = False
     """Improve cameras, shape and poses; with --keypoints, against these too. The result is never worse than the start."""
     fixed_cameras: bool = False
-    """Move shape and poses only: for calibrated cameras, where the body is wider or narrower than the masks."""
+    """Leave cameras as they are. Else a fit to keypoints turns back those that they show to be turned, and --refine moves all."""
     photometric: bool = False
     """Also compare photos and renderings of a reconstruction while refining."""
 
@@ -72,7 +72,7 @@ Way = Literal["--scan", "--refine", "--keypoints"]
 WAYS: dict[Way, set[str]] = {
     "--scan": {"keypoints", "person", "body", "joints", "views", "height", "bare"},
     "--refine": {"keypoints", "person", "photometric", "fixed_cameras"},
-    "--keypoints": {"person", "body", "smoothness"},
+    "--keypoints": {"person", "body", "smoothness", "fixed_cameras"},
 }
 """The three ways to fit, by the option that chooses each, and their other options."""
 
@@ -162,7 +162,8 @@ class Fit:
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
         config = dataclasses.replace(FitConfig(), smoothness=self.smoothness)
         with stage("fitting"):
-            fitted = fit_photos(photos, keypoints, body, body_file=body_file, config=config)
+            fixed = self.refinement.fixed_cameras
+            fitted = fit_photos(photos, keypoints, body, body_file=body_file, config=config, fixed_cameras=fixed)
         with stage("examining the fit"):
             report = fitted.report
         report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
@@ -274,7 +275,8 @@ class Check:
             if keypoints is None and record_file.exists():
                 record = read_fit_record(record_file)
         with stage("drawing the body"):
-            report = check_capture(capture, self.out)
+            same = record is not None and record.names == capture.names
+            report = check_capture(capture, self.out, record.keypoints if same else keypoints)
         tell(report)
         if self.limits:
             from humangs_jax.apps.limits import limits_table

@@ -14,7 +14,7 @@ from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.photos import Photos
+from humangs_jax.fitting.camera_errors import find_camera_errors
 from humangs_jax.fitting.files import FitRecord
 from humangs_jax.fitting.report import (
     Change,
@@ -65,8 +65,7 @@ def examine(
     """
     if len(keypoints.points) != capture.view_count:
         raise ValueError(f"keypoints of {len(keypoints.points)} views, but the capture has {capture.view_count}")
-    photos = Photos(capture.images, capture.masks, capture.cameras, capture.frames, capture.names)
-    observations, views = group_by_frame(photos, keypoints)
+    observations, views = group_by_frame(capture, keypoints)
     expected, poses = np.asarray(observations.noise), jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
     model = landmark_model(capture.body, keypoints.set.names, keypoints.set.places)
     errors = np.asarray(_errors(model, jnp.asarray(capture.betas), poses, observations))
@@ -92,7 +91,13 @@ def examine(
         swaps=swaps,
         undetermined=undetermined_joints(capture.body.joint_names, compared.any((1, 2)), *known),
         notes=_worst_frame(frames),
-        warnings=keypoint_warnings(rows, expected, violations, swaps),
+        warnings=(
+            *(
+                f"{error}, as the keypoints show: `humangs fit` turns it back"
+                for error in find_camera_errors(capture, keypoints)
+            ),
+            *keypoint_warnings(rows, expected, violations, swaps),
+        ),
     )
     landmarks = by_view(errors + np.asarray(observations.points))
     return Examination(report, frames, noise, landmarks, by_view(compared), by_view(outliers))
