@@ -53,7 +53,8 @@ class Scan:
     height: float | None = None
     """Height of the person in the scan without shoes, metres. It sets the scale of the scan."""
     bare: bool = False
-    """The person in the scan wears no clothes."""
+    """The person wears no clothes or tight ones: the body is to fill the scan, or with --refine the masks. For measuring bodies;
+    avatars are better when it stays a little inside of the masks."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Refinement:
     """Refinement of a capture that has a body."""
 
     refine: bool = False
-    """Improve cameras, shape and poses; with --keypoints, against these too. The result is never worse than the start."""
+    """Improve cameras, shape and poses by masks and keypoints: those of the fit, or --keypoints. Never worse than the start."""
     fixed_cameras: bool = False
     """Leave cameras as they are. Else a fit to keypoints turns back those that they show to be turned, and --refine moves all."""
     photometric: bool = False
@@ -71,7 +72,7 @@ class Refinement:
 Way = Literal["--scan", "--refine", "--keypoints"]
 WAYS: dict[Way, set[str]] = {
     "--scan": {"keypoints", "person", "body", "joints", "views", "height", "bare"},
-    "--refine": {"keypoints", "person", "photometric", "fixed_cameras"},
+    "--refine": {"keypoints", "person", "photometric", "fixed_cameras", "bare"},
     "--keypoints": {"person", "body", "smoothness", "fixed_cameras"},
 }
 """The three ways to fit, by the option that chooses each, and their other options."""
@@ -177,16 +178,22 @@ class Fit:
         assert self.capture is not None  # `run` has checked it
         with stage("starting"):
             from humangs_jax.data.capture import load_capture
-            from humangs_jax.fitting.files import check_place, write_fitted
+            from humangs_jax.data.photos import capture_folder
+            from humangs_jax.fitting.files import FIT_FILE, check_place, read_fit_record, write_fitted
             from humangs_jax.fitting.refine import refine_capture
-            from humangs_jax.fitting.refine_rounds import CaptureRefineConfig
+            from humangs_jax.fitting.refine_rounds import usual_config
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
         tell_deleted(target, unless=target if self.out is None else self.capture)
         with stage("reading photos and keypoints"):
             start = load_capture(self.capture, fit_masks=True)
-            keypoints = self.detections.read(start)
-        config = CaptureRefineConfig(fixed_cameras=self.refinement.fixed_cameras)
+            keypoints, record = self.detections.read(start), None
+            record_file = capture_folder(self.capture) / FIT_FILE
+            if keypoints is None and record_file.exists():
+                record = read_fit_record(record_file)
+                keypoints = record.of_views(start.names)
+        fixed, bare = self.refinement.fixed_cameras, self.scan.bare
+        config = usual_config(keypoints is not None, fixed_cameras=fixed, bare=bare)
         with stage("refining cameras and body"):
             photometric = self.refinement.photometric
             refinement = refine_capture(start, keypoints=keypoints, photometric=photometric, config=config)
@@ -195,7 +202,7 @@ class Fit:
             tell("nothing was written: refinement did not improve the capture")
             return
         with stage("writing"):
-            write_fitted(self.capture, target, refinement.capture, refinement.report)
+            write_fitted(self.capture, target, refinement.capture, refinement.report, record)
         wrote(target, "refined cameras and body")
         suggest("humangs check", target)
 

@@ -194,6 +194,8 @@ class Start:
             from humangs_jax.data.photos import load_photos
             from humangs_jax.fitting.files import write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
+            from humangs_jax.fitting.refine import refine_capture
+            from humangs_jax.fitting.refine_rounds import usual_config
 
             assert material.keypoints is not None
             photos = load_photos(self.out)
@@ -207,7 +209,16 @@ class Start:
             report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
             write_fitted(self.out, self.out, fitted.capture, report, fitted.record)
         tell(f"\n{report}")
-        return load_capture(self.out, fit_masks=self.fit_masks)
+        capture = load_capture(self.out, fit_masks=self.fit_masks)
+        if capture.masks is None or not (capture.masks > 0.5).any():
+            return capture
+        with stage("refining the body by the masks"):
+            config = usual_config(keypoints=True, fixed_cameras=not fitted.camera_errors)
+            refined = refine_capture(capture, keypoints=keypoints, config=config)
+            if refined.report.kept:
+                write_fitted(self.out, self.out, refined.capture, refined.report, fitted.record)
+        tell(f"\n{refined.report}")
+        return refined.capture
 
     def _check(self, capture: "Capture") -> None:
         """The sheet of the body over the photos, and what it says."""

@@ -22,7 +22,6 @@ from humangs_jax.fitting.report import (
     ViewReport,
     keypoint_warnings,
     limit_violations,
-    listed,
     undetermined_joints,
 )
 from humangs_jax.fitting.residuals.keypoints import found_noise, group_by_frame, keypoint_errors, landmark_certainty
@@ -114,11 +113,7 @@ def examine_record(
         return examine(capture, keypoints), keypoints
     if record is None:
         raise ValueError("neither keypoints nor the record of a fit to examine the body with")
-    if missing := [name for name in capture.names if name not in record.names]:
-        raise ValueError(f"the capture's fit knows no view {listed(missing)}: fit it again")
-    rows = [record.names.index(name) for name in capture.names]
-    points, confidences = (getattr(record.keypoints, name)[rows] for name in ("points", "confidences"))
-    keypoints = dataclasses.replace(record.keypoints, points=points, confidences=confidences)
+    keypoints = record.of_views(capture.names)
     if len(record.noise) <= capture.frames.max() or record.joint_std.shape[1] != len(capture.body.joint_names):
         raise ValueError(
             f"the capture's fit is of {len(record.noise)} frames and {record.joint_std.shape[1]} joints, but the capture has "
