@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
+from humangs_jax.cli.detect import found_here, tell_found
 from humangs_jax.cli.options import (
     UsageError,
     require_at_least,
@@ -18,7 +19,7 @@ from humangs_jax.cli.options import (
     require_suffix,
     tell_deleted,
 )
-from humangs_jax.cli.screen import stage, suggest, tell, wrote
+from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Detections:
     keypoints: Path | None = None
     """Keypoint file or folder of OpenPose, COCO, COCO-WholeBody, MMPose or AlphaPose (docs/fitting.md)."""
     person: int | None = None
-    """Which person of the keypoint file, from 0, if a view has several."""
+    """Which person of the keypoint file, from 0, if a view has several; without a file, of those on people.png."""
 
     def read(self, views: Any) -> Any:
         """The keypoints of the views of a `Photos` or `Capture`, None if no file was given. Raises: see `read_keypoints`."""
@@ -82,7 +83,8 @@ WAYS: dict[Way, set[str]] = {
 class Fit:
     """Find the body of one's own photos: from keypoints of a detector, or inside of a scan; or refine what is there.
 
-    humangs fit CAPTURE --keypoints FILE: shape and poses from photos with cameras (humangs import cameras) and 2D keypoints.
+    humangs fit CAPTURE: shape and poses from photos with cameras (humangs import cameras) and 2D keypoints: of --keypoints FILE,
+    or found in the photos, as masks are where there are none.
     humangs fit CAPTURE --refine: improve cameras and poses of a capture with its masks. humangs fit --scan MESH --out FOLDER.
     """
 
@@ -110,8 +112,6 @@ class Fit:
             if option not in WAYS[way] and f"--{option}" != way:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
                 raise UsageError(f"--{option.replace('_', '-')} is for {owners or 'captures'}, not for {way}")
-        if way == "--keypoints" and self.detections.keypoints is None:
-            raise UsageError("--keypoints FILE is missing (or --refine, to improve the body that a capture has)")
         self._check_places(way)
         if way == "--scan":
             self._fit_scan()
@@ -150,15 +150,24 @@ class Fit:
             from humangs_jax.body.library import load_body
             from humangs_jax.data.capture import DEFAULT_BODY
             from humangs_jax.data.photos import load_photos
+            from humangs_jax.detection.blazepose import available
             from humangs_jax.fitting.files import check_place, write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
             from humangs_jax.fitting.landmark_fit import FitConfig
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints, self.body))
         tell_deleted(target, unless=target if self.out is None else self.capture)
+        detections = self.detections
+        if detections.keypoints is None:
+            if not available():
+                raise UsageError(
+                    "--keypoints FILE is missing; pip install 'humangs_jax[photos]', and they are found here"
+                )
+            with stage("finding the person"):
+                detections = Detections(found_here(self.capture, detections.person))
         with stage("reading photos and keypoints"):
             photos = load_photos(self.capture)
-            keypoints = self.detections.read(photos)
+            keypoints = detections.read(photos)
             body = load_body(self.body)
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
         config = dataclasses.replace(FitConfig(), smoothness=self.smoothness)
@@ -273,6 +282,7 @@ class Check:
             from humangs_jax.apps.check import check_capture
             from humangs_jax.data.capture import load_capture
             from humangs_jax.data.photos import capture_folder
+            from humangs_jax.detection.blazepose import available
             from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
         with stage("reading the capture"):
@@ -281,6 +291,8 @@ class Check:
             record_file = capture_folder(self.capture) / FIT_FILE
             if keypoints is None and record_file.exists():
                 record = read_fit_record(record_file)
+        if available() and (capture.masks is None or (keypoints is None and record is None)):
+            capture, keypoints = self._found(capture, keypoints, record)
         with stage("drawing the body"):
             same = record is not None and record.names == capture.names
             report = check_capture(capture, self.out, record.keypoints if same else keypoints)
@@ -303,3 +315,24 @@ class Check:
             ok = ok and examination.report.ok
         if ok:
             suggest("humangs reconstruct", self.capture, "--out avatar.npz")
+
+    def _found(self, capture: Any, keypoints: Any, record: Any) -> tuple[Any, Any]:
+        """The capture and its keypoints, with what is found in the photos where either is missing; in memory only."""
+        import numpy as np
+
+        from humangs_jax.apps import detect
+        from humangs_jax.data.photos import capture_folder
+
+        known = keypoints if record is None else record.of_views(capture.names)
+        folder = capture_folder(self.capture)
+        try:
+            with stage("finding the person"):
+                people, person = detect.person_in_capture(folder, capture, known, self.detections.person)
+        except ValueError as error:
+            warn(f"{error}; the check does without what it would have found")
+            return capture, keypoints
+        tell_found(people, person)
+        if capture.masks is None:
+            masks = np.stack([detect.person_mask(photo, person) for photo in people])
+            capture = dataclasses.replace(capture, masks=masks)
+        return capture, detect.keypoints_of(people, person) if known is None else keypoints

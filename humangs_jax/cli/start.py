@@ -116,16 +116,11 @@ class Start:
             from humangs_jax.data.keypoints.reading import read_keypoints
             from humangs_jax.data.photos import load_photos
 
-            people = detect.found_in_capture(self.out)
-            photos = load_photos(self.out)
-        if material.keypoints is not None:
-            height, width = photos.images.shape[1:3]
-            given = read_keypoints(material.keypoints, photos.names, width, height, person=self.person)
-            person = detect.person_of(people, given, self.out)
-        elif photos.masks is not None and self.person is None and len(people[0].people):
-            person = detect.person_on(people, photos.masks, self.out)
-        else:
-            person = detect.chosen(people, self.person, self.out)
+            photos, given = load_photos(self.out), None
+            if material.keypoints is not None:
+                height, width = photos.images.shape[1:3]
+                given = read_keypoints(material.keypoints, photos.names, width, height, person=self.person)
+            people, person = detect.person_in_capture(self.out, photos, given, self.person)
         with stage("writing what was found"):
             detect.add_to_capture(self.out, people, person, masks="masks" in wanted)
         tell_found(people, person)
