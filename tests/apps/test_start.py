@@ -1,5 +1,6 @@
 """`humangs start`: what a folder has, what is said to be missing, and the way to the page."""
 
+import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -191,7 +192,12 @@ def test_fit_and_check_find_what_a_capture_lacks_too(mine, detected, capsys, mon
         given.append((photos, keypoints))
         raise ValueError("the fit")
 
-    truth = load_capture("demo_capture")
+    truth, shown = load_capture("demo_capture"), detect.found_in_capture("me")
+    named = lambda folder: [
+        dataclasses.replace(each, name=f"{name}.png")
+        for each, name in zip(shown, load_photos(folder).names, strict=True)
+    ]
+    monkeypatch.setattr(detect, "found_in_capture", named)
     cameras = ["import", "cameras", str(mine / "calibration.json"), "--images", str(mine / "images"), "--out", "me"]
     monkeypatch.setattr(fit_capture, "fit_photos", fit)
     assert cli.execute(cameras) == 0 and load_photos("me").masks is None
