@@ -202,7 +202,7 @@ class Fit:
                 record = read_fit_record(record_file)
                 keypoints = record.of_views(start.names)
         fixed, bare = self.refinement.fixed_cameras, self.scan.bare
-        config = usual_config(keypoints is not None, fixed_cameras=fixed, bare=bare)
+        config = usual_config(record is not None, fixed_cameras=fixed, bare=bare)
         with stage("refining cameras and body"):
             photometric = self.refinement.photometric
             refinement = refine_capture(start, keypoints=keypoints, photometric=photometric, config=config)

@@ -208,7 +208,7 @@ class Start:
         if capture.masks is None or not (capture.masks > 0.5).any():
             return capture
         with stage("refining the body by the masks"):
-            config = usual_config(keypoints=True, fixed_cameras=not fitted.camera_errors)
+            config = usual_config(fitted=True, fixed_cameras=not fitted.camera_errors)
             refined = refine_capture(capture, keypoints=keypoints, config=config)
             if refined.report.kept:
                 write_fitted(self.out, self.out, refined.capture, refined.report, fitted.record)

@@ -94,19 +94,20 @@ class CaptureRefineConfig:
     independent_colors: float = 100.0
 
 
-WIDE = StateStd(betas=1.0, body_pose=8.0)
-"""With keypoints, which hold joints where clothes would pull them away."""
+FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pose=8.0, betas=1.0)
+"""Where a fit to keypoints with calibrated cameras is off: shape and pose, more than cameras. Its keypoints hold the joints where
+clothes would pull them away."""
 SKIN = 0.001
 """Metres, for `StateStd.clothing`: masks of somebody without clothes."""
 
 
-def usual_config(keypoints: bool, *, fixed_cameras: bool = False, bare: bool = False) -> CaptureRefineConfig:
-    """Settings that suit what is known. keypoints: whether there are any. bare: the person wears tight clothes or none, and the
-    body is to fill the masks.
+def usual_config(fitted: bool, *, fixed_cameras: bool = False, bare: bool = False) -> CaptureRefineConfig:
+    """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given. bare: the person wears tight
+    clothes or none, and the body is to fill the masks.
     """
     config = CaptureRefineConfig(fixed_cameras=fixed_cameras)
-    if keypoints:
-        config = dataclasses.replace(config, std=WIDE, independent=100.0)
+    if fitted:
+        config = dataclasses.replace(config, std=FITTED, independent=100.0)
     if bare:
         std = dataclasses.replace(config.std, clothing=SKIN)
         config = dataclasses.replace(config, std=std, robust_scales=(1.0, 1.0))
