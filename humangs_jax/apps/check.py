@@ -27,6 +27,8 @@ from humangs_jax.body.model import BodyModel, BodyPose, person_vertices
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.fitting.camera_errors import find_camera_errors
 from humangs_jax.geometry import transform
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.mesh.position_map import vertex_normals
@@ -38,8 +40,9 @@ MOST_OUTSIDE = 0.05
 """Share of the body's pixels: those outside of the mask take the background's colour."""
 WIDER = (
     "{:.0%} of the body is outside the mask: it is wider than the person, or the pose is off; "
-    "`humangs fit CAPTURE --refine --fixed-cameras` fits shape and pose to the masks"
+    "`humangs fit CAPTURE --refine{}` fits {}shape and pose to the masks"
 )
+FIXED, FREE = (" --fixed-cameras", ""), ("", "cameras, ")
 LEAST_HEIGHT = 0.05
 """Share of the image's height: a body smaller than this has its lengths in another unit."""
 LEFT, RIGHT, MIDDLE = (0.15, 0.45, 1.0), (1.0, 0.35, 0.15), (0.85, 0.85, 0.85)
@@ -106,11 +109,13 @@ class CheckReport:
         return "\n".join(lines)
 
 
-def check_capture(capture: Capture, out: str | Path) -> CheckReport:
+def check_capture(capture: Capture, out: str | Path, keypoints: Keypoints | None = None) -> CheckReport:
     """Draw the posed body over every photo, write the sheet as a PNG, and report how well they agree.
 
+    Arguments: keypoints: of the views, if they are known: whether the cameras may be at fault.
     Raises: OSError if the sheet cannot be written.
     """
+    right = keypoints is not None and not find_camera_errors(capture, keypoints)
     if max(capture.images.shape[1:3]) > LONGEST_SIDE:
         capture = capture.resized(LONGEST_SIDE)
     vertices = _posed_frames(capture)
@@ -128,7 +133,7 @@ def check_capture(capture: Capture, out: str | Path) -> CheckReport:
             explained = f"it would fit if {cause}"
             view = dataclasses.replace(view, warnings=view.warnings + ((explained,) if cause else ()))
         elif view.outside is not None and view.outside > MOST_OUTSIDE:
-            view = dataclasses.replace(view, warnings=(WIDER.format(view.outside),))
+            view = dataclasses.replace(view, warnings=(WIDER.format(view.outside, *(FIXED if right else FREE)),))
         overlays.append(overlay(capture.images[i], drawn))
         views.append(view)
     contact_sheet(np.stack(overlays), out, labels=[_label(view) for view in views])

@@ -18,10 +18,11 @@ import numpy as np
 from humangs_jax.apps.start import photo_files
 from humangs_jax.core.array_types import Float, UInt
 from humangs_jax.core.progress import bar
+from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.people_file import ImagePeople, SeenPerson, seen_person, write_people
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
-from humangs_jax.data.photos import load_photos, read_description
+from humangs_jax.data.photos import Photos, load_photos, read_description
 from humangs_jax.detection.blazepose import LANDMARK_SIZE, Networks
 from humangs_jax.detection.people import SEEN, DetectedPerson, detect_people
 from humangs_jax.detection.sharpening import sharpened
@@ -86,6 +87,28 @@ def found_in_capture(folder: Path) -> list[PhotoPeople]:
         [f"{name}.png" for name in photos.names], (read_image(folder / view["image"])[0] for view in views)
     )
     return same_people(found, photos.cameras, photos.frames.tolist())
+
+
+def person_in_capture(
+    folder: Path, photos: Photos | Capture, keypoints: Keypoints | None = None, person: int | None = None
+) -> tuple[list[PhotoPeople], int]:
+    """The people in the photos of a capture folder, and the number of the one who is meant: by keypoints, if there are any, else
+    by the number asked for, else by masks, else by size. Raises: see `found_in_photos`, `person_of`, `chosen`.
+    """
+    people = found_in_capture(folder)
+    if keypoints is not None:
+        return people, person_of(people, keypoints, folder)
+    if photos.masks is not None and person is None and len(people[0].people):
+        return people, person_on(people, photos.masks, folder)
+    return people, chosen(people, person, folder)
+
+
+def keypoints_of(photos: Sequence[PhotoPeople], person: int) -> Keypoints:
+    """The keypoints of a person; of photos without the person, none."""
+    nobody = np.zeros((len(MEDIAPIPE_33.names), 3))
+    found = [nobody if (each := photo.people[person]) is None else each.person.points for photo in photos]
+    points = np.asarray(found, np.float32)
+    return Keypoints(points[..., :2], points[..., 2], MEDIAPIPE_33)
 
 
 def upright(file: Path) -> Float[np.ndarray, "h w 3"]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from humangs_jax.cli.options import require_at_least, require_folder
-from humangs_jax.cli.screen import stage, suggest, warn, wrote
+from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 
 if TYPE_CHECKING:
     from humangs_jax.apps.detect import PhotoPeople
@@ -21,6 +21,26 @@ def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
         warn(f"{name}: the person was not found in it")
     for name in repaired(photos, person):
         warn(f"{name}: left and right of the person were exchanged, as the other views show: repaired")
+
+
+def found_here(capture: Path, person: int | None) -> Path:
+    """The file of keypoints in a capture folder. What it lacks is found in its photos: keypoints, and masks if there are none.
+
+    Arguments: person: the number on the sheet, where several may be meant; then they are found again.
+    """
+    from humangs_jax.apps import detect
+    from humangs_jax.data.photos import capture_folder, load_photos
+
+    folder = capture_folder(capture)
+    file = folder / detect.KEYPOINTS_FILE
+    photos = load_photos(folder)
+    if not file.exists() or person is not None or photos.masks is None:
+        people, number = detect.person_in_capture(folder, photos, person=person)
+        detect.add_to_capture(folder, people, number, masks=photos.masks is None)
+        tell_found(people, number)
+        what = "keypoints" if photos.masks is not None else "keypoints and masks"
+        tell(f"{what} found in the photos: {folder / detect.SHEET_FILE} shows them")
+    return file
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
+from humangs_jax.cli.detect import found_here, tell_found
 from humangs_jax.cli.options import (
     UsageError,
     require_at_least,
@@ -18,7 +19,7 @@ from humangs_jax.cli.options import (
     require_suffix,
     tell_deleted,
 )
-from humangs_jax.cli.screen import stage, suggest, tell, wrote
+from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Detections:
     keypoints: Path | None = None
     """Keypoint file or folder of OpenPose, COCO, COCO-WholeBody, MMPose or AlphaPose (docs/fitting.md)."""
     person: int | None = None
-    """Which person of the keypoint file, from 0, if a view has several."""
+    """Which person of the keypoint file, from 0, if a view has several; without a file, of those on people.png."""
 
     def read(self, views: Any) -> Any:
         """The keypoints of the views of a `Photos` or `Capture`, None if no file was given. Raises: see `read_keypoints`."""
@@ -53,7 +54,8 @@ class Scan:
     height: float | None = None
     """Height of the person in the scan without shoes, metres. It sets the scale of the scan."""
     bare: bool = False
-    """The person in the scan wears no clothes."""
+    """The person wears no clothes or tight ones: the body is to fill the scan, or with --refine the masks. For measuring bodies;
+    avatars are better when it stays a little inside of the masks."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,9 +63,9 @@ class Refinement:
     """Refinement of a capture that has a body."""
 
     refine: bool = False
-    """Improve cameras, shape and poses; with --keypoints, against these too. The result is never worse than the start."""
+    """Improve cameras, shape and poses by masks and keypoints: those of the fit, or --keypoints. Never worse than the start."""
     fixed_cameras: bool = False
-    """Move shape and poses only: for calibrated cameras, where the body is wider or narrower than the masks."""
+    """Leave cameras as they are. Else a fit to keypoints turns back those that they show to be turned, and --refine moves all."""
     photometric: bool = False
     """Also compare photos and renderings of a reconstruction while refining."""
 
@@ -71,8 +73,8 @@ class Refinement:
 Way = Literal["--scan", "--refine", "--keypoints"]
 WAYS: dict[Way, set[str]] = {
     "--scan": {"keypoints", "person", "body", "joints", "views", "height", "bare"},
-    "--refine": {"keypoints", "person", "photometric", "fixed_cameras"},
-    "--keypoints": {"person", "body", "smoothness"},
+    "--refine": {"keypoints", "person", "photometric", "fixed_cameras", "bare"},
+    "--keypoints": {"person", "body", "smoothness", "fixed_cameras"},
 }
 """The three ways to fit, by the option that chooses each, and their other options."""
 
@@ -81,7 +83,8 @@ WAYS: dict[Way, set[str]] = {
 class Fit:
     """Find the body of one's own photos: from keypoints of a detector, or inside of a scan; or refine what is there.
 
-    humangs fit CAPTURE --keypoints FILE: shape and poses from photos with cameras (humangs import cameras) and 2D keypoints.
+    humangs fit CAPTURE: shape and poses from photos with cameras (humangs import cameras) and 2D keypoints: of --keypoints FILE,
+    or found in the photos, as masks are where there are none.
     humangs fit CAPTURE --refine: improve cameras and poses of a capture with its masks. humangs fit --scan MESH --out FOLDER.
     """
 
@@ -109,8 +112,6 @@ class Fit:
             if option not in WAYS[way] and f"--{option}" != way:
                 owners = " or ".join(other for other, options in WAYS.items() if option in options)
                 raise UsageError(f"--{option.replace('_', '-')} is for {owners or 'captures'}, not for {way}")
-        if way == "--keypoints" and self.detections.keypoints is None:
-            raise UsageError("--keypoints FILE is missing (or --refine, to improve the body that a capture has)")
         self._check_places(way)
         if way == "--scan":
             self._fit_scan()
@@ -149,20 +150,30 @@ class Fit:
             from humangs_jax.body.library import load_body
             from humangs_jax.data.capture import DEFAULT_BODY
             from humangs_jax.data.photos import load_photos
+            from humangs_jax.detection.blazepose import available
             from humangs_jax.fitting.files import check_place, write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
             from humangs_jax.fitting.landmark_fit import FitConfig
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints, self.body))
         tell_deleted(target, unless=target if self.out is None else self.capture)
+        detections = self.detections
+        if detections.keypoints is None:
+            if not available():
+                raise UsageError(
+                    "--keypoints FILE is missing; pip install 'humangs_jax[photos]', and they are found here"
+                )
+            with stage("finding the person"):
+                detections = Detections(found_here(self.capture, detections.person))
         with stage("reading photos and keypoints"):
             photos = load_photos(self.capture)
-            keypoints = self.detections.read(photos)
+            keypoints = detections.read(photos)
             body = load_body(self.body)
         body_file = DEFAULT_BODY if self.body is None else str(self.body)
         config = dataclasses.replace(FitConfig(), smoothness=self.smoothness)
         with stage("fitting"):
-            fitted = fit_photos(photos, keypoints, body, body_file=body_file, config=config)
+            fixed = self.refinement.fixed_cameras
+            fitted = fit_photos(photos, keypoints, body, body_file=body_file, config=config, fixed_cameras=fixed)
         with stage("examining the fit"):
             report = fitted.report
         report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
@@ -176,16 +187,22 @@ class Fit:
         assert self.capture is not None  # `run` has checked it
         with stage("starting"):
             from humangs_jax.data.capture import load_capture
-            from humangs_jax.fitting.files import check_place, write_fitted
+            from humangs_jax.data.photos import capture_folder
+            from humangs_jax.fitting.files import FIT_FILE, check_place, read_fit_record, write_fitted
             from humangs_jax.fitting.refine import refine_capture
-            from humangs_jax.fitting.refine_rounds import CaptureRefineConfig
+            from humangs_jax.fitting.refine_rounds import usual_config
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
         tell_deleted(target, unless=target if self.out is None else self.capture)
         with stage("reading photos and keypoints"):
             start = load_capture(self.capture, fit_masks=True)
-            keypoints = self.detections.read(start)
-        config = CaptureRefineConfig(fixed_cameras=self.refinement.fixed_cameras)
+            keypoints, record = self.detections.read(start), None
+            record_file = capture_folder(self.capture) / FIT_FILE
+            if keypoints is None and record_file.exists():
+                record = read_fit_record(record_file)
+                keypoints = record.of_views(start.names)
+        fixed, bare = self.refinement.fixed_cameras, self.scan.bare
+        config = usual_config(record is not None, fixed_cameras=fixed, bare=bare)
         with stage("refining cameras and body"):
             photometric = self.refinement.photometric
             refinement = refine_capture(start, keypoints=keypoints, photometric=photometric, config=config)
@@ -194,7 +211,7 @@ class Fit:
             tell("nothing was written: refinement did not improve the capture")
             return
         with stage("writing"):
-            write_fitted(self.capture, target, refinement.capture, refinement.report)
+            write_fitted(self.capture, target, refinement.capture, refinement.report, record)
         wrote(target, "refined cameras and body")
         suggest("humangs check", target)
 
@@ -265,6 +282,7 @@ class Check:
             from humangs_jax.apps.check import check_capture
             from humangs_jax.data.capture import load_capture
             from humangs_jax.data.photos import capture_folder
+            from humangs_jax.detection.blazepose import available
             from humangs_jax.fitting.files import FIT_FILE, read_fit_record
 
         with stage("reading the capture"):
@@ -273,8 +291,11 @@ class Check:
             record_file = capture_folder(self.capture) / FIT_FILE
             if keypoints is None and record_file.exists():
                 record = read_fit_record(record_file)
+        if available() and (capture.masks is None or (keypoints is None and record is None)):
+            capture, keypoints = self._found(capture, keypoints, record)
         with stage("drawing the body"):
-            report = check_capture(capture, self.out)
+            same = record is not None and record.names == capture.names
+            report = check_capture(capture, self.out, record.keypoints if same else keypoints)
         tell(report)
         if self.limits:
             from humangs_jax.apps.limits import limits_table
@@ -294,3 +315,24 @@ class Check:
             ok = ok and examination.report.ok
         if ok:
             suggest("humangs reconstruct", self.capture, "--out avatar.npz")
+
+    def _found(self, capture: Any, keypoints: Any, record: Any) -> tuple[Any, Any]:
+        """The capture and its keypoints, with what is found in the photos where either is missing; in memory only."""
+        import numpy as np
+
+        from humangs_jax.apps import detect
+        from humangs_jax.data.photos import capture_folder
+
+        known = keypoints if record is None else record.of_views(capture.names)
+        folder = capture_folder(self.capture)
+        try:
+            with stage("finding the person"):
+                people, person = detect.person_in_capture(folder, capture, known, self.detections.person)
+        except ValueError as error:
+            warn(f"{error}; the check does without what it would have found")
+            return capture, keypoints
+        tell_found(people, person)
+        if capture.masks is None:
+            masks = np.stack([detect.person_mask(photo, person) for photo in people])
+            capture = dataclasses.replace(capture, masks=masks)
+        return capture, detect.keypoints_of(people, person) if known is None else keypoints

@@ -156,16 +156,11 @@ class Start:
             from humangs_jax.data.keypoints.reading import read_keypoints
             from humangs_jax.data.photos import load_photos
 
-            people = detect.found_in_capture(self.out)
-            photos = load_photos(self.out)
-        if material.keypoints is not None:
-            height, width = photos.images.shape[1:3]
-            given = read_keypoints(material.keypoints, photos.names, width, height, person=self.person)
-            person = detect.person_of(people, given, self.out)
-        elif photos.masks is not None and self.person is None and len(people[0].people):
-            person = detect.person_on(people, photos.masks, self.out)
-        else:
-            person = detect.chosen(people, self.person, self.out)
+            photos, given = load_photos(self.out), None
+            if material.keypoints is not None:
+                height, width = photos.images.shape[1:3]
+                given = read_keypoints(material.keypoints, photos.names, width, height, person=self.person)
+            people, person = detect.person_in_capture(self.out, photos, given, self.person)
         with stage("writing what was found"):
             detect.add_to_capture(self.out, people, person, masks="masks" in wanted)
         tell_found(people, person)
@@ -234,6 +229,8 @@ class Start:
             from humangs_jax.data.photos import load_photos
             from humangs_jax.fitting.files import write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
+            from humangs_jax.fitting.refine import refine_capture
+            from humangs_jax.fitting.refine_rounds import usual_config
 
             assert material.keypoints is not None
             photos = load_photos(self.out)
@@ -247,7 +244,16 @@ class Start:
             report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
             write_fitted(self.out, self.out, fitted.capture, report, fitted.record)
         tell(f"\n{report}")
-        return load_capture(self.out, fit_masks=self.fit_masks)
+        capture = load_capture(self.out, fit_masks=self.fit_masks)
+        if capture.masks is None or not (capture.masks > 0.5).any():
+            return capture
+        with stage("refining the body by the masks"):
+            config = usual_config(fitted=True, fixed_cameras=not fitted.camera_errors)
+            refined = refine_capture(capture, keypoints=keypoints, config=config)
+            if refined.report.kept:
+                write_fitted(self.out, self.out, refined.capture, refined.report, fitted.record)
+        tell(f"\n{refined.report}")
+        return refined.capture
 
     def _check(self, capture: "Capture") -> None:
         """The sheet of the body over the photos, and what it says."""

@@ -14,7 +14,7 @@ from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.core.array_types import Bool, Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.data.photos import Photos
+from humangs_jax.fitting.camera_errors import find_camera_errors
 from humangs_jax.fitting.files import FitRecord
 from humangs_jax.fitting.report import (
     Change,
@@ -22,7 +22,6 @@ from humangs_jax.fitting.report import (
     ViewReport,
     keypoint_warnings,
     limit_violations,
-    listed,
     undetermined_joints,
 )
 from humangs_jax.fitting.residuals.keypoints import found_noise, group_by_frame, keypoint_errors, landmark_certainty
@@ -65,8 +64,7 @@ def examine(
     """
     if len(keypoints.points) != capture.view_count:
         raise ValueError(f"keypoints of {len(keypoints.points)} views, but the capture has {capture.view_count}")
-    photos = Photos(capture.images, capture.masks, capture.cameras, capture.frames, capture.names)
-    observations, views = group_by_frame(photos, keypoints)
+    observations, views = group_by_frame(capture, keypoints)
     expected, poses = np.asarray(observations.noise), jax.tree.map(lambda leaf: leaf[: len(views)], capture.poses)
     model = landmark_model(capture.body, keypoints.set.names, keypoints.set.places)
     errors = np.asarray(_errors(model, jnp.asarray(capture.betas), poses, observations))
@@ -92,7 +90,13 @@ def examine(
         swaps=swaps,
         undetermined=undetermined_joints(capture.body.joint_names, compared.any((1, 2)), *known),
         notes=_worst_frame(frames),
-        warnings=keypoint_warnings(rows, expected, violations, swaps),
+        warnings=(
+            *(
+                f"{error}, as the keypoints show: `humangs fit` turns it back"
+                for error in find_camera_errors(capture, keypoints)
+            ),
+            *keypoint_warnings(rows, expected, violations, swaps),
+        ),
     )
     landmarks = by_view(errors + np.asarray(observations.points))
     return Examination(report, frames, noise, landmarks, by_view(compared), by_view(outliers))
@@ -109,11 +113,7 @@ def examine_record(
         return examine(capture, keypoints), keypoints
     if record is None:
         raise ValueError("neither keypoints nor the record of a fit to examine the body with")
-    if missing := [name for name in capture.names if name not in record.names]:
-        raise ValueError(f"the capture's fit knows no view {listed(missing)}: fit it again")
-    rows = [record.names.index(name) for name in capture.names]
-    points, confidences = (getattr(record.keypoints, name)[rows] for name in ("points", "confidences"))
-    keypoints = dataclasses.replace(record.keypoints, points=points, confidences=confidences)
+    keypoints = record.of_views(capture.names)
     if len(record.noise) <= capture.frames.max() or record.joint_std.shape[1] != len(capture.body.joint_names):
         raise ValueError(
             f"the capture's fit is of {len(record.noise)} frames and {record.joint_std.shape[1]} joints, but the capture has "

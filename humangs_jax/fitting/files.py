@@ -14,7 +14,7 @@ is) and body_in_scan.ply.
 
 import dataclasses
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +25,7 @@ from humangs_jax.data.capture_checks import CaptureError, numbers
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import KEYPOINT_SETS
 from humangs_jax.data.photos import capture_folder, read_description
-from humangs_jax.fitting.report import FitReport
+from humangs_jax.fitting.report import FitReport, listed
 from humangs_jax.fitting.scan_fit import ScanFit, body_in_scan
 from humangs_jax.io.atomic import add_files, check_replaceable, check_writable, replace_folder
 from humangs_jax.io.npz import read_npz, write_npz
@@ -52,6 +52,14 @@ class FitRecord:
     joint_std: Float[np.ndarray, "m j"]
     determined: Float[np.ndarray, "m j"]
     shape_covariance: Float[np.ndarray, "s s"]
+
+    def of_views(self, names: Sequence[str]) -> Keypoints:
+        """The keypoints of views, in their order. Raises: ValueError if the fit knows one of them not."""
+        if missing := [name for name in names if name not in self.names]:
+            raise ValueError(f"the capture's fit knows no view {listed(missing)}: fit it again")
+        rows = [self.names.index(name) for name in names]
+        points, confidences = (getattr(self.keypoints, name)[rows] for name in ("points", "confidences"))
+        return dataclasses.replace(self.keypoints, points=points, confidences=confidences)
 
 
 def write_fit_record(path: str | Path, record: FitRecord) -> None:

@@ -10,6 +10,7 @@ from humangs_jax.body.model import BodyModel, without_expression
 from humangs_jax.data.capture import DEFAULT_BODY, Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
+from humangs_jax.fitting.camera_errors import CameraError, find_camera_errors, mended
 from humangs_jax.fitting.examination import examine
 from humangs_jax.fitting.files import FitRecord
 from humangs_jax.fitting.landmark_fit import (
@@ -32,7 +33,10 @@ FAR = 4.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FittedCapture:
-    """A fit in memory: the capture with its body, the record that is stored beside it, and what the solver did."""
+    """A fit in memory: the capture with its body, the record that is stored beside it, and what the solver did.
+
+    camera_errors: of the calibration, which the capture's cameras are without.
+    """
 
     capture: Capture
     record: FitRecord
@@ -40,6 +44,7 @@ class FittedCapture:
     model: LandmarkModel
     observations: Observations
     config: FitConfig
+    camera_errors: tuple[CameraError, ...] = ()
 
     @functools.cached_property
     def report(self) -> FitReport:
@@ -53,7 +58,8 @@ class FittedCapture:
         names = (name for name in (*STAGES, "person", "motion") if name in fit.outcomes)
         stages = tuple(Stage.of(stage, fit.outcomes[stage]) for stage in names)
         warnings = (*report.warnings, *_blind_frames(seen, smooth), *_motion_warnings(fit, self.config.smoothness))
-        return dataclasses.replace(report, stages=stages, warnings=warnings)
+        turned = (f"{error}: turned back" for error in self.camera_errors)
+        return dataclasses.replace(report, stages=stages, notes=(*report.notes, *turned), warnings=warnings)
 
 
 def fit_photos(
@@ -63,10 +69,12 @@ def fit_photos(
     *,
     body_file: str = DEFAULT_BODY,
     config: FitConfig | None = None,
+    fixed_cameras: bool = False,
 ) -> FittedCapture:
-    """Find shape and poses of the person in photos.
+    """Find shape and poses of the person in photos, and turn cameras back that the keypoints show to be turned.
 
     Arguments: keypoints: of each view, in the order of the photos. body_file: where the body comes from, see `Capture`.
+    fixed_cameras: they stay as they are.
     Raises: ValueError if the numbers of views differ, no view has a keypoint that the body has, or the body's root is not its
     first joint.
     """
@@ -77,6 +85,8 @@ def fit_photos(
         raise ValueError(
             f"body '{body.name}': expected the root to be its first joint, got joint {body.parents.index(-1)}"
         )
+    errors = () if fixed_cameras else find_camera_errors(photos, keypoints)
+    photos = mended(photos, errors) if errors else photos
     model = landmark_model(without_expression(body), keypoints.set.names, keypoints.set.places)
     observations, _ = group_by_frame(photos, keypoints)
     if not (np.asarray(observations.confidences) * np.asarray(model.known) > 0).any():
@@ -86,7 +96,7 @@ def fit_photos(
     capture = Capture(**vars(photos), body=body, betas=np.asarray(fit.betas), poses=fit.poses, body_file=body_file)
     known = (np.asarray(fit.noise), found.joint_std, found.determined, found.shape_covariance)
     record = FitRecord(keypoints, photos.names, *known)
-    return FittedCapture(capture, record, fit, model, observations, config)
+    return FittedCapture(capture, record, fit, model, observations, config, errors)
 
 
 def _blind_frames(seen, smooth):

@@ -16,7 +16,14 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.usable_views import usable_indices
-from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene, capture_origin, moved_capture, start_state
+from humangs_jax.fitting.refine_rounds import (
+    SKIN,
+    CaptureRefineConfig,
+    Scene,
+    capture_origin,
+    moved_capture,
+    start_state,
+)
 from humangs_jax.fitting.report import Change, FitReport, Stage, ViewReport, limit_violations
 from humangs_jax.fitting.residuals.colors import Likeness, color_residuals, likeness
 from humangs_jax.fitting.solve import Outcome, solve
@@ -24,14 +31,19 @@ from humangs_jax.fitting.state import cameras_of, pose_of
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 
-LEAST_GAIN = 0.2
-"""Share of the loss that a kept change removes. Masks of clothes are fitted a little better by wrong bodies: for four people who
-started at the truth, by up to 0.15.
+LEAST_GAIN, LEAST_GAIN_OF_MASKS = 0.02, 0.2
+"""Share of the loss that a kept change removes, with keypoints, and by masks alone. Masks of clothes are fitted a little better
+by wrong bodies: for four people who started at the truth, by up to 0.15; keypoints show that.
+"""
+KEYPOINTS_WORSE = 1.1
+"""A change that is kept leaves the keypoints' error below this multiple of the start's, which a fit to them made as small as can
+be: right ones have 0.8 to 1.07, wrong bodies that fill clothes 1.8. Of somebody without clothes the masks are believed.
 """
 LEAST_DIFFERENCE = 0.005
 """Least decrease of the loss that is kept: less than half a percent of the silhouettes is rounding of pixels."""
 LEAST_IOU = 0.6
 """Bodies in clothes overlap masks by more than this; less means that the start was too far off."""
+
 DEFAULT_CONFIG = CaptureRefineConfig()
 
 
@@ -53,7 +65,8 @@ def refine_capture(
     """Refine cameras (rotation, centre, focal length), shape and poses of a capture.
 
     Arguments: keypoints: of the capture's views. photometric: also by the photos' colours, with the weights that come with the
-    package. Views whose mask is empty take no part; those whose mask hardly meets the body take none in the colours.
+    package. config: after a fit to these keypoints, see `usual_config`. Views whose mask is empty take no part; those whose mask
+    hardly meets the body take none in the colours.
     Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint, or colours are asked for without masks;
     ValueError if the keypoints are of another number of views.
     """
@@ -62,7 +75,7 @@ def refine_capture(
     state, outcome, move = scene.run()
     tried = moved_capture(capture, scene.origin, state)
     before, found = scene.score(capture), scene.score(tried)
-    kept = _better(found, before)
+    kept = _better(found, before, KEYPOINTS_WORSE if config.std.clothing > SKIN else np.inf)
     best, score = (tried, found) if kept else (capture, before)
     stages = [Stage.of("silhouettes", outcome)]
     kinds = {"silhouettes": before.iou, "keypoints": before.keypoints}
@@ -149,8 +162,11 @@ def _solve_colors(avatar, views, origin, start, free, noise, config, splatting):
 # The report ----------------------------------------------------------------------------------------------------------
 
 
-def _better(found, before):
-    return before.loss - found.loss > max(LEAST_GAIN * before.loss, LEAST_DIFFERENCE)
+def _better(found, before, most_worse):
+    known = found.keypoints is not None and before.keypoints is not None
+    least = LEAST_GAIN if known else LEAST_GAIN_OF_MASKS
+    worse = known and found.keypoints > most_worse * before.keypoints
+    return not worse and before.loss - found.loss > max(least * before.loss, LEAST_DIFFERENCE)
 
 
 def _report(start, best, before, after, psnrs, stages, notes):

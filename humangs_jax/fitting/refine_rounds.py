@@ -21,7 +21,13 @@ from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.fitting.residuals.keypoints import NEAR, Observations, keypoint_residuals, make_observations
+from humangs_jax.fitting.residuals.keypoints import (
+    NEAR,
+    Observations,
+    found_noise,
+    keypoint_residuals,
+    make_observations,
+)
 from humangs_jax.fitting.residuals.outlines import BodyView, body_outline, mask_outline, mesh_edges, view_body
 from humangs_jax.fitting.residuals.silhouettes import (
     MaskView,
@@ -86,6 +92,26 @@ class CaptureRefineConfig:
     longest_side: int = 512
     color_steps: int = 15
     independent_colors: float = 100.0
+
+
+FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pose=8.0, betas=1.0)
+"""Where a fit to keypoints with calibrated cameras is off: shape and pose, more than cameras. Its keypoints hold the joints where
+clothes would pull them away."""
+SKIN = 0.001
+"""Metres, for `StateStd.clothing`: masks of somebody without clothes."""
+
+
+def usual_config(fitted: bool, *, fixed_cameras: bool = False, bare: bool = False) -> CaptureRefineConfig:
+    """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given. bare: the person wears tight
+    clothes or none, and the body is to fill the masks.
+    """
+    config = CaptureRefineConfig(fixed_cameras=fixed_cameras)
+    if fitted:
+        config = dataclasses.replace(config, std=FITTED, independent=100.0)
+    if bare:
+        std = dataclasses.replace(config.std, clothing=SKIN)
+        config = dataclasses.replace(config, std=std, robust_scales=(1.0, 1.0))
+    return config
 
 
 # The state of a capture ----------------------------------------------------------------------------------------------
@@ -248,8 +274,25 @@ class Scene:
             matches=jax.tree.map(lambda *leaves: jnp.stack(leaves), *matches),
             noise=jnp.asarray(_noise(outlines, matches), jnp.float32),
             scales=reach * jnp.asarray(self.config.robust_scales, jnp.float32),
-            keypoints=self.observations,
+            keypoints=self._keypoints(moved),
         )
+
+    def _keypoints(self, capture: Capture) -> Observations | None:
+        """The keypoints, with the noise that a body finds: a detector's own bias is no evidence against the masks."""
+        if self.observations is None:
+            return None
+        errors = self._errors(capture) * self.scale
+        median = jnp.asarray(np.nanmedian(errors) if np.isfinite(errors).any() else np.nan, jnp.float32)
+        return replace(self.observations, noise=found_noise(median, self.observations.noise))
+
+    def _errors(self, capture: Capture) -> Float[np.ndarray, "v k"]:
+        """Errors of the keypoints in pixels of the photos; NaN where there is none."""
+        assert self.keypoints is not None
+        cameras = {name: getattr(capture.cameras, name)[:, None] for name in ("K", "cam_from_world")}
+        seen = replace(self.keypoints, **cameras)
+        errors = _keypoint_errors(self.model, jnp.asarray(capture.betas), capture.poses, seen, capture.frames)
+        known = np.asarray(seen.confidences * np.asarray(self.model.known) > 0)
+        return np.where(known, np.asarray(errors), np.nan)[:, 0]
 
     def body_views(self, capture: Capture) -> list[BodyView]:
         """The body of a capture of these photos in every view."""
@@ -265,12 +308,9 @@ class Scene:
         iou, keypoints = None if np.isnan(ious).all() else float(np.nanmean(ious)), None
         loss = 0.0 if iou is None else 1 - iou
         if self.keypoints is not None:
-            cameras = {name: getattr(capture.cameras, name)[:, None] for name in ("K", "cam_from_world")}
-            seen = replace(self.keypoints, **cameras)
-            errors = _keypoint_errors(self.model, jnp.asarray(capture.betas), capture.poses, seen, capture.frames)
-            errors = np.asarray(errors)[np.asarray(seen.confidences * np.asarray(self.model.known) > 0)]
-            if len(errors):
-                keypoints = float(np.median(errors))
+            errors = self._errors(capture)
+            if np.isfinite(errors).any():
+                keypoints = float(np.nanmedian(errors))
                 loss += keypoints * self.scale / self.height
         return Score(ious, iou, keypoints, loss)
 

@@ -196,7 +196,7 @@ def test_warnings_tell_what_is_wrong(tmp_path):
     masks[:, : SIZE * 3 // 8] = 0  # the person without the upper part of the body
     slimmer = dataclasses.replace(right, masks=masks)
     report = check_capture(slimmer, tmp_path / "check.png")
-    assert all(view.outside > 0.05 and "--fixed-cameras" in view.warnings[0] for view in report.views)
+    assert all(view.outside > 0.05 and "--refine` fits cameras" in view.warnings[0] for view in report.views)
     assert all(view.outside < 0.01 for view in check_capture(right, tmp_path / "check.png").views)
 
 

@@ -22,8 +22,10 @@ from humangs_jax.data.keypoints.people_file import SeenPerson
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.photos import load_photos
 from humangs_jax.detection import blazepose
+from humangs_jax.fitting import fit_capture
 from humangs_jax.io.images import to_uint8, write_png
 
+DEMO = Path(detect.__file__).parents[1] / "assets" / "demo_capture"
 NEEDED = ("cameras", "masks", "keypoints")
 
 
@@ -181,6 +183,48 @@ def test_what_is_missing_is_found_in_the_photos_and_what_is_given_wins(without, 
     assert material.keypoints == (Path("me/keypoints.json") if "keypoints" in without else mine / "keypoints")
     imported = load_photos("me")
     np.testing.assert_allclose(imported.masks, truth.masks, atol=1 / 255)
+
+
+def test_fit_and_check_find_what_a_capture_lacks_too(mine, detected, capsys, monkeypatch):
+    given = []
+
+    def fit(photos, keypoints, *arguments, **options):
+        given.append((photos, keypoints))
+        raise ValueError("the fit")
+
+    truth, shown = load_capture("demo_capture"), detect.found_in_capture("me")
+    named = lambda folder: [
+        dataclasses.replace(each, name=f"{name}.png")
+        for each, name in zip(shown, load_photos(folder).names, strict=True)
+    ]
+    monkeypatch.setattr(detect, "found_in_capture", named)
+    cameras = ["import", "cameras", str(mine / "calibration.json"), "--images", str(mine / "images"), "--out", "me"]
+    monkeypatch.setattr(fit_capture, "fit_photos", fit)
+    assert cli.execute(cameras) == 0 and load_photos("me").masks is None
+    assert (
+        cli.execute(["fit", "me"]) == cli.BAD_DATA
+        and "--person 0 to 1: numbers on me/people.png" in capsys.readouterr().err
+    )
+    assert cli.execute(["fit", "me", "--person", "1"]) == cli.BAD_DATA
+    out, err = capsys.readouterr()
+    assert (
+        err.endswith("error: the fit\n") and "keypoints and masks found in the photos: me/people.png shows them" in out
+    )
+    ((photos, keypoints),) = given
+    np.testing.assert_allclose(photos.masks, truth.masks, atol=1 / 255)
+    np.testing.assert_allclose(keypoints.points, np.nan_to_num(landmarks_in(truth, MEDIAPIPE_33.names)), atol=1e-3)
+    assert cli.execute(["fit", "me"]) == cli.BAD_DATA  # what was found is taken
+    assert "found" not in capsys.readouterr().out and len(given) == 2
+    monkeypatch.setattr(blazepose, "available", lambda: False)
+    assert cli.execute(["fit", "me"]) == cli.BAD_USAGE
+    assert "pip install 'humangs_jax[photos]'" in capsys.readouterr().err
+
+
+@pytest.mark.slow  # draws and examines
+def test_check_compares_a_capture_without_keypoints_with_what_is_found(mine, detected, capsys):
+    assert cli.execute(["check", str(DEMO), "--person", "1", "--out", "x.png"]) == 0
+    assert "keypoints, median error" in capsys.readouterr().out and Path("x_fit.png").is_file()
+    assert not (DEMO / "keypoints.json").exists()
 
 
 def test_two_people_are_refused_with_the_sheet_that_numbers_them(mine, detected, capsys):

@@ -18,8 +18,9 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.data.views import SubjectViews
+from humangs_jax.fitting import refine as module
 from humangs_jax.fitting.refine import by_colors, refine_capture
-from humangs_jax.fitting.refine_rounds import CaptureRefineConfig
+from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene, Score, start_state, usual_config
 from humangs_jax.fitting.residuals.colors import Likeness, draw
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
@@ -178,6 +179,51 @@ def test_nothing_to_refine_by_is_an_error(masks):
         refine_capture(blind, keypoints=keypoints(confidence=0.0))
     with pytest.raises(CaptureError, match="needed for colours"):
         refine_capture(blind, keypoints=keypoints(), photometric=True)
+
+
+@pytest.mark.parametrize(
+    "before, after, kept",
+    [
+        ((0.25, 4.0), (0.24, 4.0), True),  # a twenty-fifth of the loss
+        ((0.25, 4.0), (0.247, 4.0), False),  # less than a fiftieth
+        ((0.25, 4.0), (0.26, 3.9), False),
+        ((0.25, 4.0), (0.20, 4.5), False),  # fills the masks, and leaves the keypoints
+        ((0.25, 4.0), (0.20, 4.3), True),  # within what chance does
+        ((0.25, None), (0.22, None), False),  # masks alone: clothes fit wrong bodies better
+        ((0.25, None), (0.19, None), True),
+        ((0.02, 1.0), (0.018, 1.0), False),  # rounding of pixels
+    ],
+)
+def test_small_gains_are_kept_where_keypoints_do_not_get_worse(before, after, kept):
+    score = lambda loss, keypoints: Score(np.zeros(1), 1 - loss, keypoints, loss)
+    assert module._better(score(*after), score(*before), module.KEYPOINTS_WORSE) is kept
+    bare = module._better(score(*after), score(*before), np.inf)
+    assert bare is (kept or after == (0.20, 4.5))
+
+
+def test_settings_suit_what_is_known():
+    alone, both, bare = usual_config(False), usual_config(True), usual_config(True, fixed_cameras=True, bare=True)
+    assert alone == CaptureRefineConfig()
+    assert (
+        both.std.betas > alone.std.betas
+        and both.std.focal < alone.std.focal
+        and both.std.clothing == alone.std.clothing
+        and not both.fixed_cameras
+    )
+    assert bare.fixed_cameras and bare.std.clothing < 0.002 and bare.robust_scales[0] == bare.robust_scales[1]
+
+
+@pytest.mark.slow
+def test_keypoints_weigh_by_the_noise_that_the_body_finds():
+    """A detector's bias of 6 pixels is no evidence of 0.8."""
+    known = keypoints()
+    biased = dataclasses.replace(known, points=known.points + np.float32(6.0))
+    noises = []
+    for each in (known, biased):
+        scene = Scene(truth(), each, CONFIG)
+        expected = scene.observations.noise
+        noises.append(np.asarray(scene.look(start_state(scene.origin, CONFIG), 5.0).keypoints.noise / expected))
+    assert noises[0] == pytest.approx(0.5) and (noises[1] > 5).all()
 
 
 def test_keypoints_of_other_views_are_an_error():

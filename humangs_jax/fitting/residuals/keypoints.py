@@ -9,6 +9,7 @@ import numpy as np
 from humangs_jax.body.landmarks import LandmarkModel, pose_landmarks
 from humangs_jax.core.array_types import Array, Bool, Float, Int
 from humangs_jax.core.pytree import Batchable, pytree_dataclass
+from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.photos import Photos
 from humangs_jax.fitting.residuals.priors import PosePrior, limit_residuals
@@ -53,7 +54,7 @@ def make_observations(points, confidences, K, cam_from_world) -> Observations:
     )
 
 
-def group_by_frame(photos: Photos, keypoints: Keypoints) -> tuple[Observations, Int[np.ndarray, "m c"]]:
+def group_by_frame(photos: Photos | Capture, keypoints: Keypoints) -> tuple[Observations, Int[np.ndarray, "m c"]]:
     """Observations with a leading axis of frames (m, c, ...), and the view (m, c) of each, -1 where there is none."""
     frames, count = np.asarray(photos.frames), photos.frame_count
     members = [np.flatnonzero(frames == frame) for frame in range(count)]
