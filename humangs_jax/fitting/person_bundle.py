@@ -4,38 +4,40 @@ A detector that sees one photo gives landmarks in metres in the axes of that pho
 the person. Their depths are guesses, 5 to 10 cm off, and the whole is turned by up to 20 degrees. Rotations that bring those of
 several photos together (generalised Kabsch: Gower 1975, https://doi.org/10.1007/BF02291478) are a start. Bundle adjustment then
 needs the pixels only; the 3D landmarks keep the size, and what pixels leave open.
+
+On the host in float64: a hundred unknowns, and every number of photos would be another program to compile.
 """
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+import dataclasses
 
-from humangs_jax.core.array_types import Array, Float, Int
-from humangs_jax.core.pytree import pytree_dataclass
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from humangs_jax.core.array_types import Float, Int
 from humangs_jax.fitting.similarity import align_points
-from humangs_jax.fitting.solve import Outcome, robust, solve
-from humangs_jax.geometry import quaternion
-from humangs_jax.geometry.transform import EXACT
 
 NEAR = 0.05
 """Metres: depths are clamped to at least this."""
 LANDMARK, TURN, PLACE = 0.05, 0.1, 0.1
 """Metres, radians and shares of the distance that count as one unit of the unknowns."""
 WORLD = 0.15
-"""Std of the detector's 3D landmarks, metres, shared errors counted: pixels decide where several views have them."""
+"""Std of the detector's 3D landmarks, metres, shared errors included: pixels decide where several views see them."""
 BONES = 0.01
 """Std of the difference of left and right bones, metres."""
 SIZE = 0.01
 """Std of the logarithm of the person's size against the detector's 3D landmarks: what keeps the scale."""
 ROBUST_SCALES = (40.0, 6.0)
 """Of pixels, standard deviations: the start is off by tens of them."""
-UNSEEN = 0.01
+UNSEEN = 1e-4
 """Weight of where landmarks start, for those that no photo shows."""
-STEPS, TOLERANCE = 40, 3e-4
+STEPS, TOLERANCE = 60, 1e-9
+DIFFERENCE = 1e-6
+"""Step of the forward differences, units of the unknowns."""
 ALTERNATIONS = 20
 
 
-@pytree_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
 class Evidence:
     """Landmarks of a person in c photos. points: (c, k, 2) pixels from the principal point. weights: (c, k). noise: (c,) pixels.
 
@@ -43,33 +45,26 @@ class Evidence:
     its logarithm. bones: (b, 2, 2) landmarks of left bones and of their right partners.
     """
 
-    points: Float[Array, "c k 2"]
-    weights: Float[Array, "c k"]
-    noise: Float[Array, " c"]
-    world: Float[Array, "c k 3"]
-    focal: Float[Array, " c"]
-    focal_std: Float[Array, " c"]
-    bones: Int[Array, "b 2 2"]
+    points: Float[np.ndarray, "c k 2"]
+    weights: Float[np.ndarray, "c k"]
+    noise: Float[np.ndarray, " c"]
+    world: Float[np.ndarray, "c k 3"]
+    focal: Float[np.ndarray, " c"]
+    focal_std: Float[np.ndarray, " c"]
+    bones: Int[np.ndarray, "b 2 2"]
 
 
-@pytree_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
 class Rig:
-    """c cameras about a person. landmarks: (k, 3) metres. rotations: (c, 3, 3) and places: (c, 3) take them to camera axes."""
+    """c cameras about a person. landmarks: (k, 3) metres. rotations: (c, 3, 3) and places: (c, 3) take them to camera axes.
 
-    landmarks: Float[Array, "k 3"]
-    rotations: Float[Array, "c 3 3"]
-    places: Float[Array, "c 3"]
-    focal: Float[Array, " c"]
+    focal: (c,) pixels. While it is searched all of them have further axes in front.
+    """
 
-
-@pytree_dataclass
-class _Unknowns:
-    """Changes of a start, of unit size. focal: one factor for all cameras, in standard deviations."""
-
-    landmarks: Float[Array, "k 3"]
-    turns: Float[Array, "c 3"]
-    places: Float[Array, "c 3"]
-    focal: Float[Array, ""]
+    landmarks: Float[np.ndarray, "*n k 3"]
+    rotations: Float[np.ndarray, "*n c 3 3"]
+    places: Float[np.ndarray, "*n c 3"]
+    focal: Float[np.ndarray, "*n c"]
 
 
 def align_views(
@@ -114,61 +109,85 @@ def place_person(
     return np.asarray([*(share @ (xy * distance - offsets[:, :2])), distance])
 
 
-@jax.jit
-def adjust(evidence: Evidence, start: Rig) -> tuple[Rig, Outcome]:
-    """Bundle adjustment: cameras and landmarks that explain the evidence, from a start."""
+def adjust(evidence: Evidence, start: Rig) -> tuple[Rig, float]:
+    """Bundle adjustment by Levenberg and Marquardt: the cameras, and half the square sum of the residuals."""
     c, k = evidence.weights.shape
-    unknowns = _Unknowns(jnp.zeros((k, 3)), jnp.zeros((c, 3)), jnp.zeros((c, 3)), jnp.zeros(()))
+    unknowns, cost = np.zeros(3 * k + 6 * c + 1), np.inf
+    for scale in ROBUST_SCALES:
+        of = lambda y, scale=scale: _residuals(evidence, start, y, scale)
+        found = least_squares(
+            lambda y, of=of: of(y[None])[0],
+            unknowns,
+            jac=lambda y, of=of: _jacobian(of, y),
+            method="lm",
+            max_nfev=STEPS,
+            xtol=TOLERANCE,
+            ftol=TOLERANCE,
+            gtol=TOLERANCE,
+        )
+        unknowns, cost = found.x, float(found.cost)
+    moved = _moved(evidence, start, unknowns[None])
+    return Rig(*(getattr(moved, field.name)[0] for field in dataclasses.fields(Rig))), cost
 
-    def stage(unknowns, scale):
-        return solve(lambda y: _residuals(evidence, start, y, scale), unknowns, STEPS, method="lm", tolerance=TOLERANCE)
 
-    unknowns, outcomes = jax.lax.scan(stage, unknowns, jnp.asarray(ROBUST_SCALES))
-    outcome = jax.tree.map(lambda leaf: leaf[-1], outcomes)
-    return _moved(evidence, start, unknowns), outcome
+def _jacobian(residuals, y):
+    """By forward differences, all at once."""
+    found = residuals(np.concatenate([y[None], y + DIFFERENCE * np.eye(len(y))]))
+    return (found[1:] - found[0]).T / DIFFERENCE
 
 
 def _moved(evidence, start, y) -> Rig:
-    turns = quaternion.matrix_from_axis_angle(TURN * y.turns)
-    place, change = start.places, PLACE * y.places
-    depth = place[:, 2] * jnp.exp(change[:, 2])  # never behind the camera
-    sideways = (place[:, :2] / place[:, 2:] + change[:, :2]) * depth[:, None]
+    """Rigs of unknowns (n, 3 k + 6 c + 1): changes of landmarks, turns, places, and one of all focal lengths."""
+    c, k = evidence.weights.shape
+    landmarks, turns, change, focal = np.split(y, np.cumsum([3 * k, 3 * c, 3 * c]), axis=1)
+    landmarks, turns, change = (x.reshape(len(y), -1, 3) for x in (landmarks, turns, change))
+    matrices = Rotation.from_rotvec(TURN * turns.reshape(-1, 3)).as_matrix().reshape(len(y), c, 3, 3)
+    depth = start.places[:, 2] * np.exp(np.clip(PLACE * change[..., 2], -5, 5))  # never behind the camera
+    sideways = start.places[:, :2] / start.places[:, 2:] + PLACE * change[..., :2]
     return Rig(
-        landmarks=start.landmarks + LANDMARK * y.landmarks,
-        rotations=jnp.matmul(turns, start.rotations, precision=EXACT),
-        places=jnp.concatenate([sideways, depth[:, None]], axis=-1),
-        focal=evidence.focal * jnp.exp(evidence.focal_std * y.focal),
+        landmarks=start.landmarks + LANDMARK * landmarks,
+        rotations=matrices @ start.rotations,
+        places=np.concatenate([sideways * depth[..., None], depth[..., None]], axis=-1),
+        focal=evidence.focal * np.exp(np.clip(evidence.focal_std * focal, -5, 5)),
     )
 
 
-def pixel_errors(evidence: Evidence, rig: Rig) -> Float[Array, "c k 2"]:
+def pixel_errors(evidence: Evidence, rig: Rig) -> Float[np.ndarray, "*n c k 2"]:
     """Landmarks as the cameras see them, less those detected, pixels."""
-    seen = _turned(rig) + rig.places[:, None]
-    return seen[..., :2] / jnp.maximum(seen[..., 2:], NEAR) * rig.focal[:, None, None] - evidence.points
+    return _pixel_errors(evidence, rig, _turned(rig))
+
+
+def _pixel_errors(evidence, rig, turned):
+    seen = turned + rig.places[..., None, :]
+    return seen[..., :2] / np.maximum(seen[..., 2:], NEAR) * rig.focal[..., None, None] - evidence.points
 
 
 def _turned(rig):
-    return jnp.einsum("cab,kb->cka", rig.rotations, rig.landmarks, precision=EXACT)
+    """Landmarks in the axes of every camera."""
+    return rig.landmarks[..., None, :, :] @ np.swapaxes(rig.rotations, -1, -2)
 
 
 def _residuals(evidence, start, y, scale):
+    """(n, r) for unknowns (n, u), in standard deviations."""
     rig = _moved(evidence, start, y)
-    root = jnp.sqrt(jnp.where(evidence.weights > 0, evidence.weights, 1.0))[..., None]
-    weigh = lambda errors: jnp.where(evidence.weights[..., None] > 0, root * errors, 0.0)
-    turned = _turned(rig)
-    share = evidence.weights / jnp.maximum(jnp.sum(evidence.weights, axis=1, keepdims=True), 1e-9)
-    center = lambda points: points - jnp.sum(share[..., None] * points, axis=1, keepdims=True)
-    radius = lambda points: 0.5 * jnp.log(jnp.sum(share[..., None] * jnp.square(points)) + 1e-9)
-    bone = rig.landmarks[evidence.bones]
-    lengths = jnp.sqrt(jnp.sum(jnp.square(bone[:, :, 0] - bone[:, :, 1]), axis=-1) + 1e-9)
-    return {
-        "pixels": weigh(robust(pixel_errors(evidence, rig) / evidence.noise[:, None, None], scale)),
-        "world": weigh((center(turned) - evidence.world) / WORLD),
-        "bones": (lengths[:, 0] - lengths[:, 1]) / BONES,
-        "size": (radius(center(turned)) - radius(evidence.world)) / SIZE,
-        "focal": y.focal,
+    turned, root = _turned(rig), np.sqrt(evidence.weights)[..., None]
+    errors = _pixel_errors(evidence, rig, turned) / evidence.noise[:, None, None]
+    errors = errors * (scale / np.sqrt(scale**2 + np.sum(errors**2, axis=-1, keepdims=True)))  # as `solve.robust`
+    share = evidence.weights / evidence.weights.sum(axis=1, keepdims=True)
+    centered = turned - np.sum(share[..., None] * turned, axis=-2, keepdims=True)
+    radius = lambda points: 0.5 * np.log(np.sum(share[..., None] * points**2, axis=(-2, -1)).sum(-1) + 1e-12)
+    bone = rig.landmarks[:, evidence.bones]
+    lengths = np.linalg.norm(bone[..., 0, :] - bone[..., 1, :], axis=-1)
+    k, c = evidence.weights.shape[1], len(evidence.noise)
+    parts = [
+        root * errors,
+        root * (centered - evidence.world) / WORLD,
+        (lengths[..., 0] - lengths[..., 1]) / BONES,
+        (radius(centered) - radius(evidence.world)) / SIZE,
+        y[:, -1],
         # what no evidence tells: axes and origin of the landmarks
-        "axes": y.turns[0] / TURN,
-        "origin": jnp.mean(y.landmarks, axis=0),
-        "unseen": UNSEEN * y.landmarks,
-    }
+        y[:, 3 * k : 3 * k + 3] / TURN,
+        y[:, : 3 * k].reshape(len(y), k, 3).mean(axis=1),
+        UNSEEN * y[:, : 3 * k + 6 * c],
+    ]
+    return np.concatenate([part.reshape(len(y), -1) for part in parts], axis=1)

@@ -11,11 +11,14 @@ import contextlib
 import dataclasses
 from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from humangs_jax.body.model import shape_body
 from humangs_jax.core.array_types import Bool, Float
+from humangs_jax.core.pytree import replace
+from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.sets import mirrored_name
 from humangs_jax.fitting.person_bundle import (
     Evidence,
@@ -26,7 +29,6 @@ from humangs_jax.fitting.person_bundle import (
     place_person,
 )
 from humangs_jax.fitting.residuals.keypoints import NOISE, OUTER
-from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.images import DIAGONAL_35MM
 
@@ -52,9 +54,11 @@ FEWEST_WITHOUT, MOMENT_WITHOUT = 4, 0.015
 three of four photos of several moments leave 0.021 or more."""
 LEVEL, UPRIGHT = 4.0, 15.0
 """Stds of the roll of a camera and of the lean of a body, degrees."""
+BONES_STD, STATURE_STD = 0.01, 0.001
+"""Metres by which joints and stature may differ from those of a scaled person."""
 STATURE = 1.52
 """Stature over trunk, thigh and shin together, of the shipped body's mean person."""
-BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"), ("shoulder", "hip"))
+BONES = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "ankle"))
 
 
 class SeveralMomentsError(ValueError):
@@ -146,14 +150,14 @@ def cameras_of_moment(seen: PersonViews, *, height: float | None = None) -> Pers
     seen = _cleaned(seen)
     found = _with_mirrored(seen, _mirror(seen))
     rig, evidence = found.rig, found.evidence
-    if not all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(rig)):
+    if not all(np.isfinite(getattr(rig, field.name)).all() for field in dataclasses.fields(rig)):
         raise ValueError(f"{', '.join(seen.photos)}: no cameras were found that explain the landmarks of the person")
     if found.error > ONE_MOMENT or not _around(rig):
         raise SeveralMomentsError(
             f"landmarks are off by {found.error:.1%} of the person's size, at most {ONE_MOMENT:.1%} is expected"
         )
-    change = float(np.asarray(rig.focal / evidence.focal)[0])
-    weights = np.asarray(evidence.weights)
+    change = float(rig.focal[0] / evidence.focal[0])
+    weights = evidence.weights
     medians = np.asarray([np.median(e[w > SEEN]) for e, w in zip(found.pixels, weights, strict=True)])
     cameras, landmarks = _in_world(seen, rig, height)
     views = len(cameras)
@@ -242,8 +246,7 @@ def _evidence(seen, mirror, mirrored) -> tuple[Evidence, Rig]:
     hips = [name in ("left_hip", "right_hip") for name in seen.names]
     seen_hips = np.where((weights * hips).all(1, where=np.asarray(hips), keepdims=True), weights * hips, weights)
     rays = np.asarray([_ray(*own) for own in zip(points, seen_hips, focal, strict=True)])
-    turns = np.asarray(quaternion.to_matrix(quaternion.between(jnp.asarray([0.0, 0.0, 1.0]), jnp.asarray(rays))))
-    world = np.einsum("cab,ckb->cka", turns.astype(float), world)
+    world = np.einsum("cab,ckb->cka", np.stack([_turn_to(ray) for ray in rays]), world)
     world = np.asarray([_centered(*own) for own in zip(world, weights, strict=True)])
     radii = np.sqrt((weights[..., None] * world**2).sum((1, 2)) / weights.sum(1))
     world *= (np.median(radii) / radii)[:, None, None]
@@ -251,15 +254,20 @@ def _evidence(seen, mirror, mirrored) -> tuple[Evidence, Rig]:
     noise = np.asarray([_person_size(p, w) * NOISE for p, w in zip(points, weights, strict=True)])
     offsets = np.einsum("cab,kb->cka", rotations, shape)
     places = np.stack([place_person(*own) for own in zip(points, weights, offsets, focal, strict=True)])
-    single = lambda *arrays: [jnp.asarray(x, jnp.float32) for x in arrays]
-    evidence = Evidence(*single(points, weights, noise, world, focal, std), _bones(seen.names))
-    return evidence, Rig(*single(shape, rotations, places, focal))
+    evidence = Evidence(points, weights, noise, world, focal, std, _bones(seen.names))
+    return evidence, Rig(shape, rotations, places, focal)
 
 
 def _ray(points, weights, focal):
     """The unit direction in which a camera sees the person."""
     direction = np.asarray([*(weights @ points / weights.sum() / focal), 1.0])
     return direction / np.linalg.norm(direction)
+
+
+def _turn_to(ray):
+    """The shortest rotation (3, 3) from the optical axis to a unit direction."""
+    axis = np.cross([0.0, 0.0, 1.0], ray)
+    return Rotation.from_rotvec(axis / max(np.linalg.norm(axis), 1e-12) * np.arccos(np.clip(ray[2], -1, 1))).as_matrix()
 
 
 def _person_size(points, weights):
@@ -272,7 +280,7 @@ def _bones(names):
         ends = [[f"{side}_{a}", f"{side}_{b}"] for side in ("left", "right")]
         if all(name in names for side in ends for name in side):
             rows.append([[names.index(name) for name in side] for side in ends])
-    return jnp.asarray(np.asarray(rows, np.int32).reshape(-1, 2, 2))
+    return np.asarray(rows, int).reshape(-1, 2, 2)
 
 
 # Cameras -------------------------------------------------------------------------------------------------------------
@@ -286,7 +294,7 @@ def _with_mirrored(seen, mirror) -> "_Trial":
         found = _least(seen, mirror, found)
     if views > 1 and found.error > DOUBTFUL:
         found = min(found, _least(seen, mirror, _try(seen, mirror, np.ones(views, bool))), key=lambda each: each.cost)
-    if views > 1 and _handedness(np.asarray(found.rig.landmarks, float), seen.names) < 0:
+    if views > 1 and _handedness(found.rig.landmarks, seen.names) < 0:
         found = _try(seen, mirror, ~found.mirrored)
     return found
 
@@ -297,18 +305,17 @@ class _Trial:
 
     mirrored: Bool[np.ndarray, " c"]
     rig: Rig
-    evidence: Evidence
     cost: float
+    evidence: Evidence
 
     @property
     def error(self) -> float:
-        share = self.pixels * (NOISE / np.asarray(self.evidence.noise))[:, None]
-        return _relative_error(share, np.asarray(self.evidence.weights))
+        return _relative_error(self.pixels * (NOISE / self.evidence.noise)[:, None], self.evidence.weights)
 
     @property
     def pixels(self) -> Float[np.ndarray, "c k"]:
         """Distances of landmarks from their pixels."""
-        return np.linalg.norm(np.asarray(pixel_errors(self.evidence, self.rig)), axis=-1)
+        return np.linalg.norm(pixel_errors(self.evidence, self.rig), axis=-1)
 
 
 def _least(seen, mirror, start: _Trial) -> _Trial:
@@ -326,8 +333,7 @@ def _least(seen, mirror, start: _Trial) -> _Trial:
 def _try(seen, mirror, mirrored) -> _Trial:
     """Bundle adjustment with these views (c,) mirrored."""
     evidence, start = _evidence(seen, mirror, mirrored)
-    rig, outcome = adjust(evidence, start)
-    return _Trial(mirrored, rig, evidence, float(np.nan_to_num(np.asarray(outcome.after), nan=np.inf)))
+    return _Trial(mirrored, *adjust(evidence, start), evidence)
 
 
 def _relative_error(errors, weights):
@@ -341,8 +347,8 @@ def _relative_error(errors, weights):
 
 def _around(rig):
     """Whether photos see the person from several directions: else the landmarks of one decide nothing about the others."""
-    rotations, places = np.asarray(rig.rotations, float), np.asarray(rig.places, float)
-    towards = -np.einsum("cba,cb->ca", rotations, places / np.linalg.norm(places, axis=1, keepdims=True))
+    places = rig.places
+    towards = -np.einsum("cba,cb->ca", rig.rotations, places / np.linalg.norm(places, axis=1, keepdims=True))
     return len(places) == 1 or np.rad2deg(np.arccos(np.clip(towards @ towards.T, -1, 1))).max() > LEAST_ANGLE
 
 
@@ -377,9 +383,7 @@ def _handedness(points, names):
 
 def _in_world(seen, rig, height):
     """Cameras, and landmarks (k, 3), of a person who stands upright at the origin, of this height."""
-    points, rotations, places, focal = (
-        np.asarray(x, float) for x in (rig.landmarks, rig.rotations, rig.places, rig.focal)
-    )
+    points, rotations, places, focal = rig.landmarks, rig.rotations, rig.places, rig.focal
     names = seen.names
     hips, shoulders, ankles = (_middle(points, names, part) for part in ("hip", "shoulder", "ankle"))
     body = (shoulders - ankles) / np.linalg.norm(shoulders - ankles)
@@ -419,3 +423,36 @@ def _warnings(seen, mirrored, height):
         yield f"no photo says its focal length: {USUAL_FOCAL:.0f} mm of 35-mm film, give or take {USUAL_STD:.0%}, is supposed"
     for photo in np.asarray(seen.photos, object)[mirrored]:
         yield f"{photo}: the detector exchanged left and right; they are changed back"
+
+
+def scaled_to_height(capture: Capture, height: float) -> Capture:
+    """A capture in which the person is so tall at rest, metres: cameras, places and shape change alike; photos show the same."""
+    betas = np.asarray(capture.betas, np.float64)
+    before = shape_body(capture.body, jnp.asarray(betas, jnp.float32))
+    heights = np.asarray(before.vertices)[:, 1]
+    top, bottom = int(np.argmax(heights)), int(np.argmin(heights))
+    directions = np.asarray(capture.body.shape_directions, np.float64)[..., : len(betas)]
+    scale = height / float(heights[top] - heights[bottom])
+    # joints as if all of the body were scaled, the stature exactly so
+    joints = np.asarray(before.joints, np.float64)
+    bones = np.einsum("jn,nas->jas", np.asarray(capture.body.joint_regressor, np.float64), directions)
+    rows = [
+        (bones - bones[:1]).reshape(-1, len(betas)) / BONES_STD,
+        (directions[top, 1] - directions[bottom, 1])[None] / STATURE_STD,
+        np.eye(len(betas)),
+    ]
+    wanted = [
+        (scale - 1) * (joints - joints[:1]).ravel() / BONES_STD,
+        [(height - float(heights[top] - heights[bottom])) / STATURE_STD],
+        np.zeros(len(betas)),
+    ]
+    betas = betas + np.linalg.lstsq(np.concatenate(rows), np.concatenate(wanted), rcond=None)[0]
+    after = shape_body(capture.body, jnp.asarray(betas, jnp.float32))
+    roots = scale * (before.joints[0] + capture.poses.translation)
+    matrices = capture.cameras.cam_from_world
+    return dataclasses.replace(
+        capture,
+        betas=np.asarray(betas, np.float32),
+        poses=replace(capture.poses, translation=roots - after.joints[0]),
+        cameras=replace(capture.cameras, cam_from_world=matrices.at[:, :3, 3].multiply(scale)),
+    )
