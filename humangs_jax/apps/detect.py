@@ -5,7 +5,8 @@
     people.png       the sheet
     masks/NAME.png   of the chosen person
 
-With cameras people are matched by how well they triangulate, over time by where they are; without, by their size in the photo.
+With cameras people are matched by how well they triangulate, over time by where they are; without, by their size in the photo,
+and where several are of nearly one size, by the colours of their upper bodies and legs.
 """
 
 import dataclasses
@@ -26,7 +27,7 @@ from humangs_jax.data.photos import Photos, load_photos, read_description
 from humangs_jax.detection.blazepose import LANDMARK_SIZE, Networks
 from humangs_jax.detection.people import SEEN, DetectedPerson, detect_people
 from humangs_jax.detection.sharpening import sharpened
-from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_people
+from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_colours, match_people
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import orientation, oriented, read_image, resized, to_uint8, write_png
@@ -43,6 +44,12 @@ COLOURS = ((46, 160, 67), (31, 111, 235), (219, 109, 40), (163, 113, 247), (207,
 """Of the people on the sheet, by number."""
 FAINT = 0.45
 """Share of the colour over a person's pixels."""
+BEYOND = 0.03
+"""Share of a person's size that a landmark outside of the photo is beyond its border."""
+PARTS = ((11, 12, 24, 23), (23, 24, 26, 25))
+"""Corners of upper body and thighs: landmarks of the left and right."""
+LARGE_PEOPLE = 5
+"""In a photo, at most, that are told apart by their colours."""
 
 
 class Found(NamedTuple):
@@ -59,12 +66,16 @@ class Found(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PhotoPeople:
-    """A photo. name: of the file. size: (width, height). thumbnail: (h, w, 3) for the sheet. people: None who is not in it."""
+    """A photo. name: of the file. size: (width, height). thumbnail: (h, w, 3) for the sheet. people: None who is not in it.
+    colours: several are large, and colours tell who is who. unclear: they do not.
+    """
 
     name: str
     size: tuple[int, int]
     thumbnail: Float[np.ndarray, "h w 3"]
     people: tuple[Found | None, ...]
+    colours: bool = False
+    unclear: bool = False
 
 
 def found_in_photos(folder: Path) -> list[PhotoPeople]:
@@ -150,12 +161,14 @@ def same_people(
 ) -> list[PhotoPeople]:
     """The photos with people in such an order that the i-th of each is the same person.
 
-    Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size. frames: the moment of each photo.
-    The person with the most pixels in all photos together is the first.
+    Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size, or, where several are large, that
+    of colours. frames: the moment of each photo. The person with the most pixels in all photos together is the first.
     """
-    rows = [list(photo.people) for photo in photos]
     if cameras is not None and len(photos) > 1:
         rows = _matched(photos, cameras, np.asarray([0] * len(photos) if frames is None else frames))
+    else:
+        photos = _by_colours(photos) if len(photos) > 1 else photos
+        rows = [list(photo.people) for photo in photos]
     most = max((len(row) for row in rows), default=0)
     ordered = [
         dataclasses.replace(photo, people=(*row, *[None] * (most - len(row))))
@@ -163,6 +176,43 @@ def same_people(
     ]
     order = np.argsort([-area for area in _areas(ordered)], kind="stable")
     return [dataclasses.replace(photo, people=tuple(photo.people[i] for i in order)) for photo in ordered]
+
+
+def _by_colours(photos):
+    """The photos, each with its large people in the order of those in the photo that has the most of them; see `unclear`."""
+    large = [
+        [each for each in p.people if each and each.area > RIVAL * p.people[0].area][:LARGE_PEOPLE] for p in photos
+    ]
+    most = max(range(len(photos)), key=lambda v: len(large[v]))
+    if len(large[most]) < 2:
+        return photos
+    first = _colours(photos[most], large[most])
+    ordered = []
+    for photo, people in zip(photos, large, strict=True):
+        order = match_colours(first, _colours(photo, people)) if people else ()
+        if order is None:
+            ordered.append(dataclasses.replace(photo, unclear=True))
+            continue
+        row: list[Found | None] = [None] * len(first)
+        for i, each in zip(order, people, strict=True):
+            row[i] = each
+        ordered.append(dataclasses.replace(photo, people=(*row, *photo.people[len(people) :]), colours=True))
+    return ordered
+
+
+def _colours(photo, people):
+    """Medians over each of the parts of each person, (n, parts, 3); NaN for a part that is not in the photo."""
+    height, width = photo.thumbnail.shape[:2]
+    u, v = (each.reshape(-1, 1) for each in np.meshgrid(np.linspace(0.2, 0.8, 9), np.linspace(0.2, 0.8, 9)))
+    found = np.full((len(people), len(PARTS), 3), np.nan)
+    for i, each in enumerate(people):
+        for k, part in enumerate(PARTS):
+            a, b, c, d = each.person.points[list(part), :2] * width / photo.size[0]
+            x, y = np.floor((a * (1 - u) + b * u) * (1 - v) + (d * (1 - u) + c * u) * v).astype(int).T
+            inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+            if inside.any():
+                found[i, k] = np.median(photo.thumbnail[y[inside], x[inside]], axis=0)
+    return found
 
 
 def _areas(photos):
@@ -206,7 +256,7 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
     """The number of the person that is meant: the one asked for, or the only one who is large.
 
     Arguments: sheet: where the numbers can be looked up.
-    Raises: ValueError if no photo has a person, or not so many, or if several may be meant.
+    Raises: ValueError if no photo has a person, or not so many, if several may be meant, or if it is unclear who is who.
     """
     count = len(photos[0].people)
     if not count:
@@ -214,15 +264,20 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
     if person is not None:
         if not 0 <= person < count:
             raise ValueError(f"--person {person}: expected 0 to {count - 1}, as on {sheet}")
-        return person
-    areas = _areas(photos)
-    rivals = [i for i in range(1, count) if areas[i] > RIVAL * areas[0]]
-    if rivals:
-        where = _few([photo.name for photo in photos if any(photo.people[i] is not None for i in rivals)])
+    else:
+        areas = _areas(photos)
+        rivals = [i for i in range(1, count) if areas[i] > RIVAL * areas[0]]
+        if rivals:
+            where = _few([photo.name for photo in photos if any(photo.people[i] is not None for i in rivals)])
+            raise ValueError(
+                f"{len(rivals) + 1} people in {where}: expected one. --person 0 to {len(rivals)}: numbers on {sheet}"
+            )
+    if unclear := [photo.name for photo in photos if photo.unclear]:
         raise ValueError(
-            f"{len(rivals) + 1} people in {where}: expected one. --person 0 to {len(rivals)}: numbers on {sheet}"
+            f"{_few(unclear)}: which of the people of {sheet} is meant? Their colours do not tell: cut these photos down to "
+            "one person, or leave them out"
         )
-    return 0
+    return person or 0
 
 
 def person_on(photos: Sequence[PhotoPeople], masks: Float[np.ndarray, "v h w"], folder: Path) -> int:
@@ -258,6 +313,16 @@ def _best(photos, agreement, given, folder):
 def absent(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
     """Names of the photos without the person."""
     return tuple(photo.name for photo in photos if photo.people[person] is None)
+
+
+def cut_off(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
+    """Names of the photos whose border cuts the person: landmarks lie beyond it."""
+    found = [(photo, photo.people[person]) for photo in photos]
+    return tuple(p.name for p, each in found if each is not None and _beyond(each.person.points[:, :2], p.size))
+
+
+def _beyond(points, size):
+    return bool((np.maximum(-points, points - np.asarray(size)) > BEYOND * np.ptp(points, axis=0).max()).any())
 
 
 def repaired(photos: Sequence[PhotoPeople], person: int) -> tuple[str, ...]:
@@ -378,5 +443,12 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
     canvas = Image.fromarray(to_uint8(picture))
     pen, font = ImageDraw.Draw(canvas), ImageFont.load_default(22)
     for x, y, i in heads:
-        pen.text((x, y), str(i), fill="white", stroke_width=3, stroke_fill=COLOURS[i % len(COLOURS)], font=font)
+        pen.text(
+            (x, y),
+            f"{i}?" if photo.unclear else str(i),
+            fill="white",
+            stroke_width=3,
+            stroke_fill=COLOURS[i % len(COLOURS)],
+            font=font,
+        )
     return np.asarray(canvas) / 255

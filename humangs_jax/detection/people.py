@@ -1,24 +1,31 @@
 """All people of a photo, small ones too, whichever way up the photo is.
 
-The detector finds people from a third of its window's side on, so it looks at the whole photo and at windows of a half and of a
-quarter of its longer side that overlap by half. What several windows find is one person if the landmarks agree.
+The detector finds people from a third of its window's side on, so it looks at the whole photo and at windows of a half of its
+longer side that overlap by half, and, where nobody in these is large, of a quarter. What several windows find is one person if
+the landmarks agree.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from humangs_jax.core.array_types import Float
 from humangs_jax.detection.blazepose import (
+    LANDMARK_SIZE,
     Crop,
     Detection,
     Landmarks,
     Networks,
+    mask_at,
     mask_in_photo,
 )
 
-SHARES = (1.0, 0.5, 0.25)
-"""Sides of the windows over the photo's longer side."""
+SHARES, SMALL_SHARES = (1.0, 0.5), (0.25,)
+"""Sides of the windows over the photo's longer side; the second, most of all windows, where nobody is large."""
+LARGE = 0.4
+"""Of the photo's longer side. Windows of a half find people from a sixth of it on, whose crops are a fifth: whoever needs smaller
+windows has at most a quarter of the pixels of a person with a crop of two fifths, and is not the one who is meant."""
 SMALLEST = 0.06
 """Of the photo's longer side: a person whose crop is smaller is somebody in the background, or nobody."""
 MOST_CROPS = 16
@@ -57,17 +64,40 @@ class DetectedPerson(NamedTuple):
 def detect_people(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[DetectedPerson]:
     """The people of a photo with values in [0, 1], the largest first."""
     height, width = photo.shape[:2]
+    longest = max(height, width)
+    detections = window_detections(networks, photo, SHARES)
+    found = _people(networks, photo, detections)
+    if not any(person.crop.side >= LARGE * longest for person in found):
+        smaller = window_detections(networks, photo, SMALL_SHARES)
+        found = _people(networks, photo, detections + smaller) if smaller else found
+    return [
+        DetectedPerson(
+            person.pixels + 0.5,
+            person.visibility,
+            person.world,
+            person.presence,
+            mask_in_photo(person, width, height),
+            person.crop.side,
+        )
+        for person in found
+    ]
+
+
+def _people(networks, photo, detections):
+    """The landmarks of those detections that are people, the largest first."""
+    height, width = photo.shape[:2]
     found = []
-    for detection in distinct(window_detections(networks, photo), max(height, width))[:MOST_CROPS]:
+    best_first = sorted(detections, key=lambda detection: -detection.score)
+    for detection in distinct(best_first, max(height, width))[:MOST_CROPS]:
         person, drift = _settled(networks, photo, detection.crop())
-        if person.presence >= LEAST_PRESENCE:
-            found.append((drift, _in_photo(person, width, height)))
-    kept: list[DetectedPerson] = []
+        if person.presence >= LEAST_PRESENCE and _on_mask(person, width, height) >= LEAST_ON_MASK:
+            found.append((drift, person))
+    kept: list[Landmarks] = []
     # crops far off that still drift towards a person have wrong landmarks: the one that settled speaks for the person
     for _, person in sorted(found, key=lambda pair: pair[0] > SETTLED):  # among these the detector's best
-        if _on_mask(person) >= LEAST_ON_MASK and not any(_same_pixels(person, other) for other in kept):
+        if not any(_shared(*pair, width, height) > MOST_SHARED for o in kept for pair in ((person, o), (o, person))):
             kept.append(person)
-    return sorted(kept, key=lambda person: -person.side)
+    return sorted(kept, key=lambda person: -person.crop.side)
 
 
 def _settled(networks, photo, crop):
@@ -87,16 +117,18 @@ def _settled(networks, photo, crop):
     return look, float(drift)
 
 
-def window_detections(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> list[Detection]:
-    """What the detector finds in all windows, the best first."""
-    found = [each for window in windows(photo.shape[1], photo.shape[0]) for each in networks.detect(photo, window)]
-    return sorted(found, key=lambda detection: -detection.score)
+def window_detections(
+    networks: Networks, photo: Float[np.ndarray, "h w 3"], shares: Sequence[float]
+) -> list[Detection]:
+    """What the detector finds in the windows with these shares of the longer side."""
+    height, width = photo.shape[:2]
+    return [each for window in windows(width, height, shares) for each in networks.detect(photo, window)]
 
 
-def windows(width: int, height: int) -> list[Crop]:
+def windows(width: int, height: int, shares: Sequence[float] = (*SHARES, *SMALL_SHARES)) -> list[Crop]:
     """Upright squares that cover a photo: one around it, then smaller ones that overlap by half, without those beside it."""
     longest, found = max(width, height), []
-    for share in SHARES:
+    for share in shares:
         side = share * longest
         steps = [1 if size <= side else int(np.ceil(2 * (size - side) / side)) + 1 for size in (width, height)]
         starts = [
@@ -122,20 +154,18 @@ def _same_detection(a, b):
     return float(np.hypot(*(a.hips - b.hips))) < SAME_HIPS * sides[1] and sides[1] < SAME_SIZE * sides[0]
 
 
-def _in_photo(found: Landmarks, width: int, height: int) -> DetectedPerson:
-    mask = mask_in_photo(found, width, height)
-    return DetectedPerson(found.pixels + 0.5, found.visibility, found.world, found.presence, mask, found.crop.side)
-
-
-def _on_mask(person: DetectedPerson) -> float:
+def _on_mask(person: Landmarks, width: int, height: int) -> float:
     """The share of the landmarks in the photo that lie on the mask; 0 if none lies in the photo."""
-    x, y = np.floor(person.pixels).astype(int).T
-    height, width = person.mask.shape
-    inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
-    return float(np.mean(person.mask[y[inside], x[inside]] > SEEN)) if inside.any() else 0.0
+    inside = _inside(person.pixels, width, height)
+    return float(np.mean(mask_at(person, person.pixels[inside]) > SEEN)) if inside.any() else 0.0
 
 
-def _same_pixels(person: DetectedPerson, other: DetectedPerson) -> bool:
-    """Whether more than `MOST_SHARED` of the smaller mask is the other's, too."""
-    own, theirs = person.mask > SEEN, other.mask > SEEN
-    return bool(np.sum(own & theirs) > MOST_SHARED * max(min(np.sum(own), np.sum(theirs)), 1))
+def _shared(person: Landmarks, other: Landmarks, width: int, height: int) -> float:
+    """The share of the person's mask in the photo that another person has, too."""
+    own = person.crop.to_photo(np.argwhere(person.mask > SEEN)[:, ::-1] / LANDMARK_SIZE)
+    own = own[_inside(own, width, height)]
+    return float(np.mean(mask_at(other, own) > SEEN)) if len(own) else 0.0
+
+
+def _inside(pixels, width, height):
+    return ((pixels > -0.5) & (pixels < np.asarray([width, height]) - 0.5)).all(-1)

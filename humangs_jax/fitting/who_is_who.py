@@ -25,6 +25,10 @@ SEEN, FEWEST = 0.3, 6
 """Least visibility of a landmark that counts, and least number of those that two views share."""
 
 
+PLAIN = 0.1
+"""Of colours in [0, 1]: how much farther apart the next best order of people has to be."""
+
+
 class Seen(NamedTuple):
     """People of a view. K: (3, 3). cam_from_world: (4, 4). people: each (k, 3) pixels and visibility."""
 
@@ -174,3 +178,18 @@ def in_order_of_time(frames: Sequence[list[Match]]) -> list[list[Match | None]]:
             person.append(matches[chosen[j]] if j in chosen else None)
         people += [[*[None] * f, matches[i]] for i in left]
     return [[person[f] for person in people] for f in range(len(frames))]
+
+
+def match_colours(first: Float[np.ndarray, "n k 3"], second: Float[np.ndarray, "m k 3"]) -> tuple[int, ...] | None:
+    """For each of m people of a photo which of n >= m of another one has the same colours; None if that is not plain.
+
+    Arguments: colours in [0, 1] of k parts of the body; NaN for parts that are not seen.
+    """
+    apart = np.linalg.norm(second[:, None] - first[None], axis=-1)
+    seen = np.isfinite(apart)
+    apart = np.where(seen, apart, 0).sum(-1) / np.maximum(seen.sum(-1), 1)
+    options = sorted(
+        (float(sum(apart[i, j] for i, j in enumerate(order))), order)
+        for order in itertools.permutations(range(len(first)), len(second))
+    )
+    return options[0][1] if len(options) == 1 or options[1][0] - options[0][0] >= PLAIN else None

@@ -55,6 +55,35 @@ def test_who_is_meant_is_never_guessed():
         choose([photo("a"), photo("b")], 0, Path("s.png"))
 
 
+def coloured(name, *shades, size=(60, 40)):
+    """A photo of people side by side, each of one grey."""
+    picture, people = np.ones((size[1], size[0], 3)), []
+    for i, shade in enumerate(shades):
+        picture[:, 20 * i : 20 * i + 20] = shade
+        person = found(shade, 90.0 - i)
+        person.person.points[:, :2] = 20 * i + 10, 20
+        people.append(person)
+    return PhotoPeople(name, size, picture, tuple(people))
+
+
+def test_without_cameras_colours_tell_large_people_apart():
+    photos = same_people([coloured("a", 0.9, 0.1), coloured("b", 0.2, 0.8), coloured("c", 0.05), coloured("d")])
+    shades = [[None if each is None else int(each.area) for each in p.people] for p in photos]
+    assert shades == [[89, 90], [90, 89], [90, None], [None, None]]  # the dark one has more pixels in all
+    with pytest.raises(ValueError, match="2 people in a, b: expected one"):
+        choose(photos, None, Path("s.png"))
+    assert choose(photos, 1, Path("s.png")) == 1 and detect.absent(photos, 1) == ("c", "d")
+
+
+def test_people_of_one_colour_are_not_mixed_in_silence(tmp_path):
+    photos = same_people([coloured("a", 0.9, 0.1), coloured("b", 0.5, 0.5), coloured("c", 0.9, 0.2)])
+    with pytest.raises(
+        ValueError, match=r"^b: which of the people of .*people\.png is meant\? Their colours do not tell"
+    ):
+        detect.chosen(photos, 1, tmp_path)
+    assert (tmp_path / "people.png").is_file()
+
+
 def test_what_is_written_is_of_the_person_and_of_everybody(tmp_path):
     photos = same_people([photo("x/a.jpg", found(1, 90.0), found(2, 20.0)), photo("b.jpg")])
     write_found(tmp_path, photos, 1)

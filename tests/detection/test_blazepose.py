@@ -9,10 +9,13 @@ from humangs_jax.detection.blazepose import (
     ENLARGED,
     Crop,
     Detection,
+    Landmarks,
     Networks,
     _anchors,
     _merged,
     bilinear,
+    mask_at,
+    mask_in_photo,
     refined,
     sampled,
 )
@@ -76,6 +79,19 @@ def test_bilinear_is_linear_between_pixels_and_repeats_or_ends_at_the_edge():
     np.testing.assert_allclose(bilinear(image, points, outside=-1.0), [[2.5, 6.0, 0.0, -1.0, -1.0]])
     colours = bilinear(np.stack([image, image + 1], axis=-1), points)
     np.testing.assert_allclose(colours[..., 1] - colours[..., 0], 1.0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, -3.0])
+def test_the_mask_of_a_crop_at_the_size_of_the_photo_is_the_one_at_its_pixels(angle):
+    noise = np.random.default_rng(0).uniform(size=(16, 16))
+    mask = np.kron(noise, np.ones((16, 16))).astype(np.float32)
+    mask[:2] = mask[-2:] = mask[:, :2] = mask[:, -2:] = 0  # the two differ in how the last half pixel ends
+    crop = Crop(np.asarray([30.0, 21.0]), 40.0, angle)
+    nobody = Landmarks(np.zeros((33, 2)), np.ones(33), np.zeros((33, 3)), 1.0, mask, crop, Detection(1.0, *np.eye(2)))
+    grid = np.stack(np.meshgrid(np.arange(64), np.arange(36)), axis=-1).astype(float)
+    expected = mask_at(nobody, grid.reshape(-1, 2)).reshape(36, 64)
+    assert expected.max() > 0.9
+    np.testing.assert_allclose(mask_in_photo(nobody, 64, 36), expected, atol=1e-3)
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 5), (5, 1)])

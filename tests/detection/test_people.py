@@ -101,3 +101,12 @@ def test_the_landmarks_of_a_crop_that_settled_are_taken():
     (person,) = detect_people(Drifting(), np.zeros((600, 400, 3), np.float32))
     assert person.side == pytest.approx(Drifting.side)
     np.testing.assert_allclose(person.pixels.mean(0), Drifting.hips + 0.5, atol=20)
+
+
+def test_the_smallest_windows_are_looked_at_only_where_nobody_is_large(networks, capture, monkeypatch):
+    seen, detect = [], type(networks).detect
+    monkeypatch.setattr(type(networks), "detect", lambda self, photo, w: seen.append(w.side) or detect(self, photo, w))
+    photo = np.ascontiguousarray(capture.images[0], np.float32)
+    assert len(detect_people(networks, photo)) == 1 and set(seen) == {512.0, 256.0}
+    seen.clear()
+    assert detect_people(networks, np.ones((512, 512, 3), np.float32)) == [] and set(seen) == {512.0, 256.0, 128.0}

@@ -2,11 +2,22 @@
 
 import dataclasses
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
-from person_views import MIRROR, NAMES, cameras_around, errors_of, posed, seen_by
+from fit_people import default_body
+from person_views import FOCAL, MIRROR, NAMES, cameras_around, errors_of, posed, seen_by
 
-from humangs_jax.fitting.person_cameras import SeveralMomentsError, cameras_from_person, cameras_of_moment
+from humangs_jax.body.model import BodyPose, shape_body
+from humangs_jax.data.capture import Capture
+from humangs_jax.fitting.person_cameras import (
+    SeveralMomentsError,
+    cameras_from_person,
+    cameras_of_moment,
+    scaled_to_height,
+)
+from humangs_jax.geometry.camera import Camera, stack_cameras
 
 EXACT_DEGREES, EXACT_METRES = 0.1, 0.01
 """Of exact landmarks: float32, and priors (size, level cameras) that are not quite those of the test's person."""
@@ -134,3 +145,32 @@ def test_what_cannot_be_used_is_refused_by_name():
         cameras_from_person(dataclasses.replace(seen, points=np.zeros_like(seen.points)))
     with pytest.raises(ValueError, match="no photo of the person"):
         cameras_from_person(seen.select([]))
+
+
+def test_a_person_of_another_height_looks_the_same():
+    body = default_body()
+    matrix = cameras_around(1)[0].astype(np.float32)
+    camera = Camera.from_opencv([[FOCAL, 0, 544], [0, FOCAL, 960], [0, 0, 1]], matrix, 1088, 1920)
+    rest = shape_body(body, jnp.zeros(4))
+    capture = Capture(
+        images=np.ones((1, 1920, 1088, 3), np.float32),
+        masks=None,
+        cameras=stack_cameras([camera]),
+        frames=np.zeros(1, np.int32),
+        body=body,
+        betas=np.zeros(body.shape_directions.shape[-1], np.float32),
+        poses=jax.vmap(BodyPose)(jnp.zeros((1, len(body.parents), 3)), -rest.joints[:1] + jnp.asarray([0.1, 0.2, 0.0])),
+        names=("a",),
+    )
+    tall = scaled_to_height(capture, 1.9)
+
+    def of(capture):
+        vertices = np.asarray(shape_body(body, jnp.asarray(capture.betas)).vertices + capture.poses.translation[0])
+        seen = vertices @ np.asarray(capture.cameras.cam_from_world[0, :3, :3]).T + np.asarray(
+            capture.cameras.cam_from_world[0, :3, 3]
+        )
+        return np.ptp(vertices[:, 1]), seen[:, :2] / seen[:, 2:]
+
+    (_, before), (height, after) = of(capture), of(tall)
+    assert height == pytest.approx(1.9, abs=0.003)
+    assert np.ptp(after[:, 1]) == pytest.approx(np.ptp(before[:, 1]), rel=0.01)

@@ -1,0 +1,277 @@
+"""Folders of photos as they come: a result and a warning that names the photo, or one clear line and nothing written.
+
+The person of the demo capture in a drawn room. `humangs detect` is run on each folder; `humangs start` goes on from its answer.
+"""
+
+import io
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from experiments.fitting.your_photos import in_a_room
+from humangs_jax import cli
+from humangs_jax.apps import detect
+from humangs_jax.avatar.video import write_video
+from humangs_jax.data.capture import load_capture
+from humangs_jax.data.keypoints.people_file import read_people
+from humangs_jax.detection.people import detect_people
+from humangs_jax.io.images import read_grey, resized, to_uint8
+
+HEIC = Path(__file__).parents[1] / "io" / "phone.heic"
+FLAG_TURNED, FLAG_MIRRORED = 6, 2
+"""EXIF orientations."""
+CAPTURE = load_capture("demo_capture")
+
+
+def view(i, size=384):
+    """A photo of the person, and the mask."""
+    photo = in_a_room(np.asarray(CAPTURE.images[i]), np.asarray(CAPTURE.masks[i]))
+    return resized(photo, size, size), resized(np.asarray(CAPTURE.masks[i]), size, size)
+
+
+def room(width=384, height=384):
+    return in_a_room(np.ones((height, width, 3)), np.zeros((height, width)))
+
+
+def save(folder, name, photo, **options):
+    folder.mkdir(parents=True, exist_ok=True)
+    mode = options.pop("mode", None)
+    picture = Image.fromarray(to_uint8(photo))
+    (picture.convert(mode) if mode else picture).save(folder / name, **options)
+
+
+def good(folder, count=2, suffix="png"):
+    for i in range(count):
+        save(folder, f"good{i}.{suffix}", view(i % CAPTURE.view_count)[0])
+
+
+def one(change, name="odd.png", **options):
+    """A folder of two good photos and one that is changed."""
+
+    def make(folder):
+        good(folder)
+        save(folder, name, change(view(0)[0]), **options)
+
+    return make
+
+
+def beside(scales, recoloured=False):
+    """People side by side, each of a share of the height."""
+
+    def make(folder):
+        for i in range(2):
+            photo = room(768, 384)
+            for k, scale in enumerate(scales):
+                size = round(384 * scale)
+                person, mask = view(i, size)
+                person = person[..., ::-1] if recoloured and k else person
+                part = photo[384 - size :, 384 * k : 384 * k + size]
+                part += mask[..., None] * (person - part)
+            save(folder, f"both{i}.png", photo)
+
+    return make
+
+
+def grey(photo):
+    return np.repeat(photo.mean(-1, keepdims=True), 3, axis=-1)
+
+
+def far(width, height, size):
+    """The person at a size in a large photo."""
+
+    def change(_):
+        photo, (person, mask) = room(width, height), view(0, size)
+        part = photo[height // 2 : height // 2 + size, width // 2 : width // 2 + size]
+        part += mask[..., None] * (person - part)
+        return photo
+
+    return change
+
+
+def behind_a_table(photo):
+    photo = photo.copy()
+    photo[230:] = 0.35, 0.2, 0.1
+    return photo
+
+
+def only(**photos):
+    def make(folder):
+        for name, photo in photos.items():
+            save(folder, f"{name}.png", photo)
+
+    return make
+
+
+def files(**contents):
+    """Two good photos, and files of these bytes; `_` in a name stands for a dot."""
+
+    def make(folder):
+        good(folder)
+        for name, data in contents.items():
+            (folder / name.replace("_", ".")).write_bytes(data)
+
+    return make
+
+
+def exif(flag):
+    tags = Image.Exif()
+    tags[0x0112] = flag
+    return tags
+
+
+def jpeg():
+    stream = io.BytesIO()
+    Image.fromarray(to_uint8(view(0)[0])).save(stream, "JPEG")
+    return stream.getvalue()
+
+
+def video(folder):
+    folder.mkdir()
+    write_video(folder / "room.mp4", [to_uint8(room(96, 96)) / 255] * 4, 10)
+
+
+def animated(folder):
+    good(folder)
+    frames = [Image.fromarray(to_uint8(view(i)[0])) for i in (2, 3)]
+    frames[0].save(folder / "odd.png", save_all=True, append_images=frames[1:])
+    frames[0].save(folder / "moving.gif", save_all=True, append_images=frames[1:])
+
+
+def duplicates(folder):
+    good(folder)
+    shutil.copy(folder / "good0.png", folder / "good0 (1).png")
+
+
+def forty(folder):
+    good(folder, 40)
+
+
+def nested(folder):
+    good(folder / "images" / "left")
+    good(folder / "images" / "right")
+
+
+OUTSIDE = r"warning: odd\.png: a part of the person is outside of the photo"
+NOBODY = r"warning: odd\.png: the person was not found in it"
+FOLDERS = {
+    # a result
+    "good": (good, 2, ""),
+    "one photo": (lambda folder: good(folder, 1), 1, ""),
+    "40 photos": (forty, 40, ""),
+    "JPEG": (lambda folder: good(folder, 2, "jpg"), 2, ""),
+    "a folder for each camera": (nested, 4, ""),
+    "the same photo twice": (duplicates, 3, ""),
+    "a statue": (one(grey), 3, ""),
+    "grey": (one(grey, mode="L"), 3, ""),
+    "alpha": (one(lambda photo: photo, mode="RGBA"), 3, ""),
+    "a palette": (one(lambda photo: photo, mode="P"), 3, ""),
+    "CMYK": (one(lambda photo: photo, "odd.jpg", mode="CMYK"), 3, ""),
+    "animated": (animated, 3, ""),
+    "turned by EXIF": (one(lambda photo: np.rot90(photo), exif=exif(FLAG_TURNED)), 3, ""),
+    "mirrored by EXIF": (one(lambda photo: photo[:, ::-1], "odd.jpg", exif=exif(FLAG_MIRRORED)), 3, ""),
+    "mirrored": (one(lambda photo: photo[:, ::-1]), 3, ""),
+    "upside down": (one(lambda photo: photo[::-1, ::-1]), 3, ""),
+    "on its side": (one(np.rot90), 3, ""),
+    "mixed sizes": (one(lambda photo: resized(photo, 600, 600)), 3, ""),
+    "behind a table": (one(behind_a_table), 3, ""),
+    "a panorama": (one(far(1600, 420, 200)), 3, ""),
+    "far away": (one(far(1000, 1000, 120)), 3, ""),
+    "somebody small beside": (beside((1.0, 0.4)), 2, ""),
+    "text files beside": (files(notes_txt=b"hello", data_json=b"{}"), 2, ""),
+    "another format under this name": (files(odd_png=jpeg()), 3, ""),
+    # a warning that names the photo
+    "feet cut off": (one(lambda photo: photo[:300]), 3, OUTSIDE),
+    "cut at one side": (one(lambda photo: photo[:, 160:]), 3, OUTSIDE),
+    "an empty room among them": (one(lambda photo: room()), 3, NOBODY),
+    "a black photo among them": (one(np.zeros_like), 3, NOBODY),
+    "a speck": (one(far(1000, 1000, 30)), 3, NOBODY),
+    "one pixel": (one(lambda photo: photo[:1, :1]), 3, NOBODY),
+    # one clear line
+    "no person": (only(room=room()), None, r"no person in room\.png: expected one"),
+    "black": (only(dark=np.zeros((64, 48, 3))), None, r"no person in dark\.png: expected one"),
+    "tiny photos": (only(a=room(8, 8), b=room(1, 1)), None, r"no person in a\.png, b\.png: expected one"),
+    "two people": (beside((1.0, 0.9)), None, r"2 people in both0\.png, both1\.png: expected one\. --person 0 to 1"),
+    "a photo cut short": (files(odd_jpg=jpeg()[:2000]), None, r"odd\.jpg"),
+    "an empty file": (files(odd_jpg=b""), None, r"odd\.jpg"),
+    "text under a photo's name": (files(odd_jpg=b"<html>404</html>"), None, r"odd\.jpg"),
+    "a HEIC without the extra": (files(odd_heic=HEIC.read_bytes()), None, r"odd\.heic.*heic"),
+    "one name with two suffixes": (one(lambda photo: photo, "good0.jpg"), None, r"good0\.jpg and .*good0\.png"),
+    "a video": (video, None, "no photo: expected"),
+    "text files alone": (lambda folder: (folder.mkdir(), (folder / "a.txt").write_text("a")), None, "no photo: expected"),
+    "nothing": (lambda folder: folder.mkdir(), None, "no photo: expected"),
+    "a folder that is not there": (lambda folder: None, None, "no such folder"),
+}  # fmt: skip
+FAST = (
+    "good",
+    "one name with two suffixes",
+    "a HEIC without the extra",
+    "a photo cut short",
+    "feet cut off",
+    "nothing",
+)
+
+
+@pytest.fixture(scope="module")
+def remembered():
+    """What was found in photos that an earlier folder has, too."""
+    known = {}
+
+    def find(networks, photo):
+        key = (photo.shape, photo.tobytes())
+        if key not in known:
+            known[key] = detect_people(networks, photo)
+        return known[key]
+
+    return find
+
+
+def run(kind, command, remembered, monkeypatch, capsys):
+    """Exit code, lines of errors and of warnings."""
+    monkeypatch.setattr(detect, "detect_people", remembered)
+    monkeypatch.setitem(sys.modules, "pi_heif", None)
+    FOLDERS[kind][0](Path("photos"))
+    code = cli.execute(command)
+    err = capsys.readouterr().err
+    assert "Traceback" not in err
+    return code, *([line for line in err.splitlines() if f"{word}:" in line] for word in ("error", "warning"))
+
+
+def kinds(names, fast):
+    return [pytest.param(name, marks=() if name in fast else pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize("kind", kinds(FOLDERS, FAST))
+def test_the_person_is_found_or_one_line_says_why_not(kind, remembered, tmp_path, monkeypatch, capsys):
+    _, count, said = FOLDERS[kind]
+    monkeypatch.chdir(tmp_path)
+    code, errors, warnings = run(kind, ["detect", "photos", "--out", "found"], remembered, monkeypatch, capsys)
+    if count is None:
+        assert code == cli.BAD_DATA and len(errors) == 1 and not warnings
+        assert re.search(said, errors[0])
+        assert {path.name for path in Path("found").glob("*")} <= {"people.png"}
+        return
+    assert code == 0 and not errors
+    assert len(warnings) == bool(said) and all(re.search(said, line) for line in warnings)
+    images = read_people(Path("found/keypoints.json"))[1]
+    assert len(images) == count
+    for each in images:
+        mask = read_grey(Path("found/masks") / Path(each.image).with_suffix(".png"))
+        assert mask.shape == each.size[::-1] and bool(mask.any()) == (each.people[0] is not None)
+
+
+HOPELESS = [kind for kind, (_, count, _) in FOLDERS.items() if count is None and kind != "one name with two suffixes"]
+
+
+@pytest.mark.parametrize("kind", kinds(HOPELESS, ("no person", "a photo cut short", "nothing")))
+def test_start_says_in_one_line_what_is_wrong_with_the_photos(kind, remembered, tmp_path, monkeypatch, capsys):
+    """Or that cameras are missing; there is no capture then."""
+    monkeypatch.chdir(tmp_path)
+    command = ["start", "photos", "--out", "me", "--no-browser"]
+    code, errors, warnings = run(kind, command, remembered, monkeypatch, capsys)
+    assert code == cli.BAD_DATA and len(errors) == 1 and not warnings
+    assert not Path("me").exists()
