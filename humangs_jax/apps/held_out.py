@@ -33,14 +33,16 @@ def held_out_psnr(
     variables: PyTree, config: HumanGSConfig, capture: Capture, refinement: RefineConfig | None
 ) -> HeldOut | None:
     """How well the photo that has the nearest other one is reproduced by an avatar of the others, over the person, in a crop of
-    `SIZE` pixels; None for fewer than four photos or without masks. Body and cameras are those of all photos.
+    `SIZE` pixels; None for fewer than four photos or without masks. Body and cameras are those of all photos. In its place is a
+    second copy of the nearest photo: the programs for that number of photos are compiled already.
     """
     capture = equal_exposure(capture)
     if capture.masks is None or capture.view_count < LEAST_PHOTOS:
         return None
     views = np.arange(capture.view_count)
-    view = int(_distances(capture).min(axis=1).argmin())
-    others = capture.select(views[views != view])
+    apart = _distances(capture)
+    view = int(apart.min(axis=1).argmin())
+    others = capture.select(np.where(views == view, int(apart[view].argmin()), views))
     avatar = reconstruct(variables, config, others)
     if refinement is not None:
         avatar = refine(avatar, others, refinement)

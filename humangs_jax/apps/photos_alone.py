@@ -21,11 +21,15 @@ from humangs_jax.io.images import DIAGONAL_35MM, focal_length
 
 @dataclasses.dataclass(frozen=True)
 class PhotosImported:
-    """What `import_photos` did, a line each; warnings: what a user should know. moments: see `PersonCameras`."""
+    """What `import_photos` did, a line each; warnings: what a user should know. people, person: who was found in the photos, and
+    the number of the one who is meant. one_moment: whether several photos share one pose, so that cameras can be refined.
+    """
 
     lines: tuple[str, ...]
     warnings: tuple[str, ...]
-    moments: int
+    people: list[PhotoPeople]
+    person: int
+    one_moment: bool
 
 
 def import_photos(
@@ -48,7 +52,6 @@ def import_photos(
     photos = detect.same_people(detect.detect_photos(names, map(detect.upright, files)))
     # beside `out`, which a refusal leaves as it is
     number = detect.chosen(photos, person, out, out.with_name(f"{out.resolve().name}_{detect.SHEET_FILE}"))
-    without = detect.absent(photos, number)
     shown = [i for i, photo in enumerate(photos) if photo.people[number] is not None]
     people = [found for i in shown if (found := photos[i].people[number]) is not None]
     focal = [focal_length(files[i]) for i in shown]
@@ -75,10 +78,8 @@ def import_photos(
         for photo, view in zip(used, views, strict=True)
     ]
     detect.add_to_capture(out, padded, number, masks=own_masks and masks is None)
-    warnings = [f"{name}: left out: the person was not found in it" for name in without]
-    return PhotosImported(
-        _lines(seen, found, report), (*warnings, *found.warnings, *report.checks.warnings), found.moments
-    )
+    warnings = (*found.warnings, *report.checks.warnings)
+    return PhotosImported(_lines(seen, found, report), warnings, photos, number, found.moments == 1 < len(used))
 
 
 def _calibration(seen: PersonViews, found: PersonCameras, images: Path) -> Calibration:

@@ -142,12 +142,13 @@ class Start:
             )
             write_json(self.out / MARK, {"photos": str(self.photos.resolve())})
         tell("\n".join(found.lines))
+        tell_found(found.people, found.person)
         for warning in found.warnings:
             warn(warning)
         wrote(self.out / SHEET_FILE, "who was found in the photos")
         keypoints = self.out / KEYPOINTS_FILE if material.keypoints is None else material.keypoints
         material = dataclasses.replace(material, keypoints=keypoints)
-        self._finish(self._fit(material), limits)
+        self._finish(self._fit(material, found.one_moment), limits)
 
     def _detect(self, material: "Material", wanted: list[str]) -> "Material":
         """Masks and keypoints of the imported photos where there are none."""
@@ -220,8 +221,8 @@ class Start:
             warn(f"photos were turned upright: {material.keypoints} should be of those in {self.out / 'images'}")
         return report
 
-    def _fit(self, material: "Material") -> "Capture":
-        """The body, written into the capture folder."""
+    def _fit(self, material: "Material", one_moment: bool | None = None) -> "Capture":
+        """The body, written into the capture folder. one_moment: of photos alone, see `PhotosImported`."""
         with stage("fitting the body"):
             from humangs_jax.body.library import load_body
             from humangs_jax.data.capture import load_capture
@@ -238,22 +239,26 @@ class Start:
             found_here = material.keypoints.parent == self.out  # of the one person who was chosen
             person = None if found_here else self.person
             keypoints = read_keypoints(material.keypoints, photos.names, width, height, person=person)
-            fitted = fit_photos(photos, keypoints, load_body())
+            fitted = fit_photos(photos, keypoints, load_body(), fixed_cameras=one_moment is not None)
         with stage("examining the fit"):
             report = fitted.report
             report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
             write_fitted(self.out, self.out, fitted.capture, report, fitted.record)
         tell(f"\n{report}")
         capture = load_capture(self.out, fit_masks=self.fit_masks)
-        if capture.masks is None or not (capture.masks > 0.5).any():
-            return capture
-        with stage("refining the body by the masks"):
-            config = usual_config(fitted=True, fixed_cameras=not fitted.camera_errors)
-            refined = refine_capture(capture, keypoints=keypoints, config=config)
-            if refined.report.kept:
-                write_fitted(self.out, self.out, refined.capture, refined.report, fitted.record)
-        tell(f"\n{refined.report}")
-        return refined.capture
+        if capture.masks is not None and (capture.masks > 0.5).any():
+            with stage("refining the body by the masks"):
+                fixed = not (fitted.camera_errors or one_moment)
+                config = usual_config(fitted=True, fixed_cameras=fixed, calibrated=one_moment is None)
+                refined = refine_capture(capture, keypoints=keypoints, config=config)
+                capture, report = refined.capture, refined.report
+            tell(f"\n{report}")
+        if self.height is not None:
+            from humangs_jax.fitting.person_cameras import scaled_to_height
+
+            capture = scaled_to_height(capture, self.height)
+        write_fitted(self.out, self.out, capture, report, fitted.record)
+        return capture
 
     def _check(self, capture: "Capture") -> None:
         """The sheet of the body over the photos, and what it says."""

@@ -97,17 +97,21 @@ class CaptureRefineConfig:
 FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pose=8.0, betas=1.0)
 """Where a fit to keypoints with calibrated cameras is off: shape and pose, more than cameras. Its keypoints hold the joints where
 clothes would pull them away."""
+FROM_PERSON = dataclasses.replace(FITTED, focal=0.05, camera_rotation=2.0, camera_center=0.08)
+"""The same with cameras that were found from the person."""
 SKIN = 0.001
 """Metres, for `StateStd.clothing`: masks of somebody without clothes."""
 
 
-def usual_config(fitted: bool, *, fixed_cameras: bool = False, bare: bool = False) -> CaptureRefineConfig:
+def usual_config(
+    fitted: bool, *, fixed_cameras: bool = False, bare: bool = False, calibrated: bool = True
+) -> CaptureRefineConfig:
     """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given. bare: the person wears tight
-    clothes or none, and the body is to fill the masks.
+    clothes or none, and the body is to fill the masks. calibrated: False for cameras that were found from the person.
     """
     config = CaptureRefineConfig(fixed_cameras=fixed_cameras)
     if fitted:
-        config = dataclasses.replace(config, std=FITTED, independent=100.0)
+        config = dataclasses.replace(config, std=FITTED if calibrated else FROM_PERSON, independent=100.0)
     if bare:
         std = dataclasses.replace(config.std, clothing=SKIN)
         config = dataclasses.replace(config, std=std, robust_scales=(1.0, 1.0))
