@@ -17,7 +17,6 @@ from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.usable_views import usable_indices
 from humangs_jax.fitting.refine_rounds import (
-    SKIN,
     CaptureRefineConfig,
     Scene,
     capture_origin,
@@ -34,10 +33,6 @@ from humangs_jax.geometry.transform import EXACT
 LEAST_GAIN, LEAST_GAIN_OF_MASKS = 0.02, 0.2
 """Share of the loss that a kept change removes, with keypoints, and by masks alone. Masks of clothes are fitted a little better
 by wrong bodies: for four people who started at the truth, by up to 0.15; keypoints show that.
-"""
-KEYPOINTS_WORSE = 1.1
-"""A change that is kept leaves the keypoints' error below this multiple of the start's, which a fit to them made as small as can
-be: right ones have 0.8 to 1.07, wrong bodies that fill clothes 1.8. Of somebody without clothes the masks are believed.
 """
 LEAST_DIFFERENCE = 0.005
 """Least decrease of the loss that is kept: less than half a percent of the silhouettes is rounding of pixels."""
@@ -75,7 +70,7 @@ def refine_capture(
     state, outcome, move = scene.run()
     tried = moved_capture(capture, scene.origin, state)
     before, found = scene.score(capture), scene.score(tried)
-    kept = _better(found, before, KEYPOINTS_WORSE if config.std.clothing > SKIN else np.inf)
+    kept = _better(found, before, config.keypoints_worse)
     best, score = (tried, found) if kept else (capture, before)
     stages = [Stage.of("silhouettes", outcome)]
     kinds = {"silhouettes": before.iou, "keypoints": before.keypoints}

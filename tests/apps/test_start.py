@@ -159,7 +159,7 @@ def detected(mine, monkeypatch):
             PhotoPeople(f"{name}.png", (512, 512), np.ones((48, 48, 3)), (bystander, Found(person, mask, (0, 0), 1e5)))
         )
 
-    def stop(self, material):
+    def stop(self, material, one_moment=None):
         told.append(material)
         raise ValueError("the fit")
 

@@ -196,7 +196,7 @@ def test_nothing_to_refine_by_is_an_error(masks):
 )
 def test_small_gains_are_kept_where_keypoints_do_not_get_worse(before, after, kept):
     score = lambda loss, keypoints: Score(np.zeros(1), 1 - loss, keypoints, loss)
-    assert module._better(score(*after), score(*before), module.KEYPOINTS_WORSE) is kept
+    assert module._better(score(*after), score(*before), module.DEFAULT_CONFIG.keypoints_worse) is kept
     bare = module._better(score(*after), score(*before), np.inf)
     assert bare is (kept or after == (0.20, 4.5))
 
