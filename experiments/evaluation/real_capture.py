@@ -24,14 +24,14 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.masks import person_box
-from humangs_jax.data.photos import Photos, on_white_background
-from humangs_jax.detection.blazepose import Networks, bilinear
-from humangs_jax.detection.people import DetectedPerson, detect_people
+from humangs_jax.data.photos import on_white_background, write_description
+from humangs_jax.detection.blazepose import Crop, Networks, bilinear, mask_in_photo
+from humangs_jax.detection.people import LARGER, DetectedPerson
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.io.images import resized, to_uint8
+from humangs_jax.io.images import resized, to_uint8, write_png
 from humangs_jax.io.npz import write_npz
 
 PACKAGE, VERSION = "pose2sim", "0.10.49"
@@ -39,6 +39,8 @@ DEMO = "Pose2Sim/Demo_SinglePerson"
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
 FRAMES = (0, 12, 33, 66, 90)
 """Of the videos: those that are measured."""
+STRAIGHT, BENT = "straight", "bent"
+"""Photos without the lenses' distortion, and as they were taken."""
 SIZE, PERSON = 512, 440
 """Pixels a side of a photo, and of the man's height in it."""
 EVERY = 5
@@ -74,10 +76,17 @@ class RealFrame(NamedTuple):
     crop: Float[np.ndarray, "v 3 3"]
     names: tuple[str, ...]
 
-    def photos(self, masks: Float[np.ndarray, "v s s"], cameras: Camera | None = None) -> Photos:
-        """What `fit_photos` takes: the photos on white by these masks, all of one moment. cameras: not the published ones."""
-        frames = np.zeros(len(self.images), np.int32)
-        return Photos(on_white_background(self.images, masks), masks, cameras or self.cameras, frames, self.names)
+    def save(self, folder: Path, masks: Float[np.ndarray, "v s s"], cameras: Camera | None = None) -> None:
+        """A capture folder of the photos, with the room, and these masks. cameras: not the published ones."""
+        views, cameras = [], cameras or self.cameras
+        for i, name in enumerate(self.names):
+            paths = {"image": f"images/{name}.png", "mask": f"masks/{name}.png"}
+            for path, picture in zip(paths.values(), (self.images[i], masks[i]), strict=True):
+                (folder / path).parent.mkdir(parents=True, exist_ok=True)
+                write_png(folder / path, picture)
+            matrices = {key: np.asarray(getattr(cameras, key)[i], float).tolist() for key in ("K", "cam_from_world")}
+            views.append(paths | matrices | {"frame": 0})
+        write_description(folder, views)
 
     def truth(self) -> Float[np.ndarray, "v s s 3"]:
         """The man alone on white, by the careful masks, the rims in colours of his own."""
@@ -161,25 +170,24 @@ def read_frames(video: Path, wanted: Collection[int]) -> dict[int, UInt8[np.ndar
 
 
 def prepare(folder: Path, frames: Sequence[int] = FRAMES, *, straight: bool = True) -> dict[int, RealFrame]:
-    """The frames of the capture, from `folder`/prepared where they are there. straight: without the lenses' distortion."""
-    kind = "" if straight else "_bent"
-    stored = {frame: folder / "prepared" / f"{frame:03d}{kind}.npz" for frame in frames}
-    missing = [frame for frame, file in stored.items() if not file.exists()]
+    """The frames of the capture, from `folder`/prepared where they are there. straight: without the lenses' distortion.
+
+    The empty room, as each camera sees it, is in room_NAME.png there.
+    """
+    place, kind = folder / "prepared", STRAIGHT if straight else BENT
+    missing = [frame for frame in frames if not (place / f"{frame:03d}_{kind}.npz").exists()]
     if missing:
         demo, networks = unpacked(folder), Networks()
-        cameras = read_cameras(demo / "calibration" / "Calib.qca.txt")
-        if not straight:
-            cameras = {name: camera._replace(distortion=np.zeros(4)) for name, camera in cameras.items()}
-        views = [
-            _views(networks, demo / "videos" / f"{name}.mp4", cameras[name], missing)
-            for name in bar(CAMERAS, desc="preparing videos", unit="video")
-        ]
-        for frame in missing:
-            stored[frame].parent.mkdir(exist_ok=True)
-            write_npz(
-                stored[frame], {name: np.stack([view[frame][name] for view in views]) for name in views[0][frame]}
-            )
-    return {frame: _load(file, frame) for frame, file in stored.items()}
+        place.mkdir(exist_ok=True)
+        cameras, views = read_cameras(demo / "calibration" / "Calib.qca.txt"), []
+        for name in bar(CAMERAS, desc="preparing videos", unit="video"):
+            found, room = _views(networks, demo / "videos" / f"{name}.mp4", cameras[name], missing)
+            write_png(place / f"room_{name}.png", room)
+            views.append(found)
+        for key in views[0]:
+            arrays = {name: np.stack([view[key][name] for view in views]) for name in views[0][key]}
+            write_npz(place / f"{key}.npz", arrays)
+    return {frame: _load(place / f"{frame:03d}_{kind}.npz", frame) for frame in frames}
 
 
 def _load(file, frame):
@@ -194,38 +202,49 @@ def _load(file, frame):
 
 
 def _views(networks, video, camera, frames):
-    """Of one camera: frame -> arrays of its view."""
+    """Of one camera: name of a file -> arrays of its view; and the empty room."""
     photos = read_frames(video, {*frames, *range(0, 100, EVERY)})
     people = {i: largest_person(networks, photo.astype(np.float32) / 255) for i, photo in photos.items()}
     room, known = background(list(photos.values()), [person.mask for person in people.values()])
     found = {}
     for frame in frames:
         person, photo = people[frame], photos[frame].astype(np.float32) / 255
-        careful = careful_mask(photo, room, known, person.mask)
-        (top, bottom), (left, right) = person_box(careful > 0.5)
-        side = (bottom - top) * SIZE / PERSON
-        corner = np.asarray([left + right - side, top + bottom - side]) / 2
-        crop = np.diag([SIZE / side, SIZE / side, 1.0]) @ [[1, 0, -corner[0]], [0, 1, -corner[1]], [0, 0, 1]]
-        pictures = {"images": photo, "detected": person.mask, "careful": careful}
-        found[frame] = {name: _cut(picture, camera, corner, side) for name, picture in pictures.items()}
-        found[frame] |= {"K": crop @ camera.K, "cam_from_world": camera.cam_from_world, "crop": crop}
-        points = (camera.undistorted(person.pixels) - corner) * SIZE / side
-        found[frame] |= {"points": points.astype(np.float32), "confidences": person.visibility.astype(np.float32)}
-        found[frame] |= {"world": person.world}
-    return found
+        pictures = {"images": photo, "detected": person.mask}
+        pictures["careful"] = careful_mask(photo, room, known, person.mask)
+        for kind, lens in ((STRAIGHT, camera), (BENT, camera._replace(distortion=np.zeros(4)))):
+            found[f"{frame:03d}_{kind}"] = _view(pictures, person, lens)
+    return found, room
+
+
+def _view(pictures, person, camera):
+    """A square around the man, with his landmarks and the camera of the square."""
+    (top, bottom), (left, right) = person_box(pictures["careful"] > 0.5)
+    side = (bottom - top) * SIZE / PERSON
+    corner = np.asarray([left + right - side, top + bottom - side]) / 2
+    crop = np.diag([SIZE / side, SIZE / side, 1.0]) @ [[1, 0, -corner[0]], [0, 1, -corner[1]], [0, 0, 1]]
+    found = {name: _cut(picture, camera, corner, side) for name, picture in pictures.items()}
+    found |= {"K": crop @ camera.K, "cam_from_world": camera.cam_from_world, "crop": crop, "world": person.world}
+    points = (camera.undistorted(person.pixels) - corner) * SIZE / side
+    return found | {"points": points.astype(np.float32), "confidences": person.visibility.astype(np.float32)}
 
 
 def _cut(picture, camera, corner, side):
-    """A square of a picture of the video, 8 bits: two samples and more for a pixel, then means by area."""
-    fine = SIZE * max(1, round(2 * side / SIZE))
+    """A square of a picture of the video, 8 bits: about one sample a pixel, then means by area."""
+    fine = SIZE * max(1, round(side / SIZE))
     steps = (np.arange(fine) + 0.5) * side / fine
     grid = camera.distorted(np.stack(np.meshgrid(steps, steps), axis=-1) + corner) - 0.5
     return to_uint8(resized(bilinear(picture, grid, 0.0), SIZE, SIZE))
 
 
 def largest_person(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> DetectedPerson:
-    """Of those whom the detector finds: the man fills the photo, bystanders do not."""
-    return max(detect_people(networks, photo), key=lambda person: float(person.mask.sum()))
+    """Of those whom the detector finds in the whole photo: the man fills it, bystanders do not."""
+    height, width = photo.shape[:2]
+    found = networks.detect(photo, Crop(np.asarray([width, height]) / 2, max(width, height), 0.0))
+    first = networks.landmarks(photo, max((each.crop() for each in found), key=lambda crop: crop.side))
+    again = first.again.crop()
+    person = networks.landmarks(photo, again._replace(side=min(again.side, LARGER * first.crop.side)))
+    mask = mask_in_photo(person, width, height)
+    return DetectedPerson(person.pixels + 0.5, person.visibility, person.world, person.presence, mask, person.crop.side)
 
 
 def background(
@@ -288,8 +307,13 @@ def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]
 
 def drawn_scores(avatar: Avatar, views: Capture, photos: RealFrame, shown: Sequence[int]) -> dict[str, float]:
     """psnr and psnr_foreground (dB) of an avatar from the cameras and in the poses of these views, means over them."""
-    truth = dataclasses.replace(views, images=photos.truth()[list(shown)], masks=photos.careful[list(shown)])
-    scores = score(draw_views(avatar, views).images, truth)
+    truth = photos.truth()[list(shown)]
+    return drawn_psnrs(avatar, dataclasses.replace(views, images=truth, masks=photos.careful[list(shown)]))
+
+
+def drawn_psnrs(avatar: Avatar, truth: Capture) -> dict[str, float]:
+    """The same against the photos of these views."""
+    scores = score(draw_views(avatar, truth).images, truth)
     return {"psnr": float(scores.psnr), "psnr_foreground": float(scores.psnr_foreground)}
 
 

@@ -1,0 +1,121 @@
+"""Photos that come with nothing, for `real_person.py`: cameras from the person, people in rooms, and `humangs start`."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from experiments.evaluation.real_cameras import to_reference
+from experiments.evaluation.real_capture import CAMERAS, DEMO, SIZE, RealFrame, largest_person, read_frames
+from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
+from humangs_jax.body.library import load_body
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
+from humangs_jax.detection.blazepose import Networks
+from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.io.images import image_size, read_image, resized
+
+PHOTOS, NOVEL = 4, 4
+PIXELS = 12e6
+"""Of each photo of `started`."""
+
+
+def without_calibration(frame: RealFrame, sizes: list[tuple[int, int]]) -> RealFrame:
+    """The frame with cameras from the person, and with left and right as they see them. sizes: of the whole photos, pixels.
+
+    Raises: ValueError where no cameras are found.
+    """
+    from humangs_jax.fitting.person_cameras import PersonViews, cameras_from_person  # ty: ignore[import-not-found]
+
+    back = np.linalg.inv(frame.crop)
+    points = frame.keypoints.points * back[:, None, [0, 1], [0, 1]] + back[:, None, :2, 2]
+    unknown = np.full(len(points), np.nan)
+    found = cameras_from_person(
+        PersonViews(
+            points, frame.keypoints.confidences, frame.world, MEDIAPIPE_33.names, tuple(sizes), unknown, frame.names
+        )
+    )
+    cameras = [
+        Camera.from_opencv(crop @ np.asarray(own.K, float), own.cam_from_world, SIZE, SIZE)
+        for crop, own in zip(frame.crop, found.cameras, strict=True)
+    ]
+    keypoints = frame.keypoints
+    order = np.where(found.mirrored[:, None], MEDIAPIPE_33.mirror, np.arange(len(MEDIAPIPE_33.names)))
+    pick = lambda values: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
+    keypoints = dataclasses.replace(keypoints, points=pick(keypoints.points), confidences=pick(keypoints.confidences))
+    return frame._replace(cameras=stack_cameras(cameras), keypoints=keypoints, world=pick(frame.world))
+
+
+def video_sizes(data: Path) -> list[tuple[int, int]]:
+    """Width and height of each camera's photos."""
+    return [image_size(data / "prepared" / f"room_{name}.png") for name in CAMERAS]
+
+
+# Synthetic people ----------------------------------------------------------------------------------------------------
+
+
+def person_in_rooms(seed: int, data: Path) -> tuple[RealFrame, Capture, Capture]:
+    """A synthetic person in the rooms of the real capture, as detected; the true capture of the photos; views held out."""
+    subject = make_evaluation_subject(seed, load_body(), [PHOTOS], SIZE, HeldOut(NOVEL, 0, 0))
+    true, networks = subject.inputs(PHOTOS), Networks()
+    assert true.masks is not None
+    images, people = [], []
+    for image, mask, name in zip(true.images, true.masks, CAMERAS, strict=True):
+        room = read_image(data / "prepared" / f"room_{name}.png")[0]
+        height, width = room.shape[:2]
+        room = resized(room[(height - width) // 2 :][:width], SIZE, SIZE)
+        photo = image + (1 - mask[..., None]) * (room - 1)
+        images.append((np.round(255 * photo) / 255).astype(np.float32))
+        people.append(largest_person(networks, images[-1]))
+    stack = lambda name: np.stack([getattr(person, name) for person in people])
+    keypoints = Keypoints(stack("pixels").astype(np.float32), stack("visibility").astype(np.float32), MEDIAPIPE_33)
+    same = np.broadcast_to(np.eye(3), (PHOTOS, 3, 3))
+    names = tuple(f"person_{seed}_{name}" for name in CAMERAS)
+    found = RealFrame(np.stack(images), stack("mask"), true.masks, true.cameras, keypoints, stack("world"), same, names)
+    return found, true, subject.held_out
+
+
+def as_fitted(held_out: Capture, true: Camera, body: Capture) -> Capture:
+    """The held-out views in the world of a found body, whose cameras are the true ones in another world."""
+    move = to_reference(body.cameras, true)
+    cameras = []
+    for K, matrix in zip(held_out.cameras.K, held_out.cameras.cam_from_world, strict=True):
+        moved = np.asarray(matrix, float) @ move.matrix()
+        moved[:3] /= move.scale
+        cameras.append(Camera.from_opencv(K, moved, SIZE, SIZE))
+    return dataclasses.replace(
+        held_out, cameras=stack_cameras(cameras), betas=body.betas, poses=body.poses, body=body.body
+    )
+
+
+# The command ---------------------------------------------------------------------------------------------------------
+
+
+def started(data: Path, frame: int) -> dict[str, float]:
+    """Seconds of `humangs start` on four photos of 12 megapixels, with an empty compile cache and again."""
+    with tempfile.TemporaryDirectory() as place:
+        photos = Path(place) / "photos"
+        photos.mkdir()
+        for name in CAMERAS:
+            image = read_frames(data / DEMO / "videos" / f"{name}.mp4", [frame])[frame]
+            height, width = image.shape[:2]
+            larger = np.sqrt(PIXELS / (height * width))
+            size = round(width * larger), round(height * larger)
+            Image.fromarray(image).resize(size, Image.Resampling.BICUBIC).save(photos / f"{name}.jpg", quality=95)
+        environment = os.environ | {"HUMANGS_COMPILE_CACHE": str(Path(place) / "cache")}
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        seconds = {}
+        for when in ("first", "compiled"):
+            out = Path(place) / when
+            begun = time.perf_counter()
+            command = [sys.executable, "-m", "humangs_jax.cli", "start", photos, "--out", out, "--no-browser"]
+            subprocess.run([str(word) for word in command], check=True, env=environment)
+            seconds[when] = time.perf_counter() - begun
+        return seconds | {"load": os.getloadavg()[0]}
