@@ -8,21 +8,29 @@ import tempfile
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 from PIL import Image
 
 from experiments.evaluation.real_cameras import to_reference
 from experiments.evaluation.real_capture import CAMERAS, DEMO, SIZE, RealFrame, largest_person, read_frames
 from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import images, motion_views, turntable_views
+from humangs_jax.avatar.sheets import tile
+from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.library import load_body
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
+from humangs_jax.data.motion.loading import load_motion
 from humangs_jax.detection.blazepose import Networks
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.io.images import image_size, read_image, resized
+from humangs_jax.io.images import image_size, read_image, resized, to_uint8
 
 PHOTOS, NOVEL = 4, 4
+COLUMNS = 6
+"""Of the sheet of pictures."""
 PIXELS = 12e6
 """Of each photo of `started`."""
 
@@ -119,3 +127,18 @@ def started(data: Path, frame: int) -> dict[str, float]:
             subprocess.run([str(word) for word in command], check=True, env=environment)
             seconds[when] = time.perf_counter() - begun
         return seconds | {"load": os.getloadavg()[0]}
+
+
+# Pictures ------------------------------------------------------------------------------------------------------------
+
+
+def draw_sheet(avatar: Avatar, body: Capture, path: Path) -> None:
+    """The avatar from all sides in the pose of the photos, and walking; no photo."""
+    shot = Shot(width=200, height=300)
+    around = images(avatar, *turntable_views(avatar, body.pose(0), COLUMNS, shot), shot)
+    motion = load_motion(rest_joints=avatar.rest_joints)
+    chosen = np.linspace(0, len(motion.translations) - 1, COLUMNS).astype(int)
+    poses, cameras = motion_views(avatar, motion, dataclasses.replace(shot, azimuth=40))
+    walking = images(avatar, poses[chosen], cameras[chosen], shot)
+    sheet = to_uint8(tile(np.stack([*around, *walking]), columns=COLUMNS))
+    Image.fromarray(sheet).save(path, quality=90)

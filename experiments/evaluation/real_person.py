@@ -45,7 +45,14 @@ from experiments.evaluation.real_capture import (
     held_out,
     prepare,
 )
-from experiments.evaluation.real_people import as_fitted, person_in_rooms, started, video_sizes, without_calibration
+from experiments.evaluation.real_people import (
+    as_fitted,
+    draw_sheet,
+    person_in_rooms,
+    started,
+    video_sizes,
+    without_calibration,
+)
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
@@ -60,7 +67,7 @@ from humangs_jax.refinement.config import ROUNDS, RefineConfig
 from humangs_jax.refinement.refine import refine
 
 TABLE = "real_person"
-MASKS = ("detected", "careful")
+MASKS, WAYS = ("detected", "careful"), ("refine", "fit")
 SEEDS = (9001, 9002, 9003)
 """Of synthetic people."""
 
@@ -98,13 +105,18 @@ def main() -> None:
     parser.add_argument("--label", default="now", help="of this state of the package")
     parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS))
     parser.add_argument("--frames", type=int, nargs="+", default=list(FRAMES), help="of the videos, 0 to 99")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS), help="of finding the body")
+    parser.add_argument("--pictures", type=Path, help="JPEG of the avatar from all sides, and walking")
     parser.add_argument("--page", type=Path, help="page whose table is written")
     arguments = parser.parse_args()
     if not all(0 <= frame < 100 for frame in arguments.frames):
         parser.error("--frames: expected 0 to 99")
-    results, man = Results(arguments.json, arguments.label), Man(arguments.data, arguments.frames)
+    results, man = Results(arguments.json, arguments.label), Man(arguments.data, arguments.frames, arguments.ways)
     for row in arguments.rows:
         ROWS[row](results, man)
+    if arguments.pictures:
+        body = man.body(man.numbers[0], "detected")
+        draw_sheet(avatar_of(body), body, arguments.pictures)
     text = section(results.all)
     print(text)
     if arguments.page:
@@ -119,19 +131,19 @@ ALL = (0, 1, 2, 3)
 class Man:
     """What the package makes of the capture; each thing once. frames: by number, and what else is to be looked at by name."""
 
-    def __init__(self, data: Path, frames: Sequence[int]) -> None:
-        self.data, self.numbers = data, list(frames)
+    def __init__(self, data: Path, frames: Sequence[int], ways: Sequence[str]) -> None:
+        self.data, self.numbers, self.ways = data, list(frames), ways
         self.frames: dict[int | str, RealFrame] = dict(prepare(data, frames))
         self.reference = reference_cameras(data)
-        self.photos, self.bodies = functools.cache(self._photos), functools.cache(self._bodies)
+        self.photos, self.body = functools.cache(self._photos), functools.cache(self._body)
 
     def _photos(self, name: int | str, masks: str) -> Photos:
         frame, place = self.frames[name], self.data / "captures" / f"{name}_{masks}"
         frame.save(place, getattr(frame, masks))
         return load_photos(place, fit_masks=True)
 
-    def _bodies(self, name: int | str, masks: str, views: tuple[int, ...] = ALL) -> dict[str, Capture]:
-        """A capture of some views with its body, by the way in which that was found."""
+    def _body(self, name: int | str, masks: str, way: str = "refine", views: tuple[int, ...] = ALL) -> Capture:
+        """A capture of some views with its body."""
         photos, keypoints, at = self.photos(name, masks), self.frames[name].keypoints, np.asarray(views)
         assert photos.masks is not None
         confidences = keypoints.confidences[at]
@@ -139,8 +151,9 @@ class Man:
         cameras = jax.tree.map(lambda leaf: leaf[at], photos.cameras)
         names = tuple(photos.names[view] for view in views)
         chosen = Photos(photos.images[at], photos.masks[at], cameras, photos.frames[at], names)
-        start = fit_photos(chosen, keypoints, load_body()).capture
-        return {"fit": start, "refine": refine_capture(start, keypoints=keypoints).capture}
+        if way == "fit":
+            return fit_photos(chosen, keypoints, load_body()).capture
+        return refine_capture(self.body(name, masks, "fit", views), keypoints=keypoints).capture
 
 
 def avatar_of(capture: Capture) -> Avatar:
@@ -153,19 +166,18 @@ def avatar_of(capture: Capture) -> Avatar:
 
 def calibrated(results: Results, man: Man) -> None:
     """The published calibration and nothing else."""
-    for masks, number in bar(list(itertools.product(MASKS, man.numbers)), desc="published calibration", unit="frame"):
-        for way in ("fit", "refine"):
-            results.measure(
-                f"calibrated, {way}, {masks}", str(number), functools.partial(_calibrated, man, number, masks, way)
-            )
+    cases = list(itertools.product(MASKS, man.ways, man.numbers))
+    for masks, way, number in bar(cases, desc="published calibration", unit="frame"):
+        row, made = f"calibrated, {way}, {masks}", functools.partial(_calibrated, man, number, masks, way)
+        results.measure(row, str(number), made)
 
 
 def _calibrated(man, number, masks, way):
-    frame, body = man.frames[number], man.bodies(number, masks)[way]
+    frame, body = man.frames[number], man.body(number, masks, way)
     known, unseen = held_out(body, frame, avatar_of), []
     for view in ALL:
         used = tuple(other for other in ALL if other != view)
-        blind = man.bodies(number, masks, used)[way]
+        blind = man.body(number, masks, way, used)
         camera = seen_from(blind.cameras, used, man.reference.of(frame), view)
         shown = dataclasses.replace(blind.select([0]), cameras=camera)
         drawn = drawn_scores(avatar_of(blind), shown, frame, [view])
@@ -185,8 +197,8 @@ def poses(results: Results, man: Man) -> None:
 
 
 def _posed(man, first, number):
-    avatar = avatar_of(man.bodies(first, "detected")["refine"])
-    return drawn_scores(avatar, man.bodies(number, "detected")["refine"], man.frames[number], ALL)
+    avatar = avatar_of(man.body(first, "detected"))
+    return drawn_scores(avatar, man.body(number, "detected"), man.frames[number], ALL)
 
 
 def uncalibrated(results: Results, man: Man) -> None:
@@ -203,7 +215,7 @@ def uncalibrated(results: Results, man: Man) -> None:
 def _uncalibrated(man, number, frame, sizes, masks):
     name = f"{number}_bent"
     man.frames[name] = frame = without_calibration(frame, sizes)
-    body, reference = man.bodies(name, masks)["refine"], man.reference.of(frame)
+    body, reference = man.body(name, masks), man.reference.of(frame)
     scores = mean_scores(held_out(body, frame, avatar_of)) | {"iou": float(np.mean(body_ious(body, frame.careful)))}
     return scores | _errors(frame.cameras, reference, "_start") | _errors(body.cameras, reference)
 
@@ -234,7 +246,7 @@ def _in_room(man, seed, person, way):
         return drawn_psnrs(avatar_of(true), held)
     name = f"person_{seed}_{way.replace(' ', '_')}"
     man.frames[name] = frame if way == "true cameras" else without_calibration(frame, [(SIZE, SIZE)] * len(ALL))
-    body = man.bodies(name, "detected")["refine"]
+    body = man.body(name, "detected")
     scores = drawn_psnrs(avatar_of(body), as_fitted(held, true.cameras, body))
     return scores | {"iou": float(np.mean(body_ious(body, true.masks)))} | _errors(body.cameras, true.cameras)
 
