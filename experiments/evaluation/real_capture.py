@@ -64,7 +64,7 @@ class RealFrame(NamedTuple):
 
     images: (v, s, s, 3), with the room. detected, careful: (v, s, s) masks of the detector, and of what differs from the room.
     cameras: as published. keypoints: MediaPipe's 33. world: (v, 33, 3) landmarks in metres. crop: (v, 3, 3), pixels of the photos
-    from pixels of the video (homogeneous). names: of the views.
+    from pixels of the video (homogeneous). names: of the views. moments: each view has a pose of its own.
     """
 
     images: Float[np.ndarray, "v s s 3"]
@@ -75,6 +75,7 @@ class RealFrame(NamedTuple):
     world: Float[np.ndarray, "v 33 3"]
     crop: Float[np.ndarray, "v 3 3"]
     names: tuple[str, ...]
+    moments: bool = False
 
     def save(self, folder: Path, masks: Float[np.ndarray, "v s s"], cameras: Camera | None = None) -> None:
         """A capture folder of the photos, with the room, and these masks. cameras: not the published ones."""
@@ -85,7 +86,7 @@ class RealFrame(NamedTuple):
                 (folder / path).parent.mkdir(parents=True, exist_ok=True)
                 write_png(folder / path, picture)
             matrices = {key: np.asarray(getattr(cameras, key)[i], float).tolist() for key in ("K", "cam_from_world")}
-            views.append(paths | matrices | {"frame": 0})
+            views.append(paths | matrices | {"frame": i if self.moments else 0})
         write_description(folder, views)
 
     def truth(self) -> Float[np.ndarray, "v s s 3"]:
@@ -197,8 +198,9 @@ def _load(file, frame):
     cameras = [Camera.from_opencv(K, m, SIZE, SIZE) for K, m in zip(data["K"], data["cam_from_world"], strict=True)]
     keypoints = Keypoints(data["points"], data["confidences"], MEDIAPIPE_33)
     names = tuple(f"{name}_{frame:03d}" for name in CAMERAS)
-    pictures = (as_share(name) for name in ("images", "detected", "careful"))
-    return RealFrame(*pictures, stack_cameras(cameras), keypoints, data["world"], data["crop"], names)
+    images, detected, careful = (as_share(name) for name in ("images", "detected", "careful"))
+    world, crop, cameras = data["world"], data["crop"], stack_cameras(cameras)
+    return RealFrame(images, detected, careful, cameras, keypoints, world, crop, names)
 
 
 def _views(networks, video, camera, frames):

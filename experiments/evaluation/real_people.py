@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +58,22 @@ def without_calibration(frame: RealFrame, sizes: list[tuple[int, int]]) -> RealF
     order = np.where(found.mirrored[:, None], MEDIAPIPE_33.mirror, np.arange(len(MEDIAPIPE_33.names)))
     pick = lambda values: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
     keypoints = dataclasses.replace(keypoints, points=pick(keypoints.points), confidences=pick(keypoints.confidences))
-    return frame._replace(cameras=stack_cameras(cameras), keypoints=keypoints, world=pick(frame.world))
+    return frame._replace(
+        cameras=stack_cameras(cameras), keypoints=keypoints, world=pick(frame.world), moments=found.moments
+    )
+
+
+def one_view_each(frames: Sequence[RealFrame]) -> RealFrame:
+    """The first view of the first frame, the second of the second, and so on."""
+    stack = lambda name: np.stack([getattr(frame, name)[view] for view, frame in enumerate(frames)])
+    images, detected, careful = (stack(name) for name in ("images", "detected", "careful"))
+    points, confidences = (
+        np.stack([getattr(f.keypoints, n)[v] for v, f in enumerate(frames)]) for n in ("points", "confidences")
+    )
+    cameras = stack_cameras([frame.cameras[view] for view, frame in enumerate(frames)])
+    keypoints = dataclasses.replace(frames[0].keypoints, points=points, confidences=confidences)
+    names = tuple(frame.names[view] for view, frame in enumerate(frames))
+    return RealFrame(images, detected, careful, cameras, keypoints, stack("world"), stack("crop"), names)
 
 
 def video_sizes(data: Path) -> list[tuple[int, int]]:

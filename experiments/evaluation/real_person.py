@@ -10,6 +10,7 @@ Needs the extra `photos` and `imageio-ffmpeg`. FOLDER: where `pose2sim` is downl
                 photo; where its camera stands is told by cameras that all frames have refined together
     poses       the avatar of one frame in the poses of the others
     uncalibrated  nothing given: cameras from the person
+    moments     the same, of photos that each show another moment
     rooms       synthetic people in photographed rooms: true cameras, masks and poses; true cameras alone; photos alone
     start       `humangs start` on four photos of 12 megapixels: seconds, first and when compiled
 
@@ -48,6 +49,7 @@ from experiments.evaluation.real_capture import (
 from experiments.evaluation.real_people import (
     as_fitted,
     draw_sheet,
+    one_view_each,
     person_in_rooms,
     started,
     video_sizes,
@@ -71,6 +73,8 @@ TABLE = "real_person"
 MASKS, WAYS = ("detected", "careful"), ("refine", "fit")
 SEEDS = (9001, 9002, 9003)
 """Of synthetic people."""
+MIXES = 2
+"""Of four moments."""
 
 
 class Results:
@@ -230,6 +234,22 @@ def _errors(own, reference, when=""):
     }
 
 
+def moments(results: Results, man: Man) -> None:
+    """Nothing is given, and each camera's photo is of another moment."""
+    bent, sizes = prepare(man.data, man.numbers, straight=False), video_sizes(man.data)
+    for first in bar(range(MIXES), desc="four moments", unit="mix"):
+        chosen = [man.numbers[(first + view) % len(man.numbers)] for view in ALL]
+        frames = [bent[number] for number in chosen]
+        results.measure("moments", "+".join(map(str, chosen)), functools.partial(_moments, man, frames, sizes, first))
+
+
+def _moments(man, frames, sizes, first):
+    frame = without_calibration(one_view_each(frames), sizes)
+    man.frames[f"moments_{first}"] = frame
+    ious = body_ious(man.body(f"moments_{first}", "detected"), frame.careful)
+    return {"iou": float(np.mean(ious)), "each_iou": ious, "taken_for_moments": float(frame.moments)}
+
+
 def rooms(results: Results, man: Man) -> None:
     """Synthetic people in rooms: what true cameras, masks and poses give, and what photos alone give."""
     for seed in bar(SEEDS, desc="people in rooms", unit="person"):
@@ -254,7 +274,7 @@ def start(results: Results, man: Man) -> None:
     results.measure("start", str(man.numbers[0]), functools.partial(started, man.data, man.numbers[0]))
 
 
-ROWS = {"calibrated": calibrated, "poses": poses, "uncalibrated": uncalibrated, "rooms": rooms, "start": start}
+ROWS = {each.__name__: each for each in (calibrated, poses, uncalibrated, moments, rooms, start)}
 
 
 def section(results):
