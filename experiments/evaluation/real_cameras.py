@@ -28,6 +28,8 @@ STD = StateStd(
 )
 CONFIG = CaptureRefineConfig(std=STD, coefficients=22, robust_scales=(1.0, 1.0), independent=100.0)
 """A body that fills the masks: for cameras, not for avatars."""
+TIMES = 4
+"""Refinements, each from the end of the one before: so many unknowns converge slowly."""
 
 
 class Reference(NamedTuple):
@@ -78,8 +80,10 @@ def _found(frames):
     names, white = tuple(name for frame in frames for name in frame.names), np.ones((SIZE, SIZE, 3), np.float32)
     images = np.broadcast_to(white, (len(masks), *white.shape))
     photos = Photos(images, np.stack(masks), stack_cameras(cameras), np.asarray(numbers, np.int32), names)
-    scene = Scene(fit_photos(photos, keypoints, load_body()).capture, keypoints, CONFIG)
-    found = moved_capture(scene.capture, scene.origin, scene.run()[0])
+    found = fit_photos(photos, keypoints, load_body()).capture
+    for _ in range(TIMES):
+        scene = Scene(found, keypoints, CONFIG)
+        found = moved_capture(found, scene.origin, scene.run()[0])
     print("silhouettes with the cameras of all frames:", np.round(body_ious(found, np.stack(masks)), 3))
     first = [np.asarray(each[: len(CAMERAS)], float) for each in (found.cameras.K, found.cameras.cam_from_world)]
     return Reference(np.linalg.inv(common) @ first[0], first[1])

@@ -71,6 +71,17 @@ from humangs_jax.refinement.refine import refine
 
 TABLE = "real_person"
 MASKS, WAYS = ("detected", "careful"), ("refine", "fit")
+PSNRS = {"psnr": ("held out", 1), "psnr_foreground": ("foreground", 2)}
+CAMERAS = {"degrees": ("cameras: degrees", 1), "centimetres": ("cm", 1)}
+TABLES = (
+    (
+        ("calibrated", "uncalibrated", "poses", "moments"),
+        {"iou": ("IoU", 3), "iou_unseen": ("IoU, unseen", 3)} | PSNRS | CAMERAS,
+    ),
+    (("rooms",), {"iou": ("IoU", 3)} | PSNRS | CAMERAS),
+    (("start",), {"first": ("first time, s", 0), "compiled": ("compiled, s", 0)}),
+)
+"""First words of rows, and the columns of their scores: heading and digits."""
 SEEDS = (9001, 9002, 9003)
 """Of synthetic people."""
 MIXES = 2
@@ -277,22 +288,23 @@ def start(results: Results, man: Man) -> None:
 ROWS = {each.__name__: each for each in (calibrated, poses, uncalibrated, moments, rooms, start)}
 
 
-def section(results):
-    """The table of the page."""
-    columns = {"iou": 3, "psnr": 1, "psnr_foreground": 2, "iou_unseen": 3, "degrees": 1, "centimetres": 1}
+def section(results: dict[str, Any]) -> str:
+    """The tables of the page: the man, people in rooms, seconds; means over the cases of each row."""
+    return "\n\n".join(filter(None, (_table(results, kinds, columns) for kinds, columns in TABLES)))
+
+
+def _table(results, kinds, columns):
     rows = []
     for label, each in results.items():
         for row, cases in each["rows"].items():
-            means = mean_scores({k: v for k, v in case.items() if isinstance(v, float)} for case in cases.values())
-            rows.append(
-                [
-                    label,
-                    row,
-                    len(cases),
-                    *("-" if means.get(k) is None else f"{means[k]:.{d}f}" for k, d in columns.items()),
-                ]
-            )
-    return markdown_table(["state", "row", "frames", *columns], rows, "ll" + "r" * (len(columns) + 1))
+            if row.split(",")[0] in kinds and cases:
+                means = mean_scores({k: v for k, v in case.items() if isinstance(v, float)} for case in cases.values())
+                known = [means.get(key) for key in columns]
+                digits = [number for _, number in columns.values()]
+                shown = ["-" if v is None else f"{v:.{n}f}" for v, n in zip(known, digits, strict=True)]
+                rows.append([row, label, len(cases), *shown])
+    header = ["row", "state", "cases", *(heading for heading, _ in columns.values())]
+    return markdown_table(header, rows, "ll" + "r" * (len(header) - 2)) if rows else ""
 
 
 if __name__ == "__main__":
