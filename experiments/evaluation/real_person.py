@@ -122,13 +122,17 @@ def main() -> None:
     parser.add_argument("--rows", nargs="+", choices=ROWS, default=list(ROWS))
     parser.add_argument("--frames", type=int, nargs="+", default=list(FRAMES), help="of the videos, 0 to 99")
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS), help="of finding the body")
+    parser.add_argument("--masks", nargs="+", choices=MASKS, default=list(MASKS), help="that photos are cut out by")
     parser.add_argument("--pictures", type=Path, help="JPEG of the avatar from all sides, and walking")
     parser.add_argument("--page", type=Path, help="page whose table is written")
     arguments = parser.parse_args()
     if not all(0 <= frame < 100 for frame in arguments.frames):
         parser.error("--frames: expected 0 to 99")
     enable_compile_cache()
-    results, man = Results(arguments.json, arguments.label), Man(arguments.data, arguments.frames, arguments.ways)
+    results, man = (
+        Results(arguments.json, arguments.label),
+        Man(arguments.data, arguments.frames, arguments.ways, arguments.masks),
+    )
     for row in arguments.rows:
         ROWS[row](results, man)
     if arguments.pictures:
@@ -148,8 +152,8 @@ ALL = (0, 1, 2, 3)
 class Man:
     """What the package makes of the capture; each thing once. frames: by number, and what else is to be looked at by name."""
 
-    def __init__(self, data: Path, frames: Sequence[int], ways: Sequence[str]) -> None:
-        self.data, self.numbers, self.ways = data, list(frames), ways
+    def __init__(self, data: Path, frames: Sequence[int], ways: Sequence[str], masks: Sequence[str]) -> None:
+        self.data, self.numbers, self.ways, self.masks = data, list(frames), ways, masks
         self.frames: dict[int | str, RealFrame] = dict(prepare(data, frames))
         self.reference = reference_cameras(data)
         self.photos, self.body = functools.cache(self._photos), functools.cache(self._body)
@@ -183,7 +187,7 @@ def avatar_of(capture: Capture) -> Avatar:
 
 def calibrated(results: Results, man: Man) -> None:
     """The published calibration and nothing else."""
-    cases = list(itertools.product(MASKS, man.ways, man.numbers))
+    cases = list(itertools.product(man.masks, man.ways, man.numbers))
     for masks, way, number in bar(cases, desc="published calibration", unit="frame"):
         row, made = f"calibrated, {way}, {masks}", functools.partial(_calibrated, man, number, masks, way)
         results.measure(row, str(number), made)
@@ -217,7 +221,7 @@ def _posed(man, first, number):
 def uncalibrated(results: Results, man: Man) -> None:
     """Nothing is given: cameras from the person, in photos with the lenses' distortion."""
     bent, sizes = prepare(man.data, man.numbers, straight=False), video_sizes(man.data)
-    for masks, number in bar(list(itertools.product(MASKS, man.numbers)), desc="no calibration", unit="frame"):
+    for masks, number in bar(list(itertools.product(man.masks, man.numbers)), desc="no calibration", unit="frame"):
         results.measure(
             f"uncalibrated, {masks}",
             str(number),

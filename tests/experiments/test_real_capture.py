@@ -5,6 +5,7 @@ import pytest
 
 from experiments.evaluation.real_cameras import camera_errors, seen_from, to_reference
 from experiments.evaluation.real_capture import VideoCamera, background, careful_mask, read_cameras
+from experiments.evaluation.real_person import Results, section
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.geometry.camera import Camera, stack_cameras
 
@@ -83,3 +84,20 @@ def test_cameras_are_compared_after_one_similarity():
     # the fourth camera, found by the other three
     found = seen_from(own[np.asarray([0, 1, 2])], (0, 1, 2), there, 3)
     np.testing.assert_allclose(found.cam_from_world[0], own.cam_from_world[3], atol=FLOAT32)
+
+
+def test_a_run_goes_on_where_it_stopped(tmp_path):
+    file, calls = tmp_path / "real.json", []
+
+    def scores():
+        calls.append(1)
+        return {"iou": 0.75, "psnr": 19.5, "each_iou": [0.7, 0.8]}
+
+    for _ in range(2):
+        results = Results(file, "now")
+        results.measure("calibrated, fit, detected", "33", scores)
+    results.measure("calibrated, fit, detected", "66", scores)
+    assert len(calls) == 2
+    table = section(results.all)
+    assert "| calibrated, fit, detected | now | 2 | 0.750 | - | 19.5 | - |" in table
+    assert "seconds" not in table
