@@ -64,7 +64,8 @@ class RealFrame(NamedTuple):
 
     images: (v, s, s, 3), with the room. detected, careful: (v, s, s) masks of the detector, and of what differs from the room.
     cameras: as published. keypoints: MediaPipe's 33. world: (v, 33, 3) landmarks in metres. crop: (v, 3, 3), pixels of the photos
-    from pixels of the video (homogeneous). names: of the views. moments: each view has a pose of its own.
+    from pixels of the video (homogeneous). names: of the views. moments: whether
+    each view has a pose of its own, where the cameras are from the person; None: they are published.
     """
 
     images: Float[np.ndarray, "v s s 3"]
@@ -75,7 +76,7 @@ class RealFrame(NamedTuple):
     world: Float[np.ndarray, "v 33 3"]
     crop: Float[np.ndarray, "v 3 3"]
     names: tuple[str, ...]
-    moments: bool = False
+    moments: bool | None = None
 
     def save(self, folder: Path, masks: Float[np.ndarray, "v s s"], cameras: Camera | None = None) -> None:
         """A capture folder of the photos, with the room, and these masks. cameras: not the published ones."""

@@ -9,10 +9,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from experiments.evaluation.real_cameras import to_reference
 from experiments.evaluation.real_capture import CAMERAS, DEMO, SIZE, RealFrame, largest_person, read_frames
 from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.avatar import Avatar
@@ -20,11 +20,15 @@ from humangs_jax.avatar.frames import images, motion_views, turntable_views
 from humangs_jax.avatar.sheets import tile
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.library import load_body
+from humangs_jax.core.array_types import Float
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.motion.loading import load_motion
 from humangs_jax.detection.blazepose import Networks
+from humangs_jax.fitting.person_cameras import PersonViews, cameras_from_person
+from humangs_jax.fitting.refine_rounds import posed_vertices
+from humangs_jax.fitting.similarity import align_points
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import image_size, read_image, resized, to_uint8
 
@@ -35,19 +39,20 @@ PIXELS = 12e6
 """Of each photo of `started`."""
 
 
-def without_calibration(frame: RealFrame, sizes: list[tuple[int, int]]) -> RealFrame:
+def without_calibration(
+    frame: RealFrame, sizes: list[tuple[int, int]], focal: Float[np.ndarray, " v"] | None = None
+) -> RealFrame:
     """The frame with cameras from the person, and with left and right as they see them. sizes: of the whole photos, pixels.
+    focal: lengths in their pixels, as EXIF tells them; None: unknown.
 
     Raises: ValueError where no cameras are found.
     """
-    from humangs_jax.fitting.person_cameras import PersonViews, cameras_from_person  # ty: ignore[import-not-found]
-
     back = np.linalg.inv(frame.crop)
     points = frame.keypoints.points * back[:, None, [0, 1], [0, 1]] + back[:, None, :2, 2]
-    unknown = np.full(len(points), np.nan)
+    focal = np.full(len(points), np.nan) if focal is None else focal
     found = cameras_from_person(
         PersonViews(
-            points, frame.keypoints.confidences, frame.world, MEDIAPIPE_33.names, tuple(sizes), unknown, frame.names
+            points, frame.keypoints.confidences, frame.world, MEDIAPIPE_33.names, tuple(sizes), focal, frame.names
         )
     )
     cameras = [
@@ -59,7 +64,7 @@ def without_calibration(frame: RealFrame, sizes: list[tuple[int, int]]) -> RealF
     pick = lambda values: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
     keypoints = dataclasses.replace(keypoints, points=pick(keypoints.points), confidences=pick(keypoints.confidences))
     return frame._replace(
-        cameras=stack_cameras(cameras), keypoints=keypoints, world=pick(frame.world), moments=found.moments
+        cameras=stack_cameras(cameras), keypoints=keypoints, world=pick(frame.world), moments=found.moments > 1
     )
 
 
@@ -105,17 +110,17 @@ def person_in_rooms(seed: int, data: Path) -> tuple[RealFrame, Capture, Capture]
     return found, true, subject.held_out
 
 
-def as_fitted(held_out: Capture, true: Camera, body: Capture) -> Capture:
-    """The held-out views in the world of a found body, whose cameras are the true ones in another world."""
-    move = to_reference(body.cameras, true)
+def as_fitted(held_out: Capture, true: Capture, body: Capture) -> Capture:
+    """The held-out views in the world of a found body, which is the true one in another world."""
+    own, there = (posed_vertices(each.body, jnp.asarray(each.betas), each.poses)[0] for each in (body, true))
+    move = align_points(np.asarray(own, float), np.asarray(there, float), np.ones(len(own)))
     cameras = []
     for K, matrix in zip(held_out.cameras.K, held_out.cameras.cam_from_world, strict=True):
         moved = np.asarray(matrix, float) @ move.matrix()
         moved[:3] /= move.scale
         cameras.append(Camera.from_opencv(K, moved, SIZE, SIZE))
-    return dataclasses.replace(
-        held_out, cameras=stack_cameras(cameras), betas=body.betas, poses=body.poses, body=body.body
-    )
+    cameras = stack_cameras(cameras)
+    return dataclasses.replace(held_out, cameras=cameras, betas=body.betas, poses=body.poses, body=body.body)
 
 
 # The command ---------------------------------------------------------------------------------------------------------

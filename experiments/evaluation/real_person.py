@@ -65,11 +65,14 @@ from humangs_jax.data.photos import Photos, load_photos
 from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.fitting.fit_capture import fit_photos
 from humangs_jax.fitting.refine import refine_capture
+from humangs_jax.fitting.refine_rounds import CaptureRefineConfig
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.refinement.config import ROUNDS, RefineConfig
 from humangs_jax.refinement.refine import refine
 
 TABLE = "real_person"
+FROM_PERSON = {"camera_rotation": 2.0, "camera_center": 0.08}
+"""Degrees and metres by which cameras from the person are off."""
 MASKS, WAYS = ("detected", "careful"), ("refine", "fit")
 PSNRS = {"psnr": ("held out", 1), "psnr_foreground": ("foreground", 2)}
 CAMERAS = {"degrees": ("cameras: degrees", 1), "centimetres": ("cm", 1)}
@@ -183,7 +186,11 @@ class Man:
         chosen = Photos(photos.images[at], photos.masks[at], cameras, photos.frames[at], names)
         if way == "fit":
             return fit_photos(chosen, keypoints, load_body()).capture
-        return refine_capture(self.body(name, masks, "fit", views), keypoints=keypoints).capture
+        moments, config = self.frames[name].moments, CaptureRefineConfig()
+        if moments is not None:
+            std = dataclasses.replace(config.std, **FROM_PERSON)
+            config = dataclasses.replace(config, std=std, fixed_cameras=moments)
+        return refine_capture(self.body(name, masks, "fit", views), keypoints=keypoints, config=config).capture
 
 
 def avatar_of(capture: Capture) -> Avatar:
@@ -271,7 +278,7 @@ def _moments(man, frames, sizes, first):
     frame = without_calibration(one_view_each(frames), sizes)
     man.frames[f"moments_{first}"] = frame
     ious = body_ious(man.body(f"moments_{first}", "detected"), frame.careful)
-    return {"iou": float(np.mean(ious)), "each_iou": ious, "taken_for_moments": float(frame.moments)}
+    return {"iou": float(np.mean(ious)), "each_iou": ious, "taken_for_moments": float(frame.moments is True)}
 
 
 def rooms(results: Results, man: Man) -> None:
@@ -287,9 +294,12 @@ def _in_room(man, seed, person, way):
     if way == "true":
         return drawn_psnrs(avatar_of(true), held)
     name = f"person_{seed}_{way.replace(' ', '_')}"
-    man.frames[name] = frame if way == "true cameras" else without_calibration(frame, [(SIZE, SIZE)] * len(ALL))
+    if way == "photos alone":
+        focal = np.asarray(true.cameras.K, float)[:, 0, 0]
+        frame = without_calibration(frame, [(SIZE, SIZE)] * len(ALL), focal)
+    man.frames[name] = frame
     body = man.body(name, "detected")
-    scores = drawn_psnrs(avatar_of(body), as_fitted(held, true.cameras, body))
+    scores = drawn_psnrs(avatar_of(body), as_fitted(held, true, body))
     return scores | {"iou": float(np.mean(body_ious(body, true.masks)))} | _errors(body.cameras, true.cameras)
 
 
