@@ -1,0 +1,171 @@
+"""Photos that come with nothing, for `real_person.py`: cameras from the person, people in rooms, and `humangs start`."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from PIL import Image
+
+from experiments.evaluation.real_capture import CAMERAS, DEMO, SIZE, RealFrame, largest_person, read_frames
+from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.frames import images, motion_views, turntable_views
+from humangs_jax.avatar.sheets import tile
+from humangs_jax.avatar.shot import Shot
+from humangs_jax.body.library import load_body
+from humangs_jax.core.array_types import Float
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
+from humangs_jax.data.motion.loading import load_motion
+from humangs_jax.detection.blazepose import Networks
+from humangs_jax.fitting.person_cameras import PersonViews, cameras_from_person
+from humangs_jax.fitting.refine_rounds import posed_vertices
+from humangs_jax.fitting.similarity import align_points
+from humangs_jax.geometry.camera import Camera, stack_cameras
+from humangs_jax.io.images import image_size, read_image, resized, to_uint8
+
+PHOTOS, NOVEL = 4, 4
+COLUMNS = 6
+"""Of the sheet of pictures."""
+PIXELS = 12e6
+"""Of each photo of `started`."""
+
+
+def without_calibration(
+    frame: RealFrame, sizes: list[tuple[int, int]], focal: Float[np.ndarray, " v"] | None = None
+) -> RealFrame:
+    """The frame with cameras from the person, and with left and right as they see them. sizes: of the whole photos, pixels.
+    focal: lengths in their pixels, as EXIF tells them; None: unknown.
+
+    Raises: ValueError where no cameras are found.
+    """
+    back = np.linalg.inv(frame.crop)
+    points = frame.keypoints.points * back[:, None, [0, 1], [0, 1]] + back[:, None, :2, 2]
+    focal = np.full(len(points), np.nan) if focal is None else focal
+    found = cameras_from_person(
+        PersonViews(
+            points, frame.keypoints.confidences, frame.world, MEDIAPIPE_33.names, tuple(sizes), focal, frame.names
+        )
+    )
+    cameras = [
+        Camera.from_opencv(crop @ np.asarray(own.K, float), own.cam_from_world, SIZE, SIZE)
+        for crop, own in zip(frame.crop, found.cameras, strict=True)
+    ]
+    keypoints = frame.keypoints
+    order = np.where(found.mirrored[:, None], MEDIAPIPE_33.mirror, np.arange(len(MEDIAPIPE_33.names)))
+    pick = lambda values: np.take_along_axis(values, order.reshape(*order.shape, *[1] * (values.ndim - 2)), axis=1)
+    keypoints = dataclasses.replace(keypoints, points=pick(keypoints.points), confidences=pick(keypoints.confidences))
+    return frame._replace(
+        cameras=stack_cameras(cameras), keypoints=keypoints, world=pick(frame.world), moments=found.moments > 1
+    )
+
+
+def one_view_each(frames: Sequence[RealFrame]) -> RealFrame:
+    """The first view of the first frame, the second of the second, and so on."""
+    stack = lambda name: np.stack([getattr(frame, name)[view] for view, frame in enumerate(frames)])
+    images, detected, careful = (stack(name) for name in ("images", "detected", "careful"))
+    points, confidences = (
+        np.stack([getattr(f.keypoints, n)[v] for v, f in enumerate(frames)]) for n in ("points", "confidences")
+    )
+    cameras = stack_cameras([frame.cameras[view] for view, frame in enumerate(frames)])
+    keypoints = dataclasses.replace(frames[0].keypoints, points=points, confidences=confidences)
+    names = tuple(frame.names[view] for view, frame in enumerate(frames))
+    return RealFrame(images, detected, careful, cameras, keypoints, stack("world"), stack("crop"), names)
+
+
+def video_sizes(data: Path) -> list[tuple[int, int]]:
+    """Width and height of each camera's photos."""
+    return [image_size(data / "prepared" / f"room_{name}.png") for name in CAMERAS]
+
+
+# Synthetic people ----------------------------------------------------------------------------------------------------
+
+
+def person_in_rooms(seed: int, data: Path) -> tuple[RealFrame, Capture, Capture]:
+    """A synthetic person in the rooms of the real capture, as detected; the true capture of the photos; views held out."""
+    subject = make_evaluation_subject(seed, load_body(), [PHOTOS], SIZE, HeldOut(NOVEL, 0, 0))
+    true, networks = subject.inputs(PHOTOS), Networks()
+    assert true.masks is not None
+    images, people = [], []
+    for image, mask, name in zip(true.images, true.masks, CAMERAS, strict=True):
+        room = read_image(data / "prepared" / f"room_{name}.png")[0]
+        height, width = room.shape[:2]
+        room = resized(room[(height - width) // 2 :][:width], SIZE, SIZE)
+        photo = image + (1 - mask[..., None]) * (room - 1)
+        images.append((np.round(255 * photo) / 255).astype(np.float32))
+        people.append(largest_person(networks, images[-1]))
+    stack = lambda name: np.stack([getattr(person, name) for person in people])
+    keypoints = Keypoints(stack("pixels").astype(np.float32), stack("visibility").astype(np.float32), MEDIAPIPE_33)
+    same = np.broadcast_to(np.eye(3), (PHOTOS, 3, 3))
+    names = tuple(f"person_{seed}_{name}" for name in CAMERAS)
+    found = RealFrame(np.stack(images), stack("mask"), true.masks, true.cameras, keypoints, stack("world"), same, names)
+    return found, true, subject.held_out
+
+
+def as_fitted(held_out: Capture, true: Capture, body: Capture) -> Capture:
+    """The held-out views in the world of a found body, which is the true one in another world."""
+    own, there = (posed_vertices(each.body, jnp.asarray(each.betas), each.poses)[0] for each in (body, true))
+    move = align_points(np.asarray(own, float), np.asarray(there, float), np.ones(len(own)))
+    cameras = []
+    for K, matrix in zip(held_out.cameras.K, held_out.cameras.cam_from_world, strict=True):
+        moved = np.asarray(matrix, float) @ move.matrix()
+        moved[:3] /= move.scale
+        cameras.append(Camera.from_opencv(K, moved, SIZE, SIZE))
+    cameras = stack_cameras(cameras)
+    return dataclasses.replace(held_out, cameras=cameras, betas=body.betas, poses=body.poses, body=body.body)
+
+
+# The command ---------------------------------------------------------------------------------------------------------
+
+
+def started(data: Path, frame: int) -> dict[str, float]:
+    """Seconds of `humangs start` on four photos of 12 megapixels, with an empty compile cache and again; those of the processors,
+    too, since the machine may be busy (load: processes at the end).
+    """
+    with tempfile.TemporaryDirectory() as place:
+        photos = Path(place) / "photos"
+        photos.mkdir()
+        for name in CAMERAS:
+            image = read_frames(data / DEMO / "videos" / f"{name}.mp4", [frame])[frame]
+            height, width = image.shape[:2]
+            larger = np.sqrt(PIXELS / (height * width))
+            size = round(width * larger), round(height * larger)
+            Image.fromarray(image).resize(size, Image.Resampling.BICUBIC).save(photos / f"{name}.jpg", quality=95)
+        environment = os.environ | {"HUMANGS_COMPILE_CACHE": str(Path(place) / "cache")}
+        environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+        seconds = {}
+        for when in ("first", "compiled"):
+            out = Path(place) / when
+            begun, used = time.perf_counter(), _processor_time()
+            command = [sys.executable, "-m", "humangs_jax.cli", "start", photos, "--out", out, "--no-browser"]
+            subprocess.run([str(word) for word in command], check=True, env=environment)
+            seconds[when], seconds[f"{when}_processor"] = time.perf_counter() - begun, _processor_time() - used
+        return seconds | {"load": os.getloadavg()[0]}
+
+
+def _processor_time():
+    times = os.times()
+    return times.children_user + times.children_system
+
+
+# Pictures ------------------------------------------------------------------------------------------------------------
+
+
+def draw_sheet(avatar: Avatar, body: Capture, path: Path) -> None:
+    """The avatar from all sides in the pose of the photos, and walking; no photo."""
+    shot = Shot(width=200, height=300)
+    around = images(avatar, *turntable_views(avatar, body.pose(0), COLUMNS, shot), shot)
+    motion = load_motion(rest_joints=avatar.rest_joints)
+    chosen = np.linspace(0, len(motion.translations) - 1, COLUMNS).astype(int)
+    poses, cameras = motion_views(avatar, motion, dataclasses.replace(shot, azimuth=40))
+    walking = images(avatar, poses[chosen], cameras[chosen], shot)
+    sheet = to_uint8(tile(np.stack([*around, *walking]), columns=COLUMNS))
+    Image.fromarray(sheet).save(path, quality=90)
