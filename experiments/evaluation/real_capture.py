@@ -21,12 +21,14 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
+from humangs_jax.data.exposure import camera_gains, multiplied
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.masks import person_box
 from humangs_jax.data.photos import on_white_background, write_description
-from humangs_jax.detection.blazepose import Crop, Networks, bilinear, mask_in_photo
-from humangs_jax.detection.people import LARGER, DetectedPerson
+from humangs_jax.detection.blazepose import LANDMARK_SIZE, Networks, bilinear
+from humangs_jax.detection.people import DetectedPerson, detect_people
+from humangs_jax.detection.sharpening import sharpened
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
 from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene
@@ -240,14 +242,9 @@ def _cut(picture, camera, corner, side):
 
 
 def largest_person(networks: Networks, photo: Float[np.ndarray, "h w 3"]) -> DetectedPerson:
-    """Of those whom the detector finds in the whole photo: the man fills it, bystanders do not."""
-    height, width = photo.shape[:2]
-    found = networks.detect(photo, Crop(np.asarray([width, height]) / 2, max(width, height), 0.0))
-    first = networks.landmarks(photo, max((each.crop() for each in found), key=lambda crop: crop.side))
-    again = first.again.crop()
-    person = networks.landmarks(photo, again._replace(side=min(again.side, LARGER * first.crop.side)))
-    mask = mask_in_photo(person, width, height)
-    return DetectedPerson(person.pixels + 0.5, person.visibility, person.world, person.presence, mask, person.crop.side)
+    """The man fills a photo, bystanders do not. With the mask as the package sharpens it."""
+    person = max(detect_people(networks, photo), key=lambda person: float(person.mask.sum()))
+    return person._replace(mask=sharpened(person.mask, photo, person.side / LANDMARK_SIZE))
 
 
 def background(
@@ -299,12 +296,20 @@ def _without_small(inside: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
 def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]) -> list[dict[str, float]]:
     """Of each view the PSNRs (dB) of the avatar of the others, against the man on white as he was photographed.
 
-    Arguments: body: what the product makes of the photos, with masks, cameras, shape and pose. make: an avatar from a part of it.
+    Renderings are brought to the exposure of the view's camera, which is found from all photos.
+
+    Arguments: body: what the package makes of the photos, with masks, cameras, shape and pose. make: an avatar from a part of it.
     """
-    found, views = [], range(body.view_count)
+    found, views, gains = [], range(body.view_count), camera_gains(body)
     for view in views:
-        avatar = make(body.select([other for other in views if other != view]))
-        found.append(drawn_scores(avatar, body.select([view]), photos, [view]))
+        others = [other for other in views if other != view]
+        avatar, shown = make(body.select(others)), body.select([view])
+        # of the others alone the gains are the same but for one factor
+        factor = np.exp(np.mean(np.log(gains[others] / camera_gains(body.select(others))), axis=0))
+        drawn = draw_views(avatar, shown)
+        images = multiplied(drawn.images, np.asarray(drawn.alpha), (factor / gains[view])[None])
+        truth = dataclasses.replace(shown, images=photos.truth()[[view]], masks=photos.careful[[view]])
+        found.append(_psnrs(images, truth))
     return found
 
 
@@ -316,7 +321,11 @@ def drawn_scores(avatar: Avatar, views: Capture, photos: RealFrame, shown: Seque
 
 def drawn_psnrs(avatar: Avatar, truth: Capture) -> dict[str, float]:
     """The same against the photos of these views."""
-    scores = score(draw_views(avatar, truth).images, truth)
+    return _psnrs(draw_views(avatar, truth).images, truth)
+
+
+def _psnrs(images, truth):
+    scores = score(images, truth)
     return {"psnr": float(scores.psnr), "psnr_foreground": float(scores.psnr_foreground)}
 
 

@@ -63,16 +63,14 @@ from humangs_jax.core.progress import bar
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.photos import Photos, load_photos
 from humangs_jax.evaluation.tables import mean_scores
-from humangs_jax.fitting.fit_capture import fit_photos
+from humangs_jax.fitting.fit_capture import FittedCapture, fit_photos
 from humangs_jax.fitting.refine import refine_capture
-from humangs_jax.fitting.refine_rounds import CaptureRefineConfig
+from humangs_jax.fitting.refine_rounds import usual_config
 from humangs_jax.network.weights import SHIPPED, load_weights
 from humangs_jax.refinement.config import ROUNDS, RefineConfig
 from humangs_jax.refinement.refine import refine
 
 TABLE = "real_person"
-FROM_PERSON = {"camera_rotation": 2.0, "camera_center": 0.08}
-"""Degrees and metres by which cameras from the person are off."""
 MASKS, WAYS = ("detected", "careful"), ("refine", "fit")
 PSNRS = {"psnr": ("held out", 1), "psnr_foreground": ("foreground", 2)}
 CAMERAS = {"degrees": ("cameras: degrees", 1), "centimetres": ("cm", 1)}
@@ -168,15 +166,15 @@ class Man:
         self.data, self.numbers, self.ways, self.masks = data, list(frames), ways, masks
         self.frames: dict[int | str, RealFrame] = dict(prepare(data, frames))
         self.reference = reference_cameras(data)
-        self.photos, self.body = functools.cache(self._photos), functools.cache(self._body)
+        self.photos, self.fits, self.body = map(functools.cache, (self._photos, self._fits, self._body))
 
     def _photos(self, name: int | str, masks: str) -> Photos:
         frame, place = self.frames[name], self.data / "captures" / f"{name}_{masks}"
         frame.save(place, getattr(frame, masks))
         return load_photos(place, fit_masks=True)
 
-    def _body(self, name: int | str, masks: str, way: str = "refine", views: tuple[int, ...] = ALL) -> Capture:
-        """A capture of some views with its body."""
+    def _fits(self, name: int | str, masks: str, views: tuple[int, ...]) -> FittedCapture:
+        """By the keypoints of some views."""
         photos, keypoints, at = self.photos(name, masks), self.frames[name].keypoints, np.asarray(views)
         assert photos.masks is not None
         confidences = keypoints.confidences[at]
@@ -184,13 +182,18 @@ class Man:
         cameras = jax.tree.map(lambda leaf: leaf[at], photos.cameras)
         names = tuple(photos.names[view] for view in views)
         chosen = Photos(photos.images[at], photos.masks[at], cameras, photos.frames[at], names)
+        return fit_photos(chosen, keypoints, load_body())
+
+    def _body(self, name: int | str, masks: str, way: str = "refine", views: tuple[int, ...] = ALL) -> Capture:
+        """A capture of some views with its body, as `humangs start` finds it."""
         if way == "fit":
-            return fit_photos(chosen, keypoints, load_body()).capture
-        moments, config = self.frames[name].moments, CaptureRefineConfig()
-        if moments is not None:
-            std = dataclasses.replace(config.std, **FROM_PERSON)
-            config = dataclasses.replace(config, std=std, fixed_cameras=moments)
-        return refine_capture(self.body(name, masks, "fit", views), keypoints=keypoints, config=config).capture
+            return self.fits(name, masks, views).capture
+        fitted, moments = self.fits(name, masks, views), self.frames[name].moments
+        if moments is None:
+            config = usual_config(fitted=True, fixed_cameras=not fitted.camera_errors)
+        else:
+            config = usual_config(fitted=True, fixed_cameras=moments, calibrated=False)
+        return refine_capture(fitted.capture, keypoints=fitted.record.keypoints, config=config).capture
 
 
 def avatar_of(capture: Capture) -> Avatar:

@@ -77,8 +77,8 @@ class CaptureRefineConfig:
     independent: number of independent equations that all points of a view count for. reach: how far points look in the first and
     the last round, shares of the person's height in the image. robust_scales: multiples of the reach, outwards and inwards of
     the mask. longest_side: larger photos are shrunk to this many pixels. color_steps: of L-BFGS. independent_colors: as
-    independent, of the pixels of a view. keypoints_worse: a result whose keypoints' error is more than this multiple of the start's
-    is not kept; a fit to them made it as small as can be, right results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
+    independent, of the pixels of a view. keypoints_worse: a result whose keypoints' error is more than this multiple of the
+    start's is not kept; a fit to them made it small, right results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
     """
 
     std: StateStd = dataclasses.field(default_factory=StateStd)
