@@ -19,11 +19,8 @@ from humangs_jax.core.configuration import (
 )
 
 MEASURED = "refinement.md"
-SPLITS = (0.0, 0.2, 0.4)
-"""Shares of a run after which Gaussians are split."""
 ROUNDS = 4
 """As many as the learned update was trained with; docs/tradeoff.md has what each gains."""
-MAX_GROWTH = 16.0
 
 
 @configuration
@@ -64,8 +61,6 @@ class RefineConfig:
     largest weight on a pixel of the photos is at least this moves at the full rate, others more slowly; what no photo shows
     stays. poses: also refine the body pose of each photo. The corrected poses are not returned.
 
-    growth: the number of Gaussians may grow by this factor: at `SPLITS` of the run those with the largest errors are split.
-
     held_out: with fewer photos than `HELD_OUT_PHOTOS` the share of the pixels, in square blocks, that no round and no step sees:
     the state with the highest PSNR on them is returned. With as many or more, any share above 0 holds one whole photo out of a
     trial, a third of the steps, which decides by its PSNR whether the rounds and how many of the steps are kept; then all photos
@@ -88,7 +83,6 @@ class RefineConfig:
     decay: Share = 2e-3
     visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
     poses: bool = False
-    growth: Annotated[float, Range(1, MAX_GROWTH)] = knob(1.0, cost="time of a step", gain="detail", measured=MEASURED)
     held_out: Share = 0.05
     checks: Few = 5
     seed: Seed = 0
