@@ -8,7 +8,6 @@ import zlib
 
 import numpy as np
 from hostile_cases import case, written
-from readers import SEEDS
 
 # Archives -------------------------------------------------------------------------------------------------------------
 
@@ -188,24 +187,3 @@ for kind, (header, item) in SAFETENSORS.items():
     for reader in ("safetensors", "weights", "vgg", "released checkpoint"):
         case(kind, reader, written("a.safetensors", safetensors(header)), item=item)
 case("a header of 2^60", "safetensors", written("a.safetensors", struct.pack("<Q", 1 << 60) + b"{" + bytes(64)), item=5)
-
-
-def exr_with(old, new):
-    def make(folder):
-        path = SEEDS["exr"](folder)
-        data = path.read_bytes()
-        at = data.index(old) + len(old)
-        path.write_bytes(data[:at] + new + data[at + len(new) :])
-        return path
-
-    return make
-
-
-WINDOW = b"dataWindow\0box2i\0" + struct.pack("<I", 16)
-for kind, box in {
-    "a window of 2^31": (0, 0, (1 << 31) - 2, (1 << 31) - 2),
-    "a window of 30,000": (0, 0, 29_999, 29_999),
-    "a window backwards": (9, 9, 0, 0),
-    "a window of all integers": (-(1 << 31), -(1 << 31), (1 << 31) - 1, (1 << 31) - 1),
-}.items():
-    case(kind, "exr", exr_with(WINDOW, struct.pack("<4i", *box)), item=5)

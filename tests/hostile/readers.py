@@ -48,7 +48,6 @@ from humangs_jax.data.preprocess.scenes import Settings, scan_content
 from humangs_jax.fitting.files import KEYS, read_fit_record
 from humangs_jax.fitting.scan_reading import read_joints, read_mesh
 from humangs_jax.fitting.scan_views import read_placement
-from humangs_jax.io.exr import ExrView, read_exr, write_exr
 from humangs_jax.io.glb import GlbWriter
 from humangs_jax.io.images import check_image, image_size, read_grey, read_image
 from humangs_jax.io.npz import read_npz
@@ -60,7 +59,6 @@ from humangs_jax.network.conversion import load_checkpoint
 from humangs_jax.network.weights import expected_variables, load_weights, save_weights
 from humangs_jax.objectives.loss_networks import load_vgg19
 from humangs_jax.people.bank import load_bank
-from humangs_jax.people.rendering import read_depth
 from humangs_jax.people.seeds import GENERATOR_VERSION
 from humangs_jax.people.writer import begin_set, read_manifest
 from humangs_jax.training.config import read_config, tiny
@@ -165,8 +163,6 @@ READERS = {
     "json": read_json,
     "image": read_image_in_every_way,
     "mask": read_grey,
-    "depth": read_depth,
-    "exr": read_exr,
     "pickle": read_whole_pickle,
     "torch zip": read_tensors,
     "torch stream": read_tensors,
@@ -589,8 +585,6 @@ SEEDS = {
     "json": text("a.json", json.dumps({"a": [1, 2.5, None, "x"], "b": {"c": True}})),
     "image": saved("a.png", lambda path: Image.fromarray(pixels(12, 10, 3)).save(path)),
     "mask": saved("a.jpg", lambda path: Image.fromarray(pixels(12, 10)).save(path)),
-    "depth": saved("a.png", lambda path: Image.fromarray(pixels(12, 10, dtype=np.uint16)).save(path)),
-    "exr": saved("a.exr", lambda path: write_exr(path, ExrView(np.ones((6, 5, 4), np.float32)))),
     "pickle": saved("a.pkl", lambda path: path.write_bytes(pickle.dumps({"x": np.eye(3), "n": 2}, protocol=2))),
     "torch zip": saved("a.pt", lambda path: write_checkpoint(path, {"model": tensors(STATE)})),
     "torch stream": saved("a.pth", lambda path: write_stream(path, {"model": tensors(STATE)})),

@@ -108,8 +108,8 @@ COMMANDS = (
     Command("export html", "export {inputs}/avatar{v}.npz --html me.html"),
     Command(
         "synth",
-        "synth --out people --subjects 2 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1 --depth --maps",
-        first="synth --out people --subjects 1 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1 --depth --maps",
+        "synth --out people --subjects 2 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1",
+        first="synth --out people --subjects 1 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1",
     ),
     Command(
         "train",
@@ -268,7 +268,6 @@ def stand_ins(variant):
     from humangs_jax.fitting.scan_fit import ScanFit
     from humangs_jax.fitting.similarity import Similarity
     from humangs_jax.network.presets import tiny
-    from humangs_jax.people.rendering import SurfaceMaps
     from humangs_jax.refinement.refine import Refinement
     from humangs_jax.training.validation import METRICS
 
@@ -301,11 +300,6 @@ def stand_ins(variant):
     def views_of(subject, body, poses, views):
         capture = some_capture(subject.seed, len(views), 128)
         return dataclasses.replace(capture, names=tuple(view.name for view in views))
-
-    def maps(_posed, camera):
-        return SurfaceMaps(
-            np.ones((camera.height, camera.width), np.float32), np.ones((camera.height, camera.width, 3), np.float32)
-        )
 
     def step(state, *_, **__):
         numbers = {"loss": 1.0, "psnr": 20.0, "grad_norm": 1.0, "learning_rate": 0.1}
@@ -411,7 +405,6 @@ def stand_ins(variant):
         ("people.writer", "make_subject", person),
         ("people.writer", "sample_pose", posed),
         ("people.writer", "capture_views", views_of),
-        ("people.writer", "render_maps", maps),
         ("people.writer", "cameras_around", lambda rng, vertices, azimuths, size: some_cameras(len(azimuths), size)),
         ("training.loop", "train_step", step),
         ("training.loop", "init_state", state),
