@@ -11,7 +11,7 @@ An image is shared between two of XLA's host devices where there are two cores (
 Prints tables and writes {"forward_ms", "forward_backward_ms", "forward_cpu_ms", "forward_backward_cpu_ms" (medians),
 "yardstick": {the same} or null, "ratio": ours / yardstick, "compile_s", "peak_rss_mb", "psnr", "max_abs_error",
 "fraction_above_2e-4", "gradient_relative_l2", "gradient_cosine", "gradient_signed_bias", "gradient_gain": {parameter:
-number}, "work", "config", "devices", ...}; values that need a missing reference are null.
+number}, "config", "devices", ...}; values that need a missing reference are null.
 
 Expected: psnr at least 95 dB (90 where a head's tiles are crowded), gradients within 1e-3, cosine above 0.99999, and in
 float64 no error above 1e-6. On 2 cores of an AMD EPYC (Zen 4), 52,375 Gaussians at 512: see docs/performance.md.
@@ -72,8 +72,7 @@ def main() -> None:
     prepare_process()
     result = benchmark(arguments)
     text = "\n\n".join(table for table in (times_table(result), errors_table(result)) if table)
-    work_done = ", ".join(f"{name.replace('_', ' ')} {value:,}" for name, value in result["work"].items())
-    print(f"{text}\n\nwork: {work_done}")
+    print(text)
     if arguments.json:
         write_json(arguments.json, result)
     if arguments.page:
@@ -110,7 +109,7 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
     result |= {"compile_s": max(each["compile_s"].values()), "compile_s_each": each["compile_s"]}
     result |= {"peak_rss_mb": peak_rss_mb(), "temporary_mb": each["temporary_mb"]}
     result |= errors(programs, reference)
-    result |= {"work": work(scene, config, dtype), "config": dataclasses.asdict(config)}
+    result |= {"config": dataclasses.asdict(config)}
     result |= {
         "scene": scene.kind,
         "size": scene.size,
@@ -209,13 +208,6 @@ def errors(programs: Mapping[str, Callable[[], Any]], reference: Reference | Non
             for measure, value in gradient_errors(getattr(gradients, name), expected).items():
                 found[f"gradient_{measure}"][name] = value
     return found
-
-
-def work(scene: Scene, config: Any, dtype: type) -> dict[str, float]:
-    """What the scene asks for: see `splatting/work.py`."""
-    from experiments.splatting.work import tile_work
-
-    return tile_work(scene, config, dtype)
 
 
 def name_of(run: Mapping[str, Any]) -> str:

@@ -36,8 +36,6 @@ def test_the_page_is_made_of_what_the_benchmarks_write(tmp_path):
             2,
         ),
         "savings": ("reconstruction/savings", "--preset", "tiny", *shared, "--views", 2),
-        "attention": ("reconstruction/attention", "--tokens", 33, "--heads", 2, "--repeats", 1),
-        "compilation": ("reconstruction/compilation", "--preset", "tiny", "--tokens", 32),
     }
     page = tmp_path / "page.md"
     page.write_text((REPOSITORY / "docs" / "performance_reconstruction.md").read_text())
