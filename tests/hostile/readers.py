@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 from safetensors.numpy import save_file
-from scipy.io import savemat
 from torch_writer import tensors, write_checkpoint, write_stream
 
 from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
@@ -53,7 +52,7 @@ from humangs_jax.io.images import check_image, image_size, read_grey, read_image
 from humangs_jax.io.npz import read_npz
 from humangs_jax.io.reading import reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
-from humangs_jax.io.tensor_file import read_matconvnet, read_tensors
+from humangs_jax.io.tensor_file import read_tensors
 from humangs_jax.io.text import read_json
 from humangs_jax.network.conversion import load_checkpoint
 from humangs_jax.network.weights import expected_variables, load_weights, save_weights
@@ -168,7 +167,6 @@ READERS = {
     "torch stream": read_tensors,
     "released checkpoint": load_checkpoint,
     "safetensors": read_tensors,
-    "matlab": read_matconvnet,
     "vgg": load_vgg19,
     "smplx npz": load_smplx,
     "smplx pkl": load_smplx,
@@ -533,18 +531,6 @@ def bank_arrays():
     }
 
 
-def cells(*values):
-    array = np.empty((1, len(values)), object)
-    array[0] = values
-    return array
-
-
-def matconvnet():
-    weights = np.empty((1, 2), object)
-    weights[0] = [np.ones((3, 3, 3, 4), np.float32), np.ones((4, 1), np.float32)]
-    return {"layers": cells({"type": "conv", "name": "conv1", "weights": weights}, {"type": "relu", "name": "relu1"})}
-
-
 def data_set(write, *arguments, **options):
     """A seed: the folder of a data set."""
 
@@ -590,7 +576,6 @@ SEEDS = {
     "torch stream": saved("a.pth", lambda path: write_stream(path, {"model": tensors(STATE)})),
     "released checkpoint": None,  # too large a file to be made here; the readers below it have theirs
     "safetensors": saved("a.safetensors", lambda path: save_file(STATE, path, {"note": "x"})),
-    "matlab": saved("a.mat", lambda path: savemat(path, matconvnet(), do_compression=True)),
     "vgg": None,
     "smplx npz": npz("SMPLX.npz", smplx_arrays),
     "smplx pkl": saved("SMPLX.pkl", lambda path: path.write_bytes(pickle.dumps(smplx_arrays(), protocol=2))),

@@ -41,7 +41,6 @@ LATE = (
     "plyfile",
     "imageio_ffmpeg",
     "tqdm",
-    "grain",
 )
 WORK = {
     *("reconstruct", "refine_with_report", "motion_frames", "images", "draw", "fit_photos", "refine_capture"),
@@ -156,8 +155,7 @@ def import_everything():
     sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data/datasets", ""))]
     os.environ |= {"JAX_PLATFORMS": "cpu", "TF_CPP_MIN_LOG_LEVEL": "2"}
     for name in (*LATE, *(f"humangs_jax.{name}" for name in ("cli", *HEAVY))):
-        with contextlib.suppress(ModuleNotFoundError):  # grain is optional
-            importlib.import_module(name)
+        importlib.import_module(name)
 
 
 def random_of(variant, *more):
