@@ -128,7 +128,7 @@ class Case:
 
         config = self.config
         self.capture = written_subject(folder, config, self.full_body)
-        self.loader = Loader(self.source(), config.batch_size, reader="plain")
+        self.loader = Loader(self.source(), config.batch_size)
         self.body = gaussian_body(self.full_body, config.model)
         self.batch = jax.block_until_ready(self.loader.batch_at(0))
         self.fit()
