@@ -54,10 +54,10 @@ class RefineConfig:
     drawn in a step.
 
     structural, silhouette: weights of the structural dissimilarity, and of |alpha - mask|, beside the L1 distance of colours.
-    rates: see `LearningRates`. final_rate: share of the rates that is left at the end. full_steps: after rounds, a run of more
+    rates: see `LearningRates`. full_steps: after rounds, a run of more
     steps than this takes smaller ones in proportion; Gaussians that move further overfit to the photos.
 
-    decay: each step moves means and log scales back towards the start by this share of the distance. visible: a Gaussian whose
+    visible: a Gaussian whose
     largest weight on a pixel of the photos is at least this moves at the full rate, others more slowly; what no photo shows
     stays. poses: also refine the body pose of each photo. The corrected poses are not returned.
 
@@ -78,9 +78,7 @@ class RefineConfig:
     structural: Weight = 0.2
     silhouette: Weight = 0.1
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
-    final_rate: Share = 0.1
     full_steps: Steps = 100
-    decay: Share = 2e-3
     visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
     poses: bool = False
     held_out: Share = 0.05
