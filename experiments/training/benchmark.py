@@ -4,7 +4,7 @@
     python experiments/training/benchmark.py --json OUT --page docs/performance_training.md
 
 A synthetic person is made and read by the loader; all weights are random, also those of loss networks: they cost what trained
-ones cost. Operations and bytes are counted from the compiled step, loops included (`common/compiled_costs.py`). The floor is
+ones cost. Operations are counted from the traced step, loops included (`common/costs.py`). The floor is
 the time that these operations take as plain products in the same turns. Results are added to OUT, so cases can be run one by
 one; `--page` writes them into a page and runs nothing.
 
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.compiled_costs import compiled_costs
+from experiments.common.costs import temporary_mb
 from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
 from experiments.common.results import markdown_table, publish, write_json
 from experiments.training.cases import CASES, Case
@@ -77,28 +77,24 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
     from experiments.reconstruction.cases import matmul_program
     from humangs_jax.core.compiler_options import compiler_options
 
-    program, compile_s = case.compiled(compiler_options())
+    program, compile_s, costs = case.compiled(compiler_options())
     case.program = program
-    costs = compiled_costs(program)
     product, product_flops = matmul_program(case.config.model.execution.dtype)
     load = os.getloadavg()[0]
     times = medians({"matmul": product, "step": lambda: case.run(program)}, arguments.repeats, arguments.warm_up)
     wall, cpu = map(float, times["step"])
-    floor = costs.matrix_flops / product_flops * times["matmul"]
+    floor = costs.flops / product_flops * times["matmul"]
     return {
         "ms": wall,
         "cpu_ms": cpu,
         "samples_per_s": 1e3 * case.config.batch_size / wall,
-        "flops": costs.matrix_flops,
-        "bytes": costs.bytes_accessed,
+        "flops": costs.flops,
         "unknown_trips": costs.unknown_trips,
-        "uncounted": list(costs.uncounted),
         "matmul_gflops": product_flops / times["matmul"][0] / 1e6,
         "matmul_gflops_cpu": product_flops / times["matmul"][1] / 1e6,
         "share_of_floor": float(floor[0]) / wall,
         "share_of_floor_cpu": float(floor[1]) / max(cpu, 1e-9),
-        "temporary_mb": MEBI * costs.temporary_bytes,
-        "argument_mb": MEBI * costs.argument_bytes,
+        "temporary_mb": temporary_mb(program),
         "peak_rss_mb": peak_rss_mb(),
         "compile_cpu_s": compile_s,
         "tokens": token_count(case.config),
@@ -131,7 +127,6 @@ def steps_table(result: dict[str, Any]) -> str:
         "wall, CPU s",
         "samples/s",
         "TFLOP",
-        "GB",
         "share of floor",
     ]
     header += ["MiB temporaries", "peak MiB", "compile, CPU s"]
@@ -143,7 +138,6 @@ def steps_table(result: dict[str, Any]) -> str:
             f"{row['ms'] / 1e3:.1f}, {row['cpu_ms'] / 1e3:.2f}",
             f"{row['samples_per_s']:.3f}",
             f"{row['flops'] / 1e12:.2f}",
-            f"{row['bytes'] / 1e9:.0f}",
             f"{row['share_of_floor_cpu' if row['device'] == 'cpu' else 'share_of_floor']:.2f}",
             f"{row['temporary_mb']:.0f}",
             f"{row['peak_rss_mb']:.0f}",

@@ -5,6 +5,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from experiments.common.costs import costs_of
+
 
 def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -> Any:
     """The `TrainConfig` of a preset for photos and targets of `size` pixels, numbers of views as given."""
@@ -160,8 +162,8 @@ class Case:
                 self.config, token_capacity=foreground(inputs, self.config.model)[0].execution.token_capacity
             )
 
-    def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float]:
-        """(the step as a program, CPU seconds that it took to trace and compile)."""
+    def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float, Any]:
+        """(the step as a program, CPU seconds that it took to trace and compile, its `Costs`)."""
         import jax
 
         from humangs_jax.training.step import jitted_train_step
@@ -174,8 +176,9 @@ class Case:
         )
         start = time.process_time()
         arguments = self.state, self.batch, self.body, self.networks
-        program = step.lower(*arguments, config=self.config, mesh=None).compile()
-        return program, time.process_time() - start
+        traced = step.trace(*arguments, config=self.config, mesh=None)
+        program = traced.lower().compile()
+        return program, time.process_time() - start, costs_of(traced)
 
     def run(self, program: Any) -> None:
         """One step."""
