@@ -65,11 +65,26 @@ def abstract_batch(config: Any, joints: int, betas: int) -> Any:
     return jax.eval_shape(jax.vmap(example), jax.ShapeDtypeStruct((config.batch_size,), jnp.int32))
 
 
+def random_weights(key: Any, slices: Any) -> Any:
+    """Random weights of a network of `objectives.backbones`."""
+    import jax
+    import jax.numpy as jnp
+
+    from humangs_jax.objectives.backbones import Convolution, convolutions
+
+    def draw(layer, key):
+        shape = (layer.size, layer.size, layer.inputs, layer.outputs)
+        scale = (2 / (layer.size**2 * layer.inputs)) ** 0.5
+        return Convolution(scale * jax.random.normal(key, shape), jnp.zeros(layer.outputs))
+
+    layers = list(convolutions(slices))
+    return {layer.name: draw(layer, key) for layer, key in zip(layers, jax.random.split(key, len(layers)), strict=True)}
+
+
 def random_networks(config: Any) -> Any:
     """`LossNetworks` with made-up weights for the losses that need some: they cost what the real ones cost."""
     import jax
 
-    from humangs_jax.objectives.backbones import random_weights
     from humangs_jax.objectives.loss_networks import LossNetworks
     from humangs_jax.objectives.lpips import BACKBONES, Lpips
     from humangs_jax.objectives.perceptual import VGG19, Vgg19

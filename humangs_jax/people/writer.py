@@ -233,11 +233,11 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
     content = read_json(file)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"{file}: format: expected a manifest of {FORMAT!r}")
-    if content.get("version") not in (1, VERSION):
+    if content.get("version") != VERSION:
         raise ValueError(f"{file}: version: expected {VERSION}, got {shown(content.get('version'))}")
     if not isinstance(content.get("settings"), dict):
         raise ValueError(f"{file}: settings: expected an object, got {shown(content.get('settings'))}")
-    return {"generator_version": 1, "split": None} | content
+    return {"generator_version": None, "split": None} | content
 
 
 def begin_set(folder: str | Path, split: str, settings: dict[str, Any]) -> None:

@@ -63,7 +63,6 @@ from humangs_jax.people.writer import begin_set, read_manifest
 from humangs_jax.training.config import read_config, tiny
 from humangs_jax.training.diagnose import first_failed_step
 
-RANDOM = np.random.default_rng(0)
 K = [[60.0, 0, 5], [0, 60, 6], [0, 0, 1]]
 POSE = [[1.0, 0, 0, 0], [0, -1, 0, 0.9], [0, 0, -1, 2.6], [0, 0, 0, 1]]
 VIEWS = ("000", "001")

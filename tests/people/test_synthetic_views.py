@@ -24,8 +24,6 @@ from humangs_jax.people.writer import find_people
 SIZE = 32
 BODY = load_body()
 LAYOUT = writer.Layout(SIZE, poses=2, views=3, close_views=1, held_out_views=1, novel_poses=1)
-SAME_SURFACE = 2e-3
-"""Metres: the skin's mesh is the body's but for the faces under cloth; pixels at their rim differ."""
 EIGHT_BITS = 0.5 / 255 + 1e-6
 
 
