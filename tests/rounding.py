@@ -27,14 +27,6 @@ def bound(value: float) -> float:
     return SCALE * value
 
 
-def sum_bound(terms: int, magnitudes: np.ndarray, roundings: int = 0) -> np.ndarray:
-    """Bound on the difference of two float32 sums of `terms` terms, each term rounded `roundings` times.
-
-    magnitudes: sums of the magnitudes of the terms, in float64. Both sums may be off, in opposite directions.
-    """
-    return SCALE * 2 * (terms + roundings) * UNIT * np.asarray(magnitudes, np.float64)
-
-
 def scaled_comparison(compare):
     """`np.testing.assert_allclose`, `np.allclose` or `np.isclose` with the switch applied where an array is float32."""
     if SCALE == 1:

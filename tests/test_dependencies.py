@@ -34,7 +34,7 @@ def test_imports_are_declared_and_dependencies_imported():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     required, extras = {plain(each) for each in project["dependencies"]}, project["optional-dependencies"]
     assert imported(ROOT / "humangs_jax") == required
-    groups = ("dev", "notebooks", "grain", "viewer", "hdf5", "heic", "photos")
+    groups = ("dev", "notebooks", "hdf5", "heic", "photos")
     tools = {plain(each) for name in groups for each in extras[name]}
     own = {"data"} | {plain(path.stem) for folder in ("tests", "experiments") for path in (ROOT / folder).rglob("*.py")}
     assert imported(ROOT / "tests") - own - required - tools == UNTESTED

@@ -314,7 +314,7 @@ def batch_sizes(arguments: argparse.Namespace) -> Iterator[Measurement]:
             case = Case(preset, size, 4 if preset == "small" else 2, 3 if preset == "small" else 2, "float32", batch)
             case.config = dataclasses.replace(case.config, microbatch_size=batch)
             case.prepare(Path(folder))
-            program, compile_seconds = case.compiled(compiler_options())
+            program, compile_seconds, _ = case.compiled(compiler_options())
             times = medians({"step": lambda: case.run(program)}, 3)
         statistics = jax.devices()[0].memory_stats() or {}
         ms = float(times["step"][0])

@@ -1,32 +1,28 @@
-"""What a step of training costs on a mesh of many chips, counted from the program that XLA compiles for them.
+"""What a step of training costs on a mesh of many chips, counted from the traced program.
 
     python experiments/accelerator/training_cost.py --json OUT
     python experiments/accelerator/training_cost.py --json OUT --compile --libtpu SITE_PACKAGES
 
-Counts what one chip does in one step, without the chips and without running anything: operations and what it sends to
-others from the program as JAX hands it to XLA (as the step is written: XLA removes next to nothing of either), memory
-traffic and memory from what XLA compiles for a topology of TPUs, with `--compile`. `--libtpu` is the folder into
-which `pip install --target` put the package libtpu, where it is not installed. `--chips v5e:16x16 --fsdp 256` describes the
-mesh, `--sizes 256 512` the stages, `--per-chip` the subjects of each chip. Weights of the loss networks are made up.
-Without `--compile` a minute each. Numbers and what follows from them: docs/scaling.md, made by `--page`.
+Counts what one chip does in one step, without the chips and without running anything: operations and what it sends, from
+the step as it is written (XLA removes next to nothing of either). With `--compile`, also the memory of what XLA compiles for a
+topology of TPUs; `--libtpu` is the folder into which `pip install --target` put the package libtpu, where it is not installed.
+`--chips v5e:16x16 --fsdp 256` describes the mesh, `--sizes` the stages, `--per-chip` the subjects of each chip. Weights of
+the loss networks are made up. Without `--compile` a minute each. Numbers and what follows from them: docs/scaling.md, made by
+`--page`.
 """
 
 import argparse
 import dataclasses
-import functools
 import json
 import math
 import os
-import re
 import sys
 import time
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.compiled_costs import compiled_costs, program_costs
-from experiments.common.hlo import Computation, Instruction, Program, known_trips, parse_program
+from experiments.common.costs import costs_of, temporary_mb
 from experiments.common.results import markdown_table, publish, write_json
 
 VARIANTS = {
@@ -117,7 +113,6 @@ def compilation(arguments: argparse.Namespace, devices: Any, size: int, variant:
     step = jax.jit(jitted_train_step().__wrapped__, static_argnames=("config", "mesh"), donate_argnames="state")
     start = time.perf_counter()
     traced = step.trace(state, batch, everywhere(body), everywhere(networks), config=config, mesh=mesh)
-    lowered = traced.lower(lowering_platforms=("tpu",))
     facts = {
         "chips": mesh.size,
         "subjects": config.batch_size,
@@ -125,19 +120,19 @@ def compilation(arguments: argparse.Namespace, devices: Any, size: int, variant:
         "state_bytes": sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(state)),
         "batch_bytes": sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(batch)),
         "trace_s": time.perf_counter() - start,
-    } | handed_over(lowered, mesh.size)
-    return facts | (compiled(lowered) if arguments.compile else {})
+    } | counted(traced)
+    return facts | (compiled(traced.lower(lowering_platforms=("tpu",))) if arguments.compile else {})
 
 
-def handed_over(lowered: Any, chips: int) -> dict[str, Any]:
+def counted(traced: Any) -> dict[str, Any]:
     """Of the program before XLA's optimisations."""
-    text = lowered.compiler_ir("hlo").as_hlo_module().to_string()
-    costs = program_costs(text)
+    costs = costs_of(traced)
     return {
-        "flops": costs.matrix_flops,
-        "convolution_flops": costs.convolution_flops,
+        "flops": costs.flops,
+        "convolution_flops": costs.convolutions,
         "unknown_trips": costs.unknown_trips,
-        "collectives": dataclasses.asdict(collectives(text, chips)),
+        "messages": dict(costs.messages),
+        "sent_bytes": dict(costs.sent),
     }
 
 
@@ -150,14 +145,12 @@ def compiled(lowered: Any) -> dict[str, Any]:
         program = lowered.compile()
     except jax.errors.JaxRuntimeError as error:
         return {"refused": str(error).splitlines()[0][:300]}
-    costs = compiled_costs(program)
+    memory = program.memory_analysis()
     return {
         "compile_s": time.perf_counter() - start[0],
         "compile_cpu_s": time.process_time() - start[1],
-        "compiled_flops": costs.matrix_flops,
-        "bytes": costs.bytes_accessed,
-        "temporary_bytes": costs.temporary_bytes,
-        "argument_bytes": costs.argument_bytes,
+        "temporary_mb": temporary_mb(program),
+        "argument_mb": memory.argument_size_in_bytes / 2**20,
         "jax": jax.__version__,
     }
 
@@ -198,88 +191,20 @@ def abstract_arguments(config: Any) -> tuple[Any, Any, Any, Any]:
 def table(result: dict[str, Any]) -> str:
     """One line per program."""
     header = ["one chip, one step", "TFLOP", "of them convolutions", "messages", "MB sent", "state, MB", "batch, MB"]
-    if any("bytes" in row or "refused" in row for row in result.values()):
-        header += ["compile, CPU s", "GB memory traffic", "GB needed"]
+    if any("temporary_mb" in row or "refused" in row for row in result.values()):
+        header += ["compile, CPU s", "MiB needed"]
     rows = []
     for name, row in result.items():
-        messages = sum(row["collectives"]["calls"].values())
-        sent = sum(row["collectives"]["sent_bytes"].values())
+        messages = sum(row["messages"].values())
+        sent = sum(row["sent_bytes"].values())
         mega = [sent / 1e6, row["state_bytes"] / row["chips"] / 1e6, row["batch_bytes"] / row["chips"] / 1e6]
         share = row["convolution_flops"] / row["flops"]
         cells = [name, f"{row['flops'] / 1e12:.2f}", f"{share:.0%}", messages, *(f"{x:.1f}" for x in mega)]
-        if "bytes" in row:
-            needed = row["temporary_bytes"] + row["argument_bytes"]
-            cells += [f"{row['compile_cpu_s']:.0f}", f"{row['bytes'] / 1e9:.0f}", f"{needed / 1e9:.1f}"]
+        if "temporary_mb" in row:
+            needed = row["temporary_mb"] + row["argument_mb"]
+            cells += [f"{row['compile_cpu_s']:.0f}", f"{needed:.0f}"]
         rows.append([*cells, *["refused" if "refused" in row else "-"] * (len(header) - len(cells))])
     return markdown_table(header, rows)
-
-
-SENT = {"all-gather": 1, "reduce-scatter": 1, "all-reduce": 2, "all-to-all": 1}
-"""Passes over the array. `collective-permute` sends it once, whole."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Collectives:
-    """By kind: calls, bytes of the whole arrays, and bytes that each device sends. unknown_trips: loops counted once."""
-
-    calls: dict[str, int]
-    array_bytes: dict[str, int]
-    sent_bytes: dict[str, int]
-    unknown_trips: int
-
-
-def collectives(text: str, devices: int) -> Collectives:
-    """Of an optimised program. devices: the size of a group where the program does not say (one group of all)."""
-    counter = _Counter(parse_program(text), devices)
-    total = counter.computation(counter.program.entry)
-    pick = lambda what: {kind: number for (kind, name), number in sorted(total.items()) if name == what}
-    return Collectives(pick("calls"), pick("array"), pick("sent"), len(counter.unknown))
-
-
-def group_size(attributes: str, devices: int) -> int:
-    """Devices of a group, of `replica_groups={{0,1},{2,3}}` or `[groups,size]<=[...]`."""
-    if found := re.search(r"replica_groups=\[(\d+),(\d+)\]", attributes):
-        return int(found[2])
-    if found := re.search(r"replica_groups=\{\{([\d,]+)\}", attributes):
-        return len(found[1].split(","))
-    return devices
-
-
-class _Counter:
-    def __init__(self, program: Program, devices: int):
-        self.program, self.devices = program, devices
-        self.unknown: set[str] = set()
-
-    @functools.cache  # noqa: B019, a counter lives as long as its program
-    def computation(self, name: str) -> Counter:
-        computation, total = self.program.computations[name], Counter()
-        for x in computation.instructions.values():
-            total.update(self.instruction(computation, x))
-        return total
-
-    def instruction(self, computation: Computation, x: Instruction) -> Counter:
-        kind = x.opcode.removesuffix("-start")
-        if kind in SENT or kind == "collective-permute":
-            return self.collective(computation, x, kind)
-        if x.opcode == "while":
-            trips = known_trips(self.program, computation, x)
-            if trips is None:
-                self.unknown.add(x.name)
-            body = self.computation(x.names("body")[0])
-            return Counter({key: (1 if trips is None else trips) * number for key, number in body.items()})
-        total = Counter()
-        for key in ("calls", "to_apply", "branch_computations", "true_computation", "false_computation"):
-            for name in x.names(key):
-                if name in self.program.computations:
-                    total.update(self.computation(name))
-        return total
-
-    def collective(self, computation: Computation, x: Instruction, kind: str) -> Counter:
-        given = sum(computation.instructions[name].size for name in x.operands if name in computation.instructions)
-        size = group_size(x.attributes, self.devices)
-        whole = given * size if kind == "all-gather" else given
-        share = 1 if kind == "collective-permute" else SENT[kind] * (size - 1) / size
-        return Counter({(kind, "calls"): 1, (kind, "array"): whole, (kind, "sent"): math.ceil(whole * share)})
 
 
 if __name__ == "__main__":

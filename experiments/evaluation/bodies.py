@@ -45,6 +45,7 @@ from experiments.evaluation.results import (
     finished,
     kept_rows,
     printed_table,
+    without_people,
 )
 from humangs_jax.evaluation.tables import mean_scores
 
@@ -70,7 +71,7 @@ def main() -> None:
     except (ValueError, OSError) as error:
         parser.error(str(error))
     if arguments.page:
-        publish(arguments.page, "evaluation_bodies", bodies_section(report), report)
+        publish(arguments.page, "evaluation_bodies", bodies_section(report), without_people(report))
 
 
 def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]:

@@ -48,7 +48,7 @@ def quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any
         raise ValueError(
             "the report of the refined demo has no refined scores: expected `humangs demo` without --refine 0"
         )
-    count = len(people["subjects"])
+    count = people["people"]
     if refined["people"] != count:
         raise ValueError(f"{refined['people']} people were refined: expected the same {count}")
     if people["settings"]["weights"] != refined["settings"]["weights"]:

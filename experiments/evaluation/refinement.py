@@ -1,12 +1,11 @@
 """What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colours.
 
     python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 1 2 5 15] [--sizes 256 512]
-        [--views 4] [--rounds 0 4] [--growth 1 1.5] [--off 0 2.5 5] [--longest-edge 0.017]
+        [--views 4] [--rounds 0 4] [--off 0 2.5 5] [--longest-edge 0.017]
         [--page docs/refinement.md] [--table NAME] [--plot PLOT] [--sheet SHEET] [--details SHEET]
 
-People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "after rounds"
-from what `humangs reconstruct` writes, "random colours" from as many round Gaussians of random colours on the vertices of the
-body. Scores: docs/evaluation.md.
+People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random
+colours" from as many round Gaussians of random colours on the vertices of the body. Scores: docs/evaluation.md.
 
 --off gives the photos a wrong body. Its value is the standard deviation of the translation, in millimetres. For each millimetre,
 joints turn by 0.2 degrees about each axis, and shape coefficients change by 0.02 (standard deviations). Held-out views show the
@@ -40,7 +39,7 @@ from humangs_jax.refinement.config import ROUNDS, RefineConfig
 
 DEGREES, SHAPES = 0.2, 0.02
 """Of --off: turn of a joint and change of a shape coefficient for each millimetre."""
-STARTS = ("network", "after rounds", "random colours")
+STARTS = ("network", "random colours")
 SHOWN = {
     "psnr": ("PSNR", 2),
     "psnr_foreground": ("on the person", 2),
@@ -61,7 +60,6 @@ def main() -> None:
     parser.add_argument(
         "--rounds", type=int, nargs="+", default=[0, ROUNDS], help="of the learned update; 0: Adam alone"
     )
-    parser.add_argument("--growth", type=float, nargs="+", default=[1.0], help="of the number of Gaussians")
     parser.add_argument(
         "--off", type=float, nargs="+", default=[0.0], help="millimetres that the body is off, see above"
     )
@@ -100,10 +98,10 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
     settings = settings_of(arguments, digest, config.tokens, None)
     settings |= {
         name: getattr(arguments, name)
-        for name in ("seconds", "sizes", "views", "starts", "rounds", "growth", "off", "refine_poses", "longest_edge")
+        for name in ("seconds", "sizes", "views", "starts", "rounds", "off", "refine_poses", "longest_edge")
     }
     settings |= {"scored_at": arguments.scored_at} if arguments.scored_at else {}
-    learned = any(arguments.rounds) or "after rounds" in arguments.starts
+    learned = any(arguments.rounds)
     settings |= {"refiner": shipped_digest(SHIPPED)} if learned else {}
     rows, images = kept_rows(arguments.json, settings, "cells"), {}
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
@@ -117,14 +115,13 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
             if arguments.scored_at:
                 scored = make_evaluation_subject(seed, body, arguments.views, arguments.scored_at, held_out)
                 subject = dataclasses.replace(subject, held_out=scored.held_out)
-            choices = (arguments.views, arguments.off, arguments.starts, arguments.rounds, arguments.growth)
-            for count, off, start, rounds, growth in itertools.product(*choices):
-                how = RefineConfig(rounds=rounds, growth=growth, poses=arguments.refine_poses)
+            choices = (arguments.views, arguments.off, arguments.starts, arguments.rounds)
+            for count, off, start, rounds in itertools.product(*choices):
+                how = RefineConfig(rounds=rounds, poses=arguments.refine_poses)
                 moved = with_body_off(subject, off)
                 cell, drawn = measure(variables, config, moved, count, start, how, arguments.seconds)
                 also = f", {rounds} rounds" if rounds else ""
                 also += f", body {off:g} mm off" if off else ""
-                also += "" if growth == 1 else f", {growth:g} x Gaussians"
                 row[f"{size} {count} {start}{also}"] = cell
                 if start == "network" and count == max(arguments.views):
                     images[seed] = drawn
@@ -177,8 +174,6 @@ def measure(variables, config, subject, count, start, how, seconds):
 
     inputs = subject.inputs(count)
     avatar = reconstruct(variables, config, inputs)
-    if start == "after rounds":
-        avatar = refine_with_report(avatar, inputs, RefineConfig(steps=0, seconds=None)).avatar
     if start == "random colours":
         avatar = random_start(avatar, subject.seed)
     view = frontal_view(subject.photos, subject.held_out, task_views(subject.held_out)["novel"].tolist())

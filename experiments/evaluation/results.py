@@ -104,6 +104,12 @@ def views_report(
     }
 
 
+def without_people(report: dict[str, Any]) -> dict[str, Any]:
+    """The report with the number of its people in place of their rows."""
+    kept = {name: value for name, value in report.items() if name not in ("subjects", "others")}
+    return kept | {"people": len(report["subjects"])}
+
+
 def ranked(report: dict[str, Any]) -> list[dict[str, Any]]:
     """The people of a report, best PSNR of novel views first."""
     return sorted(report["subjects"], key=lambda person: -person["psnr"])

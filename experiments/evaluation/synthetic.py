@@ -49,6 +49,7 @@ from experiments.evaluation.results import (
     table_row,
     views_report,
     views_section,
+    without_people,
 )
 
 
@@ -75,7 +76,7 @@ def main() -> None:
         parser.error(str(error))
     if arguments.page:
         section = views_section(report, arguments.page, arguments.images, arguments.plot)
-        publish(arguments.page, "evaluation_views", section, report)
+        publish(arguments.page, "evaluation_views", section, without_people(report))
 
 
 def evaluate(arguments: argparse.Namespace, lpips: Any = None) -> dict[str, Any]:

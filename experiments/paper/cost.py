@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.compiled_costs import compiled_costs, program_costs
+from experiments.common.costs import costs_of, temporary_mb
 from experiments.common.interleaved import medians, prepare_process
 from experiments.common.results import REPOSITORY, add_outputs, markdown_table, significant, write_outputs
 from experiments.paper.bench import ANIMATION, FASTER_MODELLING, OURS
@@ -113,12 +113,12 @@ def compare(width: int, repeats: int, views: int, vertices: int, size: int) -> d
         shapes = jax.eval_shape(lambda reader=reader, run=run: reader.init(jax.random.key(0), encoding, inputs, run))
         variables = jax.tree.map(lambda x: np.full(x.shape, 0.02, x.dtype), shapes)
         read = lambda v, e, x, reader=reader, run=run: reader.apply(v, e, x, run).local
-        program = jax.jit(read).lower(variables, encoding, inputs).compile()
-        costs = compiled_costs(program)
+        traced = jax.jit(read).trace(variables, encoding, inputs)
+        program = traced.lower().compile()
         sums = READ_OPERATIONS * views * vertices * width if name == "back-projection" else 0
         found[name] = {
-            "operations": costs.matrix_flops + sums,
-            "temporary_mb": costs.temporary_bytes / 2**20,
+            "operations": costs_of(traced).flops + sums,
+            "temporary_mb": temporary_mb(program),
         }
         runs[name] = functools.partial(wait, program, variables, encoding, inputs)
     for name, (wall, cpu) in medians(runs, repeats).items():
@@ -195,12 +195,11 @@ def network_flops(name: str, photos: int) -> dict[str, float]:
     inputs = jax.eval_shape(lambda: subject(1, photos, vertices, config.conventions.image_size)[0])
     forward = lambda v, x: apply_humangs(v, x, config)[0].gaussians
     variables = expected_variables(config)
-    module: Any = jax.jit(forward).lower(variables, inputs).compiler_ir("hlo")
     return {
         "photos": photos,
         "vertices": vertices,
         "parameters": sum(x.size for x in jax.tree.leaves(variables["params"])),
-        "operations": program_costs(module.as_hlo_module().to_string()).matrix_flops,
+        "operations": costs_of(jax.jit(forward).trace(variables, inputs)).flops,
     }
 
 
@@ -221,12 +220,11 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
     few = jnp.zeros((8, 3)), jnp.zeros((8, reader.width))
     variables = jax.eval_shape(lambda: streams.init(jax.random.key(0), *few, None))
     forward = lambda v, p, t: streams.apply(v, p, t, None)
-    module: Any = jax.jit(forward).lower(variables, points, tokens).compiler_ir("hlo")
     return {
         "photos": photos,
         "vertices": POINTS,
         "parameters": sum(x.size for x in jax.tree.leaves(variables["params"])),
-        "operations": program_costs(module.as_hlo_module().to_string()).matrix_flops,
+        "operations": costs_of(jax.jit(forward).trace(variables, points, tokens)).flops,
     }
 
 

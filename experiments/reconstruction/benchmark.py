@@ -4,11 +4,11 @@
 
 With all tokens and with those of the foreground, in turns with a plain matrix product, which gives the peak of this run.
 Random weights: they cost what trained ones cost. Floating-point operations and bytes are counted from the compiled
-programs, loops included (`common/compiled_costs.py`); "published_flops" is the same network with its last convolution
+programs, loops included (`common/costs.py`); "published_flops" is the same network with its last convolution
 evaluated at every pixel, as the release does. `--memory 1 4 8 16` adds the peak memory of programs for these numbers of views at
 `--memory-size`, from XLA's memory analysis: they are compiled and not run. `--stages` times encoder, sampling and decoder.
 
-Writes {"all", "foreground": {"ms", "cpu_ms", "compile_s", "tokens", "flops", "bytes", "temporary_mb", "share_of_peak",
+Writes {"all", "foreground": {"ms", "cpu_ms", "compile_s", "tokens", "flops", "temporary_mb", "share_of_peak",
 "ratio_to_matmul", "ratio_to_matmul_cpu": wall and CPU time over those of the same operations as plain products},
 "ratio_to_published_matmul", "matmul_gflops", "foreground_share", "speed_up": {"promised", "measured", "fraction"},
 "memory": {"all", "foreground": {views: {"temporary_mb", "flops"}}}, ...}.
@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.compiled_costs import compiled_costs
+from experiments.common.costs import temporary_mb
 from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
 from experiments.common.results import add_outputs, markdown_table, publish, write_outputs
 from experiments.reconstruction.cases import (
@@ -136,16 +136,8 @@ def reconstruction(variables: Any, inputs: Any, config: Any) -> tuple[Any, dict[
     """(the network as one program, what it costs by count)."""
     from humangs_jax.network.humangs import apply_humangs
 
-    program, seconds = compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)
-    costs = compiled_costs(program)
-    return program, {
-        "compile_s": seconds,
-        "flops": costs.matrix_flops,
-        "bytes": costs.bytes_accessed,
-        "transcendentals": costs.transcendentals,
-        "temporary_mb": MEBI * costs.temporary_bytes,
-        "uncounted": list(costs.uncounted),
-    }
+    program, seconds, flops = compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)
+    return program, {"compile_s": seconds, "flops": flops, "temporary_mb": temporary_mb(program)}
 
 
 def stages(variables: Any, inputs: Any, config: Any) -> dict[str, Any]:
@@ -169,8 +161,7 @@ def whole_network_flops(variables: Any, inputs: Any, config: Any) -> int:
     from humangs_jax.network.config import paper_parts
     from humangs_jax.network.humangs import apply_humangs
 
-    program, _ = compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)
-    here = compiled_costs(program).matrix_flops
+    here = compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)[2]
     encoder, reader, _ = paper_parts(config.architecture)
     if encoder.upsampler is None or reader.output_width is None:
         return here
@@ -191,9 +182,8 @@ def memory(config: Any, views: int, size: int) -> dict[str, float]:
     if config.tokens == "foreground":
         config = foreground(subject, config)[0]
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), subject)
-    program, _ = compiled(lambda v, x: apply_humangs(v, x, config)[0], expected_variables(config), shapes)
-    costs = compiled_costs(program)
-    return {"temporary_mb": MEBI * costs.temporary_bytes, "flops": costs.matrix_flops}
+    program, _, flops = compiled(lambda v, x: apply_humangs(v, x, config)[0], expected_variables(config), shapes)
+    return {"temporary_mb": temporary_mb(program), "flops": flops}
 
 
 def table(result: dict[str, Any]) -> str:
@@ -204,7 +194,6 @@ def table(result: dict[str, Any]) -> str:
             case["tokens"],
             f"{case['ms']:.0f}, {case['cpu_ms']:.0f}",
             f"{case['flops'] / 1e9:.0f}",
-            f"{case['bytes'] / 1e9:.1f}",
             f"{case['share_of_peak']:.2f}",
             f"{case['ratio_to_matmul']:.2f}, {case['ratio_to_matmul_cpu']:.2f}",
             f"{case['temporary_mb']:.0f}",
@@ -217,7 +206,6 @@ def table(result: dict[str, Any]) -> str:
         "slots",
         "wall, CPU ms",
         "GFLOP",
-        "GB",
         "share of peak",
         "/ matmul (wall, CPU)",
         "MiB",

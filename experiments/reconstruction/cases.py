@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from experiments.common.costs import costs_of
+
 DISTANCE_FACTOR = 1.8
 """The nearest of the published protocol (1.8 to 2.2)."""
 ELEVATION = np.deg2rad(5.0)
@@ -116,13 +118,14 @@ def random_variables(config: Any, seed: int = 0) -> Any:
     return variables
 
 
-def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
-    """(compiled program, seconds that tracing and compiling took)."""
+def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float, int]:
+    """(compiled program, seconds that tracing and compiling took, operations)."""
     import jax
 
     start = time.perf_counter()
-    program = jax.jit(function).lower(*arguments).compile()
-    return program, time.perf_counter() - start
+    traced = jax.jit(function).trace(*arguments)
+    program = traced.lower().compile()
+    return program, time.perf_counter() - start, costs_of(traced).flops
 
 
 def matmul_program(dtype: str) -> tuple[Callable[[], Any], float]:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.compiled_costs import compiled_costs
+from experiments.common.costs import temporary_mb
 from experiments.common.interleaved import medians, prepare_process
 from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.reconstruction.benchmark import configured
@@ -73,18 +73,17 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     else:
         networks["foreground tokens"] = lambda v, x: network(v, x, packed)
 
-    programs = {name: compiled(function, variables, inputs)[0] for name, function in networks.items()}
-    outputs = {name: program(variables, inputs) for name, program in programs.items()}
-    runs = {name: lambda p=program: jax.block_until_ready(p(variables, inputs)) for name, program in programs.items()}
+    programs = {name: compiled(function, variables, inputs) for name, function in networks.items()}
+    outputs = {name: program(variables, inputs) for name, (program, _, _) in programs.items()}
+    runs = {name: lambda p=p: jax.block_until_ready(p(variables, inputs)) for name, (p, _, _) in programs.items()}
     times = medians(runs, arguments.repeats) if arguments.repeats else {}
     reference = outputs["as published"]
     picture = drawn(reference, inputs)
     rows = {}
     for name, output in outputs.items():
-        costs = compiled_costs(programs[name])
         rows[name] = {
-            "flops": costs.matrix_flops,
-            "temporary_mb": costs.temporary_bytes / 2**20,
+            "flops": programs[name][2],
+            "temporary_mb": temporary_mb(programs[name][0]),
             "ms": float(times[name][0]) if times else None,
             "cpu_ms": float(times[name][1]) if times else None,
             **errors(output, reference, inputs),

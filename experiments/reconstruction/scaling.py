@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.compiled_costs import compiled_costs
 from experiments.common.interleaved import medians, prepare_process
 from experiments.common.results import add_outputs, markdown_table, write_outputs
 from experiments.reconstruction.benchmark import configured
@@ -63,10 +62,10 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         programs = {}
         for name in COLORS:
             case, whole = (foreground(inputs, c)[0] if name == "foreground" else c for c in (half, full))
-            programs[name] = network(variables, inputs, case)
+            programs[name], _, flops = network(variables, inputs, case)
             row[name] = {
-                "flops": compiled_costs(programs[name]).matrix_flops,
-                "published_flops": compiled_costs(network(shapes_of(whole), inputs, whole)).matrix_flops,
+                "flops": flops,
+                "published_flops": network(shapes_of(whole), inputs, whole)[2],
             }
         call = lambda program, subject: jax.block_until_ready(program(variables, subject))
         runs = {name: functools.partial(call, program, inputs) for name, program in programs.items()}
@@ -85,10 +84,10 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
 
 
 def network(variables: Any, inputs: Any, config: Any) -> Any:
-    """The compiled network."""
+    """The compiled network, as `compiled` returns it."""
     from humangs_jax.network.humangs import apply_humangs
 
-    return compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)[0]
+    return compiled(lambda v, x: apply_humangs(v, x, config)[0], variables, inputs)
 
 
 def shapes_of(config: Any) -> Any:

@@ -6,12 +6,11 @@
 Files: see `splatting/scenes.py`. DIR holds a `yardstick.py` with `Scene` and `Yardstick` (its `forward()` and
 `forward_backward(target)` take turns with ours in this process). The loss is the mean squared error against a target of
 noise; black background. Half a minute at 512. `--float64` draws the scene in float64 instead and compares that.
-An image is shared between two of XLA's host devices where there are two cores (`--devices 1`: not).
 
 Prints tables and writes {"forward_ms", "forward_backward_ms", "forward_cpu_ms", "forward_backward_cpu_ms" (medians),
 "yardstick": {the same} or null, "ratio": ours / yardstick, "compile_s", "peak_rss_mb", "psnr", "max_abs_error",
 "fraction_above_2e-4", "gradient_relative_l2", "gradient_cosine", "gradient_signed_bias", "gradient_gain": {parameter:
-number}, "work", "config", "devices", ...}; values that need a missing reference are null.
+number}, "config", "device", ...}; values that need a missing reference are null.
 
 Expected: psnr at least 95 dB (90 where a head's tiles are crowded), gradients within 1e-3, cosine above 0.99999, and in
 float64 no error above 1e-6. On 2 cores of an AMD EPYC (Zen 4), 52,375 Gaussians at 512: see docs/performance.md.
@@ -61,19 +60,12 @@ def main() -> None:
     parser.add_argument("--preset", default="exact", help="name in SPLAT_PRESETS")
     parser.add_argument("--config", type=json.loads, default={}, help="JSON of SplatConfig fields over the preset")
     parser.add_argument("--margin", type=float, default=1.0, help="room in the buffers; 1 is what eager calls take")
-    parser.add_argument(
-        "--devices",
-        type=int,
-        default=min(2, os.cpu_count() or 1),
-        help="devices that share the image; on a CPU, how many to make",
-    )
     parser.add_argument("--float64", action="store_true", help="draw in float64")
     arguments = parser.parse_args()
     prepare_process()
     result = benchmark(arguments)
     text = "\n\n".join(table for table in (times_table(result), errors_table(result)) if table)
-    work_done = ", ".join(f"{name.replace('_', ' ')} {value:,}" for name, value in result["work"].items())
-    print(f"{text}\n\nwork: {work_done}")
+    print(text)
     if arguments.json:
         write_json(arguments.json, result)
     if arguments.page:
@@ -86,15 +78,12 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
 
     jax.config.update("jax_enable_compilation_cache", False)  # compile times are of a first run
     jax.config.update("jax_enable_x64", arguments.float64)
-    jax.config.update("jax_num_cpu_devices", arguments.devices)
-    devices = jax.devices()[: arguments.devices]
-    mesh = jax.sharding.Mesh(np.array(devices), ("rows",)) if len(devices) > 1 else None
     dtype = np.float64 if arguments.float64 else np.float32
     scene = load_scene(arguments.scene, arguments.size)
     reference = load_reference(arguments.reference, arguments.size) if arguments.reference else None
     target = make_target(arguments.size, reference.seed if reference else 1)
-    config = planned(scene, arguments.preset, arguments.config, arguments.margin, dtype, mesh)
-    programs, facts = compiled(scene, target, config, dtype, mesh)
+    config = planned(scene, arguments.preset, arguments.config, arguments.margin, dtype)
+    programs, facts = compiled(scene, target, config, dtype)
 
     runs = dict(programs)
     if arguments.yardstick:
@@ -110,7 +99,7 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
     result |= {"compile_s": max(each["compile_s"].values()), "compile_s_each": each["compile_s"]}
     result |= {"peak_rss_mb": peak_rss_mb(), "temporary_mb": each["temporary_mb"]}
     result |= errors(programs, reference)
-    result |= {"work": work(scene, config, dtype), "config": dataclasses.asdict(config)}
+    result |= {"config": dataclasses.asdict(config)}
     result |= {
         "scene": scene.kind,
         "size": scene.size,
@@ -119,25 +108,23 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
         "preset": arguments.preset,
         "repeats": arguments.repeats,
         "load_average": load,
-        "devices": [device.device_kind for device in devices],
+        "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
     }
     return result
 
 
-def planned(
-    scene: Scene, preset: str, fields: Mapping[str, Any], margin: float, dtype: type = np.float32, mesh: Any = None
-) -> Any:
+def planned(scene: Scene, preset: str, fields: Mapping[str, Any], margin: float, dtype: type = np.float32) -> Any:
     """A preset with some fields replaced, and buffers that fit the scene."""
     from humangs_jax.rendering.splat_config import SPLAT_PRESETS
     from humangs_jax.rendering.splatting import plan_buffers
 
     config = dataclasses.replace(SPLAT_PRESETS[preset], **fields)
-    return plan_buffers(scene.gaussians(dtype), scene.camera(dtype), config, margin, mesh)
+    return plan_buffers(scene.gaussians(dtype), scene.camera(dtype), config, margin)
 
 
 def compiled(
-    scene: Scene, target: np.ndarray, config: Any, dtype: type = np.float32, mesh: Any = None
+    scene: Scene, target: np.ndarray, config: Any, dtype: type = np.float32
 ) -> tuple[dict[str, Callable[[], Any]], dict[str, dict[str, float]]]:
     """Our two programs, bound to the scene, and for each how long it took to compile and how much it holds while it runs.
 
@@ -153,7 +140,7 @@ def compiled(
     goal, black = jnp.asarray(target, dtype), jnp.zeros(3, dtype)
 
     def forward(gaussians):
-        return render(gaussians, camera, config, black, mesh)
+        return render(gaussians, camera, config, black)
 
     def loss(gaussians):
         return jnp.mean((forward(gaussians).rgb - goal) ** 2)
@@ -211,17 +198,9 @@ def errors(programs: Mapping[str, Callable[[], Any]], reference: Reference | Non
     return found
 
 
-def work(scene: Scene, config: Any, dtype: type) -> dict[str, float]:
-    """What the scene asks for: see `splatting/work.py`."""
-    from experiments.splatting.work import tile_work
-
-    return tile_work(scene, config, dtype)
-
-
 def name_of(run: Mapping[str, Any]) -> str:
-    """Scene, size and how many devices shared the image."""
-    devices = len(run["devices"])
-    return f"{run['scene']} {run['size']}" + (f", {devices} devices" if devices > 1 else "")
+    """Scene and size."""
+    return f"{run['scene']} {run['size']}"
 
 
 def times_table(run: Mapping[str, Any]) -> str:

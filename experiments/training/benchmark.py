@@ -1,14 +1,12 @@
 """Time, arithmetic and memory of one step of training, in turns with plain matrix products, which give the floor.
 
     python experiments/training/benchmark.py --json OUT                       # all cases: half an hour on 2 idle cores
-    python experiments/training/benchmark.py --json OUT --only "small 256" --stages --variants
     python experiments/training/benchmark.py --json OUT --page docs/performance_training.md
 
 A synthetic person is made and read by the loader; all weights are random, also those of loss networks: they cost what trained
-ones cost. Operations and bytes are counted from the compiled step, loops included (`common/compiled_costs.py`). The floor is
-the time that these operations take as plain products in the same turns. `--stages` compiles parts of a step by themselves and
-times them: gradients of a part include the part itself. `--variants` times the step with one thing changed at a time. Results
-are added to OUT, so cases can be run one by one; `--page` writes them into a page and runs nothing.
+ones cost. Operations are counted from the traced step, loops included (`common/costs.py`). The floor is
+the time that these operations take as plain products in the same turns. Results are added to OUT, so cases can be run one by
+one; `--page` writes them into a page and runs nothing.
 
 Numbers: docs/performance_training.md.
 """
@@ -18,16 +16,14 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
-from experiments.common.compiled_costs import compiled_costs
+from experiments.common.costs import temporary_mb
 from experiments.common.interleaved import medians, peak_rss_mb, prepare_process
 from experiments.common.results import markdown_table, publish, write_json
 from experiments.training.cases import CASES, Case
-from experiments.training.variants import stage_numbers, variant_numbers
 
 MEBI = 1 / 2**20
 
@@ -43,10 +39,6 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=3, help="timed rounds")
     parser.add_argument("--warm-up", type=int, default=1, help="rounds before these")
-    parser.add_argument("--stages", action="store_true", help="also time parts of the step")
-    parser.add_argument(
-        "--variants", nargs="*", help="also time the step with one thing changed at a time (all, or these)"
-    )
     parser.add_argument("--json", type=Path, help="add the numbers to this file")
     parser.add_argument("--page", type=Path, help="write the tables into this page from --json; nothing is run")
     arguments = parser.parse_args()
@@ -59,33 +51,23 @@ def main() -> None:
             preset, size, views, targets = CASES[name]
             views, targets = arguments.views or views, arguments.targets or targets
             key = f"{name}, {views} + {targets} views"
-            for numbers in benchmark(Case(preset, size, views, targets, arguments.dtype), arguments):
-                result[key] = result.get(key, {}) | numbers
-                print(key, json.dumps(numbers), flush=True)
-                if arguments.json:
-                    write_json(arguments.json, result)
-    for name, make in TABLES.items():
-        text = make(result)
-        print(text, end="\n\n")
-        if arguments.page:
-            publish(arguments.page, name, text, result)
+            result[key] = benchmark(Case(preset, size, views, targets, arguments.dtype), arguments)
+            print(key, json.dumps(result[key]), flush=True)
+            if arguments.json:
+                write_json(arguments.json, result)
+    print(text := steps_table(result))
+    if arguments.page:
+        publish(arguments.page, "training_steps", text, result)
 
 
-def benchmark(case: Case, arguments: argparse.Namespace) -> Iterator[dict[str, Any]]:
-    """What the JSON holds of a case, part by part."""
+def benchmark(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the JSON holds of a case."""
     import jax
 
     jax.config.update("jax_enable_compilation_cache", False)
     with tempfile.TemporaryDirectory() as folder:
         case.prepare(Path(folder))
-        yield step_numbers(case, arguments)
-        if arguments.stages:
-            yield {"stages": stage_numbers(case, arguments.repeats, arguments.warm_up)}
-        if arguments.variants is not None:
-            done = {}
-            for name, numbers in variant_numbers(case, arguments.variants, arguments.repeats, arguments.warm_up):
-                yield {"variants": done | {name: numbers}}
-                done[name] = numbers
+        return step_numbers(case, arguments)
 
 
 def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
@@ -95,28 +77,24 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
     from experiments.reconstruction.cases import matmul_program
     from humangs_jax.core.compiler_options import compiler_options
 
-    program, compile_s = case.compiled(compiler_options())
+    program, compile_s, costs = case.compiled(compiler_options())
     case.program = program
-    costs = compiled_costs(program)
     product, product_flops = matmul_program(case.config.model.execution.dtype)
     load = os.getloadavg()[0]
     times = medians({"matmul": product, "step": lambda: case.run(program)}, arguments.repeats, arguments.warm_up)
     wall, cpu = map(float, times["step"])
-    floor = costs.matrix_flops / product_flops * times["matmul"]
+    floor = costs.flops / product_flops * times["matmul"]
     return {
         "ms": wall,
         "cpu_ms": cpu,
         "samples_per_s": 1e3 * case.config.batch_size / wall,
-        "flops": costs.matrix_flops,
-        "bytes": costs.bytes_accessed,
+        "flops": costs.flops,
         "unknown_trips": costs.unknown_trips,
-        "uncounted": list(costs.uncounted),
         "matmul_gflops": product_flops / times["matmul"][0] / 1e6,
         "matmul_gflops_cpu": product_flops / times["matmul"][1] / 1e6,
         "share_of_floor": float(floor[0]) / wall,
         "share_of_floor_cpu": float(floor[1]) / max(cpu, 1e-9),
-        "temporary_mb": MEBI * costs.temporary_bytes,
-        "argument_mb": MEBI * costs.argument_bytes,
+        "temporary_mb": temporary_mb(program),
         "peak_rss_mb": peak_rss_mb(),
         "compile_cpu_s": compile_s,
         "tokens": token_count(case.config),
@@ -149,7 +127,6 @@ def steps_table(result: dict[str, Any]) -> str:
         "wall, CPU s",
         "samples/s",
         "TFLOP",
-        "GB",
         "share of floor",
     ]
     header += ["MiB temporaries", "peak MiB", "compile, CPU s"]
@@ -161,7 +138,6 @@ def steps_table(result: dict[str, Any]) -> str:
             f"{row['ms'] / 1e3:.1f}, {row['cpu_ms'] / 1e3:.2f}",
             f"{row['samples_per_s']:.3f}",
             f"{row['flops'] / 1e12:.2f}",
-            f"{row['bytes'] / 1e9:.0f}",
             f"{row['share_of_floor_cpu' if row['device'] == 'cpu' else 'share_of_floor']:.2f}",
             f"{row['temporary_mb']:.0f}",
             f"{row['peak_rss_mb']:.0f}",
@@ -175,40 +151,6 @@ def steps_table(result: dict[str, Any]) -> str:
         for name, row in result.items()
     )
     return markdown_table(header, rows) + f"\n\n{machines}."
-
-
-def stages_table(result: dict[str, Any]) -> str:
-    """One column per case, CPU ms."""
-    cases = {name: row["stages"] for name, row in result.items() if "stages" in row}
-    if not cases:
-        return ""
-    names = list(next(iter(cases.values())))
-    rows = [[name, *(f"{case[name][1]:.0f}" for case in cases.values())] for name in names]
-    step = ["the step", *(f"{result[name]['cpu_ms']:.0f}" for name in cases)]
-    return markdown_table(["CPU ms", *cases], [*rows, step])
-
-
-def variants_table(result: dict[str, Any]) -> str:
-    """What one change does to the step."""
-    rows = []
-    for name, row in result.items():
-        for variant, numbers in row.get("variants", {}).items():
-            ratio = numbers["cpu_ms"] / numbers["as_it_is_cpu_ms"]
-            cells = (numbers["cpu_ms"], ratio, numbers["ms"], numbers["flops"] / 1e9)
-            rows.append(
-                [f"{name}: {variant}", f"{cells[0]:.0f}", f"{cells[1]:.2f}", f"{cells[2]:.0f}", f"{cells[3]:.0f}"]
-            )
-            rows[-1] += [f"{numbers['temporary_mb']:.0f}", f"{numbers['compile_cpu_s']:.0f}"]
-    header = ["step", "CPU ms", "/ as it is", "wall ms", "GFLOP", "MiB temporaries", "compile, CPU s"]
-    return markdown_table(header, rows) if rows else ""
-
-
-TABLES: dict[str, Callable[[dict[str, Any]], str]] = {
-    "training_steps": steps_table,
-    "training_stages": stages_table,
-    "training_variants": variants_table,
-}
-"""Section of the page: what makes its table from all of the JSON."""
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from experiments.common.costs import costs_of
+
 
 def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -> Any:
     """The `TrainConfig` of a preset for photos and targets of `size` pixels, numbers of views as given."""
@@ -63,11 +65,26 @@ def abstract_batch(config: Any, joints: int, betas: int) -> Any:
     return jax.eval_shape(jax.vmap(example), jax.ShapeDtypeStruct((config.batch_size,), jnp.int32))
 
 
+def random_weights(key: Any, slices: Any) -> Any:
+    """Random weights of a network of `objectives.backbones`."""
+    import jax
+    import jax.numpy as jnp
+
+    from humangs_jax.objectives.backbones import Convolution, convolutions
+
+    def draw(layer, key):
+        shape = (layer.size, layer.size, layer.inputs, layer.outputs)
+        scale = (2 / (layer.size**2 * layer.inputs)) ** 0.5
+        return Convolution(scale * jax.random.normal(key, shape), jnp.zeros(layer.outputs))
+
+    layers = list(convolutions(slices))
+    return {layer.name: draw(layer, key) for layer, key in zip(layers, jax.random.split(key, len(layers)), strict=True)}
+
+
 def random_networks(config: Any) -> Any:
     """`LossNetworks` with made-up weights for the losses that need some: they cost what the real ones cost."""
     import jax
 
-    from humangs_jax.objectives.backbones import random_weights
     from humangs_jax.objectives.loss_networks import LossNetworks
     from humangs_jax.objectives.lpips import BACKBONES, Lpips
     from humangs_jax.objectives.perceptual import VGG19, Vgg19
@@ -128,7 +145,7 @@ class Case:
 
         config = self.config
         self.capture = written_subject(folder, config, self.full_body)
-        self.loader = Loader(self.source(), config.batch_size, reader="plain")
+        self.loader = Loader(self.source(), config.batch_size)
         self.body = gaussian_body(self.full_body, config.model)
         self.batch = jax.block_until_ready(self.loader.batch_at(0))
         self.fit()
@@ -160,8 +177,8 @@ class Case:
                 self.config, token_capacity=foreground(inputs, self.config.model)[0].execution.token_capacity
             )
 
-    def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float]:
-        """(the step as a program, CPU seconds that it took to trace and compile)."""
+    def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float, Any]:
+        """(the step as a program, CPU seconds that it took to trace and compile, its `Costs`)."""
         import jax
 
         from humangs_jax.training.step import jitted_train_step
@@ -174,8 +191,9 @@ class Case:
         )
         start = time.process_time()
         arguments = self.state, self.batch, self.body, self.networks
-        program = step.lower(*arguments, config=self.config, mesh=None).compile()
-        return program, time.process_time() - start
+        traced = step.trace(*arguments, config=self.config, mesh=None)
+        program = traced.lower().compile()
+        return program, time.process_time() - start, costs_of(traced)
 
     def run(self, program: Any) -> None:
         """One step."""

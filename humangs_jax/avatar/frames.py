@@ -306,12 +306,11 @@ def motion_frames(
     shot: Shot | None = None,
     *,
     turn: float = 0.0,
-    follow: bool = True,
     progress: bool = True,
 ) -> Iterator[Float[np.ndarray, "h w c"]]:
     """Frames of a moving avatar, drawn when asked for; see `motion_views` and `images`."""
     shot = Shot() if shot is None else shot
-    poses, cameras = motion_views(avatar, motion, shot, turn, follow)
+    poses, cameras = motion_views(avatar, motion, shot, turn)
     return images(avatar, poses, cameras, shot, "animate" if progress else None)
 
 
@@ -320,10 +319,9 @@ def without_unseen(
     poses: BodyPose,
     cameras: Camera,
     how: SplatConfig,
-    threshold: float = ALPHA_MIN,
     progress: str | None = None,
 ) -> Avatar:
-    """The avatar without the Gaussians that weigh less than `threshold` on every pixel of every one of these images.
+    """The avatar without the Gaussians that weigh less than `ALPHA_MIN` on every pixel of every one of these images.
 
     Draws all of them once to find out: worth it for what is drawn several times. docs/video.md has the error and the time.
     """
@@ -331,4 +329,4 @@ def without_unseen(
     drawn = draw(avatar, poses, cameras, how=dataclasses.replace(how, visibility=True))
     for rendering in bar(drawn, total=len(poses), desc=progress, unit="frame", shown=progress is not None):
         most = np.maximum(most, rendering.visibility)
-    return avatar.select(np.flatnonzero(most >= threshold))
+    return avatar.select(np.flatnonzero(most >= ALPHA_MIN))

@@ -11,6 +11,8 @@ import numpy as np
 from humangs_jax.core.array_types import Float
 from humangs_jax.io.images import to_uint8, write_png
 
+LARGEST_ERROR = 0.25
+"""Mean absolute difference of the channels that gets the last of `ERROR_COLORS`."""
 GAP = 4
 """Pixels of white between tiles."""
 TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT = 1 / 14, 10, 22
@@ -38,22 +40,20 @@ def side_by_side(
     path: str | Path,
     *,
     labels: Sequence[str] | None = None,
-    largest_error: float | int = 0.25,
 ) -> None:
     """Write a PNG with truth, ours and the error of every view, and the scale of the error below.
 
-    Arguments:
-        labels: one per view. largest_error: mean absolute difference of the channels that gets the last colour.
+    labels: one per view.
 
     Raises: ValueError if there is no view.
     """
-    errors = error_colors(np.abs(truth - ours).mean(axis=-1), largest_error)
+    errors = error_colors(np.abs(truth - ours).mean(axis=-1), LARGEST_ERROR)
     triples = np.stack([truth, ours, errors], axis=1).reshape(-1, *truth.shape[1:])
     headers = ("truth", "ours", "error")
     columns = 3 if len(truth) <= 3 else 6
     texts = None if labels is None else [text for label in labels for text in (label, "", "")]
     sheet = tile(triples, labels=texts, headers=headers * (columns // 3), columns=columns)
-    scale = error_legend(sheet.shape[1], _text_height(truth.shape[2]), largest_error)
+    scale = error_legend(sheet.shape[1], _text_height(truth.shape[2]), LARGEST_ERROR)
     write_png(path, np.concatenate([sheet, scale]))
 
 

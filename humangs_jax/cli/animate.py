@@ -192,7 +192,7 @@ class View:
     browser: bool = True
     """Open the browser; --no-browser only prints the address."""
     live: bool = False
-    """Follow a training run or an avatar file that is being refined. Needs viser: pip install 'humangs_jax[viewer]'."""
+    """Follow a training run or an avatar file that is being refined."""
     capture: Path | None = None
     """--live of a training run: the capture of the person that it reconstructs. Default: the shipped one."""
 
@@ -207,10 +207,7 @@ class View:
             from humangs_jax.viewer.live import follow
 
             motion = None if self.motion is None else load_motion(self.motion)
-            try:
-                follow(self.avatar, self.capture, motion, self.port, self.browser)
-            except ModuleNotFoundError as error:
-                raise ValueError(f"--live: {error}") from error
+            follow(self.avatar, self.capture, motion, self.port, self.browser)
             return
         with stage("making the page"):
             from humangs_jax.avatar.avatar import Avatar

@@ -21,7 +21,7 @@ from humangs_jax.cli.options import (
     require_suffix,
 )
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
-from humangs_jax.refinement.config import MAX_GROWTH, ROUNDS, RefineConfig
+from humangs_jax.refinement.config import ROUNDS, RefineConfig
 
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
@@ -155,8 +155,6 @@ class Refine:
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
     refine_poses: bool = False
     """Also refine the pose of each photo. On bodies that are millimetres off it gained nothing (docs/refinement.md)."""
-    growth: float = 1.0
-    """The number of Gaussians may grow by this factor: those with the largest errors are split."""
     live: bool = False
     """Write the avatar so far to --out now and then, which `humangs view --live OUT` shows."""
     fit_masks: bool = True
@@ -167,7 +165,6 @@ class Refine:
     def run(self) -> None:
         limits = refine_limits(self.limit, "--limit")
         require_between(16, LARGEST_IMAGE, image_size=self.image_size)
-        require_between(1, MAX_GROWTH, growth=self.growth)
         require_between(0 if limits["steps"] != 0 else 1, 16, rounds=self.rounds)
         require_avatar(self.out, inputs=(self.avatar,))
         with stage("starting"):
@@ -176,9 +173,7 @@ class Refine:
 
             avatar = Avatar.load(self.avatar)
         photos = _read_capture(self.capture, self.check, self.fit_masks)
-        how = RefineConfig(
-            rounds=self.rounds, image_size=self.image_size, poses=self.refine_poses, growth=self.growth, **limits
-        )
+        how = RefineConfig(rounds=self.rounds, image_size=self.image_size, poses=self.refine_poses, **limits)
         _refine_and_save(avatar, photos, self.out, how, self.live)
 
 

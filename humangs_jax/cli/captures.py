@@ -69,10 +69,6 @@ class Extras:
 
     held_out: int = 0
     """Views of the first pose from other cameras, in the sub-folder held_out/."""
-    depth: bool = False
-    """Also write 16-bit depth maps, depth/NAME.png (steps of 0.1 mm)."""
-    maps: bool = False
-    """Also write maps/NAME.exr: float32 colours, coverage, depth, positions in T-pose, the camera in the header."""
     scans: bool = False
     """Also write scan/: the first pose as a textured mesh, OBJ and GLB."""
 
@@ -135,8 +131,6 @@ class Synth:
             small.get("close_views", self.close_views),
             extras.held_out,
             frames=self.frames if self.sequences else 0,
-            depth=extras.depth,
-            maps=extras.maps,
             scan_texture=2048 if extras.scans else 0,
         )
         workers = _cores() if self.workers is None else self.workers

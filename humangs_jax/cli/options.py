@@ -45,10 +45,10 @@ def require_parent(path: Path, option: str = "--out", inputs: Iterable[Path | No
     _require_writable(path.parent, f"{option} {path}")
 
 
-def require_avatar(path: Path, option: str = "--out", inputs: Iterable[Path | None] = ()) -> None:
+def require_avatar(path: Path, inputs: Iterable[Path | None] = ()) -> None:
     """An avatar can be written to that path: a .npz, which replaces an avatar only. Raises: UsageError."""
-    require_suffix(path, (".npz",), option)
-    require_parent(path, option, inputs)
+    require_suffix(path, (".npz",))
+    require_parent(path, inputs=inputs)
     if path.exists():
         try:
             with zipfile.ZipFile(path) as archive:
@@ -56,7 +56,7 @@ def require_avatar(path: Path, option: str = "--out", inputs: Iterable[Path | No
         except (zipfile.BadZipFile, OSError):
             mine = False
         if not mine:
-            raise UsageError(f"{option} {path}: exists and is no avatar: expected another name")
+            raise UsageError(f"--out {path}: exists and is no avatar: expected another name")
 
 
 def require_folder(path: Path, option: str = "--out") -> None:
@@ -69,17 +69,15 @@ def require_folder(path: Path, option: str = "--out") -> None:
     _require_writable(above, f"{option} {path}")
 
 
-def require_replaceable(
-    folder: Path, overwrite: bool, mark: str, inputs: Iterable[Path | None] = (), option: str = "--out"
-) -> None:
+def require_replaceable(folder: Path, overwrite: bool, mark: str, inputs: Iterable[Path | None] = ()) -> None:
     """A folder of the kind that holds the file `mark` can be made there, or replaced with --overwrite. Raises: UsageError."""
     from humangs_jax.io.atomic import check_replaceable
 
-    require_folder(folder, option)
+    require_folder(folder)
     try:
         check_replaceable(folder, overwrite, mark, inputs)
     except ValueError as error:
-        raise UsageError(f"{option} {error}") from error
+        raise UsageError(f"--out {error}") from error
 
 
 def _require_writable(folder, named):

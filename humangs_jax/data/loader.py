@@ -2,7 +2,7 @@
 
 A `Source` has examples by number: `CaptureSource` (people on disk: capture folders, written synthetic sets, data sets),
 `GeneratedSource` (people made on the fly from keys) and `Mixture` (several of these by weight). `Loader` makes batches of one:
-each process the rows of its devices, some batches ahead, by grain where it is installed and by plain threads where it is not.
+each process the rows of its devices, some batches ahead.
 """
 
 from humangs_jax.data.loading.batches import Loader
@@ -18,7 +18,7 @@ from humangs_jax.data.loading.examples import (
     subject_views,
 )
 from humangs_jax.data.loading.order import Mixture, subject_order
-from humangs_jax.data.loading.threads import Waiting, has_grain
+from humangs_jax.data.loading.threads import Waiting
 
 __all__ = [
     "CaptureCache",
@@ -33,7 +33,6 @@ __all__ = [
     "Waiting",
     "draw_views",
     "find_captures",
-    "has_grain",
     "nearest_view",
     "shrink",
     "subject_order",

@@ -15,9 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from humangs_jax.core.array_types import Float
-from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import replace_file
-from humangs_jax.io.reading import Refused, check_limit, open_file, reading
 
 RGBA = ("R", "G", "B", "A")
 DEPTH = "Z"
@@ -44,13 +42,6 @@ class ExrView:
     name: str = ""
     channels: Mapping[str, Float[np.ndarray, "h w"]] = dataclasses.field(default_factory=dict)
     attributes: Mapping[str, str] = dataclasses.field(default_factory=dict)
-
-    @property
-    def camera(self) -> Camera:
-        """The camera in the header. Raises: ValueError if there is none or it is not a camera."""
-        if self.K is None or self.cam_from_world is None:
-            raise ValueError(f"view {self.name!r}: no camera: expected K and cam_from_world")
-        return Camera.from_opencv(self.K, self.cam_from_world, self.rgba.shape[1], self.rgba.shape[0])
 
 
 def write_exr(path: str | Path, views: ExrView | Sequence[ExrView], half: bool = False) -> None:
@@ -85,28 +76,6 @@ def write_exr(path: str | Path, views: ExrView | Sequence[ExrView], half: bool =
         raise OSError(f"{path}: cannot be written: {' '.join(str(error).split())}") from error
 
 
-def read_exr(path: str | Path) -> list[ExrView]:
-    """The views of a file, one per part; half floats become float32. A part without alpha is opaque, grey is repeated.
-
-    Raises: FileNotFoundError; FileError if it is no OpenEXR file, a damaged one, has more pixels than the limits allow, a part
-    without colours, or one whose K or cam_from_world is no matrix.
-    """
-    import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
-
-    path = Path(path)
-    with reading(path, "OpenEXR file"):
-        open_file(path).close()  # OpenEXR opens it by name
-        if not OpenEXR.isOpenExrFile(str(path)):  # checked first: the reader prints to stderr before it raises
-            raise Refused("not an OpenEXR file")
-        with OpenEXR.File(str(path), header_only=True) as file:
-            count = len(file.parts)
-            check_limit("array_bytes", sum(_decoded_bytes(part) for part in file.parts), "bytes of pixels")
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            if len(file.parts) < count:  # the binding drops parts that it cannot decode, with no more than a print
-                raise Refused(f"damaged: {count - len(file.parts)} of {count} parts cannot be decoded")
-            return [_from_part(part, path) for part in file.parts]
-
-
 def _to_part(view, name, half):
     import OpenEXR  # ty: ignore[import-not-found]  a compiled module without stubs
 
@@ -136,34 +105,3 @@ def _to_part(view, name, half):
         header["K"] = np.ascontiguousarray(view.K, np.float32)
         header["cam_from_world"] = np.ascontiguousarray(view.cam_from_world, np.float32)
     return OpenEXR.Part(header, channels, name)
-
-
-def _decoded_bytes(part):
-    """Of a part whose header is read: all channels in float32."""
-    (left, top), (right, bottom) = (tuple(int(x) for x in corner) for corner in part.header["dataWindow"])
-    width, height = right - left + 1, bottom - top + 1
-    check_limit("side", max(width, height), "pixels along a side")
-    check_limit("pixels", width * height, f"pixels ({width} x {height})")
-    return 4 * width * height * max(1, len(part.header["channels"]))
-
-
-def _from_part(part, path):
-    images = {name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()}
-    grey = images.pop("Y", None)
-    colours = [colour for channel in RGBA[:3] if (colour := images.pop(channel, grey)) is not None]
-    if len(colours) < 3:
-        raise ValueError(f"{path}: part {part.name()!r}: expected channels R, G, B, got {sorted(part.channels)}")
-    alpha = images.pop("A", np.ones_like(colours[0]))
-    depth = images.pop(DEPTH, None)
-    matrices = [_matrix(part, key, size, path) for key, size in (("K", 3), ("cam_from_world", 4))]
-    attributes = {k: v for k, v in part.header.items() if isinstance(v, str) and k not in STANDARD_ATTRIBUTES}
-    return ExrView(np.stack([*colours, alpha], axis=-1), depth, *matrices, part.name(), images, attributes)
-
-
-def _matrix(part, key, size, path):
-    if key not in part.header:
-        return None
-    matrix = np.asarray(part.header[key])
-    if matrix.shape != (size, size):
-        raise ValueError(f"{path}: part {part.name()!r}: {key}: expected a {size} x {size} matrix, got {matrix.shape}")
-    return matrix.astype(np.float32)

@@ -42,7 +42,7 @@ class Limits:
         readers are slow. mesh_bytes: of a scan; image_bytes: of a photo before it is decoded.
     array_bytes: all arrays of an archive unpacked, or of an EXR file. Below it a file may always unpack to plain_bytes, and
         beyond that to `ratio` times its size. plain_bytes also bounds a sparse matrix made dense.
-    members: entries of an archive. opcodes: instructions of a pickle. nesting: of JSON, YAML and MATLAB.
+    members: entries of an archive. opcodes: instructions of a pickle. nesting: of JSON and YAML.
     pixels, side: of a photo, and along one of its sides. scans: passes of a progressive JPEG.
     corners: of the triangles of a scan, every instance counted. joints: of a body.
     photos_outside: whether photos and masks of a capture may lie outside of its folder.

@@ -1,4 +1,4 @@
-"""Named tensors of a file, whichever of the formats it is in: safetensors, either format of `torch.save`, or MatConvNet's.
+"""Named tensors of a file, whichever of the formats it is in: safetensors, or either format of `torch.save`.
 
 The first bytes of a file decide; its name does not matter.
 """
@@ -6,15 +6,11 @@ The first bytes of a file decide; its name does not matter.
 import os
 import struct
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from humangs_jax.io.matlab import read_matlab
 from humangs_jax.io.reading import check_limit, open_file, reading
 from humangs_jax.io.torch_file import Tensors, Wanted, everything, read_torch_file
-
-MATLAB_START = b"MATLAB "
 
 
 def read_tensors(path: str | os.PathLike, wanted: Wanted = everything) -> tuple[Tensors, int]:
@@ -46,35 +42,3 @@ def read_safetensors(path: str | os.PathLike, wanted: Wanted = everything) -> tu
             keys = list(file.keys())
             tensors = {key: np.asarray(file.get_tensor(key)) for key in keys if wanted(key)}
             return tensors, len(keys) - len(tensors), file.metadata() or {}
-
-
-def is_matlab_file(path: str | os.PathLike) -> bool:
-    """Whether a file begins like MATLAB's."""
-    with reading(path, "file of tensors"), open_file(path) as file:
-        return file.read(len(MATLAB_START)) == MATLAB_START
-
-
-def read_matconvnet(path: str | os.PathLike) -> Tensors:
-    """Convolutions of a network in MatConvNet's `.mat` files, such as imagenet-vgg-verydeep-19.mat, in the layout of torch.
-
-    {"0.weight": (out, in, rows, columns), "0.bias": (out,), "2.weight": ...}, numbered as in torchvision's `features`. Fully
-    connected layers are convolutions there too, and not used.
-
-    Raises: FileNotFoundError; FileError if it is no such network.
-    """
-    with reading(path, "network of MatConvNet"):
-        return _convolutions(read_matlab(path, "layers"))
-
-
-def _convolutions(layers: Any) -> Tensors:
-    """From structures with a `type`. A "conv" has its filters (rows, columns, in, out) and biases under `weights`, or in older
-    files under `filters` and `biases`.
-    """
-    tensors = {}
-    for index, (layer, *_) in enumerate(layers.values):
-        if layer["type"] != "conv":
-            continue
-        kernel, bias = layer["weights"].values if "weights" in layer else (layer["filters"], layer["biases"])
-        kernel = kernel.reshape(kernel.shape + (1,) * (4 - kernel.ndim))  # MATLAB drops last axes of one
-        tensors[f"{index}.weight"], tensors[f"{index}.bias"] = kernel.transpose(3, 2, 0, 1), bias.ravel()
-    return tensors

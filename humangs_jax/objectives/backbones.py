@@ -13,7 +13,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Float, Int, Key
+from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.network.convolution import convolve
 
@@ -127,18 +127,6 @@ def convolutions(slices: Slices) -> Iterator[Conv]:
 def channels(slices: Slices) -> tuple[int, ...]:
     """Number of channels of each compared feature map."""
     return tuple([layer for layer in part if not isinstance(layer, Pool)][-1].outputs for part in slices)
-
-
-def random_weights(key: Key, slices: Slices) -> Weights:
-    """Random weights of a network, for tests and timings only."""
-
-    def draw(layer: Conv, key: Key) -> Convolution:
-        shape = (layer.size, layer.size, layer.inputs, layer.outputs)
-        scale = (2 / (layer.size**2 * layer.inputs)) ** 0.5
-        return Convolution(scale * jax.random.normal(key, shape), jnp.zeros(layer.outputs))
-
-    layers = list(convolutions(slices))
-    return {layer.name: draw(layer, key) for layer, key in zip(layers, jax.random.split(key, len(layers)), strict=True)}
 
 
 @functools.cache

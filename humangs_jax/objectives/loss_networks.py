@@ -1,7 +1,7 @@
 """The frozen networks that losses may use, read from files that the user has: none ships with the package.
 
 Files may hold torchvision's or lpips' state dicts, alone or inside larger ones, in either format of `torch.save` or as
-safetensors; VGG-19 may also be MatConvNet's `.mat`.
+safetensors.
 
 Layers have torchvision's numbers, with any prefix: `features.0.weight`, `vgg.features.0.weight`, `net.slice1.0.weight`,
 `module.0.weight`. Heads of LPIPS are `lin0.model.1.weight`, or `lins.0.` for `lin0.`. Classifiers are ignored.
@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.io.tensor_file import is_matlab_file, read_matconvnet, read_tensors
+from humangs_jax.io.tensor_file import read_tensors
 from humangs_jax.network.conversion import LOSS_PREFIX
 from humangs_jax.objectives.backbones import Convolution, Slices, Weights, channels, convolutions
 from humangs_jax.objectives.lpips import BACKBONES, Lpips
@@ -76,7 +76,7 @@ def load_vgg19(path: Path) -> Vgg19:
     Raises: OSError; ValueError naming file and tensor if the file cannot be read, or if a tensor is missing, of another
     shape or not finite.
     """
-    tensors = read_matconvnet(path) if is_matlab_file(path) else read_tensors(path, is_layer)[0]
+    tensors = read_tensors(path, is_layer)[0]
     with _named(path):
         return Vgg19(_weights(tensors, "VGG-19"))
 

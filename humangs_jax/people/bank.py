@@ -8,7 +8,6 @@ import functools
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -78,11 +77,6 @@ class PeopleBank:
     def people(self) -> int:
         """How many people there are."""
         return self.betas.shape[0]
-
-    @property
-    def size_bytes(self) -> int:
-        """Memory that the arrays take."""
-        return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(self))
 
 
 def build_bank(

@@ -1,37 +1,26 @@
-"""Views of a synthetic person: rasterized at twice the size, shaded per pixel, box-averaged; depth and position maps.
-
-Maps sample the point in the middle of each pixel. depth: along the optical axis, metres, 0 where nothing is hit. position:
-where that point is on the person in T-pose, metres: on bare skin a point of the shaped body, on cloth a point of the garment.
-"""
+"""Views of a synthetic person: rasterized at twice the size, shaded per pixel, box-averaged."""
 
 import dataclasses
-from pathlib import Path
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import PIL.Image
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.io.exr import ExrView, write_exr
-from humangs_jax.io.images import open_image
 from humangs_jax.people import shading
 from humangs_jax.people.fabrics import Spots
 from humangs_jax.people.kinematics import Rotations, Vector
 from humangs_jax.people.noise import Folds
 from humangs_jax.people.subject import SyntheticSubject
 from humangs_jax.people.surfaces import Faces, Field, Points, vertex_normals
-from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
+from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 SUPERSAMPLING = 2
 VERTEX_STEP, FACE_STEP, POINT_STEP = 4096, 8192, 1 << 15
 """Sizes of meshes are padded to multiples of these, and points are coloured in steps of that length: few shapes are compiled."""
 FOLD_SLOPE = 0.6
 """Slope of painted creases on the most wrinkled cloth."""
-DEPTH_UNIT = 1e-4
-"""Metres per level of a depth file (16-bit PNG): up to 6.5 m, 0 where nothing is hit."""
 
 _shaded_vertices, _seen_from_behind = jax.jit(shading.shaded_vertices), jax.jit(shading.seen_from_behind)
 _light_points = jax.jit(shading.light_points)
@@ -134,44 +123,3 @@ def paint(subject: SyntheticSubject, face_ids: Ids, spots: Spots) -> tuple[Value
             folds = Folds(np.random.default_rng([subject.seed, 100 + k]), upright=material.draped)
             slope[chosen] = FOLD_SLOPE * material.wrinkles * folds.slope(own.cloth[:, :3])
     return np.clip(albedo, 0.01, None), slope
-
-
-class SurfaceMaps(NamedTuple):
-    """See the module."""
-
-    depth: Map
-    position: Image
-
-
-def render_maps(posed: PosedSubject, camera: Camera) -> SurfaceMaps:
-    """The maps of one camera."""
-    surface = posed.subject.surface
-    vertices, faces = padded(posed.vertices, surface.faces)
-    fragments = rasterize_mesh(vertices, faces, camera)
-    rest, _ = padded(surface.vertices, surface.faces)
-    position = np.asarray(interpolate_attributes(fragments, faces, rest, jnp.zeros(3)))
-    return SurfaceMaps(np.maximum(np.asarray(fragments.depth), 0), position)
-
-
-def write_depth(path: str | Path, depth: Map) -> None:
-    """A 16-bit PNG in steps of `DEPTH_UNIT`. Raises: ValueError if a depth does not fit."""
-    levels = np.rint(depth / DEPTH_UNIT)
-    if not 0 <= levels.min() <= levels.max() <= 65535:
-        raise ValueError(f"{path}: depths of {depth.min():.3g} to {depth.max():.3g} m do not fit into 16 bits")
-    PIL.Image.fromarray(levels.astype(np.uint16)).save(path, format="PNG")
-
-
-def read_depth(path: str | Path) -> Map:
-    """Metres, 0 where nothing is hit. Raises: OSError if the file cannot be read; ValueError if it is no 16-bit grey PNG."""
-    with open_image(path) as (image, _):
-        if not image.mode.startswith("I"):
-            raise ValueError(f"{path}: expected a 16-bit grey PNG, got mode {image.mode}")
-        return (np.asarray(image).astype(np.float64) * DEPTH_UNIT).astype(np.float32)
-
-
-def write_maps(path: str | Path, image: Image, mask: Map, maps: SurfaceMaps, camera: Camera) -> None:
-    """An OpenEXR file: R, G, B (image: on white) premultiplied by A, depth Z, position.X/Y/Z, the camera in the header."""
-    rgba = np.concatenate([image - (1 - mask[..., None]), mask[..., None]], axis=-1)
-    channels = {f"position.{axis}": maps.position[..., i] for i, axis in enumerate("XYZ")}
-    K, cam_from_world = np.asarray(camera.K), np.asarray(camera.cam_from_world)
-    write_exr(path, ExrView(rgba, maps.depth, K, cam_from_world, name=Path(path).stem, channels=channels))

@@ -5,7 +5,6 @@ out/SEED/                            a capture (docs/capture_format.md): views o
 out/SEED/held_out/                   a capture of its own with the views that reconstruction may not see
 out/SEED/motion.npz                  of sequences: the whole motion whose frames the capture shows
 out/SEED/scan/                       where asked for: the first pose as a lit, textured mesh, see `baking`
-out/SEED/depth/NAME.png, maps/NAME.exr    where asked for, see `rendering`; also in held_out/
 """
 
 import dataclasses
@@ -33,7 +32,7 @@ from humangs_jax.io.text import read_json, write_json
 from humangs_jax.people.baking import export_scan
 from humangs_jax.people.cameras import cameras_around, close_cameras, spread_azimuths
 from humangs_jax.people.poses import sample_rotations
-from humangs_jax.people.rendering import PosedSubject, pose_subject, render_maps, render_view, write_depth, write_maps
+from humangs_jax.people.rendering import PosedSubject, pose_subject, render_view
 from humangs_jax.people.seeds import GENERATOR_VERSION, seeds_of, split_of
 from humangs_jax.people.sequences import sample_sequence
 from humangs_jax.people.subject import SyntheticSubject, make_subject
@@ -57,7 +56,7 @@ class Layout:
     poses: how many; each is seen by `views` cameras of the published protocol and `close_views` nearer ones.
     held_out_views: cameras of the same pose, and of each of `novel_poses` others, in held_out/.
     frames: 0: poses are independent. Otherwise `poses` evenly spaced frames of a motion of `frames` frames, 30 a second.
-    depth, maps: files beside each image. scan_texture: texels a side of the scan's texture, 0: no scan.
+    scan_texture: texels a side of the scan's texture, 0: no scan.
     """
 
     image_size: int = 512
@@ -67,8 +66,6 @@ class Layout:
     held_out_views: int = 0
     novel_poses: int = 0
     frames: int = 0
-    depth: bool = False
-    maps: bool = False
     scan_texture: int = 0
 
 
@@ -138,9 +135,9 @@ def write_person(folder: str | Path, seed: int, body: BodyModel, layout: Layout)
     held_out = _views([seed, HELD_OUT_STREAM], cameras_around, layout.held_out_views, others, size)
 
     def write(temporary: Path):
-        _write_views(temporary, subject, body, posed, views, layout)
+        save_capture(temporary, capture_views(subject, body, posed, views))
         if held_out:
-            _write_views(temporary / HELD_OUT, subject, body, others, held_out, layout)
+            save_capture(temporary / HELD_OUT, capture_views(subject, body, others, held_out))
         if motion is not None:
             save_motion(temporary / "motion.npz", motion)
         if layout.scan_texture:
@@ -230,32 +227,17 @@ def _views(stream, place, count, poses, size, mark=""):
     return views
 
 
-def _write_views(folder, subject, body, posed, views, layout):
-    capture = capture_views(subject, body, posed, views)
-    save_capture(folder, capture)
-    images, masks = capture.images, np.asarray(capture.masks)
-    for name in ("depth", "maps"):
-        if getattr(layout, name):
-            (folder / name).mkdir()
-    for i, view in enumerate(views if layout.depth or layout.maps else ()):
-        maps = render_maps(posed[view.frame], view.camera)
-        if layout.depth:
-            write_depth(folder / "depth" / f"{view.name}.png", maps.depth)
-        if layout.maps:
-            write_maps(folder / "maps" / f"{view.name}.exr", images[i], masks[i], maps, view.camera)
-
-
 def read_manifest(folder: str | Path) -> dict[str, Any]:
     """What a set was made with. Raises: ValueError, one line naming the file, if it is no manifest of this format."""
     file = Path(folder) / MANIFEST
     content = read_json(file)
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise ValueError(f"{file}: format: expected a manifest of {FORMAT!r}")
-    if content.get("version") not in (1, VERSION):
+    if content.get("version") != VERSION:
         raise ValueError(f"{file}: version: expected {VERSION}, got {shown(content.get('version'))}")
     if not isinstance(content.get("settings"), dict):
         raise ValueError(f"{file}: settings: expected an object, got {shown(content.get('settings'))}")
-    return {"generator_version": 1, "split": None} | content
+    return {"generator_version": None, "split": None} | content
 
 
 def begin_set(folder: str | Path, split: str, settings: dict[str, Any]) -> None:

@@ -19,11 +19,8 @@ from humangs_jax.core.configuration import (
 )
 
 MEASURED = "refinement.md"
-SPLITS = (0.0, 0.2, 0.4)
-"""Shares of a run after which Gaussians are split."""
 ROUNDS = 4
 """As many as the learned update was trained with; docs/tradeoff.md has what each gains."""
-MAX_GROWTH = 16.0
 
 
 @configuration
@@ -57,14 +54,12 @@ class RefineConfig:
     drawn in a step.
 
     structural, silhouette: weights of the structural dissimilarity, and of |alpha - mask|, beside the L1 distance of colours.
-    rates: see `LearningRates`. final_rate: share of the rates that is left at the end. full_steps: after rounds, a run of more
+    rates: see `LearningRates`. full_steps: after rounds, a run of more
     steps than this takes smaller ones in proportion; Gaussians that move further overfit to the photos.
 
-    decay: each step moves means and log scales back towards the start by this share of the distance. visible: a Gaussian whose
+    visible: a Gaussian whose
     largest weight on a pixel of the photos is at least this moves at the full rate, others more slowly; what no photo shows
     stays. poses: also refine the body pose of each photo. The corrected poses are not returned.
-
-    growth: the number of Gaussians may grow by this factor: at `SPLITS` of the run those with the largest errors are split.
 
     held_out: with fewer photos than `HELD_OUT_PHOTOS` the share of the pixels, in square blocks, that no round and no step sees:
     the state with the highest PSNR on them is returned. With as many or more, any share above 0 holds one whole photo out of a
@@ -83,12 +78,9 @@ class RefineConfig:
     structural: Weight = 0.2
     silhouette: Weight = 0.1
     rates: LearningRates = dataclasses.field(default_factory=LearningRates)
-    final_rate: Share = 0.1
     full_steps: Steps = 100
-    decay: Share = 2e-3
     visible: Annotated[float, Range(1e-9, 1e6)] = 0.02
     poses: bool = False
-    growth: Annotated[float, Range(1, MAX_GROWTH)] = knob(1.0, cost="time of a step", gain="detail", measured=MEASURED)
     held_out: Share = 0.05
     checks: Few = 5
     seed: Seed = 0

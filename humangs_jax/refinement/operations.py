@@ -24,9 +24,8 @@ from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.objectives.metrics import decibels
-from humangs_jax.refinement.config import SPLITS, RefineConfig
+from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.crops import held_out_blocks
-from humangs_jax.refinement.density import inner_errors, split, with_room
 from humangs_jax.refinement.learned import (
     MOST_PHOTOS,
     Graph,
@@ -97,8 +96,8 @@ class Operations:
         splat: SplatConfig,
         fresh: Avatar | None = None,
     ):
-        self.avatar, self.config, self.mesh, self.splat = with_room(avatar, config.growth), config, mesh, splat
-        self.original, self.fresh = avatar, with_room(fresh or avatar, config.growth)
+        self.avatar, self.config, self.mesh, self.splat = avatar, config, mesh, splat
+        self.fresh = fresh or avatar
         self.began, self.compile_seconds = time.perf_counter(), 0.0
         self.compiled_for = dataclasses.replace(config, **HOST_SETTINGS)  # the same for runs of 5 s and of 15 s
         everything = jnp.ones(views.masks.shape, bool)
@@ -111,13 +110,12 @@ class Operations:
             self.avatar, self.fresh, self.all, self.seen, self.held = jax.device_put(
                 (self.avatar, self.fresh, self.all, self.seen, self.held), everywhere
             )
-        self.empty = self.avatar
         self.any_held = bool(np.asarray(held).any())  # a small crop may have no block to hold out
         self.use(np.flatnonzero(np.asarray(~held).any(axis=(1, 2))))
 
     def use(self, photos: np.ndarray) -> None:
         """From now on rounds and steps see these photos, in the order of the seed."""
-        self.useful, self.avatar = photos, self.empty
+        self.useful = photos
         self.order = _order(photos, self.config.views_per_step, np.random.default_rng(self.config.seed))
 
     def elapsed(self) -> float:
@@ -136,8 +134,6 @@ class Operations:
             self.step(state, 0.0)
         if self.config.rounds:
             self.learned(state.parameters, 1)
-        if self.config.growth > 1:
-            self.denser(state)
 
     def step(self, state: RefineState, passed: float, share: float = 1.0) -> RefineState:
         """The state after one step, at a share of the rates."""
@@ -215,23 +211,21 @@ class Operations:
     @functools.cached_property
     def graph(self) -> Graph:
         """The graph of the avatar's own Gaussians."""
-        return graph_of(np.asarray(self.original.gaussians.means))
+        return graph_of(np.asarray(self.avatar.gaussians.means))
 
     def learned(self, parameters: Parameters, rounds: int) -> Parameters:
-        """The parameters after rounds of the learned update. Slots without a Gaussian (`growth`) stay empty."""
-        count = len(self.original.gaussians.means)
-        everything = stacked(parameters)
-        start = values = everything[:count]
-        hidden = jnp.zeros((count, Refiner.width))
+        """The parameters after rounds of the learned update."""
+        start = values = stacked(parameters)
+        hidden = jnp.zeros((len(values), Refiner.width))
         used = min(len(self.useful), MOST_PHOTOS)
         chosen = self.useful[np.arange(used) * len(self.useful) // used]
         for _ in range(rounds):
             each = [self.signals(parameters, int(i)) for i in chosen]
-            signals = jax.tree.map(lambda *x: jnp.stack(x)[:, :count], *each)
+            signals = jax.tree.map(lambda *x: jnp.stack(x), *each)
             values, hidden = compiled(refiner_round)(
-                load_refiner(), values, start, hidden, signals, self.graph, self.original
+                load_refiner(), values, start, hidden, signals, self.graph, self.avatar
             )
-            parameters = unstacked(everything.at[:count].set(values), parameters)
+            parameters = unstacked(values, parameters)
         return parameters
 
     def signals(self, parameters: Parameters, view: int) -> Signals:
@@ -241,16 +235,6 @@ class Operations:
         gradient, _ = compiled(_pulled)(pull_back, compiled(squared_errors)(image, photo))
         _, colors = compiled(_pulled)(pull_back, compiled(colors_alone)(image))
         return compiled(signals_from)(gradient, colors, rendering, photo)
-
-    def denser(self, state: RefineState) -> tuple[RefineState, Avatar]:
-        """The state and the avatar after the Gaussians with the largest errors were split."""
-        errors = jnp.zeros(len(state.trust))
-        for i in self.useful:
-            photo = compiled(_chosen)(self.seen, i)
-            image, pull_back, _ = self.drawn(state.parameters, photo)
-            errors += compiled(_pulled)(pull_back, compiled(inner_errors)(image, photo))[1]
-        count = round((self.config.growth - 1) * len(self.original.gaussians.means) / len(SPLITS))
-        return compiled(split)(state, self.avatar, errors, count)
 
     def state(self, parameters: Parameters, found: Comparison) -> RefineState:
         """The state that Adam's steps start from, and are drawn back to."""

@@ -16,7 +16,10 @@ from humangs_jax.rendering.gaussians import Gaussians, widened
 from humangs_jax.rendering.unconstrained import UnconstrainedGaussians, constrain, unconstrain
 
 PULLED = ("means", "log_scales")
-"""Parameters that `RefineConfig.decay` draws back to the start."""
+"""Parameters that each step moves back towards the start, by `DECAY` of the distance."""
+DECAY = 2e-3
+FINAL_RATE = 0.1
+"""Share of the learning rates that is left at the end."""
 ADAM = optax.scale_by_adam()
 
 
@@ -78,7 +81,7 @@ def update(
     Adam's steps do not shrink with the gradient, so the trust multiplies the step and not the loss.
     """
     steps, adam = ADAM.update(cast(Any, gradient), state.adam)
-    cosine = config.final_rate + (1 - config.final_rate) * 0.5 * (1 + jnp.cos(jnp.pi * progress))
+    cosine = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + jnp.cos(jnp.pi * progress))
 
     def moved(name):
         value, step = getattr(state.parameters, name), getattr(steps, name)
@@ -87,7 +90,7 @@ def update(
             return value - rate * step if config.poses else value
         trust = state.trust.reshape(-1, *[1] * (value.ndim - 1))
         value = value - rate * trust * step
-        return value - config.decay * (value - getattr(state.start, name)) if name in PULLED else value
+        return value - DECAY * (value - getattr(state.start, name)) if name in PULLED else value
 
     names = [field.name for field in dataclasses.fields(Parameters)]
     return replace(state, parameters=Parameters(*map(moved, names)), adam=adam)

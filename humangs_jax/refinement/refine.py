@@ -106,7 +106,7 @@ def refine_views(
 ) -> tuple[Avatar, Int[Array, ""]]:
     """The pure function behind `refine`: `steps` steps of one photo each, in turns, on all their pixels.
 
-    Static: config (its limits, rounds, `full_steps`, held-out pixels and `growth` are not used), splat (with `max_pairs`, see
+    Static: config (its limits, rounds, `full_steps` and held-out pixels are not used), splat (with `max_pairs`, see
     `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs that did not fit. Batch over people whose arrays have
     the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
     """

@@ -20,8 +20,6 @@ from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.progress import bar as progress_bar
 from humangs_jax.objectives.metrics import decibels
-from humangs_jax.refinement.config import SPLITS
-from humangs_jax.refinement.density import without_clear
 from humangs_jax.refinement.objective import avatar_of, comparison_of
 from humangs_jax.refinement.operations import Operations, only
 from humangs_jax.refinement.parameters import RefineState
@@ -43,10 +41,9 @@ OVERRUN = 1.5
 
 
 class Found(NamedTuple):
-    """A state, the avatar whose slots it is for (`growth`), and how many rounds it has had."""
+    """A state, and how many rounds it has had."""
 
     state: RefineState
-    avatar: Avatar
     rounds: int
 
 
@@ -70,9 +67,9 @@ class Run(Operations):
             total=100, desc="refine", unit="%", shown=progress, bar_format="{l_bar}{bar}| {elapsed}"
         )
         with self.compiling():
-            self.start = self.initial(self.empty)
+            self.start = self.initial(self.avatar)
             each = self.compared(self.start, self.all)
-            self.best = Found(self.state(self.start, comparison_of(each, self.all)), self.empty, 0)
+            self.best = Found(self.state(self.start, comparison_of(each, self.all)), 0)
         steps, interrupted = None, False
         trial = Trial(self.useful, self.config.rounds, 1.0)
         try:
@@ -87,16 +84,13 @@ class Run(Operations):
         self.bar.update(100 - self.bar.n)
         self.bar.close()
         seconds = self.elapsed()
-        state, self.avatar, rounds = self.best
+        state, rounds = self.best
         fitted, everybody = only(self.all, trial.used), [str(i) for i in range(len(self.all.images))]
         before, after = (
             comparison_of(x, fitted) for x in (only(each, trial.used), self.compared(state.parameters, fitted))
         )
         kept = float(after.loss) < float(before.loss)
-        refined = self.original
-        if kept:
-            refined = avatar_of(state.parameters, self.avatar)
-            refined = refined if self.config.growth == 1 else without_clear(refined, self.splat.alpha_min)
+        refined = avatar_of(state.parameters, self.avatar) if kept else self.avatar
         if self.mesh is not None:  # back from all devices to the default one
             refined = jax.tree.map(jnp.asarray, jax.device_get(refined))
         pair = (before, after if kept else before)
@@ -181,28 +175,25 @@ class Run(Operations):
         """The state after the rounds, on the photos in use, and the loss on them."""
         parameters, photos = self.learned(self.initial(self.fresh), self.config.rounds), only(self.all, self.useful)
         found = comparison_of(self.compared(parameters, photos), photos)
-        return Found(self.state(parameters, found), self.avatar, self.config.rounds), float(found.loss)
+        return Found(self.state(parameters, found), self.config.rounds), float(found.loss)
 
     def steps(self, begin: Found, total: int, end: int, shown: tuple[float, float]) -> Iterator[tuple[int, Found]]:
         """The first `end` of `total` steps: how many are done, and the state, at each check and at the end.
 
         shown: from where to where the bar goes.
         """
-        config, splits = self.config, list(SPLITS) if self.config.growth > 1 else []
+        config = self.config
         self.use(self.useful)  # the order of the photos begins again
-        state, self.avatar, rounds = begin
+        state, rounds = begin
         share = min(1.0, config.full_steps / max(total, 1)) if rounds else 1.0
         for done in range(1, end + 1):
             passed = (done - 1) / total
-            if splits and passed >= splits[0]:
-                state, self.avatar = self.denser(state)
-                splits.pop(0)
             state = self.step(state, passed, share)
             self.done += 1
             self.bar.update(int(100 * (shown[0] + (shown[1] - shown[0]) * done / total)) - self.bar.n)
             self.late = self.late or (config.seconds is not None and self.elapsed() > OVERRUN * config.seconds)
             if done * config.checks // total > (done - 1) * config.checks // total or done == end or self.late:
-                yield done, Found(state, self.avatar, rounds)
+                yield done, Found(state, rounds)
             if self.late:
                 return
 
@@ -224,4 +215,4 @@ class Run(Operations):
     def show(self, found: Found) -> None:
         """Let whoever watches see a state."""
         if self.watch is not None:
-            self.watch(avatar_of(found.state.parameters, found.avatar))
+            self.watch(avatar_of(found.state.parameters, self.avatar))

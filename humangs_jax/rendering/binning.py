@@ -171,38 +171,19 @@ def footprints_by(
     return footprints(projected, jnp.minimum(reach, config.radius_sigma**2))
 
 
-class Share(NamedTuple):
-    """Every `count`-th row of tiles, from row `index` on: what one of `count` devices draws of an image."""
-
-    index: Int[Array, ""] | int = 0
-    count: int = 1
-
-    def of(self, row0, rows):
-        """First and number of the share's rows among `rows` ones from row0 on, in units of `count` rows."""
-        first = (row0 - self.index + self.count - 1) // self.count
-        return first, (row0 + rows - self.index + self.count - 1) // self.count - first
-
-
-WHOLE = Share()
-
-
-def count_pairs(
-    footprints: Footprints | Squares, grid: TileGrid, share: Share = WHOLE
-) -> tuple[Int[Array, ""], Int[Array, ""]]:
+def count_pairs(footprints: Footprints | Squares, grid: TileGrid) -> tuple[Int[Array, ""], Int[Array, ""]]:
     """(rows, pairs) that `emit_pairs` needs, without any buffer; both saturate at `SUM_LIMIT`."""
-    _, counts = share.of(*footprints.rows(grid))
-    return _saturating_sum(counts), _count_row_by_row(footprints, grid, share, jnp.max(counts, initial=0))
+    _, counts = footprints.rows(grid)
+    return _saturating_sum(counts), _count_row_by_row(footprints, grid, jnp.max(counts, initial=0))
 
 
-def emit_pairs(
-    footprints: Footprints | Squares, grid: TileGrid, max_rows: int, max_pairs: int, share: Share = WHOLE
-) -> Pairs:
+def emit_pairs(footprints: Footprints | Squares, grid: TileGrid, max_rows: int, max_pairs: int) -> Pairs:
     """All pairs, splat by splat, in buffers of fixed size; if they overflow, the last splats lose theirs."""
     bands = footprints.bands()
-    first, counts = share.of(*footprints.rows(grid))
+    first, counts = footprints.rows(grid)
     rows = expand(counts, max_rows)
     slot = jnp.arange(max_rows, dtype=jnp.int32)
-    row = (take(first - rows.first, rows.source) + slot) * share.count + share.index
+    row = take(first - rows.first, rows.source) + slot
     table = take(jnp.stack(bands, axis=-1), rows.source)
     column0, column1 = type(bands)(*(table[:, i] for i in range(len(bands)))).columns(row, grid)
     pairs = expand(jnp.where(slot < rows.needed, jnp.maximum(column1 - column0 + 1, 0), 0), max_pairs)
@@ -212,7 +193,7 @@ def emit_pairs(
     tiles = jnp.where(slot < pairs.needed, table[:, 0] + slot, grid.tiles)
     # If rows are missing, so are their pairs, and they are counted row by row; otherwise this loop runs zero times.
     missing = rows.needed > max_rows
-    recount = _count_row_by_row(footprints, grid, share, jnp.where(missing, jnp.max(counts, initial=0), 0))
+    recount = _count_row_by_row(footprints, grid, jnp.where(missing, jnp.max(counts, initial=0), 0))
     needed = jnp.where(missing, recount, pairs.needed)
     return Pairs(tiles, table[:, 1], needed, needed - jnp.minimum(pairs.needed, max_pairs))
 
@@ -227,13 +208,13 @@ def _last(v, tile_size, tiles):
     return jnp.clip(jnp.floor((v - 0.5 + SLACK) / tile_size), -1, tiles - 1).astype(jnp.int32)
 
 
-def _count_row_by_row(footprints, grid: TileGrid, share: Share, most_rows):
+def _count_row_by_row(footprints, grid: TileGrid, most_rows):
     """Pairs of all splats: their first rows of tiles, then their second ones, and so on."""
     bands = footprints.bands()
-    first, counts = share.of(*footprints.rows(grid))
+    first, counts = footprints.rows(grid)
 
     def count(i, total):
-        column0, column1 = bands.columns((first + i) * share.count + share.index, grid)
+        column0, column1 = bands.columns(first + i, grid)
         here = jnp.where(i < counts, jnp.maximum(column1 - column0 + 1, 0), 0)
         return jnp.minimum(total + _saturating_sum(here), SUM_LIMIT)
 

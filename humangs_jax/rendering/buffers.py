@@ -12,7 +12,6 @@ import logging
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.sharding import Mesh
 
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Int
@@ -21,7 +20,6 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering import binning
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import drawn_camera, project_gaussians
-from humangs_jax.rendering.sharing import device_count
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig, splat_config
 from humangs_jax.rendering.tiling import TileGrid
 
@@ -70,27 +68,24 @@ def plan_buffers(
     cameras: Camera,
     config: SplatConfig | str = DEFAULT_CONFIG,
     margin: float = 1.25,
-    mesh: Mesh | None = None,
 ) -> SplatConfig:
     """`config` with buffers for one camera, or for the most demanding one of a batch, times `margin`.
 
     Sizes are rounded up to (4, 5, 6 or 7) 2^i, so that similar scenes share one compilation. Measures concrete arrays:
-    call it outside of transformations. mesh: the one that `render` will be given, if any.
+    call it outside of transformations.
 
     No margin is enough for Gaussians that are optimised for long: they grow. `Rendering.overflow` above 0 tells, and
     `SplatConfig.warn_overflow` logs it. Then plan again from the Gaussians as they are; the program compiles again.
     """
     config = splat_config(config)
-    rows, pairs = (round_up(int(most * margin)) for most in _needed(gaussians, cameras, config, mesh))
+    rows, pairs = (round_up(int(most * margin)) for most in _needed(gaussians, cameras, config))
     return dataclasses.replace(config, max_rows=rows, max_pairs=pairs)
 
 
-def raise_on_overflow(
-    overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig, mesh: Mesh | None
-) -> None:
+def raise_on_overflow(overflow: Int[Array, "*v"], gaussians: Gaussians, cameras: Camera, config: SplatConfig) -> None:
     """Raises BufferOverflowError, which says what is needed, if a view has overflowed."""
     if missing := int(jnp.max(overflow, initial=0)):
-        rows, pairs = _needed(gaussians, cameras, config, mesh)
+        rows, pairs = _needed(gaussians, cameras, config)
         raise BufferOverflowError(
             f"{missing} (splat, tile) pairs of a view did not fit: it needs max_pairs >= {pairs} "
             f"and max_rows >= {rows}, got max_pairs = {config.max_pairs}, max_rows = {config.max_rows}"
@@ -115,22 +110,21 @@ def _warn(missing, max_pairs, max_rows):
         )
 
 
-def _needed(gaussians, cameras, config, mesh):
-    """Most rows and most pairs that any of the views needs, on any of the devices that share them."""
+def _needed(gaussians, cameras, config):
+    """Most rows and most pairs that any of the views needs."""
     gaussians, cameras = at_least_float32((gaussians, cameras))
     config = dataclasses.replace(config, max_pairs=None, max_rows=None)  # not read here: one program for all
-    return [int(most) for most in _count(gaussians, cameras, config, device_count(mesh))]
+    return [int(most) for most in _count(gaussians, cameras, config)]
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
-def _count(gaussians, cameras, config, shares):
+@functools.partial(jax.jit, static_argnums=2)
+def _count(gaussians, cameras, config):
     def one(camera):
         projected = project_gaussians(gaussians, camera, config)
         camera = drawn_camera(camera, config)
         footprints = binning.footprints_by(projected, projected.dimmed(gaussians.opacities), config)
         grid = TileGrid(camera.width, camera.height, config.tile_size)
-        counts = (binning.count_pairs(footprints, grid, binning.Share(i, shares)) for i in range(shares))
-        return [jnp.max(jnp.stack(most)) for most in zip(*counts, strict=True)]
+        return binning.count_pairs(footprints, grid)
 
     if not cameras.batch_shape:
         return one(cameras)

@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.numerics import at_least_float32, safe_divide
@@ -25,7 +24,6 @@ from humangs_jax.rendering.compositing import composite, pack_splats
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.projection import ProjectedGaussians, drawn_camera, project_gaussians
 from humangs_jax.rendering.schedules.splat_rows import FEATURE_COUNT
-from humangs_jax.rendering.sharing import draw_shared
 from humangs_jax.rendering.splat_config import DEFAULT_CONFIG, SplatConfig
 from humangs_jax.rendering.tiling import TileGrid, sort_into_tiles, take, tiles_to_image
 
@@ -94,35 +92,25 @@ def draw_projected(
     """
     gaussians, camera, background = with_background(gaussians, camera, background)
     config = with_default_buffers(gaussians, camera, config)
-    rendering = _draw(projected, gaussians, camera, background, config, None)
+    rendering = _draw(projected, gaussians, camera, background, config)
     warn_of_overflow(rendering.overflow, config)
     return rendering
 
 
-def draw(
-    gaussians: Gaussians, camera: Camera, background: Float[Array, "3"], config: SplatConfig, mesh: Mesh | None
-) -> Rendering:
+def draw(gaussians: Gaussians, camera: Camera, background: Float[Array, "3"], config: SplatConfig) -> Rendering:
     """`splatting.render` with buffers that are decided, `config.max_pairs`: pure, and without checks."""
-    return _draw(project_gaussians(gaussians, camera, config), gaussians, camera, background, config, mesh)
+    return _draw(project_gaussians(gaussians, camera, config), gaussians, camera, background, config)
 
 
-def draw_views(
-    gaussians: Gaussians,
-    cameras: Camera,
-    background: Float[Array, "3"],
-    config: SplatConfig,
-    mesh: Mesh | None,
-    batch_size: int,
-) -> Rendering:
-    """`draw` for every camera of a batch, `batch_size` of them at a time."""
-    one = lambda camera: draw(gaussians, camera, background, config, mesh)
-    return lax.map(one, cameras, batch_size=batch_size if batch_size > 1 else None)
+def draw_views(gaussians: Gaussians, cameras: Camera, background: Float[Array, "3"], config: SplatConfig) -> Rendering:
+    """`draw` for every camera of a batch, one after the other."""
+    return lax.map(lambda camera: draw(gaussians, camera, background, config), cameras)
 
 
-def _draw(projected, gaussians, camera, background, config: SplatConfig, mesh: Mesh | None) -> Rendering:
+def _draw(projected, gaussians, camera, background, config: SplatConfig) -> Rendering:
     if config.scale != 1:
         small = dataclasses.replace(config, scale=1.0)
-        drawn = _draw(projected, gaussians, drawn_camera(camera, config), background, small, mesh)
+        drawn = _draw(projected, gaussians, drawn_camera(camera, config), background, small)
         return _resized(drawn, camera)
     grid = TileGrid(camera.width, camera.height, config.tile_size)
     if gaussians.means.shape[0] == 0:
@@ -144,18 +132,18 @@ def _draw(projected, gaussians, camera, background, config: SplatConfig, mesh: M
     seen = jnp.concatenate([gaussians.colors, behind[:, None]], axis=-1)
     splats = pack_splats(projected, opacities, seen, config.alpha_min)
     splats = splats.at[order].get(unique_indices=True, mode="promise_in_bounds")
-    features, transmittance, peaks, overflow = draw_shared(_draw_tiles, mesh, footprints, splats, grid, config)
+    features, transmittance, peaks, overflow = _draw_tiles(footprints, splats, grid, config)
     visibility = jnp.zeros_like(peaks).at[order].set(peaks, unique_indices=True) if config.visibility else None
     return _blended(features, transmittance, grid, background, nearest, overflow, visibility)
 
 
-def _draw_tiles(footprints, splats, grid: TileGrid, config: SplatConfig, share: binning.Share):
+def _draw_tiles(footprints, splats, grid: TileGrid, config: SplatConfig):
     """Tiles of premultiplied features (t, 4, p) and the final T (t, 1, p), largest weights (g,), overflow.
 
     Footprints and splats in depth order.
     """
     assert config.max_pairs is not None  # callers have fitted the buffers
-    pairs = binning.emit_pairs(footprints, grid, config.max_rows or config.max_pairs, config.max_pairs, share)
+    pairs = binning.emit_pairs(footprints, grid, config.max_rows or config.max_pairs, config.max_pairs)
     lists = sort_into_tiles(pairs.tiles, pairs.splats, grid.tiles, splats.shape[0])
     features, transmittance, peaks = composite(splats, lists, grid, config)
     return features, transmittance[:, None], lax.stop_gradient(peaks), pairs.overflow

@@ -8,12 +8,10 @@ means, quats, scales, opacities, colors, deformations, the background, and K and
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jax.sharding import Mesh
 
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.array_types import Array, Bool
@@ -41,7 +39,6 @@ def render(
     camera: Camera,
     config: SplatConfig | str = DEFAULT_CONFIG,
     background: Background = None,
-    mesh: Mesh | None = None,
 ) -> Rendering:
     """Draws Gaussians as one camera sees them.
 
@@ -53,9 +50,6 @@ def render(
 
     Arguments: gaussians: (g, ...) one set, metres. camera: one camera; its size is the image's. config: what is drawn, and
     the buffers; or the name of one of `SPLAT_PRESETS`. background: (3,) RGB, three numbers, or a colour's name; None: white.
-    mesh: of one axis, whose devices share the image's rows of tiles; None: one device draws it all. (A CPU runs one program on
-    one core; it has as many devices as `jax.config.update("jax_num_cpu_devices", 2)` says before JAX is first used. There,
-    wait for each compiled call that shares an image, `jax.block_until_ready`, or set PJRT_NPROC: docs/performance.md.)
 
     Raises: TypeError for arguments of other classes; ValueError for a batch of cameras or of sets, for shapes that do not fit
     each other, a background that is no colour, values that are not finite, opacities outside of [0, 1] and negative scales or
@@ -70,7 +64,7 @@ def render(
             f"render draws one camera, got a batch {camera.batch_shape}: use render_views(gaussians, cameras), "
             "or jax.vmap(render, in_axes=(None, 0))(gaussians, cameras) to draw all views at once"
         )
-    return _render(_draw_image, gaussians, camera, config, background, mesh)
+    return _render(_draw_image, gaussians, camera, config, background)
 
 
 @checked_arguments
@@ -79,11 +73,9 @@ def render_views(
     cameras: Camera,
     config: SplatConfig | str = DEFAULT_CONFIG,
     background: Background = None,
-    batch_size: int = 1,
-    mesh: Mesh | None = None,
 ) -> Rendering:
-    """Draws every camera of a batch (leading axis v), `batch_size` views at a time: working memory does not
-    grow with v (what a gradient keeps of each view does).
+    """Draws every camera of a batch (leading axis v), one after the other: working memory does not grow with v
+    (what a gradient keeps of each view does).
 
     `jax.vmap` of `render` draws all views at once (their tiles become one list of tiles) and holds the buffers of all. On
     CPUs it is as fast, but slower with gradients of many views. Arguments and errors: as `render`.
@@ -95,7 +87,7 @@ def render_views(
             "render_views draws cameras with one leading axis, got "
             + (f"a batch {cameras.batch_shape}" if cameras.batch_shape else "a single camera: use render")
         )
-    return _render(draw_views, gaussians, cameras, config, background, mesh, batch_size)
+    return _render(draw_views, gaussians, cameras, config, background)
 
 
 @checked_arguments
@@ -114,34 +106,32 @@ def seen_from(
     return jnp.max(visibility, axis=0) >= threshold
 
 
-def _render(
-    draw: Callable[..., Rendering], gaussians: Gaussians, cameras: Camera, config, background, mesh, *more: Any
-) -> Rendering:
+def _render(draw: Callable[..., Rendering], gaussians: Gaussians, cameras: Camera, config, background) -> Rendering:
     if gaussians.batch_shape:
         raise ValueError(f"expected one set of Gaussians, got a batch {gaussians.batch_shape}: draw it with jax.vmap")
     config = splat_config(config)
     gaussians, cameras, background = with_background(gaussians, cameras, background)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((gaussians, cameras, background))):
         config = with_default_buffers(gaussians, cameras, config)
-        rendering = draw(gaussians, cameras, background, config, mesh, *more)
+        rendering = draw(gaussians, cameras, background, config)
         warn_of_overflow(rendering.overflow, config)
         return rendering
     check_values("render", gaussian_values(gaussians) | camera_values(cameras) | {"background": (background, FINITE)})
     if config.max_pairs is None:
-        config = plan_buffers(gaussians, cameras, config, margin=1.0, mesh=mesh)
-    rendering = _jitted(draw, len(more))(gaussians, cameras, background, config, mesh, *more)
-    raise_on_overflow(rendering.overflow, gaussians, cameras, config, mesh)
+        config = plan_buffers(gaussians, cameras, config, margin=1.0)
+    rendering = _jitted(draw)(gaussians, cameras, background, config)
+    raise_on_overflow(rendering.overflow, gaussians, cameras, config)
     return rendering
 
 
 @functools.cache
-def _jitted(draw, more):
-    return jax.jit(draw, static_argnums=range(3, 5 + more), compiler_options=compiler_options())
+def _jitted(draw):
+    return jax.jit(draw, static_argnums=3, compiler_options=compiler_options())
 
 
-def _draw_image(gaussians, camera, background, config, mesh):
+def _draw_image(gaussians, camera, background, config):
     gaussians = jax.tree.map(lambda leaf: _once_per_image(leaf, camera), gaussians)
-    return draw(gaussians, camera, background, config, mesh)
+    return draw(gaussians, camera, background, config)
 
 
 @jax.custom_vjp

@@ -149,7 +149,7 @@ class Checkpoints:
         except (FileError, FileNotFoundError) as error:
             problem = str(error)
         recorded = (self._manager.metrics(step) or {}).get(CHECKSUM)
-        if state is not None and recorded not in (None, found := _checksum(state)):
+        if state is not None and recorded != (found := _checksum(state)):
             state, problem = None, f"{path}: damaged: its arrays have the checksum {found}, recorded is {recorded}"
         if jax.process_count() > 1:
             from jax.experimental import multihost_utils
@@ -165,7 +165,7 @@ class Checkpoints:
 
 
 CHECKSUM = "checksum"
-"""Beside the score of a checkpoint; the first ones do not have it."""
+"""Beside the score of a checkpoint."""
 
 
 def _checksum(state: TrainState) -> str:

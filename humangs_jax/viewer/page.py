@@ -12,6 +12,7 @@ import json
 import os
 import re
 import webbrowser
+from collections.abc import Mapping
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
 
@@ -114,11 +115,7 @@ def serve(text: str, port: int = 0, open_browser: bool = True) -> None:
 
     Arguments: port: 0 for any free one. Raises: OSError, one line, if the port is taken.
     """
-    try:
-        server = page_server(text, port)
-    except (OSError, OverflowError) as error:
-        raise OSError(f"--port {port}: {error}") from error
-    with server:
+    with page_server({"/": text}, port) as server:
         url = f"http://127.0.0.1:{server.server_address[1]}/"
         say(f"{url} shows the avatar; Ctrl-C ends.")
         if open_browser:
@@ -127,26 +124,28 @@ def serve(text: str, port: int = 0, open_browser: bool = True) -> None:
             server.serve_forever()
 
 
-def page_server(text: str, port: int = 0) -> ThreadingHTTPServer:
-    """A server of one page on 127.0.0.1, not yet running."""
-    content = text.encode()
+def page_server(pages: Mapping[str, str], port: int = 0) -> ThreadingHTTPServer:
+    """A server on 127.0.0.1, not yet running, of texts by path, as they are when they are asked for. Raises: as `serve`."""
 
     class Page(BaseHTTPRequestHandler):
         def do_GET(self):
-            found = self.path.split("?")[0] in ("/", "/index.html")
-            self.send_response(200 if found else 404)
+            content = pages.get(self.path.split("?")[0].replace("/index.html", "/"))
+            data = b"" if content is None else content.encode()
+            self.send_response(404 if content is None else 200)
             self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(content) if found else 0))
+            self.send_header("Content-Length", str(len(data)))
             self.send_header("Cache-Control", "no-store")
             self.end_headers()
-            if found:
-                with contextlib.suppress(ConnectionError):  # the browser was closed meanwhile
-                    self.wfile.write(content)
+            with contextlib.suppress(ConnectionError):  # the browser was closed meanwhile
+                self.wfile.write(data)
 
         def log_message(self, format, *args):
-            """Nothing: one page, one user."""
+            """Nothing: few pages, one user."""
 
-    server = ThreadingHTTPServer(("127.0.0.1", port), Page)
+    try:
+        server = ThreadingHTTPServer(("127.0.0.1", port), Page)
+    except (OSError, OverflowError) as error:
+        raise OSError(f"--port {port}: {error}") from error
     server.daemon_threads = True
     return server
 
@@ -174,19 +173,20 @@ def _shipped_network() -> HumanGSConfig:
 def page_script(*names: str) -> str:
     """The text of some of the page's scripts, below the tables that they share with the readers of motions in Python."""
     rules = json.dumps(page_rules(), separators=(",", ":")).replace("<", "\\u003c")
-    return "\n".join([f"const RULES = {rules};", *(_read(f"{name}.js") for name in names)])
+    return "\n".join([f"const RULES = {rules};", *(read_part(f"{name}.js") for name in names)])
 
 
-def _read(name: str) -> str:
+def read_part(name: str) -> str:
+    """The text of a file in page/."""
     return (resources.files("humangs_jax") / "viewer" / "page" / name).read_text(encoding="utf-8").strip()
 
 
 def _template() -> str:
     """index.html with styles, shaders and scripts in their places; the avatar's are still marked."""
     parts = {
-        "style": _read("style.css"),
-        "shaders": "\n".join(f'<script type="x-shader" id="{name}">\n{_read(name)}\n</script>' for name in SHADERS),
-        "sorting": _read("sorting.js"),  # runs twice: in the page, and as the text of a worker
+        "style": read_part("style.css"),
+        "shaders": "\n".join(f'<script type="x-shader" id="{name}">\n{read_part(name)}\n</script>' for name in SHADERS),
+        "sorting": read_part("sorting.js"),  # runs twice: in the page, and as the text of a worker
         "scripts": page_script(*SCRIPTS),
     }
-    return _MARK.sub(lambda mark: parts.get(mark[1], mark[0]), _read("index.html"))
+    return _MARK.sub(lambda mark: parts.get(mark[1], mark[0]), read_part("index.html"))

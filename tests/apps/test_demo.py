@@ -4,10 +4,10 @@ import subprocess
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from exr_files import camera_of, read_exr
 
 from humangs_jax.apps.demo import run_demo
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.io.exr import read_exr
 from humangs_jax.refinement.config import RefineConfig
 
 pytestmark = pytest.mark.slow
@@ -95,7 +95,7 @@ def test_exr_agrees_with_itself(out):
         alpha = view.rgba[..., 3]
         assert view.rgba.dtype == np.float32 and 0.03 < alpha.mean() < 0.5
         assert (view.rgba[..., :3] <= alpha[..., None] + 1e-4).all()  # premultiplied, on black
-        distance = np.linalg.norm(view.camera.center - np.asarray([0.0, 0.9, 0.0]))
+        distance = np.linalg.norm(camera_of(view).center - np.asarray([0.0, 0.9, 0.0]))
         depths = view.depth[alpha > 0.9]
         assert abs(np.median(depths) - distance) < 0.5 and (view.depth[alpha == 0] == 0).all()
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from avatar_cases import two_balls
 from command_line import run
+from exr_files import read_exr
 
 from humangs_jax import cli
 from humangs_jax.avatar.shot import Shot
 from humangs_jax.cli.animate import Animate, Render
 from humangs_jax.data.motion import Motion, save_motion
-from humangs_jax.io.exr import read_exr
 from humangs_jax.io.images import read_image
 
 

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from avatar_cases import CENTRES, NAMES, RADIUS, SPLAT, two_balls
+from exr_files import read_exr
 from scipy.spatial.transform import Rotation
 
 from humangs_jax.avatar import frames, layers
@@ -13,7 +14,6 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import project
-from humangs_jax.io.exr import read_exr
 from humangs_jax.io.images import read_image
 from humangs_jax.io.reading import Limits, set_limits
 from humangs_jax.rendering.splatting import Rendering

@@ -1,4 +1,4 @@
-"""Sources, mixtures, rows of processes, grain and the path without it."""
+"""Sources, mixtures, rows of processes, threads that read ahead."""
 
 import collections
 import json
@@ -15,9 +15,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from humangs_jax.data.loader import Example, Loader, Mixture, Source, Waiting, has_grain
+from humangs_jax.data.loader import Example, Loader, Mixture, Source, Waiting
 from humangs_jax.data.loading.order import MIX_BLOCK, block_counts, source_at
-from humangs_jax.data.loading.threads import read_in_order
 from humangs_jax.data.preprocess.run import FORMAT
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
@@ -73,13 +72,9 @@ def same(a, b):
     return all(x.dtype == y.dtype and np.array_equal(x, y) for x, y in pairs)
 
 
-READERS = ["plain", pytest.param("grain", marks=pytest.mark.skipif(not has_grain(), reason="grain is not installed"))]
-
-
-@pytest.mark.parametrize("reader", READERS)
-def test_batches_are_in_order_whatever_thread_is_first(reader):
+def test_batches_are_in_order_whatever_thread_is_first():
     slow_first = CountingSource(delay=lambda index: 0.02 if index % 3 == 0 else 0.0)
-    loader = Loader(slow_first, 4, seed=5, reader=reader)
+    loader = Loader(slow_first, 4, seed=5)
     seen = list(loader.batches(2, 6))
     assert [step for step, _ in seen] == [2, 3, 4, 5]
     for step, batch in seen:
@@ -88,42 +83,23 @@ def test_batches_are_in_order_whatever_thread_is_first(reader):
         assert batch.inputs.images.shape == (4, 3 + loader.input_count(step), SIZE, SIZE, 3)
 
 
-@pytest.mark.skipif(not has_grain(), reason="grain is not installed")
-def test_grain_and_the_plain_path_give_the_same_batches(monkeypatch):
-    loader = Loader(CountingSource(), 3, seed=2)
-    with_grain = list(loader.batches(0, 5))
-    for name in [name for name in sys.modules if name == "grain" or name.startswith("grain.")]:
-        monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "grain", None)  # as if it were not installed
-    with pytest.raises(ImportError):
-        import grain  # noqa: F401
-    assert not has_grain()
-    without = list(loader.batches(0, 5))
-    assert all(a == b and same(x, y) for (a, x), (b, y) in zip(with_grain, without, strict=True))
-    with pytest.raises(ImportError):
-        next(read_in_order(lambda i: i, 3, 1, 1, "grain"))
-
-
-@pytest.mark.parametrize("reader", READERS)
-def test_a_resumed_run_sees_the_rest_of_the_batches(reader):
-    loader = Loader(CountingSource(), 2, seed=9, reader=reader)
+def test_a_resumed_run_sees_the_rest_of_the_batches():
+    loader = Loader(CountingSource(), 2, seed=9)
     whole, rest = dict(loader.batches(0, 8)), dict(loader.batches(5, 8))
     assert sorted(rest) == [5, 6, 7] and all(same(whole[step], rest[step]) for step in rest)
     assert not same(whole[6], whole[7])
 
 
-@pytest.mark.parametrize("reader", READERS)
-def test_errors_of_threads_end_the_loop_at_their_place(reader):
-    steps = Loader(CountingSource(broken_at=5), 2, reader=reader).batches(0, 9)
+def test_errors_of_threads_end_the_loop_at_their_place():
+    steps = Loader(CountingSource(broken_at=5), 2).batches(0, 9)
     assert [next(steps)[0], next(steps)[0]] == [0, 1]
     with pytest.raises(ValueError, match="example 5 of"):
         next(steps)
 
 
-@pytest.mark.parametrize("reader", READERS)
-def test_leaving_the_loop_ends_all_threads(reader):
+def test_leaving_the_loop_ends_all_threads():
     before = set(threading.enumerate())
-    steps = Loader(CountingSource(delay=lambda _: 0.001), 2, reader=reader).batches(0, 10_000)
+    steps = Loader(CountingSource(delay=lambda _: 0.001), 2).batches(0, 10_000)
     next(steps)
     steps.close()
     deadline = time.time() + 10
@@ -285,12 +261,11 @@ def test_people_of_another_split_are_refused(tmp_path):
     assert len(find_people(tmp_path)) == 2  # of a data set: scans have numbers for names, too
 
 
-@pytest.mark.parametrize("reader", READERS)
-def test_waiting_is_measured(reader):
+def test_waiting_is_measured():
     slow = Waiting()
-    list(Loader(CountingSource(delay=lambda _: 0.03), 1, threads=1, reader=reader).batches(0, 6, waiting=slow))
+    list(Loader(CountingSource(delay=lambda _: 0.03), 1, threads=1).batches(0, 6, waiting=slow))
     assert slow.items == 6 and slow.seconds > 0.1
     fast = Waiting()
-    for _ in Loader(CountingSource(), 1, reader=reader).batches(0, 6, waiting=fast):
+    for _ in Loader(CountingSource(), 1).batches(0, 6, waiting=fast):
         time.sleep(0.05)
     assert fast.seconds - fast.first_seconds < 0.5 * slow.seconds

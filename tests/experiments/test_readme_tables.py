@@ -21,7 +21,7 @@ DEMO = {
 def test_quality():
     settings = {"settings": {"weights": "a"}}
     people = settings | {
-        "subjects": [{}] * 3,
+        "people": 3,
         "by_views": {"4": {task: SCORES | BASELINE for task in ("novel", "animation")}},
     }
     lengths = {seconds: {task: SCORES for task in ("novel", "animation")} for seconds in ("0", "1")}

@@ -36,8 +36,6 @@ def test_the_page_is_made_of_what_the_benchmarks_write(tmp_path):
             2,
         ),
         "savings": ("reconstruction/savings", "--preset", "tiny", *shared, "--views", 2),
-        "attention": ("reconstruction/attention", "--tokens", 33, "--heads", 2, "--repeats", 1),
-        "compilation": ("reconstruction/compilation", "--preset", "tiny", "--tokens", 32),
     }
     page = tmp_path / "page.md"
     page.write_text((REPOSITORY / "docs" / "performance_reconstruction.md").read_text())
@@ -49,7 +47,7 @@ def test_the_page_is_made_of_what_the_benchmarks_write(tmp_path):
 
     benchmark = results["benchmark"]
     for case in (benchmark["all"], benchmark["foreground"]):
-        assert case["flops"] > 0 and case["bytes"] > 0 and 0 < case["share_of_peak"] < 2 and not case["uncounted"]
+        assert case["flops"] > 0 and 0 < case["share_of_peak"] < 2
         np.testing.assert_allclose(case["share_of_peak"] * case["ratio_to_matmul"], 1)
     assert benchmark["foreground"]["flops"] < benchmark["all"]["flops"] < benchmark["published_flops"]
     assert 0.1 < benchmark["foreground_share"] < 0.5

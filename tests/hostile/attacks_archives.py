@@ -1,4 +1,4 @@
-"""npz, MATLAB, safetensors and OpenEXR files: false sizes, bombs, nesting."""
+"""npz and safetensors files: false sizes, bombs, nesting."""
 
 import io
 import json
@@ -6,9 +6,7 @@ import struct
 import zipfile
 import zlib
 
-import numpy as np
 from hostile_cases import case, written
-from readers import SEEDS
 
 # Archives -------------------------------------------------------------------------------------------------------------
 
@@ -108,62 +106,7 @@ case(
 )
 
 
-# MATLAB, safetensors, OpenEXR -----------------------------------------------------------------------------------------------
-
-
-def element(kind, data):
-    return struct.pack("<II", kind, len(data)) + data + bytes(-len(data) % 8)
-
-
-def matrix(klass, shape, *parts, name=b""):
-    head = element(6, struct.pack("<II", klass, 0)) + element(5, np.asarray(shape, "<i4").tobytes()) + element(1, name)
-    return element(14, head + b"".join(parts))
-
-
-def mat_file(*elements):
-    return b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM" + b"".join(elements)
-
-
-def nested_cells(depth):
-    inner, size, heads = matrix(6, (1, 1), element(9, bytes(8))), 0, []
-    size = len(inner)
-    for i in range(depth):
-        name = element(1, b"layers" if i == depth - 1 else b"")
-        head = element(6, struct.pack("<II", 1, 0)) + element(5, struct.pack("<ii", 1, 1)) + name
-        size += len(head)
-        heads.append(struct.pack("<II", 14, size) + head)
-        size += 8
-    return mat_file(*reversed(heads), inner)
-
-
-LAYERS = {"name": b"layers"}
-MATS = {
-    "5,000 cells in cells": (nested_cells(5000), 1),
-    "100,000 cells in cells": (nested_cells(100_000), 1),
-    "10^9 cells": (mat_file(matrix(1, (1, 1_000_000_000), **LAYERS)), 5),
-    "cells below 0": (mat_file(matrix(1, (1, -1), **LAYERS)), 6),
-    "10^9 structures": (
-        mat_file(matrix(2, (1, 10**9), element(5, struct.pack("<i", 8)), element(1, b"type\0\0\0\0"), **LAYERS)),
-        5,
-    ),
-    "names of no length": (
-        mat_file(matrix(2, (1, 1), element(5, struct.pack("<i", 0)), element(1, b"type"), **LAYERS)),
-        6,
-    ),
-    "a function handle": (mat_file(matrix(16, (1, 1), matrix(6, (1, 1), element(9, bytes(8))), **LAYERS)), 6),
-    "an object": (mat_file(matrix(3, (1, 1), **LAYERS)), 6),
-    "numbers of 2^62": (mat_file(matrix(6, ((1 << 31) - 1, (1 << 31) - 1), element(9, bytes(8)), **LAYERS)), 5),
-    "compressed zeros of 4 GiB": (
-        mat_file(struct.pack("<II", 15, len(z := b"\x78\xda" + deflated_zeros(4 << 30))), z),
-        5,
-    ),
-    "compressed nonsense": (mat_file(element(15, b"\xff" * 64)), 6),
-    "of the other byte order": (b"MATLAB 5.0 MAT-file".ljust(124) + b"\1\0MI", 6),
-    "of version 7.3": (b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM", 6),
-}
-for kind, (data, item) in MATS.items():
-    case(kind, "matlab", written("a.mat", data), item=item)
-    case(kind, "vgg", written("a.mat", data), item=item)
+# safetensors -----------------------------------------------------------------------------------------------
 
 
 def safetensors(header, data=bytes(64)):
@@ -188,24 +131,3 @@ for kind, (header, item) in SAFETENSORS.items():
     for reader in ("safetensors", "weights", "vgg", "released checkpoint"):
         case(kind, reader, written("a.safetensors", safetensors(header)), item=item)
 case("a header of 2^60", "safetensors", written("a.safetensors", struct.pack("<Q", 1 << 60) + b"{" + bytes(64)), item=5)
-
-
-def exr_with(old, new):
-    def make(folder):
-        path = SEEDS["exr"](folder)
-        data = path.read_bytes()
-        at = data.index(old) + len(old)
-        path.write_bytes(data[:at] + new + data[at + len(new) :])
-        return path
-
-    return make
-
-
-WINDOW = b"dataWindow\0box2i\0" + struct.pack("<I", 16)
-for kind, box in {
-    "a window of 2^31": (0, 0, (1 << 31) - 2, (1 << 31) - 2),
-    "a window of 30,000": (0, 0, 29_999, 29_999),
-    "a window backwards": (9, 9, 0, 0),
-    "a window of all integers": (-(1 << 31), -(1 << 31), (1 << 31) - 1, (1 << 31) - 1),
-}.items():
-    case(kind, "exr", exr_with(WINDOW, struct.pack("<4i", *box)), item=5)

@@ -106,7 +106,7 @@ PHOTOS = {
 }  # fmt: skip
 for kind, (data, item) in PHOTOS.items():
     expect = "either" if kind in ("8 bits and a bomb", "16 bits and a bomb", "text of a gigabyte") else "refused"
-    for reader, name in (("image", "a.png"), ("mask", "a.jpg"), ("depth", "a.png")):
+    for reader, name in (("image", "a.png"), ("mask", "a.jpg")):
         case(kind, reader, written(name, data), expect, item)
 
 
@@ -147,7 +147,7 @@ DECODED = {
     "no end": png(4, 4, data=zlib.compress(bytes(52)))[:-12],
 }
 for kind, data in DECODED.items():
-    for reader in ("image", "mask", "depth"):
+    for reader in ("image", "mask"):
         case(kind, reader, written("a.png", data), item=6)
     case(f"a photo with {kind}", "capture", capture_with_photo(data), item=6)
 case("a palette", "mask", written("a.png", BY_PALETTE), "either", item=6)

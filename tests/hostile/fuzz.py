@@ -398,7 +398,7 @@ STRUCTURES = {
         mutated_json,
     ),
     **dict.fromkeys(("pickle", "smplx pkl", "aist", "thuman fit"), mutated_pickle),
-    **dict.fromkeys(("image", "depth"), mutated_png),
+    "image": mutated_png,
     **dict.fromkeys(("opencv yaml", "easymocap", "colmap", "obj", "off", "log", "bvh"), mutated_text),
     **dict.fromkeys(("missing photos", "actorshq", "thuman mesh", "thuman scan"), mutated_text),
     **{

@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 from safetensors.numpy import save_file
-from scipy.io import savemat
 from torch_writer import tensors, write_checkpoint, write_stream
 
 from humangs_jax.apps.settings import PRESETS, load_settings, save_settings
@@ -48,25 +47,22 @@ from humangs_jax.data.preprocess.scenes import Settings, scan_content
 from humangs_jax.fitting.files import KEYS, read_fit_record
 from humangs_jax.fitting.scan_reading import read_joints, read_mesh
 from humangs_jax.fitting.scan_views import read_placement
-from humangs_jax.io.exr import ExrView, read_exr, write_exr
 from humangs_jax.io.glb import GlbWriter
 from humangs_jax.io.images import check_image, image_size, read_grey, read_image
 from humangs_jax.io.npz import read_npz
 from humangs_jax.io.reading import reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
-from humangs_jax.io.tensor_file import read_matconvnet, read_tensors
+from humangs_jax.io.tensor_file import read_tensors
 from humangs_jax.io.text import read_json
 from humangs_jax.network.conversion import load_checkpoint
 from humangs_jax.network.weights import expected_variables, load_weights, save_weights
 from humangs_jax.objectives.loss_networks import load_vgg19
 from humangs_jax.people.bank import load_bank
-from humangs_jax.people.rendering import read_depth
 from humangs_jax.people.seeds import GENERATOR_VERSION
 from humangs_jax.people.writer import begin_set, read_manifest
 from humangs_jax.training.config import read_config, tiny
 from humangs_jax.training.diagnose import first_failed_step
 
-RANDOM = np.random.default_rng(0)
 K = [[60.0, 0, 5], [0, 60, 6], [0, 0, 1]]
 POSE = [[1.0, 0, 0, 0], [0, -1, 0, 0.9], [0, 0, -1, 2.6], [0, 0, 0, 1]]
 VIEWS = ("000", "001")
@@ -165,14 +161,11 @@ READERS = {
     "json": read_json,
     "image": read_image_in_every_way,
     "mask": read_grey,
-    "depth": read_depth,
-    "exr": read_exr,
     "pickle": read_whole_pickle,
     "torch zip": read_tensors,
     "torch stream": read_tensors,
     "released checkpoint": load_checkpoint,
     "safetensors": read_tensors,
-    "matlab": read_matconvnet,
     "vgg": load_vgg19,
     "smplx npz": load_smplx,
     "smplx pkl": load_smplx,
@@ -537,18 +530,6 @@ def bank_arrays():
     }
 
 
-def cells(*values):
-    array = np.empty((1, len(values)), object)
-    array[0] = values
-    return array
-
-
-def matconvnet():
-    weights = np.empty((1, 2), object)
-    weights[0] = [np.ones((3, 3, 3, 4), np.float32), np.ones((4, 1), np.float32)]
-    return {"layers": cells({"type": "conv", "name": "conv1", "weights": weights}, {"type": "relu", "name": "relu1"})}
-
-
 def data_set(write, *arguments, **options):
     """A seed: the folder of a data set."""
 
@@ -589,14 +570,11 @@ SEEDS = {
     "json": text("a.json", json.dumps({"a": [1, 2.5, None, "x"], "b": {"c": True}})),
     "image": saved("a.png", lambda path: Image.fromarray(pixels(12, 10, 3)).save(path)),
     "mask": saved("a.jpg", lambda path: Image.fromarray(pixels(12, 10)).save(path)),
-    "depth": saved("a.png", lambda path: Image.fromarray(pixels(12, 10, dtype=np.uint16)).save(path)),
-    "exr": saved("a.exr", lambda path: write_exr(path, ExrView(np.ones((6, 5, 4), np.float32)))),
     "pickle": saved("a.pkl", lambda path: path.write_bytes(pickle.dumps({"x": np.eye(3), "n": 2}, protocol=2))),
     "torch zip": saved("a.pt", lambda path: write_checkpoint(path, {"model": tensors(STATE)})),
     "torch stream": saved("a.pth", lambda path: write_stream(path, {"model": tensors(STATE)})),
     "released checkpoint": None,  # too large a file to be made here; the readers below it have theirs
     "safetensors": saved("a.safetensors", lambda path: save_file(STATE, path, {"note": "x"})),
-    "matlab": saved("a.mat", lambda path: savemat(path, matconvnet(), do_compression=True)),
     "vgg": None,
     "smplx npz": npz("SMPLX.npz", smplx_arrays),
     "smplx pkl": saved("SMPLX.pkl", lambda path: path.write_bytes(pickle.dumps(smplx_arrays(), protocol=2))),

@@ -41,7 +41,6 @@ LATE = (
     "plyfile",
     "imageio_ffmpeg",
     "tqdm",
-    "grain",
 )
 WORK = {
     *("reconstruct", "refine_with_report", "motion_frames", "images", "draw", "fit_photos", "refine_capture"),
@@ -108,8 +107,8 @@ COMMANDS = (
     Command("export html", "export {inputs}/avatar{v}.npz --html me.html"),
     Command(
         "synth",
-        "synth --out people --subjects 2 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1 --depth --maps",
-        first="synth --out people --subjects 1 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1 --depth --maps",
+        "synth --out people --subjects 2 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1",
+        first="synth --out people --subjects 1 --size 128 --views 2 --close-views 0 --workers 1 --held-out 1",
     ),
     Command(
         "train",
@@ -156,8 +155,7 @@ def import_everything():
     sys.path[:0] = [str(HERE), *(str(HERE.parent / name) for name in ("network", "data/datasets", ""))]
     os.environ |= {"JAX_PLATFORMS": "cpu", "TF_CPP_MIN_LOG_LEVEL": "2"}
     for name in (*LATE, *(f"humangs_jax.{name}" for name in ("cli", *HEAVY))):
-        with contextlib.suppress(ModuleNotFoundError):  # grain is optional
-            importlib.import_module(name)
+        importlib.import_module(name)
 
 
 def random_of(variant, *more):
@@ -268,7 +266,6 @@ def stand_ins(variant):
     from humangs_jax.fitting.scan_fit import ScanFit
     from humangs_jax.fitting.similarity import Similarity
     from humangs_jax.network.presets import tiny
-    from humangs_jax.people.rendering import SurfaceMaps
     from humangs_jax.refinement.refine import Refinement
     from humangs_jax.training.validation import METRICS
 
@@ -301,11 +298,6 @@ def stand_ins(variant):
     def views_of(subject, body, poses, views):
         capture = some_capture(subject.seed, len(views), 128)
         return dataclasses.replace(capture, names=tuple(view.name for view in views))
-
-    def maps(_posed, camera):
-        return SurfaceMaps(
-            np.ones((camera.height, camera.width), np.float32), np.ones((camera.height, camera.width, 3), np.float32)
-        )
 
     def step(state, *_, **__):
         numbers = {"loss": 1.0, "psnr": 20.0, "grad_norm": 1.0, "learning_rate": 0.1}
@@ -411,7 +403,6 @@ def stand_ins(variant):
         ("people.writer", "make_subject", person),
         ("people.writer", "sample_pose", posed),
         ("people.writer", "capture_views", views_of),
-        ("people.writer", "render_maps", maps),
         ("people.writer", "cameras_around", lambda rng, vertices, azimuths, size: some_cameras(len(azimuths), size)),
         ("training.loop", "train_step", step),
         ("training.loop", "init_state", state),

@@ -3,9 +3,10 @@ import json
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from exr_files import camera_of, read_exr
 
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.io.exr import ExrView, read_exr, write_exr
+from humangs_jax.io.exr import ExrView, write_exr
 
 HEIGHT, WIDTH = 13, 9  # odd and unequal: a transposed or strided write cannot pass
 
@@ -36,9 +37,9 @@ def assert_same(a, b):
     assert a.channels.keys() == b.channels.keys()
     for name in a.channels:
         np.testing.assert_array_equal(a.channels[name], b.channels[name])
-    np.testing.assert_array_equal(a.camera.K, b.camera.K)
-    np.testing.assert_array_equal(a.camera.cam_from_world, b.camera.cam_from_world)
-    assert (a.camera.width, a.camera.height) == (b.camera.width, b.camera.height)
+    np.testing.assert_array_equal(camera_of(a).K, camera_of(b).K)
+    np.testing.assert_array_equal(camera_of(a).cam_from_world, camera_of(b).cam_from_world)
+    assert (camera_of(a).width, camera_of(a).height) == (camera_of(b).width, camera_of(b).height)
 
 
 def test_several_views_round_trip_exactly(tmp_path):
@@ -102,29 +103,6 @@ def test_half_precision_keeps_metres(tmp_path):
     assert (tmp_path / "half.exr").stat().st_size < (tmp_path / "float.exr").stat().st_size
 
 
-def test_files_of_others(tmp_path):
-    """Half floats without alpha, and grey ones."""
-    import OpenEXR
-
-    image = np.random.default_rng(0).random((HEIGHT, WIDTH)).astype(np.float16)
-    for name, channels in (("rgb", "RGB"), ("grey", "Y")):
-        with OpenEXR.File({}, {c: image for c in channels}) as file:
-            file.write(str(tmp_path / f"{name}.exr"))
-        (view,) = read_exr(tmp_path / f"{name}.exr")
-        np.testing.assert_array_equal(view.rgba[..., :3], np.repeat(image[..., None], 3, -1).astype(np.float32))
-        assert (view.rgba[..., 3] == 1).all() and view.depth is None
-    with OpenEXR.File({}, {"Z": image}) as file:
-        file.write(str(tmp_path / "depth.exr"))
-    with pytest.raises(ValueError, match=r"depth.exr: part .*expected channels R, G, B"):
-        read_exr(tmp_path / "depth.exr")
-    with OpenEXR.File({"K": np.eye(4, dtype="f")}, {"Y": image}) as file:
-        file.write(str(tmp_path / "camera.exr"))
-    with pytest.raises(ValueError, match=r"camera.exr: part .*K: expected a 3 x 3 matrix"):
-        read_exr(tmp_path / "camera.exr")
-    with pytest.raises(ValueError, match="no camera"):
-        _ = ExrView(np.zeros((4, 4, 4), np.float32)).camera
-
-
 def with_small_channel():
     view = make_view(0)
     view.channels["n"] = np.zeros((2, 2), np.float32)  # past the shape check of the constructor
@@ -156,17 +134,6 @@ def test_bad_views_write_nothing(tmp_path, case):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_bad_files(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no.exr: no such file"):
-        read_exr(tmp_path / "no.exr")
-    (tmp_path / "bad.exr").write_bytes(b"hello" * 10)
-    with pytest.raises(ValueError, match=r"bad.exr: not an OpenEXR file"):
-        read_exr(tmp_path / "bad.exr")
-    write_exr(tmp_path / "whole.exr", [make_view(i) for i in range(3)])
-    data = (tmp_path / "whole.exr").read_bytes()
-    for share in (0.1, 0.5, 0.95):
-        (tmp_path / "cut.exr").write_bytes(data[: int(share * len(data))])
-        with pytest.raises(ValueError, match=r"cut.exr: (damaged: \d of 3 parts|not a readable OpenEXR file)"):
-            read_exr(tmp_path / "cut.exr")
+def test_a_missing_folder_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match="no such folder"):
         write_exr(tmp_path / "nowhere" / "a.exr", make_view(0))

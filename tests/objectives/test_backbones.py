@@ -6,8 +6,9 @@ import loss_cases
 import numpy as np
 import pytest
 
+from experiments.training.cases import random_weights
 from humangs_jax.objectives import backbones, lpips, perceptual
-from humangs_jax.objectives.backbones import Conv, Convolution, Pool, feature_maps, random_weights
+from humangs_jax.objectives.backbones import Conv, Convolution, Pool, feature_maps
 
 TABLES = {"vgg19": perceptual.VGG19, **lpips.BACKBONES}
 SMALLEST = {"vgg19": 16, "vgg": 16, "alex": 31, "squeeze": 25}

@@ -1,4 +1,4 @@
-"""Written sets: cameras of the protocol and close ones, maps that agree with the body, resuming, processes, splits."""
+"""Written sets: cameras of the protocol and close ones, resuming, processes, splits."""
 
 import filecmp
 import itertools
@@ -6,33 +6,24 @@ import json
 import os
 import tempfile
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from humangs_jax.body.library import load_body
-from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.data.capture import load_capture
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.motion import load_motion
 from humangs_jax.io.atomic import replace_folder
-from humangs_jax.io.exr import read_exr
 from humangs_jax.people import cameras, seeds, writer
 from humangs_jax.people.bank import build_bank
-from humangs_jax.people.rendering import DEPTH_UNIT, padded, read_depth, render_maps, write_depth
 from humangs_jax.people.seeds import DEMO, SPLITS, seeds_of, split_of
-from humangs_jax.people.subject import make_subject
 from humangs_jax.people.writer import find_people
-from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, rasterize_mesh
 
 SIZE = 32
 BODY = load_body()
-LAYOUT = writer.Layout(SIZE, poses=2, views=3, close_views=1, held_out_views=1, novel_poses=1, depth=True, maps=True)
-SAME_SURFACE = 2e-3
-"""Metres: the skin's mesh is the body's but for the faces under cloth; pixels at their rim differ."""
+LAYOUT = writer.Layout(SIZE, poses=2, views=3, close_views=1, held_out_views=1, novel_poses=1)
 EIGHT_BITS = 0.5 / 255 + 1e-6
 
 
@@ -71,45 +62,9 @@ def test_a_written_person_has_all_views_in_all_forms(folder, body):
     assert held_out.names == ("0_00", "1_00")
     np.testing.assert_array_equal(held_out.pose(0).rotations, capture.pose(0).rotations)
     assert np.abs(held_out.pose(1).rotations - capture.pose(1).rotations).max() > 0.05  # a novel pose
-    for where, views in ((person, capture), (person / "held_out", held_out)):
-        for i, name in enumerate(views.names):
-            (view,) = read_exr(where / "maps" / f"{name}.exr")
-            np.testing.assert_array_equal(view.cam_from_world, views.cameras.cam_from_world[i])
-            np.testing.assert_array_equal(view.K, views.cameras.K[i])
-            on_white = view.rgba[..., :3] + (1 - view.rgba[..., 3:])
-            np.testing.assert_allclose(on_white, views.images[i], atol=EIGHT_BITS)
-            np.testing.assert_allclose(view.rgba[..., 3], views.masks[i], atol=EIGHT_BITS)
-            depth = read_depth(where / "depth" / f"{name}.png")
-            np.testing.assert_allclose(depth, view.depth, atol=0.51 * DEPTH_UNIT)
-            assert ((depth > 0) == (view.channels["position.X"] != 0)).mean() > 0.99
-            assert ((depth > 0) & (views.masks[i] == 0)).sum() == 0  # what is hit in its middle is covered
-            assert ((depth == 0) & (views.masks[i] == 1)).sum() <= 2  # a gap between four samples
     manifest = json.loads((folder / "manifest.json").read_text())
     assert manifest["generator_version"] == seeds.GENERATOR_VERSION and manifest["split"] == "demo"
     assert manifest["subjects"] == [person.name] and manifest["settings"]["image_size"] == SIZE
-
-
-@pytest.mark.slow
-def test_maps_agree_with_the_body_where_it_is_bare(body):
-    person = make_subject(DEMO[1], body)
-    posed = writer.sample_pose(person, 0)
-    camera = cameras.cameras_around(np.random.default_rng(0), posed.vertices, np.asarray([0.3]), 64)[0]
-    shown = render_maps(posed, camera)
-    pose = BodyPose(jnp.asarray(posed.rotations), jnp.asarray(posed.translation))
-    rest = jax.jit(shape_body)(body, jnp.asarray(person.betas))
-    naked = rasterize_mesh(jax.jit(pose_body)(body, rest, pose).vertices, body.faces, camera)
-    expected = np.asarray(interpolate_attributes(naked, body.faces, rest.vertices, jnp.zeros(3)))
-    fragments = rasterize_mesh(*padded(posed.vertices, person.surface.faces), camera)
-    ids = np.asarray(fragments.face_ids)
-    np.testing.assert_array_equal(shown.depth > 0, ids >= 0)
-    skin = (ids >= 0) & (person.face_materials[ids] == 0) & (np.asarray(naked.depth) > 0)
-    assert skin.sum() > 15
-    depth_error = np.abs(shown.depth - np.asarray(naked.depth))[skin]
-    position_error = np.linalg.norm(shown.position - expected, axis=-1)[skin]
-    assert (depth_error < SAME_SURFACE).mean() > 0.95 and np.median(depth_error) < 1e-5
-    assert (position_error < SAME_SURFACE).mean() > 0.95 and np.median(position_error) < 1e-5
-    cloth = (ids >= 0) & (person.face_materials[ids] > 1) & (np.asarray(naked.depth) > 0)
-    assert np.mean(shown.depth[cloth] < np.asarray(naked.depth)[cloth]) > 0.9  # cloth is in front of the skin
 
 
 @given(st.integers(0, 10_000))
@@ -156,16 +111,6 @@ def test_sequences_are_written_with_their_motion_and_a_scan(tmp_path, body):
     assert {"scan.obj", "scan.glb", "material.mtl"} <= {path.name for path in (person / "scan").iterdir()}
 
 
-def test_depths_that_do_not_fit_are_an_error(tmp_path):
-    with pytest.raises(ValueError, match="do not fit into 16 bits"):
-        write_depth(tmp_path / "depth.png", np.full((2, 2), 7.0, np.float32))
-    from humangs_jax.io.images import write_png
-
-    write_png(tmp_path / "eight.png", np.zeros((2, 2), np.float32))
-    with pytest.raises(ValueError, match="expected a 16-bit grey PNG"):
-        read_depth(tmp_path / "eight.png")
-
-
 def test_sets_are_resumed_only_with_the_same_settings(tmp_path, monkeypatch):
     made = []
     fast(monkeypatch, made)
@@ -196,14 +141,14 @@ def test_people_that_cannot_be_made_are_named_and_the_others_written(tmp_path, m
 
 @pytest.mark.slow
 def test_processes_write_the_same_files(tmp_path):
-    layout = writer.Layout(SIZE, views=1, close_views=1, depth=True, maps=True)
+    layout = writer.Layout(SIZE, views=1, close_views=1)
     alone, together = tmp_path / "alone", tmp_path / "together"
     writer.write_set(alone, 3, layout, "demo", progress=False)
     writer.write_set(together, 3, layout, "demo", workers=2, progress=False)
     files = sorted(f.relative_to(alone) for f in alone.rglob("*") if f.is_file())
     assert files == sorted(f.relative_to(together) for f in together.rglob("*") if f.is_file())
-    texts = [f for f in files if f.suffix in (".png", ".exr", ".json")]
-    assert len(texts) == 1 + 3 * (1 + 2 * 4)
+    texts = [f for f in files if f.suffix in (".png", ".json")]
+    assert len(texts) == 1 + 3 * (1 + 2 * 2)
     _, different, errors = filecmp.cmpfiles(alone, together, texts, shallow=False)
     assert different == errors == []
     for file in set(files) - set(texts):  # an npz tells when it was written
@@ -215,10 +160,10 @@ def test_processes_write_the_same_files(tmp_path):
     ("arguments", "layout", "first"),
     [
         (("--subjects", "3"), writer.Layout(512, 1, 60, 12), 0),
-        (("--size", "128", "--poses", "4", "--sequences", "--frames", "30", "--depth", "--first", "7"),
-         writer.Layout(128, 4, 60, 12, frames=30, depth=True), 7),
-        (("--views", "4", "--close-views", "0", "--held-out", "8", "--maps", "--scans"),
-         writer.Layout(512, 1, 4, 0, 8, maps=True, scan_texture=2048), 0),
+        (("--size", "128", "--poses", "4", "--sequences", "--frames", "30", "--first", "7"),
+         writer.Layout(128, 4, 60, 12, frames=30), 7),
+        (("--views", "4", "--close-views", "0", "--held-out", "8", "--scans"),
+         writer.Layout(512, 1, 4, 0, 8, scan_texture=2048), 0),
         (("--for-training",), writer.Layout(256, 2, 12), 0),
     ],
 )  # fmt: skip

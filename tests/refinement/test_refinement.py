@@ -210,7 +210,6 @@ def test_specks_of_a_mask_do_not_widen_the_crops():
         ({"rounds": 0, "steps": 0}, "rounds 0, steps 0"),
         ({"rounds": -1}, "rounds -1"),
         ({"seconds": 0.0}, "seconds"),
-        ({"decay": 2.0}, "decay"),
         ({"visible": 0.0}, "visible"),
         ({"full_steps": 0}, "full_steps"),
     ],

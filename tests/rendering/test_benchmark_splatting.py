@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments.splatting import benchmark, scaling, scenes, tradeoff, work
+from experiments.splatting import benchmark, scaling, tradeoff
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.reference import render_reference
-from humangs_jax.rendering.splat_config import SplatConfig
 
 EXPERIMENTS = Path(__file__).parents[2] / "experiments"
 SIZE, COUNT = 40, 60
@@ -25,7 +24,6 @@ TIMES = ("forward_ms", "forward_backward_ms", "forward_cpu_ms", "forward_backwar
 FLOAT32_PSNR = 80.0  # roundings of 1e-7; a decision at 1/255 that falls the other way on one pixel costs 1e-4
 FLOAT32_GRADIENT = 1e-3
 STORED_AS_FLOAT32 = 1e-6
-ROUNDED_EITHER_WAY = 2  # pairs whose alpha is 1/255 to rounding
 
 YARDSTICK = """
 import time
@@ -80,7 +78,7 @@ def files(tmp_path_factory):
 
 def run(folder, *options):
     out = folder / "out.json"
-    command = [sys.executable, EXPERIMENTS / "benchmark_splatting.py", "--scene", folder / "scene.npz"]
+    command = [sys.executable, EXPERIMENTS / "splatting/benchmark.py", "--scene", folder / "scene.npz"]
     command += ["--size", str(SIZE), "--json", out, *options]
     environment = {**os.environ, "JAX_PLATFORMS": "cpu"}
     done = subprocess.run(list(map(str, command)), capture_output=True, text=True, env=environment, check=False)
@@ -105,9 +103,6 @@ def test_reports_times_beside_the_yardstick_and_errors(files):
     assert all(0 < error < FLOAT32_GRADIENT for error in result["gradient_relative_l2"].values())
     assert all(0.99999 < cosine <= 1 + 1e-9 for cosine in result["gradient_cosine"].values())
     assert all(abs(bias) < FLOAT32_GRADIENT for bias in result["gradient_signed_bias"].values())
-    work = result["work"]
-    assert 0 < work["contributing_pairs"] <= work["pixel_pairs_in_lists"]
-    assert work["tile_pairs"] <= len(result["devices"]) * work["tile_pairs_capacity"]
     assert result["config"]["tile_size"] == 8 and result["gaussians"] == COUNT
     assert f"| {result['psnr']:.1f} |" in printed and f"| {result['scene']} {SIZE}" in printed
 
@@ -137,41 +132,6 @@ def test_errors_of_gradients_see_bias_and_gain():
     assert found["gain"] == pytest.approx(-0.1, abs=0.01)
     assert found["relative_l2"] == pytest.approx(math.hypot(0.1, 0.01), rel=0.05)
     assert benchmark.gradient_errors(-exact, exact)["cosine"] == pytest.approx(-1)
-
-
-@pytest.mark.slow
-def test_work_needed_agrees_with_brute_force(files):
-    """Every pixel against every Gaussian, in float64."""
-    scene = scenes.load_scene(files / "scene.npz", SIZE)
-    config = SplatConfig()
-    projected, _ = work.projected_splats(scene, config)
-    order = np.argsort(projected.depths, kind="stable")
-    x, y, xx, xy, yy = (np.asarray(projected[i], np.float64)[order, None, None] for i in (0, 1, 3, 4, 5))
-    dx, dy = np.arange(SIZE) + 0.5 - x, (np.arange(SIZE) + 0.5)[:, None] - y
-    squared = (yy * dx**2 - 2 * xy * dx * dy + xx * dy**2) / (xx * yy - xy**2)
-    alpha = np.minimum(scene.opacities[order, None, None] * np.exp(-0.5 * squared), config.alpha_max)
-    alpha = np.where(alpha < config.alpha_min, 0, alpha)
-    weighs = (np.cumprod(1 - alpha, axis=0) > config.transmittance_stop) & (alpha > 0)
-    for tile_size in (8, 16):
-        lists = work.make_lists(scene, config, tile_size)
-        counted = work.draw_lists(lists, SIZE, tile_size, config).contributing.sum()
-        assert abs(counted - weighs.sum()) <= ROUNDED_EITHER_WAY
-    boxes = work.culling_squares(projected, np.where(projected.visible, 1.0, 0.0))["opacity-aware box"]
-    met = 0
-    for left in range(0, SIZE, 8):
-        for top in range(0, SIZE, 8):
-            columns = np.abs(np.clip(projected.x, left + 0.5, left + 7.5) - projected.x) <= boxes[0]
-            rows = np.abs(np.clip(projected.y, top + 0.5, top + 7.5) - projected.y) <= boxes[1]
-            met += (columns & rows).sum()
-    assert work.tiles_met(projected, *boxes, SIZE, 8) == met
-
-
-def test_blocks_work_as_long_as_their_neediest_tile():
-    steps = work.block_steps
-    counts, used = np.array([0, 9, 3, 30, 5]), np.array([0, 9, 3, 12, 5])
-    assert steps(counts, counts, 2, 8) == 2 * 32 + 2 * 8  # lists of 30 and 9, then of 5 and 3
-    assert steps(counts, used, 2, 8) == 2 * 16 + 2 * 8
-    assert steps(np.zeros(4, int), np.zeros(4, int), 2, 8) == 0
 
 
 def test_pareto_front_holds_what_nothing_beats():

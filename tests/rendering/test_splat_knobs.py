@@ -1,10 +1,6 @@
-"""What each knob of SplatConfig does to the image, the visibility of Gaussians, and images shared among devices."""
+"""What each knob of SplatConfig does to the image, the visibility of Gaussians."""
 
 import dataclasses
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,9 +10,7 @@ from splat_scenes import COUNT, HEIGHT, WIDTH, camera, few, random_gaussians
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import Camera, stack_cameras
-from humangs_jax.rendering import binning
 from humangs_jax.rendering.gaussians import Gaussians
-from humangs_jax.rendering.projection import project, squared_reach
 from humangs_jax.rendering.reference import render_reference
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
 from humangs_jax.rendering.splatting import plan_buffers, render, seen_from
@@ -170,84 +164,6 @@ def test_one_plan_serves_an_animation():
     assert drawn._cache_size() == 1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("count", [2, 3])
-def test_shares_partition_the_pairs(count):
-    gaussians = random_gaussians(2, np.float32)
-    view, grid = camera(np.float32), binning.TileGrid(WIDTH, HEIGHT, 4)
-    footprints = binning.footprints(project(gaussians, view), squared_reach(gaussians.opacities))
-    emit = jax.jit(lambda share: binning.emit_pairs(footprints, grid, 2048, 4096, binning.Share(share, count)))
-    whole = binning.emit_pairs(footprints, grid, 2048, 4096)
-    parts = [emit(jnp.int32(i)) for i in range(count)]
-    listed = lambda p: set(zip(*(np.asarray(a)[np.asarray(p.tiles) < grid.tiles].tolist() for a in p[:2]), strict=True))
-    assert sum(int(p.needed) for p in parts) == int(whole.needed) == len(listed(whole))
-    assert set().union(*map(listed, parts)) == listed(whole)
-    for i, part in enumerate(parts):
-        assert {tile // grid.columns % count for tile, _ in listed(part)} <= {i}
-        rows, pairs = jax.jit(lambda share: binning.count_pairs(footprints, grid, binning.Share(share, count)))(i)
-        assert int(pairs) == int(part.needed) and int(rows) >= 1
-
-
-SHARED = """
-import sys
-sys.path.insert(0, sys.argv[1])
-import jax
-jax.config.update("jax_platforms", "cpu")
-jax.config.update("jax_num_cpu_devices", 3)
-jax.config.update("jax_enable_x64", True)
-import dataclasses
-import jax.numpy as jnp
-import numpy as np
-from splat_scenes import camera, random_gaussians
-from humangs_jax.geometry.camera import Camera
-from humangs_jax.rendering.splatting import SplatConfig, plan_buffers, render, render_views
-
-gaussians, view = random_gaussians(1), camera(width=37, height=45)
-config = SplatConfig(block=4, chunk=4, chunk_backward=4, visibility=True)
-
-def loss(arguments, config, mesh):
-    gaussians, K, background = arguments
-    r = render(gaussians, Camera(K, view.cam_from_world, view.width, view.height), config, background, mesh)
-    return jnp.sum(r.rgb**2) + jnp.sum(r.depth * r.alpha)
-
-def close(a, b):
-    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
-        np.testing.assert_allclose(x, y, atol=1e-9 * max(1, np.abs(y).max()))
-
-alone = render(gaussians, view, config)
-arguments = gaussians, view.K, jnp.asarray([0.1, 0.5, 0.9])
-expected = jax.jit(jax.grad(loss), static_argnums=(1, 2))(arguments, plan_buffers(gaussians, view, config), None)
-mesh = jax.make_mesh((3,), ("rows",))
-close(render(gaussians, view, config, mesh=mesh), alone)
-planned = plan_buffers(gaussians, view, config, mesh=mesh)
-assert planned.max_pairs < plan_buffers(gaussians, view, config).max_pairs
-close(jax.jit(jax.grad(loss), static_argnums=(1, 2))(arguments, planned, mesh), expected)
-try:
-    render(gaussians, view, dataclasses.replace(planned, max_pairs=10), mesh=mesh)
-except ValueError as error:
-    assert "max_pairs >=" in str(error)
-else:
-    raise AssertionError("an overflow went by")
-views = Camera(jnp.stack([view.K, view.K]), jnp.stack([view.cam_from_world] * 2), view.width, view.height)
-close(render_views(gaussians, views, config, mesh=mesh).rgb[1], alone.rgb)
-print("shared")
-"""
-
-
-@pytest.mark.slow
-def test_devices_share_an_image():
-    """Devices of a CPU must be asked for before JAX starts: hence a process of its own."""
-    here = str(Path(__file__).parent)
-    done = subprocess.run([sys.executable, "-c", SHARED, here], capture_output=True, text=True, check=False)
-    assert done.returncode == 0 and done.stdout.split() == ["shared"], done.stderr[-3000:]
-
-
-def test_a_mesh_of_two_axes_is_refused():
-    mesh = jax.make_mesh((1, 1), ("a", "b"))
-    with pytest.raises(ValueError, match=r"one axis, got \('a', 'b'\)"):
-        render(random_gaussians(0, np.float32), camera(np.float32), SMALL, mesh=mesh)
-
-
 def test_settings_are_checked():
     for wrong in ({"radius_sigma": 0.0}, {"square": True}, {"scale": 0.0}):
         with pytest.raises(ValueError, match="SplatConfig"):
@@ -260,34 +176,3 @@ def test_cameras_of_a_batch_are_planned_together():
     far = Camera(near.K, near.cam_from_world.at[2, 3].add(3.0), WIDTH, HEIGHT)
     both = plan_buffers(gaussians, stack_cameras([near, far]), SMALL)
     assert both == max((plan_buffers(gaussians, c, SMALL) for c in (near, far)), key=lambda c: c.max_pairs)
-
-
-IN_FLIGHT = """
-import sys
-sys.path.insert(0, sys.argv[1])
-import jax
-jax.config.update("jax_platforms", "cpu")
-jax.config.update("jax_num_cpu_devices", 2)
-import numpy as np
-from splat_scenes import camera, random_gaussians
-from humangs_jax.rendering.splatting import plan_buffers, render
-
-gaussians, view, mesh = random_gaussians(1, np.float32), camera(np.float32), jax.make_mesh((2,), ("rows",))
-config = plan_buffers(gaussians, view, mesh=mesh)
-draw = jax.jit(lambda gaussians: render(gaussians, view, config, mesh=mesh).rgb)
-wait = jax.block_until_ready if sys.argv[2] == "wait" else lambda image: image
-expected = np.asarray(draw(gaussians))
-images = [wait(draw(gaussians)) for _ in range(200)]
-assert all(np.array_equal(image, expected) for image in images)
-print("drawn")
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("how", "threads"), [("wait", {}), ("fly", {"PJRT_NPROC": "80"})])
-def test_loops_on_two_devices_survive(how, threads):
-    """As docs/performance.md says: wait for each call, or start more threads than calls can be in flight."""
-    here, environment = Path(__file__).parent, {**os.environ, **threads}
-    command = [sys.executable, "-c", IN_FLIGHT, str(here), how]
-    run = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=here.parents[1])
-    assert run.returncode == 0 and run.stdout.endswith("drawn\n"), run.stderr[-2000:]

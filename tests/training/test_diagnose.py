@@ -13,6 +13,7 @@ from rounding import bound
 from target_cases import DRIVEN, PIXELS, SIZE, mapped_tube, small, views
 from training_cases import without_upsampler
 
+from experiments.training.cases import random_weights
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, Loader
 from humangs_jax.network.humangs import init_humangs
@@ -20,7 +21,7 @@ from humangs_jax.network.presets import PRESETS
 from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.stages import Recorder, inexact_leaves
 from humangs_jax.network.transformer import Block
-from humangs_jax.objectives.backbones import VGG16, channels, random_weights
+from humangs_jax.objectives.backbones import VGG16, channels
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.objectives.perceptual import VGG19, Vgg19

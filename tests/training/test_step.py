@@ -10,6 +10,7 @@ import pytest
 from rounding import bound
 from training_cases import without_upsampler
 
+from experiments.training.cases import random_weights
 from humangs_jax.avatar.animate import skin
 from humangs_jax.avatar.reconstruct import reconstruct_views
 from humangs_jax.body.model import BodyPose
@@ -18,7 +19,7 @@ from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSam
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.humangs import init_humangs
-from humangs_jax.objectives.backbones import VGG16, channels, random_weights
+from humangs_jax.objectives.backbones import VGG16, channels
 from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.objectives.perceptual import VGG19, Vgg19

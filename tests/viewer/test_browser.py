@@ -82,7 +82,7 @@ def test_the_page_asks_for_nothing(browser):
 def test_localhost_shows_the_same_page(page_file):
     import threading
 
-    server = page_server(page_file.read_text())
+    server = page_server({"/": page_file.read_text()})
     threading.Thread(target=server.serve_forever, daemon=True).start()
     try:
         with chromium.Chromium() as browser:

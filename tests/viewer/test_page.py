@@ -83,7 +83,7 @@ def test_notebooks_hold_the_whole_page():
 
 
 def test_the_server_serves_the_page_to_this_machine_and_nothing_else():
-    server = page.page_server("<p>é</p>")
+    server = page.page_server({"/": "<p>é</p>"})
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
     try:

@@ -231,8 +231,8 @@ def test_an_avatar_may_have_joints_of_any_name(name):
 
 
 def test_the_page_has_no_tables_of_its_own():
-    from humangs_jax.viewer.page import _read
+    from humangs_jax.viewer.page import read_part
 
-    own = "".join(_read(f"{name}.js") for name in ("motion_files", "skeletons"))
+    own = "".join(read_part(f"{name}.js") for name in ("motion_files", "skeletons"))
     for word in ("upleg", "toebase", "mocap", "smpl_", "body_pose", "clavicle", "0.35"):
         assert word not in own, word

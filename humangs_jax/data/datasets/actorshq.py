@@ -43,13 +43,13 @@ def find_actorshq(folder: str | Path) -> tuple[Path, ...]:
     return tuple(sorted(path for pattern in ("*/", "*/*/") for path in folder.glob(pattern) if is_one(path)))
 
 
-def open_actorshq(folder: str | Path, body: FileBody, scale: str | None = None) -> Subject:
-    """One sequence. scale: "1x", "2x" or "4x"; None: the smallest images that are there.
+def open_actorshq(folder: str | Path, body: FileBody) -> Subject:
+    """One sequence, in the smallest images that are there.
 
     Raises: CaptureError naming file and key.
     """
     folder = Path(folder)
-    scale = scale or next((s for s in SCALES if (folder / s / CALIBRATION).is_file()), SCALES[0])
+    scale = next((s for s in SCALES if (folder / s / CALIBRATION).is_file()), SCALES[0])
     cameras = read_csv_cameras(folder / scale / CALIBRATION)
     part = lambda name, kind: re.compile(re.escape(name) + f"_{kind}" + r"(\d+)")
 

@@ -142,11 +142,10 @@ def video_subject(
     folders: Mapping[str, Folders],
     parameters: BodyParameters,
     listed: set[tuple[str, int]] = frozenset(),  # ty: ignore[invalid-parameter-default]
-    first_frame: int = 0,
 ) -> Subject:
     """The photos of some cameras that have a mask and a pose, frame after frame and camera after camera.
 
-    folders: by the name of the camera. listed: (camera, frame) that are known to be missing. first_frame: that of the first pose.
+    folders: by the name of the camera. listed: (camera, frame) that are known to be missing.
     Raises: CaptureError if there is no photo.
     """
     count, missing = len(parameters.translations), {"listed as missing": 0, "no photo": 0, "no mask": 0, "no pose": 0}
@@ -156,19 +155,16 @@ def video_subject(
         photos, masks = numbered(folder.photos, folder.frame_of), numbered(folder.masks, folder.frame_of)
         known = {frame for owner, frame in listed if owner == camera.name}
         missing["listed as missing"] += len(known)
-        missing["no photo"] += sum(
-            frame not in photos and frame not in known for frame in range(first_frame, first_frame + count)
-        )
+        missing["no photo"] += sum(frame not in photos and frame not in known for frame in range(count))
         for frame, photo in photos.items():
-            row = frame - first_frame
             if frame in known:
                 continue
-            if not 0 <= row < count:
+            if not 0 <= frame < count:
                 missing["no pose"] += 1
             elif frame not in masks:
                 missing["no mask"] += 1
             else:
-                shown.append((row, number))
+                shown.append((frame, number))
                 files.append((photo, masks[frame]))
     if not shown:
         told = ", ".join(f"{reason}: {number}" for reason, number in missing.items() if number)
@@ -194,7 +190,7 @@ def video_subject(
         frames=frames,
         cameras=owners,
         frame_count=count,
-        view_name=lambda view: f"{cameras[owners[view]].name}_{frames[view] + first_frame:08d}",
+        view_name=lambda view: f"{cameras[owners[view]].name}_{frames[view]:08d}",
         read=read,
         parameters=parameters.poses,
         missing={reason: number for reason, number in missing.items() if number},

@@ -9,7 +9,7 @@ import numpy as np
 
 from humangs_jax.data.loading.examples import Example, Source
 from humangs_jax.data.loading.order import input_count_at
-from humangs_jax.data.loading.threads import Reader, Waiting, prefetched, read_in_order
+from humangs_jax.data.loading.threads import Waiting, prefetched, read_in_order
 
 AHEAD = 2
 """Batches prepared while one is worked on."""
@@ -24,7 +24,7 @@ class Loader:
         devices hold, so that replicas hold equal rows. None: everything on the default device.
     first_step, first_example: where the numbering of examples starts: those of steps before had other batches.
     process_index, process_count: where `sharding` is None, the part of the batch to make: equal runs of rows.
-    reader: "grain", "plain", or "auto": grain where it is installed. Batches are the same. threads: that make examples.
+    threads: that make examples.
 
     Raises: ValueError if the batch cannot be divided among the processes.
     """
@@ -37,7 +37,6 @@ class Loader:
     first_example: int = 0
     process_index: int = 0
     process_count: int = 1
-    reader: Reader = "auto"
     threads: int = 4
 
     def __post_init__(self):
@@ -79,9 +78,9 @@ class Loader:
         return self._place([self.example_at(step, row) for row in self.rows])
 
     def batches(
-        self, start: int, stop: int, ahead: int = AHEAD, waiting: Waiting | None = None
+        self, start: int, stop: int, waiting: Waiting | None = None
     ) -> Generator[tuple[int, Example], None, None]:
-        """(step, batch) for start <= step < stop; `ahead` batches are made and put on the devices by threads meanwhile.
+        """(step, batch) for start <= step < stop; `AHEAD` batches are made and put on the devices by threads meanwhile.
 
         Errors of the threads are raised here. Closing the generator (or leaving the loop over it) ends them.
         waiting: the time that the loop waited for batches is added to it.
@@ -93,8 +92,7 @@ class Loader:
                 lambda i: self.example_at(start + i // len(rows), rows[i % len(rows)]),
                 (stop - start) * len(rows),
                 self.threads,
-                ahead * len(rows),
-                self.reader,
+                AHEAD * len(rows),
             )
             try:
                 for step in range(start, stop):
@@ -102,7 +100,7 @@ class Loader:
             finally:
                 examples.close()
 
-        return prefetched(make, ahead, waiting)
+        return prefetched(make, AHEAD, waiting)
 
     def _place(self, examples):
         """Stack the rows of this process and put them on the devices."""

@@ -1,20 +1,16 @@
 """Work ahead of a loop: several threads make examples in order, one thread prepares the batches that are asked for next.
 
-Examples are made by grain if it is installed, else by the standard library. Both call the same pure function with the same
-numbers, so the results are equal to the bit. Threads suffice: decoding and jitted functions release the interpreter's lock,
-and worker processes of grain take seconds to start.
+Threads suffice: decoding and jitted functions release the interpreter's lock.
 """
 
 import collections
 import concurrent.futures
 import dataclasses
-import importlib
-import importlib.util
 import queue
 import threading
 import time
 from collections.abc import Callable, Generator, Iterator
-from typing import Any, Literal, TypeVar
+from typing import TypeVar
 
 T = TypeVar("T")
 
@@ -88,39 +84,12 @@ def prefetched(make: Callable[[], Iterator[T]], ahead: int, waiting: Waiting | N
         thread.join()
 
 
-Reader = Literal["auto", "grain", "plain"]
-
-
-def has_grain() -> bool:
-    """Whether grain can be imported."""
-    return importlib.util.find_spec("grain") is not None
-
-
-def read_in_order(
-    make: Callable[[int], T], count: int, threads: int, ahead: int, reader: Reader = "auto"
-) -> Generator[T, None, None]:
+def read_in_order(make: Callable[[int], T], count: int, threads: int, ahead: int) -> Generator[T, None, None]:
     """make(0), make(1), ..., make(count - 1), up to `ahead` of them started before they are needed.
 
-    Raises: ImportError if reader is "grain" and it is not installed; what `make` raises, in its turn.
+    Raises: what `make` raises, in its turn.
     """
-    if count <= 0:
-        return
-    read = _read_with_grain if reader == "grain" or (reader == "auto" and has_grain()) else _read_plainly
-    yield from read(make, count, max(1, threads), max(1, ahead))
-
-
-def _read_with_grain(make, count, threads, ahead):
-    grain: Any = importlib.import_module("grain")  # optional, and then unknown to type checkers
-    options = grain.ReadOptions(num_threads=threads, prefetch_buffer_size=max(ahead, threads))
-    examples = iter(grain.MapDataset.range(count).map(make).to_iter_dataset(options))
-    try:
-        yield from examples
-    finally:
-        examples.close()
-
-
-def _read_plainly(make, count, threads, ahead):
-    ahead = max(ahead, threads)
+    threads, ahead = max(1, threads), max(1, ahead, threads)
     with concurrent.futures.ThreadPoolExecutor(threads, thread_name_prefix="humangs-reader") as pool:
         pending = collections.deque(pool.submit(make, i) for i in range(min(ahead, count)))
         begun = len(pending)

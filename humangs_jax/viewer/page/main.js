@@ -201,7 +201,7 @@ async function start() {
   controls.update();
   invalidate();
 
-  // ---- for tests ----
+  // ---- for tests and for live.html ----
   const nested = (flat, width) => Array.from({ length: flat.length / width }, (_, i) => flat.slice(width * i, width * i + width));
   function exactPose({ rotations, translation, frame }) {
     if (frame !== undefined) return motionPose(scene.motion, frame);
@@ -209,6 +209,14 @@ async function start() {
     return { quats: rotations.map((r) => quatFromAxisAngle(...r)), translation: translation || [0, 0, 0] };
   }
   return {
+    // What people have set: a page of the next avatar takes it over (live.html).
+    state: () => ({ orbit: { ...orbit }, mode: app.mode, frame: app.frame, playing: app.playing }),
+    restore(kept) {
+      Object.assign(orbit, kept.orbit);
+      setPlaying(kept.playing);
+      setMode(kept.mode);
+      if (scene.motion) setFrame(kept.frame);
+    },
     firstImage, floats: renderer.floats, gaussians: scene.count,
     // Draws one image at once: { K, cam_from_world, width, height }, a pose { rotations, translation } or { frame },
     // and a background; nothing but the person. `resume` goes back to the page.

@@ -1,0 +1,26 @@
+"""Reading the OpenEXR files that the package writes."""
+
+import numpy as np
+import OpenEXR
+
+from humangs_jax.geometry.camera import Camera
+from humangs_jax.io.exr import RGBA, STANDARD_ATTRIBUTES, ExrView
+
+
+def read_exr(path):
+    """The views of a file, one per part, as float32."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return [_view(part) for part in file.parts]
+
+
+def camera_of(view):
+    """The camera in the header."""
+    return Camera.from_opencv(view.K, view.cam_from_world, view.rgba.shape[1], view.rgba.shape[0])
+
+
+def _view(part):
+    images = {name: np.asarray(channel.pixels, np.float32) for name, channel in part.channels.items()}
+    rgba = np.stack([images.pop(name) for name in RGBA], axis=-1)
+    matrices = [part.header.get(key) for key in ("K", "cam_from_world")]
+    attributes = {k: v for k, v in part.header.items() if isinstance(v, str) and k not in STANDARD_ATTRIBUTES}
+    return ExrView(rgba, images.pop("Z", None), *matrices, part.name(), images, attributes)
