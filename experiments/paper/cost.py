@@ -135,8 +135,8 @@ def wait(program: Any, *arguments: Any) -> None:
 
 def configurations(width: int, size: int) -> dict[str, Any]:
     """The networks whose readers are compared."""
-    from humangs_jax.network.cross_attention import CrossAttentionReader
-    from humangs_jax.network.systems import back_projection
+    from experiments.systems import back_projection
+    from experiments.systems.cross_attention import CrossAttentionReader
 
     config = back_projection("bench").with_conventions(image_size=size, tokens="all")
     reader = CrossAttentionReader(width, layers=1, head_width=32)
@@ -184,10 +184,10 @@ def network_flops(name: str, photos: int) -> dict[str, float]:
     """Operations of a whole network in its published size, counted in the program before its compilation."""
     import jax
 
+    from experiments.systems import SYSTEMS
     from humangs_jax.body.library import load_body
     from humangs_jax.data.views import gaussian_body
     from humangs_jax.network.humangs import apply_humangs
-    from humangs_jax.network.systems import SYSTEMS
     from humangs_jax.network.weights import expected_variables
 
     config = SYSTEMS[name]("published").with_conventions(tokens="all").with_execution(dtype="float32")
@@ -209,9 +209,9 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
     import jax
     import jax.numpy as jnp
 
+    from experiments.systems import SYSTEMS
+    from experiments.systems.two_stream import TwoStreamReader, TwoStreams
     from humangs_jax.network.execution import Execution
-    from humangs_jax.network.systems import SYSTEMS
-    from humangs_jax.network.two_stream import TwoStreamReader, TwoStreams
 
     reader = SYSTEMS[name]("published").architecture.reader
     assert isinstance(reader, TwoStreamReader)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
-from humangs_jax.core.configuration import Patch, configuration, knob
+from humangs_jax.core.configuration import Patch, knob, part
 from humangs_jax.geometry.camera import plucker_rays
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
@@ -18,7 +18,7 @@ from humangs_jax.network.transformer import INIT_STD, Transformer, TransformerCo
 from humangs_jax.network.upsampler import Upsampler, UpsamplerConfig
 
 
-@configuration
+@part
 class PatchTransformer:
     """The paper's encoder: one token per patch of every view, attention over all of them, an upsampler.
 

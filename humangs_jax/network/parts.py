@@ -5,13 +5,12 @@
 That is one pass per person. What runs again for every target is a driver, which corrects the canonical Gaussians for a pose
 (`Driver`), or a decoder that makes images without Gaussians (`PixelDecoder`). Both are called in `network.humangs` alone.
 
-A part is a frozen dataclass: its fields are its configuration, which weights files record, and its methods are pure functions.
-A new part is a new file with such a class, and one line of a preset that names it. Variables of a part are {"params": ...,
+A part is a class with the decorator `core.configuration.part`: its fields are its configuration, which weights files record by
+the name of the class, and its methods are pure functions. A new part is a new file with such a class, and one line of a preset
+that names it: see `experiments/systems`. Variables of a part are {"params": ...,
 "batch_stats": ...}, the latter only where it has running statistics, which only encoders update.
 
 A part that works on a map of the body's surface says which one in a field or property `surface_map`, see `network.surface_map`.
-
-Weights files name a part by module and class: a part that moves leaves an alias at its old place.
 """
 
 import dataclasses

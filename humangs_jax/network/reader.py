@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
-from humangs_jax.core.configuration import Spread, Width, configuration
+from humangs_jax.core.configuration import Spread, Width, part
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.network.bilinear import sample_bilinear, texel_indices
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
@@ -47,7 +47,7 @@ class VertexFeatures:
     dropped_reads: Int[Array, ""] | None = None
 
 
-@configuration
+@part
 class PixelAlignedReader:
     """What vertices read.
 

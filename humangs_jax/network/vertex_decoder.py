@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from humangs_jax.core.array_types import Array, Float, Key
-from humangs_jax.core.configuration import Bias, Few, Range, Spread, Width, configuration, knob
+from humangs_jax.core.configuration import Bias, Few, Range, Spread, Width, knob, part
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
@@ -41,7 +41,7 @@ INITIAL_SHELL = 4.0
 """Logit of the nearest shell, of 0 elsewhere: Gaussians start near the surface."""
 
 
-@configuration
+@part
 class VertexDecoder:
     """The paper's decoder: a light MLP from the features of a vertex to its Gaussians.
 

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.configuration import Layers, Ratio, Width, configuration
+from humangs_jax.core.configuration import Layers, Ratio, Width, part
 from humangs_jax.network.attention import NORM_EPSILON, attention
 from humangs_jax.network.encoder import touched_patches
 from humangs_jax.network.execution import Execution
@@ -29,7 +29,7 @@ from humangs_jax.network.vertex_decoder import positional_encoding
 INIT = nn.initializers.normal(INIT_STD)
 
 
-@configuration
+@part
 class CrossAttentionReader:
     """Vertices as queries, image tokens as keys and values. width: features of a vertex. layers, mlp_ratio, head_width: as in
     `TransformerConfig`.

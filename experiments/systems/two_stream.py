@@ -17,11 +17,11 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from experiments.systems.cross_attention import INIT, check_heads, image_tokens
 from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.configuration import Few, Layers, Ratio, Vertices, Width, configuration
+from humangs_jax.core.configuration import Few, Layers, Ratio, Vertices, Width, part
 from humangs_jax.geometry.curve import along_curve
 from humangs_jax.network.attention import NORM_EPSILON, attention
-from humangs_jax.network.cross_attention import INIT, check_heads, image_tokens
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, Pass, Variables
@@ -33,7 +33,7 @@ CURVE_REACH = 1.2
 """Normalised units: half the side of the curve's cube; canonical bodies are 1.8 high and less than 2 wide."""
 
 
-@configuration
+@part
 class TwoStreamReader:
     """Joint attention of points and tokens.
 

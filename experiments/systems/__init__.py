@@ -11,22 +11,22 @@ import dataclasses
 from collections.abc import Callable
 from typing import Literal
 
+from experiments.systems.correction import CorrectionMLP
+from experiments.systems.cross_attention import CrossAttentionReader
+from experiments.systems.grouped import GroupDecoder, GroupReader
+from experiments.systems.pixel_queries import NoReader, QueryDecoder, lvsm_transformer
+from experiments.systems.shell_textures import PlainPhotos, ShellDecoder, ShellTextureReader
+from experiments.systems.surface_gaussians import PoseMapDriver, SurfaceDecoder, TextureDriver, TextureReader
+from experiments.systems.two_stream import TwoStreamReader
 from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
-from humangs_jax.network.correction import CorrectionMLP
-from humangs_jax.network.cross_attention import CrossAttentionReader
 from humangs_jax.network.encoder import PatchTransformer
 from humangs_jax.network.execution import Execution
-from humangs_jax.network.grouped import GroupDecoder, GroupReader
 from humangs_jax.network.parts import Driver, Reader
-from humangs_jax.network.pixel_queries import NoReader, QueryDecoder, lvsm_transformer
 from humangs_jax.network.reader import PixelAlignedReader
-from humangs_jax.network.shell_textures import PlainPhotos, ShellDecoder, ShellTextureReader
-from humangs_jax.network.surface_gaussians import PoseMapDriver, SurfaceDecoder, TextureDriver, TextureReader
 from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
-from humangs_jax.network.two_stream import TwoStreamReader
 from humangs_jax.network.vertex_decoder import VertexDecoder
 
 Size = Literal["published", "bench"]

@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.configuration import Range, configuration
+from humangs_jax.core.configuration import Range, part
 from humangs_jax.network.convolution import Convolution
 from humangs_jax.network.encoder import encoder_pixels
 from humangs_jax.network.execution import Execution
@@ -38,7 +38,7 @@ LEAST_WIDTH = 8
 """Of the maps of the convolutional decoder, whose width halves as their sides double."""
 
 
-@configuration
+@part
 class NoReader:
     """The reader of systems whose decoders read the inputs themselves: its features are the encoding."""
 
@@ -58,7 +58,7 @@ class Photos(NamedTuple):
     view_count: Int[Array, ""] | None
 
 
-@configuration
+@part
 class QueryDecoder:
     """A `PixelDecoder`. transformer: without a class token. texture: the neural texture (HumanRAM), None: the body is unknown
     (LVSM). fusion: width of the convolutional decoder, which needs a patch size that is a power of 2; None: the linear map.

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Key
-from humangs_jax.core.configuration import Few, Layers, Spread, Width, configuration
+from humangs_jax.core.configuration import Few, Layers, Spread, Width, part
 from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
@@ -68,7 +68,7 @@ def pose_vector(pose: BodyPose, joints: int) -> Float[Array, " q"]:
     return pose.rotations[1:].reshape(-1)
 
 
-@configuration
+@part
 class CorrectionMLP:
     """The LCA-style driver, for readers that give features `local` of vertices, and a decoder with K Gaussians per vertex.
 

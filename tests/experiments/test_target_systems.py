@@ -11,16 +11,16 @@ from network_cases import random_inputs, random_variables
 from target_cases import BLOCKS, DRIVEN, PATCH, PIXELS, SIZE, mapped_tube, small, views
 from training_cases import tube
 
+from experiments.systems.correction import CorrectionMLP, apply_corrections
+from experiments.systems.surface_gaussians import PoseMapDriver, TextureDriver
 from humangs_jax.avatar.reconstruct import make_avatar
 from humangs_jax.avatar.targets import frame_outputs, target_pixels, target_queries
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.core.pytree import replace
 from humangs_jax.network.config import Architecture
-from humangs_jax.network.correction import CorrectionMLP, apply_corrections
 from humangs_jax.network.humangs import apply_humangs, draw_pixels
 from humangs_jax.network.parts import Driver, PixelDecoder
-from humangs_jax.network.surface_gaussians import PoseMapDriver, TextureDriver
 from humangs_jax.network.surface_map import SurfaceMap, surface_texels
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN
 
