@@ -1,10 +1,10 @@
-"""The systems of `network.systems` in sizes for tests: every stage, as small as can be."""
+"""The systems of `experiments.systems` in sizes for tests: every stage, as small as can be."""
 
 import dataclasses
 
+from experiments.systems import SYSTEMS
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.surface_map import SurfaceMap
-from humangs_jax.network.systems import SYSTEMS
 from humangs_jax.network.transformer import TransformerConfig
 
 WIDTH, HEAD = 16, 8

@@ -8,14 +8,14 @@ import numpy as np
 from system_cases import small_system
 from training_cases import POSES, tube
 
+from experiments.systems import SYSTEMS
 from humangs_jax.body.model import Texels
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.encoder import TriplaneConfig
 from humangs_jax.network.surface_map import SurfaceMap
-from humangs_jax.network.systems import SYSTEMS
-from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
 
 PIXELS, DRIVEN = ("lvsm", "humanram"), ("giga", "animatable", "lca")

@@ -90,9 +90,9 @@ class Variant(NamedTuple):
 
 def variants(steps: int) -> dict[str, Variant]:
     """All that `train_all.py` trains, by name, in the order of its queue."""
+    from experiments.systems import ONE_PHOTO, SYSTEMS
     from humangs_jax.data.loader import ViewSampling
     from humangs_jax.network.config import paper_parts
-    from humangs_jax.network.systems import ONE_PHOTO, SYSTEMS
     from humangs_jax.network.upsampler import UpsamplerConfig
     from humangs_jax.training.config import LossConfig, TrainConfig
     from humangs_jax.training.optimizer import OptimizerConfig
@@ -378,7 +378,7 @@ def shown(weights: tuple[Any, Any], case: Any, background: float = 1.0) -> tuple
 
 def takes_one(config: Any) -> bool:
     """Whether a system refuses a second photo."""
-    from humangs_jax.network.grouped import GroupReader
+    from experiments.systems.grouped import GroupReader
 
     reader = config.architecture.reader
     return isinstance(reader, GroupReader) or getattr(reader, "most_views", None) == 1
@@ -386,7 +386,7 @@ def takes_one(config: Any) -> bool:
 
 def animatable(config: Any) -> bool:
     """Whether a system can show a pose that no photo shows: LVSM knows no body."""
-    from humangs_jax.network.pixel_queries import QueryDecoder
+    from experiments.systems.pixel_queries import QueryDecoder
 
     decoder = config.architecture.decoder
     return not (isinstance(decoder, QueryDecoder) and decoder.texture is None)

@@ -2,7 +2,7 @@
 
     python experiments/paper/cost.py --page docs/paper.md --image docs/images/paper_cost.png
 
-The two readers of `network.systems` "back_projection" and "cross_attention", alone, on maps of the same width: forward passes
+The two readers of `experiments.systems` "back_projection" and "cross_attention", alone, on maps of the same width: forward passes
 over views, vertices and image sizes, in turns. Time is CPU time of all threads. Operations of attention are products of matrices,
 counted in the compiled program; back-projection has none: its weighted sums of four neighbours count as 8 a vertex, view and
 feature. Memory is what the program needs besides arguments and results. All patches are tokens, as in the paper.
@@ -104,12 +104,10 @@ def compare(width: int, repeats: int, views: int, vertices: int, size: int) -> d
     """CPU ms, operations and temporary MiB of both readers on the same maps."""
     import jax
 
-    from humangs_jax.network.parts import Pass
-
     inputs, encoding = subject(width, views, vertices, size)
     runs, found = {}, {}
     for name, config in configurations(width, size).items():
-        reader, run = config.architecture.reader, Pass(config)
+        reader, run = config.architecture.reader, config.run()
         shapes = jax.eval_shape(lambda reader=reader, run=run: reader.init(jax.random.key(0), encoding, inputs, run))
         variables = jax.tree.map(lambda x: np.full(x.shape, 0.02, x.dtype), shapes)
         read = lambda v, e, x, reader=reader, run=run: reader.apply(v, e, x, run).local
@@ -135,8 +133,8 @@ def wait(program: Any, *arguments: Any) -> None:
 
 def configurations(width: int, size: int) -> dict[str, Any]:
     """The networks whose readers are compared."""
-    from humangs_jax.network.cross_attention import CrossAttentionReader
-    from humangs_jax.network.systems import back_projection
+    from experiments.systems import back_projection
+    from experiments.systems.cross_attention import CrossAttentionReader
 
     config = back_projection("bench").with_conventions(image_size=size, tokens="all")
     reader = CrossAttentionReader(width, layers=1, head_width=32)
@@ -184,10 +182,10 @@ def network_flops(name: str, photos: int) -> dict[str, float]:
     """Operations of a whole network in its published size, counted in the program before its compilation."""
     import jax
 
+    from experiments.systems import SYSTEMS
     from humangs_jax.body.library import load_body
     from humangs_jax.data.views import gaussian_body
     from humangs_jax.network.humangs import apply_humangs
-    from humangs_jax.network.systems import SYSTEMS
     from humangs_jax.network.weights import expected_variables
 
     config = SYSTEMS[name]("published").with_conventions(tokens="all").with_execution(dtype="float32")
@@ -208,9 +206,9 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
     import jax
     import jax.numpy as jnp
 
+    from experiments.systems import SYSTEMS
+    from experiments.systems.two_stream import TwoStreamReader, TwoStreams
     from humangs_jax.network.execution import Execution
-    from humangs_jax.network.systems import SYSTEMS
-    from humangs_jax.network.two_stream import TwoStreamReader, TwoStreams
 
     reader = SYSTEMS[name]("published").architecture.reader
     assert isinstance(reader, TwoStreamReader)

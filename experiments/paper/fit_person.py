@@ -85,8 +85,8 @@ def fit_all(arguments: argparse.Namespace, out: Path) -> None:
 
 def configuration(steps: int, size: Any) -> Any:
     """Their loss without LPIPS, whose part structural dissimilarity takes: L1, and 0.005 of the squared offsets."""
+    from experiments.systems import SYSTEMS
     from humangs_jax.data.loader import ViewSampling
-    from humangs_jax.network.systems import SYSTEMS
     from humangs_jax.training.config import LossConfig, TrainConfig
     from humangs_jax.training.optimizer import OptimizerConfig
 

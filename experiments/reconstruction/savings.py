@@ -50,7 +50,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     import jax
 
     from humangs_jax.network.config import paper_parts
-    from humangs_jax.network.humangs import needed_reads
+    from humangs_jax.network.reader import needed_reads
     from humangs_jax.network.weights import load_weights
 
     config = configured(arguments.preset, arguments.dtype, arguments.size)
@@ -60,7 +60,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     config = config.with_execution(tokens="all")
     variables = variables or random_variables(config)
     inputs = benchmark_inputs(config, arguments.views, arguments.size)
-    capacity = int(jax.jit(needed_reads, static_argnames="config")(inputs, config))
+    capacity = int(jax.jit(lambda x: needed_reads(x, config.run()))(inputs))
     seeing = lambda c: c.with_execution(vertex_capacity=capacity)
     packed, touched, share = foreground(inputs, config)
 
@@ -121,11 +121,10 @@ def everywhere(variables: Any, inputs: Any, config: Any) -> Any:
     from humangs_jax.network.bilinear import sample_bilinear, texel_indices
     from humangs_jax.network.config import paper_parts
     from humangs_jax.network.humangs import decode, encode, part_variables, read
-    from humangs_jax.network.parts import Pass
     from humangs_jax.network.pixel_aligned import COUNT_EPSILON, sum_over_views
     from humangs_jax.network.reader import project_and_test, view_weights
 
-    run, reader = Pass(config), paper_parts(config.architecture)[1]
+    run, reader = config.run(), paper_parts(config.architecture)[1]
     encoding = encode(variables, inputs, config)
     features = read(variables, encoding, inputs, config)
     if reader.output_width is not None:

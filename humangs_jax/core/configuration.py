@@ -6,14 +6,12 @@ Numbers are annotated with their range, which every way to make a configuration 
     class Fit:
         steps: Annotated[int, Range(1, 1000)] = 100
 
-A field annotated with a `typing.Protocol` may hold any dataclass that follows it. Its JSON names the class under "kind", as
-"humangs_jax.network.encoder.PatchTransformer". Reading imports modules of this package only; others must be imported before.
+A field annotated with a `typing.Protocol` may hold any `part` that follows it. Its JSON names the class under "kind", as
+"PatchTransformer". Reading imports nothing: a part of another package is known once its module is imported.
 """
 
-import contextlib
 import dataclasses
 import functools
-import importlib
 import json
 import numbers
 import sys
@@ -170,6 +168,20 @@ def configuration(cls: type[T]) -> type[T]:
     return dataclasses.dataclass(frozen=True)(cls)
 
 
+_PARTS: dict[str, type] = {}
+
+
+@typing.dataclass_transform(frozen_default=True, field_specifiers=(dataclasses.field, knob))
+def part(cls: type[T]) -> type[T]:
+    """A `configuration` that files may name by its class. Raises: ValueError if there is another part of this name."""
+    other = _PARTS.get(cls.__name__, cls)
+    if other.__module__ != cls.__module__:  # the cell of a notebook may run again
+        raise ValueError(f"part {cls.__name__} of {cls.__module__}: {other.__module__} has one of this name")
+    configuration(cls)  # the class itself
+    _PARTS[cls.__name__] = cls
+    return cls
+
+
 def vary(config: T, changes: Mapping[str, Any]) -> T:
     """A configuration with fields exchanged, each named by its path: an ablation in one line.
 
@@ -226,7 +238,9 @@ def _plain(value: Any, kind: bool = False) -> Any:
     """A configuration as what JSON has. kind: whether the class must be named."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         annotations = typing.get_type_hints(type(value))
-        named = {KIND: f"{type(value).__module__}.{type(value).__qualname__}"} if kind else {}
+        if kind and _PARTS.get(type(value).__name__) is not type(value):
+            raise ValueError(f"{type(value).__name__} is no registered part: decorate its class with `part`")
+        named = {KIND: type(value).__name__} if kind else {}
         names = [field.name for field in dataclasses.fields(value)]
         return named | {name: _plain(getattr(value, name), _holds_part(annotations[name])) for name in names}
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
@@ -281,25 +295,20 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
 
 def _find_part(kind, protocol, path):
     """The class that a "kind" names."""
-    expected = (
-        f"{path}.{KIND}: expected the full name of a frozen dataclass that is a {protocol.__name__}, got {kind!r}"
-    )
-    if not isinstance(kind, str) or "." not in kind:
-        raise ValueError(expected)
-    module, _, name = kind.rpartition(".")
-    # beside the protocol: other modules may do something when they are imported
-    if module not in sys.modules and module.startswith(f"{protocol.__module__.rpartition('.')[0]}."):
-        with contextlib.suppress(ImportError):
-            importlib.import_module(module)
-    if module not in sys.modules:
-        raise ValueError(f"{expected}: import the module {module} first")
-    cls = getattr(sys.modules[module], name, None)
-    frozen = isinstance(cls, type) and dataclasses.is_dataclass(cls) and cls.__dataclass_params__.frozen
     # not issubclass: it refuses protocols with attributes, and a field without a default is no attribute of its class
     members = [member for member in vars(protocol) if not member.startswith("_")]
-    if not (frozen and all(hasattr(cls, member) or member in cls.__dataclass_fields__ for member in members)):
-        raise ValueError(expected)
-    return cls
+    known = {
+        name: cls
+        for name, cls in _PARTS.items()
+        if all(hasattr(cls, member) or member in _annotations(cls) for member in members)
+    }
+    name = kind.rpartition(".")[2] if isinstance(kind, str) else ""  # the first files say in which module, too
+    if name not in known:
+        raise ValueError(
+            f"{path}.{KIND}: expected the name of a registered {protocol.__name__}, one of {', '.join(sorted(known))} "
+            f"(others: import their module first); got {kind!r}"
+        )
+    return known[name]
 
 
 def _build_dataclass(cls, values, path):

@@ -1,12 +1,10 @@
 """Weights on disk: one safetensors file, tensors under their path in the variables, their description in its header.
 
 Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format": "humangs-weights",
-"version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}; the first files have no checksum. Files of
-version 1 (one "config", which said how the network ran, too) still load. float16 halves the file (and rounds to 11 bits); loading
-gives float32.
+"version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}; the first files have no checksum. float16 halves
+the file (and rounds to 11 bits); loading gives float32.
 """
 
-import json
 import os
 from importlib import resources
 from pathlib import Path
@@ -22,14 +20,13 @@ from humangs_jax.io.arrays import check_checksum, checksum
 from humangs_jax.io.atomic import write_bytes
 from humangs_jax.io.reading import reading
 from humangs_jax.io.tensor_file import read_safetensors
-from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
+from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.parts import Variables
 
 FORMAT = "humangs-weights"
 VERSION = "2"
 SHIPPED = "assets/weights.safetensors"
-HEADS = "params/decoder/"
 
 
 def expected_variables(config: HumanGSConfig) -> Variables:
@@ -87,110 +84,20 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
 
 def _load_weights(path):
     tensors, _, metadata = read_safetensors(path)
-    if metadata.get("format") != FORMAT or metadata.get("version") not in ("1", VERSION):
+    if metadata.get("format") != FORMAT or metadata.get("version") != VERSION:
         found = f"format {metadata.get('format')!r}, version {metadata.get('version')!r}"
-        raise ValueError(f"{path}: expected header format {FORMAT!r}, version {VERSION!r} or '1'; found {found}")
+        raise ValueError(f"{path}: expected header format {FORMAT!r}, version {VERSION!r}; found {found}")
     try:
-        if metadata["version"] == VERSION:
-            config = HumanGSConfig(
-                config_from_json(Architecture, metadata.get("architecture", "")),
-                config_from_json(Conventions, metadata.get("conventions", "")),
-            )
-        else:
-            config = config_of_version_1(metadata.get("config", ""))
-            tensors = {key.replace("params/readout/", "params/reader/"): x for key, x in tensors.items()}
+        config = HumanGSConfig(
+            config_from_json(Architecture, metadata.get("architecture", "")),
+            config_from_json(Conventions, metadata.get("conventions", "")),
+        )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     variables = variables_from_tensors(tensors, config, str(path))
     recorded = (metadata.get(name, "") for name in ("architecture", "conventions"))
     check_checksum(metadata.get("checksum"), checksum(tensors, *recorded))
     return variables, config
-
-
-def fit_variables(variables: Variables, old: HumanGSConfig, new: HumanGSConfig) -> Variables:
-    """Variables of the network `old` for the network `new`, to train on.
-
-    Both have the paper's reader and decoder. `new` may have shells where `old` has none, another number of free Gaussians and
-    other settings without tensors. New tensors start as initialised, and with zero weight where they enter a layer. With
-    another `decoder.frame` offsets and rotations are initialised again, because their axes differ.
-
-    Raises: ValueError naming the setting or the tensor if more differs.
-    """
-    (_, old_reader, old_decoder), (_, new_reader, new_decoder) = map(paper_parts, (old.architecture, new.architecture))
-    for name, was, wanted in (  # either shifts what tensors hold
-        ("reader.sample_rgb", old_reader.sample_rgb, new_reader.sample_rgb),
-        ("decoder.tight", old_decoder.tight, new_decoder.tight),
-    ):
-        if was != wanted:
-            raise ValueError(f"{name} {was}: that of trained weights cannot become {wanted}")
-    if old_reader.shells not in ((), new_reader.shells):
-        raise ValueError(f"shells {old_reader.shells}: those of trained weights cannot become {new_reader.shells}")
-    ours, wanted = flatten_variables(variables), flatten_variables(expected_variables(new))
-    anew = {key for key in wanted if key.startswith(f"{HEADS}shells_")} - set(ours)
-    if unknown := sorted((set(ours) - set(wanted)) | (set(wanted) - set(ours) - anew)):
-        raise ValueError(f"tensor {unknown[0]!r} is in one of the two networks alone")
-    if old_decoder.frame != new_decoder.frame:
-        anew |= {key for key in ours if key.startswith(f"{HEADS}geometry_out")}
-
-    differ = {key for key in set(ours) - anew if ours[key].shape != wanted[key].shape}
-    heads = {key for key in differ if key.startswith(HEADS) and key.split("/")[-2].endswith("_out")}
-    trunk = {key for key in differ if key == f"{HEADS}trunk_0/kernel" and len(ours[key]) <= len(wanted[key])}
-    if wrong := sorted(differ - heads - trunk):
-        was, now = ours[wrong[0]].shape, wanted[wrong[0]].shape
-        raise ValueError(f"tensor {wrong[0]!r} has shape {was}, the other network wants {now}")
-    if not (anew | differ):
-        return variables
-
-    def fit(key, leaf):
-        if key in trunk:  # shells and normals enter last
-            return leaf.at[len(ours[key]) :].set(0).at[: len(ours[key])].set(ours[key])
-        if key in heads:  # Gaussians come one after the other
-            both = min(leaf.shape[-1], ours[key].shape[-1])
-            return leaf.at[..., :both].set(ours[key][..., :both])
-        return leaf if key in anew else ours[key]
-
-    fresh = flatten_variables(init_humangs(jax.random.key(0), new))  # compiles for a while: only where it is needed
-    structure = jax.tree.structure(expected_variables(new))
-    return jax.tree.unflatten(structure, [fit(key, leaf) for key, leaf in fresh.items()])
-
-
-def config_of_version_1(text: str) -> HumanGSConfig:
-    """The configuration of a file of version 1, where one object mixed architecture, conventions and execution.
-
-    Raises: ValueError for text that is not such a configuration.
-    """
-    try:
-        old = json.loads(text)
-        encoder, upsampler, sampling = (old.get(name, {}) for name in ("transformer", "upsampler", "sampling"))
-        upsampled = upsampler.get("enabled", True)
-        conventions = ("image_size", "tokens", "position_map", "ray_origins", "skinning", "rendering", "body_vertices")
-        transformer = _pick(encoder, "width", "layers", "mlp_ratio", "class_token")
-        new = {
-            "architecture": {
-                "encoder": {
-                    "kind": "humangs_jax.network.encoder.PatchTransformer",
-                    **_pick(old, "patch_size", "texture"),
-                    "transformer": transformer | _pick(encoder.get("attention", {}), "head_width", "qk_norm"),
-                    "upsampler": _pick(upsampler, "hidden", "features") if upsampled else None,
-                },
-                "reader": {
-                    "kind": "humangs_jax.network.reader.PixelAlignedReader",
-                    "output_width": upsampler.get("out", 768) if upsampled else None,
-                    **_pick(sampling, "sample_rgb", "shells"),
-                },
-                "decoder": {"kind": "humangs_jax.network.vertex_decoder.VertexDecoder"} | old.get("decoder", {}),
-            },
-            "conventions": _pick(old, *conventions, "longest_edge")
-            | _pick(sampling, "pool")
-            | {"pixel_grid": sampling.get("convention", "half_pixel")},
-        }
-    except (AttributeError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"config of version 1: {error!r}") from error
-    return config_from_json(HumanGSConfig, json.dumps(new))
-
-
-def _pick(values: dict[str, Any], *names: str) -> dict[str, Any]:
-    return {name: values[name] for name in names if name in values}
 
 
 def variables_from_tensors(tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str) -> Variables:

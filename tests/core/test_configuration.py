@@ -1,34 +1,19 @@
 """Every number of every configuration has a range, and every way to make one checks it."""
 
 import dataclasses
-import importlib
 import json
-import pkgutil
 import typing
 from typing import Annotated
 
 import numpy as np
 import pytest
 
-import humangs_jax.network
+import experiments.systems  # noqa: F401
 from humangs_jax.apps import settings, tune
-from humangs_jax.core.configuration import Range, _ranges, config_from_json, config_to_json, configuration, vary
+from humangs_jax.core.configuration import _PARTS, Range, _ranges, config_from_json, config_to_json, configuration, vary
 from humangs_jax.network.execution import Execution
 from humangs_jax.people.on_the_fly import OnTheFlyConfig
 from humangs_jax.training import config
-
-for module in pkgutil.iter_modules(humangs_jax.network.__path__):
-    importlib.import_module(f"humangs_jax.network.{module.name}")
-
-
-def parts():
-    """All parts that a weights file may name."""
-    for module in pkgutil.iter_modules(humangs_jax.network.__path__):
-        loaded = importlib.import_module(f"humangs_jax.network.{module.name}")
-        for value in vars(loaded).values():
-            part = isinstance(value, type) and dataclasses.is_dataclass(value) and hasattr(value, "init")
-            if part and value.__module__ == loaded.__name__ and not hasattr(value, "setup"):  # no module of Linen
-                yield value
 
 
 def reachable(cls, found):
@@ -44,7 +29,14 @@ def reachable(cls, found):
 
 
 ALL = set()
-for each in (settings.Settings, tune.FrontPoint, config.TrainConfig, settings.RefineConfig, OnTheFlyConfig, *parts()):
+for each in (
+    settings.Settings,
+    tune.FrontPoint,
+    config.TrainConfig,
+    settings.RefineConfig,
+    OnTheFlyConfig,
+    *_PARTS.values(),
+):
     reachable(each, ALL)
 
 

@@ -147,12 +147,12 @@ def configuration(path, value):
 
 
 ENCODER = "model.architecture.encoder"
-CROSS_ATTENTION = {"kind": "humangs_jax.network.cross_attention.CrossAttentionReader", "layers": 10**9}
+READER = {"kind": "PixelAlignedReader", "output_width": 10**9}
 CONFIGURATIONS = {
     "100,000 layers": (f"{ENCODER}.transformer.layers", 100_000, 5),
     "10^400 layers": (f"{ENCODER}.transformer.layers", 10**400, 6),
     "no layers": (f"{ENCODER}.transformer.layers", 0, 6),
-    "10^9 layers that look at the photos": ("model.architecture.reader", CROSS_ATTENTION, 6),
+    "a reader of 10^9 features": ("model.architecture.reader", READER, 6),
     "heads of no width": (f"{ENCODER}.transformer.head_width", 0, 6),
     "patches of 0": (f"{ENCODER}.patch_size", 0, 6),
     "patches below 0": (f"{ENCODER}.patch_size", -4, 6),

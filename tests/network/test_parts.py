@@ -9,22 +9,21 @@ import pytest
 from network_cases import TINY, random_inputs
 
 from humangs_jax.core.array_types import Float, Key
-from humangs_jax.core.configuration import config_from_json, config_to_json
+from humangs_jax.core.configuration import Width, config_from_json, config_to_json, part
 from humangs_jax.network.config import Architecture, paper_parts
 from humangs_jax.network.humangs import apply_humangs, decode, encode, init_humangs, read
 from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.parts import Decoder, Encoder, Encoding, Pass, Reader, Variables
-from humangs_jax.network.reader import VertexFeatures
+from humangs_jax.network.parts import Decoder, Encoder, Encoding, Pass, Reader, Variables, VertexFeatures
 from humangs_jax.network.stages import Recorder
 from humangs_jax.network.vertex_decoder import positional_encoding
 from humangs_jax.network.weights import load_weights, save_weights
 
 
-@dataclasses.dataclass(frozen=True)
-class CrossAttentionReader:
+@part
+class LookingReader:
     """Vertices look at all tokens of all views, by their canonical position."""
 
-    width: int = 8
+    width: Width = 8
 
     def init(self, key: Key, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> Variables:
         queries, keys = jax.random.split(key)
@@ -40,13 +39,13 @@ class CrossAttentionReader:
 
 
 DECODER = dataclasses.replace(paper_parts(TINY.architecture)[2], residual_color=False)
-CONFIG = TINY.with_parts(reader=CrossAttentionReader(), decoder=DECODER)
+CONFIG = TINY.with_parts(reader=LookingReader(), decoder=DECODER)
 
 
 def test_the_papers_parts_are_parts():
     encoder, reader, decoder = paper_parts(TINY.architecture)
     assert isinstance(encoder, Encoder) and isinstance(reader, Reader) and isinstance(decoder, Decoder)
-    with pytest.raises(ValueError, match="CrossAttentionReader"):
+    with pytest.raises(ValueError, match="LookingReader"):
         paper_parts(CONFIG.architecture)
 
 
@@ -74,7 +73,15 @@ def test_a_part_is_named_in_json_and_found_again():
     text = config_to_json(CONFIG.architecture)
     assert config_from_json(Architecture, text) == CONFIG.architecture
     with pytest.raises(ValueError, match=r"config\.decoder\.kind: expected .* Decoder"):
-        config_from_json(Architecture, '{"decoder": {"kind": "humangs_jax.network.execution.Execution"}}')
+        config_from_json(Architecture, '{"decoder": {"kind": "Execution"}}')
+
+
+def test_a_part_of_this_name_exists_once_and_only_a_registered_one_is_written():
+    with pytest.raises(ValueError, match=r"part LookingReader of elsewhere: .*test_parts has one of this name"):
+        part(type("LookingReader", (), {"__module__": "elsewhere", "__annotations__": {}}))
+    plain = dataclasses.make_dataclass("Plain", [], bases=(LookingReader,), frozen=True)
+    with pytest.raises(ValueError, match="Plain is no registered part"):
+        config_to_json(TINY.with_parts(reader=plain()).architecture)
 
 
 @pytest.mark.slow

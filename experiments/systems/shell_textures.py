@@ -17,8 +17,9 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 
+from experiments.systems.unet import UNet, check_scales, doubled, halved
 from humangs_jax.core.array_types import Array, Bool, Float, Key
-from humangs_jax.core.configuration import Patch, Spread, Width, configuration
+from humangs_jax.core.configuration import Patch, Spread, Width, part
 from humangs_jax.core.numerics import safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry import quaternion
@@ -27,7 +28,6 @@ from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
 from humangs_jax.network.pixel_aligned import DEPTH_TOLERANCE, UNSEEN_COLOR, project_vertices
 from humangs_jax.network.surface_map import SurfaceMap
-from humangs_jax.network.unet import UNet, check_scales, doubled, halved
 from humangs_jax.network.vertex_decoder import INITIAL_OPACITY
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -49,7 +49,7 @@ class ShellTextures:
     seen: Bool[Array, "s h w"]
 
 
-@configuration
+@part
 class PlainPhotos:
     """The encoder of systems that read the photos themselves: its maps are their colours."""
 
@@ -64,7 +64,7 @@ class PlainPhotos:
         return Encoding(inputs.images, None, jnp.zeros((), jnp.int32)), {}
 
 
-@configuration
+@part
 class ShellTextureReader:
     """The textures. shells: ascending distances from the surface, normalised units, the first 0."""
 
@@ -86,7 +86,7 @@ class ShellTextureReader:
             raise ValueError("shell textures need texels and posed_normals of the inputs, see `prepare_inputs`")
         unit, texels = subject_unit(inputs.canonical_vertices), inputs.texels
         steps = jnp.asarray(self.shells, inputs.images.dtype)
-        size, grid = (inputs.cameras.width, inputs.cameras.height), run.config.conventions.pixel_grid
+        size, grid = (inputs.cameras.width, inputs.cameras.height), run.conventions.pixel_grid
         covered = texels.covered
 
         def look(best, view):
@@ -142,7 +142,7 @@ def _filled(sums, weights):
     return jnp.where(weights > 0, mean, coarse)
 
 
-@configuration
+@part
 class ShellDecoder:
     """The U-Net. widths: its features, the finest scale first. largest_scale: of a Gaussian, normalised units."""
 

@@ -9,17 +9,17 @@ import pytest
 from network_cases import random_inputs, random_variables
 from system_cases import WIDTH, small_system
 
+from experiments.systems import ONE_PHOTO, SYSTEMS
+from experiments.systems.cross_attention import CrossAttentionReader
+from experiments.systems.shell_textures import DISTANCES, ShellTextureReader, fill_unseen
+from experiments.systems.two_stream import TwoStreamReader
+from experiments.systems.unet import UNet
 from humangs_jax.body.model import Texels
 from humangs_jax.core.pytree import replace
 from humangs_jax.network.bilinear import sample_bilinear
-from humangs_jax.network.cross_attention import CrossAttentionReader
 from humangs_jax.network.humangs import apply_humangs, decode, encode, read
 from humangs_jax.network.inputs import subject_unit
 from humangs_jax.network.pixel_aligned import project_vertices
-from humangs_jax.network.shell_textures import DISTANCES, ShellTextureReader, fill_unseen
-from humangs_jax.network.systems import ONE_PHOTO, SYSTEMS
-from humangs_jax.network.two_stream import TwoStreamReader
-from humangs_jax.network.unet import UNet
 from humangs_jax.network.upsampler import UpsamplerConfig
 
 ATTENDING = ("cross_attention", "lhm_views", "lhm_plus")

@@ -11,16 +11,16 @@ from network_cases import random_inputs, random_variables
 from target_cases import BLOCKS, DRIVEN, PATCH, PIXELS, SIZE, mapped_tube, small, views
 from training_cases import tube
 
+from experiments.systems.correction import CorrectionMLP, apply_corrections
+from experiments.systems.surface_gaussians import PoseMapDriver, TextureDriver
 from humangs_jax.avatar.reconstruct import make_avatar
 from humangs_jax.avatar.targets import frame_outputs, target_pixels, target_queries
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.core.pytree import replace
 from humangs_jax.network.config import Architecture
-from humangs_jax.network.correction import CorrectionMLP, apply_corrections
 from humangs_jax.network.humangs import apply_humangs, draw_pixels
 from humangs_jax.network.parts import Driver, PixelDecoder
-from humangs_jax.network.surface_gaussians import PoseMapDriver, TextureDriver
 from humangs_jax.network.surface_map import SurfaceMap, surface_texels
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN
 
@@ -278,12 +278,18 @@ def test_parts_that_do_not_fit_are_refused():
     ):
         with pytest.raises(ValueError, match=r"(SurfaceMap.size|driver.widths|CorrectionMLP.layers).*expected 1 to"):
             wrong()
-    many = small("lca").with_parts(driver=CorrectionMLP(8, 1, joints=5))
-    with pytest.raises(ValueError, match=r"driver\.joints 5: the pose has 2 joints"):
-        outputs = jax.eval_shape(lambda v: apply_humangs(v, inputs_of("lca"), many)[0], random_variables(many))
-        jax.eval_shape(lambda v, o: frame_outputs(v, o, tube(), BETAS, pose(), many), random_variables(many), outputs)
+    for driver, said in (
+        (CorrectionMLP(8, 1, joints=5), r"driver\.joints 5: the pose has 2 joints"),
+        (CorrectionMLP(8, 1, joints=2, gaussians_per_vertex=2), r"driver\.gaussians_per_vertex 2: the decoder gives"),
+    ):
+        other = small("lca").with_parts(driver=driver)
+        variables, inputs = random_variables(other), inputs_of("lca")
+        outputs = jax.eval_shape(lambda v, x, c: apply_humangs(v, x, c)[0], variables, inputs, other)
+        with pytest.raises(ValueError, match=said):
+            jax.eval_shape(lambda v, o, c: frame_outputs(v, o, tube(), BETAS, pose(), c), variables, outputs, other)
     with pytest.raises(ValueError, match="works on a map of the surface"):
-        jax.eval_shape(lambda: apply_humangs({}, replace(inputs_of("animatable"), texels=None), small("animatable"))[0])
+        mapless = replace(inputs_of("animatable"), texels=None)
+        jax.eval_shape(lambda: apply_humangs({}, mapless, small("animatable"))[0])
 
 
 @pytest.mark.slow

@@ -26,20 +26,20 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from experiments.systems.correction import CHANNELS, apply_corrections, pose_vector
+from experiments.systems.unet import UNet, check_scales
 from humangs_jax.body.model import BodyPose, Texels
 from humangs_jax.core.array_types import Array, Float, Key
-from humangs_jax.core.configuration import Few, Spread, Weight, Width, configuration
+from humangs_jax.core.configuration import Few, Spread, Weight, Width, part
 from humangs_jax.core.numerics import safe_divide, safe_normalize
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.network.bilinear import sample_bilinear, texel_indices
-from humangs_jax.network.correction import CHANNELS, apply_corrections, pose_vector
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
 from humangs_jax.network.pixel_aligned import UNSEEN_COLOR, project_vertices, visible_vertices
 from humangs_jax.network.surface_map import SurfaceMap
-from humangs_jax.network.unet import UNet, check_scales
 from humangs_jax.network.vertex_decoder import normal_frames
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -68,7 +68,7 @@ class Surface:
     texels: Texels
 
 
-@configuration
+@part
 class TextureReader:
     """Photos -> the texture of the body. sharpness: of the softmax over the cosines of visible views; larger: the best view."""
 
@@ -85,7 +85,7 @@ class TextureReader:
         if inputs.posed_normals is None:
             raise ValueError("a TextureReader needs posed_normals of the inputs, see `prepare_inputs`")
         unit, covered = subject_unit(inputs.canonical_vertices), texels.covered.reshape(-1)
-        size, grid = (inputs.cameras.width, inputs.cameras.height), run.config.conventions.pixel_grid
+        size, grid = (inputs.cameras.width, inputs.cameras.height), run.conventions.pixel_grid
 
         def view(image, depth_map, camera, vertices, normals, present):
             points = texels.interpolate(vertices).reshape(-1, 3)
@@ -105,7 +105,7 @@ class TextureReader:
         return SurfaceTexture(colors.reshape(*shape, 3), seen.reshape(shape).astype(colors.dtype))
 
 
-@configuration
+@part
 class SurfaceDecoder:
     """A flat Gaussian on the surface for every texel, row-major, with the texture's colour: what drivers correct.
 
@@ -147,7 +147,7 @@ def _texels(inputs: HumanGSInputs) -> Texels:
     return inputs.texels
 
 
-@configuration
+@part
 class TextureDriver:
     """GIGA-style: one U-Net on the texture, seen or not, and positions; its coarsest maps attend to the pose.
 
@@ -188,7 +188,7 @@ class TextureDriver:
         return UNet(self.widths, CHANNELS, PoseAttention(self.pose_width, self.pose_tokens, parent=None))
 
 
-@configuration
+@part
 class PoseMapDriver:
     """Animatable-Gaussians-style: three U-Nets on the map of posed positions, for offsets, shapes and colours.
 
