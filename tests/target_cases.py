@@ -14,8 +14,8 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
 from humangs_jax.network.config import HumanGSConfig
+from humangs_jax.network.encoder import TriplaneConfig
 from humangs_jax.network.surface_map import SurfaceMap
-from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
 
 PIXELS, DRIVEN = ("lvsm", "humanram"), ("giga", "animatable", "lca")

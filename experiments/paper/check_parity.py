@@ -212,10 +212,9 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
 
     from humangs_jax.geometry import quaternion
     from humangs_jax.network.config import paper_parts
+    from humangs_jax.network.encoder import sample_triplane
     from humangs_jax.network.humangs import apply_humangs, part_variables
-    from humangs_jax.network.parts import Pass
     from humangs_jax.network.stages import Recorder
-    from humangs_jax.network.tokenizer import sample_triplane
     from humangs_jax.network.vertex_decoder import corrected_skinning_weights
     from humangs_jax.rendering.gaussians import skin_gaussians
 
@@ -231,7 +230,7 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
     if (
         encoder.upsampler is not None
     ):  # vertices read the last convolution only where they need it; here it is everywhere
-        convolution = reader.output(maps.shape[-1], Pass(config))
+        convolution = reader.output(maps.shape[-1], config.run())
         maps = convolution.apply(part_variables(variables, "reader"), maps, method="everywhere")
     pixels, texture = stages["pixels"], variables["params"]["encoder"]["tokenizer"]["texture"]
     entering = [features.local]

@@ -104,12 +104,10 @@ def compare(width: int, repeats: int, views: int, vertices: int, size: int) -> d
     """CPU ms, operations and temporary MiB of both readers on the same maps."""
     import jax
 
-    from humangs_jax.network.parts import Pass
-
     inputs, encoding = subject(width, views, vertices, size)
     runs, found = {}, {}
     for name, config in configurations(width, size).items():
-        reader, run = config.architecture.reader, Pass(config)
+        reader, run = config.architecture.reader, config.run()
         shapes = jax.eval_shape(lambda reader=reader, run=run: reader.init(jax.random.key(0), encoding, inputs, run))
         variables = jax.tree.map(lambda x: np.full(x.shape, 0.02, x.dtype), shapes)
         read = lambda v, e, x, reader=reader, run=run: reader.apply(v, e, x, run).local

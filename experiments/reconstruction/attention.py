@@ -42,7 +42,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.network.attention import attention
+    from humangs_jax.network.transformer import attention
 
     product, product_flops = matmul_program("float32")
     rows = []

@@ -122,11 +122,10 @@ def everywhere(variables: Any, inputs: Any, config: Any) -> Any:
     from humangs_jax.network.bilinear import sample_bilinear, texel_indices
     from humangs_jax.network.config import paper_parts
     from humangs_jax.network.humangs import decode, encode, part_variables, read
-    from humangs_jax.network.parts import Pass
     from humangs_jax.network.pixel_aligned import COUNT_EPSILON, sum_over_views
     from humangs_jax.network.reader import project_and_test, view_weights
 
-    run, reader = Pass(config), paper_parts(config.architecture)[1]
+    run, reader = config.run(), paper_parts(config.architecture)[1]
     encoding = encode(variables, inputs, config)
     features = read(variables, encoding, inputs, config)
     if reader.output_width is not None:

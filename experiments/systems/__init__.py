@@ -20,12 +20,11 @@ from experiments.systems.surface_gaussians import PoseMapDriver, SurfaceDecoder,
 from experiments.systems.two_stream import TwoStreamReader
 from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
-from humangs_jax.network.encoder import PatchTransformer
+from humangs_jax.network.encoder import PatchTransformer, TriplaneConfig
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.parts import Driver, Reader
 from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.surface_map import SurfaceMap
-from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
 
@@ -138,7 +137,10 @@ def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) 
     """
     if size == "published":
         encoder = _photo_encoder(TransformerConfig(width=1024, class_token=False), patch_size=16)
-        reader, decoder = TwoStreamReader(pooling=pooling, most_views=most_views), VertexDecoder(hidden=512)
+        reader, decoder = (
+            TwoStreamReader(pooling=pooling, most_views=most_views, patch_size=16),
+            VertexDecoder(hidden=512),
+        )
         conventions = Conventions(tokens="foreground", pixels="person", longest_edge=0.01)
     else:
         encoder = _photo_encoder(dataclasses.replace(BENCH_TRANSFORMER, class_token=False))
@@ -168,7 +170,7 @@ def gst(size: Size = "published") -> HumanGSConfig:
             TransformerConfig(width=1280, layers=32, class_token=False, head_width=80), patch_size=16
         )
         conventions = Conventions(image_size=256, body_vertices=6890)  # those of SMPL
-        return HumanGSConfig(Architecture(encoder, GroupReader(), GroupDecoder()), conventions)
+        return HumanGSConfig(Architecture(encoder, GroupReader(patch_size=16), GroupDecoder()), conventions)
     config = lhm("bench")
     reader = GroupReader(26, BENCH_WIDTH, 2, 2, BENCH_HEAD)
     return config.with_parts(reader=reader, decoder=GroupDecoder(group_size=128))

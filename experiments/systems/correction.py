@@ -19,7 +19,7 @@ from humangs_jax.core.numerics import inverse_sigmoid
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.parts import HumanGSOutputs, Pass, Variables
+from humangs_jax.network.parts import HumanGSOutputs, Pass, Variables, VertexFeatures
 from humangs_jax.network.vertex_decoder import COLOR_MARGIN, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -70,42 +70,42 @@ def pose_vector(pose: BodyPose, joints: int) -> Float[Array, " q"]:
 
 @part
 class CorrectionMLP:
-    """The LCA-style driver, for readers that give features `local` of vertices, and a decoder with K Gaussians per vertex.
+    """The LCA-style driver, for readers that give `VertexFeatures`, and a decoder with K Gaussians per vertex.
 
-    hidden: width. layers: hidden ones. joints: of the body. offset_scale: metres, bound of the offsets.
+    hidden: width. layers: hidden ones. joints: of the body. offset_scale: metres, bound of the offsets. gaussians_per_vertex: K.
     """
 
     hidden: Width = 512
     layers: Layers = 3
     joints: Few = 55
     offset_scale: Spread = 0.05
+    gaussians_per_vertex: Few = 1
 
     def init(self, key: Key, features: Any, inputs: HumanGSInputs, run: Pass) -> Variables:
-        """{"params"} of the MLP. Raises: ValueError for features or a decoder without what it needs."""
-        per_vertex = getattr(run.config.architecture.decoder, "gaussians_per_vertex", None)
-        if per_vertex is None or not hasattr(features, "local"):
-            raise ValueError(
-                "a CorrectionMLP needs a reader that gives features of vertices, and K Gaussians per vertex"
-            )
+        """{"params"} of the MLP. Raises: ValueError for other features."""
+        if not isinstance(features, VertexFeatures):
+            raise ValueError(f"a CorrectionMLP needs VertexFeatures, got {type(features).__name__}")
         entering = features.local.shape[-1] + 3 * (self.joints - 1)
-        return cast(Variables, self._module(per_vertex).init(key, jnp.zeros((1, entering))))
+        return cast(Variables, self._module().init(key, jnp.zeros((1, entering))))
 
     def apply(
         self, variables: Variables, outputs: HumanGSOutputs, pose: BodyPose, posed: Float[Array, "n 3"], run: Pass
     ) -> HumanGSOutputs:
-        """See `parts.Driver`. Raises: ValueError, see `pose_vector`."""
+        """See `parts.Driver`. Raises: ValueError for another K; see `pose_vector`."""
         local = outputs.scene.local
-        per_vertex = len(outputs.gaussians.opacities) // len(local)
+        per_vertex = self.gaussians_per_vertex
+        if len(outputs.gaussians.opacities) != per_vertex * len(local):
+            raise ValueError(f"driver.gaussians_per_vertex {per_vertex}: the decoder gives another number")
         vector = jnp.broadcast_to(pose_vector(pose, self.joints), (len(local), 3 * (self.joints - 1)))
-        raw = self._module(per_vertex).apply(variables, jnp.concatenate([local, vector], axis=-1))
+        raw = self._module().apply(variables, jnp.concatenate([local, vector], axis=-1))
         gaussians, offsets = apply_corrections(outputs.gaussians, raw.reshape(-1, CHANNELS), self.offset_scale)
         driven = offsets.reshape(len(local), per_vertex, 3)  # of a body of 1.8 m, metres are normalised units
         if outputs.tight_offsets is not None:  # the canonical ones stay small, too
             driven = jnp.concatenate([outputs.tight_offsets, driven], axis=1)
         return replace(outputs, gaussians=gaussians, tight_offsets=driven)
 
-    def _module(self, per_vertex):
-        return CorrectionModule(self.hidden, self.layers, per_vertex)
+    def _module(self):
+        return CorrectionModule(self.hidden, self.layers, self.gaussians_per_vertex)
 
 
 class CorrectionModule(nn.Module):

@@ -15,15 +15,12 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.configuration import Layers, Ratio, Width, part
-from humangs_jax.network.attention import NORM_EPSILON, attention
-from humangs_jax.network.encoder import touched_patches
+from humangs_jax.core.configuration import Layers, Patch, Ratio, Width, part
+from humangs_jax.network.encoder import pack_patches, touched_patches
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.parts import Encoding, Pass, Variables
-from humangs_jax.network.reader import VertexFeatures
-from humangs_jax.network.tokenizer import pack_patches
-from humangs_jax.network.transformer import INIT_STD, layer_norm
+from humangs_jax.network.parts import Encoding, Pass, Variables, VertexFeatures
+from humangs_jax.network.transformer import INIT_STD, NORM_EPSILON, attention, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
 
 INIT = nn.initializers.normal(INIT_STD)
@@ -32,13 +29,14 @@ INIT = nn.initializers.normal(INIT_STD)
 @part
 class CrossAttentionReader:
     """Vertices as queries, image tokens as keys and values. width: features of a vertex. layers, mlp_ratio, head_width: as in
-    `TransformerConfig`.
+    `TransformerConfig`. patch_size: of the encoder whose tokens are looked at.
     """
 
     width: Width = 768
     layers: Layers = 1
     mlp_ratio: Ratio = 4
     head_width: Width = 64
+    patch_size: Patch = 8
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
@@ -52,21 +50,20 @@ class CrossAttentionReader:
     def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for an encoder with an upsampler."""
         canonical = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
-        local = self._module(run).apply(variables, canonical, *image_tokens(encoding, inputs, run))
+        local = self._module(run).apply(variables, canonical, *image_tokens(encoding, inputs, run, self.patch_size))
         return VertexFeatures(cast(Array, local), encoding.global_token, normals=inputs.canonical_normals)
 
     def _module(self, run: Pass):
-        return VertexQueries(self, run.config.execution)
+        return VertexQueries(self, run.execution)
 
 
 def image_tokens(
-    encoding: Encoding, inputs: HumanGSInputs, run: Pass
+    encoding: Encoding, inputs: HumanGSInputs, run: Pass, patch: int
 ) -> tuple[Float[Array, "l d"], Int[Array, ""] | None]:
     """The tokens of all views, those of padding last, and the number of real ones (None: all).
 
     Raises: ValueError unless the maps have one element a patch.
     """
-    patch = run.config.architecture.encoder.patch_size
     height, width, features = encoding.maps.shape[1:]
     if inputs.images.shape[1:3] != (height * patch, width * patch):
         raise ValueError(
@@ -74,9 +71,9 @@ def image_tokens(
             f"{inputs.images.shape[2]} x {inputs.images.shape[1]}: encoder.upsampler must be None"
         )
     tokens = encoding.maps.reshape(-1, features)
-    if run.config.tokens == "foreground":
+    if run.tokens == "foreground":
         packing = pack_patches(
-            touched_patches(inputs, patch), min(run.config.execution.token_capacity or len(tokens), len(tokens))
+            touched_patches(inputs, patch), min(run.execution.token_capacity or len(tokens), len(tokens))
         )
         return tokens.at[packing.indices].get(mode="fill", fill_value=0), packing.count
     return tokens, None if inputs.view_count is None else inputs.view_count * (height * width)

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from experiments.systems.cross_attention import CrossBlock, check_heads, image_tokens
 from experiments.systems.two_stream import check_views
 from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.configuration import Bias, Layers, Ratio, Spread, Vertices, Width, part
+from humangs_jax.core.configuration import Bias, Layers, Patch, Ratio, Spread, Vertices, Width, part
 from humangs_jax.geometry import quaternion
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
@@ -35,7 +35,7 @@ ATTRIBUTES = {"offsets": 3, "quats": 4, "scales": 3, "opacities": 1, "colors": 3
 class GroupReader:
     """Learned tokens, one an attribute and group, that look at the tokens of one photo.
 
-    groups: of vertices. width: of a token. layers, mlp_ratio, head_width: of the attention, as in `CrossAttentionReader`.
+    groups: of vertices. width: of a token. layers, mlp_ratio, head_width, patch_size: as in `CrossAttentionReader`.
     """
 
     groups: Vertices = 26
@@ -43,6 +43,7 @@ class GroupReader:
     layers: Layers = 6
     mlp_ratio: Ratio = 2
     head_width: Width = 64
+    patch_size: Patch = 8
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
@@ -57,10 +58,10 @@ class GroupReader:
     ) -> Float[Array, "a r d"]:
         """Tokens of the 5 attributes of r groups. Raises ValueError for a second photo, or an encoder with an upsampler."""
         check_views(inputs, 1)
-        return cast(Array, self._module(run).apply(variables, *image_tokens(encoding, inputs, run)))
+        return cast(Array, self._module(run).apply(variables, *image_tokens(encoding, inputs, run, self.patch_size)))
 
     def _module(self, run: Pass):
-        return GroupTokens(self, run.config.execution)
+        return GroupTokens(self, run.execution)
 
 
 class GroupTokens(nn.Module):

@@ -24,13 +24,12 @@ import jax
 import jax.numpy as jnp
 
 from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.configuration import Range, part
+from humangs_jax.core.configuration import Patch, Range, part
 from humangs_jax.network.convolution import Convolution
-from humangs_jax.network.encoder import encoder_pixels
+from humangs_jax.network.encoder import TEXTURE_STD, TriplaneConfig, encoder_pixels, patchify, sample_triplane
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables, scene_outputs
-from humangs_jax.network.tokenizer import TEXTURE_STD, TriplaneConfig, patchify, sample_triplane
 from humangs_jax.network.transformer import INIT_STD, Transformer, TransformerConfig
 from humangs_jax.network.upsampler import KAIMING, SLOPE, UpConvolution
 
@@ -62,11 +61,13 @@ class Photos(NamedTuple):
 class QueryDecoder:
     """A `PixelDecoder`. transformer: without a class token. texture: the neural texture (HumanRAM), None: the body is unknown
     (LVSM). fusion: width of the convolutional decoder, which needs a patch size that is a power of 2; None: the linear map.
+    patch_size: of photos and targets.
     """
 
     transformer: TransformerConfig = dataclasses.field(default_factory=lambda: lvsm_transformer(24))
     texture: TriplaneConfig | None = None
     fusion: Annotated[int, Range(2, 16_384)] | None = None
+    patch_size: Patch = 8
 
     def __post_init__(self):
         """Raises ValueError for a class token, or too few layers to fuse four depths."""
@@ -97,7 +98,7 @@ class QueryDecoder:
         return jax.lax.map(one, queries)
 
     def _module(self, run):
-        return QueryModule(self, run.config.architecture.encoder.patch_size, run.config.execution)
+        return QueryModule(self, self.patch_size, run.execution)
 
 
 def lvsm_transformer(layers: int) -> TransformerConfig:

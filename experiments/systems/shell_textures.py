@@ -86,7 +86,7 @@ class ShellTextureReader:
             raise ValueError("shell textures need texels and posed_normals of the inputs, see `prepare_inputs`")
         unit, texels = subject_unit(inputs.canonical_vertices), inputs.texels
         steps = jnp.asarray(self.shells, inputs.images.dtype)
-        size, grid = (inputs.cameras.width, inputs.cameras.height), run.config.conventions.pixel_grid
+        size, grid = (inputs.cameras.width, inputs.cameras.height), run.conventions.pixel_grid
         covered = texels.covered
 
         def look(best, view):

@@ -85,7 +85,7 @@ class TextureReader:
         if inputs.posed_normals is None:
             raise ValueError("a TextureReader needs posed_normals of the inputs, see `prepare_inputs`")
         unit, covered = subject_unit(inputs.canonical_vertices), texels.covered.reshape(-1)
-        size, grid = (inputs.cameras.width, inputs.cameras.height), run.config.conventions.pixel_grid
+        size, grid = (inputs.cameras.width, inputs.cameras.height), run.conventions.pixel_grid
 
         def view(image, depth_map, camera, vertices, normals, present):
             points = texels.interpolate(vertices).reshape(-1, 3)

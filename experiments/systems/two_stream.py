@@ -19,14 +19,12 @@ import jax.numpy as jnp
 
 from experiments.systems.cross_attention import INIT, check_heads, image_tokens
 from humangs_jax.core.array_types import Array, Float, Int, Key
-from humangs_jax.core.configuration import Few, Layers, Ratio, Vertices, Width, part
+from humangs_jax.core.configuration import Few, Layers, Patch, Ratio, Vertices, Width, part
 from humangs_jax.geometry.curve import along_curve
-from humangs_jax.network.attention import NORM_EPSILON, attention
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.parts import Encoding, Pass, Variables
-from humangs_jax.network.reader import VertexFeatures
-from humangs_jax.network.transformer import layer_norm
+from humangs_jax.network.parts import Encoding, Pass, Variables, VertexFeatures
+from humangs_jax.network.transformer import NORM_EPSILON, attention, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
 
 CURVE_REACH = 1.2
@@ -47,6 +45,7 @@ class TwoStreamReader:
     head_width: Width = 64
     pooling: Vertices = 1
     most_views: Few | None = None
+    patch_size: Patch = 8
 
     def __post_init__(self):
         """Raises ValueError for sizes that do not fit together."""
@@ -61,11 +60,11 @@ class TwoStreamReader:
         """Features of the n vertices. Raises ValueError for too many views, or an encoder with an upsampler."""
         check_views(inputs, self.most_views)
         canonical = inputs.canonical_vertices / subject_unit(inputs.canonical_vertices)
-        local = self._module(run).apply(variables, canonical, *image_tokens(encoding, inputs, run))
+        local = self._module(run).apply(variables, canonical, *image_tokens(encoding, inputs, run, self.patch_size))
         return VertexFeatures(cast(Array, local), encoding.global_token, normals=inputs.canonical_normals)
 
     def _module(self, run: Pass):
-        return TwoStreams(self, run.config.execution)
+        return TwoStreams(self, run.execution)
 
 
 def check_views(inputs: HumanGSInputs, most: int | None) -> None:

@@ -105,7 +105,6 @@ def stages(case: Case) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
     from humangs_jax.data.views import prepare_inputs
     from humangs_jax.network.humangs import decode, part_variables
     from humangs_jax.network.humangs import read as read_features
-    from humangs_jax.network.parts import Pass
     from humangs_jax.training.forward import DrawnTargets, draw_targets, white_backgrounds
     from humangs_jax.training.optimizer import make_optimizer
     from humangs_jax.training.step import loss_terms
@@ -118,7 +117,7 @@ def stages(case: Case) -> dict[str, tuple[Callable[..., Any], tuple[Any, ...]]]:
 
     def encode(params):
         own = part_variables({**variables, "params": params}, "encoder")
-        return config.model.architecture.encoder.apply(own, inputs, Pass(config.model, train=True))[0]
+        return config.model.architecture.encoder.apply(own, inputs, config.model.run(train=True))[0]
 
     def read(params, encoding):
         own = {**variables, "params": params}

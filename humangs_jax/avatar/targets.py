@@ -23,7 +23,7 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import encoder_pixels
 from humangs_jax.network.humangs import apply_humangs, draw_pixels, drive_outputs
-from humangs_jax.network.parts import HumanGSOutputs, Pass, Variables
+from humangs_jax.network.parts import HumanGSOutputs, Variables
 from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS
 
@@ -43,7 +43,7 @@ def frame_outputs(
 def target_queries(body: BodyModel, targets: SubjectViews, config: HumanGSConfig) -> Float[Array, "v h w 9"]:
     """What a `PixelDecoder` gets of targets: rays and canonical positions of the body. Their photos and masks are not used."""
     hidden = replace(targets, images=jnp.zeros_like(targets.images), masks=jnp.zeros_like(targets.masks))
-    queries = encoder_pixels(prepare_inputs(body, hidden, config), Pass(config))[..., 3:]
+    queries = encoder_pixels(prepare_inputs(body, hidden, config), config.run())[..., 3:]
     return jax.lax.stop_gradient(queries)
 
 

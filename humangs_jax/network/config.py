@@ -4,20 +4,18 @@ Weights files record `Architecture` and `Conventions`. `Execution` belongs to th
 """
 
 import dataclasses
-from typing import Any, Literal
+from typing import Any
 
 import jax
 
-from humangs_jax.core.configuration import Edge, InputSide, Length, Vertices, configuration, knob
-from humangs_jax.network.bilinear import PixelGrid
+from humangs_jax.core.configuration import configuration
 from humangs_jax.network.encoder import PatchTransformer
-from humangs_jax.network.execution import Execution, TokenSelection
-from humangs_jax.network.parts import Decoder, Driver, Encoder, PixelDecoder, Reader
+from humangs_jax.network.execution import Conventions, Execution, TokenSelection
+from humangs_jax.network.parts import Decoder, Driver, Encoder, Pass, PixelDecoder, Reader
 from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.vertex_decoder import VertexDecoder
-
-SCALING, EVALUATION = "performance_reconstruction.md", "evaluation.md"
 
 
 @configuration
@@ -84,48 +82,6 @@ def paper_parts(architecture: Architecture) -> tuple[PatchTransformer, PixelAlig
     raise ValueError(f"expected the parts of the paper's network, got {names}")
 
 
-@configuration
-class Conventions:
-    """What the weights were trained with. No tensor's shape depends on it; with other values the results are worse.
-
-    image_size: side of the photos, pixels (the network takes any multiple of the patch size). tokens: patches that became
-    tokens. pixels: "person": where there are masks, only their pixels count. No photo then sees the body where it covers the
-    background, and Gaussians of vertices that lie off the person in all photos are dropped. position_map: its shading.
-    ray_origins: the release divides camera centres by s, and the ray origins taken from them once more, so that the moments
-    of its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex (paper) or over all
-    (release). pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn. skinning_reach:
-    Gaussians between the legs farther than this from their vertex, metres, move with both (`body.skinning.spread_weights`);
-    None: all with their vertex. light: other poses are drawn in the light of the photos (`avatar.light`). low_pass: metres
-    that a pixel of the training images shows of the person, if their low-pass is to be part of the scales
-    (`avatar.low_pass`); None: it stays with the renderer. body_vertices, longest_edge: number of vertices to which bodies are
-    decimated, and metres to which their edges are split afterwards; None for neither.
-    """
-
-    image_size: InputSide = knob(
-        512,
-        cost="detail of the photos",
-        gain="tokens grow with its square, attention with its fourth power",
-        measured=SCALING,
-    )
-    tokens: TokenSelection = "all"
-    pixels: Literal["all", "person"] = "all"
-    position_map: Literal["plain", "gouraud"] = "plain"
-    ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
-    pool: Literal["visible", "all"] = "visible"
-    pixel_grid: PixelGrid = "half_pixel"
-    skinning: Literal["affine", "rotation"] = "affine"
-    rendering: Literal["exact", "inria"] = "exact"
-    skinning_reach: Length | None = None
-    light: bool = False
-    low_pass: Length | None = None
-    body_vertices: Vertices | None = knob(
-        None, cost="detail of the body", gain="Gaussians, reads and decoding in proportion", measured=EVALUATION
-    )
-    longest_edge: Edge | None = knob(
-        None, cost="Gaussians grow as it shrinks", gain="detail where the body is coarse", measured=EVALUATION
-    )
-
-
 @jax.tree_util.register_static
 @configuration
 class HumanGSConfig:
@@ -145,7 +101,11 @@ class HumanGSConfig:
     @property
     def tokens(self) -> TokenSelection:
         """The selection of tokens in force."""
-        return self.execution.tokens or self.conventions.tokens
+        return self.run().tokens
+
+    def run(self, train: bool = False, axis_name: Any = None, stage: StageCaller = call) -> Pass:
+        """How one pass of this network runs."""
+        return Pass(self.conventions, self.execution, train, axis_name, stage)
 
     @property
     def image_size(self) -> int:

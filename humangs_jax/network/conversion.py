@@ -18,11 +18,10 @@ import numpy as np
 from humangs_jax.io.reading import reading
 from humangs_jax.io.tensor_file import is_safetensors, read_safetensors, read_tensors
 from humangs_jax.network.config import Architecture, HumanGSConfig, paper_parts
-from humangs_jax.network.encoder import PatchTransformer
+from humangs_jax.network.encoder import PatchTransformer, TriplaneConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.presets import published
 from humangs_jax.network.reader import PixelAlignedReader
-from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder

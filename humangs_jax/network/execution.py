@@ -1,11 +1,12 @@
-"""How the network runs: settings of time and memory. Weights files do not record them."""
+"""How the network runs, which weights files do not record (`Execution`), and what the weights were trained with."""
 
 import dataclasses
 from typing import Any, Literal
 
 import jax.numpy as jnp
 
-from humangs_jax.core.configuration import Chunk, Edge, InputSide, Presets, Room, Vertices, configuration, knob
+from humangs_jax.core.configuration import Chunk, Edge, InputSide, Length, Presets, Room, Vertices, configuration, knob
+from humangs_jax.network.bilinear import PixelGrid
 from humangs_jax.rendering.mesh.rasterizer import RasterConfig
 
 MEASURED, TRADE, EVALUATION = "performance_reconstruction.md", "tradeoff.md", "evaluation.md"
@@ -23,7 +24,7 @@ class Execution:
     token_capacity: slots for foreground tokens over all views, 0: room for all patches (`reconstruct` and `stack_captures` fit
     it to the photos; in training it is for the largest number of photos, see `training.forward.token_share`).
     dtype: of the encoder's products; parameters, norms, softmax statistics and the decoder stay float32 at least.
-    attention: see `network.attention`. attention_chunk: queries per block of the chunked kernel.
+    attention: see `network.transformer`. attention_chunk: queries per block of the chunked kernel.
     scan: run the blocks as one compiled loop. Their parameters are copied side by side in every call (12 layers of 768: 340 MB).
     remat: what a block recomputes in the backward pass instead of keeping it: nothing, all ("full"), or all but the results of
     attention and of products with weights ("dots"). On a CPU only a `scan` recomputes: XLA merges what is computed twice
@@ -98,6 +99,48 @@ class Execution:
     def compute_dtype(self) -> Any:
         """For Linen modules; None promotes inputs and parameters, so that float64 stays float64."""
         return None if self.dtype == "float32" else jnp.dtype(self.dtype)
+
+
+@configuration
+class Conventions:
+    """What the weights were trained with. No tensor's shape depends on it; with other values the results are worse.
+
+    image_size: side of the photos, pixels (the network takes any multiple of the patch size). tokens: patches that became
+    tokens. pixels: "person": where there are masks, only their pixels count. No photo then sees the body where it covers the
+    background, and Gaussians of vertices that lie off the person in all photos are dropped. position_map: its shading.
+    ray_origins: the release divides camera centres by s, and the ray origins taken from them once more, so that the moments
+    of its rays ("twice_normalized") fit no camera. pool: average over the views that see a vertex (paper) or over all
+    (release). pixel_grid: see `network.bilinear`. skinning, rendering: how the Gaussians are posed and drawn. skinning_reach:
+    Gaussians between the legs farther than this from their vertex, metres, move with both (`body.skinning.spread_weights`);
+    None: all with their vertex. light: other poses are drawn in the light of the photos (`avatar.light`). low_pass: metres
+    that a pixel of the training images shows of the person, if their low-pass is to be part of the scales
+    (`avatar.low_pass`); None: it stays with the renderer. body_vertices, longest_edge: number of vertices to which bodies are
+    decimated, and metres to which their edges are split afterwards; None for neither.
+    """
+
+    image_size: InputSide = knob(
+        512,
+        cost="detail of the photos",
+        gain="tokens grow with its square, attention with its fourth power",
+        measured=MEASURED,
+    )
+    tokens: TokenSelection = "all"
+    pixels: Literal["all", "person"] = "all"
+    position_map: Literal["plain", "gouraud"] = "plain"
+    ray_origins: Literal["normalized", "twice_normalized"] = "normalized"
+    pool: Literal["visible", "all"] = "visible"
+    pixel_grid: PixelGrid = "half_pixel"
+    skinning: Literal["affine", "rotation"] = "affine"
+    rendering: Literal["exact", "inria"] = "exact"
+    skinning_reach: Length | None = None
+    light: bool = False
+    low_pass: Length | None = None
+    body_vertices: Vertices | None = knob(
+        None, cost="detail of the body", gain="Gaussians, reads and decoding in proportion", measured=EVALUATION
+    )
+    longest_edge: Edge | None = knob(
+        None, cost="Gaussians grow as it shrinks", gain="detail where the body is coarse", measured=EVALUATION
+    )
 
 
 EXECUTIONS = Presets(

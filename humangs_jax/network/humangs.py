@@ -24,7 +24,7 @@ from humangs_jax.geometry.camera import Camera
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import touched_patches
 from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, PixelDecoder, Variables
+from humangs_jax.network.parts import Encoding, HumanGSOutputs, PixelDecoder, Variables
 from humangs_jax.network.reader import project_and_test, view_weights
 from humangs_jax.network.stages import StageCaller, call
 
@@ -49,7 +49,7 @@ def apply_humangs(
     Raises: ValueError if images and cameras differ in size, the patch size does not divide it, or inputs lack normals that the
     configuration needs.
     """
-    run, parts = Pass(config, train, axis_name, stage), config.architecture
+    run, parts = config.run(train, axis_name, stage), config.architecture
     of = lambda name: part_variables(variables, name)
     encoding, statistics = stage("encoding", lambda: parts.encoder.apply(of("encoder"), inputs, run))
     features = stage("vertex features", lambda e: parts.reader.apply(of("reader"), e, inputs, run), encoding)
@@ -69,7 +69,7 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
 
     A part without parameters or running statistics is absent.
     """
-    run, parts = Pass(config), config.architecture
+    run, parts = config.run(), config.architecture
     encoder_key, decoder_key = jax.random.split(key)
     inputs = _example_inputs(config)
     encoder = parts.encoder.init(encoder_key, inputs, run)
@@ -89,19 +89,19 @@ def init_humangs(key: Key, config: HumanGSConfig) -> Variables:
 @functools.partial(jax.jit, static_argnames="config")
 def encode(variables: Variables, inputs: HumanGSInputs, config: HumanGSConfig) -> Encoding:
     """The first part of `apply_humangs`, with the running batch statistics. Raises: as it."""
-    return config.architecture.encoder.apply(part_variables(variables, "encoder"), inputs, Pass(config))[0]
+    return config.architecture.encoder.apply(part_variables(variables, "encoder"), inputs, config.run())[0]
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def read(variables: Variables, encoding: Encoding, inputs: HumanGSInputs, config: HumanGSConfig) -> Any:
     """The second part of `apply_humangs`: features of the body. Raises: as it."""
-    return config.architecture.reader.apply(part_variables(variables, "reader"), encoding, inputs, Pass(config))
+    return config.architecture.reader.apply(part_variables(variables, "reader"), encoding, inputs, config.run())
 
 
 @functools.partial(jax.jit, static_argnames="config")
 def decode(variables: Variables, features: Any, inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSOutputs:
     """The third part of `apply_humangs`: canonical Gaussians, metric; `dropped_tokens` is 0 (it belongs to the encoding)."""
-    return config.architecture.decoder.apply(part_variables(variables, "decoder"), features, inputs, Pass(config))
+    return config.architecture.decoder.apply(part_variables(variables, "decoder"), features, inputs, config.run())
 
 
 def drive_outputs(
@@ -111,7 +111,7 @@ def drive_outputs(
     driver = config.architecture.driver
     if driver is None:
         return outputs
-    return driver.apply(part_variables(variables, "driver"), outputs, pose, posed, Pass(config))
+    return driver.apply(part_variables(variables, "driver"), outputs, pose, posed, config.run())
 
 
 def draw_pixels(
@@ -121,7 +121,7 @@ def draw_pixels(
     decoder = config.architecture.decoder
     if not isinstance(decoder, PixelDecoder):
         raise ValueError(f"{type(decoder).__name__} makes Gaussians: expected a decoder that draws pixels")
-    return decoder.draw(part_variables(variables, "decoder"), outputs.scene, queries, Pass(config))
+    return decoder.draw(part_variables(variables, "decoder"), outputs.scene, queries, config.run())
 
 
 def part_variables(variables: Variables, part: str) -> Variables:
@@ -136,7 +136,7 @@ def needed_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""
 
 def needed_reads(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]:
     """The vertex capacity that these photos need: the most vertices for which any view is read."""
-    run = Pass(config)
+    run = config.run()
     counted = view_weights(project_and_test(inputs, run)[1], inputs, run)
     return jnp.max(jnp.sum(counted, axis=1, dtype=jnp.int32))
 

@@ -14,34 +14,38 @@ A part that works on a map of the body's surface says which one in a field or pr
 """
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax.numpy as jnp
 
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.pytree import pytree_dataclass
+from humangs_jax.network.execution import Conventions, Execution, TokenSelection
 from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.rendering.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from humangs_jax.network.config import HumanGSConfig
 
 Variables = dict[str, Any]
 
 
 class Pass(NamedTuple):
-    """How one pass of the network runs.
+    """How one pass of the network runs: all that a part knows besides its own fields. See `HumanGSConfig.run`.
 
     train: batch norms use this subject's statistics and update the running ones. axis_name: vmap axes over which those are
     shared. stage: how named stages are called, see `network.stages`.
     """
 
-    config: "HumanGSConfig"
+    conventions: Conventions
+    execution: Execution
     train: bool = False
     axis_name: str | tuple[str, ...] | None = None
     stage: StageCaller = call
+
+    @property
+    def tokens(self) -> TokenSelection:
+        """The selection of tokens in force."""
+        return self.execution.tokens or self.conventions.tokens
 
 
 class Encoding(NamedTuple):
@@ -54,6 +58,41 @@ class Encoding(NamedTuple):
     maps: Float[Array, "v h w d"]
     global_token: Float[Array, " e"] | None
     dropped_tokens: Int[Array, ""]
+
+
+@pytree_dataclass
+class Shells:
+    """What the photos show at the s points along the normal of each vertex.
+
+    distances: (s,). colors: (n, s, 3) mean photo colour over the views in which the point is visible and on the person, weighted
+    by how much the posed normal faces them; grey without such a view. seen: (n, s) the sum of those weights over the number of
+    views. inside: (n, s) mean mask at the point over the views that contain it. hull: (n, s) the minimum of the same, 0
+    outside of the visual hull. A view that does not contain the point is ignored; without any view both are 1.
+    """
+
+    distances: Float[Array, " s"]
+    colors: Float[Array, "n s 3"]
+    seen: Float[Array, "n s"]
+    inside: Float[Array, "n s"]
+    hull: Float[Array, "n s"]
+
+
+@pytree_dataclass
+class VertexFeatures:
+    """What the photos show of each vertex.
+
+    local: (n, d) pooled feature. global_token: (e,) or None. photo_colors: (n, 3) and visible_fraction: (n,), or None.
+    shells: points off the surface, or None. normals: (n, 3) unit, of the canonical body, or None.
+    dropped_reads: vertices, summed over views, for which the vertex capacity had no room.
+    """
+
+    local: Float[Array, "n d"]
+    global_token: Float[Array, " e"] | None = None
+    photo_colors: Float[Array, "n 3"] | None = None
+    visible_fraction: Float[Array, " n"] | None = None
+    shells: Shells | None = None
+    normals: Float[Array, "n 3"] | None = None
+    dropped_reads: Int[Array, ""] | None = None
 
 
 @pytree_dataclass

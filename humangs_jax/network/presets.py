@@ -4,10 +4,9 @@ import dataclasses
 
 from humangs_jax.core.configuration import Presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
-from humangs_jax.network.encoder import PatchTransformer
+from humangs_jax.network.encoder import PatchTransformer, TriplaneConfig
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.reader import PixelAlignedReader
-from humangs_jax.network.tokenizer import TriplaneConfig
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder

@@ -1,6 +1,6 @@
 """The paper's reader: posed vertices projected into the photos, features read there, views pooled.
 
-Vertices can also read the photos themselves, at the surface and at distances along their normals (`network.shells`).
+Vertices can also read the photos themselves, at the surface and at distances along their normals (`network.pixel_aligned`).
 """
 
 import itertools
@@ -10,41 +10,21 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
+from humangs_jax.core.array_types import Array, Bool, Float, Key
 from humangs_jax.core.configuration import Spread, Width, part
-from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.network.bilinear import sample_bilinear, texel_indices
+from humangs_jax.network.bilinear import KERNEL, sample_bilinear, sample_neighborhoods, texel_indices
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.neighborhoods import KERNEL, sample_neighborhoods
-from humangs_jax.network.parts import Encoding, Pass, Variables
+from humangs_jax.network.parts import Encoding, Pass, Shells, Variables, VertexFeatures
 from humangs_jax.network.pixel_aligned import (
     COUNT_EPSILON,
     dropped_reads,
     photo_colors,
     project_vertices,
+    sample_shells,
     sum_over_views,
     visible_vertices,
 )
-from humangs_jax.network.shells import Shells, sample_shells
 from humangs_jax.network.upsampler import OutputConvolution
-
-
-@pytree_dataclass
-class VertexFeatures:
-    """What the photos show of each vertex.
-
-    local: (n, d) pooled feature. global_token: (e,) or None. photo_colors: (n, 3) and visible_fraction: (n,), or None.
-    shells: points off the surface, or None. normals: (n, 3) unit, of the canonical body, or None.
-    dropped_reads: vertices, summed over views, for which the vertex capacity had no room.
-    """
-
-    local: Float[Array, "n d"]
-    global_token: Float[Array, " e"] | None = None
-    photo_colors: Float[Array, "n 3"] | None = None
-    visible_fraction: Float[Array, " n"] | None = None
-    shells: Shells | None = None
-    normals: Float[Array, "n 3"] | None = None
-    dropped_reads: Int[Array, ""] | None = None
 
 
 @part
@@ -76,11 +56,11 @@ class PixelAlignedReader:
     def output(self, channels: int, run: Pass) -> OutputConvolution:
         """The last convolution, of maps with that many channels."""
         assert self.output_width is not None
-        return OutputConvolution(self.output_width, channels, run.config.execution.compute_dtype)
+        return OutputConvolution(self.output_width, channels, run.execution.compute_dtype)
 
     def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for shells without posed normals."""
-        conventions, capacity = run.config.conventions, run.config.execution.vertex_capacity
+        conventions, capacity = run.conventions, run.execution.vertex_capacity
         pixels, visible = project_and_test(inputs, run)
         weights = view_weights(visible, inputs, run).astype(pixels.dtype)
         size = (inputs.cameras.width, inputs.cameras.height)
@@ -121,7 +101,7 @@ def read_shells(inputs: HumanGSInputs, distances: tuple[float, ...], run: Pass) 
         inputs.posed_normals,
         distances,
         inputs.present,
-        run.config.conventions.pixel_grid,
+        run.conventions.pixel_grid,
     )
 
 
@@ -130,13 +110,13 @@ def project_and_test(inputs: HumanGSInputs, run: Pass) -> tuple[Float[Array, "v 
     unit = subject_unit(inputs.canonical_vertices)
     cameras, vertices = inputs.cameras.in_units(unit), inputs.posed_vertices / unit
     pixels, depths = jax.vmap(project_vertices)(cameras, vertices)
-    size, grid = (cameras.width, cameras.height), run.config.conventions.pixel_grid
+    size, grid = (cameras.width, cameras.height), run.conventions.pixel_grid
     see = lambda p, z, surface: visible_vertices(p, z, surface, size, grid)
     return pixels, jax.vmap(see)(pixels, depths, inputs.depth_maps) & inputs.present[:, None]
 
 
 def view_weights(visible: Bool[Array, "v n"], inputs: HumanGSInputs, run: Pass) -> Bool[Array, "v n"]:
     """Which views are pooled at each vertex."""
-    if run.config.conventions.pool == "visible":
+    if run.conventions.pool == "visible":
         return visible
     return jnp.broadcast_to(inputs.present[:, None], visible.shape)

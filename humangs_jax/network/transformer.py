@@ -4,9 +4,20 @@
 
 LayerNorms of the blocks have a weight and no bias, the final one has both (eps 1e-5). Norms and softmax run in float32
 at least, and so does the residual stream; products run in `dtype`.
+Attention over the tokens of all views is softmax(q k^T / sqrt(e)) v per head, with normalised q and k. Tokens that are padding
+stand at the end; the first `count` ones are attended to. Three exact implementations:
+
+- "chunked": matrix products over blocks of one head's queries, recomputed in the backward pass, so that memory grows
+  with L and not with L^2;
+- "xla": `jax.nn.dot_product_attention`, which materialises L x L logits;
+- "cudnn": its fused flash attention (NVIDIA, half precision only).
+
+"auto" takes "cudnn" for half precision on a GPU, "xla" on GPU and TPU up to `XLA_TOKENS` tokens (not in float64: its
+softmax is always float32), and "chunked" otherwise. On a CPU of two cores, 4,097 tokens and 12 heads of 64, "xla" needs
+2.6 s of processor time and 7.9 with its gradient, "chunked" 0.8 and 2.9 (experiments/reconstruction/attention.py).
 """
 
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -15,8 +26,104 @@ from jax.ad_checkpoint import checkpoint_name
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import Layers, Ratio, Width, configuration
-from humangs_jax.network.attention import NORM_EPSILON, PRODUCT, Attention
-from humangs_jax.network.execution import Execution
+from humangs_jax.network.execution import AttentionKernel, Execution
+
+NORM_EPSILON = 1e-5
+PRODUCT = "product"
+"""Name of the arrays of a block that `Execution.remat` "dots" may keep for the backward pass."""
+XLA_TOKENS = 8192
+"""Up to here L x L logits of all heads fit beside a model on any accelerator (12 heads, float32: 3 GB a layer)."""
+
+
+def resolve_implementation(implementation: str, tokens: int, dtype: Any) -> AttentionKernel:
+    """What "auto" stands for on the default backend, for that many tokens of that dtype."""
+    if implementation != "auto":
+        return cast(AttentionKernel, implementation)
+    backend = jax.default_backend()
+    if backend == "gpu" and jnp.dtype(dtype).itemsize == 2:
+        return "cudnn"
+    fits = tokens <= XLA_TOKENS and jnp.dtype(dtype).itemsize <= 4
+    return "xla" if backend in ("gpu", "tpu") and fits else "chunked"
+
+
+def chunked_attention(
+    q: Float[Array, "m h e"],
+    k: Float[Array, "l h e"],
+    v: Float[Array, "l h e"],
+    count: Int[Array, ""] | None,
+    query_chunk: int,
+) -> Float[Array, "m h e"]:
+    """Exact attention, head by head and one block of queries after the other; softmax statistics in float32 at least."""
+    length, heads, width = q.shape
+    blocks = -(-length // query_chunk)
+    block = -(-length // blocks)
+    q, k, v = (jnp.swapaxes(x, 0, 1) for x in (q * width**-0.5, k, v))
+    q = jnp.pad(q, ((0, 0), (0, blocks * block - length), (0, 0))).reshape(heads, blocks, block, width)
+    statistics = jnp.promote_types(q.dtype, jnp.float32)
+    absent = None if count is None else jnp.arange(k.shape[1]) >= count
+
+    @jax.checkpoint
+    def attend(queries, keys, values):
+        logits = jnp.einsum("qe,ke->qk", queries, keys, preferred_element_type=statistics)
+        if absent is not None:
+            logits = jnp.where(absent, jnp.finfo(statistics).min, logits)
+        weights = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True)))
+        total = jnp.sum(weights, axis=-1, keepdims=True)
+        out = jnp.einsum("qk,ke->qe", weights.astype(values.dtype), values, preferred_element_type=statistics)
+        return (out / total).astype(values.dtype)  # dividing the sum spares a pass over the L x L weights
+
+    def attend_head(head):
+        queries, keys, values = head
+        return jax.lax.map(lambda block: attend(block, keys, values), queries)
+
+    out = jax.lax.map(attend_head, (q, k, v)).reshape(heads, blocks * block, width)
+    return jnp.swapaxes(out[:, :length], 0, 1)
+
+
+def attention(
+    q: Float[Array, "m h e"],
+    k: Float[Array, "l h e"],
+    v: Float[Array, "l h e"],
+    count: Int[Array, ""] | None = None,
+    implementation: str = "auto",
+    query_chunk: int = 1024,
+) -> Float[Array, "m h e"]:
+    """Attention of every query to the first `count` tokens (None: to all)."""
+    resolved = resolve_implementation(implementation, max(len(q), len(k)), q.dtype)
+    if resolved == "chunked":
+        return chunked_attention(q, k, v, count, query_chunk)
+    lengths = None if count is None else count.astype(jnp.int32)[None]
+    out = jax.nn.dot_product_attention(
+        q[None], k[None], v[None], key_value_seq_lengths=lengths, implementation=resolved
+    )
+    return out[0]
+
+
+class Attention(nn.Module):
+    """Multi-head self-attention without biases; tokens (l, d) -> (l, d)."""
+
+    head_width: int
+    qk_norm: bool
+    execution: Execution
+    kernel_init: Any
+
+    @nn.compact
+    def __call__(self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> Float[Array, "l d"]:
+        length, width = tokens.shape
+        heads, dtype = width // self.head_width, self.execution.compute_dtype
+        dense = lambda features, name: nn.Dense(
+            features, use_bias=False, dtype=dtype, kernel_init=self.kernel_init, name=name
+        )
+        qkv = checkpoint_name(dense(3 * width, "qkv")(tokens), PRODUCT)
+        qkv = qkv.reshape(length, 3, heads, self.head_width)
+        q, k, v = qkv[:, 0], qkv[:, 1], qkv[:, 2]
+        if self.qk_norm:
+            q = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name="q_norm")(q)
+            k = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name="k_norm")(k)
+        out = attention(q, k, v, count, self.execution.attention, self.execution.attention_chunk)
+        out = checkpoint_name(out, PRODUCT)
+        return dense(width, "out")(out.reshape(length, width))
+
 
 INIT_STD = 0.02
 _POLICIES = {"full": None, "dots": jax.checkpoint_policies.save_only_these_names(PRODUCT)}

@@ -18,8 +18,8 @@ from flax.linen.dtypes import promote_dtype
 
 from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.configuration import Range, configuration
+from humangs_jax.network.bilinear import KERNEL
 from humangs_jax.network.convolution import Convolution
-from humangs_jax.network.neighborhoods import KERNEL
 
 SLOPE = 0.2
 MOMENTUM = 0.9
@@ -70,7 +70,7 @@ class UpConvolution(nn.Module):
 class OutputConvolution(nn.Module):
     """The last convolution, 3x3: (n, 9 c) neighbourhoods and (n,) coverages, pooled over views -> (n, features).
 
-    See `network.neighborhoods`. `everywhere` convolves a map instead; it is for looking at maps.
+    See `network.bilinear`. `everywhere` convolves a map instead; it is for looking at maps.
     """
 
     features: int

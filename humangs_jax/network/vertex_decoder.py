@@ -19,9 +19,8 @@ from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.geometry import quaternion
 from humangs_jax.geometry.transform import EXACT
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
-from humangs_jax.network.parts import HumanGSOutputs, Pass, Variables
-from humangs_jax.network.reader import VertexFeatures
-from humangs_jax.network.shells import Shells, on_the_person
+from humangs_jax.network.parts import HumanGSOutputs, Pass, Shells, Variables, VertexFeatures
+from humangs_jax.network.pixel_aligned import on_the_person
 from humangs_jax.rendering.gaussians import Gaussians
 
 FREQUENCIES = (1, 2, 4, 8, 16, 32)
@@ -90,7 +89,7 @@ class VertexDecoder:
             return cast(RawGaussians, self._module(features).apply(variables, entering))
 
         # where the body is wider than the person, all photos show the background
-        drop = run.config.conventions.pixels == "person" and features.shells is not None
+        drop = run.conventions.pixels == "person" and features.shells is not None
         raw = run.stage("raw heads", heads, {"local": features.local, "global_token": features.global_token})
         return run.stage(
             "canonical Gaussians", lambda raw: self._assemble(raw, features, canonical, unit, inputs.spacing, drop), raw

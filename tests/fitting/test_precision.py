@@ -24,9 +24,8 @@ from humangs_jax.fitting.state import Origin, camera_origin, cameras_of, clothin
 from humangs_jax.fitting.triangulation import triangulate_robustly
 from humangs_jax.geometry import camera, quaternion, svd3, transform
 from humangs_jax.network import vertex_decoder
+from humangs_jax.network.parts import Shells, VertexFeatures
 from humangs_jax.network.pixel_aligned import project_vertices
-from humangs_jax.network.reader import VertexFeatures
-from humangs_jax.network.shells import Shells
 from humangs_jax.network.vertex_decoder import RawGaussians, VertexDecoder
 from humangs_jax.rendering.gaussians import Gaussians, covariances, skin_gaussians
 from humangs_jax.rendering.projection import project_gaussians

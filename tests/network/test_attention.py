@@ -5,13 +5,13 @@ import pytest
 from jax.test_util import check_grads
 from rounding import bound
 
-from humangs_jax.network.attention import (
+from humangs_jax.network.execution import Execution
+from humangs_jax.network.transformer import (
     Attention,
     attention,
     chunked_attention,
     resolve_implementation,
 )
-from humangs_jax.network.execution import Execution
 
 FLOAT32_TOLERANCE = 2e-6
 """Outputs are averages of numbers of order one; a dozen float32 roundings."""

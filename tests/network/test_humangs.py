@@ -10,13 +10,12 @@ from network_cases import ALL_TOKENS, TINY, random_inputs, random_variables
 from humangs_jax.core.pytree import replace
 from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, paper_parts
-from humangs_jax.network.encoder import PatchTransformer, touched_patches
+from humangs_jax.network.encoder import PatchTransformer, pack_patches, touched_patches
 from humangs_jax.network.execution import Execution
 from humangs_jax.network.humangs import apply_humangs, encode, needed_reads, needed_tokens, read
 from humangs_jax.network.inputs import subject_unit
-from humangs_jax.network.parts import Encoding, Pass
+from humangs_jax.network.parts import Encoding
 from humangs_jax.network.reader import project_and_test
-from humangs_jax.network.tokenizer import pack_patches
 from humangs_jax.network.transformer import Block, TransformerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
 from humangs_jax.network.weights import expected_variables
@@ -126,7 +125,7 @@ def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
     )
     variables = variables_of(plain)
     features = read(variables, encode(variables, inputs, plain), inputs, plain)
-    decoder = plain.architecture.decoder.init(jax.random.key(0), features, inputs, Pass(plain))
+    decoder = plain.architecture.decoder.init(jax.random.key(0), features, inputs, plain.run())
     variables = {**variables, "params": {**variables["params"], "decoder": decoder["params"]}}
     fresh = run(variables, inputs, plain)[1].gaussians
     unit, k = subject_unit(inputs.canonical_vertices), DECODER.gaussians_per_vertex
@@ -269,7 +268,7 @@ def test_views_are_read_only_for_the_vertices_they_see():
     inputs = random_inputs()
     inputs = replace(inputs, depth_maps=inputs.depth_maps.at[0, :, :16].set(-1.0))
     variables, needed = variables_of(TINY), int(needed_reads(inputs, TINY))
-    seen = project_and_test(inputs, Pass(TINY))[1].sum(axis=1)
+    seen = project_and_test(inputs, TINY.run())[1].sum(axis=1)
     assert needed == seen.max() and seen.min() < needed
     of_capacity = lambda n: TINY.with_execution(vertex_capacity=n)
     reference, exact, tight = (run(variables, inputs, of_capacity(n))[1] for n in (None, needed, needed - 1))

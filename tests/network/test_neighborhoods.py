@@ -3,8 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.network.bilinear import sample_bilinear
-from humangs_jax.network.neighborhoods import sample_neighborhoods
+from humangs_jax.network.bilinear import sample_bilinear, sample_neighborhoods
 
 FLOAT64_TOLERANCE = 1e-12
 """The same sums in another order."""

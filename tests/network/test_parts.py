@@ -13,8 +13,7 @@ from humangs_jax.core.configuration import Width, config_from_json, config_to_js
 from humangs_jax.network.config import Architecture, paper_parts
 from humangs_jax.network.humangs import apply_humangs, decode, encode, init_humangs, read
 from humangs_jax.network.inputs import HumanGSInputs
-from humangs_jax.network.parts import Decoder, Encoder, Encoding, Pass, Reader, Variables
-from humangs_jax.network.reader import VertexFeatures
+from humangs_jax.network.parts import Decoder, Encoder, Encoding, Pass, Reader, Variables, VertexFeatures
 from humangs_jax.network.stages import Recorder
 from humangs_jax.network.vertex_decoder import positional_encoding
 from humangs_jax.network.weights import load_weights, save_weights

@@ -7,8 +7,7 @@ import pytest
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit
-from humangs_jax.network.pixel_aligned import UNSEEN_COLOR
-from humangs_jax.network.shells import on_the_person, sample_shells
+from humangs_jax.network.pixel_aligned import UNSEEN_COLOR, on_the_person, sample_shells
 
 BODY, COAT = 0.5, 0.8
 """Radii of two spheres about the origin."""

@@ -1,7 +1,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from humangs_jax.network.tokenizer import sample_triplane
+from humangs_jax.network.encoder import sample_triplane
 
 
 def test_planes_and_axes():

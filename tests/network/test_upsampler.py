@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from network_cases import random_like
 
-from humangs_jax.network.bilinear import sample_bilinear
-from humangs_jax.network.neighborhoods import sample_neighborhoods
+from humangs_jax.network.bilinear import sample_bilinear, sample_neighborhoods
 from humangs_jax.network.upsampler import MOMENTUM, OutputConvolution, UpConvolution, Upsampler, UpsamplerConfig
 
 CONFIG = UpsamplerConfig(hidden=4)

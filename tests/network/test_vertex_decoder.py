@@ -8,9 +8,7 @@ from network_cases import TINY, random_inputs
 
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry import quaternion
-from humangs_jax.network.parts import Pass
-from humangs_jax.network.reader import VertexFeatures
-from humangs_jax.network.shells import Shells
+from humangs_jax.network.parts import Shells, VertexFeatures
 from humangs_jax.network.vertex_decoder import (
     OBLIQUE,
     DecoderModule,
@@ -151,7 +149,7 @@ def test_scales_follow_the_spacing_of_vertices_and_nothing_else_does():
     inputs = random_inputs(vertices=4)
     decoder = VertexDecoder(hidden=8, tight=1, free=1)
     features = VertexFeatures(jnp.ones((4, 3)), jnp.ones(2))
-    run = Pass(TINY)
+    run = TINY.run()
     variables = decoder.init(jax.random.key(0), features, inputs, run)
     spacing = jnp.asarray([1.0, 0.5, 0.25, 2.0])
     as_trained = decoder.apply(variables, features, inputs, run).gaussians
