@@ -1,12 +1,10 @@
 """Weights on disk: one safetensors file, tensors under their path in the variables, their description in its header.
 
 Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format": "humangs-weights",
-"version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}; the first files have no checksum. Files of
-version 1 (one "config", which said how the network ran, too) still load. float16 halves the file (and rounds to 11 bits); loading
-gives float32.
+"version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}; the first files have no checksum. float16 halves
+the file (and rounds to 11 bits); loading gives float32.
 """
 
-import json
 import os
 from importlib import resources
 from pathlib import Path
@@ -87,18 +85,14 @@ def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, Huma
 
 def _load_weights(path):
     tensors, _, metadata = read_safetensors(path)
-    if metadata.get("format") != FORMAT or metadata.get("version") not in ("1", VERSION):
+    if metadata.get("format") != FORMAT or metadata.get("version") != VERSION:
         found = f"format {metadata.get('format')!r}, version {metadata.get('version')!r}"
-        raise ValueError(f"{path}: expected header format {FORMAT!r}, version {VERSION!r} or '1'; found {found}")
+        raise ValueError(f"{path}: expected header format {FORMAT!r}, version {VERSION!r}; found {found}")
     try:
-        if metadata["version"] == VERSION:
-            config = HumanGSConfig(
-                config_from_json(Architecture, metadata.get("architecture", "")),
-                config_from_json(Conventions, metadata.get("conventions", "")),
-            )
-        else:
-            config = config_of_version_1(metadata.get("config", ""))
-            tensors = {key.replace("params/readout/", "params/reader/"): x for key, x in tensors.items()}
+        config = HumanGSConfig(
+            config_from_json(Architecture, metadata.get("architecture", "")),
+            config_from_json(Conventions, metadata.get("conventions", "")),
+        )
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     variables = variables_from_tensors(tensors, config, str(path))
@@ -152,45 +146,6 @@ def fit_variables(variables: Variables, old: HumanGSConfig, new: HumanGSConfig) 
     fresh = flatten_variables(init_humangs(jax.random.key(0), new))  # compiles for a while: only where it is needed
     structure = jax.tree.structure(expected_variables(new))
     return jax.tree.unflatten(structure, [fit(key, leaf) for key, leaf in fresh.items()])
-
-
-def config_of_version_1(text: str) -> HumanGSConfig:
-    """The configuration of a file of version 1, where one object mixed architecture, conventions and execution.
-
-    Raises: ValueError for text that is not such a configuration.
-    """
-    try:
-        old = json.loads(text)
-        encoder, upsampler, sampling = (old.get(name, {}) for name in ("transformer", "upsampler", "sampling"))
-        upsampled = upsampler.get("enabled", True)
-        conventions = ("image_size", "tokens", "position_map", "ray_origins", "skinning", "rendering", "body_vertices")
-        transformer = _pick(encoder, "width", "layers", "mlp_ratio", "class_token")
-        new = {
-            "architecture": {
-                "encoder": {
-                    "kind": "humangs_jax.network.encoder.PatchTransformer",
-                    **_pick(old, "patch_size", "texture"),
-                    "transformer": transformer | _pick(encoder.get("attention", {}), "head_width", "qk_norm"),
-                    "upsampler": _pick(upsampler, "hidden", "features") if upsampled else None,
-                },
-                "reader": {
-                    "kind": "humangs_jax.network.reader.PixelAlignedReader",
-                    "output_width": upsampler.get("out", 768) if upsampled else None,
-                    **_pick(sampling, "sample_rgb", "shells"),
-                },
-                "decoder": {"kind": "humangs_jax.network.vertex_decoder.VertexDecoder"} | old.get("decoder", {}),
-            },
-            "conventions": _pick(old, *conventions, "longest_edge")
-            | _pick(sampling, "pool")
-            | {"pixel_grid": sampling.get("convention", "half_pixel")},
-        }
-    except (AttributeError, TypeError, json.JSONDecodeError) as error:
-        raise ValueError(f"config of version 1: {error!r}") from error
-    return config_from_json(HumanGSConfig, json.dumps(new))
-
-
-def _pick(values: dict[str, Any], *names: str) -> dict[str, Any]:
-    return {name: values[name] for name in names if name in values}
 
 
 def variables_from_tensors(tensors: dict[str, np.ndarray], config: HumanGSConfig, where: str) -> Variables:

@@ -31,7 +31,7 @@ from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import write_text
 from humangs_jax.io.tensor_file import read_safetensors
 from humangs_jax.network.config import Conventions, HumanGSConfig
-from humangs_jax.network.weights import SHIPPED, config_of_version_1
+from humangs_jax.network.weights import SHIPPED
 from humangs_jax.viewer.packing import fitted_shape, pack
 
 SCRIPTS = ("kinematics", "scene", "camera", "splatting", "motion_files", "skeletons", "controls", "main")
@@ -166,8 +166,6 @@ def _shipped_network() -> HumanGSConfig:
     """The network of the shipped weights, without reading their tensors; the default one if none are shipped."""
     with resources.as_file(resources.files("humangs_jax") / SHIPPED) as file:
         metadata = read_safetensors(file, lambda key: False)[2] if file.exists() else {}
-    if "config" in metadata:
-        return config_of_version_1(metadata["config"])
     return HumanGSConfig(conventions=config_from_json(Conventions, metadata.get("conventions", "{}")))
 
 

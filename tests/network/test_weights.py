@@ -92,8 +92,6 @@ def test_tensors_that_do_not_fit_are_named(file, change, message):
         ({"architecture": json.dumps({"encoder": {"kind": "antigravity.Encoder"}})}, "import their module first"),
         ({"architecture": json.dumps({"encoder": {"kind": "VertexDecoder"}})}, "a registered Encoder, one of "),
         ({"architecture": json.dumps({"encoder": {"kind": "PatchTransformer", "a": 1}})}, "encoder.a"),
-        ({"version": "1", "config": "[]"}, "config of version 1"),
-        ({"version": "1", "config": json.dumps({"patch_size": 8.5})}, "patch_size"),
     ],
 )
 def test_bad_headers_are_clear_errors(file, metadata, message):
@@ -182,70 +180,3 @@ def test_fitting_to_the_same_network_changes_nothing():
 def test_networks_that_differ_more_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         fit_variables(VARIABLES, TINY, TINY.with_parts(**changes))
-
-
-OF_VERSION_1 = {
-    "image_size": 32,
-    "patch_size": 8,
-    "tokens": "foreground",
-    "token_capacity": 16,
-    "position_map": "plain",
-    "skinning": "affine",
-    "rendering": "exact",
-    "body_vertices": None,
-    "longest_edge": None,
-    "ray_origins": "normalized",
-    "dtype": "float32",
-    "texture": {"resolution": 8, "channels": 2},
-    "transformer": {
-        "width": 16,
-        "layers": 4,
-        "mlp_ratio": 4,
-        "class_token": True,
-        "remat": False,
-        "remat_policy": "full",
-        "scan": False,
-        "attention": {"head_width": 8, "qk_norm": True, "implementation": "auto", "query_chunk": 1024},
-    },
-    "upsampler": {"enabled": True, "hidden": 8, "out": 8, "features": "intermediate"},
-    "sampling": {
-        "pool": "visible",
-        "convention": "half_pixel",
-        "sample_rgb": True,
-        "vertex_capacity": None,
-        "shells": [0.0, 0.015, 0.03, 0.05, 0.08, 0.12, 0.18],
-    },
-    "decoder": {
-        "hidden": 16,
-        "tight": 1,
-        "free": 2,
-        "skinning_joints": None,
-        "offset_scale": 0.25,
-        "initial_log_scale": -4.8,
-        "frame": "normal",
-        "residual_color": True,
-    },
-}
-"""The configuration in the header of a file that version 0.1 wrote for `tiny`."""
-
-
-def test_missing_fields_of_version_1_are_defaults():
-    config = weights.config_of_version_1(json.dumps({"transformer": {"layers": 8}}))
-    encoder, reader, _ = paper_parts(config.architecture)
-    assert encoder.transformer.layers == 8 and encoder.transformer.width == 768
-    assert encoder.upsampler is not None and reader.output_width == 768
-
-
-def test_files_of_version_1_load(tmp_path):
-    """One configuration for everything, and the output convolution under another name."""
-    tensors = {
-        key.replace("params/reader/", "params/readout/"): np.asarray(x)
-        for key, x in weights.flatten_variables(VARIABLES).items()
-    }
-    assert "params/readout/kernel" in tensors
-    header = {"format": weights.FORMAT, "version": "1", "config": json.dumps(OF_VERSION_1)}
-    save_file(tensors, tmp_path / "old.safetensors", header)
-    variables, config = load_weights(tmp_path / "old.safetensors")
-    assert config == TINY.trained
-    for ours, old in zip(jax.tree.leaves(variables), jax.tree.leaves(VARIABLES), strict=True):
-        np.testing.assert_array_equal(ours, old)
