@@ -50,7 +50,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     import jax
 
     from humangs_jax.network.config import paper_parts
-    from humangs_jax.network.humangs import needed_reads
+    from humangs_jax.network.reader import needed_reads
     from humangs_jax.network.weights import load_weights
 
     config = configured(arguments.preset, arguments.dtype, arguments.size)
@@ -60,7 +60,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     config = config.with_execution(tokens="all")
     variables = variables or random_variables(config)
     inputs = benchmark_inputs(config, arguments.views, arguments.size)
-    capacity = int(jax.jit(needed_reads, static_argnames="config")(inputs, config))
+    capacity = int(jax.jit(lambda x: needed_reads(x, config.run()))(inputs))
     seeing = lambda c: c.with_execution(vertex_capacity=capacity)
     packed, touched, share = foreground(inputs, config)
 

@@ -175,10 +175,10 @@ def pilot(arguments, config, on_the_fly, started, name) -> dict:
     """One run: scores on the validation people with 4 inputs and 6 targets each, and CPU seconds."""
     import jax
 
+    from experiments.training.grow import fit_variables
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import find_captures
     from humangs_jax.data.views import gaussian_body
-    from humangs_jax.network.weights import fit_variables
     from humangs_jax.objectives.metrics import outline_psnr
     from humangs_jax.people.bank import load_bank
     from humangs_jax.people.on_the_fly import OnTheFlyConfig

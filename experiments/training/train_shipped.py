@@ -14,6 +14,7 @@ humangs_jax/assets/weights.md.
 
 import os
 import signal
+import sys
 import threading
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,6 +23,8 @@ import tyro
 
 from humangs_jax.core.allocator import keep_freed_memory
 from humangs_jax.training.config import TrainConfig, small
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
 VALIDATION_SUBJECTS = 8
 
@@ -59,9 +62,10 @@ def main(
     import jax
     import numpy as np
 
+    from experiments.training.grow import fit_variables
     from humangs_jax.body.library import load_body
     from humangs_jax.data.loader import find_captures
-    from humangs_jax.network.weights import fit_variables, load_weights
+    from humangs_jax.network.weights import load_weights
     from humangs_jax.people.bank import load_bank
     from humangs_jax.people.writer import Layout, write_set
     from humangs_jax.training.loop import TrainingInterrupted, train

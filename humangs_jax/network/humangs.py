@@ -25,7 +25,6 @@ from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.encoder import touched_patches
 from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, PixelDecoder, Variables
-from humangs_jax.network.reader import project_and_test, view_weights
 from humangs_jax.network.stages import StageCaller, call
 
 PARTS = ("encoder", "reader", "decoder", "driver")
@@ -132,13 +131,6 @@ def part_variables(variables: Variables, part: str) -> Variables:
 def needed_tokens(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]:
     """The token capacity that these photos need: patches that the foreground touches, over all views."""
     return jnp.sum(touched_patches(inputs, config.architecture.encoder.patch_size), dtype=jnp.int32)
-
-
-def needed_reads(inputs: HumanGSInputs, config: HumanGSConfig) -> Int[Array, ""]:
-    """The vertex capacity that these photos need: the most vertices for which any view is read."""
-    run = config.run()
-    counted = view_weights(project_and_test(inputs, run)[1], inputs, run)
-    return jnp.max(jnp.sum(counted, axis=1, dtype=jnp.int32))
 
 
 def _example_inputs(config):

@@ -10,7 +10,7 @@ from typing import cast
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Bool, Float, Key
+from humangs_jax.core.array_types import Array, Bool, Float, Int, Key
 from humangs_jax.core.configuration import Spread, Width, part
 from humangs_jax.network.bilinear import KERNEL, sample_bilinear, sample_neighborhoods, texel_indices
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
@@ -120,3 +120,9 @@ def view_weights(visible: Bool[Array, "v n"], inputs: HumanGSInputs, run: Pass) 
     if run.conventions.pool == "visible":
         return visible
     return jnp.broadcast_to(inputs.present[:, None], visible.shape)
+
+
+def needed_reads(inputs: HumanGSInputs, run: Pass) -> Int[Array, ""]:
+    """The vertex capacity that these photos need: the most vertices for which any view is read."""
+    counted = view_weights(project_and_test(inputs, run)[1], inputs, run)
+    return jnp.max(jnp.sum(counted, axis=1, dtype=jnp.int32))

@@ -9,11 +9,12 @@ import pytest
 from network_cases import TINY, random_inputs, random_variables
 from safetensors.numpy import load_file, save_file
 
+from experiments.training.grow import fit_variables
 from humangs_jax.core.configuration import config_from_json, config_to_json
 from humangs_jax.network import presets, weights
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.humangs import apply_humangs
-from humangs_jax.network.weights import fit_variables, load_weights, save_weights
+from humangs_jax.network.weights import load_weights, save_weights
 
 ENCODER, READER, DECODER = paper_parts(TINY.architecture)
 VARIABLES = random_variables(TINY)
