@@ -2,7 +2,7 @@
 
     python experiments/paper/cost.py --page docs/paper.md --image docs/images/paper_cost.png
 
-The two readers of `network.systems` "back_projection" and "cross_attention", alone, on maps of the same width: forward passes
+The two readers of `experiments.systems` "back_projection" and "cross_attention", alone, on maps of the same width: forward passes
 over views, vertices and image sizes, in turns. Time is CPU time of all threads. Operations of attention are products of matrices,
 counted in the compiled program; back-projection has none: its weighted sums of four neighbours count as 8 a vertex, view and
 feature. Memory is what the program needs besides arguments and results. All patches are tokens, as in the paper.

@@ -278,12 +278,18 @@ def test_parts_that_do_not_fit_are_refused():
     ):
         with pytest.raises(ValueError, match=r"(SurfaceMap.size|driver.widths|CorrectionMLP.layers).*expected 1 to"):
             wrong()
-    many = small("lca").with_parts(driver=CorrectionMLP(8, 1, joints=5))
-    with pytest.raises(ValueError, match=r"driver\.joints 5: the pose has 2 joints"):
-        outputs = jax.eval_shape(lambda v: apply_humangs(v, inputs_of("lca"), many)[0], random_variables(many))
-        jax.eval_shape(lambda v, o: frame_outputs(v, o, tube(), BETAS, pose(), many), random_variables(many), outputs)
+    for driver, said in (
+        (CorrectionMLP(8, 1, joints=5), r"driver\.joints 5: the pose has 2 joints"),
+        (CorrectionMLP(8, 1, joints=2, gaussians_per_vertex=2), r"driver\.gaussians_per_vertex 2: the decoder gives"),
+    ):
+        other = small("lca").with_parts(driver=driver)
+        variables, inputs = random_variables(other), inputs_of("lca")
+        outputs = jax.eval_shape(lambda v, x, c: apply_humangs(v, x, c)[0], variables, inputs, other)
+        with pytest.raises(ValueError, match=said):
+            jax.eval_shape(lambda v, o, c: frame_outputs(v, o, tube(), BETAS, pose(), c), variables, outputs, other)
     with pytest.raises(ValueError, match="works on a map of the surface"):
-        jax.eval_shape(lambda: apply_humangs({}, replace(inputs_of("animatable"), texels=None), small("animatable"))[0])
+        mapless = replace(inputs_of("animatable"), texels=None)
+        jax.eval_shape(lambda: apply_humangs({}, mapless, small("animatable"))[0])
 
 
 @pytest.mark.slow
