@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy import ndimage
 
+from experiments.evaluation.real_person import FRAMES
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Bool, Float, UInt8
 from humangs_jax.core.progress import bar
@@ -39,8 +40,6 @@ from humangs_jax.io.npz import write_npz
 PACKAGE, VERSION = "pose2sim", "0.10.49"
 DEMO = "Pose2Sim/Demo_SinglePerson"
 CAMERAS = ("cam01", "cam02", "cam03", "cam04")
-FRAMES = (0, 12, 33, 66, 90)
-"""Of the videos: those that are measured."""
 STRAIGHT, BENT = "straight", "bent"
 """Photos without the lenses' distortion, and as they were taken."""
 SIZE, PERSON = 512, 440

@@ -5,7 +5,7 @@ import pytest
 
 from experiments.evaluation.real_cameras import camera_errors, seen_from, to_reference
 from experiments.evaluation.real_capture import VideoCamera, background, careful_mask, read_cameras
-from experiments.evaluation.real_person import Results, section
+from experiments.evaluation.real_rows import Results, section
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.geometry.camera import Camera, stack_cameras
 

@@ -1,0 +1,275 @@
+"""The rows of `real_person.py`: what the package makes of the man, and how it is scored."""
+
+import dataclasses
+import functools
+import itertools
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments.common.results import markdown_table, write_json
+from experiments.evaluation.options import shipped_digest
+from experiments.evaluation.real_cameras import camera_errors, reference_cameras, seen_from, to_reference
+from experiments.evaluation.real_capture import (
+    PACKAGE,
+    SIZE,
+    VERSION,
+    RealFrame,
+    body_ious,
+    drawn_psnrs,
+    drawn_scores,
+    held_out,
+    prepare,
+)
+from experiments.evaluation.real_people import (
+    as_fitted,
+    one_view_each,
+    person_in_rooms,
+    started,
+    video_sizes,
+    without_calibration,
+)
+from humangs_jax.avatar.avatar import Avatar
+from humangs_jax.avatar.reconstruct import reconstruct
+from humangs_jax.body.library import load_body
+from humangs_jax.core.progress import bar
+from humangs_jax.data.capture import Capture
+from humangs_jax.data.photos import Photos, load_photos
+from humangs_jax.evaluation.tables import mean_scores
+from humangs_jax.fitting.fit_capture import FittedCapture, fit_photos
+from humangs_jax.fitting.refine import refine_capture
+from humangs_jax.fitting.refine_rounds import usual_config
+from humangs_jax.network.weights import SHIPPED, load_weights
+from humangs_jax.refinement.config import ROUNDS, RefineConfig
+from humangs_jax.refinement.refine import refine
+
+PSNRS = {"psnr": ("held out", 1), "psnr_foreground": ("foreground", 2)}
+CAMERAS = {"degrees": ("cameras: degrees", 1), "centimetres": ("cm", 1)}
+TABLES = (
+    (
+        ("calibrated", "uncalibrated", "poses", "moments"),
+        {"iou": ("IoU", 3), "iou_unseen": ("IoU, unseen", 3)} | PSNRS | CAMERAS,
+    ),
+    (("rooms",), {"iou": ("IoU", 3)} | PSNRS | CAMERAS),
+    (
+        ("start",),
+        {
+            "first": ("first time, s", 0),
+            "compiled": ("compiled, s", 0),
+            "first_processor": ("processor: first, s", 0),
+            "compiled_processor": ("compiled, s", 0),
+            "load": ("load", 0),
+        },
+    ),
+)
+"""First words of rows, and the columns of their scores: heading and digits."""
+SEEDS = (4_000_100, 4_000_101, 4_000_102)
+"""Of synthetic people."""
+MIXES = 2
+"""Of four moments."""
+
+
+class Results:
+    """Scores by label, row and frame, written after each."""
+
+    def __init__(self, file: Path, label: str) -> None:
+        self.file, settings = (
+            file,
+            {"capture": f"{PACKAGE} {VERSION}", "rounds": ROUNDS, "weights": shipped_digest(SHIPPED)},
+        )
+        self.all: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+        self.rows = self.all.setdefault(label, {"settings": settings, "rows": {}})["rows"]
+
+    def measure(self, row: str, case: str, scores: Callable[[], dict[str, Any]]) -> None:
+        """Of one case of a row, unless it is there."""
+        cases = self.rows.setdefault(row, {})
+        if case not in cases:
+            cases[case] = scores()
+            write_json(self.file, self.all)
+        print(
+            f"{row}, {case}: " + ", ".join(f"{k} {v:.3f}" for k, v in cases[case].items() if isinstance(v, float)),
+            flush=True,
+        )
+
+
+# The package's way ---------------------------------------------------------------------------------------------------
+
+ALL = (0, 1, 2, 3)
+
+
+class Man:
+    """What the package makes of the capture; each thing once. frames: by number, and what else is to be looked at by name."""
+
+    def __init__(self, data: Path, frames: Sequence[int], ways: Sequence[str], masks: Sequence[str]) -> None:
+        self.data, self.numbers, self.ways, self.masks = data, list(frames), ways, masks
+        self.frames: dict[int | str, RealFrame] = dict(prepare(data, frames))
+        self.reference = reference_cameras(data)
+        self.photos, self.fits, self.body = map(functools.cache, (self._photos, self._fits, self._body))
+
+    def _photos(self, name: int | str, masks: str) -> Photos:
+        frame, place = self.frames[name], self.data / "captures" / f"{name}_{masks}"
+        frame.save(place, getattr(frame, masks))
+        return load_photos(place, fit_masks=True)
+
+    def _fits(self, name: int | str, masks: str, views: tuple[int, ...]) -> FittedCapture:
+        """By the keypoints of some views."""
+        photos, keypoints, at = self.photos(name, masks), self.frames[name].keypoints, np.asarray(views)
+        assert photos.masks is not None
+        confidences = keypoints.confidences[at]
+        keypoints = dataclasses.replace(keypoints, points=keypoints.points[at], confidences=confidences)
+        cameras = jax.tree.map(lambda leaf: leaf[at], photos.cameras)
+        names = tuple(photos.names[view] for view in views)
+        chosen = Photos(photos.images[at], photos.masks[at], cameras, photos.frames[at], names)
+        return fit_photos(chosen, keypoints, load_body())
+
+    def _body(self, name: int | str, masks: str, way: str = "refine", views: tuple[int, ...] = ALL) -> Capture:
+        """A capture of some views with its body, as `humangs start` finds it."""
+        if way == "fit":
+            return self.fits(name, masks, views).capture
+        fitted, moments = self.fits(name, masks, views), self.frames[name].moments
+        if moments is None:
+            config = usual_config(fitted=True, fixed_cameras=not fitted.camera_errors)
+        else:
+            config = usual_config(fitted=True, fixed_cameras=moments, calibrated=False)
+        return refine_capture(fitted.capture, keypoints=fitted.record.keypoints, config=config).capture
+
+
+def avatar_of(capture: Capture) -> Avatar:
+    """By the network, and rounds of the learned update."""
+    return refine(reconstruct(*load_weights(), capture), capture, RefineConfig(rounds=ROUNDS, steps=0))
+
+
+# Rows ----------------------------------------------------------------------------------------------------------------
+
+
+def calibrated(results: Results, man: Man) -> None:
+    """The published calibration and nothing else."""
+    cases = list(itertools.product(man.masks, man.ways, man.numbers))
+    for masks, way, number in bar(cases, desc="published calibration", unit="frame"):
+        row, made = f"calibrated, {way}, {masks}", functools.partial(_calibrated, man, number, masks, way)
+        results.measure(row, str(number), made)
+
+
+def _calibrated(man, number, masks, way):
+    frame, body = man.frames[number], man.body(number, masks, way)
+    known, unseen = held_out(body, frame, avatar_of), []
+    for view in ALL:
+        used = tuple(other for other in ALL if other != view)
+        blind = man.body(number, masks, way, used)
+        camera = seen_from(blind.cameras, used, man.reference.of(frame), view)
+        unseen += body_ious(dataclasses.replace(blind.select([0]), cameras=camera), frame.careful[[view]])
+    scores = mean_scores(known) | {"iou": float(np.mean(body_ious(body, frame.careful)))}
+    scores |= {"iou_unseen": float(np.mean(unseen))} | _errors(body.cameras, man.reference.of(frame))
+    return scores | {"each_psnr_foreground": [row["psnr_foreground"] for row in known], "each_iou_unseen": unseen}
+
+
+def poses(results: Results, man: Man) -> None:
+    """The avatar of one frame in the poses of the others."""
+    first = man.numbers[0]
+    for number in bar(man.numbers[1:], desc="other poses", unit="frame"):
+        results.measure(f"poses, avatar of frame {first}", str(number), functools.partial(_posed, man, first, number))
+
+
+def _posed(man, first, number):
+    avatar = avatar_of(man.body(first, "detected"))
+    return drawn_scores(avatar, man.body(number, "detected"), man.frames[number], ALL)
+
+
+def uncalibrated(results: Results, man: Man) -> None:
+    """Nothing is given: cameras from the person, in photos with the lenses' distortion."""
+    bent, sizes = prepare(man.data, man.numbers, straight=False), video_sizes(man.data)
+    for masks, number in bar(list(itertools.product(man.masks, man.numbers)), desc="no calibration", unit="frame"):
+        results.measure(
+            f"uncalibrated, {masks}",
+            str(number),
+            functools.partial(_uncalibrated, man, number, bent[number], sizes, masks),
+        )
+
+
+def _uncalibrated(man, number, frame, sizes, masks):
+    name = f"{number}_bent"
+    man.frames[name] = frame = without_calibration(frame, sizes)
+    body, reference = man.body(name, masks), man.reference.of(frame)
+    scores = mean_scores(held_out(body, frame, avatar_of)) | {"iou": float(np.mean(body_ious(body, frame.careful)))}
+    return scores | _errors(frame.cameras, reference, "_start") | _errors(body.cameras, reference)
+
+
+def _errors(own, reference, when=""):
+    degrees, centimetres = camera_errors(own, reference)
+    size = 1 / to_reference(own, reference).scale
+    return {
+        f"degrees{when}": float(degrees.mean()),
+        f"centimetres{when}": float(centimetres.mean()),
+        f"size{when}": size,
+        f"each_degrees{when}": degrees.tolist(),
+        f"each_centimetres{when}": centimetres.tolist(),
+    }
+
+
+def moments(results: Results, man: Man) -> None:
+    """Nothing is given, and each camera's photo is of another moment."""
+    bent, sizes = prepare(man.data, man.numbers, straight=False), video_sizes(man.data)
+    for first in bar(range(MIXES), desc="four moments", unit="mix"):
+        chosen = [man.numbers[(first + view) % len(man.numbers)] for view in ALL]
+        frames = [bent[number] for number in chosen]
+        results.measure("moments", "+".join(map(str, chosen)), functools.partial(_moments, man, frames, sizes, first))
+
+
+def _moments(man, frames, sizes, first):
+    frame = without_calibration(one_view_each(frames), sizes)
+    man.frames[f"moments_{first}"] = frame
+    ious = body_ious(man.body(f"moments_{first}", "detected"), frame.careful)
+    return {"iou": float(np.mean(ious)), "each_iou": ious, "taken_for_moments": float(frame.moments is True)}
+
+
+def rooms(results: Results, man: Man) -> None:
+    """Synthetic people in rooms: what true cameras, masks and poses give, and what photos alone give."""
+    for seed in bar(SEEDS, desc="people in rooms", unit="person"):
+        person = functools.cache(functools.partial(person_in_rooms, seed, man.data))
+        for way in ("true", "true cameras", "photos alone"):
+            results.measure(f"rooms, {way}", str(seed), functools.partial(_in_room, man, seed, person, way))
+
+
+def _in_room(man, seed, person, way):
+    frame, true, held = person()
+    if way == "true":
+        return drawn_psnrs(avatar_of(true), held)
+    name = f"person_{seed}_{way.replace(' ', '_')}"
+    if way == "photos alone":
+        focal = np.asarray(true.cameras.K, float)[:, 0, 0]
+        frame = without_calibration(frame, [(SIZE, SIZE)] * len(ALL), focal)
+    man.frames[name] = frame
+    body = man.body(name, "detected")
+    scores = drawn_psnrs(avatar_of(body), as_fitted(held, true, body))
+    return scores | {"iou": float(np.mean(body_ious(body, true.masks)))} | _errors(body.cameras, true.cameras)
+
+
+def start(results: Results, man: Man) -> None:
+    """The whole command."""
+    results.measure("start", str(man.numbers[0]), functools.partial(started, man.data, man.numbers[0]))
+
+
+ROWS = {each.__name__: each for each in (calibrated, poses, uncalibrated, moments, rooms, start)}
+
+
+def section(results: dict[str, Any]) -> str:
+    """The tables of the page: the man, people in rooms, seconds; means over the cases of each row."""
+    return "\n\n".join(filter(None, (_table(results, kinds, columns) for kinds, columns in TABLES)))
+
+
+def _table(results, kinds, columns):
+    rows = []
+    for label, each in results.items():
+        for row, cases in each["rows"].items():
+            if row.split(",")[0] in kinds and cases:
+                means = mean_scores({k: v for k, v in case.items() if isinstance(v, float)} for case in cases.values())
+                known = [means.get(key) for key in columns]
+                digits = [number for _, number in columns.values()]
+                shown = ["-" if v is None else f"{v:.{n}f}" for v, n in zip(known, digits, strict=True)]
+                rows.append([row, label, len(cases), *shown])
+    header = ["row", "state", "cases", *(heading for heading, _ in columns.values())]
+    return markdown_table(header, rows, "ll" + "r" * (len(header) - 2)) if rows else ""
