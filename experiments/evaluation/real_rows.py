@@ -33,6 +33,7 @@ from experiments.evaluation.real_people import (
     video_sizes,
     without_calibration,
 )
+from humangs_jax.apps.held_out import better_body
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.body.library import load_body
@@ -131,11 +132,17 @@ class Man:
         if way == "fit":
             return self.fits(name, masks, views).capture
         fitted, moments = self.fits(name, masks, views), self.frames[name].moments
-        if moments is None:
-            config = usual_config(fitted=True, fixed_cameras=not fitted.camera_errors)
-        else:
-            config = usual_config(fitted=True, fixed_cameras=moments, calibrated=False)
-        return refine_capture(fitted.capture, keypoints=fitted.record.keypoints, config=config).capture
+        fixed = not fitted.camera_errors if moments is None else moments
+        known = {"fixed_cameras": fixed, "calibrated": moments is None}
+        loose, tight = (
+            refine_capture(
+                fitted.capture,
+                keypoints=fitted.record.keypoints,
+                config=usual_config(fitted=True, tight=tight, **known),
+            ).capture
+            for tight in (False, True)
+        )
+        return better_body(*load_weights(), loose, tight, RefineConfig(rounds=ROUNDS, steps=0))[0]
 
 
 def avatar_of(capture: Capture) -> Avatar:

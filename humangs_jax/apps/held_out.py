@@ -8,6 +8,7 @@ from humangs_jax.avatar.reconstruct import reconstruct
 from humangs_jax.core.array_types import PyTree
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.exposure import equal_exposure
+from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.views import cropped
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
@@ -16,6 +17,8 @@ from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine
 
 LEAST_PHOTOS, SIZE = 4, 512
+CLEARLY = 0.1
+"""Decibels by which a second body has to be better."""
 
 
 class HeldOut(NamedTuple):
@@ -36,7 +39,7 @@ def held_out_psnr(
     `SIZE` pixels; None for fewer than four photos or without masks. Body and cameras are those of all photos. In its place is a
     second copy of the nearest photo: the programs for that number of photos are compiled already.
     """
-    capture = equal_exposure(capture)
+    capture = equal_exposure(usable_views(capture))
     if capture.masks is None or capture.view_count < LEAST_PHOTOS:
         return None
     views = np.arange(capture.view_count)
@@ -48,6 +51,18 @@ def held_out_psnr(
         avatar = refine(avatar, others, refinement)
     photo = cropped(capture.select([view]), SIZE)
     return HeldOut(capture.names[view], float(score(draw_views(avatar, photo).images, photo).psnr_foreground))
+
+
+def better_body(
+    variables: PyTree, config: HumanGSConfig, first: Capture, second: Capture, refinement: RefineConfig | None
+) -> tuple[Capture, HeldOut | None]:
+    """The capture whose body makes the better avatar, judged by a photo that is held out of it, and what that photo says.
+
+    More of the masks is covered by a body that fills clothes; the avatar is not better for it. Without enough photos the first.
+    """
+    one = held_out_psnr(variables, config, first, refinement)
+    two = None if one is None else held_out_psnr(variables, config, second, refinement)
+    return (second, two) if one is not None and two is not None and two.psnr > one.psnr + CLEARLY else (first, one)
 
 
 def _distances(capture):

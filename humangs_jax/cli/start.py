@@ -19,6 +19,7 @@ from humangs_jax.cli.options import (
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
 
 if TYPE_CHECKING:
+    from humangs_jax.apps.held_out import HeldOut
     from humangs_jax.apps.start import Material
     from humangs_jax.data.calibration.importing import ImportReport
     from humangs_jax.data.capture import Capture
@@ -97,7 +98,7 @@ class Start:
 
                 capture = load_capture(self.out, fit_masks=self.fit_masks)
             tell(f"{self.out} has a body: going on from there (--overwrite begins anew)")
-            self._finish(capture, limits)
+            self._finish(capture, None, limits)
             return
         if self.overwrite:
             tell_deleted(self.out)
@@ -122,7 +123,7 @@ class Start:
             raise ValueError(f"{self.photos}: {names} missing: make them as above and run the same command again")
         if detected:
             material = self._detect(material, detected)
-        self._finish(self._fit(material), limits)
+        self._finish(*self._fit(material), limits)
 
     def _from_photos_alone(self, material: "Material", limits: dict[str, Any] | None) -> None:
         """Cameras, keypoints and masks from the person in the photos."""
@@ -148,7 +149,7 @@ class Start:
         wrote(self.out / SHEET_FILE, "who was found in the photos")
         keypoints = self.out / KEYPOINTS_FILE if material.keypoints is None else material.keypoints
         material = dataclasses.replace(material, keypoints=keypoints)
-        self._finish(self._fit(material, found.one_moment), limits)
+        self._finish(*self._fit(material, found.one_moment), limits)
 
     def _detect(self, material: "Material", wanted: list[str]) -> "Material":
         """Masks and keypoints of the imported photos where there are none."""
@@ -192,10 +193,10 @@ class Start:
         require_replaceable(self.out, self.overwrite or begun or fitted, "capture.json", inputs)
         return fitted
 
-    def _finish(self, capture: "Capture", limits: dict[str, Any] | None) -> None:
+    def _finish(self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None) -> None:
         """The steps after the fit."""
         self._check(capture)
-        self._reconstruct(capture, limits)
+        self._reconstruct(capture, None if limits is None else estimate, limits)
 
     def _import(self, material: "Material") -> "ImportReport":
         """Photos and cameras as a capture folder."""
@@ -221,9 +222,12 @@ class Start:
             warn(f"photos were turned upright: {material.keypoints} should be of those in {self.out / 'images'}")
         return report
 
-    def _fit(self, material: "Material", one_moment: bool | None = None) -> "Capture":
-        """The body, written into the capture folder. one_moment: of photos alone, see `PhotosImported`."""
+    def _fit(self, material: "Material", one_moment: bool | None = None) -> "tuple[Capture, HeldOut | None]":
+        """The body, written into the capture folder, and what a held-out photo says of it, if it was asked. one_moment: of photos
+        alone, see `PhotosImported`.
+        """
         with stage("fitting the body"):
+            from humangs_jax.apps.held_out import better_body
             from humangs_jax.body.library import load_body
             from humangs_jax.data.capture import load_capture
             from humangs_jax.data.keypoints.reading import read_keypoints
@@ -232,6 +236,8 @@ class Start:
             from humangs_jax.fitting.fit_capture import fit_photos
             from humangs_jax.fitting.refine import refine_capture
             from humangs_jax.fitting.refine_rounds import usual_config
+            from humangs_jax.network.weights import load_weights
+            from humangs_jax.refinement.config import RefineConfig
 
             assert material.keypoints is not None
             photos = load_photos(self.out)
@@ -245,20 +251,29 @@ class Start:
             report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
             write_fitted(self.out, self.out, fitted.capture, report, fitted.record)
         tell(f"\n{report}")
-        capture = load_capture(self.out, fit_masks=self.fit_masks)
+        capture, estimate = load_capture(self.out, fit_masks=self.fit_masks), None
         if capture.masks is not None and (capture.masks > 0.5).any():
             with stage("refining the body by the masks"):
-                fixed = not (fitted.camera_errors or one_moment)
-                config = usual_config(fitted=True, fixed_cameras=fixed, calibrated=one_moment is None)
-                refined = refine_capture(capture, keypoints=keypoints, config=config)
-                capture, report = refined.capture, refined.report
+                fixed, calibrated = not (fitted.camera_errors or one_moment), one_moment is None
+                loose, tight = (
+                    refine_capture(
+                        capture,
+                        keypoints=keypoints,
+                        config=usual_config(fitted=True, fixed_cameras=fixed, tight=tight, calibrated=calibrated),
+                    )
+                    for tight in (False, True)
+                )
+            with stage("comparing bodies by a held-out photo"):
+                weights, rounds = load_weights(), RefineConfig(**ROUNDS_ALONE)
+                capture, estimate = better_body(*weights, loose.capture, tight.capture, rounds)
+            report = (tight if capture is tight.capture else loose).report
             tell(f"\n{report}")
         if self.height is not None:
             from humangs_jax.fitting.person_cameras import scaled_to_height
 
             capture = scaled_to_height(capture, self.height)
         write_fitted(self.out, self.out, capture, report, fitted.record)
-        return capture
+        return capture, estimate
 
     def _check(self, capture: "Capture") -> None:
         """The sheet of the body over the photos, and what it says."""
@@ -269,7 +284,7 @@ class Start:
         tell(f"\n{report}")
         wrote(self.out / "check.png", "the body over the photos: look at it")
 
-    def _reconstruct(self, capture: "Capture", limits: dict[str, Any] | None) -> None:
+    def _reconstruct(self, capture: "Capture", estimate: "HeldOut | None", limits: dict[str, Any] | None) -> None:
         """Avatar and page."""
         with stage("reconstructing"):
             from humangs_jax.avatar.reconstruct import reconstruct
@@ -290,11 +305,12 @@ class Start:
             tell(refinement.summary())
             if refinement.interrupted:
                 raise KeyboardInterrupt
-        with stage("holding one photo out"):
-            from humangs_jax.apps.held_out import held_out_psnr
-            from humangs_jax.refinement.config import RefineConfig
+        if estimate is None:
+            with stage("holding one photo out"):
+                from humangs_jax.apps.held_out import held_out_psnr
+                from humangs_jax.refinement.config import RefineConfig
 
-            estimate = held_out_psnr(*weights, capture, None if limits is None else RefineConfig(**ROUNDS_ALONE))
+                estimate = held_out_psnr(*weights, capture, None if limits is None else RefineConfig(**ROUNDS_ALONE))
         if estimate is not None:
             tell(estimate)
         with stage("writing the page"):

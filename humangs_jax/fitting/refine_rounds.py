@@ -102,21 +102,25 @@ FITTED = StateStd(focal=0.005, camera_rotation=1.0, camera_center=0.02, body_pos
 clothes would pull them away."""
 FROM_PERSON = dataclasses.replace(FITTED, focal=0.05, camera_rotation=2.0, camera_center=0.08)
 """The same with cameras that were found from the person."""
-SKIN = 0.001
-"""Metres, for `StateStd.clothing`: masks of somebody without clothes."""
+SKIN, TIGHT = 0.001, 0.015
+"""Metres, for `StateStd.clothing`: masks of somebody without clothes, and in tight ones."""
 
 
 def usual_config(
-    fitted: bool, *, fixed_cameras: bool = False, bare: bool = False, calibrated: bool = True
+    fitted: bool, *, fixed_cameras: bool = False, bare: bool = False, tight: bool = False, calibrated: bool = True
 ) -> CaptureRefineConfig:
-    """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given. bare: the person wears tight
-    clothes or none, and the body is to fill the masks. calibrated: False for cameras that were found from the person.
+    """Settings that suit what is known. fitted: the start is a fit to the keypoints that are given. bare: the body is to fill the
+    masks. tight: the person wears tight clothes. calibrated: False for cameras that were found from the person.
     """
     config = CaptureRefineConfig(fixed_cameras=fixed_cameras)
     if fitted:
         config = dataclasses.replace(config, std=FITTED if calibrated else FROM_PERSON, independent=100.0)
-    if bare or not calibrated:  # the masks are believed; cameras were fitted to these very keypoints
+    if bare or tight or not calibrated:  # the masks are believed; cameras were fitted to these very keypoints
         config = dataclasses.replace(config, keypoints_worse=math.inf)
+    if tight:
+        config = dataclasses.replace(
+            config, std=dataclasses.replace(config.std, clothing=TIGHT, betas=2.0, body_pose=10.0)
+        )
     if bare:
         std = dataclasses.replace(config.std, clothing=SKIN)
         config = dataclasses.replace(config, std=std, robust_scales=(1.0, 1.0))

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from humangs_jax.apps import held_out
-from humangs_jax.apps.held_out import held_out_psnr
+from humangs_jax.apps.held_out import better_body, held_out_psnr
 from humangs_jax.body.decimation import decimate
 from humangs_jax.body.library import load_body
 from humangs_jax.network.presets import tiny
@@ -31,3 +31,15 @@ def test_few_photos_and_photos_without_masks_hold_none_out(body):
     capture = toy_capture(body, toy_avatar(body, 0.0), views=4)
     assert held_out_psnr({}, tiny(), capture.select([0, 1, 2]), None) is None
     assert held_out_psnr({}, tiny(), dataclasses.replace(capture, masks=None), None) is None
+
+
+def test_the_body_with_the_better_avatar_is_taken(body, monkeypatch):
+    capture = toy_capture(body, toy_avatar(body, 0.0), views=4)
+    other, wrong = dataclasses.replace(capture, body_file="other"), {}
+    monkeypatch.setattr(held_out, "reconstruct", lambda _, __, photos: toy_avatar(body, wrong[photos.body_file]))
+    for first, second, taken in ((0.15, 0.0, other), (0.0, 0.15, capture), (0.0, 0.0, capture)):
+        wrong |= {capture.body_file: first, "other": second}
+        found, estimate = better_body({}, tiny(), capture, other, None)
+        assert found is taken and estimate.psnr > 25
+    few = capture.select([0, 1])
+    assert better_body({}, tiny(), few, other, None) == (few, None)
