@@ -229,7 +229,6 @@ class Start:
         with stage("fitting the body"):
             from humangs_jax.apps.held_out import better_body
             from humangs_jax.body.library import load_body
-            from humangs_jax.data.capture import load_capture
             from humangs_jax.data.keypoints.reading import read_keypoints
             from humangs_jax.data.photos import load_photos
             from humangs_jax.fitting.files import write_fitted
@@ -240,7 +239,7 @@ class Start:
             from humangs_jax.refinement.config import RefineConfig
 
             assert material.keypoints is not None
-            photos = load_photos(self.out)
+            photos = load_photos(self.out, fit_masks=self.fit_masks)
             height, width = photos.images.shape[1:3]
             found_here = material.keypoints.parent == self.out  # of the one person who was chosen
             person = None if found_here else self.person
@@ -249,9 +248,8 @@ class Start:
         with stage("examining the fit"):
             report = fitted.report
             report = dataclasses.replace(report, warnings=(*report.warnings, *keypoints.warnings))
-            write_fitted(self.out, self.out, fitted.capture, report, fitted.record)
         tell(f"\n{report}")
-        capture, estimate = load_capture(self.out, fit_masks=self.fit_masks), None
+        capture, estimate = fitted.capture, None
         if capture.masks is not None and (capture.masks > 0.5).any():
             with stage("refining the body by the masks"):
                 fixed, calibrated = not (fitted.camera_errors or one_moment), one_moment is None
