@@ -178,7 +178,6 @@ def test_from_photos_to_images(folder, tmp_path, monkeypatch, capsys):
         (["FOLDER", "--scan", "scan.obj"], "give either a CAPTURE folder or --scan MESH"),
         (["FOLDER"], "body.npz exists: --overwrite replaces it"),
         (["FOLDER", "--keypoints", "k.json"], "body.npz exists: --overwrite replaces it"),
-        (["FOLDER", "--photometric"], "--photometric is for --refine, not for --keypoints"),
         (["FOLDER", "--bare"], "--bare is for --scan or --refine, not for --keypoints"),
         (["FOLDER", "--refine", "--smoothness", "0.1"], "--smoothness is for --keypoints, not for --refine"),
         (["FOLDER", "--keypoints", "k.json", "--out", "new"], "k.json"),

@@ -10,14 +10,13 @@ stay. Photos of 512 px. What it is refined by:
     clothed            masks of the dressed person with hair, as photos have them
     keypoints          COCO's 17, normal errors of --noise-px, no masks
     clothed+keypoints  both
-    clothed+photos     dressed masks, then the colours of the photos
 
 --json writes {"cases": {case: means}, "subjects": [{"seed", "cases": {case: row}}], "settings"} after every person. A row has
 `iou_before`, `iou_after` (body against the masks of the case), `bare_iou_before`, `bare_iou_after` (against the true body),
 `joints_before_mm`, `joints_after_mm` (mean over the body's 22 joints, in the world), `aligned_before_mm`, `aligned_after_mm`
 (after the best rigid motion, since cameras and person moved together look the same), `focal_before_percent`,
-`focal_after_percent`, `seconds`, `refined` (1: kept), and with photos `psnr_before`, `psnr_after` of the reconstructed avatar,
-dB. --images writes the body over the photos, before and after. About 10 s of CPU time a case and person, 25 s with photos,
+`focal_after_percent`, `seconds`, `refined` (1: kept).
+--images writes the body over the photos, before and after. About 10 s of CPU time a case and person,
 and two minutes of compiling.
 """
 
@@ -33,7 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import check_section, markdown_table, publish, write_json
 
 TABLE = "fit_refinement"
-CASES = ("bare", "clothed", "keypoints", "clothed+keypoints", "clothed+photos")
+CASES = ("bare", "clothed", "keypoints", "clothed+keypoints")
 
 
 def main() -> None:
@@ -97,15 +96,10 @@ def refine_subject(seed: int, body: Any, arguments: argparse.Namespace) -> dict[
         start = truth if arguments.exact else disturbed(truth, seed)
         given = dataclasses.replace(start, masks=None) if case == "keypoints" else start
         begun = time.perf_counter()
-        refined = refine_capture(
-            given, keypoints=keypoints if "keypoints" in case else None, photometric="photos" in case
-        )
+        refined = refine_capture(given, keypoints=keypoints if "keypoints" in case else None)
         seconds = time.perf_counter() - begun
         rows[case] = scores(start, refined.capture, truth, bare.masks)
         rows[case] |= {"seconds": seconds, "refined": float(refined.report.kept)}
-        if "avatar_psnr" in refined.report.errors:
-            psnr = refined.report.errors["avatar_psnr"]
-            rows[case] |= {"psnr_before": float(psnr.before or 0), "psnr_after": psnr.after}
         if arguments.images:
             draw(arguments.images / f"{seed}_{case}.png", start, refined.capture)
     return rows

@@ -66,14 +66,12 @@ class Refinement:
     """Improve cameras, shape and poses by masks and keypoints: those of the fit, or --keypoints. Never worse than the start."""
     fixed_cameras: bool = False
     """Leave cameras as they are. Else a fit to keypoints turns back those that they show to be turned, and --refine moves all."""
-    photometric: bool = False
-    """Also compare photos and renderings of a reconstruction while refining."""
 
 
 Way = Literal["--scan", "--refine", "--keypoints"]
 WAYS: dict[Way, set[str]] = {
     "--scan": {"keypoints", "person", "body", "joints", "views", "height", "bare"},
-    "--refine": {"keypoints", "person", "photometric", "fixed_cameras", "bare"},
+    "--refine": {"keypoints", "person", "fixed_cameras", "bare"},
     "--keypoints": {"person", "body", "smoothness", "fixed_cameras"},
 }
 """The three ways to fit, by the option that chooses each, and their other options."""
@@ -204,8 +202,7 @@ class Fit:
         fixed, bare = self.refinement.fixed_cameras, self.scan.bare
         config = usual_config(record is not None, fixed_cameras=fixed, bare=bare)
         with stage("refining cameras and body"):
-            photometric = self.refinement.photometric
-            refinement = refine_capture(start, keypoints=keypoints, photometric=photometric, config=config)
+            refinement = refine_capture(start, keypoints=keypoints, config=config)
         tell(refinement.report)
         if not refinement.report.kept:
             tell("nothing was written: refinement did not improve the capture")

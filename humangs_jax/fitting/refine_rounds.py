@@ -76,8 +76,8 @@ class CaptureRefineConfig:
     solver in each. points: of an outline.
     independent: number of independent equations that all points of a view count for. reach: how far points look in the first and
     the last round, shares of the person's height in the image. robust_scales: multiples of the reach, outwards and inwards of
-    the mask. longest_side: larger photos are shrunk to this many pixels. color_steps: of L-BFGS. independent_colors: as
-    independent, of the pixels of a view. keypoints_worse: a result whose keypoints' error is more than this multiple of the
+    the mask. longest_side: larger photos are shrunk to this many pixels.
+    keypoints_worse: a result whose keypoints' error is more than this multiple of the
     start's is not kept; a fit to them made it small, right results have 0.8 to 1.07, wrong bodies that fill clothes 1.8.
     """
 
@@ -92,8 +92,6 @@ class CaptureRefineConfig:
     reach: tuple[float, float] = (0.08, 0.015)
     robust_scales: tuple[float, float] = (1.0, 0.5)
     longest_side: int = 512
-    color_steps: int = 15
-    independent_colors: float = 100.0
     keypoints_worse: float = 1.3
 
 

@@ -24,7 +24,6 @@ NAMED = 5
 LABELS = {
     "keypoint_error_px": ("keypoints, median error", "{:.2f} px"),
     "silhouette_iou": ("silhouette IoU", "{:.3f}"),
-    "avatar_psnr": ("avatar against the photos", "{:.2f} dB"),
     "loss": ("loss", "{:.4f}"),
     "scan_outside_median_mm": ("scan outside of the skin, median", "{:.1f} mm"),
     "scan_outside_5_mm": ("scan outside of the skin, 5 % below", "{:.1f} mm"),

@@ -8,8 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.body.decimation import decimate
 from humangs_jax.body.landmarks import landmark_model, pose_landmarks
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
@@ -17,16 +15,12 @@ from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
-from humangs_jax.data.views import SubjectViews
 from humangs_jax.fitting import refine as module
-from humangs_jax.fitting.refine import by_colors, refine_capture
+from humangs_jax.fitting.refine import refine_capture
 from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene, Score, start_state, usual_config
-from humangs_jax.fitting.residuals.colors import Likeness, draw
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
-from humangs_jax.rendering.gaussians import Gaussians
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
-from humangs_jax.rendering.splat_config import SplatConfig
 from tests.fitting.fit_people import default_body, rotations_of
 
 SIZE, VIEWS = 192, 3
@@ -177,8 +171,6 @@ def test_nothing_to_refine_by_is_an_error(masks):
         refine_capture(blind)
     with pytest.raises(CaptureError, match="no keypoints"):
         refine_capture(blind, keypoints=keypoints(confidence=0.0))
-    with pytest.raises(CaptureError, match="needed for colours"):
-        refine_capture(blind, keypoints=keypoints(), photometric=True)
 
 
 @pytest.mark.parametrize(
@@ -229,31 +221,3 @@ def test_keypoints_weigh_by_the_noise_that_the_body_finds():
 def test_keypoints_of_other_views_are_an_error():
     with pytest.raises(ValueError, match="of 3 views, but the capture has 2"):
         refine_capture(truth().select([0, 1]), keypoints=keypoints())
-
-
-@pytest.mark.slow  # compiles the renderer and its gradient
-def test_colours_alone_turn_cameras_and_poses_back():
-    """A painted body of Gaussians, drawn by the renderer: what is off comes back through its gradient."""
-    size, capture = 48, truth()
-    body = decimate(default_body(), 600)
-    rest, count = shape_body(body, jnp.zeros(3)), len(body.template)
-    rng = np.random.default_rng(0)
-    colors = 0.5 + 0.5 * jnp.sin(rest.vertices @ jnp.asarray(rng.normal(0, 12, (3, 3)), jnp.float32))
-    identity = jnp.tile(jnp.asarray([1.0, 0, 0, 0]), (count, 1))
-    gaussians = Gaussians(rest.vertices, identity, jnp.full((count, 3), 0.02), jnp.full(count, 0.9), colors)
-    avatar = Avatar(
-        gaussians, body.skinning_weights, rest.vertices, rest.joints, body.faces, body.parents, body.joint_names
-    )
-    small = dataclasses.replace(capture, cameras=capture.cameras.resized(size, size))
-    config = SplatConfig(max_pairs=1 << 14)
-    per_view = lambda c: jax.tree.map(lambda leaf: jnp.repeat(leaf, VIEWS, 0), c.poses)
-    images = draw(avatar, per_view(small), small.cameras, config)
-    start = turned(small, 1.0)
-    views = SubjectViews(
-        images, jnp.ones((VIEWS, size, size)), start.cameras, *jax.tree.leaves(per_view(start)), jnp.zeros(3)
-    )
-    likeness = Likeness(avatar, views, 0.0, 0.05, config)
-    moved, outcome = by_colors(likeness, start, CaptureRefineConfig(color_steps=30, independent_colors=1000.0))
-    assert float(outcome.after) < 0.2 * float(outcome.before)
-    off = lambda c: float(jnp.mean(jnp.square(draw(avatar, per_view(c), c.cameras, config) - images)))
-    assert off(moved) < 0.2 * off(start)
