@@ -48,7 +48,8 @@ def refine_capture(
 
     Arguments: keypoints: of the capture's views. config: after a fit to these keypoints, see `usual_config`. Views whose mask is
     empty take no part.
-    Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint; ValueError if the keypoints are of another number of views.
+    Raises: CaptureError if there is neither a mask that shows anybody nor a keypoint; ValueError if the keypoints are of another
+    number of views.
     """
     _check(capture, keypoints)
     scene = Scene(capture, keypoints, config)
