@@ -17,6 +17,8 @@ from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine
 
 LEAST_PHOTOS, SIZE = 4, 512
+LONGEST = 1024
+"""Pixels: larger photos are reduced, whose crops around the person would be all the same."""
 CLEARLY = 0.1
 """Decibels by which a second body has to be better."""
 
@@ -39,7 +41,10 @@ def held_out_psnr(
     `SIZE` pixels; None for fewer than four photos or without masks. Body and cameras are those of all photos. In its place is a
     second copy of the nearest photo: the programs for that number of photos are compiled already.
     """
-    capture = equal_exposure(usable_views(capture))
+    capture = usable_views(capture)
+    if max(capture.images.shape[1:3]) > LONGEST:
+        capture = capture.resized(LONGEST)
+    capture = equal_exposure(capture)
     if capture.masks is None or capture.view_count < LEAST_PHOTOS:
         return None
     views = np.arange(capture.view_count)

@@ -1,6 +1,6 @@
 """Photos without a calibration -> a capture without a body: the people in them are found, and from the person the cameras.
 
-See `fitting.person_cameras`. Of several people without cameras to match them by, the largest one of each photo is the person.
+See `fitting.person_cameras`; who is who in several photos: `apps.detect`.
 """
 
 import dataclasses
@@ -44,7 +44,7 @@ def import_photos(
     """Write the capture folder `out`, with keypoints.json and people.png, from photos alone; what is there is replaced.
 
     Arguments: person: number on people.png, where several may be meant. height: of the person, metres. masks: folder of masks of
-    another program. own_masks: whether the detector's masks are written where there are none.
+    another program. own_masks: whether the detector's masks are written.
     Raises: ValueError (one line) if no camera is found or several people may be meant; as `import_cameras`.
     """
     images, files = photo_files(folder)
@@ -77,7 +77,7 @@ def import_photos(
         dataclasses.replace(photo, name=f"{Path(view['image']).stem}.png", size=size)
         for photo, view in zip(used, views, strict=True)
     ]
-    detect.add_to_capture(out, padded, number, masks=own_masks and masks is None)
+    detect.add_to_capture(out, padded, number, masks=own_masks)
     warnings = (*found.warnings, *report.checks.warnings)
     return PhotosImported(_lines(seen, found, report), warnings, photos, number, found.moments == 1 < len(used))
 

@@ -128,11 +128,11 @@ class Start:
     def _from_photos_alone(self, material: "Material", limits: dict[str, Any] | None) -> None:
         """Cameras, keypoints and masks from the person in the photos."""
         with stage("finding the person and the cameras"):
-            from humangs_jax.apps.detect import KEYPOINTS_FILE, SHEET_FILE
+            from humangs_jax.apps.detect import SHEET_FILE
             from humangs_jax.apps.photos_alone import import_photos
             from humangs_jax.io.text import write_json
 
-            own_masks = not (self.without_masks or material.alpha)
+            own_masks = not (self.without_masks or material.alpha or material.masks)
             found = import_photos(
                 material.images,
                 self.out,
@@ -147,8 +147,7 @@ class Start:
         for warning in found.warnings:
             warn(warning)
         wrote(self.out / SHEET_FILE, "who was found in the photos")
-        keypoints = self.out / KEYPOINTS_FILE if material.keypoints is None else material.keypoints
-        material = dataclasses.replace(material, keypoints=keypoints)
+        material = self._with_found(material, own_masks)
         self._finish(*self._fit(material, found.one_moment), limits)
 
     def _detect(self, material: "Material", wanted: list[str]) -> "Material":
@@ -167,9 +166,14 @@ class Start:
             detect.add_to_capture(self.out, people, person, masks="masks" in wanted)
         tell_found(people, person)
         tell(f"{' and '.join(wanted)} found in the photos: {self.out / detect.SHEET_FILE} shows them")
-        if material.keypoints is not None:
-            return material
-        return dataclasses.replace(material, keypoints=self.out / detect.KEYPOINTS_FILE)
+        return self._with_found(material, "masks" in wanted)
+
+    def _with_found(self, material: "Material", masks: bool) -> "Material":
+        """The material with what was found in the photos: keypoints where there are none, and perhaps masks."""
+        from humangs_jax.apps.detect import KEYPOINTS_FILE, MASKS
+
+        keypoints = material.keypoints or self.out / KEYPOINTS_FILE
+        return dataclasses.replace(material, keypoints=keypoints, masks=self.out / MASKS if masks else material.masks)
 
     def _photos(self) -> Path:
         """The folder of photos; that of a video is beside --out."""
@@ -227,6 +231,7 @@ class Start:
         alone, see `PhotosImported`.
         """
         with stage("fitting the body"):
+            from humangs_jax.apps.detect import MASKS
             from humangs_jax.apps.held_out import better_body
             from humangs_jax.body.library import load_body
             from humangs_jax.data.keypoints.reading import read_keypoints
@@ -239,7 +244,8 @@ class Start:
             from humangs_jax.refinement.config import RefineConfig
 
             assert material.keypoints is not None
-            photos = load_photos(self.out, fit_masks=self.fit_masks)
+            # the detector's own masks are at the photos' edges already
+            photos = load_photos(self.out, fit_masks=self.fit_masks and material.masks != self.out / MASKS)
             height, width = photos.images.shape[1:3]
             found_here = material.keypoints.parent == self.out  # of the one person who was chosen
             person = None if found_here else self.person

@@ -96,8 +96,7 @@ class PersonCameras:
 
     views: photos that are used. The rest is of these: cameras: one of each. landmarks: (c, k, 3) metres, of the person in each.
     moments: 1, or as many as photos: then each camera stands in a world of its own. mirrored: (c,) whether the detector exchanged
-    left and right. errors: (c,) median distance of landmarks from their pixels, pixels. focal_change: factor on the given or
-    supposed focal lengths. warnings: what a user should know.
+    left and right. errors: (c,) median distance of landmarks from their pixels, pixels. warnings: what a user should know.
     """
 
     views: tuple[int, ...]
@@ -106,7 +105,6 @@ class PersonCameras:
     mirrored: Bool[np.ndarray, " c"]
     moments: int
     errors: Float[np.ndarray, " c"]
-    focal_change: float
     warnings: tuple[str, ...]
 
 
@@ -136,7 +134,6 @@ def cameras_from_person(seen: PersonViews, *, height: float | None = None) -> Pe
         join("mirrored"),
         len(found),
         join("errors"),
-        float(np.mean([each.focal_change for each in found])),
         tuple(dict.fromkeys(warning for each in found for warning in each.warnings)),
     )
 
@@ -149,16 +146,14 @@ def cameras_of_moment(seen: PersonViews, *, height: float | None = None) -> Pers
     _check(seen, height)
     seen = _cleaned(seen)
     found = _with_mirrored(seen, _mirror(seen))
-    rig, evidence = found.rig, found.evidence
+    rig = found.rig
     if not all(np.isfinite(getattr(rig, field.name)).all() for field in dataclasses.fields(rig)):
         raise ValueError(f"{', '.join(seen.photos)}: no cameras were found that explain the landmarks of the person")
     if found.error > ONE_MOMENT or not _around(rig):
         raise SeveralMomentsError(
             f"landmarks are off by {found.error:.1%} of the person's size, at most {ONE_MOMENT:.1%} is expected"
         )
-    change = float(rig.focal[0] / evidence.focal[0])
-    weights = evidence.weights
-    medians = np.asarray([np.median(e[w > SEEN]) for e, w in zip(found.pixels, weights, strict=True)])
+    medians = np.asarray([np.median(e[w > SEEN]) for e, w in zip(found.pixels, found.evidence.weights, strict=True)])
     cameras, landmarks = _in_world(seen, rig, height)
     views = len(cameras)
     return PersonCameras(
@@ -168,7 +163,6 @@ def cameras_of_moment(seen: PersonViews, *, height: float | None = None) -> Pers
         found.mirrored,
         1,
         medians,
-        change,
         tuple(_warnings(seen, found.mirrored, height)),
     )
 

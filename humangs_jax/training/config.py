@@ -173,7 +173,7 @@ def small() -> TrainConfig:
     return TrainConfig(
         views=ViewSampling(input_counts=(1, 2, 4, 4, 4, 6), target_count=3, mixed_pose_share=0.2),
         loss=against_fog,
-        disturbances=Disturbances(share=1.0),
+        disturbances=Disturbances(share=0.4),
         optimizer=OptimizerConfig(learning_rate=5e-4, warmup_steps=100),
         target_size=256,
         steps=20_000,

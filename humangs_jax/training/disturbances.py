@@ -24,9 +24,10 @@ from humangs_jax.geometry.camera import Camera
 class Disturbances:
     """Standard deviations of normal distributions, unless said otherwise; one draw for each photo, or for each example.
 
-    share: of the examples that are disturbed; 0: none, and no work. exposure: of a photo, natural logarithm of the gain.
-    tint: of each channel of a photo, likewise. mask_pixels: masks are eroded or dilated by up to this, uniform, and the colour
-    of some background appears there. camera_degrees: of a camera about the person. camera_metres: its shift, each axis.
+    exposure: of every photo, natural logarithm of the gain. tint: of each channel of a photo, likewise.
+    share: of the examples that are disturbed in the other ways, too; 0: nothing is disturbed, and no work.
+    mask_pixels: masks are eroded or dilated by up to this, uniform, and the colour of some background appears there.
+    camera_degrees: of a camera about the person. camera_metres: its shift, each axis.
     pose_degrees: each axis of each joint, the same in all photos of an example, as are the following.
     body_metres: each axis of the translation. betas: each shape coefficient; the wrong shape is also that of the targets.
     """
@@ -43,7 +44,7 @@ class Disturbances:
 
 
 def disturb(key: Key, example: Example, body: BodyModel, config: Disturbances) -> Example:
-    """The example with disturbed inputs and betas, or as it is. Pure and jittable."""
+    """The example with other exposures, or with all of its inputs and betas disturbed. Pure and jittable."""
     choice_key, betas_key, views_key = jax.random.split(key, 3)
 
     def disturbed(example):
@@ -53,8 +54,21 @@ def disturb(key: Key, example: Example, body: BodyModel, config: Disturbances) -
         inputs = disturb_views(views_key, replace(inputs, betas=betas), pelvis, config)
         return replace(example, inputs=inputs, targets=replace(targets, betas=betas))
 
+    def exposed(example):
+        views = example.inputs
+        outside = 1 - views.masks[..., None]
+        images = _gains(views_key, len(views.images), views.images.dtype, config) * (views.images - outside) + outside
+        return replace(example, inputs=replace(views, images=jnp.clip(images, 0, 1)))
+
     chosen = jax.random.bernoulli(choice_key, config.share)
-    return jax.lax.cond(chosen, disturbed, lambda example: example, example)
+    return jax.lax.cond(chosen, disturbed, exposed, example)
+
+
+def _gains(key, count, dtype, config):
+    """(v, 1, 1, 3), one exposure for each photo."""
+    gain_key, tint_key = jax.random.split(key)
+    gain = config.exposure * jax.random.normal(gain_key, (count, 1, 1, 1), dtype)
+    return jnp.exp(gain + config.tint * jax.random.normal(tint_key, (count, 1, 1, 3), dtype))
 
 
 def disturb_views(key: Key, views: SubjectViews, pelvis: Float[Array, "3"], config: Disturbances) -> SubjectViews:
@@ -82,9 +96,8 @@ def disturb_photos(
     g, the mask m' and the colour b of a background.
     """
     count = len(images)
-    gain_key, tint_key, radius_key, background_key = jax.random.split(key, 4)
-    gain = config.exposure * jax.random.normal(gain_key, (count, 1, 1, 1), images.dtype)
-    gain = jnp.exp(gain + config.tint * jax.random.normal(tint_key, (count, 1, 1, 3), images.dtype))
+    gain_key, radius_key, background_key = jax.random.split(key, 3)
+    gain = _gains(gain_key, count, images.dtype, config)
     radii = jax.random.randint(radius_key, (count,), -config.mask_pixels, config.mask_pixels + 1)
     backgrounds = jax.random.uniform(background_key, (count, 1, 1, 3), images.dtype)
     cut = _grown(masks, radii, config.mask_pixels)

@@ -96,7 +96,7 @@ def test_a_wrong_focal_length_changes_distances_and_hardly_directions():
     found = cameras_from_person(seen_by(posed(), matrices, focal=1.15 * 1680))
     angles, centers, _ = errors_of(found, matrices)
     assert angles.max() < NOISY_DEGREES and centers.max() < NOISY_METRES
-    assert found.focal_change < 1
+    assert all(float(camera.K[0, 0]) < 1.15 * 1680 for camera in found.cameras)
 
 
 @pytest.mark.slow

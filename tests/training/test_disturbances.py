@@ -102,17 +102,33 @@ def test_all_photos_of_an_example_have_the_same_wrong_body(example):
     np.testing.assert_allclose(off.cameras.cam_from_world, views.cameras.cam_from_world, atol=ROUNDING)
 
 
-def test_a_share_of_the_examples_is_disturbed_and_targets_keep_photos_and_cameras(example, body):
+def test_every_example_has_its_exposures_a_share_the_rest_and_targets_keep_photos_and_cameras(example, body):
     settings = Disturbances(share=0.5)
     disturb = jax.jit(lambda key: disturbances.disturb(key, example, body, settings))
     changed = []
     for seed in range(12):
         after = disturb(jax.random.key(seed))
-        changed.append(not np.array_equal(after.inputs.images, example.inputs.images))
+        changed.append(not np.array_equal(after.inputs.betas, example.inputs.betas))
+        assert not np.array_equal(after.inputs.images, example.inputs.images)
+        if not changed[-1]:
+            same = replace(after.inputs, images=example.inputs.images)
+            jax.tree.map(np.testing.assert_array_equal, same, example.inputs)
+            _check_one_gain_a_channel(after.inputs.images, example.inputs)
         np.testing.assert_array_equal(after.inputs.betas, after.targets.betas)
         same = replace(after.targets, betas=example.targets.betas)
         jax.tree.map(np.testing.assert_array_equal, same, example.targets)
     assert 0 < sum(changed) < 12
+
+
+def _check_one_gain_a_channel(images, before):
+    """Whole pixels of the person have the ratio of their photo, the background is as white as before."""
+    for image, own, mask in zip(*map(np.asarray, (images, before.images, before.masks)), strict=True):
+        whole = (mask == 1)[..., None] & (image < 1) & (own > 0.1)
+        for channel in range(3):
+            at = whole[..., channel]
+            ratios = image[at, channel] / own[at, channel]
+            assert np.ptp(ratios) < 20 * ROUNDING  # over values from 0.1 on
+        np.testing.assert_allclose(image[mask == 0], own[mask == 0], atol=ROUNDING)
 
 
 def test_a_share_above_one_is_refused():
