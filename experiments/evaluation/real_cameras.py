@@ -30,7 +30,7 @@ STD = StateStd(
 CONFIG = CaptureRefineConfig(std=STD, coefficients=22, robust_scales=(1.0, 1.0), independent=100.0)
 """A body that fills the masks: for cameras, not for avatars."""
 TIMES = 4
-"""Refinements, each from the end of the one before: so many unknowns converge slowly."""
+"""Refinements one after the other: with this number of unknowns one does not converge."""
 
 
 class Reference(NamedTuple):

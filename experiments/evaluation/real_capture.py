@@ -45,7 +45,7 @@ STRAIGHT, BENT = "straight", "bent"
 SIZE, PERSON = 512, 440
 """Pixels a side of a photo, and of the man's height in it."""
 EVERY = 5
-"""The background is the median of each of so many frames."""
+"""The background is the median over every fifth frame."""
 Y_UP_FROM_Z_UP = np.asarray([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 SPREAD, DIFFERENT = 25, 0.07
 """Pixels of a video by which BlazePose's mask is dilated for the background; difference of colours from which on one is his."""
