@@ -24,8 +24,11 @@ from humangs_jax.geometry import quaternion, transform
 P = TypeVar("P", Photos, Capture)
 LEAST_DEGREES, MOST_DEGREES = 0.3, 8.0
 """Smaller errors hardly matter: a third of a degree is 1.5 cm at 3 m. Larger ones are no calibration that is a little off."""
-CLEAR = 5.0
-"""Standard errors from which on a rotation is no chance."""
+CLEAR, LEAST_GAIN = 5.0, 25.0
+"""Standard errors, and fall of the cost, from which on a rotation is no chance. A detector that errs alike in all landmarks of a
+view imitates one: on five synthetic people in rooms with exact cameras the cost fell by 5 to 16, on five photos of a man whose
+calibration is off by 32 to 121.
+"""
 PRIOR = np.radians(1.0)
 """Expected size of rotations: holds what cameras and points together can do without a residual."""
 ALIKE = 0.9
@@ -65,13 +68,14 @@ def find_camera_errors(photos: Photos | Capture, keypoints: Keypoints) -> tuple[
         return ()
     gradients, matrices = seen.equations()
     chosen: list[int] = []
+    gain = 0.0
     while len(chosen) < seen.count - 2:
         others = [c for c in range(seen.count) if c not in chosen]
         found = {c: _solved(gradients, matrices, [*chosen, c]) for c in others}
         best = max(others, key=lambda c: found[c].gain)
-        if found[best].clear < CLEAR:
+        if found[best].clear < CLEAR or found[best].gain < gain + LEAST_GAIN:
             break
-        chosen.append(best)
+        chosen, gain = [*chosen, best], found[best].gain
     if not chosen:
         return ()
     solved = _solved(gradients, matrices, chosen)
