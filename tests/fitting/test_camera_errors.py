@@ -77,6 +77,16 @@ def test_outliers_exchanged_sides_and_another_person_are_no_camera_errors():
     assert find_camera_errors(truth, nothing) == ()
 
 
+def test_landmarks_that_the_detector_hardly_sees_turn_no_camera():
+    """An error that all landmarks of a view share is a rotation, too, however small their scatter: the certainty decides."""
+    truth, keypoints = person(2, 1, 4)
+    points = np.array(keypoints.points)
+    points[1] += [3.0, 0.0]
+    for certainty, named in ((1.0, True), (0.1, False)):
+        found = find_camera_errors(truth, Keypoints(points, certainty * keypoints.confidences, keypoints.set))
+        assert bool(found) is named, certainty
+
+
 @pytest.mark.slow  # two fits
 def test_a_fit_turns_the_camera_back_and_says_so_and_check_names_it(tmp_path):
     truth, keypoints = person(1, 1, 4)
