@@ -9,10 +9,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from PIL import Image
 
-from experiments.evaluation.real_cameras import to_reference
 from experiments.evaluation.real_capture import CAMERAS, DEMO, SIZE, RealFrame, largest_person, read_frames
 from experiments.evaluation.subjects import HeldOut, make_evaluation_subject
 from humangs_jax.avatar.avatar import Avatar
@@ -27,6 +27,8 @@ from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.motion.loading import load_motion
 from humangs_jax.detection.blazepose import Networks
 from humangs_jax.fitting.person_cameras import PersonViews, cameras_from_person
+from humangs_jax.fitting.refine_rounds import posed_vertices
+from humangs_jax.fitting.similarity import align_points
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import image_size, read_image, resized, to_uint8
 
@@ -108,14 +110,19 @@ def person_in_rooms(seed: int, data: Path) -> tuple[RealFrame, Capture, Capture]
     return found, true, subject.held_out
 
 
-def as_fitted(held_out: Capture, true: Capture, body: Capture) -> Capture:
-    """The held-out views in the world of found cameras, with the found body."""
-    move, cameras = to_reference(body.cameras, true.cameras), []
-    for K, matrix in zip(held_out.cameras.K, held_out.cameras.cam_from_world, strict=True):
-        moved = np.asarray(matrix, float) @ move.matrix()
-        moved[:3] /= move.scale
-        cameras.append(Camera.from_opencv(K, moved, SIZE, SIZE))
-    cameras = stack_cameras(cameras)
+def as_fitted(held_out: Capture, true: Capture, body: Capture, same_world: bool) -> Capture:
+    """The held-out views with the found body. Unless it was found in the same world, a similarity that brings the true body to it
+    places them.
+    """
+    cameras = held_out.cameras
+    if not same_world:
+        own, there = (posed_vertices(each.body, jnp.asarray(each.betas), each.poses)[0] for each in (body, true))
+        move, moved = align_points(np.asarray(own, float), np.asarray(there, float), np.ones(len(own))), []
+        for K, matrix in zip(cameras.K, cameras.cam_from_world, strict=True):
+            matrix = np.asarray(matrix, float) @ move.matrix()
+            matrix[:3] /= move.scale
+            moved.append(Camera.from_opencv(K, matrix, SIZE, SIZE))
+        cameras = stack_cameras(moved)
     return dataclasses.replace(held_out, cameras=cameras, betas=body.betas, poses=body.poses, body=body.body)
 
 
