@@ -1,0 +1,73 @@
+"""Tables of formats: files, folders and data sets that can be read or written, a row each.
+
+A row names its code and imports it when it is first asked for, so that the command line, its help and the docs can list every
+format without importing any. A new format is one file and one line: `MOTIONS["mine"] = Format("my program's", "my.module:read",
+(".mine",))`.
+"""
+
+import dataclasses
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+FOLDER = ""
+"""Suffix of formats whose files lie in a folder."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Format:
+    """One kind of files; tables with more to say of each have a subclass."""
+
+    about: str
+    """Whose files these are, a few words: shown by `--help` and in the docs."""
+    code: str | Callable[..., Any]
+    """The function that reads or writes them; as text "package.module:function"."""
+    suffixes: tuple[str, ...] = ()
+    """Of its files, in lower case, with the dot; FOLDER for a folder. Empty: names do not tell."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any:
+        """What the code makes of the arguments."""
+        return imported(self.code)(*arguments, **options)
+
+
+F = TypeVar("F", bound=Format)
+
+
+class Formats(dict[str, F]):
+    """Formats by name, in the order in which they are asked."""
+
+    @property
+    def suffixes(self) -> tuple[str, ...]:
+        """All of them, each once."""
+        return tuple(dict.fromkeys(suffix for each in self.values() for suffix in each.suffixes))
+
+    def of(self, path: Path) -> "Formats[F]":
+        """Those whose files are called like this one, or are folders."""
+        suffix = FOLDER if path.is_dir() else path.suffix.lower()
+        return self.where(lambda each: suffix in each.suffixes)
+
+    def where(self, holds: Callable[[F], bool]) -> "Formats[F]":
+        """Those for which this holds."""
+        return Formats({name: each for name, each in self.items() if holds(each)})
+
+    def listed(self) -> str:
+        """All in one line, ".npz, .pkl: AMASS, AIST++; .json or a folder: LHM": by suffix, or by name where names do not tell."""
+        groups: dict[tuple[str, ...], list[str]] = {}
+        for name, each in self.items():
+            groups.setdefault(each.suffixes or (name,), []).append(each.about)
+        return "; ".join(f"{alternatives(key)}: {', '.join(abouts)}" for key, abouts in groups.items())
+
+
+def alternatives(suffixes: tuple[str, ...]) -> str:
+    """As errors name them: ".bvh, .glb or a folder"."""
+    words = [suffix or "a folder" for suffix in suffixes]
+    return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def imported(code: str | Callable[..., Any]) -> Callable[..., Any]:
+    """The function that "package.module:function" names; a function is itself."""
+    if not isinstance(code, str):
+        return code
+    module, _, name = code.partition(":")
+    return getattr(importlib.import_module(module), name)

@@ -1,0 +1,29 @@
+"""Tables of formats: listed without their code, which is imported when a row is called."""
+
+import sys
+from pathlib import Path
+
+from humangs_jax.core.registry import FOLDER, Format, Formats, alternatives
+
+TABLE = Formats(
+    one=Format("ours", "colorsys:rgb_to_hsv", (".npz", ".pkl")),
+    other=Format("theirs", "no.such.module:read", (".npz", ".pkl")),
+    folders=Format("a file per frame", lambda path: path.name, (".json", FOLDER)),
+)
+
+
+def test_a_table_lists_its_formats_without_importing_them(tmp_path):
+    sys.modules.pop("colorsys", None)
+    assert TABLE.listed() == ".npz or .pkl: ours, theirs; .json or a folder: a file per frame"
+    assert TABLE.suffixes == (".npz", ".pkl", ".json", "")
+    assert list(TABLE.of(Path("A.NPZ"))) == ["one", "other"] and list(TABLE.of(tmp_path)) == ["folders"]
+    assert "colorsys" not in sys.modules
+    assert TABLE["one"](1.0, 0.0, 0.0) == (0.0, 1.0, 1.0) and "colorsys" in sys.modules
+
+
+def test_a_row_added_in_one_line_is_listed_and_called(monkeypatch):
+    monkeypatch.setitem(TABLE, "mine", Format("my own", lambda path: path.stem, (".mine",)))
+    assert TABLE.listed().endswith("; .mine: my own")
+    assert [each(Path("walk.mine")) for each in TABLE.of(Path("walk.mine")).values()] == ["walk"]
+    assert alternatives(TABLE.suffixes) == ".npz, .pkl, .json, a folder or .mine"
+    assert Formats(a=Format("A", len), b=Format("B", len)).listed() == "a: A; b: B"
