@@ -96,7 +96,7 @@ def section(results: dict[str, Any]) -> str:
         if "error" in row:
             rows.append([name, "error", "", "", "", row["error"]])
             continue
-        numbers = [f"{row['reach']:.2f}", f"{row['psnr']:.1f}", f"{row['psnr_foreground']:.1f}"]
+        numbers = [f"{row['reach']:.2f}", f"{row['psnr']:.1f}", f"{row['psnr_fg']:.1f}"]
         rows.append([name, "warned" if row["warnings"] else "avatar", *numbers, (row["warnings"] or [""])[0]])
     return markdown_table(["case", "result", "reach", "PSNR", "on the person", "first line"], rows, "llrrrl")
 
@@ -111,7 +111,7 @@ def weights(change: Callable[[Any], Any]) -> Callable[[Any, Any], tuple[Any, Any
 
 def computed(dtype: str) -> Callable[[Any, Any], tuple[Any, Any]]:
     """Another type of number for the encoder's products."""
-    return lambda variables, config: (variables, config.with_execution(dtype=dtype))
+    return lambda variables, config: (variables, config.with_runtime(dtype=dtype))
 
 
 def in_type(dtype: str) -> Callable[[Any], Any]:

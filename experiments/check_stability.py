@@ -88,7 +88,7 @@ def with_room(cases):
     size = config.conventions.image_size
     examples = [Example(standardize(photos, size), standardize(targets, size)) for *_, photos, targets in cases]
     fitted = [fit_buffers(prepare_inputs(body, example.inputs, config), config) for example in examples]
-    config = max(fitted, key=lambda fit: fit.execution.token_capacity)
+    config = max(fitted, key=lambda fit: fit.runtime.token_capacity)
     return [(variables, config, body, example) for (variables, *_), example in zip(cases, examples, strict=True)]
 
 
@@ -123,7 +123,7 @@ def published_case(seed, size):
 
     body, capture = load_body(), load_capture("demo_capture")
     config = presets.published().with_conventions(image_size=size, body_vertices=4000)
-    config = config.with_execution(dtype="float32", tokens="foreground")
+    config = config.with_runtime(dtype="float32", tokens="foreground")
     variables = init_humangs(jax.random.key(seed), config)
     return variables, config, body, capture, load_capture("demo_capture/held_out").select(range(TARGETS))
 
@@ -146,14 +146,14 @@ def observe(case, name):
     with jax.enable_x64(wide), jax.default_matmul_precision(products):
         learned = cast(variables["params"]), cast(variables.get("batch_stats", {}))
         if name == "float16":
-            model = config.with_execution(dtype="float16", scan=False)
+            model = config.with_runtime(dtype="float16", scan=False)
             stages = {
                 stage: {"values": values}
                 for stage, values in observer(model, run)(*learned, cast(body), cast(example)).items()
             }
         else:
             run = dataclasses.replace(
-                run, model=config.with_execution(dtype="bfloat16" if name == "bfloat16" else "float32")
+                run, model=config.with_runtime(dtype="bfloat16" if name == "bfloat16" else "float32")
             )
             _, found = observe_subject(*learned, cast(body), cast(example), jax.random.key(0), run, NO_NETWORKS)
             stages = {x.name: {"values": x.values, "cotangents": x.cotangents, "gradients": x.gradients} for x in found}

@@ -28,7 +28,7 @@ PRESETS_HEAD = """
 
 `hg.PRESETS`, `--preset` of `reconstruct`, `animate`, `render`, `demo`; measured in [tradeoff.md](tradeoff.md).
 
-| preset | settings | `Execution.preset` |
+| preset | settings | `Runtime.preset` |
 |---|---|---|
 """
 
@@ -38,7 +38,7 @@ def page() -> str:
     from humangs_jax.apps.settings import Settings
     from humangs_jax.network.config import Conventions
     from humangs_jax.network.encoder import PatchTransformer
-    from humangs_jax.network.execution import Execution
+    from humangs_jax.network.runtime import Runtime
     from humangs_jax.network.vertex_decoder import VertexDecoder
     from humangs_jax.people.on_the_fly import OnTheFlyConfig
     from humangs_jax.refinement.config import RefineConfig
@@ -47,7 +47,7 @@ def page() -> str:
     from humangs_jax.training.config import TrainConfig
 
     classes = (
-        Execution,
+        Runtime,
         Conventions,
         PatchTransformer,
         VertexDecoder,
@@ -65,16 +65,16 @@ def page() -> str:
 def preset_rows() -> list[str]:
     """A row for each preset: what differs from the defaults."""
     from humangs_jax.apps.settings import PRESETS, Settings
-    from humangs_jax.network.execution import Execution
+    from humangs_jax.network.runtime import Runtime
 
     def changes(value: Any, usual: Any) -> list[str]:
-        names = [field.name for field in dataclasses.fields(value) if field.name != "execution"]
+        names = [field.name for field in dataclasses.fields(value) if field.name != "runtime"]
         return [f"{name} {getattr(value, name)}" for name in names if getattr(value, name) != getattr(usual, name)]
 
-    plain = Settings(), Execution()
+    plain = Settings(), Runtime()
     rows = []
     for name, preset in PRESETS.items():
-        own, network = ", ".join(changes(preset, plain[0])), ", ".join(changes(preset.execution, plain[1]))
+        own, network = ", ".join(changes(preset, plain[0])), ", ".join(changes(preset.runtime, plain[1]))
         rows.append(f"| `{name}` | {own} | {network or 'as trained'} |")
     return rows
 

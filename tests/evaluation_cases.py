@@ -7,8 +7,8 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import Capture, capture_from_arrays
-from humangs_jax.objectives.backbones import Convolution, channels, convolutions
-from humangs_jax.objectives.lpips import BACKBONES, Lpips
+from humangs_jax.losses.backbones import Convolution, channels, convolutions
+from humangs_jax.losses.lpips import BACKBONES, Lpips
 
 
 @functools.cache
@@ -41,7 +41,7 @@ def random_lpips(net) -> Lpips:
 
 
 def ellipse(height, width, tall=0.35, wide=0.2, soft=True):
-    """A mask of a person, roughly, with a soft outline."""
+    """A mask of a person, roughly, with a soft silhouette."""
     y, x = np.mgrid[:height, :width] + 0.5
     distance = np.hypot((y / height - 0.5) / tall, (x / width - 0.5) / wide)
     return (np.clip((1 - distance) * 12, 0, 1) if soft else (distance < 1)).astype(np.float32)

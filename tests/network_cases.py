@@ -10,7 +10,7 @@ from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables
 
 TINY = tiny()
-ALL_TOKENS = TINY.with_execution(tokens="all")
+ALL_TOKENS = TINY.with_runtime(tokens="all")
 
 
 def random_inputs(seed=0, views=2, vertices=20, size=32):

@@ -26,7 +26,7 @@ PATCH = 8
 
 @functools.cache
 def small(name: str) -> HumanGSConfig:
-    config = SYSTEMS[name]("bench").with_execution(scan=True, token_capacity=0)  # scan: compiles in less time
+    config = SYSTEMS[name]("bench").with_runtime(scan=True, token_capacity=0)  # scan: compiles in less time
     parts = config.architecture
     change = dataclasses.replace
     if name in PIXELS:

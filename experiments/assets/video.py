@@ -3,8 +3,8 @@
     python experiments/assets/video.py --image docs/images/video.png --json OUT --page docs/video.md
 
 The person is the shipped one, feed-forward (--avatar FILE for another). The walk is the shipped one, moved 2.5 metres forward.
-Times are CPU times of drawing the same frames of the walk, medians of rounds in which each way of drawing has its turn, as shares
-of that of the exact preset; PSNR is the lowest of the frames.
+Times are CPU times of drawing the same frames of the walk, medians of iterations in which each way of drawing has its turn, as
+shares of that of the exact preset; PSNR is the lowest of the frames.
 """
 
 import argparse
@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--avatar", type=Path, help="an avatar file instead of the shipped person")
     parser.add_argument("--image", type=Path, help="write the sheet here")
     parser.add_argument("--size", type=int, default=512, help="side of the images that are timed, pixels")
-    parser.add_argument("--repeats", type=int, default=5, help="rounds of timing; 0: none")
+    parser.add_argument("--repeats", type=int, default=5, help="iterations of timing; 0: none")
     add_outputs(parser, "video")
     arguments = parser.parse_args()
     from experiments.common.interleaved import prepare_process
@@ -156,7 +156,7 @@ def over_checks(image: "np.ndarray") -> "np.ndarray":
 
 
 def layered(avatar: "Avatar", motion: "Motion") -> "list[tuple[str, np.ndarray]]":
-    """The layers of an EXR file, as colours."""
+    """The layers of an EXR file, as colors."""
     import jax.numpy as jnp
     import numpy as np
 

@@ -30,7 +30,7 @@ def timed(function: Callable[[], object]) -> tuple[float, float]:
 
 
 def medians(runs: Mapping[str, Callable[[], object]], repeats: int, warm_up: int = 1) -> dict[str, np.ndarray]:
-    """(wall ms, CPU ms) of every run: medians over `repeats` rounds in which each has one turn."""
+    """(wall ms, CPU ms) of every run: medians over `repeats` iterations in which each has one turn."""
     for _ in range(warm_up):
         for run in runs.values():
             run()

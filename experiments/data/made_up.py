@@ -22,7 +22,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 SEEDS = (3_000_271, 3_000_584)
 """People who are written, of the split "demo"."""
 TIGHT = ("tank", "leggings", "socks")
-"""What all of them wear, with short hair: close to the skin, so that the body's outline tells whether it stands in its place."""
+"""What all of them wear, with short hair: close to the skin, so that the body's silhouette tells whether it stands in its
+place."""
 HANDS = slice(25, 40), slice(40, 55)
 COLUMNS = 10
 """Shape directions, and as many of expression, of an old SMPL-X file."""

@@ -171,7 +171,7 @@ def bodies_section(report: dict[str, Any]) -> str:
     """The table of the page: a row a body, what it costs and how well it matches."""
     bodies, settings = report["bodies"], report["settings"]
     tasks = [task for task in TASKS if task in bodies[PAINTED]]
-    keys = [key for key in ("psnr", "psnr_foreground", "lpips") if bodies[PAINTED]["novel"].get(key) is not None]
+    keys = [key for key in ("psnr", "psnr_fg", "lpips") if bodies[PAINTED]["novel"].get(key) is not None]
     header = [
         "body",
         "vertices",

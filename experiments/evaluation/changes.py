@@ -35,7 +35,7 @@ def photographed(seed: int, capture: Any) -> Any:
 
 
 def outcome(network, capture, held_out) -> dict[str, Any]:
-    """What becomes of one capture: {"error"}, or {"warnings", "reach", "psnr", "psnr_foreground"}.
+    """What becomes of one capture: {"error"}, or {"warnings", "reach", "psnr", "psnr_fg"}.
 
     reach: largest distance of a Gaussian from its vertex, in body heights. Raises: AssertionError: a number is not finite.
     """
@@ -58,11 +58,11 @@ def outcome(network, capture, held_out) -> dict[str, Any]:
     warnings = list(likely_mistakes(capture))
     assert np.isfinite(np.asarray(drawn.images)).all() and np.isfinite(np.asarray(drawn.alpha)).all()
     scores = score_tasks(drawn.images, held_out, alpha=drawn.alpha)["novel"]
-    return {"warnings": warnings, "reach": reach} | {name: scores[name] for name in ("psnr", "psnr_foreground")}
+    return {"warnings": warnings, "reach": reach} | {name: scores[name] for name in ("psnr", "psnr_fg")}
 
 
 def photos(change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    """Other colours on the person; white behind."""
+    """Other colors on the person; white behind."""
 
     def changed(capture):
         masks = capture.masks[..., None]

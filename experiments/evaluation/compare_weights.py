@@ -1,7 +1,7 @@
 """Weights, or two ways to use them, side by side: feed-forward and refined, of the same people.
 
-    python experiments/evaluation/refinement.py --split validation --seconds 5 --sizes 256 --rounds 0 --weights A --json a.json
-    python experiments/evaluation/compare_weights.py first=a.json trained=b.json --page docs/evaluation.md [--table NAME]
+    python experiments/evaluation/refinement.py --split validation --seconds 5 --sizes 256 --iterations 0 --weights A --json
+    a.json python experiments/evaluation/compare_weights.py first=a.json trained=b.json --page docs/evaluation.md [--table NAME]
 
 The scores are those of `refinement.py`, means over its people. Results may differ in --weights, --tokens, --crop and
 --skinning-reach.
@@ -18,7 +18,12 @@ from experiments.common.results import add_outputs, check_section, markdown_tabl
 
 COMPARED = ("weights", "tokens", "crop", "skinning_reach")
 """Settings that may differ."""
-SCORES = {"psnr": ("PSNR", 2), "psnr_foreground": ("on the person", 2), "ssim": ("SSIM", 4), "fog": ("fog", 3)}
+SCORES = {
+    "psnr": ("PSNR", 2),
+    "psnr_fg": ("on the person", 2),
+    "ssim": ("SSIM", 4),
+    "semi_transparent": ("semi_transparent", 3),
+}
 TASKS = {"novel": "same pose", "animation": "unseen poses"}
 
 
@@ -62,8 +67,8 @@ def compare(results: dict[str, Any]) -> dict[str, Any]:
 
 
 def by_person(results: dict[str, Any]) -> dict[str, Any]:
-    """{name: {seconds: PSNR on the person in the pose of the photos, of each person}}."""
-    score = lambda subject, cell, run: subject["cells"][cell][run]["novel"]["psnr_foreground"]
+    """{name: {seconds: foreground PSNR in the pose of the photos, of each person}}."""
+    score = lambda subject, cell, run: subject["cells"][cell][run]["novel"]["psnr_fg"]
     return {
         name: {run: [score(subject, cell, run) for subject in result["subjects"]] for run in runs}
         for name, result in results.items()

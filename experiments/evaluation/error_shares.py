@@ -1,12 +1,12 @@
-"""Where the error of reconstructions is: at the outline, in holes, in the colours of the person, or around the person.
+"""Where the error of reconstructions is: at the silhouette, in holes, in the colors of the person, or around the person.
 
     python experiments/evaluation/error_shares.py PEOPLE --weights before=OLD.safetensors now= [--sizes 256 512]
         [--views 4] [--targets 6] [--json OUT] [--page docs/evaluation.md]
 
 PEOPLE is a folder of captures with masks, such as `humangs synth --poses 2 --views 12 --close-views 0` writes them. NAME=
 without a file stands for the shipped weights. Numbers are means over all views of all people: PSNR; PSNR of the predicted
-colours under the true coverage; shares of the squared error; fog, also of the true images. About 20 s and 2 s a person on 2
-CPU cores.
+colors under the true coverage; shares of the squared error; semi-transparent foreground, also of the true images. About 20 s and
+2 s a person on 2 CPU cores.
 """
 
 import argparse
@@ -17,9 +17,9 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import add_outputs, markdown_table, write_outputs
 
 BAND = 3
-"""Pixels to either side that count as the outline."""
+"""Pixels to either side that count as the silhouette."""
 LEAST_COVERAGE = 0.05
-"""Below this coverage the predicted colour is undefined; the true one is used."""
+"""Below this coverage the predicted color is undefined; the true one is used."""
 TABLE = "evaluation_error_shares"
 
 
@@ -95,17 +95,19 @@ def measure(arguments: argparse.Namespace, weights: Path | None, size: int) -> d
 
 
 def _order(name):
-    """PSNR, then shares of the error, then fog."""
-    return not name.startswith("PSNR"), name.startswith("fog"), name
+    """PSNR, then shares of the error, then semi-transparent foreground."""
+    return not name.startswith("PSNR"), name.startswith("semi_transparent"), name
 
 
 def shares(rgb, alpha, image, mask) -> dict[str, float]:
-    """Squared error of one image by place, its PSNR, also under the true coverage, and fog. (h, w, 3) and (h, w)."""
+    """Squared error of one image by place, its PSNR, also under the true coverage, and semi-transparent foreground. (h, w, 3)
+    and (h, w).
+    """
     import jax.numpy as jnp
     import numpy as np
     from scipy import ndimage
 
-    from humangs_jax.objectives import metrics
+    from humangs_jax.losses import metrics
 
     psnr = lambda drawn: float(metrics.psnr(jnp.asarray(drawn), jnp.asarray(image)))
     error = ((np.clip(rgb, 0, 1) - image) ** 2).mean(-1)
@@ -116,14 +118,14 @@ def shares(rgb, alpha, image, mask) -> dict[str, float]:
     covered = color * mask[..., None] + 1 - mask[..., None]
     return {
         "PSNR": psnr(rgb),
-        "PSNR with the true outline and the predicted colours, dB": psnr(covered),
+        "PSNR with the true silhouette and the predicted colors, dB": psnr(covered),
         "squared error": float(error.mean()),
-        "share at the outline": float((error * ~(inner | outer)).mean()),
+        "share at the silhouette": float((error * ~(inner | outer)).mean()),
         "share in holes": float((error * (1 - alpha) * inner).mean()),
-        "share in colours": float((error * alpha * inner).mean()),
+        "share in colors": float((error * alpha * inner).mean()),
         "share around the person": float((error * outer).mean()),
-        "fog": float(metrics.fog(jnp.asarray(alpha), jnp.asarray(mask))),
-        "fog of the true images": float(metrics.fog(jnp.asarray(mask), jnp.asarray(mask))),
+        "semi_transparent": float(metrics.semi_transparent(jnp.asarray(alpha), jnp.asarray(mask))),
+        "semi_transparent of the true images": float(metrics.semi_transparent(jnp.asarray(mask), jnp.asarray(mask))),
     }
 
 

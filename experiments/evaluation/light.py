@@ -4,8 +4,8 @@
     python experiments/evaluation/light.py --subjects 8 --sheet docs/images/light.jpg
 
 "One pose": four photos of one pose. "Four poses": one photo of each of four poses. Two more poses are unseen. Avatars are those
-of the pass and of the four rounds of refinement. "True surface": the generator's own people, drawn in a new pose with the
-light that each point has in the photos of one pose. This is the best that an avatar with fixed colours can do.
+of the pass and of the four iterations of refinement. "True surface": the generator's own people, drawn in a new pose with the
+light that each point has in the photos of one pose. This is the best that an avatar with fixed colors can do.
 """
 
 import argparse
@@ -66,12 +66,12 @@ def evaluate(arguments) -> dict[str, Any]:
         if arguments.json:
             write_json(arguments.json, report)
     if arguments.sheet:
-        write_triples(arguments.sheet, images, 2, ("truth", "fixed colours", "light of the photos"))
+        write_triples(arguments.sheet, images, 2, ("truth", "fixed colors", "light of the photos"))
     return report
 
 
 def measure(variables, config, seed, body, size):
-    """Scores by avatar and task of one person; an unseen pose, true, and after the rounds without and with the light."""
+    """Scores by avatar and task of one person; an unseen pose, true, and after the iterations without and with the light."""
     import numpy as np
 
     from experiments.evaluation.pictures import cropped
@@ -100,11 +100,11 @@ def measure(variables, config, seed, body, size):
         photos, seen = capture_views(subject, body, posed, photographed), sorted({view.frame for view in photographed})
         for light, how in (("without", without_light), ("with", config)):
             avatar = reconstruct(variables, how, photos)
-            rounds = refine(avatar, photos, RefineConfig(steps=0, seconds=None))
-            for label, made in (("pass", avatar), ("4 rounds", rounds)):
+            iterations = refine(avatar, photos, RefineConfig(steps=0, seconds=None))
+            for label, made in (("pass", avatar), ("4 iterations", iterations)):
                 cells[f"{name}, {label}, {light}"] = scores_of(made, truth, seen)
             if name == "one pose":
-                images += list(draw_views(rounds, truth.select(shown)).images)
+                images += list(draw_views(iterations, truth.select(shown)).images)
     fixed = [
         dataclasses.replace(pose, normals=posed[0].normals, openness=posed[0].openness, lit=posed[0].lit)
         for pose in posed
@@ -133,9 +133,9 @@ def scores_of(avatar, truth, seen, drawn=None):
 def section(report):
     """The table of the page."""
     rows = []
-    shown = lambda scores: [f"{scores[key]:.2f}" for key in ("psnr", "psnr_foreground")]
+    shown = lambda scores: [f"{scores[key]:.2f}" for key in ("psnr", "psnr_fg")]
     for name, tasks in report["means"].items():
-        photos, avatar, light = name.split(", ") if ", " in name else ("", "true surface, fixed colours", "")
+        photos, avatar, light = name.split(", ") if ", " in name else ("", "true surface, fixed colors", "")
         still = shown(tasks["novel"]) if photos else ["", ""]
         rows.append([photos, avatar, light, *still, *shown(tasks["animation"])])
     header = [

@@ -3,7 +3,7 @@
     python experiments/evaluation/masks.py --subjects 8 --json OUT --page docs/stability.md
     python experiments/evaluation/masks.py --subjects 2 --sheet docs/images/masks.jpg
 
-Four photos of each person, in front of a room of 120 boxes of random colours, which a mask that is too large lets through. Masks
+Four photos of each person, in front of a room of 120 boxes of random colors, which a mask that is too large lets through. Masks
 are dilated or eroded by squares. "Exact": the true masks, and photos that were on white from the start.
 """
 
@@ -24,7 +24,7 @@ from humangs_jax.evaluation.tables import mean_scores
 PHOTOS = 4
 ERRORS = (0, -1, 1, -3, 3)
 """Pixels of 256 that the masks are too large."""
-AVATARS = ("pass", "4 rounds")
+AVATARS = ("pass", "4 iterations")
 TABLE = "masks"
 BOXES, LARGEST, NOISE = 120, 0.3, 0.03
 """Of a room: how many, their largest side in image heights, standard deviation of the noise on the photo."""
@@ -76,7 +76,7 @@ def evaluate(arguments) -> dict[str, Any]:
 
 
 def measure(variables, config, subject):
-    """Scores by masks and avatar of one person; a held-out view, true, and after the rounds without and with moved masks."""
+    """Scores by masks and avatar of one person; a held-out view, true, and after the iterations without and with moved masks."""
     from experiments.evaluation.pictures import frontal_view
     from experiments.evaluation.subjects import score_tasks
     from humangs_jax.avatar.reconstruct import reconstruct
@@ -114,7 +114,7 @@ def measure(variables, config, subject):
 
 
 def in_a_room(images, masks, seed):
-    """The photos, which are on white, in front of boxes of random colours; in 8 bits."""
+    """The photos, which are on white, in front of boxes of random colors; in 8 bits."""
     photos = []
     for i, (image, mask) in enumerate(zip(images, masks, strict=True)):
         rng, (height, width) = np.random.default_rng((seed, i)), mask.shape
@@ -141,7 +141,7 @@ def section(report):
     """The table of the page."""
     means = report["means"]
     pair = lambda name, key: [f"{means[f'{name}, {avatar}'][key]:.2f}" for avatar in AVATARS]
-    both = lambda name: [*pair(name, "psnr"), *pair(name, "psnr_foreground")]
+    both = lambda name: [*pair(name, "psnr"), *pair(name, "psnr_fg")]
     rows = [["exact", "photos on white", *both("exact")]]
     rows += [
         [f"{error:+d}" if error else "0", how, *both(f"{error}, {how}")]

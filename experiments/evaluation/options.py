@@ -72,7 +72,7 @@ def seeds_asked_for(arguments: argparse.Namespace, body: Any) -> list[int]:
 
 def load_lpips(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> Any:
     """The weights of LPIPS or None; ends with a message that names the file if it cannot be read."""
-    from humangs_jax.objectives.loss_networks import load_loss_networks
+    from humangs_jax.losses.loss_networks import load_loss_networks
 
     files = (arguments.lpips_backbone, arguments.lpips_heads, arguments.lpips_net)
     try:
@@ -97,7 +97,7 @@ def load_network(arguments: argparse.Namespace) -> tuple[Any, Any, str]:
         digest = file_digest(path)
     if (reach := arguments.skinning_reach) is not None:
         config = replace(config, conventions=replace(config.conventions, skinning_reach=reach or None))
-    return variables, config.with_execution(tokens=arguments.tokens, crop=arguments.crop), digest
+    return variables, config.with_runtime(tokens=arguments.tokens, crop=arguments.crop), digest
 
 
 def settings_of(arguments: argparse.Namespace, digest: str, tokens: str, lpips: Any) -> dict[str, Any]:

@@ -97,7 +97,7 @@ def shipped_person(longest_edge: float | None = None) -> "Avatar":
     from humangs_jax.network.weights import load_weights
 
     variables, config = load_weights()
-    config = config.with_execution(longest_edge=longest_edge)
+    config = config.with_runtime(longest_edge=longest_edge)
     return reconstruct(variables, config, load_capture(DEMO_CAPTURE))
 
 
@@ -164,7 +164,7 @@ def compare(image: Any, avatar: "Avatar", camera: "Camera", pose: "BodyPose") ->
     import jax.numpy as jnp
 
     from humangs_jax.avatar.animate import skin
-    from humangs_jax.objectives import metrics
+    from humangs_jax.losses import metrics
     from humangs_jax.rendering.splat_config import SPLAT_PRESETS
     from humangs_jax.rendering.splatting import render
 
@@ -202,7 +202,7 @@ def motion_scores(browser: "Chromium", avatar: "Avatar", frames: int) -> tuple[f
 
 
 def truncation_scores(avatar: "Avatar", size: int) -> dict[str, float]:
-    """PSNR on the person, dB, of `hg.render` in a pose of the walk, by the number of skinning weights kept of each Gaussian."""
+    """foreground PSNR, dB, of `hg.render` in a pose of the walk, by the number of skinning weights kept of each Gaussian."""
     import jax.numpy as jnp
 
     from humangs_jax.avatar.animate import skin
@@ -230,7 +230,7 @@ def section(numbers: dict[str, Any]) -> str:
     lines.append(["first image after, s", *(f"{row['first_image_seconds']:.1f}" for row in rows)])
     lines.append([f"frames per second, {numbers['size']} px, software WebGL", *(f"{row['fps']:.1f}" for row in rows)])
     lines.append(["one sort by depth, ms", *(f"{row['sort_ms']:.1f}" for row in rows)])
-    kept = [["PSNR on the person, dB", *(f"{value:.0f}" for value in numbers["weights_kept"].values())]]
+    kept = [["foreground PSNR, dB", *(f"{value:.0f}" for value in numbers["weights_kept"].values())]]
     heads = ["skinning weights kept", *numbers["weights_kept"]]
     return markdown_table(header, lines) + "\n\n" + markdown_table(heads, kept)
 

@@ -110,7 +110,7 @@ def plot_views(path: Path, report: dict[str, Any]) -> None:
 
     counts = list(report["by_views"])
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.4))
-    for axis, key, title in zip(axes, ("psnr", "psnr_foreground"), ("whole picture", "on the person"), strict=True):
+    for axis, key, title in zip(axes, ("psnr", "psnr_fg"), ("whole picture", "on the person"), strict=True):
         for task, color in zip(TASKS, ("C0", "C1"), strict=True):
             for prefix, style, name in (("", "o-", "ours"), ("baseline_", "s--", "painted body")):
                 if all(task in report["by_views"][count] for count in counts):

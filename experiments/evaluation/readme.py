@@ -53,7 +53,7 @@ def quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any
         raise ValueError(f"{refined['people']} people were refined: expected the same {count}")
     if people["settings"]["weights"] != refined["settings"]["weights"]:
         raise ValueError("evaluation_views and refinement_32 are of different weights: measure them again")
-    dashes = {"baseline_psnr": None, "baseline_psnr_foreground": None}
+    dashes = {"baseline_psnr": None, "baseline_psnr_fg": None}
     rows = {
         f"the shipped person, {demo['image_size'][0]} px ({demo['views']['held_out']} views)": demo,
         "the same, refined as `humangs demo` does (15 s)": demo["refined"] | dashes,
@@ -67,9 +67,9 @@ def quality(demo: dict[str, Any], people: dict[str, Any], refined: dict[str, Any
                 how = f"{size} px" if seconds == "0" else f"{size} px, refined for {seconds} s"
                 rows[f"these {count}, {how}, other cameras"] = lengths[seconds]["novel"] | dashes
                 rows[f"{how}, in poses that no photo shows"] = lengths[seconds]["animation"] | dashes
-    columns = {"psnr": 1, "ssim": 3, "psnr_foreground": 1, "baseline_psnr": 1, "baseline_psnr_foreground": 1}
+    columns = {"psnr": 1, "ssim": 3, "psnr_fg": 1, "baseline_psnr": 1, "baseline_psnr_fg": 1}
     cells = lambda scores: ["" if scores[key] is None else f"{scores[key]:.{n}f}" for key, n in columns.items()]
-    header = ["", "PSNR", "SSIM", "PSNR on the person", "painted body mesh: PSNR", "on the person"]
+    header = ["", "PSNR", "SSIM", "foreground PSNR", "painted body mesh: PSNR", "on the person"]
     return markdown_table(header, [[name, *cells(scores)] for name, scores in rows.items()])
 
 

@@ -18,7 +18,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.data.photos import Photos
 from humangs_jax.detection.blazepose import bilinear
 from humangs_jax.fitting.fit_capture import fit_photos
-from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene, moved_capture
+from humangs_jax.fitting.refine_iterations import CaptureRefineConfig, Scene, moved_capture
 from humangs_jax.fitting.similarity import Similarity
 from humangs_jax.fitting.state import StateStd
 from humangs_jax.geometry.camera import Camera, stack_cameras

@@ -32,7 +32,7 @@ from humangs_jax.detection.people import DetectedPerson, detect_people
 from humangs_jax.detection.sharpening import sharpened
 from humangs_jax.evaluation.cases import draw_views
 from humangs_jax.evaluation.scores import score
-from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene
+from humangs_jax.fitting.refine_iterations import CaptureRefineConfig, Scene
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import resized, to_uint8, write_png
 from humangs_jax.io.npz import write_npz
@@ -48,7 +48,7 @@ EVERY = 5
 """The background is the median over every fifth frame."""
 Y_UP_FROM_Z_UP = np.asarray([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 SPREAD, DIFFERENT = 25, 0.07
-"""Pixels of a video by which BlazePose's mask is dilated for the background; difference of colours from which on one is his."""
+"""Pixels of a video by which BlazePose's mask is dilated for the background; difference of colors from which on one is his."""
 SHADOW, TINT = (0.5, 1.02), 0.04
 """A shadow multiplies the background by so much, in all channels alike but for the second number."""
 SAME, BRIGHT, SPECK = 0.03, 0.3, 800
@@ -57,7 +57,7 @@ NEAR, DEEP = 14, 7
 """Pixels of a video: he is nowhere further outside of BlazePose's mask than the first, and everywhere further inside than the
 second."""
 RIM = 3
-"""Pixels of a photo: colours of the truth's rim are those from so far inside."""
+"""Pixels of a photo: colors of the truth's rim are those from so far inside."""
 
 
 class RealFrame(NamedTuple):
@@ -92,7 +92,7 @@ class RealFrame(NamedTuple):
         write_description(folder, views)
 
     def truth(self) -> Float[np.ndarray, "v s s 3"]:
-        """The man alone on white, by the careful masks, the rims in colours of his own."""
+        """The man alone on white, by the careful masks, the rims in colors of his own."""
         return np.stack([on_white_background(*pair) for pair in zip(self._without_rims(), self.careful, strict=True)])
 
     def _without_rims(self):
@@ -313,7 +313,7 @@ def held_out(body: Capture, photos: RealFrame, make: Callable[[Capture], Avatar]
 
 
 def drawn_scores(avatar: Avatar, views: Capture, photos: RealFrame, shown: Sequence[int]) -> dict[str, float]:
-    """psnr and psnr_foreground (dB) of an avatar from the cameras and in the poses of these views, means over them."""
+    """psnr and psnr_fg (dB) of an avatar from the cameras and in the poses of these views, means over them."""
     truth = photos.truth()[list(shown)]
     return drawn_psnrs(avatar, dataclasses.replace(views, images=truth, masks=photos.careful[list(shown)]))
 
@@ -325,7 +325,7 @@ def drawn_psnrs(avatar: Avatar, truth: Capture) -> dict[str, float]:
 
 def _psnrs(images, truth):
     scores = score(images, truth)
-    return {"psnr": float(scores.psnr), "psnr_foreground": float(scores.psnr_foreground)}
+    return {"psnr": float(scores.psnr), "psnr_fg": float(scores.psnr_fg)}
 
 
 def body_ious(body: Capture, careful: Float[np.ndarray, "v s s"]) -> list[float]:

@@ -27,7 +27,7 @@ from humangs_jax.data.keypoints.sets import MEDIAPIPE_33
 from humangs_jax.data.motion.loading import load_motion
 from humangs_jax.detection.blazepose import Networks
 from humangs_jax.fitting.person_cameras import PersonViews, cameras_from_person
-from humangs_jax.fitting.refine_rounds import posed_vertices
+from humangs_jax.fitting.refine_iterations import posed_vertices
 from humangs_jax.fitting.similarity import align_points
 from humangs_jax.geometry.camera import Camera, stack_cameras
 from humangs_jax.io.images import image_size, read_image, resized, to_uint8

@@ -43,12 +43,12 @@ from humangs_jax.data.photos import Photos, load_photos
 from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.fitting.fit_capture import FittedCapture, fit_photos
 from humangs_jax.fitting.refine import refine_capture
-from humangs_jax.fitting.refine_rounds import usual_config
+from humangs_jax.fitting.refine_iterations import usual_config
 from humangs_jax.network.weights import SHIPPED, load_weights
-from humangs_jax.refinement.config import ROUNDS, RefineConfig
+from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 from humangs_jax.refinement.refine import refine
 
-PSNRS = {"psnr": ("held out", 1), "psnr_foreground": ("foreground", 2)}
+PSNRS = {"psnr": ("held out", 1), "psnr_fg": ("foreground", 2)}
 CAMERAS = {"degrees": ("cameras: degrees", 1), "centimetres": ("cm", 1)}
 TABLES = (
     (
@@ -80,7 +80,7 @@ class Results:
     def __init__(self, file: Path, label: str) -> None:
         self.file, settings = (
             file,
-            {"capture": f"{PACKAGE} {VERSION}", "rounds": ROUNDS, "weights": shipped_digest(SHIPPED)},
+            {"capture": f"{PACKAGE} {VERSION}", "iterations": ITERATIONS, "weights": shipped_digest(SHIPPED)},
         )
         self.all: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
         self.rows = self.all.setdefault(label, {"settings": settings, "rows": {}})["rows"]
@@ -142,12 +142,12 @@ class Man:
             ).capture
             for tight in (False, True)
         )
-        return better_body(*load_weights(), loose, tight, RefineConfig(rounds=ROUNDS, steps=0))[0]
+        return better_body(*load_weights(), loose, tight, RefineConfig(iterations=ITERATIONS, steps=0))[0]
 
 
 def avatar_of(capture: Capture) -> Avatar:
-    """By the network, and rounds of the learned update."""
-    return refine(reconstruct(*load_weights(), capture), capture, RefineConfig(rounds=ROUNDS, steps=0))
+    """By the network, and iterations of the learned update."""
+    return refine(reconstruct(*load_weights(), capture), capture, RefineConfig(iterations=ITERATIONS, steps=0))
 
 
 # Rows ----------------------------------------------------------------------------------------------------------------
@@ -171,7 +171,7 @@ def _calibrated(man, number, masks, way):
         unseen += body_ious(dataclasses.replace(blind.select([0]), cameras=camera), frame.careful[[view]])
     scores = mean_scores(known) | {"iou": float(np.mean(body_ious(body, frame.careful)))}
     scores |= {"iou_unseen": float(np.mean(unseen))} | _errors(body.cameras, man.reference.of(frame))
-    return scores | {"each_psnr_foreground": [row["psnr_foreground"] for row in known], "each_iou_unseen": unseen}
+    return scores | {"each_psnr_fg": [row["psnr_fg"] for row in known], "each_iou_unseen": unseen}
 
 
 def poses(results: Results, man: Man) -> None:

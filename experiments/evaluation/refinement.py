@@ -1,11 +1,11 @@
-"""What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colours.
+"""What refinement gains on held-out views, against its seconds, from the feed-forward avatar or from random colors.
 
     python experiments/evaluation/refinement.py --subjects 8 --json refinement.json [--seconds 1 2 5 15] [--sizes 256 512]
-        [--views 4] [--rounds 0 4] [--off 0 2.5 5] [--longest-edge 0.017]
+        [--views 4] [--iterations 0 4] [--off 0 2.5 5] [--longest-edge 0.017]
         [--page docs/refinement.md] [--table NAME] [--plot PLOT] [--sheet SHEET] [--details SHEET]
 
 People and held-out views are those of `evaluation/subjects.py`. "network" starts from the reconstruction, "random
-colours" from as many round Gaussians of random colours on the vertices of the body. Scores: docs/evaluation.md.
+colors" from as many round Gaussians of random colors on the vertices of the body. Scores: docs/evaluation.md.
 
 --off gives the photos a wrong body. Its value is the standard deviation of the translation, in millimetres. For each millimetre,
 joints turn by 0.2 degrees about each axis, and shape coefficients change by 0.02 (standard deviations). Held-out views show the
@@ -35,16 +35,16 @@ from experiments.evaluation.options import (
 )
 from experiments.evaluation.results import TASK_NAMES, kept_rows
 from humangs_jax.evaluation.tables import mean_scores
-from humangs_jax.refinement.config import ROUNDS, RefineConfig
+from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 
 DEGREES, SHAPES = 0.2, 0.02
 """Of --off: turn of a joint and change of a shape coefficient for each millimetre."""
-STARTS = ("network", "random colours")
+STARTS = ("network", "random colors")
 SHOWN = {
     "psnr": ("PSNR", 2),
-    "psnr_foreground": ("on the person", 2),
-    "psnr_outline": ("outline", 2),
-    "fog": ("fog", 3),
+    "psnr_fg": ("on the person", 2),
+    "psnr_boundary": ("boundary", 2),
+    "semi_transparent": ("semi_transparent", 3),
 }
 
 
@@ -58,7 +58,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="+", default=[4], help="numbers of photos")
     parser.add_argument("--starts", nargs="+", choices=STARTS, default=["network"], help="what is refined")
     parser.add_argument(
-        "--rounds", type=int, nargs="+", default=[0, ROUNDS], help="of the learned update; 0: Adam alone"
+        "--iterations", type=int, nargs="+", default=[0, ITERATIONS], help="of the learned update; 0: Adam alone"
     )
     parser.add_argument(
         "--off", type=float, nargs="+", default=[0.0], help="millimetres that the body is off, see above"
@@ -94,14 +94,14 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
 
     body, (variables, config, digest) = load_body(), load_network(arguments)
     drawing = arguments.sheet or arguments.details
-    config = config.with_execution(longest_edge=arguments.longest_edge)
+    config = config.with_runtime(longest_edge=arguments.longest_edge)
     settings = settings_of(arguments, digest, config.tokens, None)
     settings |= {
         name: getattr(arguments, name)
-        for name in ("seconds", "sizes", "views", "starts", "rounds", "off", "refine_poses", "longest_edge")
+        for name in ("seconds", "sizes", "views", "starts", "iterations", "off", "refine_poses", "longest_edge")
     }
     settings |= {"scored_at": arguments.scored_at} if arguments.scored_at else {}
-    learned = any(arguments.rounds)
+    learned = any(arguments.iterations)
     settings |= {"refiner": shipped_digest(SHIPPED)} if learned else {}
     rows, images = kept_rows(arguments.json, settings, "cells"), {}
     held_out = HeldOut(arguments.held_out, arguments.poses, arguments.pose_views)
@@ -115,12 +115,12 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
             if arguments.scored_at:
                 scored = make_evaluation_subject(seed, body, arguments.views, arguments.scored_at, held_out)
                 subject = dataclasses.replace(subject, held_out=scored.held_out)
-            choices = (arguments.views, arguments.off, arguments.starts, arguments.rounds)
-            for count, off, start, rounds in itertools.product(*choices):
-                how = RefineConfig(rounds=rounds, poses=arguments.refine_poses)
+            choices = (arguments.views, arguments.off, arguments.starts, arguments.iterations)
+            for count, off, start, iterations in itertools.product(*choices):
+                how = RefineConfig(iterations=iterations, poses=arguments.refine_poses)
                 moved = with_body_off(subject, off)
                 cell, drawn = measure(variables, config, moved, count, start, how, arguments.seconds)
-                also = f", {rounds} rounds" if rounds else ""
+                also = f", {iterations} iterations" if iterations else ""
                 also += f", body {off:g} mm off" if off else ""
                 row[f"{size} {count} {start}{also}"] = cell
                 if start == "network" and count == max(arguments.views):
@@ -174,7 +174,7 @@ def measure(variables, config, subject, count, start, how, seconds):
 
     inputs = subject.inputs(count)
     avatar = reconstruct(variables, config, inputs)
-    if start == "random colours":
+    if start == "random colors":
         avatar = random_start(avatar, subject.seed)
     view = frontal_view(subject.photos, subject.held_out, task_views(subject.held_out)["novel"].tolist())
     scores, first = score_all(avatar, subject.held_out, view)
@@ -189,7 +189,7 @@ def measure(variables, config, subject, count, start, how, seconds):
 
 
 def random_start(avatar, seed):
-    """Round Gaussians of random colours where the body's surface is, as many as the avatar has."""
+    """Round Gaussians of random colors where the body's surface is, as many as the avatar has."""
     import jax.numpy as jnp
     import numpy as np
 
@@ -211,17 +211,19 @@ def random_start(avatar, seed):
 
 
 def score_all(avatar, held_out, view=0):
-    """Scores by task, also the fog of the true images, and the image of a view."""
+    """Scores by task, also the semi-transparent foreground of the true images, and the image of a view."""
     from experiments.evaluation.subjects import score_tasks, task_views
     from humangs_jax.evaluation.cases import draw_views
-    from humangs_jax.objectives.metrics import fog
+    from humangs_jax.losses.metrics import semi_transparent
 
     drawn = draw_views(avatar, held_out)
     scores = score_tasks(drawn.images, held_out, alpha=drawn.alpha)
     for task, views in task_views(held_out).items():
         if task in scores:
             masks = held_out.masks[views]
-            scores[task]["fog_of_truth"] = sum(float(fog(mask, mask)) for mask in masks) / len(masks)
+            scores[task]["semi_transparent_of_truth"] = sum(
+                float(semi_transparent(mask, mask)) for mask in masks
+            ) / len(masks)
     return scores, drawn.images[view]
 
 
@@ -262,12 +264,16 @@ def section(report):
     if scored_at:
         about += f" Views of {scored_at} px."
     true = {
-        scored_at or name.split()[0]: lengths["0"]["novel"]["fog_of_truth"]
+        scored_at or name.split()[0]: lengths["0"]["novel"]["semi_transparent_of_truth"]
         for name, lengths in report["means"].items()
-        if "fog_of_truth" in lengths["0"]["novel"]
+        if "semi_transparent_of_truth" in lengths["0"]["novel"]
     }
     if true:
-        about += " Fog of the true images: " + ", ".join(f"{fog:.3f} at {size} px" for size, fog in true.items()) + "."
+        about += (
+            " Semi-transparent foreground of the true images: "
+            + ", ".join(f"{semi_transparent:.3f} at {size} px" for size, semi_transparent in true.items())
+            + "."
+        )
     return f"{about}\n\n{markdown_table(header, rows, 'llll' + 'r' * (len(SHOWN) + 1))}"
 
 
@@ -279,7 +285,7 @@ def plot(path, report):
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(9, 3.6))
-    for axis, key in zip(axes, ("psnr", "psnr_foreground"), strict=True):
+    for axis, key in zip(axes, ("psnr", "psnr_fg"), strict=True):
         for i, (name, lengths) in enumerate(report["means"].items()):
             size, count, start = name.split(" ", 2)
             for task, style in zip(TASK_NAMES, ("o-", "s--"), strict=True):

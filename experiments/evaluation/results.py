@@ -24,10 +24,10 @@ COLUMNS = {  # heading and digits
     "psnr": ("PSNR", 2),
     "ssim": ("SSIM", 3),
     "lpips": ("LPIPS", 4),
-    "psnr_foreground": ("fg PSNR", 2),
+    "psnr_fg": ("fg PSNR", 2),
     "baseline_psnr": ("base", 2),
     "baseline_ssim": ("base SSIM", 3),
-    "baseline_psnr_foreground": ("base fg", 2),
+    "baseline_psnr_fg": ("base fg", 2),
     "baseline_lpips": ("base LPIPS", 4),
     "foreground": ("share", 3),
 }
@@ -139,11 +139,11 @@ SHOWN = {
     "psnr": "PSNR",
     "ssim": "SSIM",
     "lpips": "LPIPS",
-    "psnr_foreground": "PSNR on the person",
+    "psnr_fg": "foreground PSNR",
     "baseline_psnr": "painted body: PSNR",
     "baseline_ssim": "SSIM",
     "baseline_lpips": "LPIPS",
-    "baseline_psnr_foreground": "on the person",
+    "baseline_psnr_fg": "on the person",
 }
 """Scores of the page's tables, and their headings."""
 
@@ -194,7 +194,7 @@ def verdict(report: dict[str, Any], task: str) -> str:
     if worse:
         said = "on average, PSNR falls " + ", ".join(f"by {lost:.2f} dB from {a} to {b} photos" for a, b, lost in worse)
     people = len(report["subjects"])
-    whole, person = (ahead(report, task, key) for key in ("psnr", "psnr_foreground"))
+    whole, person = (ahead(report, task, key) for key in ("psnr", "psnr_fg"))
     return (
         f"{TASK_NAMES[task].capitalize()}: {said}; with {report['views']}, {whole} of {people} people have a higher PSNR than "
         f"their painted body, {person} on the person alone."
@@ -212,7 +212,7 @@ def extremes_table(report: dict[str, Any], tasks: Sequence[str]) -> str:
     for name, people in (("best", best), ("worst", worst)):
         for place, row in enumerate(people, 1):
             scores = [row["by_views"][count][task] for task in tasks]
-            numbers = [cell(s, key) for s in scores for key in ("psnr", "psnr_foreground", "baseline_psnr")]
+            numbers = [cell(s, key) for s in scores for key in ("psnr", "psnr_fg", "baseline_psnr")]
             rows.append([f"{name} {place}", row["seed"], *numbers])
     return markdown_table(header, rows)
 

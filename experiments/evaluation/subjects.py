@@ -25,9 +25,9 @@ from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.io.images import to_uint8
+from humangs_jax.losses.lpips import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
-from humangs_jax.objectives.lpips import Lpips
 from humangs_jax.people.cameras import cameras_around, spread_azimuths
 from humangs_jax.people.rendering import PosedSubject
 from humangs_jax.people.subject import SyntheticSubject, make_subject
@@ -172,7 +172,7 @@ def score_tasks(
 ) -> dict[str, Scores]:
     """Mean scores of drawn held-out views (v, h, w, 3) by task, under the protocol "humangs"; tasks without views are left out.
 
-    alpha: their coverage (v, h, w), for fog and silhouettes.
+    alpha: their coverage (v, h, w), for semi-transparent foreground and silhouettes.
     """
     net = "vgg" if lpips is None else lpips.net
     protocol = dataclasses.replace(PROTOCOLS["humangs"], lpips=(net,))
@@ -184,5 +184,5 @@ def score_tasks(
 def score_person(drawn: Drawn, held_out: Capture, lpips: Lpips | None = None) -> dict[str, Scores]:
     """Scores by task, those of the painted body beside ours under names with the prefix "baseline_"."""
     ours, painted = (score_tasks(x, held_out, lpips) for x in (drawn.ours, drawn.painted))
-    compared = ("psnr", "ssim", "psnr_foreground", "lpips")
+    compared = ("psnr", "ssim", "psnr_fg", "lpips")
     return {task: ours[task] | {f"baseline_{name}": painted[task][name] for name in compared} for task in ours}

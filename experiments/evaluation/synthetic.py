@@ -6,10 +6,10 @@
 Subjects are drawn from the test seeds (`humangs_jax.people.seeds`), which training never sees; choices are made
 on `--split validation`. A person is made once, rendered from evenly spaced cameras (`evaluation/subjects.py`), reconstructed
 from every number of photos asked for, and always compared with the same held-out views: "novel" ones in the pose of the photos,
-and "animation" ones in unseen poses. The baseline is the body mesh, each vertex painted with the mean photo colour over the
+and "animation" ones in unseen poses. The baseline is the body mesh, each vertex painted with the mean photo color over the
 input views that see it (grey where none does), in the same pose. `evaluation/results.py` defines the scores.
 
---json writes {"psnr", "ssim", "lpips", "psnr_foreground", "foreground", "baseline_psnr", "baseline_ssim",
+--json writes {"psnr", "ssim", "lpips", "psnr_fg", "foreground", "baseline_psnr", "baseline_ssim",
 "baseline_psnr_foreground", "baseline_lpips": means over people of the novel views with 4 photos (or the most asked for, see
 "views"), "by_views": {"4": {"novel": the same keys, "animation": the same keys}, ...}, "settings": {...},
 "subjects": [{"seed", the same keys, "by_views": {...}}, ...], "others": rows of people who are not asked for or not finished}

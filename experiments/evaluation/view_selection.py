@@ -64,7 +64,7 @@ def evaluate(subjects, count):
         def score_of(chosen, photos=photos, held_out=held_out):
             drawn = capture_renderings(reconstruct(variables, config, photos.select(chosen)), held_out)[1]
             found = score(np.stack([np.asarray(rendering.rgb) for rendering in drawn]), held_out)
-            return {"psnr": found.psnr, "psnr_foreground": found.psnr_foreground}
+            return {"psnr": found.psnr, "psnr_fg": found.psnr_fg}
 
         select_views(photos, count)  # compiles
         began = time.perf_counter()
@@ -83,12 +83,11 @@ def section(people, count):
 
     titles = {"random": f"{count} at random", "chosen": f"{count} chosen", "all": f"all {PHOTOS}"}
     means = {
-        key: {name: float(np.mean([p[key][name] for p in people])) for name in ("psnr", "psnr_foreground")}
-        for key in titles
+        key: {name: float(np.mean([p[key][name] for p in people])) for name in ("psnr", "psnr_fg")} for key in titles
     }
     better = sum(p["chosen"]["psnr"] > p["random"]["psnr"] for p in people)
     seconds = float(np.median([p["seconds"] for p in people]))
-    rows = [[title, *(f"{means[key][n]:.2f}" for n in ("psnr", "psnr_foreground"))] for key, title in titles.items()]
+    rows = [[title, *(f"{means[key][n]:.2f}" for n in ("psnr", "psnr_fg"))] for key, title in titles.items()]
     about = (
         f"Means over {len(people)} people of the validation seeds, {PHOTOS} photos of 256 pixels at random azimuths; "
         f"{DRAWS} random choices each. The chosen ones are better for {better} of {len(people)}; choosing takes {seconds:.2f} s."

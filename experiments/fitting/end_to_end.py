@@ -120,7 +120,7 @@ def compare(variables, config, body, subject, arguments) -> dict:
         sheet = np.concatenate([subject.held_out.images[:3], *(drawn[:3] for drawn in pictures.values())])
         contact_sheet(sheet, arguments.images / f"{subject.seed}.png")
     found = {f"{name}_psnr": s.psnr for name, s in scores.items()}
-    return found | {f"{name}_foreground": s.psnr_foreground for name, s in scores.items()} | {"joints_mm": millimetres}
+    return found | {f"{name}_foreground": s.psnr_fg for name, s in scores.items()} | {"joints_mm": millimetres}
 
 
 def fit_photos(photos, body, seed, arguments):

@@ -16,8 +16,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from experiments.common.results import publish
 
-CLEAR, SCALE, ROUNDS, STEP = 0.5, 0.02, 15, 0.01
-"""Least visibility; scale of the robust weights and step of the derivatives, metres; rounds of reweighting."""
+CLEAR, SCALE, ITERATIONS, STEP = 0.5, 0.02, 15, 0.01
+"""Least visibility; scale of the robust weights and step of the derivatives, metres; iterations of reweighting."""
 RIDGE = 1e-3
 """Keeps offsets near 0 along directions that no view shows."""
 WRONG = 0.05
@@ -129,7 +129,7 @@ def solved(rows):
     """The offset that explains the errors best, and the median length of what is left, millimetres."""
     changes, errors = (np.stack(each) for each in zip(*rows, strict=True))
     weights, offset = np.ones(len(rows)), np.zeros(3)
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         matrix = np.einsum("n,nij,nik->jk", weights, changes, changes) + RIDGE * np.eye(3)
         offset = np.linalg.solve(matrix, np.einsum("n,nij,ni->j", weights, changes, errors))
         left = np.linalg.norm(errors - changes @ offset, axis=-1)

@@ -85,7 +85,7 @@ def evaluate(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def refine_subject(seed: int, body: Any, arguments: argparse.Namespace) -> dict[str, dict[str, float]]:
     """The rows of one person, by case."""
-    from experiments.fitting.refine_cases import disturbed, noisy_keypoints, true_captures
+    from experiments.fitting.refine_cases import augmented, noisy_keypoints, true_captures
     from humangs_jax.fitting.refine import refine_capture
 
     clothed, bare = true_captures(seed, body, arguments.views, arguments.size)
@@ -93,7 +93,7 @@ def refine_subject(seed: int, body: Any, arguments: argparse.Namespace) -> dict[
     rows = {}
     for case in arguments.cases:
         truth = bare if case == "bare" else clothed
-        start = truth if arguments.exact else disturbed(truth, seed)
+        start = truth if arguments.exact else augmented(truth, seed)
         given = dataclasses.replace(start, masks=None) if case == "keypoints" else start
         begun = time.perf_counter()
         refined = refine_capture(given, keypoints=keypoints if "keypoints" in case else None)

@@ -37,7 +37,7 @@ def bare_masks(capture: Any) -> np.ndarray:
     """(v, h, w) coverage by the posed body, without clothes."""
     import jax.numpy as jnp
 
-    from humangs_jax.fitting.refine_rounds import posed_vertices
+    from humangs_jax.fitting.refine_iterations import posed_vertices
     from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
     vertices = posed_vertices(capture.body, jnp.asarray(capture.betas), capture.poses)
@@ -50,7 +50,7 @@ def bare_masks(capture: Any) -> np.ndarray:
     return np.stack(masks)
 
 
-def disturbed(capture: Any, seed: int, errors: Errors = Errors()) -> Any:
+def augmented(capture: Any, seed: int, errors: Errors = Errors()) -> Any:
     """The capture with focal lengths (all longer or all shorter), cameras (about their own centres) and joints off by fixed
     amounts.
     """
@@ -95,7 +95,7 @@ def noisy_keypoints(truth: Any, seed: int, noise_px: float) -> Any:
 
 def mean_overlap(capture: Any, masks: Any) -> float:
     """Mean intersection over union of the posed body and masks (v, h, w) of the views."""
-    from humangs_jax.fitting.refine_rounds import overlap
+    from humangs_jax.fitting.refine_iterations import overlap
 
     covered = bare_masks(capture) > 0.5
     return float(np.mean([overlap(body, mask) for body, mask in zip(covered, masks, strict=True)]))

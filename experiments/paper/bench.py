@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "paper.md"
-SCORES = {"psnr": ("PSNR, dB", 2), "psnr_mask": ("foreground PSNR, dB", 2), "ssim": ("SSIM", 4)}
+SCORES = {"psnr": ("PSNR, dB", 2), "psnr_fg": ("foreground PSNR, dB", 2), "ssim": ("SSIM", 4)}
 PHOTOS, TARGETS = 4, 6
 """Photos that a network is trained with, unless it takes one; views of each person that all are compared on."""
 VIEW_COUNTS = (1, 2, 4, 6, 8)
@@ -98,9 +98,9 @@ def variants(steps: int) -> dict[str, Variant]:
     from humangs_jax.training.optimizer import OptimizerConfig
 
     def run(model: Any, photos: int = PHOTOS, **fields: Any) -> Any:
-        capacity = -(-model.execution.token_capacity * (photos + 1) // (PHOTOS + 1))  # one may show more than its share
+        capacity = -(-model.runtime.token_capacity * (photos + 1) // (PHOTOS + 1))  # one may show more than its share
         settings: dict[str, Any] = {
-            "model": model.with_execution(token_capacity=capacity),
+            "model": model.with_runtime(token_capacity=capacity),
             "views": ViewSampling(input_counts=(photos,)),
             "loss": LossConfig(),
             "optimizer": OptimizerConfig(learning_rate=1e-3, warmup_steps=min(50, steps // 4)),
@@ -121,7 +121,7 @@ def variants(steps: int) -> dict[str, Variant]:
     bare = ours.with_parts(reader=flat)
     gray = {"reader": replace(flat, sample_rgb=False), "decoder": replace(decoder, residual_color=False)}
     tokenless = replace(encoder, transformer=replace(encoder.transformer, class_token=False))
-    everywhere = ours.with_conventions(tokens="all").with_execution(token_capacity=0)
+    everywhere = ours.with_conventions(tokens="all").with_runtime(token_capacity=0)
 
     def upsampled(features: Any) -> Any:
         width = encoder.transformer.width
@@ -137,7 +137,7 @@ def variants(steps: int) -> dict[str, Variant]:
         "no global token": Variant(run(ours.with_parts(encoder=tokenless)), "humangs", "global token"),
         "back-projection, another seed": Variant(run(plain, seed=1), "back-projection", NOISE),
         "humangs, another seed": Variant(run(ours, seed=1), "humangs", NOISE),
-        "no photo colours": Variant(run(ours.with_parts(**gray)), "no shells", "photo colours (ours)"),
+        "no photo colors": Variant(run(ours.with_parts(**gray)), "no shells", "photo colors (ours)"),
         "canonical frame": Variant(
             run(bare.with_parts(decoder=replace(decoder, frame="canonical"))), "no shells", "normal frame (ours)"
         ),
@@ -215,13 +215,13 @@ def score(variables: Any, body: Any, config: Any, people: Any, count: int) -> di
 
     compared = dataclasses.replace(
         config,
-        model=config.model.with_execution(token_capacity=0),
+        model=config.model.with_runtime(token_capacity=0),
         views=dataclasses.replace(config.views, input_counts=(count,), target_count=TARGETS),
     )
     examples = validation_examples(cached_people(people), compared, len(people))
     numbers, _ = validate(variables, body, examples, compared)
-    names = (*SCORES, "fog", "dropped_tokens", "overflow")
-    # JSON has no NaN: networks that draw pixels have no fog
+    names = (*SCORES, "semi_transparent", "dropped_tokens", "overflow")
+    # JSON has no NaN: networks that draw pixels have no semi-transparent foreground
     return {name: x for name in names if (x := numbers[name]) == x}
 
 
@@ -230,7 +230,7 @@ def headline(row: Mapping[str, Any]) -> dict[str, float]:
     return row["by_views"][str(row["photos"])]
 
 
-def seed_interval(rows: Mapping[str, Any], score: str = "psnr_mask") -> float | None:
+def seed_interval(rows: Mapping[str, Any], score: str = "psnr_fg") -> float | None:
     """Half of the 95 % interval, in dB, of a difference between two runs, by their seeds alone; None without a pair of seeds.
 
     From the pairs of runs that differ in their seed alone: Student's t with as many degrees of freedom as pairs, which takes
@@ -257,8 +257,8 @@ def untrained(rows: Mapping[str, Any], painted: Mapping[str, Mapping[str, float]
 
     painted: its scores by number of photos, of the same people and views. That of `PHOTOS` counts for all.
     """
-    least = painted[str(PHOTOS)]["psnr_mask"] + MARGIN
-    return [name for name, row in rows.items() if headline(row)["psnr_mask"] < least]
+    least = painted[str(PHOTOS)]["psnr_fg"] + MARGIN
+    return [name for name, row in rows.items() if headline(row)["psnr_fg"] < least]
 
 
 def results(name: str) -> Any:
@@ -296,7 +296,7 @@ def quick_people(folder: Path, split: str = "test") -> Path:
 
 def load_networks(paths: Any) -> tuple[Any, ...]:
     """LPIPS for the evaluator, or nothing."""
-    from humangs_jax.objectives.loss_networks import load_loss_networks
+    from humangs_jax.losses.loss_networks import load_loss_networks
 
     found = load_loss_networks(None, paths[0], paths[1] if len(paths) > 1 else None, "vgg").lpips if paths else None
     return () if found is None else (found,)

@@ -169,7 +169,7 @@ def complete_config(config: Any, release: dict[str, Any], dtype: str, image_size
         decoder = dataclasses.replace(decoder, tight=tight, free=free)
     pool = "visible" if release["transformer.project_all_vertices"] is False else "all"
     config = config.with_parts(decoder=decoder).with_conventions(image_size=image_size, pool=pool)
-    return config.with_execution(dtype="bfloat16" if dtype == "bfloat16" else "float32")
+    return config.with_runtime(dtype="bfloat16" if dtype == "bfloat16" else "float32")
 
 
 def subject_inputs(arrays: dict[str, Any], index: int, dtype: Any) -> Any:
@@ -219,7 +219,7 @@ def compute_stages(variables: Any, inputs: Any, config: Any, skinning_weights: A
     from humangs_jax.rendering.gaussians import skin_gaussians
 
     channels_first = lambda x: jnp.moveaxis(x, -1, 1)
-    config = config.with_execution(scan=False, remat="none")
+    config = config.with_runtime(scan=False, remat="none")
     encoder, reader, _ = paper_parts(config.architecture)
     recorder = Recorder()
     with nn.intercept_methods(recorder.watch):
@@ -331,7 +331,7 @@ def run_checkpoint(checkpoint: Path, arrays: Path, config: Path, dtype: str) -> 
             f"{arrays}: in_lbs_weights has shape {expected['in_lbs_weights'].shape}, the checkpoint's "
             f"{converted.skinning_weights.shape}"
         )
-    working = jnp.float64 if dtype == "float64" else jnp.float32  # bfloat16: products only, see `network.execution`
+    working = jnp.float64 if dtype == "float64" else jnp.float32  # bfloat16: products only, see `network.runtime`
     variables = jax.tree.map(lambda x: jnp.asarray(x, working), converted.variables)
     compute = jax.jit(compute_stages, static_argnames="config")
     with jax.default_matmul_precision("highest"):  # GPUs and TPUs multiply float32 in fewer bits otherwise

@@ -60,9 +60,7 @@ def main() -> None:
     numbers = Numbers()
     rows = sorted(claims(numbers), key=lambda row: VERDICTS.index(row.verdict))
     lines = [[row.claim, row.paper, row.measured, row.verdict + (f": {row.why}" if row.why else "")] for row in rows]
-    half = (
-        f"+-{numbers.interval['psnr_mask']:.2f} dB of foreground PSNR and +-{numbers.interval['psnr']:.2f} dB of PSNR"
-    )
+    half = f"+-{numbers.interval['psnr_fg']:.2f} dB of foreground PSNR and +-{numbers.interval['psnr']:.2f} dB of PSNR"
     text = "\n\n".join(
         [
             markdown_table(["claim", "what the paper says", "what we measured", "holds?"], lines, "llll"),
@@ -84,7 +82,7 @@ class Numbers:
         self.runs = results("paper")["runs"]
         self.rows = results("paper_tables")["rows"]
         self.cost = results("paper_cost")
-        intervals = {score: seed_interval(self.runs, score) for score in ("psnr", "psnr_mask")}
+        intervals = {score: seed_interval(self.runs, score) for score in ("psnr", "psnr_fg")}
         self.interval = {score: half for score, half in intervals.items() if half is not None}
         self.gray = untrained(self.runs, results(PAINTED_TABLE)["validation"])
 
@@ -126,10 +124,10 @@ def of_systems(n: Numbers) -> list[Claim]:
     few_near = [n.test(ours, count, near) - n.test("ghg", count, near) for count in (1, 2)]
     gst = n.test(ours, 1, near) - n.test("gst", 1, near)
     plain = [n.test("back-projection") - n.test(name) for name in ("giga", "ghg")]
-    plain_fg = [n.change("back-projection", name, "psnr_mask") for name in ("giga", "ghg")]
+    plain_fg = [n.change("back-projection", name, "psnr_fg") for name in ("giga", "ghg")]
     extended = [n.test(ours) - n.test(name) for name in ("giga", "ghg")]
     moved = n.test(ours, task="animation") - n.test("humanram", task="animation")
-    several = n.change("lhm_views", "lhm", "psnr_mask")
+    several = n.change("lhm_views", "lhm", "psnr_fg")
     others = [f"`{name}`" for name in ("lhm", "lvsm", "gst") if name in n.gray]
     return [
         Claim(
@@ -148,13 +146,13 @@ def of_systems(n: Numbers) -> list[Claim]:
             "better than GST",
             f"{pair(DOMAINS[OURS][0], DOMAINS['GST, released weights'][0])} of GST's released weights with one photo",
             f"one photo each: `humangs`, trained with four, near: {n.said(gst)}; `humangs, 1 photo`, foreground: "
-            f"{n.said(n.change('humangs, 1 photo', 'gst', 'psnr_mask'), score='psnr_mask')}",
+            f"{n.said(n.change('humangs, 1 photo', 'gst', 'psnr_fg'), score='psnr_fg')}",
             *n.judge(gst, needs=["gst"]),
         ),
         Claim(
             "better than GIGA and GHG",
             f"{pair(DOMAINS[GIGA_SPLIT][0], DOMAINS['GIGA, on its split'][0])}, {pair(DOMAINS[OURS][0], DOMAINS[GHG][0])}",
-            f"the paper's reader (`back-projection`): {n.said(*plain)}; foreground {n.said(*plain_fg, score='psnr_mask')}. "
+            f"the paper's reader (`back-projection`): {n.said(*plain)}; foreground {n.said(*plain_fg, score='psnr_fg')}. "
             f"`humangs`, with our additions: {n.said(*extended)}",
             *n.judge(*plain),
         ),
@@ -174,8 +172,8 @@ def of_systems(n: Numbers) -> list[Claim]:
         Claim(
             "several photos beat one-photo LHM (cited from LCA)",
             "multi-view beats single-view",
-            f"`lhm_views` against `lhm`, foreground: {n.said(several, score='psnr_mask')}",
-            *n.judge(several, needs=["lhm", "lhm_views"], score="psnr_mask"),
+            f"`lhm_views` against `lhm`, foreground: {n.said(several, score='psnr_fg')}",
+            *n.judge(several, needs=["lhm", "lhm_views"], score="psnr_fg"),
         ),
     ]
 
@@ -183,23 +181,23 @@ def of_systems(n: Numbers) -> list[Claim]:
 def of_parts(n: Numbers) -> list[Claim]:
     """What a part of the network gains."""
     gaussians = n.change("1 + 4 Gaussians a vertex", "1 Gaussian a vertex")
-    gaussians_fg = n.change("1 + 4 Gaussians a vertex", "1 Gaussian a vertex", "psnr_mask")
+    gaussians_fg = n.change("1 + 4 Gaussians a vertex", "1 Gaussian a vertex", "psnr_fg")
     token = [n.change("humangs", "no global token", photos=count) for count in (1, 2, 4, 6)]
-    token_fg = [n.change("humangs", "no global token", "psnr_mask", count) for count in (1, 2, 4, 6)]
+    token_fg = [n.change("humangs", "no global token", "psnr_fg", count) for count in (1, 2, 4, 6)]
     depths = n.change("features of four depths", "features of the last layer")
-    pooled = n.change("humangs", "pooling over all views", "psnr_mask")
-    reads = n.change("back-projection", "cross-attention", "psnr_mask")
+    pooled = n.change("humangs", "pooling over all views", "psnr_fg")
+    reads = n.change("back-projection", "cross-attention", "psnr_fg")
     return [
         Claim(
             "1 tight + 4 free Gaussians a vertex against 1",
             "+0.15 dB (THuman2.1), +0.04 to +0.11 elsewhere",
-            f"{n.said(gaussians)}; foreground {n.said(gaussians_fg, score='psnr_mask')}",
+            f"{n.said(gaussians)}; foreground {n.said(gaussians_fg, score='psnr_fg')}",
             *n.judge(gaussians),
         ),
         Claim(
             "the global token helps with 1 and 2 photos, not from 4 on",
             "a figure",
-            f"1, 2, 4, 6 photos: {n.said(*token)}; foreground {n.said(*token_fg, score='psnr_mask')}",
+            f"1, 2, 4, 6 photos: {n.said(*token)}; foreground {n.said(*token_fg, score='psnr_fg')}",
             *n.judge(*token[:2]),
         ),
         Claim(
@@ -212,14 +210,14 @@ def of_parts(n: Numbers) -> list[Claim]:
         Claim(
             "pooling over visible views",
             "described so; the release pools all",
-            f"against all views, foreground: {n.said(pooled, score='psnr_mask')}",
-            *n.judge(pooled, score="psnr_mask"),
+            f"against all views, foreground: {n.said(pooled, score='psnr_fg')}",
+            *n.judge(pooled, score="psnr_fg"),
         ),
         Claim(
             "back-projection instead of attention to the photos",
             "no numbers",
-            f"`back-projection` against `cross-attention`, foreground: {n.said(reads, score='psnr_mask')}",
-            *n.judge(reads, needs=["cross-attention"], score="psnr_mask"),
+            f"`back-projection` against `cross-attention`, foreground: {n.said(reads, score='psnr_fg')}",
+            *n.judge(reads, needs=["cross-attention"], score="psnr_fg"),
         ),
     ]
 
@@ -299,13 +297,11 @@ def additions(n: Numbers) -> list[list[str]]:
     """What is ours and not the paper's: the change without it."""
     pairs = {
         "shells": ("no shells", "humangs"),
-        "photo colours (of a network without shells)": ("no photo colours", "no shells"),
+        "photo colors (of a network without shells)": ("no photo colors", "no shells"),
         "Gaussians in the normals' frame (of a network without shells)": ("canonical frame", "no shells"),
         "the person's tokens alone (with all of them)": ("all tokens", "humangs"),
     }
-    return [
-        [name, n.said(n.change(*variants, score="psnr_mask"), score="psnr_mask")] for name, variants in pairs.items()
-    ]
+    return [[name, n.said(n.change(*variants, score="psnr_fg"), score="psnr_fg")] for name, variants in pairs.items()]
 
 
 def pair(a: Any, b: Any) -> str:

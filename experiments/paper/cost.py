@@ -47,7 +47,7 @@ def main() -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--width", type=int, default=128, help="features of maps, vertices and attention")
-    parser.add_argument("--repeats", type=int, default=3, help="timed rounds")
+    parser.add_argument("--repeats", type=int, default=3, help="timed iterations")
     parser.add_argument(
         "--networks", action="store_true", help="count the networks alone; readers: as docs/results has them"
     )
@@ -188,7 +188,7 @@ def network_flops(name: str, photos: int) -> dict[str, float]:
     from humangs_jax.network.humangs import apply_humangs
     from humangs_jax.network.weights import expected_variables
 
-    config = SYSTEMS[name]("published").with_conventions(tokens="all").with_execution(dtype="float32")
+    config = SYSTEMS[name]("published").with_conventions(tokens="all").with_runtime(dtype="float32")
     vertices = len(gaussian_body(load_body(), config).template)
     inputs = jax.eval_shape(lambda: subject(1, photos, vertices, config.conventions.image_size)[0])
     forward = lambda v, x: apply_humangs(v, x, config)[0].gaussians
@@ -208,11 +208,11 @@ def joint_flops(name: str, photos: int) -> dict[str, float]:
 
     from experiments.systems import SYSTEMS
     from experiments.systems.two_stream import TwoStreamReader, TwoStreams
-    from humangs_jax.network.execution import Execution
+    from humangs_jax.network.runtime import Runtime
 
     reader = SYSTEMS[name]("published").architecture.reader
     assert isinstance(reader, TwoStreamReader)
-    streams = TwoStreams(reader, Execution())
+    streams = TwoStreams(reader, Runtime())
     points = jax.ShapeDtypeStruct((POINTS, 3), jnp.float32)
     tokens = jax.ShapeDtypeStruct((photos * TOKENS, reader.width), jnp.float32)
     few = jnp.zeros((8, 3)), jnp.zeros((8, reader.width))

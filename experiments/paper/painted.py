@@ -4,7 +4,7 @@
 
 VALIDATION: the folder `validation` that train_all.py writes into its OUT, scored on the views on which it scores every variant.
 PEOPLE: the --people of tables.py, scored as there, in the pose of the photos. Folders that are missing are made (docs/paper.md).
-The vertices have the mean colours of the photos that see them, grey where none does.
+The vertices have the mean colors of the photos that see them, grey where none does.
 """
 
 import argparse
@@ -57,9 +57,9 @@ def on_validation(folder: Path, count: int) -> dict[str, float]:
     cache = CaptureCache(folders, load_capture(folders[0]).body)
     sampling = ViewSampling((count,), target_count=TARGETS, jitter=0.0, scattered_share=0.0, mixed_pose_share=0.0)
     for index, subject in enumerate(subject_order(0, 0, len(folders))):
-        outline = cache.outline(int(subject))
-        assert outline is not None
-        inputs, targets = draw_views(view_generator(0, index), outline, count, sampling)
+        boundary = cache.boundary(int(subject))
+        assert boundary is not None
+        inputs, targets = draw_views(view_generator(0, index), boundary, count, sampling)
         capture = load_capture(folders[int(subject)])
         rows.append(scores(capture.select(inputs), capture.select(targets)))
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
@@ -85,14 +85,14 @@ def scores(inputs: Any, truth: Any) -> dict[str, float]:
     import jax.numpy as jnp
 
     from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
-    from humangs_jax.objectives.metrics import masked_psnr, psnr
-    from humangs_jax.objectives.ssim import similarity_map
+    from humangs_jax.losses.metrics import masked_psnr, psnr
+    from humangs_jax.losses.ssim import similarity_map
 
     images, masks = jnp.asarray(truth.images), jnp.asarray(truth.masks)
     shown = jnp.clip(draw_painted_body(painted_body(inputs), truth), 0, 1)
     return {
         "psnr": float(jnp.mean(jax.vmap(psnr)(shown, images))),
-        "psnr_mask": float(jnp.mean(jax.vmap(masked_psnr)(shown, images, masks))),
+        "psnr_fg": float(jnp.mean(jax.vmap(masked_psnr)(shown, images, masks))),
         "ssim": float(jnp.mean(jax.vmap(similarity_map)(shown, images))),
     }
 
@@ -100,7 +100,7 @@ def scores(inputs: Any, truth: Any) -> dict[str, float]:
 def text_of(numbers: dict[str, Any]) -> str:
     """One row a set of people and number of photos."""
     rows = [
-        [f"{PAINTED}, {split} people", count, f"{x['psnr']:.2f}", f"{x['psnr_mask']:.2f}", f"{x['ssim']:.3f}"]
+        [f"{PAINTED}, {split} people", count, f"{x['psnr']:.2f}", f"{x['psnr_fg']:.2f}", f"{x['ssim']:.3f}"]
         for split, counts in numbers.items()
         for count, x in counts.items()
     ]

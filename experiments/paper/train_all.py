@@ -187,7 +187,7 @@ def table(
         cells: list[object] = [name, row["photos"]]
         cells += [f"{scores[key]:.{digits}f}" for key, (_, digits) in SCORES.items()]
         if against in rows:
-            change = scores["psnr_mask"] - headline(rows[against])["psnr_mask"]
+            change = scores["psnr_fg"] - headline(rows[against])["psnr_fg"]
             said = NOISE if queue[name].claim == NOISE else verdict(change, interval)
             cells += [against, f"{change:+.2f}", NOT_TRAINED if name in gray or against in gray else said]
         else:
@@ -206,7 +206,7 @@ def table(
     if counted:
         counts = sorted({int(count) for own in counted.values() for count in own})
         shown = [
-            [name, *(f"{own[str(c)]['psnr_mask']:.2f}" if str(c) in own else "" for c in counts)]
+            [name, *(f"{own[str(c)]['psnr_fg']:.2f}" if str(c) in own else "" for c in counts)]
             for name, own in counted.items()
         ]
         texts.append(markdown_table(["foreground PSNR, dB, by photos", *map(str, counts)], shown))

@@ -11,8 +11,8 @@ Faults are counted in images of random poses from random cameras, as shares of t
 - hollow: the INNER side of cloth is seen where the naked body, posed alike, would be at least 1 cm nearer: one looks through a
   neckline, a cuff or a hem into empty clothes.
 - gaps: the background is seen where the naked body would be.
-Diversity is that of descriptions (`person.describe`: shape, garments, colours, hair; a millisecond each) and of images
-(foreground share, colours as seen, joint angles). 1,000 descriptions take 3 s, 1,000 subjects with images about 15 minutes
+Diversity is that of descriptions (`person.describe`: shape, garments, colors, hair; a millisecond each) and of images
+(foreground share, colors as seen, joint angles). 1,000 descriptions take 3 s, 1,000 subjects with images about 15 minutes
 on 2 CPU cores. Expected: poking below 0.1 %.
 """
 
@@ -156,14 +156,14 @@ def describe_all(body, arguments):
 
 
 def look_at_all(body, arguments):
-    """Faults, foreground shares, colours and angles of built people; and a row of faults for every pose."""
+    """Faults, foreground shares, colors and angles of built people; and a row of faults for every pose."""
     import numpy as np
 
     from humangs_jax.people import cameras, rendering
     from humangs_jax.people.subject import make_subject
     from humangs_jax.people.writer import sample_pose
 
-    rows, colours, angles, shares = [], np.zeros((12, 4, 4)), [], []
+    rows, colors, angles, shares = [], np.zeros((12, 4, 4)), [], []
     for i in range(arguments.subjects):
         seed = arguments.first + i
         subject = make_subject(seed, body)
@@ -179,7 +179,7 @@ def look_at_all(body, arguments):
                 counts += count_faults(body, posed, batch[k])
                 if pose == 0 and k == 0:
                     image, mask = rendering.render_view(posed, batch[k])
-                    colours += _colour_histogram(image[mask == 1])
+                    colors += _color_histogram(image[mask == 1])
                     shares.append(float(mask.mean()))
             rows.append(
                 {"seed": seed, "pose": pose, "pixels": counts[0]}
@@ -195,9 +195,9 @@ def look_at_all(body, arguments):
             "poses_above_0.1_percent": float((each > 1e-3).mean()),
         }
     numbers["foreground_share"] = _spread(np.asarray(shares))
-    numbers["colour_cells_used"] = float((colours / colours.sum() > 1e-3).mean())
+    numbers["colour_cells_used"] = float((colors / colors.sum() > 1e-3).mean())
     angles = np.stack(angles)
-    return {"numbers": numbers, "colours": colours, "angles": angles, "shares": np.asarray(shares)}, rows
+    return {"numbers": numbers, "colours": colors, "angles": angles, "shares": np.asarray(shares)}, rows
 
 
 def count_faults(body, posed, camera):
@@ -255,30 +255,30 @@ def _spread(values):
     return {name: round(float(value), 4) for name, value in marks.items()}
 
 
-def _hsv(colours):
-    """(n, 3) hue, saturation, value of (n, 3) colours."""
+def _hsv(colors):
+    """(n, 3) hue, saturation, value of (n, 3) colors."""
     import numpy as np
 
-    high, low = colours.max(-1), colours.min(-1)
+    high, low = colors.max(-1), colors.min(-1)
     chroma = np.maximum(high - low, 1e-9)
-    r, g, b = colours.T
+    r, g, b = colors.T
     hue = np.select([high == r, high == g], [((g - b) / chroma) % 6, (b - r) / chroma + 2], (r - g) / chroma + 4) / 6
     return np.stack([hue % 1, (high - low) / np.maximum(high, 1e-9), high], -1)
 
 
-def _hues(colours):
+def _hues(colors):
     """Shares of dyes: neutral ones and 12 hues."""
     import numpy as np
 
-    hue, saturation, _ = _hsv(colours).T
-    coloured = saturation > 0.15
-    counts = np.bincount((hue[coloured] * 12).astype(int) % 12, minlength=12)
+    hue, saturation, _ = _hsv(colors).T
+    colored = saturation > 0.15
+    counts = np.bincount((hue[colored] * 12).astype(int) % 12, minlength=12)
     names = ["red", "orange", "yellow", "lime", "green", "sea", "cyan", "azure", "blue", "violet", "magenta", "rose"]
-    shares = {"neutral": round(float((~coloured).mean()), 3)}
-    return shares | {name: round(float(c) / len(colours), 3) for name, c in zip(names, counts, strict=True)}
+    shares = {"neutral": round(float((~colored).mean()), 3)}
+    return shares | {name: round(float(c) / len(colors), 3) for name, c in zip(names, counts, strict=True)}
 
 
-def _colour_histogram(pixels):
+def _color_histogram(pixels):
     """(12, 4, 4) counts of hue, saturation, value, each image with the same weight."""
     import numpy as np
 

@@ -46,7 +46,7 @@ def main() -> None:
     parser.add_argument(
         "--dtype", choices=("auto", "float32", "bfloat16"), default="auto", help="auto: float32 on a CPU"
     )
-    parser.add_argument("--repeats", type=int, default=3, help="timed rounds")
+    parser.add_argument("--repeats", type=int, default=3, help="timed iterations")
     parser.add_argument("--stages", action="store_true", help="also time the stages")
     parser.add_argument("--memory", type=int, nargs="*", default=[], help="numbers of views to analyse the memory for")
     parser.add_argument("--memory-size", type=int, default=512)
@@ -70,14 +70,14 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
     inputs = benchmark_inputs(config, arguments.views, arguments.size)
     variables = random_variables(config)
     packed, touched, share = foreground(inputs, config)
-    cases = {"all": config.with_execution(tokens="all"), "foreground": packed}
+    cases = {"all": config.with_runtime(tokens="all"), "foreground": packed}
     patches = round(touched / share)
 
-    product, product_flops = matmul_program(config.execution.dtype)
+    product, product_flops = matmul_program(config.runtime.dtype)
     runs, facts = {"matmul": product}, {}
     for name, case in cases.items():
         program, facts[name] = reconstruction(variables, inputs, case)
-        facts[name]["tokens"] = patches if name == "all" else case.execution.token_capacity
+        facts[name]["tokens"] = patches if name == "all" else case.runtime.token_capacity
         runs[name] = lambda program=program: jax.block_until_ready(program(variables, inputs))
         if arguments.stages:
             runs |= {f"{name} {stage}": run for stage, run in stages(variables, inputs, case).items()}
@@ -111,7 +111,7 @@ def benchmark(arguments: argparse.Namespace) -> dict[str, Any]:
         "views": arguments.views,
         "size": arguments.size,
         "vertices": int(inputs.canonical_vertices.shape[0]),
-        "dtype": config.execution.dtype,
+        "dtype": config.runtime.dtype,
         "repeats": arguments.repeats,
         "load_average": load,
         "device": jax.devices()[0].device_kind,
@@ -129,7 +129,7 @@ def configured(preset: str, dtype: str, size: int) -> Any:
         raise SystemExit(f"--preset {preset}: expected one of {', '.join(PRESETS)}")
     if dtype == "auto":
         dtype = "float32" if jax.default_backend() == "cpu" else "bfloat16"
-    return PRESETS[preset]().with_conventions(image_size=size).with_execution(dtype=dtype)
+    return PRESETS[preset]().with_conventions(image_size=size).with_runtime(dtype=dtype)
 
 
 def reconstruction(variables: Any, inputs: Any, config: Any) -> tuple[Any, dict[str, Any]]:
@@ -178,7 +178,7 @@ def memory(config: Any, views: int, size: int) -> dict[str, float]:
     from humangs_jax.network.humangs import apply_humangs
     from humangs_jax.network.weights import expected_variables
 
-    subject = benchmark_inputs(config.with_execution(tokens="all"), views, size)
+    subject = benchmark_inputs(config.with_runtime(tokens="all"), views, size)
     if config.tokens == "foreground":
         config = foreground(subject, config)[0]
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), subject)

@@ -88,7 +88,7 @@ def foreground(inputs: Any, config: Any) -> tuple[Any, int, float]:
 
     touched = int(jax.jit(needed_tokens, static_argnames="config")(inputs, config))
     patches = int(np.prod(inputs.images.shape[:3])) // config.architecture.encoder.patch_size**2
-    config = config.with_execution(tokens="foreground", token_capacity=round_up(touched))
+    config = config.with_runtime(tokens="foreground", token_capacity=round_up(touched))
     return config, touched, touched / patches
 
 

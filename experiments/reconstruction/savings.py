@@ -4,7 +4,7 @@
 
 Starts from the network as published (all tokens, the last convolution at every pixel, every view for every vertex) and
 leaves out one thing after the other; the rows of a table are timed in turns. Errors are those of the Gaussians against
-the first row (relative L2 of offsets from the vertices, and of colours) and of an image drawn from them (PSNR). With
+the first row (relative L2 of offsets from the vertices, and of colors) and of an image drawn from them (PSNR). With
 random weights (the default) the rows that are exact by construction must show rounding only; what foreground tokens do
 to a network that was trained with all of them, only `--weights` of such a network tell.
 
@@ -37,7 +37,7 @@ def main() -> None:
     parser.add_argument(
         "--dtype", choices=("auto", "float32", "bfloat16"), default="auto", help="auto: float32 on a CPU"
     )
-    parser.add_argument("--repeats", type=int, default=3, help="timed rounds; 0: errors only")
+    parser.add_argument("--repeats", type=int, default=3, help="timed iterations; 0: errors only")
     add_outputs(parser, "reconstruction_savings")
     arguments = parser.parse_args()
     prepare_process()
@@ -57,11 +57,11 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
     variables = None
     if arguments.weights:
         variables, config = load_weights(arguments.weights)
-    config = config.with_execution(tokens="all")
+    config = config.with_runtime(tokens="all")
     variables = variables or random_variables(config)
     inputs = benchmark_inputs(config, arguments.views, arguments.size)
     capacity = int(jax.jit(lambda x: needed_reads(x, config.run()))(inputs))
-    seeing = lambda c: c.with_execution(vertex_capacity=capacity)
+    seeing = lambda c: c.with_runtime(vertex_capacity=capacity)
     packed, touched, share = foreground(inputs, config)
 
     networks: dict[str, Callable[[Any, Any], Any]] = {"as published": lambda v, x: everywhere(v, x, config)}
@@ -100,7 +100,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         "pool": config.conventions.pool,
         "views": arguments.views,
         "size": arguments.size,
-        "dtype": config.execution.dtype,
+        "dtype": config.runtime.dtype,
         "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
     }
@@ -140,7 +140,7 @@ def everywhere(variables: Any, inputs: Any, config: Any) -> Any:
 
 
 def errors(gaussians: Any, reference: Any, inputs: Any) -> dict[str, float]:
-    """Relative L2 errors of offsets from the vertices, and of colours."""
+    """Relative L2 errors of offsets from the vertices, and of colors."""
     per_vertex = len(reference.means) // len(inputs.canonical_vertices)
     vertices = np.repeat(np.asarray(inputs.canonical_vertices), per_vertex, axis=0)
     relative = lambda a, b: float(np.linalg.norm(a - b) / max(np.linalg.norm(b), 1e-30))
@@ -182,7 +182,7 @@ def table(result: dict[str, Any]) -> str:
         error = f"{row['offsets_relative_l2']:.1e}, {row['colors_relative_l2']:.1e}"
         flops, memory = f"{row['flops'] / 1e9:.0f}", f"{row['temporary_mb']:.0f}"
         rows.append([name, flops, time, gain, memory, error, pictured])
-    header = ["left out so far", "GFLOP", "wall, CPU ms", "gain (CPU)", "MiB", "offsets, colours", "picture, dB"]
+    header = ["left out so far", "GFLOP", "wall, CPU ms", "gain (CPU)", "MiB", "offsets, colors", "picture, dB"]
     return (
         f"{result['weights']} weights, {result['preset']}, {result['views']} views of {result['size']}, "
         f"pool {result['pool']}, foreground share {result['foreground_share']:.3f}, "

@@ -34,7 +34,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, nargs="+", default=[1, 2, 4, 8, 16])
     parser.add_argument("--size", type=int, default=256, help="side of the photos, pixels")
-    parser.add_argument("--repeats", type=int, default=1, help="timed rounds")
+    parser.add_argument("--repeats", type=int, default=1, help="timed iterations")
     add_outputs(parser, "reconstruction_scaling")
     parser.add_argument("--image", "--picture", type=Path, help="draw them here (.png)")
     arguments = parser.parse_args()
@@ -77,7 +77,7 @@ def measure(arguments: argparse.Namespace) -> dict[str, Any]:
         "width": WIDTH,
         "layers": LAYERS,
         "size": arguments.size,
-        "dtype": half.execution.dtype,
+        "dtype": half.runtime.dtype,
         "device": jax.devices()[0].device_kind,
         "jax": jax.__version__,
     }

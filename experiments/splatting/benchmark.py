@@ -56,7 +56,7 @@ def main() -> None:
     parser.add_argument("--yardstick", type=Path, help="folder of a compiled yardstick")
     parser.add_argument("--json", type=Path, help="write the numbers here")
     parser.add_argument("--page", type=Path, help=f"page whose table {TABLE} gets this run's rows")
-    parser.add_argument("--repeats", type=int, default=15, help="timed rounds; 0: errors only")
+    parser.add_argument("--repeats", type=int, default=15, help="timed iterations; 0: errors only")
     parser.add_argument("--preset", default="exact", help="name in SPLAT_PRESETS")
     parser.add_argument("--config", type=json.loads, default={}, help="JSON of SplatConfig fields over the preset")
     parser.add_argument("--margin", type=float, default=1.0, help="room in the buffers; 1 is what eager calls take")

@@ -28,7 +28,7 @@ WIDTH, HEIGHT, COUNT = 24, 16, 32
 FOCAL = 24.0
 
 IMAGE, GRADIENT = 1e-5, 1e-4
-"""Bounds of a case that is nothing special to float32: largest error of a colour or of alpha, and the largest relative
+"""Bounds of a case that is nothing special to float32: largest error of a color or of alpha, and the largest relative
 L2 error among the eight gradients. Roundings of 6e-8, through a few hundred operations."""
 
 FAR, FARTHER = (2e-4, 1e-3), (3e-2, 2e-1)

@@ -41,7 +41,7 @@ def main() -> None:
     parser.add_argument("--scene", help="npz of a scene, or 'demo'")
     parser.add_argument("--measured", type=Path, help="JSON of an earlier run, instead of a scene")
     parser.add_argument("--size", type=int, default=512, help="side of the image where pixels are not what grows")
-    parser.add_argument("--repeats", type=int, default=7, help="timed rounds")
+    parser.add_argument("--repeats", type=int, default=7, help="timed iterations")
     add_outputs(parser, "splatting_scaling")
     parser.add_argument("--image", "--picture", type=Path, help="draw the growth here")
     arguments = parser.parse_args()

@@ -30,7 +30,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scene", nargs="+", required=True, help="npz files of scenes, or 'demo'")
     parser.add_argument("--size", type=int, nargs="+", default=[512], help="sides of the image, pixels")
-    parser.add_argument("--repeats", type=int, default=11, help="timed rounds")
+    parser.add_argument("--repeats", type=int, default=11, help="timed iterations")
     add_outputs(parser, "splatting_stages")
     arguments = parser.parse_args()
     prepare_process()

@@ -97,7 +97,7 @@ def main() -> None:
     parser.add_argument("--scene", help="npz of a scene, or 'demo'")
     parser.add_argument("--measured", type=Path, help="JSON of an earlier run, or in docs/results, instead of a scene")
     parser.add_argument("--size", type=int, default=512, help="side of the image, pixels")
-    parser.add_argument("--repeats", type=int, default=9, help="timed rounds")
+    parser.add_argument("--repeats", type=int, default=9, help="timed iterations")
     parser.add_argument("--only", nargs="+", help="knobs to measure (also: hidden, combined, preset)")
     add_outputs(parser, "splatting_tradeoff")
     parser.add_argument("--image", "--picture", type=Path, help="draw the Pareto front here")

@@ -21,9 +21,9 @@ from experiments.systems.two_stream import TwoStreamReader
 from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
 from humangs_jax.network.encoder import PatchTransformer, TriplaneConfig
-from humangs_jax.network.execution import Execution
 from humangs_jax.network.parts import Driver, Reader
 from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
@@ -51,7 +51,7 @@ def bench() -> HumanGSConfig:
         body_vertices=1500,
         longest_edge=0.05,
     )
-    return HumanGSConfig(Architecture(encoder, reader, decoder), conventions, Execution(token_capacity=BENCH_TOKENS))
+    return HumanGSConfig(Architecture(encoder, reader, decoder), conventions, Runtime(token_capacity=BENCH_TOKENS))
 
 
 def humangs(size: Size = "published") -> HumanGSConfig:
@@ -63,9 +63,7 @@ def lvsm(size: Size = "published") -> HumanGSConfig:
     """LVSM-style (`pixel_queries`), decoder-only, 24 layers. Novel views only: it cannot be animated."""
     encoder, conventions = PlainPhotos(patch_size=8), Conventions(image_size=256)
     if size == "published":
-        return HumanGSConfig(
-            Architecture(encoder, NoReader(), QueryDecoder()), conventions, Execution(dtype="bfloat16")
-        )
+        return HumanGSConfig(Architecture(encoder, NoReader(), QueryDecoder()), conventions, Runtime(dtype="bfloat16"))
     blocks = dataclasses.replace(BENCH_TRANSFORMER, class_token=False)
     conventions = dataclasses.replace(bench().conventions, tokens="all", pixels="all")
     return HumanGSConfig(Architecture(encoder, NoReader(), QueryDecoder(blocks)), conventions)
@@ -113,7 +111,7 @@ def _on_the_surface(size: Size, reader: Reader, surface: SurfaceMap, driver: Dri
 
 
 def back_projection(size: Size = "published") -> HumanGSConfig:
-    """The paper's reader and decoder without what we added (photo colours, shells, normal frames) and without an upsampler: the
+    """The paper's reader and decoder without what we added (photo colors, shells, normal frames) and without an upsampler: the
     partner of `cross_attention`, from which it differs in the reader alone.
     """
     config = humangs(size)
@@ -147,8 +145,8 @@ def lhm(size: Size = "published", most_views: int | None = 1, pooling: int = 1) 
         reader = TwoStreamReader(BENCH_WIDTH, 2, 4, BENCH_HEAD, pooling, most_views)
         decoder, conventions = VertexDecoder(hidden=BENCH_WIDTH), bench().conventions
     decoder = dataclasses.replace(decoder, tight=1, free=0, offset_scale=0.5, initial_log_scale=-4.0)
-    execution = Execution() if size == "published" else bench().execution
-    return HumanGSConfig(Architecture(encoder, reader, decoder), conventions, execution)
+    runtime = Runtime() if size == "published" else bench().runtime
+    return HumanGSConfig(Architecture(encoder, reader, decoder), conventions, runtime)
 
 
 def lhm_views(size: Size = "published") -> HumanGSConfig:
@@ -177,7 +175,7 @@ def gst(size: Size = "published") -> HumanGSConfig:
 
 
 def ghg(size: Size = "published") -> HumanGSConfig:
-    """GHG-style (`shell_textures`): copied colours on five shells; no transformer."""
+    """GHG-style (`shell_textures`): copied colors on five shells; no transformer."""
     published = size == "published"
     reader = ShellTextureReader(SurfaceMap("atlas", 1024 if published else 64))
     # texels of the bench are 3 cm wide on the innermost shell

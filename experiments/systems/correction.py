@@ -24,7 +24,7 @@ from humangs_jax.network.vertex_decoder import COLOR_MARGIN, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
 
 CHANNELS = 14
-"""Of a correction: offset 3, quaternion 4, logarithm of the scale 3, logits of opacity 1 and colour 3."""
+"""Of a correction: offset 3, quaternion 4, logarithm of the scale 3, logits of opacity 1 and color 3."""
 SCALING = 2.0
 """Corrections of the logarithm of a scale are bounded to this."""
 
@@ -37,7 +37,7 @@ class Corrected(NamedTuple):
 
 
 def apply_corrections(gaussians: Gaussians, raw: Float[Array, "g 14"], offset_scale: float) -> Corrected:
-    """Gaussians with corrections, `CHANNELS` numbers each: zeros change nothing (but colours closer to 0 or 1 than
+    """Gaussians with corrections, `CHANNELS` numbers each: zeros change nothing (but colors closer to 0 or 1 than
     `COLOR_MARGIN`), and Gaussians of opacity 0 keep it.
 
     offset_scale: metres to which offsets, in canonical axes, are bounded by tanh.

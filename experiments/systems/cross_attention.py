@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.configuration import Layers, Patch, Ratio, Width, part
 from humangs_jax.network.encoder import pack_patches, touched_patches
-from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, Pass, Variables, VertexFeatures
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import INIT_STD, NORM_EPSILON, attention, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
 
@@ -54,7 +54,7 @@ class CrossAttentionReader:
         return VertexFeatures(cast(Array, local), encoding.global_token, normals=inputs.canonical_normals)
 
     def _module(self, run: Pass):
-        return VertexQueries(self, run.execution)
+        return VertexQueries(self, run.runtime)
 
 
 def image_tokens(
@@ -73,7 +73,7 @@ def image_tokens(
     tokens = encoding.maps.reshape(-1, features)
     if run.tokens == "foreground":
         packing = pack_patches(
-            touched_patches(inputs, patch), min(run.execution.token_capacity or len(tokens), len(tokens))
+            touched_patches(inputs, patch), min(run.runtime.token_capacity or len(tokens), len(tokens))
         )
         return tokens.at[packing.indices].get(mode="fill", fill_value=0), packing.count
     return tokens, None if inputs.view_count is None else inputs.view_count * (height * width)
@@ -89,7 +89,7 @@ class VertexQueries(nn.Module):
     """Canonical positions (n, 3) and tokens (l, e) -> features (n, d)."""
 
     config: CrossAttentionReader
-    execution: Execution
+    runtime: Runtime
 
     @nn.compact
     def __call__(
@@ -97,7 +97,7 @@ class VertexQueries(nn.Module):
     ) -> Float[Array, "n d"]:
         x = nn.Dense(self.config.width, kernel_init=INIT, name="position")(positional_encoding(positions))
         for index in range(self.config.layers):
-            x = CrossBlock(self.config.head_width, self.config.mlp_ratio, self.execution, name=f"block_{index}")(
+            x = CrossBlock(self.config.head_width, self.config.mlp_ratio, self.runtime, name=f"block_{index}")(
                 x, tokens, count
             )
         return layer_norm(None, "norm", use_bias=True)(x)
@@ -108,20 +108,20 @@ class CrossBlock(nn.Module):
 
     head_width: int
     mlp_ratio: int
-    execution: Execution
+    runtime: Runtime
 
     @nn.compact
     def __call__(
         self, x: Float[Array, "n d"], tokens: Float[Array, "l e"], count: Int[Array, ""] | None
     ) -> Float[Array, "n d"]:
-        width, dtype = x.shape[-1], self.execution.compute_dtype
+        width, dtype = x.shape[-1], self.runtime.compute_dtype
         dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
         heads = lambda y: y.reshape(len(y), -1, self.head_width)
         rms = lambda y, name: nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name=name)(y)
         q = rms(heads(dense(width, "q")(layer_norm(dtype, "norm1")(x))), "q_norm")
         k, v = jnp.split(dense(2 * width, "kv")(tokens), 2, axis=-1)
         k = rms(heads(k), "k_norm")
-        seen = attention(q, k, heads(v), count, self.execution.attention, self.execution.attention_chunk)
+        seen = attention(q, k, heads(v), count, self.runtime.attention, self.runtime.attention_chunk)
         x = x + dense(width, "out")(seen.reshape(len(x), width))
         hidden = dense(self.mlp_ratio * width, "mlp_in")(layer_norm(dtype, "norm2")(x))
         return x + dense(width, "mlp_out")(jax.nn.gelu(hidden, approximate=False))

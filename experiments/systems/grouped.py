@@ -20,9 +20,9 @@ from experiments.systems.two_stream import check_views
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.configuration import Bias, Layers, Patch, Ratio, Spread, Vertices, Width, part
 from humangs_jax.geometry import quaternion
-from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import layer_norm
 from humangs_jax.network.vertex_decoder import INITIAL_OPACITY, LAST_STD
 from humangs_jax.rendering.gaussians import Gaussians
@@ -61,21 +61,21 @@ class GroupReader:
         return cast(Array, self._module(run).apply(variables, *image_tokens(encoding, inputs, run, self.patch_size)))
 
     def _module(self, run: Pass):
-        return GroupTokens(self, run.execution)
+        return GroupTokens(self, run.runtime)
 
 
 class GroupTokens(nn.Module):
     """Image tokens (l, e) -> (5, groups, d)."""
 
     config: GroupReader
-    execution: Execution
+    runtime: Runtime
 
     @nn.compact
     def __call__(self, tokens: Float[Array, "l e"], count: Int[Array, ""] | None) -> Float[Array, "a r d"]:
         config, shape = self.config, (len(ATTRIBUTES) * self.config.groups, self.config.width)
         x = self.param("queries", nn.initializers.normal(1.0), shape)
         for index in range(config.layers):
-            block = CrossBlock(config.head_width, config.mlp_ratio, self.execution, name=f"block_{index}")
+            block = CrossBlock(config.head_width, config.mlp_ratio, self.runtime, name=f"block_{index}")
             x = block(x, tokens, count)
         return layer_norm(None, "norm", use_bias=True)(x).reshape(len(ATTRIBUTES), config.groups, config.width)
 

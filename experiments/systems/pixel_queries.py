@@ -27,9 +27,9 @@ from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.configuration import Patch, Range, part
 from humangs_jax.network.convolution import Convolution
 from humangs_jax.network.encoder import TEXTURE_STD, TriplaneConfig, encoder_pixels, patchify, sample_triplane
-from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs
 from humangs_jax.network.parts import Encoding, HumanGSOutputs, Pass, Variables, scene_outputs
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import INIT_STD, Transformer, TransformerConfig
 from humangs_jax.network.upsampler import KAIMING, SLOPE, UpConvolution
 
@@ -98,7 +98,7 @@ class QueryDecoder:
         return jax.lax.map(one, queries)
 
     def _module(self, run):
-        return QueryModule(self, self.patch_size, run.execution)
+        return QueryModule(self, self.patch_size, run.runtime)
 
 
 def lvsm_transformer(layers: int) -> TransformerConfig:
@@ -107,11 +107,11 @@ def lvsm_transformer(layers: int) -> TransformerConfig:
 
 
 class QueryModule(nn.Module):
-    """Photos (v, h, w, 12: rgb, ray, position) and pixels of one target (i, j, 9: ray, position) -> its colours (i, j, 3)."""
+    """Photos (v, h, w, 12: rgb, ray, position) and pixels of one target (i, j, 9: ray, position) -> its colors (i, j, 3)."""
 
     config: QueryDecoder
     patch: int
-    execution: Execution
+    runtime: Runtime
 
     @nn.compact
     def __call__(
@@ -120,7 +120,7 @@ class QueryModule(nn.Module):
         query: Float[Array, "i j 9"],
         view_count: Int[Array, ""] | None = None,
     ) -> Float[Array, "i j 3"]:
-        config, patch, dtype = self.config, self.patch, self.execution.compute_dtype
+        config, patch, dtype = self.config, self.patch, self.runtime.compute_dtype
         width, rays = config.transformer.width, (photos[..., 3:9], query[..., :6])
         seen, asked = rays
         if config.texture is not None:
@@ -145,7 +145,7 @@ class QueryModule(nn.Module):
         targets = len(asked)
         # the target comes first: photos that are padding are the last tokens
         count = None if view_count is None else targets + view_count * (len(seen) // len(photos))
-        depths = Transformer(config.transformer, self.execution, name="transformer")(
+        depths = Transformer(config.transformer, self.runtime, name="transformer")(
             jnp.concatenate([asked, seen]), count
         )
         rows, columns = query.shape[0] // patch, query.shape[1] // patch

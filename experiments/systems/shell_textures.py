@@ -1,9 +1,9 @@
 """GHG-style: textures of shells of the body, copied from the photos, and a U-Net that makes a Gaussian of every texel.
 
 Theirs (Kwon et al. 2024, https://arxiv.org/abs/2407.12777): UV maps of 1024 x 1024 texels of the surface of the body and of four
-shells around it, up to 4 cm off along the normals. A texel has the colour of the photo that sees it best; a network of gated
-convolutions fills the rest of the innermost one, the outer ones keep what was seen. A convolutional U-Net takes the colours and
-the offsets of the shells and gives rotation, scale (at most 1 cm) and opacity. Means and colours are not predicted.
+shells around it, up to 4 cm off along the normals. A texel has the color of the photo that sees it best; a network of gated
+convolutions fills the rest of the innermost one, the outer ones keep what was seen. A convolutional U-Net takes the colors and
+the offsets of the shells and gives rotation, scale (at most 1 cm) and opacity. Means and colors are not predicted.
 
 Our reading: the best view is the one whose ray meets the posed normal most directly; unseen texels of the innermost shell are
 filled from their neighbours through coarser and coarser maps (pull-push, Gortler et al. 1996), without a network; texels of outer
@@ -51,7 +51,7 @@ class ShellTextures:
 
 @part
 class PlainPhotos:
-    """The encoder of systems that read the photos themselves: its maps are their colours."""
+    """The encoder of systems that read the photos themselves: its maps are their colors."""
 
     patch_size: Patch = 1
 

@@ -3,16 +3,16 @@
 GIGA (Zubekhin et al. 2025, https://arxiv.org/abs/2504.07144): photos of the CURRENT frame are projected onto a texture of 512
 x 512 texels, the visible views weighted by the softmax of 5 times the cosine at which they see a texel. Encoders for textures
 and for canonical positions (64 x 1, 2, 4, 8 channels), whose coarsest maps attend to an MLP of the pose (162 numbers, width
-1024), and decoders of 3, 3 and 8 channels give colour, offset and the rest of a Gaussian a texel, which skinning poses. SSIM
+1024), and decoders of 3, 3 and 8 channels give color, offset and the rest of a Gaussian a texel, which skinning poses. SSIM
 0.5, L1 0.5, alpha 0.2, perceptual 0.5 and penalties of offsets, opacities and scales. Our reading: one U-Net of 3 + 1 + 3
-channels (colour, whether seen, position) and 14; no static texture of other frames, which half of their steps drop; the pose
+channels (color, whether seen, position) and 14; no static texture of other frames, which half of their steps drop; the pose
 is that of the target.
 
 Animatable Gaussians (Li et al. 2023, https://arxiv.org/abs/2311.16096) is fitted to ONE person: maps of the front and the
 back of the T-pose, 1024 x 1024 texels each, a Gaussian for every texel that shows the body; three StyleUNets turn a map of
-posed positions into colours, offsets (times 0.05) and the rest. L1 + 0.1 LPIPS + 0.005 of squared offsets, Adam 5e-4, 800,000
+posed positions into colors, offsets (times 0.05) and the rest. L1 + 0.1 LPIPS + 0.005 of squared offsets, Adam 5e-4, 800,000
 steps of one person. It reads no photo: the weights contain the person, and fit nobody else. Our reading: plain U-Nets on maps
-of one size, colours that do not depend on the view, no PCA of novel poses, positions relative to the middle and the root's
+of one size, colors that do not depend on the view, no PCA of novel poses, positions relative to the middle and the root's
 rotation.
 
 Both start from the same Gaussians, flat ones on the surface: with zero corrections the body itself. Texels that show nothing
@@ -107,9 +107,9 @@ class TextureReader:
 
 @part
 class SurfaceDecoder:
-    """A flat Gaussian on the surface for every texel, row-major, with the texture's colour: what drivers correct.
+    """A flat Gaussian on the surface for every texel, row-major, with the texture's color: what drivers correct.
 
-    Nothing is learned. Without a texture, features of any other kind, colours are grey.
+    Nothing is learned. Without a texture, features of any other kind, colors are grey.
     """
 
     surface_map: SurfaceMap = dataclasses.field(default_factory=SurfaceMap)
@@ -190,7 +190,7 @@ class TextureDriver:
 
 @part
 class PoseMapDriver:
-    """Animatable-Gaussians-style: three U-Nets on the map of posed positions, for offsets, shapes and colours.
+    """Animatable-Gaussians-style: three U-Nets on the map of posed positions, for offsets, shapes and colors.
 
     widths: of each U-Net. offset_scale: metres, bound of the offsets.
     """

@@ -21,9 +21,9 @@ from experiments.systems.cross_attention import INIT, check_heads, image_tokens
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.configuration import Few, Layers, Patch, Ratio, Vertices, Width, part
 from humangs_jax.geometry.curve import along_curve
-from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, Pass, Variables, VertexFeatures
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import NORM_EPSILON, attention, layer_norm
 from humangs_jax.network.vertex_decoder import positional_encoding
 
@@ -64,7 +64,7 @@ class TwoStreamReader:
         return VertexFeatures(cast(Array, local), encoding.global_token, normals=inputs.canonical_normals)
 
     def _module(self, run: Pass):
-        return TwoStreams(self, run.execution)
+        return TwoStreams(self, run.runtime)
 
 
 def check_views(inputs: HumanGSInputs, most: int | None) -> None:
@@ -77,7 +77,7 @@ class TwoStreams(nn.Module):
     """Canonical positions (n, 3) and tokens (l, e) -> features (n, d)."""
 
     config: TwoStreamReader
-    execution: Execution
+    runtime: Runtime
 
     @nn.compact
     def __call__(
@@ -98,7 +98,7 @@ class TwoStreams(nn.Module):
         present = jnp.ones(len(tokens)) if count is None else (jnp.arange(len(tokens)) < count).astype(jnp.float32)
         pooled = jnp.sum(tokens * present[:, None], axis=0) / jnp.maximum(jnp.sum(present), 1)
         for index in range(config.blocks):
-            block = TwoStreamBlock(config, self.execution, index + 1 == config.blocks, name=f"block_{index}")
+            block = TwoStreamBlock(config, self.runtime, index + 1 == config.blocks, name=f"block_{index}")
             points, tokens = block(points, tokens, count, pooled)
         points = layer_norm(None, "norm", use_bias=True)(points)
         return points if cluster is None else points[cluster] + dense("skip")(embedded)
@@ -111,7 +111,7 @@ class TwoStreamBlock(nn.Module):
     """
 
     config: TwoStreamReader
-    execution: Execution
+    runtime: Runtime
     last: bool
 
     @nn.compact
@@ -122,7 +122,7 @@ class TwoStreamBlock(nn.Module):
         count: Int[Array, ""] | None,
         pooled: Float[Array, " d"],
     ) -> tuple[Float[Array, "n d"], Float[Array, "l d"]]:
-        config, dtype = self.config, self.execution.compute_dtype
+        config, dtype = self.config, self.runtime.compute_dtype
         width, vertices = config.width, len(points)
         dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=INIT, name=name)
 
@@ -150,6 +150,6 @@ class TwoStreamBlock(nn.Module):
         token_k, token_v, *token_q = heads(tokens, "tokens", of_tokens[:2], ask=not self.last)
         k, v, q = jnp.concatenate([k, token_k]), jnp.concatenate([v, token_v]), jnp.concatenate([q, *token_q])
         total = None if count is None else vertices + count
-        seen = attention(q, k, v, total, self.execution.attention, self.execution.attention_chunk)
+        seen = attention(q, k, v, total, self.runtime.attention, self.runtime.attention_chunk)
         points = update(points, seen[:vertices], "points", of_points[2:])
         return points, tokens if self.last else update(tokens, seen[vertices:], "tokens", of_tokens[2:])

@@ -4,11 +4,11 @@ import dataclasses
 from typing import Any
 
 from humangs_jax.apps.settings import PRESETS, Settings
-from humangs_jax.network.execution import Execution
+from humangs_jax.network.runtime import Runtime
 
 SIZE = 512
 """Side of the frames in pixels, unless a point says otherwise."""
-STARTS = ("network", "random colours", "painted body", "published network")
+STARTS = ("network", "random colors", "painted body", "published network")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,10 +26,10 @@ class Point:
 
 def point(name: str, knob: str, size: int = SIZE, start: str = "network", **changes: Any) -> Point:
     """A point by what differs from the default one."""
-    fields = {field.name for field in dataclasses.fields(Execution)}
-    execution = Execution(**{key: value for key, value in changes.items() if key in fields})
+    fields = {field.name for field in dataclasses.fields(Runtime)}
+    runtime = Runtime(**{key: value for key, value in changes.items() if key in fields})
     rest: dict[str, Any] = {"views": 4} | {key: value for key, value in changes.items() if key not in fields}
-    return Point(name, knob, Settings(execution=execution, **rest), size, start)
+    return Point(name, knob, Settings(runtime=runtime, **rest), size, start)
 
 
 DEFAULT = point("default", "default")
@@ -46,7 +46,7 @@ def points() -> list[Point]:
     found += [point(f"{n} steps", "refinement", refine_steps=n, refine_size=256) for n in (25, 50, 100, 200)]
     for n in (0, 50, 200):
         random: dict[str, Any] = {"refine_steps": n, "refine_size": 256}
-        found += [point(f"random colours, {n} steps", "naive", start="random colours", **random)]
+        found += [point(f"random colors, {n} steps", "naive", start="random colors", **random)]
     found += [point(f"{n} photos" if n > 1 else "1 photo", "photos", views=n) for n in (1, 2, 3, 6)]
     found += [point(f"photos of {n}", "photo size", image_size=n) for n in (128, 192, 384, 512)]
     found += [point("all tokens", "tokens", tokens="all"), point("cropped", "tokens", crop=True)]
@@ -55,7 +55,7 @@ def points() -> list[Point]:
     found += [point(f"body of {n}", "Gaussians", body_vertices=n) for n in (1000, 2000, 3000)]
     found += [point(f"edges of {edge * 1e3:g} mm", "Gaussians", longest_edge=edge) for edge in (0.024, 0.02, 0.017)]
     found += [point("100 steps at 512", "refinement", refine_steps=100, refine_size=512)]
-    found += [refined(*limits) for limits in ROUNDS]
+    found += [refined(*limits) for limits in ITERATIONS]
     found += [combined(**fields) for fields in COMBINED]
     found += [
         point(f"published, {t} tokens", "published", start="published network", tokens=t) for t in ("foreground", "all")
@@ -63,7 +63,7 @@ def points() -> list[Point]:
     return found
 
 
-ROUNDS = (
+ITERATIONS = (
     *((n, 0, 256) for n in (1, 2, 3, 4, 6)),
     *((4, steps, 256) for steps in (25, 50, 100)),
     *((4, steps, 512) for steps in (0, 100)),
@@ -71,11 +71,11 @@ ROUNDS = (
 """Of the learned update, steps of Adam after them, and the size of the photos."""
 
 
-def refined(rounds: int, steps: int, size: int) -> Point:
-    """A point with rounds, named by what it does."""
-    parts = [f"{rounds} round{'s' * (rounds > 1)}", *([f"{steps} steps"] if steps else [])]
+def refined(iterations: int, steps: int, size: int) -> Point:
+    """A point with iterations, named by what it does."""
+    parts = [f"{iterations} round{'s' * (iterations > 1)}", *([f"{steps} steps"] if steps else [])]
     name = ", ".join(parts) + (f" at {size}" if size != 256 else "")
-    return point(name, "refinement", refine_rounds=rounds, refine_steps=steps, refine_size=size)
+    return point(name, "refinement", refine_iterations=iterations, refine_steps=steps, refine_size=size)
 
 
 COMBINED: tuple[dict[str, Any], ...] = (
@@ -91,20 +91,20 @@ COMBINED: tuple[dict[str, Any], ...] = (
     {"body_vertices": 2000, "splat": "fast"},
     {"body_vertices": 2000, "splat": "near_exact"},
     {"views": 1, "crop": True, "image_size": 128, "body_vertices": 2000, "splat": "fast"},
-    {"crop": True, "refine_rounds": 4, "refine_size": 128},
-    {"crop": True, "refine_rounds": 4, "refine_size": 256},
-    {"crop": True, "refine_rounds": 4, "refine_size": 256, "splat": "near_exact"},
-    {"views": 2, "crop": True, "refine_rounds": 4, "refine_size": 256},
-    {"views": 6, "crop": True, "refine_rounds": 4, "refine_size": 256},
-    {"views": 6, "crop": True, "refine_rounds": 4, "refine_steps": 100, "refine_size": 256},
-    {"views": 6, "crop": True, "refine_rounds": 4, "refine_size": 512},
-    {"views": 6, "crop": True, "refine_rounds": 4, "refine_steps": 100, "refine_size": 512},
-    {"body_vertices": 2000, "crop": True, "refine_rounds": 4, "refine_size": 256, "splat": "near_exact"},
-    {"body_vertices": 1000, "crop": True, "refine_rounds": 4, "refine_size": 256, "splat": "fast"},
-    {"crop": True, "image_size": 128, "refine_rounds": 4, "refine_size": 128},
-    {"crop": True, "image_size": 384, "refine_rounds": 4, "refine_size": 512},
-    {"crop": True, "longest_edge": 0.02, "refine_rounds": 4, "refine_size": 256},
-    {"crop": True, "longest_edge": 0.02, "refine_rounds": 4, "refine_steps": 100, "refine_size": 512},
+    {"crop": True, "refine_iterations": 4, "refine_size": 128},
+    {"crop": True, "refine_iterations": 4, "refine_size": 256},
+    {"crop": True, "refine_iterations": 4, "refine_size": 256, "splat": "near_exact"},
+    {"views": 2, "crop": True, "refine_iterations": 4, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_iterations": 4, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_iterations": 4, "refine_steps": 100, "refine_size": 256},
+    {"views": 6, "crop": True, "refine_iterations": 4, "refine_size": 512},
+    {"views": 6, "crop": True, "refine_iterations": 4, "refine_steps": 100, "refine_size": 512},
+    {"body_vertices": 2000, "crop": True, "refine_iterations": 4, "refine_size": 256, "splat": "near_exact"},
+    {"body_vertices": 1000, "crop": True, "refine_iterations": 4, "refine_size": 256, "splat": "fast"},
+    {"crop": True, "image_size": 128, "refine_iterations": 4, "refine_size": 128},
+    {"crop": True, "image_size": 384, "refine_iterations": 4, "refine_size": 512},
+    {"crop": True, "longest_edge": 0.02, "refine_iterations": 4, "refine_size": 256},
+    {"crop": True, "longest_edge": 0.02, "refine_iterations": 4, "refine_steps": 100, "refine_size": 512},
     {"crop": True, "refine_steps": 200, "refine_size": 256},
 )
 """Several knobs at once."""
@@ -115,7 +115,7 @@ SHORT = {
     "crop": "cropped",
     "body_vertices": "body of {}",
     "longest_edge": "edges of {} m",
-    "refine_rounds": "{} rounds",
+    "refine_iterations": "{} iterations",
     "refine_steps": "{} steps",
     "refine_size": "at {}",
     "splat": "{}",

@@ -32,7 +32,7 @@ def main() -> int:
     if claimed["settings"] != settings_of():
         print("the sweep was made with other weights or people: run sweep.py again")
         return 1
-    bench, table, faults = Bench(1, arguments.people, rounds=3), [], 0
+    bench, table, faults = Bench(1, arguments.people, iterations=3), [], 0
     for point in points():
         if point.knob == "preset":
             row = {"people": []}

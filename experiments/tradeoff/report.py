@@ -21,8 +21,8 @@ SIZE = 512
 EQUAL = 1.05
 """Times of points that differ by less are taken for equal: they are measured beside other programs."""
 TASKS = {"novel": "same pose", "animation": "unseen poses"}
-SCORES = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 3), "psnr_foreground": ("on the person", 2)}
-NAIVE = ("painted body", "random colours")
+SCORES = {"psnr": ("PSNR", 2), "ssim": ("SSIM", 3), "psnr_fg": ("on the person", 2)}
+NAIVE = ("painted body", "random colors")
 KINDS = {"feed-forward": "#1f6f8b", "refined": "#c0392b", "naive": "#7f8c8d"}
 Row = dict[str, Any]
 
@@ -78,7 +78,7 @@ def kind(row: Row) -> str:
     """Of `KINDS`."""
     if row["start"] in NAIVE:
         return "naive"
-    return "refined" if row["settings"]["refine_steps"] or row["settings"]["refine_rounds"] else "feed-forward"
+    return "refined" if row["settings"]["refine_steps"] or row["settings"]["refine_iterations"] else "feed-forward"
 
 
 def compared(rows: list[Row]) -> list[Row]:
@@ -213,7 +213,7 @@ def growth_table(rows: list[Row], result: dict[str, Any]) -> str:
     """Slopes of log time over log size, of the one-knob points with the default."""
     default = next(row for row in rows if row["name"] == "default")
     of = lambda *knobs: [row for row in rows if row["knob"] in knobs and row["start"] == "network"]
-    options = lambda row: row["settings"]["execution"]
+    options = lambda row: row["settings"]["runtime"]
     trained = 256
     series = {
         "photos": [(r["settings"]["views"], r["reconstruct"]) for r in [default, *of("photos")]],
@@ -228,7 +228,7 @@ def growth_table(rows: list[Row], result: dict[str, Any]) -> str:
         "steps of refinement": [
             (r["settings"]["refine_steps"], r["refine_share"])
             for r in of("refinement")
-            if r["settings"]["refine_size"] == trained and not r["settings"]["refine_rounds"]
+            if r["settings"]["refine_size"] == trained and not r["settings"]["refine_iterations"]
         ],
         "background pixels of a frame": [(int(n) ** 2, share) for n, share in result["growth"].get("box", {}).items()],
     }

@@ -4,7 +4,7 @@
         [--image docs/images/tradeoff] [--front]
 
 The points are those of `points.py`. Quality is the mean over people of the split "tradeoff", whom nothing else has seen:
-PSNR, SSIM and PSNR on the person, of new views in the pose of the photos and in unseen poses. Photos and true images have
+PSNR, SSIM and foreground PSNR, of new views in the pose of the photos and in unseen poses. Photos and true images have
 512 pixels; frames of another size are brought to 512 before they are compared. Times are
 CPU times of all threads, of the first person, in turns with the default point's, and kept as ratios of medians: other
 programs stretch wall times by far more. Refinement is counted in steps, which do not depend on the load either. Compilation
@@ -38,8 +38,8 @@ SHOTS = {"held_out": 3, "poses": 2, "pose_views": 1}
 PHOTOS = (1, 2, 3, 4, 6)
 TRUE_SIZE = 512
 FRAMES = 10
-"""Timed rounds of drawing a frame."""
-QUALITY = ("psnr", "ssim", "psnr_foreground")
+"""Timed iterations of drawing a frame."""
+QUALITY = ("psnr", "ssim", "psnr_fg")
 
 
 def main() -> None:
@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, required=True, help="points that are there are not measured again")
     parser.add_argument("--subjects", type=int, default=2, help="how many people")
     parser.add_argument("--people", type=Path, help="folder where rendered people are kept for later runs")
-    parser.add_argument("--rounds", type=int, default=2, help="timed rounds of making an avatar")
+    parser.add_argument("--iterations", type=int, default=2, help="timed iterations of making an avatar")
     parser.add_argument("--only", nargs="+", help="knobs to measure")
     parser.add_argument("--page", type=Path, help="page whose tables are written")
     parser.add_argument("--image", type=Path, help="draw the fronts to IMAGE_reconstruction.png and IMAGE_frames.png")
@@ -81,7 +81,7 @@ def sweep(arguments: argparse.Namespace) -> dict[str, Any]:
     missing = [(i, p) for i, p in missing if p.start != "published network" or "reconstruct" not in rows[p.name]]
     if not missing and result["growth"]:
         return result
-    bench = Bench(subjects, arguments.people, arguments.rounds)
+    bench = Bench(subjects, arguments.people, arguments.iterations)
     # all of one person, then the next: times are of the first
     for done, (i, each) in enumerate(tqdm(missing, desc="points")):
         if done % 20 == 19:
@@ -107,7 +107,7 @@ def described(point) -> dict[str, Any]:
     from humangs_jax.core.configuration import config_to_json
     from humangs_jax.refinement.learned import SHIPPED
 
-    learned = {"refiner": shipped_digest(SHIPPED)} if point.settings.refine_rounds else {}
+    learned = {"refiner": shipped_digest(SHIPPED)} if point.settings.refine_iterations else {}
     return learned | {
         "knob": point.knob,
         "size": point.size,
@@ -138,7 +138,7 @@ def person_of(seed: int, body, folder: Path | None):
 class Bench:
     """The people, the network, and the default point, with which others take turns."""
 
-    def __init__(self, subjects: int, people: Path | None, rounds: int = 2):
+    def __init__(self, subjects: int, people: Path | None, iterations: int = 2):
         from experiments.tradeoff.points import DEFAULT
         from humangs_jax.body.library import load_body
         from humangs_jax.network.weights import load_weights
@@ -148,7 +148,7 @@ class Bench:
         body = load_body()
         seeds = seeds_of("tradeoff", 0, subjects)
         self.person = functools.cache(lambda i: person_of(seeds[i], body, people))
-        self.default, self.rounds = DEFAULT, rounds
+        self.default, self.iterations = DEFAULT, iterations
         self.kept: dict[Any, Any] = {}
         self.default_avatar = self.made(DEFAULT, 0)
 
@@ -186,7 +186,7 @@ class Bench:
                 avatar = painted_body(photos)
             else:
                 avatar = reconstruct_with(settings.unrefined, self.variables, self.config, photos)
-                if point.start == "random colours":
+                if point.start == "random colors":
                     avatar = random_start(avatar, self.person(i).seed)
                 if settings.refinement is not None:
                     avatar = refine_with_report(avatar, photos, settings.refinement).avatar
@@ -249,12 +249,12 @@ class Bench:
         from humangs_jax.core.allocator import peak_memory
 
         settings, usual = point.settings, self.default.settings
-        same = (settings.views, settings.execution) == (usual.views, usual.execution)
+        same = (settings.views, settings.runtime) == (usual.views, usual.runtime)
         pairs = []
-        for _ in range(0 if same and point is not self.default else self.rounds):
+        for _ in range(0 if same and point is not self.default else self.iterations):
             pairs.append((timed(lambda: self.make(settings))[1], self.default_make_ms()))
         own, default = np.median(pairs, axis=0) if pairs else (1.0, 1.0)
-        ratio = 0.0 if point.start == "random colours" else 1.0 if point is self.default else float(own / default)
+        ratio = 0.0 if point.start == "random colors" else 1.0 if point is self.default else float(own / default)
         with peak_memory() as peak:
             self.make(settings)
         refined, memory = 0.0, peak[0]
@@ -272,10 +272,10 @@ class Bench:
         photos, avatar = self.person(0).inputs(settings.views or 4), self.make(settings)
         run = lambda config: refine_with_report(avatar, photos, config)
         run(dataclasses.replace(settings, refine_steps=min(settings.refine_steps, 1)).refinement)  # compiles
-        default = [self.default_make_ms() for _ in range(self.rounds)]
+        default = [self.default_make_ms() for _ in range(self.iterations)]
         with peak_memory() as peak:
             own = timed(lambda: run(settings.refinement))[1]
-        default += [self.default_make_ms() for _ in range(self.rounds)]
+        default += [self.default_make_ms() for _ in range(self.iterations)]
         return own / float(np.median(default)), peak[0]
 
     def frame_times(self, point, drawn) -> dict[str, Any]:
@@ -300,7 +300,7 @@ class Bench:
         return (jax.block_until_ready(rendering) for rendering in renderings)
 
     def painted_times(self) -> dict[str, Any]:
-        """Of the painted body: the mesh with its colours, rasterized."""
+        """Of the painted body: the mesh with its colors, rasterized."""
         from humangs_jax.evaluation.baseline import draw_painted_body, painted_body
 
         photos, held_out = self.person(0).inputs(4), self.person(0).held_out
@@ -308,7 +308,7 @@ class Bench:
         colors = painted_body(photos)
         draw_painted_body(colors, one)
         makes = [
-            (timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(self.rounds)
+            (timed(lambda: np.asarray(painted_body(photos)))[1], self.default_make_ms()) for _ in range(self.iterations)
         ]
         usual = self.frames(self.default_avatar, self.default.size, self.how(self.default, self.default_avatar))
         next(usual)
@@ -355,7 +355,7 @@ class Bench:
                 reconstruct_batch(self.variables, self.config, captures)
             )
             run()
-            pairs = np.asarray([(timed(run)[1], self.default_make_ms()) for _ in range(self.rounds)])
+            pairs = np.asarray([(timed(run)[1], self.default_make_ms()) for _ in range(self.iterations)])
             batch[str(count)] = float(np.divide(*np.median(pairs, axis=0)))
         small = self.person(0).held_out.cameras.resized(256, 256)
         how = self.how(self.default, self.default_avatar)
@@ -365,8 +365,8 @@ class Bench:
             boxes[side] = self.frames(
                 self.default_avatar, side, how, replace(small, K=small.K + shift, width=side, height=side)
             )
-        rounds = [[timed(lambda f=f: next(f))[1] for f in boxes.values()] for _ in range(FRAMES + 1)][1:]
-        times = np.median(rounds, axis=0)
+        iterations = [[timed(lambda f=f: next(f))[1] for f in boxes.values()] for _ in range(FRAMES + 1)][1:]
+        times = np.median(iterations, axis=0)
         return {"batch": batch, "box": {str(side): float(t / times[0]) for side, t in zip(boxes, times, strict=True)}}
 
 

@@ -37,8 +37,8 @@ def main() -> None:
     parser.add_argument(
         "--dtype", choices=("auto", "float32", "bfloat16"), default="auto", help="auto: float32 on a CPU"
     )
-    parser.add_argument("--repeats", type=int, default=3, help="timed rounds")
-    parser.add_argument("--warm-up", type=int, default=1, help="rounds before these")
+    parser.add_argument("--repeats", type=int, default=3, help="timed iterations")
+    parser.add_argument("--warm-up", type=int, default=1, help="iterations before these")
     parser.add_argument("--json", type=Path, help="add the numbers to this file")
     parser.add_argument("--page", type=Path, help="write the tables into this page from --json; nothing is run")
     arguments = parser.parse_args()
@@ -79,7 +79,7 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
 
     program, compile_s, costs = case.compiled(compiler_options())
     case.program = program
-    product, product_flops = matmul_program(case.config.model.execution.dtype)
+    product, product_flops = matmul_program(case.config.model.runtime.dtype)
     load = os.getloadavg()[0]
     times = medians({"matmul": product, "step": lambda: case.run(program)}, arguments.repeats, arguments.warm_up)
     wall, cpu = map(float, times["step"])
@@ -101,7 +101,7 @@ def step_numbers(case: Case, arguments: argparse.Namespace) -> dict[str, Any]:
         "gaussians": len(case.body.template) * case.config.model.architecture.decoder.gaussians_per_vertex,
         "parameters": sum(x.size for x in jax.tree.leaves(case.state.params)),
         "losses": case.metrics,
-        "dtype": case.config.model.execution.dtype,
+        "dtype": case.config.model.runtime.dtype,
         "repeats": arguments.repeats,
         "load_average": load,
         "device": jax.devices()[0].device_kind,
@@ -115,7 +115,7 @@ def token_count(config: Any) -> int:
     patches = (
         config.views.input_counts[0] * (model.conventions.image_size // model.architecture.encoder.patch_size) ** 2
     )
-    return model.execution.token_capacity if model.tokens == "foreground" else patches
+    return model.runtime.token_capacity if model.tokens == "foreground" else patches
 
 
 def steps_table(result: dict[str, Any]) -> str:

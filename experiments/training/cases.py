@@ -26,9 +26,9 @@ def settings(preset: str, size: int, views: int, targets: int, batch: int = 1) -
     )
 
 
-def with_model(config: Any, upsampler: Any = None, **execution: Any) -> Any:
-    """With other fields of the network's `Execution`, or with an upsampler in proportion to the network."""
-    model = config.model.with_execution(**execution)
+def with_model(config: Any, upsampler: Any = None, **runtime: Any) -> Any:
+    """With other fields of the network's `Runtime`, or with an upsampler in proportion to the network."""
+    model = config.model.with_runtime(**runtime)
     if upsampler is not None:
         encoder, reader = model.architecture.encoder, model.architecture.reader
         model = model.with_parts(
@@ -66,11 +66,11 @@ def abstract_batch(config: Any, joints: int, betas: int) -> Any:
 
 
 def random_weights(key: Any, slices: Any) -> Any:
-    """Random weights of a network of `objectives.backbones`."""
+    """Random weights of a network of `losses.backbones`."""
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.objectives.backbones import Convolution, convolutions
+    from humangs_jax.losses.backbones import Convolution, convolutions
 
     def draw(layer, key):
         shape = (layer.size, layer.size, layer.inputs, layer.outputs)
@@ -85,15 +85,15 @@ def random_networks(config: Any) -> Any:
     """`LossNetworks` with made-up weights for the losses that need some: they cost what the real ones cost."""
     import jax
 
-    from humangs_jax.objectives.loss_networks import LossNetworks
-    from humangs_jax.objectives.lpips import BACKBONES, Lpips
-    from humangs_jax.objectives.perceptual import VGG19, Vgg19
+    from humangs_jax.losses.loss_networks import LossNetworks
+    from humangs_jax.losses.lpips import BACKBONES, Lpips
+    from humangs_jax.losses.perceptual import VGG19, Vgg19
 
     key = jax.random.key(0)
     perceptual = Vgg19(random_weights(key, VGG19)) if config.loss.perceptual else None
     lpips = None
     if config.loss.lpips:
-        from humangs_jax.objectives.backbones import channels
+        from humangs_jax.losses.backbones import channels
 
         slices = BACKBONES["vgg"]
         heads = [jax.numpy.full(count, 1.0 / count) for count in channels(slices)]
@@ -174,7 +174,7 @@ class Case:
                 self.body, first(self.batch).inputs, self.config.model
             )
             self.config = with_model(
-                self.config, token_capacity=foreground(inputs, self.config.model)[0].execution.token_capacity
+                self.config, token_capacity=foreground(inputs, self.config.model)[0].runtime.token_capacity
             )
 
     def compiled(self, options: dict[str, Any] | None) -> tuple[Any, float, Any]:

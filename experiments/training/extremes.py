@@ -80,7 +80,7 @@ def base_config() -> Any:
     from experiments.training.cases import settings
 
     config = settings("tiny", SIZE, 2, 2)
-    model = config.model.with_conventions(body_vertices=VERTICES).with_execution(token_capacity=0)
+    model = config.model.with_conventions(body_vertices=VERTICES).with_runtime(token_capacity=0)
     loss = dataclasses.replace(config.loss, structural_scales=2)
     every = {"steps": STEPS, "validate_every": STEPS, "checkpoint_every": STEPS}
     return dataclasses.replace(config, model=model, loss=loss, **every)
@@ -122,7 +122,7 @@ def runs() -> dict[str, tuple[Any, Any, Any]]:
         )
         return lambda config: dataclasses.replace(config, optimizer=optimizer(config))
 
-    computed = lambda dtype: lambda config: dataclasses.replace(config, model=config.model.with_execution(dtype=dtype))
+    computed = lambda dtype: lambda config: dataclasses.replace(config, model=config.model.with_runtime(dtype=dtype))
     same, rounded = lambda x: x, lambda tree: jax.tree.map(lambda x: x.astype(jnp.bfloat16), tree)
     repeated = lambda config: dataclasses.replace(config, batch_size=REPEATED, microbatch_size=REPEATED)
     plain = captured_people

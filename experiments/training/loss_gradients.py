@@ -22,7 +22,7 @@ TABLE = "loss_gradients"
 DIRECTIONS = 3
 STEPS = (1e-4, 1e-5, 1e-6, 1e-8, 1e-9)
 """Of central differences, relative to the size of what is varied. Thousands of Gaussians move: within the longer steps some
-exchange places in the depth order, and colours jump."""
+exchange places in the depth order, and colors jump."""
 NETWORKS = ("perceptual", "lpips")
 """Terms that need a network of their own."""
 SIDE, TARGETS, VERTICES = 32, 2, 800
@@ -95,8 +95,8 @@ def own_case(names: list[str], side: int = SIDE) -> tuple[Any, Any]:
 
     from humangs_jax.data.views import SubjectViews
     from humangs_jax.geometry.camera import Camera
+    from humangs_jax.losses.losses import FAR_SURFACE, ray_spread
     from humangs_jax.network.parts import HumanGSOutputs
-    from humangs_jax.objectives.losses import FAR_SURFACE, ray_spread
     from humangs_jax.rendering.gaussians import Gaussians
     from humangs_jax.rendering.splatting import Rendering
     from humangs_jax.training.forward import DrawnTargets
@@ -164,13 +164,13 @@ def network_case(names: list[str]) -> tuple[Any, Any]:
     from humangs_jax.core.pytree import replace
     from humangs_jax.data.loader import CaptureCache, CaptureSource
     from humangs_jax.data.views import gaussian_body
+    from humangs_jax.losses.losses import FAR_SURFACE
     from humangs_jax.network.humangs import init_humangs
-    from humangs_jax.objectives.losses import FAR_SURFACE
     from humangs_jax.training.forward import draw_targets, reconstruct_example, white_backgrounds
     from humangs_jax.training.step import subject_loss
 
     config = settings("tiny", SIDE, 2, TARGETS)
-    model = config.model.with_conventions(body_vertices=VERTICES).with_execution(token_capacity=0)
+    model = config.model.with_conventions(body_vertices=VERTICES).with_runtime(token_capacity=0)
     config = dataclasses.replace(config, model=model, loss=loss_of(names))
     networks, key, body = loss_networks(config.loss), jax.random.key(0), load_body()
     with tempfile.TemporaryDirectory() as folder:

@@ -4,12 +4,12 @@
     python experiments/training/train_refiner.py --out runs/more --start runs/refiner/refiner.safetensors
 
 Makes the samples first: people of training seeds that the shipped network has not seen, its avatar of each from four photos, and
-ten views, four of them those photos. A step draws --batch samples and a number of photos for each, runs the rounds, and compares
-the result of each round with views that are not among the photos. Gradients pass through the rounds, but not through the errors
-that a round sees.
+ten views, four of them those photos. A step draws --batch samples and a number of photos for each, runs the iterations, and
+compares the result of each round with views that are not among the photos. Gradients pass through the iterations, but not
+through the errors that a round sees.
 The same command continues the run in --out; Ctrl-C saves. Writes OUT/refiner.safetensors. Validation is on other people.
 
-On two cores of a CPU: 1.7 s a sample, people included, then 2.4 s for a step of two samples and three rounds.
+On two cores of a CPU: 1.7 s a sample, people included, then 2.4 s for a step of two samples and three iterations.
 """
 
 import argparse
@@ -46,11 +46,11 @@ def main() -> None:
         help="weights to start from, of all layers or some; default: a network that changes nothing",
     )
     parser.add_argument("--steps", type=int, default=1300)
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--iterations", type=int, default=3)
     parser.add_argument("--batch", type=int, default=2, help="samples in a step, a thread each")
     parser.add_argument("--learning-rate", type=float, default=1.5e-3)
     arguments = parser.parse_args()
-    counts = ("samples", "people", "steps", "rounds", "batch")
+    counts = ("samples", "people", "steps", "iterations", "batch")
     if min(getattr(arguments, name) for name in counts) < 1:
         parser.error(f"expected at least 1 of {', '.join(f'--{name}' for name in counts)}")
     from humangs_jax.core.allocator import keep_freed_memory
@@ -192,7 +192,9 @@ def compiled(function: Any) -> Any:
     return jax.jit(function, static_argnames=static, compiler_options=compiler_options())
 
 
-def run_rounds(variables: Any, sample: Sample, photos: int, rounds: int, splat: Any) -> tuple[list[Any], list[Any]]:
+def run_iterations(
+    variables: Any, sample: Sample, photos: int, iterations: int, splat: Any
+) -> tuple[list[Any], list[Any]]:
     """Parameters side by side after each round, and the signals that each round saw."""
     import jax
     import jax.numpy as jnp
@@ -201,7 +203,7 @@ def run_rounds(variables: Any, sample: Sample, photos: int, rounds: int, splat: 
 
     start = values = stacked(sample.start)
     hidden, after, seen = jnp.zeros((len(start), Refiner.width)), [], []
-    for _ in range(rounds):
+    for _ in range(iterations):
         parameters = unstacked(values, sample.start)
         each = [
             compiled(photo_signals)(parameters, sample.avatar, view, splat=splat)[0] for view in sample.views[:photos]
@@ -214,28 +216,28 @@ def run_rounds(variables: Any, sample: Sample, photos: int, rounds: int, splat: 
     return after, seen
 
 
-def through_rounds(variables: Any, start: Any, seen: list[Any], graph: Any, avatar: Any, cotangents: Any) -> Any:
+def through_iterations(variables: Any, start: Any, seen: list[Any], graph: Any, avatar: Any, cotangents: Any) -> Any:
     """Gradient with respect to the variables, from those with respect to the parameters after each round."""
     import jax
     import jax.numpy as jnp
 
     from humangs_jax.refinement.learned import Refiner, refiner_round
 
-    def rounds(variables):
+    def iterations(variables):
         values, hidden, after = start, jnp.zeros((len(start), Refiner.width)), []
         for signals in seen:
             values, hidden = refiner_round(variables, values, start, hidden, signals, graph, avatar)
             after.append(values)
         return after
 
-    return jax.vjp(rounds, variables)[1](cotangents)[0]
+    return jax.vjp(iterations, variables)[1](cotangents)[0]
 
 
 def view_loss(values: Any, like: Any, avatar: Any, view: Any, splat: Any) -> tuple[Any, Any]:
     """Loss of one view, relative to the person's share of the image; mean squared error."""
     import jax.numpy as jnp
 
-    from humangs_jax.objectives.ssim import structural_dissimilarity
+    from humangs_jax.losses.ssim import structural_dissimilarity
     from humangs_jax.refinement.learned import unstacked
     from humangs_jax.refinement.objective import posed_gaussians
     from humangs_jax.rendering.splatting import render
@@ -263,7 +265,7 @@ def view_gradient() -> Any:
     return jax.jit(differentiated, static_argnames="splat", compiler_options=compiler_options())
 
 
-def validate(variables: Any, folders: list[Path], rounds: int, splat: Any) -> list[float]:
+def validate(variables: Any, folders: list[Path], iterations: int, splat: Any) -> list[float]:
     """PSNR of views that are not among the photos, mean over samples, before and after each round."""
     import numpy as np
 
@@ -272,7 +274,7 @@ def validate(variables: Any, folders: list[Path], rounds: int, splat: Any) -> li
     rows = []
     for folder in folders:
         sample = read_sample(folder)
-        after, _ = run_rounds(variables, sample, PHOTOS, rounds, splat)
+        after, _ = run_iterations(variables, sample, PHOTOS, iterations, splat)
         scored = lambda values, sample=sample: [
             -10 * np.log10(float(view_gradient()(values, sample.start, sample.avatar, view, splat=splat)[0][1]))
             for view in sample.views[PHOTOS:]
@@ -281,7 +283,7 @@ def validate(variables: Any, folders: list[Path], rounds: int, splat: Any) -> li
     return np.mean(rows, axis=0).round(3).tolist()
 
 
-def step_gradient(variables: Any, folders: list[Path], rounds: int, splat: Any, seed: tuple[int, int]) -> Any:
+def step_gradient(variables: Any, folders: list[Path], iterations: int, splat: Any, seed: tuple[int, int]) -> Any:
     """Gradient of one sample, which the seed chooses: a new view for each round, two for the last one."""
     import numpy as np
 
@@ -290,20 +292,20 @@ def step_gradient(variables: Any, folders: list[Path], rounds: int, splat: Any, 
     rng = np.random.default_rng(seed)
     sample = read_sample(folders[rng.integers(len(folders))])
     photos = int(rng.choice(COUNTS))
-    after, seen = run_rounds(variables, sample, photos, rounds, splat)
+    after, seen = run_iterations(variables, sample, photos, iterations, splat)
     first = max(photos, PHOTOS)
     targets = list(first + rng.permutation(len(sample.views) - first))
     cotangents = []
     for i, values in enumerate(after):
-        count = 2 if i == rounds - 1 else 1
+        count = 2 if i == iterations - 1 else 1
         each = [
             view_gradient()(
                 values, sample.start, sample.avatar, sample.views[targets[(i + j) % len(targets)]], splat=splat
             )[1]
             for j in range(count)
         ]
-        cotangents.append(ROUND_WEIGHT ** (rounds - 1 - i) * sum(each) / count)
-    return compiled(through_rounds)(variables, stacked(sample.start), seen, sample.graph, sample.avatar, cotangents)
+        cotangents.append(ROUND_WEIGHT ** (iterations - 1 - i) * sum(each) / count)
+    return compiled(through_iterations)(variables, stacked(sample.start), seen, sample.graph, sample.avatar, cotangents)
 
 
 def train(folders: list[Path], validation: list[Path], arguments: argparse.Namespace) -> None:
@@ -351,9 +353,9 @@ def train(folders: list[Path], validation: list[Path], arguments: argparse.Names
         try:
             while (step := int(state["step"])) < arguments.steps:
                 if step % VALIDATE_EVERY == 0:
-                    dB = validate(state["variables"], validation, arguments.rounds, splat)
+                    dB = validate(state["variables"], validation, arguments.iterations, splat)
                     bar.write(f"step {step}: {dB} dB before and after each round")
-                one = functools.partial(step_gradient, state["variables"], folders, arguments.rounds, splat)
+                one = functools.partial(step_gradient, state["variables"], folders, arguments.iterations, splat)
                 gradients = list(threads.map(one, [(step, i) for i in range(arguments.batch)]))
                 gradient = jax.tree.map(lambda *x: sum(x) / len(x), *gradients)
                 variables, opt_state = updated(gradient, state["optimizer"], state["variables"])
@@ -365,7 +367,7 @@ def train(folders: list[Path], validation: list[Path], arguments: argparse.Names
             bar.write("interrupted: the same command goes on")
     write_bytes(path, serialization.to_bytes(jax.device_get(state)))
     if int(state["step"]) == arguments.steps:
-        dB = validate(state["variables"], validation, arguments.rounds, splat)
+        dB = validate(state["variables"], validation, arguments.iterations, splat)
         print(f"step {arguments.steps}: {dB} dB before and after each round")
         save_refiner(arguments.out / "refiner.safetensors", state["variables"])
 

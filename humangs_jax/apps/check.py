@@ -1,6 +1,6 @@
 """A look at a capture before its use: the posed body over each photo, and numbers that show what is wrong.
 
-Blue is the person's left side, red the right, the green line the outline of the body; photo and body
+Blue is the person's left side, red the right, the green line the silhouette of the body; photo and body
 should coincide. Most captures that fail have a wrong convention: a view whose body is not where the mask is, is tried again
 with each usual mistake undone, and the mistake that explains it is named.
 """
@@ -37,7 +37,7 @@ from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, raster
 LONGEST_SIDE = 512
 """Larger photos are shrunk to this for the check, pixels."""
 MOST_OUTSIDE = 0.05
-"""Share of the body's pixels: those outside of the mask take the background's colour."""
+"""Share of the body's pixels: those outside of the mask take the background's color."""
 WIDER = (
     "{:.0%} of the body is outside the mask: it is wider than the person, or the pose is off; "
     "`humangs fit CAPTURE --refine{}` fits {}shape and pose to the masks"
@@ -46,7 +46,7 @@ FIXED, FREE = (" --fixed-cameras", ""), ("", "cameras, ")
 LEAST_HEIGHT = 0.05
 """Share of the image's height: a body smaller than this has its lengths in another unit."""
 LEFT, RIGHT, MIDDLE = (0.15, 0.45, 1.0), (1.0, 0.35, 0.15), (0.85, 0.85, 0.85)
-OUTLINE = (0.1, 0.85, 0.2)
+BOUNDARY = (0.1, 0.85, 0.2)
 AMBIENT = 0.35
 OPACITY = 0.55
 
@@ -150,14 +150,14 @@ def draw_body(
 
 
 def overlay(photo: Float[np.ndarray, "h w 3"], drawn: BodyImage) -> Float[np.ndarray, "h w 3"]:
-    """Half-transparent body over a photo, with its outline."""
+    """Half-transparent body over a photo, with its silhouette."""
     covered = np.asarray(drawn.covered)
     blended = photo + OPACITY * covered[..., None] * (np.asarray(drawn.shaded) - photo)
-    return np.where(_outline(covered)[..., None], np.asarray(OUTLINE), blended)
+    return np.where(_boundary(covered)[..., None], np.asarray(BOUNDARY), blended)
 
 
 def side_tints(body: BodyModel) -> Float[np.ndarray, "n 3"]:
-    """Colours of the vertices: left, right, or between, by the names of the joints that move them, else by x in T-pose."""
+    """Colors of the vertices: left, right, or between, by the names of the joints that move them, else by x in T-pose."""
     weights = np.asarray(body.skinning_weights)
     left, right = (
         weights @ np.array([name.startswith(side) for name in body.joint_names]) for side in ("left", "right")
@@ -253,7 +253,7 @@ def _mistake_in_space(draw, camera, translation, mask):
     return max(fitting, key=lambda mistake: fitting[mistake]) if fitting else None
 
 
-def _outline(covered):
+def _boundary(covered):
     """Pixels of the body beside pixels outside it."""
     padded = np.pad(covered, 1, mode="edge")
     neighbours = (padded[:-2, 1:-1], padded[2:, 1:-1], padded[1:-1, :-2], padded[1:-1, 2:])

@@ -70,13 +70,13 @@ def run_demo(
 def summary(report: dict[str, Any]) -> str:
     """What `run_demo` found, in one line."""
     quality = (
-        f"PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.3f}, foreground PSNR {report['psnr_foreground']:.2f} dB on "
+        f"PSNR {report['psnr']:.2f} dB, SSIM {report['ssim']:.3f}, foreground PSNR {report['psnr_fg']:.2f} dB on "
         f"{report['views']['held_out']} views that the network has not seen (painted body mesh: {report['baseline_psnr']:.2f} dB)"
     )
     refined = report.get("refined")
     if refined is None:
         return quality
-    gain = f"{refined['psnr']:.2f}, foreground {refined['psnr_foreground']:.2f} dB"
+    gain = f"{refined['psnr']:.2f}, foreground {refined['psnr_fg']:.2f} dB"
     return f"{quality}; refined for {refined['seconds']:.0f} s: {gain}"
 
 
@@ -116,7 +116,7 @@ def _write_products(
         **{name: round(value, 4) for name, value in dataclasses.asdict(scores).items()},
         **refined,
         "baseline_psnr": round(baseline.psnr, 4),
-        "baseline_psnr_foreground": round(baseline.psnr_foreground, 4),
+        "baseline_psnr_fg": round(baseline.psnr_fg, 4),
         "lpips": "not computed: no LPIPS weights are available",
         "gaussians": len(avatar.gaussians.means),
         "views": {"input": inputs.view_count, "held_out": truth.view_count},

@@ -6,7 +6,7 @@
     masks/NAME.png   of the chosen person
 
 With cameras people are matched by how well they triangulate, over time by where they are; without, by their size in the photo,
-and where several are of nearly one size, by the colours of their upper bodies and legs.
+and where several are of nearly one size, by the colors of their upper bodies and legs.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from humangs_jax.data.photos import Photos, load_photos, read_description
 from humangs_jax.detection.blazepose import LANDMARK_SIZE, Networks
 from humangs_jax.detection.people import SEEN, DetectedPerson, detect_people
 from humangs_jax.detection.sharpening import sharpened
-from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_colours, match_people
+from humangs_jax.fitting.who_is_who import Match, Seen, in_order_of_time, match_colors, match_people
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.io.atomic import add_files
 from humangs_jax.io.images import orientation, oriented, read_image, resized, to_uint8, write_png
@@ -40,16 +40,16 @@ LISTED = 3
 """Names of photos in a line, at most."""
 THUMBNAIL = 480
 """Pixels of the longest side of a photo on the sheet."""
-COLOURS = ((46, 160, 67), (31, 111, 235), (219, 109, 40), (163, 113, 247), (207, 34, 46))
+COLORS = ((46, 160, 67), (31, 111, 235), (219, 109, 40), (163, 113, 247), (207, 34, 46))
 """Of the people on the sheet, by number."""
 FAINT = 0.45
-"""Share of the colour over a person's pixels."""
+"""Share of the color over a person's pixels."""
 BEYOND = 0.03
 """Share of a person's size that a landmark outside of the photo is beyond its border."""
 PARTS = ((11, 12, 24, 23), (23, 24, 26, 25))
 """Corners of upper body and thighs: landmarks of the left and right."""
 LARGE_PEOPLE = 5
-"""In a photo, at most, that are told apart by their colours."""
+"""In a photo, at most, that are told apart by their colors."""
 
 
 class Found(NamedTuple):
@@ -67,14 +67,14 @@ class Found(NamedTuple):
 @dataclasses.dataclass(frozen=True, eq=False)
 class PhotoPeople:
     """A photo. name: of the file. size: (width, height). thumbnail: (h, w, 3) for the sheet. people: None who is not in it.
-    colours: several are large, and colours tell who is who. unclear: they do not.
+    colors: several are large, and colors tell who is who. unclear: they do not.
     """
 
     name: str
     size: tuple[int, int]
     thumbnail: Float[np.ndarray, "h w 3"]
     people: tuple[Found | None, ...]
-    colours: bool = False
+    colors: bool = False
     unclear: bool = False
 
 
@@ -162,12 +162,12 @@ def same_people(
     """The photos with people in such an order that the i-th of each is the same person.
 
     Arguments: cameras: a batch, of the photos; None: not known, and the order is that of size, or, where several are large, that
-    of colours. frames: the moment of each photo. The person with the most pixels in all photos together is the first.
+    of colors. frames: the moment of each photo. The person with the most pixels in all photos together is the first.
     """
     if cameras is not None and len(photos) > 1:
         rows = _matched(photos, cameras, np.asarray([0] * len(photos) if frames is None else frames))
     else:
-        photos = _by_colours(photos) if len(photos) > 1 else photos
+        photos = _by_colors(photos) if len(photos) > 1 else photos
         rows = [list(photo.people) for photo in photos]
     most = max((len(row) for row in rows), default=0)
     ordered = [
@@ -178,7 +178,7 @@ def same_people(
     return [dataclasses.replace(photo, people=tuple(photo.people[i] for i in order)) for photo in ordered]
 
 
-def _by_colours(photos):
+def _by_colors(photos):
     """The photos, each with its large people in the order of those in the photo that has the most of them; see `unclear`."""
     large = [
         [each for each in p.people if each and each.area > RIVAL * p.people[0].area][:LARGE_PEOPLE] for p in photos
@@ -186,21 +186,21 @@ def _by_colours(photos):
     most = max(range(len(photos)), key=lambda v: len(large[v]))
     if len(large[most]) < 2:
         return photos
-    first = _colours(photos[most], large[most])
+    first = _colors(photos[most], large[most])
     ordered = []
     for photo, people in zip(photos, large, strict=True):
-        order = match_colours(first, _colours(photo, people)) if people else ()
+        order = match_colors(first, _colors(photo, people)) if people else ()
         if order is None:
             ordered.append(dataclasses.replace(photo, unclear=True))
             continue
         row: list[Found | None] = [None] * len(first)
         for i, each in zip(order, people, strict=True):
             row[i] = each
-        ordered.append(dataclasses.replace(photo, people=(*row, *photo.people[len(people) :]), colours=True))
+        ordered.append(dataclasses.replace(photo, people=(*row, *photo.people[len(people) :]), colors=True))
     return ordered
 
 
-def _colours(photo, people):
+def _colors(photo, people):
     """Medians over each of the parts of each person, (n, parts, 3); NaN for a part that is not in the photo."""
     height, width = photo.thumbnail.shape[:2]
     u, v = (each.reshape(-1, 1) for each in np.meshgrid(np.linspace(0.2, 0.8, 9), np.linspace(0.2, 0.8, 9)))
@@ -274,7 +274,7 @@ def choose(photos: Sequence[PhotoPeople], person: int | None, sheet: Path) -> in
             )
     if unclear := [photo.name for photo in photos if photo.unclear]:
         raise ValueError(
-            f"{_few(unclear)}: which of the people of {sheet} is meant? Their colours do not tell: cut these photos down to "
+            f"{_few(unclear)}: which of the people of {sheet} is meant? Their colors do not tell: cut these photos down to "
             "one person, or leave them out"
         )
     return person or 0
@@ -414,7 +414,7 @@ def _images(photos, numbers):
 
 
 def write_sheet(path: Path, photos: Sequence[PhotoPeople], person: int | None = None) -> None:
-    """The photos side by side, everybody in a colour and with a number. person: the one who was chosen."""
+    """The photos side by side, everybody in a color and with a number. person: the one who was chosen."""
     from humangs_jax.avatar.sheets import contact_sheet
 
     pictures = [_picture(photo, person) for photo in photos]
@@ -435,9 +435,9 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
     for i, found in enumerate(photo.people):
         if found is None:
             continue
-        colour = np.asarray(COLOURS[i % len(COLOURS)]) / 255
+        color = np.asarray(COLORS[i % len(COLORS)]) / 255
         mask = resized(person_mask(photo, i), width, height)[..., None] * (FAINT if chosen in (None, i) else FAINT / 2)
-        picture = picture * (1 - mask) + colour * mask
+        picture = picture * (1 - mask) + color * mask
         x, y = found.person.points[0, :2] * width / photo.size[0]
         heads.append((float(np.clip(x, 8, width - 24)), float(np.clip(y - 30, 2, height - 26)), i))
     canvas = Image.fromarray(to_uint8(picture))
@@ -448,7 +448,7 @@ def _picture(photo: PhotoPeople, chosen: int | None) -> Float[np.ndarray, "h w 3
             f"{i}?" if photo.unclear else str(i),
             fill="white",
             stroke_width=3,
-            stroke_fill=COLOURS[i % len(COLOURS)],
+            stroke_fill=COLORS[i % len(COLORS)],
             font=font,
         )
     return np.asarray(canvas) / 255

@@ -55,7 +55,7 @@ def held_out_psnr(
     if refinement is not None:
         avatar = refine(avatar, others, refinement)
     photo = cropped(capture.select([view]), SIZE)
-    return HeldOut(capture.names[view], float(score(draw_views(avatar, photo).images, photo).psnr_foreground))
+    return HeldOut(capture.names[view], float(score(draw_views(avatar, photo).images, photo).psnr_fg))
 
 
 def better_body(

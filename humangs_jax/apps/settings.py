@@ -17,10 +17,10 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.configuration import (
     Few,
+    Iterations,
     PhotoSide,
     Presets,
     RefineSteps,
-    Rounds,
     config_from_json,
     config_to_json,
     configuration,
@@ -32,8 +32,8 @@ from humangs_jax.data.view_selection import select_views
 from humangs_jax.io.reading import Refused, reading
 from humangs_jax.io.text import parse_json, read_text, write_json
 from humangs_jax.network.config import HumanGSConfig
-from humangs_jax.network.execution import EXECUTIONS, Execution
 from humangs_jax.network.parts import Variables
+from humangs_jax.network.runtime import RUNTIMES, Runtime
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.refine import refine_with_report
 
@@ -46,14 +46,16 @@ KIND = "humangs_jax settings"
 class Settings:
     """How an avatar is made and drawn. The size of the frames is not in it: it belongs to the screen.
 
-    views: photos that are used at most, chosen by `select_views`; None: all. execution: of the network. refine_rounds,
+    views: photos that are used at most, chosen by `select_views`; None: all. runtime: of the network. refine_iterations,
     refine_steps: of refinement, see `RefineConfig`, 0 and 0 for none; refine_size: photos whose longer side is larger are reduced
     to it for refinement, pixels. splat: as `Shot.splat`. prune: as `Shot.prune`.
     """
 
     views: Few | None = knob(None, cost="what the other photos show", gain="time in proportion", measured=MEASURED)
-    execution: Execution = dataclasses.field(default_factory=Execution)
-    refine_rounds: Rounds = knob(0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED)
+    runtime: Runtime = dataclasses.field(default_factory=Runtime)
+    refine_iterations: Iterations = knob(
+        0, cost="time in proportion", gain="most of what steps gain", measured=MEASURED
+    )
     refine_steps: RefineSteps = knob(0, cost="time in proportion", gain="detail of the photos", measured=MEASURED)
     refine_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
     splat: Literal["as_trained", "exact", "near_exact", "fast", "inria"] = knob(
@@ -64,20 +66,20 @@ class Settings:
     @property
     def refinement(self) -> RefineConfig | None:
         """What `refine` is given; None for no refinement."""
-        if not self.refine_rounds and not self.refine_steps:
+        if not self.refine_iterations and not self.refine_steps:
             return None
         return RefineConfig(
-            rounds=self.refine_rounds, steps=self.refine_steps, seconds=None, image_size=self.refine_size
+            iterations=self.refine_iterations, steps=self.refine_steps, seconds=None, image_size=self.refine_size
         )
 
     @property
     def unrefined(self) -> "Settings":
         """The same without refinement."""
-        return dataclasses.replace(self, refine_rounds=0, refine_steps=0)
+        return dataclasses.replace(self, refine_iterations=0, refine_steps=0)
 
     def network(self, config: HumanGSConfig) -> HumanGSConfig:
         """A network of these weights, run in this way."""
-        return dataclasses.replace(config, execution=self.execution)
+        return dataclasses.replace(config, runtime=self.runtime)
 
     def photos(self, capture: Capture) -> Capture:
         """The photos that are used."""
@@ -94,14 +96,14 @@ class Settings:
 
 PRESETS: Presets[Settings] = Presets(
     {
-        "realtime": Settings(views=4, execution=EXECUTIONS["realtime"], splat="fast"),
+        "realtime": Settings(views=4, runtime=RUNTIMES["realtime"], splat="fast"),
         "balanced": Settings(
-            views=4, execution=EXECUTIONS["balanced"], refine_rounds=4, refine_size=256, splat="near_exact"
+            views=4, runtime=RUNTIMES["balanced"], refine_iterations=4, refine_size=256, splat="near_exact"
         ),
         "quality": Settings(
-            views=4, execution=EXECUTIONS["quality"], refine_rounds=4, refine_size=512, splat="near_exact"
+            views=4, runtime=RUNTIMES["quality"], refine_iterations=4, refine_size=512, splat="near_exact"
         ),
-        "best": Settings(execution=EXECUTIONS["best"], refine_rounds=4, refine_steps=100, refine_size=512),
+        "best": Settings(runtime=RUNTIMES["best"], refine_iterations=4, refine_steps=100, refine_size=512),
     },
     "; those of training are in humangs_jax.training.config",
 )
@@ -118,7 +120,7 @@ def reconstruct_with(
 ) -> Avatar:
     """An avatar of the person of a capture: `reconstruct`, then `refine` where the settings say so.
 
-    Arguments: settings: or the name of one of `PRESETS`. config: of the weights; its execution is replaced by that of the
+    Arguments: settings: or the name of one of `PRESETS`. config: of the weights; its runtime is replaced by that of the
     settings. capture: `Settings.photos` are used. progress: show the bar of refinement.
 
     Raises: ValueError as `reconstruct` and `refine`.

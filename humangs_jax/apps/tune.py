@@ -236,13 +236,15 @@ def measure(settings: Settings, variables: Variables, config: HumanGSConfig, cap
 
 
 def refinement_parts(settings: Settings) -> list[tuple[RefineConfig, float]]:
-    """Short runs of refinement, and how often each has to be counted: the rounds, and a few steps for all."""
+    """Short runs of refinement, and how often each has to be counted: the iterations, and a few steps for all."""
     few = min(settings.refine_steps, STEPS)
-    rounds = dataclasses.replace(settings, refine_steps=0).refinement
-    steps = dataclasses.replace(settings, refine_rounds=0, refine_steps=few).refinement
+    iterations = dataclasses.replace(settings, refine_steps=0).refinement
+    steps = dataclasses.replace(settings, refine_iterations=0, refine_steps=few).refinement
     if steps is not None:
         steps = dataclasses.replace(steps, held_out=0.0)  # a trial may find that no more steps are worth it
-    return [(c, times) for c, times in ((rounds, 1.0), (steps, settings.refine_steps / max(few, 1))) if c is not None]
+    return [
+        (c, times) for c, times in ((iterations, 1.0), (steps, settings.refine_steps / max(few, 1))) if c is not None
+    ]
 
 
 def frames_of(avatar: Avatar, settings: Settings, size: int):
@@ -270,11 +272,13 @@ def _milliseconds(run):
 def in_words(tuned: Tuned, best: FrontPoint) -> str:
     """What was chosen, what it takes, and what it gives up against the best setting, by the committed sweep."""
     settings, cost, point = tuned.point.settings, tuned.cost, tuned.point
-    views, size = settings.views, settings.execution.image_size
+    views, size = settings.views, settings.runtime.image_size
     parts = ["all photos" if views is None else f"{views} photo{'s' * (views > 1)}"]
     parts += [f"of {size} pixels"] if size else []
-    parts += ["cut to the person"] if settings.execution.crop else []
-    refined = [f"{n} {name}" for n, name in ((settings.refine_rounds, "rounds"), (settings.refine_steps, "steps")) if n]
+    parts += ["cut to the person"] if settings.runtime.crop else []
+    refined = [
+        f"{n} {name}" for n, name in ((settings.refine_iterations, "iterations"), (settings.refine_steps, "steps")) if n
+    ]
     parts += [f"{' and '.join(refined)} of refinement" if refined else "no refinement"]
     parts += [f"drawn {settings.splat}"]
     takes = f"{cost.reconstruct_ms:.0f} ms a reconstruction, {cost.frame_ms:.1f} ms a frame"

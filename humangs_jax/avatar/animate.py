@@ -16,7 +16,7 @@ from humangs_jax.rendering.gaussians import Gaussians, factored, gaussian_values
 def skin(avatar: Avatar, pose: BodyPose) -> Gaussians:
     """Posed Gaussians, differentiable in avatar and pose; affine skinning leaves its linear part in `deformations`.
 
-    Colours stay, or are those of the avatar's light.
+    Colors stay, or are those of the avatar's light.
     """
     joints = joint_transforms(avatar.rest_joints, avatar.parents, pose.rotations, pose.translation)
     gaussians, transforms = avatar.gaussians, blend_transforms(avatar.skinning_weights, joints)

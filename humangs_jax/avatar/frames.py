@@ -97,7 +97,7 @@ def splatting_of(shot: Shot, avatar: Avatar) -> SplatConfig:
 def image_of(
     rendering: Rendering, color: tuple[float, float, float] | None
 ) -> Float[np.ndarray, "h w 3"] | Float[np.ndarray, "h w 4"]:
-    """A rendering onto black as an image in [0, 1]: over a colour, or with straight alpha for None, as PNG and WebM have it."""
+    """A rendering onto black as an image in [0, 1]: over a color, or with straight alpha for None, as PNG and WebM have it."""
     rgb, alpha = np.asarray(rendering.rgb), np.asarray(rendering.alpha)[..., None]
     if color is not None:
         return np.clip(rgb + (1 - alpha) * np.asarray(color, rgb.dtype), 0, 1)

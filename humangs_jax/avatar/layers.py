@@ -1,11 +1,11 @@
 """Views of an avatar as files: PNG images, and an OpenEXR file of layers for compositing programs.
 
-Layers of a view, besides the colours:
+Layers of a view, besides the colors:
 
 Z: depth along the camera's axis, metres. position: the point of the world on the ray of the pixel at that depth, metres.
 normal: of the body's surface, in the world; unit vectors. Each Gaussian has the normal of the vertex that is nearest to it in the
-    T-pose, turned by its own skinning transform; a pixel has the mean by the weights of its colour, normalised.
-part: the joint that most of the pixel's colour follows, 1 for the first of the header's `parts`, 0 where alpha is below 1/2. A
+    T-pose, turned by its own skinning transform; a pixel has the mean by the weights of its color, normalised.
+part: the joint that most of the pixel's color follows, 1 for the first of the header's `parts`, 0 where alpha is below 1/2. A
     Gaussian follows the joint of its largest skinning weight.
 
 None of these is multiplied by alpha; they are 0 where alpha is.
@@ -46,7 +46,7 @@ COVERED = 0.5
 
 @dataclasses.dataclass(frozen=True)
 class ExrLayers:
-    """The contents of an EXR file of views, besides colours. half: colours, normals and parts in 16 bits; Z and positions
+    """The contents of an EXR file of views, besides colors. half: colors, normals and parts in 16 bits; Z and positions
     stay in 32, since half floats are 2 mm apart at 4 m.
     """
 
@@ -168,7 +168,7 @@ def unprojected(camera: Camera, depth: Float[np.ndarray, "h w"]) -> Float[np.nda
 def splatted(
     gaussians: Gaussians, camera: Camera, how: SplatConfig, values: Float[Array, "g c"]
 ) -> Float[np.ndarray, "h w c"]:
-    """Any numbers of Gaussians summed by the weights of their colours: splatting draws three channels at a time."""
+    """Any numbers of Gaussians summed by the weights of their colors: splatting draws three channels at a time."""
     count = values.shape[1]
     triples = jnp.pad(values, ((0, 0), (0, -count % 3))).reshape(len(values), -1, 3)
     each = (replace(gaussians, colors=triples[:, i]) for i in range(triples.shape[1]))

@@ -1,9 +1,9 @@
-"""The light of the photos. Colours contain it, so they are corrected (`relit`) for parts that turn in another pose.
+"""The light of the photos. Colors contain it, so they are corrected (`relit`) for parts that turn in another pose.
 
-The log of the brightness is a polynomial of second order in the surface's unit normal, the same for all colours. A Lambertian
+The log of the brightness is a polynomial of second order in the surface's unit normal, the same for all colors. A Lambertian
 surface in distant light has a brightness of that order (Ramamoorthi and Hanrahan 2001, https://doi.org/10.1145/383259.383317).
 
-Its coefficients come from the colours of the avatar. Vertices that are near each other mostly have the same albedo. If their
+Its coefficients come from the colors of the avatar. Vertices that are near each other mostly have the same albedo. If their
 normals and their brightness differ, the light is the cause (Retinex: Land and McCann 1971,
 https://doi.org/10.1364/JOSA.61.000001). Prints and the edges of clothes are outliers.
 """
@@ -43,7 +43,7 @@ TINY = 1e-24
 class Light:
     """coefficients: (8,), of `light_terms`. normals: (g, 3), unit, of the body's surface in the T-pose.
 
-    shading: (g,) log of the brightness in the photos: the colours of the Gaussians are those under this light.
+    shading: (g,) log of the brightness in the photos: the colors of the Gaussians are those under this light.
     """
 
     coefficients: Float[Array, "8"]
@@ -76,7 +76,7 @@ def turned_normals(normals: Float[Array, "g 3"], linear: Float[Array, "g 3 3"]) 
 
 
 def relit(colors: Float[Array, "g 3"], light: Light, linear: Float[Array, "g 3 3"]) -> Float[Array, "g 3"]:
-    """Colours where `linear` has turned the surface. They do not exceed 1, except where they do in the photos."""
+    """Colors where `linear` has turned the surface. They do not exceed 1, except where they do in the photos."""
     terms = light_terms(turned_normals(light.normals, linear))
     change = jnp.clip(log_brightness(terms, light.coefficients) - light.shading, -LIMIT, LIMIT)
     return jnp.minimum(colors * jnp.exp(change)[:, None], jnp.maximum(colors, 1.0))
@@ -85,7 +85,7 @@ def relit(colors: Float[Array, "g 3"], light: Light, linear: Float[Array, "g 3 3
 def light_coefficients(
     vertices: Float[Array, "n 3"], colors: Float[Array, "n 3"], weights: Float[Array, " n"], terms: Float[Array, "n 8"]
 ) -> Float[Array, "8"]:
-    """The light that explains the colours of vertices.
+    """The light that explains the colors of vertices.
 
     Arguments: vertices: metres, in the T-pose. colors, weights: of the vertices; those without weight do not count. terms: of
     the light in the photos. Returns: coefficients with the least absolute deviations of the differences between vertices that

@@ -55,7 +55,7 @@ def reconstruct(variables: PyTree, config: HumanGSConfig, capture: Capture) -> A
     """
     _check(capture, "capture")
     body = gaussian_body(capture.body, config)
-    photos = standardize(equal_exposure(capture), config.image_size, config.execution.crop)
+    photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
     views, count = upright(photos, capture.body), len(photos.images)
     turned, bucket = views is not photos, round_up(count, smallest=1)
     if bucket > count:
@@ -122,7 +122,7 @@ def _stacked(config, captures):
     coefficients = max(len(capture.betas) for capture in captures)
     subjects, turned = [], []
     for capture in captures:
-        photos = standardize(equal_exposure(capture), config.image_size, config.execution.crop)
+        photos = standardize(equal_exposure(capture), config.image_size, config.runtime.crop)
         turned.append((views := upright(photos, capture.body)) is not photos)
         views = pad_views(views, bucket)
         betas = jnp.pad(views.betas, (0, coefficients - len(views.betas)))  # those left out are 0
@@ -137,7 +137,7 @@ def fit_buffers(inputs: HumanGSInputs, config: HumanGSConfig) -> HumanGSConfig:
     """The configuration with room for all that some inputs hold, those of one subject or of a batch."""
     capacity = 0 if config.tokens == "all" else round_up(int(_needed_tokens(inputs, config)))
     # vertex_capacity: reading all vertices is 2 % of the time
-    return config.with_execution(token_capacity=capacity, vertex_capacity=None)
+    return config.with_runtime(token_capacity=capacity, vertex_capacity=None)
 
 
 @checked_arguments
@@ -145,7 +145,7 @@ def reconstruct_views(
     variables: PyTree, config: HumanGSConfig, body: BodyModel, views: SubjectViews
 ) -> tuple[Avatar, Int[Array, ""]]:
     """The pure function behind `reconstruct`: one subject's views -> avatar, and the count of foreground patches that did
-    not fit into `config.execution.token_capacity`.
+    not fit into `config.runtime.token_capacity`.
 
     Batch over subjects with `jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))`; `stack_captures` makes the arguments.
     Weights files record no token capacity, and the default has room for all patches, which takes the time of all.

@@ -1,4 +1,4 @@
-"""Sheets of labelled images, and comparisons with the error in colour.
+"""Sheets of labelled images, and comparisons with the error in color.
 
 Images are (h, w, 3) float arrays in [0, 1].
 """
@@ -18,7 +18,7 @@ GAP = 4
 TEXT_SHARE, SMALLEST_TEXT, LARGEST_TEXT = 1 / 14, 10, 22
 """Height of the letters: a share of the width of a tile, within limits, pixels."""
 ERROR_COLORS = ((1, 1, 1), (1, 0.87, 0.35), (0.93, 0.38, 0.13), (0.6, 0.04, 0.2), (0.12, 0, 0.12))
-"""Colours of errors from none to the largest, evenly spaced: white first, like the background, then darker
+"""Colors of errors from none to the largest, evenly spaced: white first, like the background, then darker
 at every step, so that the order is also visible in grey."""
 
 
@@ -117,7 +117,7 @@ def write_texts(
 
 
 def error_colors(errors: Float[np.ndarray, "*shape"], largest: float | int) -> Float[np.ndarray, "*shape 3"]:
-    """Colours of non-negative errors: `ERROR_COLORS`, linear in between; errors above `largest` get the last."""
+    """Colors of non-negative errors: `ERROR_COLORS`, linear in between; errors above `largest` get the last."""
     if not largest > 0:
         raise ValueError(f"largest error: expected a positive number, got {largest}")
     stops = np.linspace(0, largest, len(ERROR_COLORS))

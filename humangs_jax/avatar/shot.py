@@ -23,7 +23,7 @@ class Shot:
     height: int | None = None
     """Height of the images in pixels."""
     background: str = "white"
-    """A colour (a CSS name or #rrggbb), or transparent."""
+    """A color (a CSS name or #rrggbb), or transparent."""
     azimuth: float = 0.0
     """Degrees around the person; 0 looks at the front, 90 at the left side."""
     elevation: float = 6.0
@@ -65,7 +65,7 @@ class Shot:
         return tangent * width / height, tangent
 
     def color(self) -> tuple[float, float, float] | None:
-        """Red, green and blue of the background in [0, 1]; None: transparent. Raises: ValueError for what is no colour."""
+        """Red, green and blue of the background in [0, 1]; None: transparent. Raises: ValueError for what is no color."""
         if self.background == "white":  # without numpy: --help asks for it, too
             return 1.0, 1.0, 1.0
         if self.background.strip().lower() == "transparent":

@@ -77,7 +77,7 @@ def show_targets(
     if config.architecture.draws_pixels and background != 1:
         raise ValueError(f"a network that draws pixels shows people on white; background {background:g} was asked for")
     body = gaussian_body(inputs.body, config)
-    views = standardize(equal_exposure(inputs), config.image_size, config.execution.crop)
+    views = standardize(equal_exposure(inputs), config.image_size, config.runtime.crop)
     prepared = _prepare(body, views, config)
     config = fit_buffers(prepared, config)
     outputs = _outputs(variables, prepared, config)

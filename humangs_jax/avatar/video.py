@@ -1,4 +1,4 @@
-"""Frames -> a video: .mp4 (H.264, plays everywhere), .webm (VP9, may be transparent), .gif (256 colours for all frames, endless
+"""Frames -> a video: .mp4 (H.264, plays everywhere), .webm (VP9, may be transparent), .gif (256 colors for all frames, endless
 loop), or a folder of PNG files (may be transparent).
 """
 
@@ -43,7 +43,7 @@ def check_video(
         raise ValueError(f"{option} {path}: expected a name ending in {', '.join(SUFFIXES)}, or a folder for PNG files")
     if transparent and suffix in (".mp4", ".gif"):
         raise ValueError(
-            f"{option} {path}: {suffix} has no transparency: expected .webm, a folder for PNG files, or a colour"
+            f"{option} {path}: {suffix} has no transparency: expected .webm, a folder for PNG files, or a color"
         )
     if suffix == ".gif" and frames * width * height * 3 > LARGEST_GIF:
         raise ValueError(
@@ -116,7 +116,7 @@ def _write_mp4(path, frames, fps, shape):
 def _write_webm(path, frames, fps, shape):
     quality = ["-c:v", "libvpx-vp9", "-crf", str(VP9_QUALITY), "-b:v", "0", "-deadline", "good", "-cpu-used", "4"]
     quality += ["-fflags", "+bitexact"]  # no random number in the file
-    if shape[-1] == 4:  # a second stream beside the colours; alternate reference frames would separate the two
+    if shape[-1] == 4:  # a second stream beside the colors; alternate reference frames would separate the two
         quality += ["-pix_fmt", "yuva420p", "-auto-alt-ref", "0"]
     else:
         quality += ["-pix_fmt", "yuv420p"]
@@ -158,7 +158,7 @@ def _write_by_ffmpeg(path, frames, fps, shape, quality):
 
 
 def _indexed(frame, palette, background):
-    """A frame (h, w, 3) in the palette's colours; Pillow looks up colours by their upper 6 bits, which white and 252 share."""
+    """A frame (h, w, 3) in the palette's colors; Pillow looks up colors by their upper 6 bits, which white and 252 share."""
     from PIL import Image
 
     indices = np.array(Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE))
@@ -169,7 +169,7 @@ def _indexed(frame, palette, background):
 
 
 def _commonest(pixels):
-    """The most frequent colour (3,) of (h, w, 3) pixels: the background, where it is of one colour."""
+    """The most frequent color (3,) of (h, w, 3) pixels: the background, where it is of one color."""
     packed = pixels.reshape(-1, 3).astype(np.int32) @ (1 << 16, 1 << 8, 1)
     values, counts = np.unique(packed, return_counts=True)
     common = int(values[counts.argmax()])
@@ -188,7 +188,7 @@ def _write_gif(path, frames, fps, _):
     colors = np.zeros((256, 3), np.uint8)
     known = np.asarray(palette.getpalette(), np.uint8).reshape(-1, 3)[:255]
     colors[: len(known)] = known
-    colors[255] = _commonest(sampled)  # else the background would become the mean of colours like it
+    colors[255] = _commonest(sampled)  # else the background would become the mean of colors like it
     palette.putpalette(colors.tobytes())
     images = [_indexed(frame, palette, colors[255]) for frame in kept]
     # durations are whole hundredths of a second; rounding the times, not the durations, keeps the speed

@@ -36,13 +36,13 @@ def ancestors(parents: tuple[int, ...]) -> list[np.ndarray]:
     up = np.asarray([*(count if parent == -1 else parent for parent in parents), count])
     if up.min() < 0 or up.max() > count:
         raise ValueError(f"some joints do not descend from the root: parents {parents}")
-    rounds = []
+    iterations = []
     while (up[:-1] < count).any():
-        if len(rounds) > count.bit_length():
+        if len(iterations) > count.bit_length():
             raise ValueError(f"some joints do not descend from the root: parents {parents}")
-        rounds.append(up[:-1])
+        iterations.append(up[:-1])
         up = up[up]
-    return rounds
+    return iterations
 
 
 def joint_transforms(
@@ -56,16 +56,16 @@ def joint_transforms(
     Arguments: rest_joints in metres; parents, root -1; rotations as axis-angle in radians, relative to the parent;
     translation in metres, applied last. Returns: rigid transforms from rest to posed space.
 
-    The chain is composed by doubling: after each round a transform reaches twice as many joints up. Ten levels are four rounds,
-    and the program compiles in a third of the time of one that goes level by level.
+    The chain is composed by doubling: after each round a transform reaches twice as many joints up. Ten levels are four
+    iterations, and the program compiles in a third of the time of one that goes level by level.
     """
     local = quaternion.matrix_from_axis_angle(rotations)
-    rounds = ancestors(parents)
+    iterations = ancestors(parents)
     root = parents.index(-1)
     bones = rest_joints - rest_joints[np.asarray([max(parent, 0) for parent in parents])]
     bones = bones.at[root].set(rest_joints[root])
     world, position = local, bones
-    for up in rounds:
+    for up in iterations:
         above = jnp.concatenate([world, jnp.eye(3, dtype=world.dtype)[None]])[up]
         from_above = jnp.concatenate([position, jnp.zeros((1, 3), position.dtype)])[up]
         position = from_above + jnp.sum(above * position[..., None, :], axis=-1)

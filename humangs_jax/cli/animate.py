@@ -108,7 +108,7 @@ class Render:
     capture: Path | None = None
     """Take cameras and poses from this capture folder instead of a circle."""
     exr: bool = False
-    """Also write views.exr, one part per view: premultiplied colours, further channels, and the camera (docs/video.md)."""
+    """Also write views.exr, one part per view: premultiplied colors, further channels, and the camera (docs/video.md)."""
     channels: str = "rgba,z"
     """Of views.exr: rgba (always there), z, position, normal, part, separated by commas."""
     exr_type: Literal["float", "half"] = "float"

@@ -21,7 +21,7 @@ from humangs_jax.cli.options import (
     require_suffix,
 )
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
-from humangs_jax.refinement.config import ROUNDS, RefineConfig
+from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 
 if TYPE_CHECKING:
     from humangs_jax.avatar.avatar import Avatar
@@ -85,7 +85,8 @@ class Reconstruct:
     """Number type of the encoder's matrix products ("as_trained": float32). The short ones are faster on GPU and TPU."""
     refine: str | None = None
     """Fit the avatar to the photos afterwards for so long: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not
-    at all. Default, if there are masks: rounds of a learned update alone, one to two seconds, on photos of at most 512 pixels."""
+    at all. Default, if there are masks: iterations of a learned update alone, one to two seconds, on photos of at most 512
+    pixels."""
     preset: Preset | None = None
     """Speed against accuracy (docs/tradeoff.md): photos, network and refinement, where the options above do not say."""
     config: Path | None = None
@@ -118,7 +119,7 @@ class Reconstruct:
             variables, config = load_weights(self.weights)
         config = config if settings is None else settings.network(config)
         said = {"tokens": self.tokens, "dtype": self.dtype}
-        config = config.with_execution(**{name: value for name, value in said.items() if value != "as_trained"})
+        config = config.with_runtime(**{name: value for name, value in said.items() if value != "as_trained"})
         with stage("reconstructing"):
             avatar = reconstruct(variables, config, photos)
             avatar.gaussians.means.block_until_ready()
@@ -136,7 +137,7 @@ class Reconstruct:
 
 @dataclasses.dataclass(frozen=True)
 class Refine:
-    """Fit an avatar to the photos of a capture: rounds of a learned update, then gradient descent.
+    """Fit an avatar to the photos of a capture: iterations of a learned update, then gradient descent.
 
     Ctrl-C ends it early; the best avatar until then is written.
     """
@@ -148,8 +149,8 @@ class Refine:
     out: Path = Path("refined.npz")
     """The avatar file to write; an avatar that is there is replaced."""
     limit: str = "15s"
-    """How long: seconds ("15s"), steps ("100steps") or rounds alone ("0steps"), after a compilation of some seconds."""
-    rounds: int = ROUNDS
+    """How long: seconds ("15s"), steps ("100steps") or iterations alone ("0steps"), after a compilation of some seconds."""
+    iterations: int = ITERATIONS
     """Rounds of the learned update before the steps; 0: steps alone."""
     image_size: int | None = None
     """Reduce photos whose longer side is larger, pixels. Default: photos as they are."""
@@ -165,7 +166,7 @@ class Refine:
     def run(self) -> None:
         limits = refine_limits(self.limit, "--limit")
         require_between(16, LARGEST_IMAGE, image_size=self.image_size)
-        require_between(0 if limits["steps"] != 0 else 1, 16, rounds=self.rounds)
+        require_between(0 if limits["steps"] != 0 else 1, 16, iterations=self.iterations)
         require_avatar(self.out, inputs=(self.avatar,))
         with stage("starting"):
             from humangs_jax.avatar.avatar import Avatar
@@ -173,7 +174,7 @@ class Refine:
 
             avatar = Avatar.load(self.avatar)
         photos = _read_capture(self.capture, self.check, self.fit_masks)
-        how = RefineConfig(rounds=self.rounds, image_size=self.image_size, poses=self.refine_poses, **limits)
+        how = RefineConfig(iterations=self.iterations, image_size=self.image_size, poses=self.refine_poses, **limits)
         _refine_and_save(avatar, photos, self.out, how, self.live)
 
 

@@ -17,8 +17,8 @@ def tell_found(photos: "list[PhotoPeople]", person: int) -> None:
     """Say which photos are without the person, and what was repaired."""
     from humangs_jax.apps.detect import absent, cut_off, repaired
 
-    if any(photo.colours for photo in photos):
-        warn(f"several people in a photo: number {person} is the same by the colours of upper body and legs alone")
+    if any(photo.colors for photo in photos):
+        warn(f"several people in a photo: number {person} is the same by the colors of upper body and legs alone")
     for name in absent(photos, person):
         warn(f"{name}: the person was not found in it")
     for name in cut_off(photos, person):
@@ -52,7 +52,7 @@ class Detect:
     """Find the person in photos: 33 keypoints and a mask for each, and a sheet on which everybody has a number.
 
     Needs `pip install 'humangs_jax[photos]'`. In a capture folder, whose cameras are known, people are matched by how well they
-    triangulate; in other photos by their size, or by their colours where several are large. docs/your_photos.md shows the way.
+    triangulate; in other photos by their size, or by their colors where several are large. docs/your_photos.md shows the way.
     """
 
     photos: Positional[Path]

@@ -72,7 +72,7 @@ class Evaluate:
                 require_suffix(path, (suffixes[name],), f"--{name}")
         with stage("starting"):
             from humangs_jax.evaluation.run import evaluate
-            from humangs_jax.objectives.loss_networks import load_lpips
+            from humangs_jax.losses.loss_networks import load_lpips
 
         networks = []
         for net in ("vgg", "alex", "squeeze"):

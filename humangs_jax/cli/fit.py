@@ -188,7 +188,7 @@ class Fit:
             from humangs_jax.data.photos import capture_folder
             from humangs_jax.fitting.files import FIT_FILE, check_place, read_fit_record, write_fitted
             from humangs_jax.fitting.refine import refine_capture
-            from humangs_jax.fitting.refine_rounds import usual_config
+            from humangs_jax.fitting.refine_iterations import usual_config
 
         target = check_place(self.capture, self.out, self.overwrite, (self.detections.keypoints,))
         tell_deleted(target, unless=target if self.out is None else self.capture)

@@ -116,12 +116,12 @@ def require_between(least: float | int, most: float | int, **values: float | int
             raise UsageError(f"--{name.replace('_', '-')} {value}: expected {bounds}")
 
 
-ROUNDS_ALONE: dict[str, Any] = {"steps": 0, "seconds": None, "image_size": 512}
+ITERATIONS_ALONE: dict[str, Any] = {"steps": 0, "seconds": None, "image_size": 512}
 """Of refinement, where nothing is asked for: one to two seconds, however large the photos."""
 
 
 def refine_limits(text: str, option: str) -> dict[str, Any]:
-    """Fields of `RefineConfig` for "15s", "15" (seconds), "100steps", or "0steps" (rounds only). Raises: UsageError."""
+    """Fields of `RefineConfig` for "15s", "15" (seconds), "100steps", or "0steps" (iterations only). Raises: UsageError."""
     match = re.fullmatch(r"(?P<number>\d+(\.\d*)?)(?P<unit>s|steps)?", text.strip())
     number = float(match["number"]) if match else 0.0
     in_steps = match is not None and match["unit"] == "steps"
@@ -131,9 +131,9 @@ def refine_limits(text: str, option: str) -> dict[str, Any]:
 
 
 def first_refinement(text: str | None) -> dict[str, Any] | None:
-    """Fields of `RefineConfig` for --refine of a new avatar: `refine_limits`, "0" for None, by default `ROUNDS_ALONE`."""
+    """Fields of `RefineConfig` for --refine of a new avatar: `refine_limits`, "0" for None, by default `ITERATIONS_ALONE`."""
     if text is None:
-        return ROUNDS_ALONE
+        return ITERATIONS_ALONE
     return None if text == "0" else refine_limits(text, "--refine")
 
 

@@ -9,7 +9,7 @@ from tyro.conf import Positional
 
 from humangs_jax.cli.detect import tell_found
 from humangs_jax.cli.options import (
-    ROUNDS_ALONE,
+    ITERATIONS_ALONE,
     UsageError,
     first_refinement,
     require_at_least,
@@ -62,7 +62,7 @@ class Start:
     """Move masks that are too large or too small to the edges in the photos; --no-fit-masks takes them as they are."""
     refine: str | None = None
     """Fit the avatar to the photos for so long: seconds ("15s") or steps ("100steps"), see `humangs refine`; "0": not at all.
-    Needs masks. Default, if there are masks: rounds of a learned update alone, one to two seconds."""
+    Needs masks. Default, if there are masks: iterations of a learned update alone, one to two seconds."""
     browser: bool = True
     """Open the page at the end."""
     overwrite: bool = False
@@ -239,7 +239,7 @@ class Start:
             from humangs_jax.fitting.files import write_fitted
             from humangs_jax.fitting.fit_capture import fit_photos
             from humangs_jax.fitting.refine import refine_capture
-            from humangs_jax.fitting.refine_rounds import usual_config
+            from humangs_jax.fitting.refine_iterations import usual_config
             from humangs_jax.network.weights import load_weights
             from humangs_jax.refinement.config import RefineConfig
 
@@ -268,8 +268,8 @@ class Start:
                     for tight in (False, True)
                 )
             with stage("comparing bodies by a held-out photo"):
-                weights, rounds = load_weights(), RefineConfig(**ROUNDS_ALONE)
-                capture, estimate = better_body(*weights, loose.capture, tight.capture, rounds)
+                weights, iterations = load_weights(), RefineConfig(**ITERATIONS_ALONE)
+                capture, estimate = better_body(*weights, loose.capture, tight.capture, iterations)
             report = (tight if capture is tight.capture else loose).report
             tell(f"\n{report}")
         if self.height is not None:
@@ -314,7 +314,9 @@ class Start:
                 from humangs_jax.apps.held_out import held_out_psnr
                 from humangs_jax.refinement.config import RefineConfig
 
-                estimate = held_out_psnr(*weights, capture, None if limits is None else RefineConfig(**ROUNDS_ALONE))
+                estimate = held_out_psnr(
+                    *weights, capture, None if limits is None else RefineConfig(**ITERATIONS_ALONE)
+                )
         if estimate is not None:
             tell(estimate)
         with stage("writing the page"):

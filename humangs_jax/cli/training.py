@@ -83,8 +83,8 @@ class Train:
         with stage("starting"):
             self.processes.join()  # before anything asks for devices
             from humangs_jax.data.datasets.bodies import FileBody
+            from humangs_jax.losses.loss_networks import load_loss_networks
             from humangs_jax.network.weights import load_weights
-            from humangs_jax.objectives.loss_networks import load_loss_networks
             from humangs_jax.rendering.splat_config import drawn_as
             from humangs_jax.training.config import fitting_losses, read_config
             from humangs_jax.training.diagnose import diagnose_run
@@ -99,7 +99,7 @@ class Train:
             variables = None
             if self.init_weights is not None:
                 variables, model = load_weights(self.init_weights)
-                model = dataclasses.replace(model, execution=settings.model.execution)
+                model = dataclasses.replace(model, runtime=settings.model.runtime)
                 drawn = drawn_as(settings.splat, model.conventions.rendering)
                 settings = dataclasses.replace(settings, model=model, splat=drawn)
             file_body = FileBody.load(self.body)
@@ -165,9 +165,9 @@ class Convert:
             from safetensors.numpy import save
 
             from humangs_jax.io.atomic import write_bytes
+            from humangs_jax.losses.loss_networks import collect_loss_networks
             from humangs_jax.network.conversion import LOSS_PREFIX, describe, load_checkpoint
             from humangs_jax.network.weights import save_weights
-            from humangs_jax.objectives.loss_networks import collect_loss_networks
 
         with stage("reading"):
             networks, names = ({}, []) if losses is None else collect_loss_networks(checkpoint)

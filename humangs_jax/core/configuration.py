@@ -62,7 +62,7 @@ Room = Annotated[int, Range(0, 1 << 31)]
 """Slots, or 0 for as many as may be needed."""
 Chunk = Annotated[int, Range(1, 65_536)]
 """What is worked on at once."""
-Rounds = Annotated[int, Range(0, 1000)]
+Iterations = Annotated[int, Range(0, 1000)]
 RefineSteps = Annotated[int, Range(0, 100_000)]
 """Of refinement: some hours."""
 Steps = Annotated[int, Range(1, 100_000_000)]

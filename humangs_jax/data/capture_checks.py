@@ -14,7 +14,7 @@ from humangs_jax.io.atomic import check_replaceable
 from humangs_jax.io.reading import FileError, reading, shown
 from humangs_jax.io.text import parse_json, read_text
 
-COLOUR_SLACK = 1e-3
+COLOR_SLACK = 1e-3
 """Resampled images overshoot [0, 1] a little; values further outside have another range, for instance 0 to 255."""
 
 
@@ -93,9 +93,9 @@ def floats(value: Any, file: object, field: str, shape: tuple[int, ...]) -> Floa
 
 
 def check_range(array: np.ndarray, file: object, field: str) -> None:
-    """Colours and coverage lie in [0, 1]."""
+    """Colors and coverage lie in [0, 1]."""
     low, high = float(array.min()), float(array.max())
-    if low < -COLOUR_SLACK or high > 1 + COLOUR_SLACK:
+    if low < -COLOR_SLACK or high > 1 + COLOR_SLACK:
         raise CaptureError(file, field, f"expected values in [0, 1], got {low:.4g} to {high:.4g}")
 
 

@@ -1,6 +1,6 @@
-"""Equal exposure: cameras that meter for themselves show one skin in several colours; a gain for each channel makes them agree.
+"""Equal exposure: cameras that meter for themselves show one skin in several colors; a gain for each channel makes them agree.
 
-What two photos both show of the body should have one colour in both. The gains are those that bring the medians of the ratios
+What two photos both show of the body should have one color in both. The gains are those that bring the medians of the ratios
 nearest to 1; their logarithms have the mean 0 over the photos. Where little is shared they stay near 1.
 """
 
@@ -26,7 +26,7 @@ SIZE = 256
 FACING, THICKNESS = 0.5, 0.02
 """Of a point that a photo shows: least cosine between normal and ray; metres by which it may lie behind the nearest surface."""
 INSIDE, BLUR = 5, 3
-"""Sides of squares of pixels: one that lies in the mask around each point, and one over which colours are averaged."""
+"""Sides of squares of pixels: one that lies in the mask around each point, and one over which colors are averaged."""
 WHOLE = 0.99
 """Least value of a mask in that square."""
 USABLE = (0.06, 0.95)
@@ -53,7 +53,7 @@ def equal_exposure(capture: Capture) -> Capture:
 
 
 def exposures(capture: Capture) -> Float[np.ndarray, "v 3"]:
-    """By what to multiply the colours of an avatar of these photos, so that it is rendered as each camera exposed it."""
+    """By what to multiply the colors of an avatar of these photos, so that it is rendered as each camera exposed it."""
     apart, found = unusable_views(capture), np.ones((capture.view_count, 3))
     if usable := [i for i in range(capture.view_count) if i not in apart]:
         found[usable] = 1 / camera_gains(capture.select(usable))
@@ -61,7 +61,7 @@ def exposures(capture: Capture) -> Float[np.ndarray, "v 3"]:
 
 
 def camera_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
-    """By what to multiply the colours of each view, see `gains_of`; ones without masks.
+    """By what to multiply the colors of each view, see `gains_of`; ones without masks.
 
     capture: photos on white, all of which show the person.
     """
@@ -79,7 +79,7 @@ def camera_gains(capture: Capture) -> Float[np.ndarray, "v 3"]:
 
 
 def gains_of(colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]) -> Float[np.ndarray, "v 3"]:
-    """Gains of views from the colours of common points; all 1 where there is hardly a difference, or nothing in common.
+    """Gains of views from the colors of common points; all 1 where there is hardly a difference, or nothing in common.
 
     colors: in [0, 1]. seen: which points a view shows.
     """
@@ -106,7 +106,7 @@ def gains_of(colors: Float[np.ndarray, "v n 3"], seen: Bool[np.ndarray, "v n"]) 
 
 
 def with_gains(capture: Capture, gains: Float[np.ndarray, "v 3"]) -> Capture:
-    """The capture with the person's colours multiplied; the white behind stays. Raises: ValueError without masks."""
+    """The capture with the person's colors multiplied; the white behind stays. Raises: ValueError without masks."""
     if capture.masks is None:
         raise ValueError("gains need masks: without them the background would be multiplied, too")
     return dataclasses.replace(capture, images=multiplied(capture.images, capture.masks, gains))
@@ -115,7 +115,7 @@ def with_gains(capture: Capture, gains: Float[np.ndarray, "v 3"]) -> Capture:
 def multiplied(
     images: Float[np.ndarray, "v h w 3"], alpha: Float[np.ndarray, "v h w"], gains: Float[np.ndarray, "v 3"]
 ) -> Float[np.ndarray, "v h w 3"]:
-    """Images over white with their colours multiplied. A rendering in the exposure of its camera: by 1 / gains."""
+    """Images over white with their colors multiplied. A rendering in the exposure of its camera: by 1 / gains."""
     white = 1 - alpha[..., None]
     return np.clip((images - white) * gains[:, None, None].astype(np.float32) + white, 0, 1)
 
@@ -129,7 +129,7 @@ def seen_colors(
     mask: Float[Array, "h w"],
     camera: Camera,
 ) -> tuple[Float[Array, "n 3"], Bool[Array, " n"]]:
-    """Of one photo the colours of the body's vertices, and which of them it shows."""
+    """Of one photo the colors of the body's vertices, and which of them it shows."""
     vertices = pose_body(body, rest, pose).vertices
     towards = camera.center - vertices
     normals = vertex_normals(vertices, body.faces)

@@ -2,7 +2,7 @@
 
 Segmentation leaves silhouettes that are some pixels off. A pixel too much shows the background at the person's rim, a pixel too
 little cuts the person, in all photos alike, so no later stage can find it. Here the photo is searched along the normals of the
-silhouette: at which distance from it do the colours change most, on average over the silhouette, and near each of its points?
+silhouette: at which distance from it do the colors change most, on average over the silhouette, and near each of its points?
 
 A stripe along the rim that looks like the background (rim light before a bright wall, piping) has a stronger edge on its other
 side. So a mask is moved only where sectors of the silhouette agree, and views do, that there is no edge where it ends now.
@@ -21,13 +21,13 @@ from humangs_jax.io.images import resized
 PERSON_HEIGHT = 200
 """Lengths below are in pixels of a person who is that high."""
 REACH, STEP = 4.0, 0.5
-"""Largest distance that an outline is moved, and the steps that are tried."""
+"""Largest distance that a silhouette is moved, and the steps that are tried."""
 NEIGHBORHOOD, SMOOTHING = 4.0, 2.0
-"""Standard deviations: of the part of the outline whose colours decide about a point, and of the distances found."""
+"""Standard deviations: of the part of the silhouette whose colors decide about a point, and of the distances found."""
 LEAST = 0.75
-"""Masks whose outline is off by less on average stay as they are: exact ones would only lose (docs/stability.md)."""
+"""Masks whose silhouette is off by less on average stay as they are: exact ones would only lose (docs/stability.md)."""
 LEAST_MOVE = 0.5
-"""Parts of the outline that would move by less stay where they are."""
+"""Parts of the silhouette that would move by less stay where they are."""
 MOST_PIXELS = 400
 """Height of the person at which the photo is searched; larger photos are reduced."""
 LEAST_PART = 0.005
@@ -39,7 +39,7 @@ SECTORS, SECTOR_POINTS = 16, 8
 AGREE, AGREE_ALONE = 0.7, 0.5
 """Shares of the sectors that must find the edge at one distance: of all views that would be moved alike, and of the view."""
 EDGE, OF_TEXTURE = 0.06, 1.0
-"""There is an edge where colours change more than beside it, by these shares of the strongest change and of that beside it."""
+"""There is an edge where colors change more than beside it, by these shares of the strongest change and of that beside it."""
 SEEN_APART, CLEAR = 1.5, 1.3
 """Pixels: an edge that is nearer than the first to the mask's is not told from it; a blurred edge ends within the second."""
 THIN = 0.0007
@@ -70,7 +70,7 @@ def fit_mask(
 def masks_at_edges(
     images: Sequence[Float[np.ndarray, "h w 3"]], masks: Sequence[Float[np.ndarray, "h w"]]
 ) -> list[tuple[Float[np.ndarray, "h w"], float]]:
-    """Each mask with its outline at the photo's edges, and by how many pixels of the photo it was too large (negative: small).
+    """Each mask with its silhouette at the photo's edges, and by how many pixels of the photo it was too large (negative: small).
 
     Arguments: images: the photos of one person with their background, values in [0, 1]. masks: coverage in [0, 1].
     A mask is kept, with 0, if it is empty, full or a line, off by less than `LEAST`, or of a photo without a background; and if
@@ -85,7 +85,7 @@ def masks_at_edges(
 
 
 def _believed(shift, seen):
-    """Whether a shift is one of the mask and not of the person's colours."""
+    """Whether a shift is one of the mask and not of the person's colors."""
     alike = [other for other in seen if other.excess * shift.excess > 0]
     if not alike or 2 * len(alike) < len(seen) or np.mean([other.thin for other in alike]) > THIN:
         return False
@@ -94,7 +94,7 @@ def _believed(shift, seen):
 
 
 def _moved(mask, shift):
-    """The mask with its outline where the photo has its edges."""
+    """The mask with its silhouette where the photo has its edges."""
     own = mask[shift.window].astype(np.float32)
     moved = np.clip(signed_distance(own) - shift.moves + 0.5, 0, 1)
     fitted = mask.copy()
@@ -117,7 +117,7 @@ def _shift(image, mask):
     height, width = own.shape
     size = max(1, round(reduced * width)), max(1, round(reduced * height))
     small = (resized(photo, *size), resized(own, *size)) if reduced < 1 else (photo, own)
-    whole, moves = outline_moves(*small, reduced * unit)
+    whole, moves = boundary_moves(*small, reduced * unit)
     if abs(whole) < LEAST * reduced * unit:
         return _Shift(0.0)
     moves = resized(moves.astype(np.float32), width, height) / reduced
@@ -125,10 +125,11 @@ def _shift(image, mask):
     return _Shift(whole / reduced, window, moves, unit, votes, _thin_parts(own, whole / reduced / unit))
 
 
-def outline_moves(
+def boundary_moves(
     image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"], unit: float
 ) -> tuple[float, Float[np.ndarray, "h w"]]:
-    """How far inside the mask's outline (pixels; negative: outside) the photo has its edges: on the whole, and near each pixel.
+    """How far inside the mask's silhouette (pixels; negative: outside) the photo has its edges: on the whole, and near each
+    pixel.
 
     unit: pixels of this image for one of a person `PERSON_HEIGHT` high.
     """
@@ -166,7 +167,7 @@ def sector_votes(
     count = max(1, min(SECTORS, len(angles) // SECTOR_POINTS))
     sectors = np.argsort(np.argsort(angles)) * count // len(angles)
 
-    def colours(depth):
+    def colors(depth):
         """At that distance inside of the points; not beyond the middle of a limb or the frame."""
         at = points + depth * normal
         sample = lambda values: ndimage.map_coordinates(values, at, order=1, mode="nearest")
@@ -178,7 +179,7 @@ def sector_votes(
         return np.linalg.norm(one[0] - other[0], axis=-1), one[1] & other[1]
 
     steps = np.arange(-REACH, REACH + STEP / 2, STEP) * unit
-    line = [colours(depth) for depth in [steps[0] - STEP * unit, *steps, steps[-1] + STEP * unit]]
+    line = [colors(depth) for depth in [steps[0] - STEP * unit, *steps, steps[-1] + STEP * unit]]
     profile = np.zeros((count, len(steps)))
     for i, (one, other) in enumerate(zip(line, line[2:], strict=False)):
         size, seen = change(one, other)
@@ -189,7 +190,7 @@ def sector_votes(
 
     # across the mask's end, and twice beside it on the side where there is no edge if the mask is off
     lag = min(unit, max(abs(whole) - CLEAR, 0.5))
-    beside = [colours(-np.sign(whole) * lag * i) for i in (-1, 1, 3, 5)]
+    beside = [colors(-np.sign(whole) * lag * i) for i in (-1, 1, 3, 5)]
     (across, over), *textures = [change(one, other) for one, other in itertools.pairwise(beside)]
     votes = [0, 0]
     for sector in range(count):
@@ -235,7 +236,7 @@ def box_of(inside: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "2 2"]:
 
 
 def signed_distance(mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Pixels from the outline, positive inside; where the mask is neither 0 nor 1, its values say how far."""
+    """Pixels from the silhouette, positive inside; where the mask is neither 0 nor 1, its values say how far."""
     inside = mask >= 0.5
     whole = np.where(
         inside, ndimage.distance_transform_edt(inside) - 0.5, 0.5 - ndimage.distance_transform_edt(~inside)

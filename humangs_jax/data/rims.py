@@ -19,7 +19,7 @@ CONTRAST, CERTAIN = 0.02, 0.15
 
 def clean_rims(image: Float[np.ndarray, "h w 3"], mask: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
     """A photo without the room's share in the pixels along the edge of the mask, and beyond: what they have of the difference
-    between the colours further outside and further inside is taken away, and all other detail stays.
+    between the colors further outside and further inside is taken away, and all other detail stays.
     """
     inside = mask > 0.5
     if not inside.any() or inside.all():
@@ -48,7 +48,7 @@ def _depth(inside):
 
 
 def _blurred(colors, where, sigma):
-    """The mean colour of what is nearby and True, and whether there is anything."""
+    """The mean color of what is nearby and True, and whether there is anything."""
     blur = lambda values: ndimage.gaussian_filter(values.astype(np.float32), sigma, truncate=4.0, mode="nearest")
     weight = blur(where)
     found = np.stack([blur(colors[..., i] * where) for i in range(3)], axis=-1)

@@ -75,17 +75,15 @@ def gaussian_body(body: BodyModel, config: HumanGSConfig) -> BodyModel:
     """The body whose vertices carry the Gaussians: decimated, then with long edges split, as the weights want it; with the map
     of its surface where the network works on one.
 
-    Its `spacing` is relative to the mesh that the weights were trained with: 1 unless `execution.longest_edge` asks for more
-    vertices or `execution.body_vertices` for fewer. The last four results are kept: making one takes as long as
+    Its `spacing` is relative to the mesh that the weights were trained with: 1 unless `runtime.longest_edge` asks for more
+    vertices or `runtime.body_vertices` for fewer. The last four results are kept: making one takes as long as
     a small network does on a CPU.
 
-    Raises: ValueError if `execution` has both.
+    Raises: ValueError if `runtime` has both.
     """
-    asked = config.execution
+    asked = config.runtime
     if None not in (asked.body_vertices, asked.longest_edge):
-        raise ValueError(
-            "execution: body_vertices asks for fewer vertices, longest_edge for more: expected one of them"
-        )
+        raise ValueError("runtime: body_vertices asks for fewer vertices, longest_edge for more: expected one of them")
     return body if fits(body, config) else _remeshed(_ByContent(body), *_wanted(config))
 
 
@@ -95,7 +93,7 @@ def fits(body: BodyModel, config: HumanGSConfig) -> bool:
 
 
 def _wanted(config):
-    trained, asked = config.conventions, config.execution
+    trained, asked = config.conventions, config.runtime
     vertices, edges = (trained.body_vertices, trained.longest_edge), (asked.body_vertices, asked.longest_edge)
     return *vertices, *edges, config.architecture.surface_map
 
@@ -153,7 +151,7 @@ def prepare_inputs(body: BodyModel, views: SubjectViews, config: HumanGSConfig) 
 
     def rasterize_view(arguments):
         vertices, camera = arguments
-        return draw(vertices / unit, canonical, body.faces, camera, config.execution.raster)
+        return draw(vertices / unit, canonical, body.faces, camera, config.runtime.raster)
 
     normals = lambda vertices: vertex_normals(vertices, body.faces)
 

@@ -1,6 +1,6 @@
 """The detector's masks, which have 256 pixels a side, at the size of the photo: a guided filter moves their edges to the photo's.
 
-He, Sun, Tang, Guided image filtering (2013): within each window the mask is an affine function of the photo's colours. The means
+He, Sun, Tang, Guided image filtering (2013): within each window the mask is an affine function of the photo's colors. The means
 are taken of a reduced photo (He, Sun, Fast guided filter, 2015), so that large photos cost little more.
 """
 
@@ -13,7 +13,7 @@ from humangs_jax.io.images import resized
 LEVEL = 0.4
 """Of the detector's masks at the person's edge: at 0.5 they are 3 % too small, and lose hands and feet."""
 RADIUS, EPSILON = 2.0, 1e-4
-"""Of the filter: half side of its windows in pixels of the detector's mask, and variance of colours that is no edge."""
+"""Of the filter: half side of its windows in pixels of the detector's mask, and variance of colors that is no edge."""
 STEEPER = 2.0
 """The filter's masks rise more slowly than true ones by this factor."""
 MOST = 2.0
@@ -43,7 +43,7 @@ def sharpened(
 
 
 def _affine(guide, mask, radius):
-    """Slopes (h, w, 3) and offsets (h, w) of the mask as a function of the colours, means over the windows of each pixel."""
+    """Slopes (h, w, 3) and offsets (h, w) of the mask as a function of the colors, means over the windows of each pixel."""
     side = 2 * radius + 1
     mean = lambda x: ndimage.uniform_filter(x, (side, side) + (0,) * (x.ndim - 2), mode="nearest")
     colors, level = mean(guide), mean(mask)

@@ -17,7 +17,7 @@ from humangs_jax.rendering.mesh.rasterizer import interpolate_attributes, raster
 
 
 def painted_body(inputs: Capture) -> Float[Array, "n 3"]:
-    """A colour for each vertex of the body: the mean photo colour over the views that see it, grey where none does."""
+    """A color for each vertex of the body: the mean photo color over the views that see it, grey where none does."""
     body = inputs.body
     rest = shape_body(body, jnp.asarray(inputs.betas))
     size = (inputs.cameras.width, inputs.cameras.height)

@@ -281,7 +281,7 @@ def predictions_method(folder: str | Path, people: int) -> Method:
     """Images that another program rendered: FOLDER/PERSON/VIEW.png (or .jpg), FOLDER/VIEW.png where there is one person.
 
     VIEW is the file name of the true photo without its suffix, or view_NNN as `humangs render` numbers them. An alpha channel is
-    the coverage, and the colours are put on the background; without one the image is on the protocol's background already.
+    the coverage, and the colors are put on the background; without one the image is on the protocol's background already.
     Raises: FileNotFoundError if the folder does not exist.
     """
     root = Path(folder)

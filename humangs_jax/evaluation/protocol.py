@@ -13,7 +13,7 @@ from humangs_jax.core.array_types import Float
 from humangs_jax.core.configuration import Presets
 from humangs_jax.data.masks import box_of
 from humangs_jax.io.images import resized
-from humangs_jax.objectives.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM, SsimWindow
+from humangs_jax.losses.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM, SsimWindow
 
 Background = Literal["white", "black", "dataset"]
 Net = Literal["vgg", "alex", "squeeze"]

@@ -23,7 +23,7 @@ SIDE, INPUT_SIDE = 320, 128
 QUALITY = 88
 """Of the JPEGs."""
 LARGEST_ERROR = 0.25
-"""Mean absolute difference of the channels that gets the last colour."""
+"""Mean absolute difference of the channels that gets the last color."""
 _MARK = re.compile(r"\{\{(\w+)\}\}")
 
 

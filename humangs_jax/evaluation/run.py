@@ -38,9 +38,9 @@ from humangs_jax.evaluation.tables import (
 )
 from humangs_jax.io.atomic import write_texts
 from humangs_jax.io.text import json_text
+from humangs_jax.losses.lpips import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
-from humangs_jax.objectives.lpips import Lpips
 
 logger = logging.getLogger(__name__)
 
@@ -175,7 +175,7 @@ def evaluate(
         avatar: a file, or a folder with PERSON.npz. weights: a file, or (variables, config). predictions: a folder of images, see
             `cases.predictions_method`. method: a function. One of them; the shipped weights if none is given.
         protocol: a name in `PROTOCOLS`, or a protocol of one's own.
-        lpips: networks from `objectives.loss_networks.load_lpips`; without one, its LPIPS is None and the reason is reported.
+        lpips: networks from `losses.loss_networks.load_lpips`; without one, its LPIPS is None and the reason is reported.
         page_images: how many images are kept for the page, the worst ones.
 
     Raises: ValueError or OSError, one line: unknown protocol, nothing to compare, sizes that differ, files that cannot be read.

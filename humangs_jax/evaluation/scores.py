@@ -19,10 +19,10 @@ from humangs_jax.core.checks import FINITE, check_values
 from humangs_jax.data.capture import Capture
 from humangs_jax.evaluation.protocol import PROTOCOLS, EvaluationProtocol, WholeFrame
 from humangs_jax.evaluation.tables import Row, mean_scores
-from humangs_jax.objectives.backbones import smallest_side
-from humangs_jax.objectives.lpips import BACKBONES, Lpips, lpips
-from humangs_jax.objectives.metrics import decibels, fog, masked_psnr, outline_band, silhouette_iou
-from humangs_jax.objectives.ssim import SsimWindow, mean_similarity, similarity_map
+from humangs_jax.losses.backbones import smallest_side
+from humangs_jax.losses.lpips import BACKBONES, Lpips, lpips
+from humangs_jax.losses.metrics import boundary_band, decibels, masked_psnr, semi_transparent, silhouette_iou
+from humangs_jax.losses.ssim import SsimWindow, mean_similarity, similarity_map
 from humangs_jax.rendering.buffers import round_up
 
 PATCH, STRIDE = 64, 32
@@ -56,9 +56,9 @@ def person_scores(
     size: Int[Array, "2"],
     window: SsimWindow,
 ) -> tuple[dict[str, Scalar], Bool[Array, "y x"]]:
-    """psnr_foreground, psnr_outline (both dB), patch_psnr, patch_ssim, of images as in `pair_scores`; and which patches count.
+    """psnr_fg, psnr_outline (both dB), patch_psnr, patch_ssim, of images as in `pair_scores`; and which patches count.
 
-    mask: coverage. band: 1 along its outline. Both 0 beyond the size. Without a patch that counts their scores are NaN.
+    mask: coverage. band: 1 along its silhouette. Both 0 beyond the size. Without a patch that counts their scores are NaN.
     """
     shares = _patch_means(mask, PATCH)
     within = [STRIDE * jnp.arange(side) + PATCH <= n for side, n in zip(shares.shape, size, strict=True)]
@@ -67,8 +67,8 @@ def person_scores(
     similarities = jnp.mean(similarity_map(predicted, truth, window), axis=-1)
     mean = lambda x: jnp.sum(jnp.where(kept, x, 0)) / jnp.sum(kept)
     return {
-        "psnr_foreground": masked_psnr(predicted, truth, mask),
-        "psnr_outline": masked_psnr(predicted, truth, band),
+        "psnr_fg": masked_psnr(predicted, truth, mask),
+        "psnr_boundary": masked_psnr(predicted, truth, band),
         "patch_psnr": mean(decibels(_patch_means(errors, PATCH))),
         "patch_ssim": mean(_patch_means(similarities, PATCH - window.size + 1)),
     }, kept
@@ -81,8 +81,8 @@ def _patch_means(x, side):
 
 @jax.jit
 def alpha_scores(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> dict[str, Scalar]:
-    """iou and fog of a rendering's coverage."""
-    return {"iou": silhouette_iou(alpha, mask), "fog": fog(alpha, mask)}
+    """iou and semi-transparent foreground of a rendering's coverage."""
+    return {"iou": silhouette_iou(alpha, mask), "semi_transparent": semi_transparent(alpha, mask)}
 
 
 def _precise_lpips(weights, predicted, truth, size=None):
@@ -129,7 +129,7 @@ def score_image(
         if alpha is not None:
             row |= alpha_scores(_padded(alpha), _padded(mask))
     if not empty:
-        frame = [_padded(x) for x in (predicted, truth, mask, outline_band(mask))]
+        frame = [_padded(x) for x in (predicted, truth, mask, boundary_band(mask))]
         scores, kept = person_scores(*frame, jnp.asarray(mask.shape), window)
         kept = np.argwhere(kept)
         row |= scores | {"patches": len(kept)}
@@ -161,7 +161,7 @@ def _patch_lpips(weights, predicted, truth, corners):
 def score_names(protocol: EvaluationProtocol) -> tuple[str, ...]:
     """The scores of an image, in the order in which tables show them."""
     nets = [f"lpips_{net}" for net in protocol.lpips]
-    person = ("psnr_foreground", "psnr_outline", "iou", "fog", "foreground")
+    person = ("psnr_fg", "psnr_boundary", "iou", "semi_transparent", "foreground")
     return ("psnr", "ssim", *nets, *person, "patch_psnr", "patch_ssim", *(f"patch_{net}" for net in nets), "patches")
 
 
@@ -174,7 +174,7 @@ def missing_reasons(protocol: EvaluationProtocol, networks: Networks, masks: boo
             reasons[name] = f"no weights of LPIPS {net} were given (docs/loss_networks.md)"
         elif name not in ("psnr", "ssim", f"lpips_{net}") and not masks:
             reasons[name] = "the true images have no masks"
-        elif name in ("iou", "fog") and not alpha:
+        elif name in ("iou", "semi_transparent") and not alpha:
             reasons[name] = "the predictions have no alpha channel"
     return reasons
 
@@ -212,11 +212,11 @@ def on_background(
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """Means over views. psnr and psnr_foreground in dB, ssim by scikit-image, foreground: share of the true mask."""
+    """Means over views. psnr and psnr_fg in dB, ssim by scikit-image, foreground: share of the true mask."""
 
     psnr: float
     ssim: float
-    psnr_foreground: float
+    psnr_fg: float
     foreground: float
 
 

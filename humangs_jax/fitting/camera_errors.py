@@ -33,7 +33,7 @@ PRIOR = np.radians(1.0)
 """Expected size of rotations: holds what cameras and points together can do without a residual."""
 ALIKE = 0.9
 """Share of the cost from which on another camera explains as much."""
-ROUNDS, FRAMES, CAMERAS = 8, 24, 64
+ITERATIONS, FRAMES, CAMERAS = 8, 24, 64
 """Of reweighting; moments that are looked at, at most; with more cameras than this nothing is said."""
 ROBUST_SCALE = 3.0
 """Of residuals, standard deviations."""
@@ -148,14 +148,14 @@ class _Seen:
         standard deviations, landmark by landmark; the points are eliminated. Outliers are found with all cameras free.
         """
         turned, points, weights = np.zeros((self.count, 3)), self._middle(), self.weights
-        for _ in range(ROUNDS):
+        for _ in range(ITERATIONS):
             gradients, matrices, errors, points = self._linear(turned, points, weights)
             turned = turned - _solve(gradients.sum(0), matrices.sum(0)).reshape(-1, 3)
             lengths = np.linalg.norm(errors, axis=-1)
             noise = max(float(np.median(lengths[weights > 0])) / RAYLEIGH_MEDIAN, LEAST_NOISE)
             scale = (ROBUST_SCALE * noise) ** 2
             weights = self.weights * np.square(scale / (scale + lengths**2)) / noise**2
-        for _ in range(ROUNDS):
+        for _ in range(ITERATIONS):
             gradients, matrices, _, points = self._linear(np.zeros_like(turned), points, weights)
         return gradients, matrices
 

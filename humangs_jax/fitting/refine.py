@@ -1,4 +1,4 @@
-"""Cameras, shape and poses refined against silhouettes and keypoints (`refine_rounds`): kept only if the score is better."""
+"""Cameras, shape and poses refined against silhouettes and keypoints (`refine_iterations`): kept only if the score is better."""
 
 import dataclasses
 import functools
@@ -9,7 +9,7 @@ import numpy as np
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.capture_checks import CaptureError
 from humangs_jax.data.keypoints.keypoints import Keypoints
-from humangs_jax.fitting.refine_rounds import (
+from humangs_jax.fitting.refine_iterations import (
     CaptureRefineConfig,
     Scene,
     moved_capture,

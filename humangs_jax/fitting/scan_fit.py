@@ -26,7 +26,7 @@ from humangs_jax.fitting.scan_search import (
     ScanFitConfig,
     improve,
     landmarks_and_joints,
-    run_rounds,
+    run_iterations,
     search,
     start_from_landmarks,
     start_state,
@@ -36,15 +36,15 @@ from humangs_jax.fitting.state import scale_of
 from humangs_jax.geometry import quaternion
 
 LANDMARK_STDS = (0.2, 0.1, 0.05, 0.02, 0.01)
-"""Metres: std of given joints in the rounds that bring a body to them."""
+"""Metres: std of given joints in the iterations that bring a body to them."""
 LANDMARK_STEPS = 5
-"""Steps of the solver in each of these rounds."""
+"""Steps of the solver in each of these iterations."""
 CLOSER = COARSE[4:]
 """Rounds of the best start of a search with all joints."""
 FINE = (Round(0.15, 0.07), Round(0.1, 0.05), Round(0.1, 0.03), Round(0.08, 0.03), *(Round(0.05, 0.02),) * 6)
-"""The last rounds."""
+"""The last iterations."""
 FINE_NORMAL = 0.02
-"""Metres that a difference of 1 between normals counts like in the last rounds."""
+"""Metres that a difference of 1 between normals counts like in the last iterations."""
 LEAST_SCALE = 0.03
 """Metres: least robust scale for clothed people, the depth of folds."""
 SETTLED = 0.02
@@ -110,17 +110,19 @@ def fit_scan(
         for std in LANDMARK_STDS:
             own = dataclasses.replace(given(start.align), std=jnp.float32(std))
             state, _ = improve(whole, ScanMatches.none(), own, tolerances, state, LANDMARK_STEPS)
-        rounds = FINE
+        iterations = FINE
     else:
         start, state = search(scan, whole, tolerances, given, config, effective)
-        rounds = (*CLOSER, *FINE)
+        iterations = (*CLOSER, *FINE)
     target = Target(scan, start.align, config.points, effective, FINE_NORMAL)
     if clothed:
-        rounds = tuple(dataclasses.replace(each, robust_scale=max(each.robust_scale, LEAST_SCALE)) for each in rounds)
-    state, outcomes = run_rounds(whole, target, given(start.align), tolerances, state, rounds, config.steps)
+        iterations = tuple(
+            dataclasses.replace(each, robust_scale=max(each.robust_scale, LEAST_SCALE)) for each in iterations
+        )
+    state, outcomes = run_iterations(whole, target, given(start.align), tolerances, state, iterations, config.steps)
     scale, (betas, pose) = float(scale_of(state)), whole.body(state)
     pose, world_from_scan, up = place_upright(body, scan, betas, pose, start.align, scale)
-    away, covered = target.distances(whole, state, rounds[-1].gate)
+    away, covered = target.distances(whole, state, iterations[-1].gate)
     report = _report(scan, bool(known.any()), world_from_scan.scale, up, scale * away, covered, outcomes)
     violations = limit_violations(body.joint_names, jax.tree.map(lambda leaf: leaf[None], pose))
     report = dataclasses.replace(report, violations=violations)

@@ -48,7 +48,7 @@ class Scan:
 def read_mesh(path: str | Path, colors: bool = False) -> Any:
     """A trimesh.Trimesh with all geometry of the file.
 
-    Arguments: colors: give it colours of the vertices, see `read_meshes`.
+    Arguments: colors: give it colors of the vertices, see `read_meshes`.
     Raises: ValueError, naming the file, if it cannot be read, has no faces or corners that are not finite.
     """
     import trimesh

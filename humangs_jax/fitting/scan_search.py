@@ -1,9 +1,9 @@
-"""Where a scan is, how large and in which stance; and the rounds that bring a body to it.
+"""Where a scan is, how large and in which stance; and the iterations that bring a body to it.
 
 From landmarks: the similarity that takes the trunk's landmarks to those of a resting body, robustly. Without landmarks: the
 root mean square distance from the centre of the surface gives the scale; turns and stances are compared by the distances of few
-points, and the best are followed for a few coarse rounds. A surface hardly distinguishes a person's front from the back as long
-as the limbs are in the same place, so the best are also followed for a body that faces the other way.
+points, and the best are followed for a few coarse iterations. A surface hardly distinguishes a person's front from the back as
+long as the limbs are in the same place, so the best are also followed for a body that faces the other way.
 
 A round pairs scan and body as they are, then takes a few steps of damped least squares with these pairs.
 """
@@ -91,18 +91,18 @@ LOOSE = 0.01
 """Metres: std of the skin, on both sides, in the search."""
 
 
-def run_rounds(
+def run_iterations(
     problem: ScanProblem,
     target: Target,
     given: Given,
     tolerances: Tolerances,
     state: FitState,
-    rounds: tuple[Round, ...],
+    iterations: tuple[Round, ...],
     steps: int,
 ) -> tuple[FitState, list[Outcome]]:
-    """The body after some rounds, and what the solver did in each."""
+    """The body after some iterations, and what the solver did in each."""
     outcomes = []
-    for each in rounds:
+    for each in iterations:
         matches = target.matches(problem, state, each.gate, each.robust_scale, tolerances)
         own = dataclasses.replace(tolerances, prior=jnp.float32(each.prior))
         state, outcome = improve(problem, matches, given, own, state, steps)
@@ -308,7 +308,7 @@ def search(
     config: ScanFitConfig,
     effective: float,
 ) -> tuple[Start, FitState]:
-    """The best start, and the body after its coarse rounds, with all joints of `whole` free.
+    """The best start, and the body after its coarse iterations, with all joints of `whole` free.
 
     Arguments: given: what is known, in the frame of an alignment of the scan. effective: see `Target`.
     """
@@ -318,7 +318,7 @@ def search(
     def follow(start, state=None):
         target = Target(scan, start.align, config.coarse_points, effective, COARSE_NORMAL)
         state = start_state(trunk, start.rotations) if state is None else state
-        state, _ = run_rounds(trunk, target, given(start.align), loose, state, COARSE, config.steps)
+        state, _ = run_iterations(trunk, target, given(start.align), loose, state, COARSE, config.steps)
         return leftover(trunk, target, given(start.align), loose, state), start, state
 
     def turned(start, state):

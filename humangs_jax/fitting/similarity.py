@@ -6,7 +6,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Float
 
-ROUNDS = 10
+ITERATIONS = 10
 """Rounds of reweighting by the distances."""
 
 
@@ -65,7 +65,7 @@ def align_robustly(
     Raises: see `align_points`.
     """
     found = align_points(source, target, weights)
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         away = np.linalg.norm(found(source) - target, axis=1) / std
         found = align_points(source, target, weights / (1 + away * away))
     return found

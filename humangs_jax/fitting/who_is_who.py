@@ -26,7 +26,7 @@ SEEN, FEWEST = 0.3, 6
 
 
 PLAIN = 0.1
-"""Of colours in [0, 1]: how much farther apart the next best order of people has to be."""
+"""Of colors in [0, 1]: how much farther apart the next best order of people has to be."""
 
 
 class Seen(NamedTuple):
@@ -180,10 +180,10 @@ def in_order_of_time(frames: Sequence[list[Match]]) -> list[list[Match | None]]:
     return [[person[f] for person in people] for f in range(len(frames))]
 
 
-def match_colours(first: Float[np.ndarray, "n k 3"], second: Float[np.ndarray, "m k 3"]) -> tuple[int, ...] | None:
-    """For each of m people of a photo which of n >= m of another one has the same colours; None if that is not plain.
+def match_colors(first: Float[np.ndarray, "n k 3"], second: Float[np.ndarray, "m k 3"]) -> tuple[int, ...] | None:
+    """For each of m people of a photo which of n >= m of another one has the same colors; None if that is not plain.
 
-    Arguments: colours in [0, 1] of k parts of the body; NaN for parts that are not seen.
+    Arguments: colors in [0, 1] of k parts of the body; NaN for parts that are not seen.
     """
     apart = np.linalg.norm(second[:, None] - first[None], axis=-1)
     seen = np.isfinite(apart)

@@ -2,7 +2,7 @@
 
 Channels R, G, B, A and Z (depth along the optical axis, metres, 0 for background), and further channels
 under their own names (`position.X`), in 32 bits or in half precision. Header of each part: `K` (3x3, pixels) and
-`cam_from_world` (4x4, OpenCV, metres), float32, exact. Colours are stored as given. Compositing programs expect them
+`cam_from_world` (4x4, OpenCV, metres), float32, exact. Colors are stored as given. Compositing programs expect them
 premultiplied, that is rendered onto black. Ours are the values of the photos, as in PNG files: encoded for a display by the curve
 of sRGB, not linear in light.
 """
@@ -30,7 +30,7 @@ STANDARD_ATTRIBUTES = {"name", "type", "compression", "owner", "view", "comments
 class ExrView:
     """One rendered view.
 
-    rgba: (h, w, 4) colours and coverage. depth: (h, w) metres, or None.
+    rgba: (h, w, 4) colors and coverage. depth: (h, w) metres, or None.
     K, cam_from_world: (3, 3) pixels and (4, 4) metres of its camera, both or neither.
     name: of the part; unique in a file. channels: further (h, w) images by name. attributes: strings for the header.
     """

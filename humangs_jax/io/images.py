@@ -34,61 +34,61 @@ DIAGONAL_35MM = 43.27
 EXIF_MARKS = (b"Exif", b"eXIf", b"Raw profile type", b"adobe.com/xap", b"com.adobe.xmp")
 """A file without any of these has no EXIF; looking further would decode a PNG."""
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_COLOUR_TYPES = {2: "rgb", 4: "grey and alpha", 6: "rgba"}
-"""Colour types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
+PNG_COLOR_TYPES = {2: "rgb", 4: "grey and alpha", 6: "rgba"}
+"""Color types of a PNG file that Pillow silently cuts from 16 to 8 bits (grey alone, type 0, it reads in full)."""
 PALETTE = 3
-"""The colour type whose pixels are numbers of a palette."""
+"""The color type whose pixels are numbers of a palette."""
 ADAM7 = ((0, 0, 8, 8), (0, 4, 8, 8), (4, 0, 8, 4), (0, 2, 4, 4), (2, 0, 4, 2), (0, 1, 2, 2), (1, 0, 2, 1))
 """First row, first column and steps of the passes of an interlaced PNG (https://www.w3.org/TR/png-3/#8Interlace)."""
 
 
 def read_image(path: str | Path) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
-    """Colours and, where the file has an alpha channel, alpha. Grey images become three equal channels.
+    """Colors and, where the file has an alpha channel, alpha. Grey images become three equal channels.
 
     Raises: FileNotFoundError; FileError if the file cannot be read as a photo or has more pixels than the limit.
     """
     pixels = _read_pixels(path)
     if pixels.shape[-1] in (1, 3):
         return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3))), None
-    colours = np.broadcast_to(pixels[..., :-1], (*pixels.shape[:2], 3))
-    return np.ascontiguousarray(colours), np.ascontiguousarray(pixels[..., -1])
+    colors = np.broadcast_to(pixels[..., :-1], (*pixels.shape[:2], 3))
+    return np.ascontiguousarray(colors), np.ascontiguousarray(pixels[..., -1])
 
 
 def read_grey(path: str | Path) -> Float[np.ndarray, "h w"]:
     """A mask, coverage in [0, 1]: a grey image, or what else segmentation tools write.
 
-    A palette or colours: 1 where the image has the one label (of a palette) or the one colour that is not the background. The
+    A palette or colors: 1 where the image has the one label (of a palette) or the one color that is not the background. The
     background is black, and label 0 if there is one. Several greys of a palette are those of a grey image. An alpha channel is
-    the mask if the colours are those of a photo, all alike, or the same mask.
+    the mask if the colors are those of a photo, all alike, or the same mask.
 
-    Raises: as `read_image`; FileError for several labels or colours, for a label 0 that is not black, for no black, and for alpha
+    Raises: as `read_image`; FileError for several labels or colors, for a label 0 that is not black, for no black, and for alpha
     and greys that differ: which is the person?
     """
     with open_image(path) as (image, data):
         if image.format == "PNG":
             _checked_chunks(data)
         if image.mode == "P" and image.convert("RGBA").getchannel("A").getextrema()[0] == 255:
-            colours = np.asarray(image.getpalette("RGB") or (), int).reshape(-1, 3)
-            return _mask_of_labels(np.asarray(image), np.pad(colours, ((0, 256 - len(colours)), (0, 0))))
-    colours, alpha = read_image(path)
+            colors = np.asarray(image.getpalette("RGB") or (), int).reshape(-1, 3)
+            return _mask_of_labels(np.asarray(image), np.pad(colors, ((0, 256 - len(colors)), (0, 0))))
+    colors, alpha = read_image(path)
     with reading(path, "mask"):
         if alpha is not None and alpha.min() < 1:
-            return _mask_of_alpha(colours, alpha)
-        if _is_grey(colours):
-            return colours[..., 0] if (colours == colours[..., :1]).all() else colours.mean(axis=-1)
-        codes = to_uint8(colours).astype(np.uint32) @ np.asarray([1 << 16, 1 << 8, 1], np.uint32)
+            return _mask_of_alpha(colors, alpha)
+        if _is_grey(colors):
+            return colors[..., 0] if (colors == colors[..., :1]).all() else colors.mean(axis=-1)
+        codes = to_uint8(colors).astype(np.uint32) @ np.asarray([1 << 16, 1 << 8, 1], np.uint32)
         if (count := np.count_nonzero(np.unique(codes))) != 1 or codes.all():
             black = " without black" if codes.all() else ""
-            raise Refused(f"{count} colours{black}: which is the person? expected one on black, or {GREY_MASK}")
+            raise Refused(f"{count} colors{black}: which is the person? expected one on black, or {GREY_MASK}")
         return (codes > 0).astype(np.float32)
 
 
-def _is_grey(colours):
-    return float(np.ptp(colours, axis=-1).max()) <= GREY_SLACK
+def _is_grey(colors):
+    return float(np.ptp(colors, axis=-1).max()) <= GREY_SLACK
 
 
 def _mask_of_labels(labels, palette):
-    """The mask of a palette image: labels (h, w), colours of the palette (256, 3) from 0 to 255."""
+    """The mask of a palette image: labels (h, w), colors of the palette (256, 3) from 0 to 255."""
     used = np.unique(labels)
     black = [label for label in used.tolist() if not palette[label].any()]
     if 0 in used:  # tools count the background as 0, people draw it black: where these differ nobody knows
@@ -100,16 +100,16 @@ def _mask_of_labels(labels, palette):
     others = [label for label in used.tolist() if label != background]
     if background is not None and len(others) <= 1:
         return ((labels != background) & bool(others)).astype(np.float32)
-    colours = palette[used]
-    if len(used) > 2 and colours.max() >= 128 and _is_grey(colours / 255):
+    colors = palette[used]
+    if len(used) > 2 and colors.max() >= 128 and _is_grey(colors / 255):
         return palette[labels].mean(axis=-1, dtype=np.float32) / np.float32(255)
     shown = ", ".join(map(str, others[:5])) + (", ..." if len(others) > 5 else "")
     which = "which is the person" if background is not None else "0 is not black: which is the background"
     raise Refused(f"a palette of the labels {shown}: {which}? expected one label besides a black 0, or {GREY_MASK}")
 
 
-def _mask_of_alpha(colours, alpha):
-    shown = colours[alpha > 0]
+def _mask_of_alpha(colors, alpha):
+    shown = colors[alpha > 0]
     flat = not len(shown) or np.ptp(shown, axis=0).max() <= GREY_SLACK
     if flat or not _is_grey(shown) or np.abs(shown[:, 0] - alpha[alpha > 0]).max() <= GREY_SLACK:
         return alpha
@@ -153,7 +153,7 @@ def oriented(pixels: np.ndarray, flag: int) -> np.ndarray:
 
 
 def write_png(path: str | Path, image: Float[np.ndarray, "h w c"] | Float[np.ndarray, "h w"]) -> None:
-    """Write colours or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside are clipped.
+    """Write colors or grey in [0, 1] as an 8-bit PNG, rounded to the nearest level; values outside are clipped.
 
     A fourth channel is alpha. The file appears whole or not at all. Raises: OSError if it cannot be written.
     """
@@ -180,7 +180,7 @@ def to_uint8(image: Float[np.ndarray, "*shape"]) -> np.ndarray:
 
 
 def named_color(name: str) -> tuple[float, float, float]:
-    """Red, green and blue in [0, 1] of a CSS name or "#rrggbb". Raises: ValueError for what is no opaque colour."""
+    """Red, green and blue in [0, 1] of a CSS name or "#rrggbb". Raises: ValueError for what is no opaque color."""
     from PIL import ImageColor
 
     try:
@@ -188,7 +188,7 @@ def named_color(name: str) -> tuple[float, float, float]:
     except ValueError:
         alpha = [0]
     if alpha:
-        raise ValueError(f'background {name!r}: expected a colour such as white or "#20a0ff"')
+        raise ValueError(f'background {name!r}: expected a color such as white or "#20a0ff"')
     return red / 255, green / 255, blue / 255
 
 
@@ -300,7 +300,7 @@ def _read_pixels(path):
     with open_image(path) as (image, data):
         if data[:8] == PNG_SIGNATURE:
             chunks = _checked_chunks(data)
-            if data[24] == 16 and data[25] in PNG_COLOUR_TYPES:
+            if data[24] == 16 and data[25] in PNG_COLOR_TYPES:
                 return _decode_deep_png(chunks).astype(np.float32) / np.float32(65535)
         if image.mode.startswith("I"):  # 16-bit grey
             return np.asarray(image, np.float32)[..., None] / np.float32(65535)
@@ -318,10 +318,10 @@ BAND = 1024
 
 def _decode_deep_png(chunks: list[tuple[bytes, bytes]]) -> UInt[np.ndarray, "h w c"]:
     """The pixels of a PNG file of 16 bits a channel (https://www.w3.org/TR/png-3/)."""
-    width, height, _, colour_type, *methods = struct.unpack(">IIBBBBB", chunks[0][1])
+    width, height, _, color_type, *methods = struct.unpack(">IIBBBBB", chunks[0][1])
     if methods[:2] != [0, 0] or methods[2] > 1 or 0 in (width, height):
         raise Refused("not a readable image: a PNG header with unknown methods")
-    channels = {2: 3, 4: 2, 6: 4}[colour_type]
+    channels = {2: 3, 4: 2, 6: 4}[color_type]
     passes = ADAM7 if methods[2] else ((0, 0, 1, 1),)
     sizes = [(len(range(y, height, dy)), len(range(x, width, dx))) for y, x, dy, dx in passes]
     lengths = [h * (1 + 2 * channels * w) if w else 0 for h, w in sizes]

@@ -26,7 +26,7 @@ TYPES = ("obj", "ply", "glb", "stl", "off")
 def read_meshes(path: str | Path, *, textures: bool = False, colors: bool = False) -> list[Any]:
     """The triangle meshes of a file in its common coordinates, as trimesh.Trimesh; empty if it has none.
 
-    Arguments: textures: with materials and textures. colors: with colours of the vertices instead, painted or from a texture;
+    Arguments: textures: with materials and textures. colors: with colors of the vertices instead, painted or from a texture;
     grey where they are not known. Materials and textures that the file names but that cannot be read are left out, which is
     logged.
     Raises: FileNotFoundError; FileError if it is damaged, of another format, or asks for more than the limits allow.
@@ -148,11 +148,11 @@ def _folder_of(path):
 
 
 GREY = 153
-"""Of 255: vertices whose colour is not known."""
+"""Of 255: vertices whose color is not known."""
 
 
 def _paint(mesh):
-    """Give a mesh colours of its vertices in place of a texture."""
+    """Give a mesh colors of its vertices in place of a texture."""
     from trimesh.visual import ColorVisuals
 
     count, visual = len(mesh.vertices), mesh.visual

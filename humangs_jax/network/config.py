@@ -1,6 +1,6 @@
 """The configuration of a network, in three: what its weights are, what they were trained with, and how it runs.
 
-Weights files record `Architecture` and `Conventions`. `Execution` belongs to the user and the machine.
+Weights files record `Architecture` and `Conventions`. `Runtime` belongs to the user and the machine.
 """
 
 import dataclasses
@@ -10,9 +10,9 @@ import jax
 
 from humangs_jax.core.configuration import configuration
 from humangs_jax.network.encoder import PatchTransformer
-from humangs_jax.network.execution import Conventions, Execution, TokenSelection
 from humangs_jax.network.parts import Decoder, Driver, Encoder, Pass, PixelDecoder, Reader
 from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.runtime import Conventions, Runtime, TokenSelection
 from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.network.surface_map import SurfaceMap
 from humangs_jax.network.vertex_decoder import VertexDecoder
@@ -35,7 +35,7 @@ class Architecture:
         reader, decoder = self.reader, self.decoder
         if isinstance(reader, PixelAlignedReader) and isinstance(decoder, VertexDecoder):
             if decoder.residual_color and not reader.sample_rgb:
-                raise ValueError("decoder.residual_color needs reader.sample_rgb: there is no photo colour to correct")
+                raise ValueError("decoder.residual_color needs reader.sample_rgb: there is no photo color to correct")
             if reader.shells and decoder.frame != "normal":
                 raise ValueError('reader.shells lie along the normals: they need decoder.frame = "normal"')
         if self.driver is not None and self.draws_pixels:
@@ -85,11 +85,11 @@ def paper_parts(architecture: Architecture) -> tuple[PatchTransformer, PixelAlig
 @jax.tree_util.register_static
 @configuration
 class HumanGSConfig:
-    """A network: see `Architecture`, `Conventions`, `Execution`, and `network.presets`. For JAX a pytree without leaves."""
+    """A network: see `Architecture`, `Conventions`, `Runtime`, and `network.presets`. For JAX a pytree without leaves."""
 
     architecture: Architecture = dataclasses.field(default_factory=Architecture)
     conventions: Conventions = dataclasses.field(default_factory=Conventions)
-    execution: Execution = dataclasses.field(default_factory=Execution)
+    runtime: Runtime = dataclasses.field(default_factory=Runtime)
 
     def __post_init__(self):
         """Raises ValueError for photos that the encoder cannot cut into patches, and for fields of other types."""
@@ -105,21 +105,21 @@ class HumanGSConfig:
 
     def run(self, train: bool = False, axis_name: Any = None, stage: StageCaller = call) -> Pass:
         """How one pass of this network runs."""
-        return Pass(self.conventions, self.execution, train, axis_name, stage)
+        return Pass(self.conventions, self.runtime, train, axis_name, stage)
 
     @property
     def image_size(self) -> int:
         """Side of the photos in force, pixels."""
-        return self.execution.image_size or self.conventions.image_size
+        return self.runtime.image_size or self.conventions.image_size
 
     @property
     def trained(self) -> "HumanGSConfig":
-        """What a weights file records: this network with default execution."""
-        return dataclasses.replace(self, execution=Execution())
+        """What a weights file records: this network with default runtime."""
+        return dataclasses.replace(self, runtime=Runtime())
 
-    def with_execution(self, **changes: Any) -> "HumanGSConfig":
+    def with_runtime(self, **changes: Any) -> "HumanGSConfig":
         """The same network, run in another way."""
-        return dataclasses.replace(self, execution=dataclasses.replace(self.execution, **changes))
+        return dataclasses.replace(self, runtime=dataclasses.replace(self.runtime, **changes))
 
     def with_conventions(self, **changes: Any) -> "HumanGSConfig":
         """The same parts under other conventions."""

@@ -204,7 +204,7 @@ def infer_config(state: StateDict, head_width: int | None = None) -> HumanGSConf
     size = patch * max(1, base.conventions.image_size // patch)
     conventions = dataclasses.replace(base.conventions, image_size=size)
     architecture = Architecture(encoder, PixelAlignedReader(output_width=output_width), decoder)
-    return HumanGSConfig(architecture, conventions, base.execution)
+    return HumanGSConfig(architecture, conventions, base.runtime)
 
 
 def _shape(state: StateDict, key: str, axes: int) -> tuple[int, ...]:

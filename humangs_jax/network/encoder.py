@@ -20,9 +20,9 @@ from humangs_jax.core.configuration import Patch, Side, Width, configuration, kn
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.geometry.camera import plucker_rays
 from humangs_jax.network.bilinear import sample_bilinear
-from humangs_jax.network.execution import Execution
 from humangs_jax.network.inputs import HumanGSInputs, subject_unit
 from humangs_jax.network.parts import Encoding, Pass, Variables
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import INIT_STD, Transformer, TransformerConfig
 from humangs_jax.network.upsampler import Upsampler, UpsamplerConfig
 
@@ -104,7 +104,7 @@ class PatchTransformer:
     """The paper's encoder: one token per patch of every view, attention over all of them, an upsampler.
 
     patch_size: side of a token's patch, pixels. texture: the neural texture. upsampler: None: the maps are those of the last
-    layer (ablation). geometry: what a pixel knows besides its colour: its ray and the canonical position seen there, or only its
+    layer (ablation). geometry: what a pixel knows besides its color: its ray and the canonical position seen there, or only its
     place in the photo, for systems whose photos have neither cameras nor poses.
     """
 
@@ -129,7 +129,7 @@ class PatchTransformer:
     def init(self, key: Key, inputs: HumanGSInputs, run: Pass) -> Variables:
         """{"params", "batch_stats"} of `EncoderModule`; the latter only with an upsampler."""
         pixels = jnp.zeros((1, 2 * self.patch_size, 2 * self.patch_size, 12))
-        return cast(Variables, EncoderModule(self, run.execution).init(key, pixels))
+        return cast(Variables, EncoderModule(self, run.runtime).init(key, pixels))
 
     def apply(self, variables: Variables, inputs: HumanGSInputs, run: Pass) -> tuple[Encoding, Variables]:
         """See `parts.Encoder`. Raises: ValueError if images and cameras differ in size, or are not made of whole patches."""
@@ -138,11 +138,11 @@ class PatchTransformer:
         packing, dropped = None, jnp.zeros((), jnp.int32)
         if run.tokens == "foreground":
             touched = touched_patches(inputs, self.patch_size)
-            packing = pack_patches(touched, min(run.execution.token_capacity or len(touched), len(touched)))
+            packing = pack_patches(touched, min(run.runtime.token_capacity or len(touched), len(touched)))
             dropped = jnp.sum(touched, dtype=jnp.int32) - packing.count
 
         statistics = variables.get("batch_stats", {})
-        module = EncoderModule(self, run.execution, run.axis_name)
+        module = EncoderModule(self, run.runtime, run.axis_name)
         update = run.train and bool(statistics)
         result = module.apply(
             variables, pixels, packing, inputs.view_count, run.train, mutable=["batch_stats"] if update else False
@@ -193,7 +193,7 @@ class EncoderModule(nn.Module):
     """Pixels of all views (v, h, w, 12: rgb, rays, canonical position) -> maps (v, h', w', d), global token."""
 
     config: PatchTransformer
-    execution: Execution
+    runtime: Runtime
     axis_name: str | tuple[str, ...] | None = None
 
     @nn.compact
@@ -204,7 +204,7 @@ class EncoderModule(nn.Module):
         view_count: Int[Array, ""] | None = None,
         train: bool = False,
     ) -> tuple[Float[Array, "v i j d"], Float[Array, " e"] | None]:
-        config, dtype = self.config, self.execution.compute_dtype
+        config, dtype = self.config, self.runtime.compute_dtype
         width, class_token = config.transformer.width, config.transformer.class_token
         patches = patchify(pixels, config.patch_size)
         patch_count = len(patches)
@@ -220,7 +220,7 @@ class EncoderModule(nn.Module):
             tokens = jnp.concatenate([first.astype(tokens.dtype), tokens])
             count = None if count is None else count + 1
 
-        depths = Transformer(config.transformer, self.execution, name="transformer")(tokens, count)
+        depths = Transformer(config.transformer, self.runtime, name="transformer")(tokens, count)
         global_token = depths[-1][0] if class_token else None
         if class_token:
             depths = [x[1:] for x in depths]

@@ -21,8 +21,8 @@ import jax.numpy as jnp
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.array_types import Array, Float, Int, Key
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.network.execution import Conventions, Execution, TokenSelection
 from humangs_jax.network.inputs import HumanGSInputs
+from humangs_jax.network.runtime import Conventions, Runtime, TokenSelection
 from humangs_jax.network.stages import StageCaller, call
 from humangs_jax.rendering.gaussians import Gaussians
 
@@ -37,7 +37,7 @@ class Pass(NamedTuple):
     """
 
     conventions: Conventions
-    execution: Execution
+    runtime: Runtime
     train: bool = False
     axis_name: str | tuple[str, ...] | None = None
     stage: StageCaller = call
@@ -45,7 +45,7 @@ class Pass(NamedTuple):
     @property
     def tokens(self) -> TokenSelection:
         """The selection of tokens in force."""
-        return self.execution.tokens or self.conventions.tokens
+        return self.runtime.tokens or self.conventions.tokens
 
 
 class Encoding(NamedTuple):
@@ -64,7 +64,7 @@ class Encoding(NamedTuple):
 class Shells:
     """What the photos show at the s points along the normal of each vertex.
 
-    distances: (s,). colors: (n, s, 3) mean photo colour over the views in which the point is visible and on the person, weighted
+    distances: (s,). colors: (n, s, 3) mean photo color over the views in which the point is visible and on the person, weighted
     by how much the posed normal faces them; grey without such a view. seen: (n, s) the sum of those weights over the number of
     views. inside: (n, s) mean mask at the point over the views that contain it. hull: (n, s) the minimum of the same, 0
     outside of the visual hull. A view that does not contain the point is ignored; without any view both are 1.

@@ -2,7 +2,7 @@
 
 Lengths are normalised units throughout (see `network.inputs`): cameras, vertices and depth maps alike.
 
-Shells are points off the body's surface, looked up in all photos: where loose clothes and hair are, and their colour. Each vertex
+Shells are points off the body's surface, looked up in all photos: where loose clothes and hair are, and their color. Each vertex
 has one point at every distance of a list along its posed normal. Where a photo shows the background, the point is not part of the
 person. Points that all photos show on the person are in the visual hull (Laurentini 1994).
 """
@@ -25,7 +25,7 @@ DEPTH_TOLERANCE = 0.05
 COUNT_EPSILON = 1e-8
 """Added to the number of pooled views, as published: no view at all gives zeros."""
 UNSEEN_COLOR = 0.5
-"""Photo colour of a vertex that no view sees."""
+"""Photo color of a vertex that no view sees."""
 
 
 def project_vertices(camera: Camera, vertices: Float[Array, "n 3"]) -> tuple[Float[Array, "n 2"], Float[Array, " n"]]:
@@ -100,7 +100,7 @@ def dropped_reads(weights: Float[Array, "v n"], capacity: int | None) -> Int[Arr
 def photo_colors(
     images: Float[Array, "v h w 3"], pixels: Float[Array, "v n 2"], visible: Bool[Array, "v n"], grid: PixelGrid
 ) -> Float[Array, "n 3"]:
-    """Mean photo colour over the views that see each vertex, grey where none does."""
+    """Mean photo color over the views that see each vertex, grey where none does."""
     size = (images.shape[2], images.shape[1])
     colors = jax.vmap(sample_bilinear)(images, texel_indices(pixels, size, size, grid))
     counts = jnp.sum(visible, axis=0)[:, None]
@@ -143,7 +143,7 @@ def sample_shells(
         points = (vertices[:, None] + steps[:, None] * normals[:, None]).reshape(-1, 3)
         pixels, depths = project_vertices(camera, points)
         indices = texel_indices(pixels, size, size, grid)
-        mask = mask[..., None].astype(image.dtype)  # the colour of the background is not used
+        mask = mask[..., None].astype(image.dtype)  # the color of the background is not used
         read = sample_bilinear(jnp.concatenate([image * mask, mask], axis=-1), indices)
         surface = sample_nearest(depth_map, indices)
         framed = jnp.all((pixels > 0) & (pixels < jnp.asarray(size, pixels.dtype)), axis=-1) & (depths > 0)

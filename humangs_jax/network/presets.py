@@ -5,8 +5,8 @@ import dataclasses
 from humangs_jax.core.configuration import Presets
 from humangs_jax.network.config import Architecture, Conventions, HumanGSConfig, paper_parts
 from humangs_jax.network.encoder import PatchTransformer, TriplaneConfig
-from humangs_jax.network.execution import Execution
 from humangs_jax.network.reader import PixelAlignedReader
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.upsampler import UpsamplerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
@@ -26,17 +26,17 @@ def published() -> HumanGSConfig:
             skinning="rotation",
             rendering="inria",
         ),
-        execution=Execution(dtype="bfloat16"),
+        runtime=Runtime(dtype="bfloat16"),
     )
 
 
 def paper() -> HumanGSConfig:
     """The paper: visible views pooled, a plain position map; conventions otherwise ours."""
-    return HumanGSConfig(execution=Execution(dtype="bfloat16"))
+    return HumanGSConfig(runtime=Runtime(dtype="bfloat16"))
 
 
 def small() -> HumanGSConfig:
-    """Trained on a CPU and shipped: tokens of the foreground only, colour read off the photos.
+    """Trained on a CPU and shipped: tokens of the foreground only, color read off the photos.
 
     It has no upsampler, for its cost on a CPU (docs/training.md).
     """
@@ -67,7 +67,7 @@ def small() -> HumanGSConfig:
             body_vertices=4000,
             longest_edge=0.03,
         ),
-        Execution(token_capacity=1344),
+        Runtime(token_capacity=1344),
     )
 
 
@@ -85,7 +85,7 @@ def tiny() -> HumanGSConfig:
             dataclasses.replace(decoder, hidden=16),
         ),
         Conventions(image_size=32, tokens="foreground"),
-        Execution(token_capacity=16),
+        Runtime(token_capacity=16),
     )
 
 

@@ -32,7 +32,7 @@ class PixelAlignedReader:
     """What vertices read.
 
     output_width: features of a last 3x3 convolution, evaluated only where vertices read the maps; None: the maps are read as they
-    are. sample_rgb: also read the photo colour at each vertex, averaged over the views that see it, and their fraction.
+    are. sample_rgb: also read the photo color at each vertex, averaged over the views that see it, and their fraction.
     shells: ascending distances along the vertex normals, normalised units, at which the photos are read too; (): none.
     """
 
@@ -56,11 +56,11 @@ class PixelAlignedReader:
     def output(self, channels: int, run: Pass) -> OutputConvolution:
         """The last convolution, of maps with that many channels."""
         assert self.output_width is not None
-        return OutputConvolution(self.output_width, channels, run.execution.compute_dtype)
+        return OutputConvolution(self.output_width, channels, run.runtime.compute_dtype)
 
     def apply(self, variables: Variables, encoding: Encoding, inputs: HumanGSInputs, run: Pass) -> VertexFeatures:
         """Features of the n vertices. Raises ValueError for shells without posed normals."""
-        conventions, capacity = run.conventions, run.execution.vertex_capacity
+        conventions, capacity = run.conventions, run.runtime.vertex_capacity
         pixels, visible = project_and_test(inputs, run)
         weights = view_weights(visible, inputs, run).astype(pixels.dtype)
         size = (inputs.cameras.width, inputs.cameras.height)

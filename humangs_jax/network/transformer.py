@@ -26,11 +26,11 @@ from jax.ad_checkpoint import checkpoint_name
 
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.configuration import Layers, Ratio, Width, configuration
-from humangs_jax.network.execution import AttentionKernel, Execution
+from humangs_jax.network.runtime import AttentionKernel, Runtime
 
 NORM_EPSILON = 1e-5
 PRODUCT = "product"
-"""Name of the arrays of a block that `Execution.remat` "dots" may keep for the backward pass."""
+"""Name of the arrays of a block that `Runtime.remat` "dots" may keep for the backward pass."""
 XLA_TOKENS = 8192
 """Up to here L x L logits of all heads fit beside a model on any accelerator (12 heads, float32: 3 GB a layer)."""
 
@@ -104,13 +104,13 @@ class Attention(nn.Module):
 
     head_width: int
     qk_norm: bool
-    execution: Execution
+    runtime: Runtime
     kernel_init: Any
 
     @nn.compact
     def __call__(self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> Float[Array, "l d"]:
         length, width = tokens.shape
-        heads, dtype = width // self.head_width, self.execution.compute_dtype
+        heads, dtype = width // self.head_width, self.runtime.compute_dtype
         dense = lambda features, name: nn.Dense(
             features, use_bias=False, dtype=dtype, kernel_init=self.kernel_init, name=name
         )
@@ -120,7 +120,7 @@ class Attention(nn.Module):
         if self.qk_norm:
             q = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name="q_norm")(q)
             k = nn.RMSNorm(epsilon=NORM_EPSILON, dtype=dtype, name="k_norm")(k)
-        out = attention(q, k, v, count, self.execution.attention, self.execution.attention_chunk)
+        out = attention(q, k, v, count, self.runtime.attention, self.runtime.attention_chunk)
         out = checkpoint_name(out, PRODUCT)
         return dense(width, "out")(out.reshape(length, width))
 
@@ -159,7 +159,7 @@ class Block(nn.Module):
     """One pre-norm block; tokens (l, d) -> (l, d)."""
 
     config: TransformerConfig
-    execution: Execution
+    runtime: Runtime
     index: int
 
     @property
@@ -169,11 +169,11 @@ class Block(nn.Module):
 
     @nn.compact
     def __call__(self, x: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> Float[Array, "l d"]:
-        config, dtype = self.config, self.execution.compute_dtype
+        config, dtype = self.config, self.runtime.compute_dtype
         init = nn.initializers.normal(INIT_STD / (2 * (self.index + 1)) ** 0.5)
         dense = lambda features, name: nn.Dense(features, use_bias=False, dtype=dtype, kernel_init=init, name=name)
         normed = layer_norm(dtype, "norm1")(x)
-        x = x + Attention(config.head_width, config.qk_norm, self.execution, init, name="attention")(normed, count)
+        x = x + Attention(config.head_width, config.qk_norm, self.runtime, init, name="attention")(normed, count)
         hidden = dense(config.mlp_ratio * config.width, "mlp_in")(layer_norm(dtype, "norm2")(x))
         hidden = checkpoint_name(hidden, PRODUCT)
         return x + dense(config.width, "mlp_out")(jax.nn.gelu(hidden, approximate=False))
@@ -183,31 +183,31 @@ class Transformer(nn.Module):
     """Tokens (l, d) -> outputs after layers L/4, L/2, 3L/4 (raw) and L (after the final norm), each (l, d)."""
 
     config: TransformerConfig
-    execution: Execution
+    runtime: Runtime
 
     stage_names = {"input_norm": "input norm", "norm": "final norm"}  # noqa: RUF012 (Linen would take a ClassVar for a field)
 
     @nn.compact
     def __call__(self, tokens: Float[Array, "l d"], count: Int[Array, ""] | None = None) -> list[Float[Array, "l d"]]:
-        config, execution = self.config, self.execution
-        x = layer_norm(execution.compute_dtype, "input_norm")(tokens)
+        config, runtime = self.config, self.runtime
+        x = layer_norm(runtime.compute_dtype, "input_norm")(tokens)
         x = x.astype(jnp.promote_types(x.dtype, jnp.float32))
         quarters = (config.layers // 4, config.layers // 2, 3 * config.layers // 4)
-        if execution.scan and not self.is_initializing():
+        if runtime.scan and not self.is_initializing():
             x, collected = self._scan_blocks(x, count, quarters)
         else:
             collected = []
-            block_class = Block if execution.remat == "none" else nn.remat(Block, policy=_POLICIES[execution.remat])
+            block_class = Block if runtime.remat == "none" else nn.remat(Block, policy=_POLICIES[runtime.remat])
             for index in range(config.layers):
-                x = block_class(config, execution, index, name=f"block_{index}")(x, count)
+                x = block_class(config, runtime, index, name=f"block_{index}")(x, count)
                 if index + 1 in quarters:
                     collected.append(x)
-        return [*collected, layer_norm(execution.compute_dtype, "norm", use_bias=True)(x)]
+        return [*collected, layer_norm(runtime.compute_dtype, "norm", use_bias=True)(x)]
 
     def _scan_blocks(self, x, count, quarters):
         """The blocks as one loop over their stacked parameters: (output, outputs at the quarters)."""
-        config, remat = self.config, self.execution.remat
-        block = Block(config, self.execution, 0, parent=None)
+        config, remat = self.config, self.runtime.remat
+        block = Block(config, self.runtime, 0, parent=None)
         blocks = [self.variables["params"][f"block_{index}"] for index in range(config.layers)]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *blocks)
         slots = [quarters.index(i + 1) if i + 1 in quarters else len(quarters) for i in range(config.layers)]

@@ -1,7 +1,7 @@
 """From features of a body vertex to its K Gaussians.
 
 Input of a vertex: pooled local feature, global token, positional encoding of the canonical position, and optionally its
-photo colour, the fraction of views that see it, and what the photos show at distances along its normal. The first
+photo color, the fraction of views that see it, and what the photos show at distances along its normal. The first
 `tight` Gaussians of a vertex are those whose offsets a loss keeps small.
 """
 
@@ -29,11 +29,11 @@ LAST_STD = 0.001
 INITIAL_OPACITY = -1.0
 """Before the sigmoid."""
 COLOR_MARGIN = 0.01
-"""Photo colours are pulled this far inside (0, 1) before the inverse sigmoid: white stays correctable."""
+"""Photo colors are pulled this far inside (0, 1) before the inverse sigmoid: white stays correctable."""
 WEIGHT_EPSILON = 1e-9
 """Added to skinning weights before their logarithm, as published."""
 THINNER = 1.2
-"""Subtracted from the bias of the scale along the normal: a third of the thickness, so that outlines are sharp."""
+"""Subtracted from the bias of the scale along the normal: a third of the thickness, so that silhouettes are sharp."""
 OBLIQUE = (0.36, 0.48, 0.8)
 """A unit vector along no axis of a body. Where normals are opposite to it, frames turn quickly between vertices."""
 INITIAL_SHELL = 4.0
@@ -50,7 +50,7 @@ class VertexDecoder:
     bounded to it by tanh (normalised units; what shells add is not), None leaves them unbounded as published.
     initial_log_scale: initial bias of the scales, before the softplus. frame: axes of offsets and rotations, "canonical"
     those of the canonical body (published), "normal" ones whose z is the vertex's normal, along which Gaussians start
-    `THINNER`. residual_color: colours are predicted relative to the photo colour.
+    `THINNER`. residual_color: colors are predicted relative to the photo color.
     """
 
     hidden: Width = 256
@@ -140,7 +140,7 @@ class VertexDecoder:
 class RawGaussians:
     """Heads before their activations.
 
-    geometry: (n, k, 10) offset, quaternion, scale. appearance: (n, k, 4) colour, opacity. skinning: (n, k, j) logits or
+    geometry: (n, k, 10) offset, quaternion, scale. appearance: (n, k, 4) color, opacity. skinning: (n, k, j) logits or
     None. shells: (n, k, s) logits or None.
     """
 
@@ -172,7 +172,7 @@ def positional_encoding(x: Float[Array, "n 3"]) -> Float[Array, "n 39"]:
 
 
 def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> Float[Array, "n c"]:
-    """What is configured of: local feature, global token, encoded position, photo colour as 2 rgb - 1, visible fraction,
+    """What is configured of: local feature, global token, encoded position, photo color as 2 rgb - 1, visible fraction,
     normal, shells; in this order.
     """
     vertices = canonical.shape[0]
@@ -181,7 +181,7 @@ def decoder_input(features: VertexFeatures, canonical: Float[Array, "n 3"]) -> F
         parts.append(jnp.broadcast_to(features.global_token, (vertices, features.global_token.shape[0])))
     parts.append(positional_encoding(canonical))
     if features.photo_colors is not None:
-        assert features.visible_fraction is not None  # it comes with the colours
+        assert features.visible_fraction is not None  # it comes with the colors
         parts += [2 * features.photo_colors - 1, features.visible_fraction[:, None]]
     if features.normals is not None:
         parts.append(features.normals)
@@ -198,10 +198,10 @@ def normal_frames(normals: Float[Array, "n 3"]) -> Float[Array, "n 4"]:
 
 
 def activate(raw: RawGaussians, config: VertexDecoder, features: VertexFeatures | None = None) -> VertexGaussians:
-    """Quaternion normalised, scale softplus, colour and opacity sigmoid, offset bounded if so configured.
+    """Quaternion normalised, scale softplus, color and opacity sigmoid, offset bounded if so configured.
 
     With shells each Gaussian chooses between them by weights that sum to 1; the mean distance along the normal and the mean
-    photo colour are what its own offset and colour correct.
+    photo color are what its own offset and color correct.
     """
     offsets, quats, scales = jnp.split(raw.geometry, (3, 7), axis=-1)
     quats = quaternion.normalize(quats)

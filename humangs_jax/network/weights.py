@@ -2,7 +2,7 @@
 
 Keys are "params/encoder/..." and "batch_stats/encoder/..."; the header's metadata holds {"format": "humangs-weights",
 "version": "2", "architecture": JSON, "conventions": JSON, "checksum": SHA-256}; the first files have no checksum. float16 halves
-the file (and rounds to 11 bits); loading gives float32.
+the file (and iterations to 11 bits); loading gives float32.
 """
 
 import os
@@ -66,7 +66,7 @@ def save_weights(
 
 @checked_arguments
 def load_weights(path: str | os.PathLike | None = None) -> tuple[Variables, HumanGSConfig]:
-    """Variables (float32) and configuration of a file, with default `Execution`; None loads the weights of this package.
+    """Variables (float32) and configuration of a file, with default `Runtime`; None loads the weights of this package.
 
     Raises: FileNotFoundError; ValueError if the file is not a weights file of this package, or a tensor is missing, unknown, of
     the wrong shape or not finite, naming file and key; or if the contents are not those of the checksum.

@@ -1,6 +1,6 @@
 """What is worn on top and on the feet: hoods, scarves, hats, glasses, bags, necklaces, shoes.
 
-Swept tubes, sheets, boxes and outlines that follow one joint or the nearest skin.
+Swept tubes, sheets, boxes and silhouettes that follow one joint or the nearest skin.
 """
 
 import functools
@@ -9,11 +9,11 @@ import numpy as np
 
 from humangs_jax.people import hair, surfaces, tailoring
 from humangs_jax.people.anatomy import FLOOR, Anatomy
-from humangs_jax.people.fabrics import Material, band, colour, mix
+from humangs_jax.people.fabrics import Material, band, color, mix
 from humangs_jax.people.kinematics import HEAD, LEFT_ANKLE, LEFT_EYE, NECK, RIGHT_EYE
 from humangs_jax.people.noise import ripples
 from humangs_jax.people.outfits import Garment
-from humangs_jax.people.surfaces import Outlines, Surface, blurred, circle, grid_faces, hanging, join, sweep, unit
+from humangs_jax.people.surfaces import Boundaries, Surface, blurred, circle, grid_faces, hanging, join, sweep, unit
 
 RING, COLUMNS = 40, 32
 """Points of a ring around neck or head; of a ring of a shoe."""
@@ -28,7 +28,7 @@ def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: fl
     if kind in ("glasses", "sunglasses"):
         return glasses(anatomy, garment)
     if kind == "necklace":
-        metal = colour(0.12, 0.5, 0.75) if fabric.rng(2).random() < 0.5 else colour(0.6, 0.04, 0.72)
+        metal = color(0.12, 0.5, 0.75) if fabric.rng(2).random() < 0.5 else color(0.6, 0.04, 0.72)
         return [(necklace(anatomy, sizes["length"]), _painted(metal, 0.6))]
     if kind in ("cap", "brim_hat"):
         shell = hat(0.016, 0.0, crown=0.008) if kind == "cap" else hat(0.017, 0.0, crown=0.05)
@@ -41,26 +41,26 @@ def build(rng: np.random.Generator, anatomy: Anatomy, garment: Garment, ease: fl
     else:  # a headscarf
         opening, ends = _face_opening(0.312, 0.98, 0.078), rng.uniform(0.08, 0.13)
         surface = hair.falling_tube(rng, anatomy, 0.022, 0.06, opening, wave=0.005, ends=ends)
-    return [(surface, Material(fabric.colours, wrinkles=0.3))]
+    return [(surface, Material(fabric.colors, wrinkles=0.3))]
 
 
 def _painted(dye, sheen):
-    """A material of one colour."""
+    """A material of one color."""
     return Material(lambda s: np.broadcast_to(np.asarray(dye, np.float32), (len(s.cloth), 3)), sheen=sheen)
 
 
 def _panelled(fabric, s):
     """Six panels of a cap with a button on top."""
-    angle, colours = np.arctan2(s.template[:, 0], s.template[:, 2] - 0.02), fabric.colours(s)
+    angle, colors = np.arctan2(s.template[:, 0], s.template[:, 2] - 0.02), fabric.colors(s)
     seam = np.abs((angle / (np.pi / 3) + 0.5) % 1 - 0.5) * (np.pi / 3) * 0.08
-    return mix(colours, colours * 0.6, band(seam, -1, 0.0016) * (s.template[:, 1] > 0.34))
+    return mix(colors, colors * 0.6, band(seam, -1, 0.0016) * (s.template[:, 1] > 0.34))
 
 
 def _ribboned(fabric, s):
     """A hat with a ribbon above its brim."""
     above = hair.above_line(s.template, hair.CAP_LINE)
     on_crown = np.hypot(s.template[:, 0], s.template[:, 2] - 0.02) < 0.118
-    return mix(fabric.colours(s), fabric.other, band(above, 0.002, 0.026, 0.002) * on_crown)
+    return mix(fabric.colors(s), fabric.other, band(above, 0.002, 0.026, 0.002) * on_crown)
 
 
 def neck_ring(anatomy: Anatomy, lift: float) -> tuple[np.ndarray, np.ndarray]:
@@ -129,8 +129,8 @@ def _tail(rng, anatomy, start, side, length, thickness, ease):
     rows = max(5, int(length / 0.03))
     y = np.linspace(start[1] + 0.01, start[1] - length, rows)
     x = side * (0.028 + 0.012 * np.linspace(0, 1, rows)) + 0.006 * np.sin(np.linspace(0, 3, rows))
-    outline = blurred(hanging(anatomy.trunk, 0.2), 2)
-    z = outline.radius(y, np.arctan2(x, np.full(rows, 0.12))) + ease + 0.016
+    boundary = blurred(hanging(anatomy.trunk, 0.2), 2)
+    z = boundary.radius(y, np.arctan2(x, np.full(rows, 0.12))) + ease + 0.016
     z = np.maximum(z, start[2] + 0.7 * thickness + np.linspace(0, 0.01, rows))
     path = np.stack([x, y, z], -1)
     widths = np.stack([np.full(rows, 0.045 + 0.3 * thickness), np.full(rows, 0.010)], -1)
@@ -199,7 +199,7 @@ def glasses(anatomy: Anatomy, garment: Garment) -> list[tuple[Surface, Material]
     across, flat = np.linspace(-1, 1, 7), np.full(7, front + 0.002)
     bridge = np.stack([(apart * 1.06 - half) * across, middle[1] + 0.004 + 0.003 * (1 - across**2), flat], -1)
     parts.append(sweep(bridge, UP, wire, 6))
-    glass = (lenses, _painted(colour(0.08, 0.3, 0.06), 0.7))
+    glass = (lenses, _painted(color(0.08, 0.3, 0.06), 0.7))
     made = [(parts, _painted(garment.fabric.base, 0.4)), *([glass] if dark else [])]
     return [(join([_on_head(anatomy, v, f, v - middle) for v, f in pieces]), material) for pieces, material in made]
 
@@ -254,11 +254,13 @@ def _shoe(anatomy, side, height, sole, ease):
     low = np.asarray([0.004, 0.012, 0.022, 0.033, 0.045, 0.058, 0.072])
     levels = floor + np.concatenate([low[low < height - 0.004], shaft])
     # thin slices of the foot; thick ones, averaged, of the shin, where the body has few vertices
-    thin, thick = (surfaces.outlines(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03))
+    thin, thick = (
+        surfaces.boundaries(points[:, 1], points[:, [0, 2]], levels, None, window) for window in (0.012, 0.03)
+    )
     shin = np.clip((levels - levels[0] - 0.08) / 0.03, 0, 1)[:, None]
     pairs = (thin.centers, thick.centers), (thin.radii, blurred(thick, 2).radii)
     shape = hanging(
-        Outlines(levels, *(a + (b - a) * shin for a, b in pairs)), 0.6
+        Boundaries(levels, *(a + (b - a) * shin for a, b in pairs)), 0.6
     )  # the sole is as wide as what is above it
     below = ((-sole, 0.0), (-sole, 0.0), (-0.3 * sole, 0.004), (0.004, 0.004), (0.006, 0.0))
     rows = [(floor + y, 0, extra) for y, extra in below] + [(level, i + 1, 0.0) for i, level in enumerate(levels[1:])]

@@ -1,4 +1,4 @@
-"""The shaped body for fitting clothes: template coordinates for cutting, limbs, outlines.
+"""The shaped body for fitting clothes: template coordinates for cutting, limbs, silhouettes.
 
 Cuts (hems, necklines, hairlines) and paint are given in TEMPLATE coordinates: the T-pose of the mean body in metres. A vertex
 keeps them for every shape of the person, so one number fits all people. Draping uses the rest vertices of the person.
@@ -10,7 +10,7 @@ import functools
 import numpy as np
 
 from humangs_jax.people.kinematics import LEFT_ANKLE, LEFT_HIP, LEFT_KNEE, LEFT_SHOULDER, LEFT_WRIST
-from humangs_jax.people.surfaces import Faces, Outlines, Points, Surface, blurred, outlines, vertex_normals
+from humangs_jax.people.surfaces import Boundaries, Faces, Points, Surface, blurred, boundaries, vertex_normals
 
 BODY_NAME, BODY_VERTICES = "makehuman", 13380
 """The body that the cuts below were measured on."""
@@ -30,7 +30,7 @@ class Anatomy:
     """skin: the whole body at rest, with attributes `template` (n, 3), `normals` (n, 3), `cloth` (n, 4).
 
     joints: (j, 3) at rest. parents: of the joints. arm, leg: (n,) membership in [0, 1].
-    trunk: outlines of trunk and thighs across y. legs, arms: outlines of the left and right limb, across y and across |x|.
+    trunk: silhouettes of trunk and thighs across y. legs, arms: silhouettes of the left and right limb, across y and across |x|.
     """
 
     skin: Surface
@@ -38,10 +38,10 @@ class Anatomy:
     parents: tuple[int, ...]
     arm: np.ndarray
     leg: np.ndarray
-    trunk: Outlines
-    hips_and_legs: Outlines
-    legs: tuple[Outlines, Outlines]
-    arms: tuple[Outlines, Outlines]
+    trunk: Boundaries
+    hips_and_legs: Boundaries
+    legs: tuple[Boundaries, Boundaries]
+    arms: tuple[Boundaries, Boundaries]
 
 
 def smoothstep(low: float, high: float, x: np.ndarray) -> np.ndarray:
@@ -111,17 +111,17 @@ def measure(
     body = (np.abs(template[:, 0]) < 0.19) & (template[:, 1] < 0.2)
     trunk_points = vertices[body & (template[:, 1] > -0.6)]
     spine = np.zeros((len(levels), 2))
-    torso = outlines(trunk_points[:, 1], trunk_points[:, [0, 2]], levels, spine, 0.025)
+    torso = boundaries(trunk_points[:, 1], trunk_points[:, [0, 2]], levels, spine, 0.025)
     lower = vertices[body & (template[:, 1] < WAIST + 0.03)]
-    hips = outlines(lower[:, 1], lower[:, [0, 2]], levels, spine, 0.025)
+    hips = boundaries(lower[:, 1], lower[:, [0, 2]], levels, spine, 0.025)
     legs, arms = [], []
     for offset, side in enumerate((1, -1)):
         line = joints[[LEFT_ANKLE + offset, LEFT_KNEE + offset, LEFT_HIP + offset]]
         centers = np.stack([np.interp(levels, line[:, 1], line[:, i]) for i in (0, 2)], -1)
         own = vertices[(template[:, 0] * side > 0.004) & (template[:, 1] < CROTCH + 0.1) & (template[:, 1] > -1.15)]
-        legs.append(blurred(outlines(own[:, 1], own[:, [0, 2]], levels, centers, 0.025)))
+        legs.append(blurred(boundaries(own[:, 1], own[:, [0, 2]], levels, centers, 0.025)))
         line = joints[[LEFT_SHOULDER + offset, LEFT_WRIST + offset]]
         centers = np.stack([np.interp(along, np.abs(line[:, 0]), line[:, i]) for i in (1, 2)], -1)
         own = vertices[(template[:, 0] * side > 0.2) & (template[:, 1] > -0.05) & (np.abs(template[:, 0]) < 0.68)]
-        arms.append(blurred(outlines(np.abs(own[:, 0]), own[:, [1, 2]], along, centers, 0.025)))
+        arms.append(blurred(boundaries(np.abs(own[:, 0]), own[:, [1, 2]], along, centers, 0.025)))
     return Anatomy(skin, joints, parents, arm, leg, blurred(torso), blurred(hips), tuple(legs), tuple(arms))

@@ -45,7 +45,7 @@ class PeopleBank:
     vertices: (p, n, 3) at rest, metres. normals: (p, n, 3) unit. joint_ids, joint_weights: (p, n, k).
     faces: (p, f, 3). uvs: (p, f, 3, 2) texture coordinates of the corners, steps of 1 / `UV_STEPS`, v DOWN.
     face_pieces: (p, f) piece of each face; of the pieces m: sheen (p, m), groups (p, m): pieces of one number are dyed
-    alike, dyeable (p, m): 1 where a piece is cloth that may have another colour.
+    alike, dyeable (p, m): 1 where a piece is cloth that may have another color.
     texture: (p, t, t, 6) albedo (255 is 1) and slopes (see `baking.BakedSubject`).
     rotations: (p, q, j, 3) poses; nearest: (p, q) the pose that is most like each.
     Static: parents; mirrored_joints: each joint's mirror image; split: range of the seeds; generator: `GENERATOR_VERSION`.

@@ -1,10 +1,10 @@
-"""Skin, face, eyes and hair colours, painted in template coordinates so that they sit on the features of every shape."""
+"""Skin, face, eyes and hair colors, painted in template coordinates so that they sit on the features of every shape."""
 
 import dataclasses
 
 import numpy as np
 
-from humangs_jax.people.fabrics import Material, Spots, band, colour, mix
+from humangs_jax.people.fabrics import Material, Spots, band, color, mix
 from humangs_jax.people.hair import LONG_CUTS, SHORT_LINE, Haircut, above_line, beard_field
 from humangs_jax.people.noise import Ripples, lattice
 from humangs_jax.people.outfits import drawn
@@ -18,14 +18,14 @@ HAIR = {
 }  # fmt: skip
 """Hue, saturation and value of hair, or their ranges."""
 FAIR_ODDS, DARK_ODDS = np.asarray([[0.2, 0.35, 0.22, 0.08, 0.06, 0.05], [0.80, 0.12, 0.01, 0.0, 0.03, 0.03]])
-"""Odds of the colours of hair above, of fair and of dark skin."""
+"""Odds of the colors of hair above, of fair and of dark skin."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Complexion:
-    """Colours (3,) of skin, lips, hair and iris; the rest are strengths in [0, 1].
+    """Colors (3,) of skin, lips, hair and iris; the rest are strengths in [0, 1].
 
-    brow: of the brows. freckles. wrinkles: of age. shadow: make-up on the lids, with its colour. liner: around the eyes.
+    brow: of the brows. freckles. wrinkles: of age. shadow: make-up on the lids, with its color. liner: around the eyes.
     blush: on the cheeks. tan: of arms and face against the rest.
     """
 
@@ -33,7 +33,7 @@ class Complexion:
     lips: np.ndarray
     hair: np.ndarray
     iris: np.ndarray
-    shadow_colour: np.ndarray
+    shadow_color: np.ndarray
     brow: float
     freckles: float
     wrinkles: float
@@ -44,7 +44,7 @@ class Complexion:
 
 
 def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Complexion:
-    """Random colouring; fair skin goes with any hair, dark skin with dark hair, age with grey."""
+    """Random coloring; fair skin goes with any hair, dark skin with dark hair, age with grey."""
     darkness = rng.beta(1.05, 1.15)
     fair, mid, dark = np.asarray([0.86, 0.67, 0.57]), np.asarray([0.70, 0.49, 0.36]), np.asarray([0.26, 0.155, 0.105])
     skin = fair + (mid - fair) * min(2 * darkness, 1) if darkness < 0.5 else mid + (dark - mid) * (2 * darkness - 1)
@@ -54,25 +54,25 @@ def sample_complexion(rng: np.random.Generator, male: bool, years: float) -> Com
     lips = skin * np.asarray([0.90, 0.64, 0.64])
     if made_up and rng.random() < 0.75:
         hue = rng.choice([rng.uniform(0.94, 1.03), rng.uniform(0.935, 0.97)])
-        lips = 0.3 * lips + 0.7 * colour(hue, rng.uniform(0.45, 0.8), rng.uniform(0.35, 0.75))
+        lips = 0.3 * lips + 0.7 * color(hue, rng.uniform(0.45, 0.8), rng.uniform(0.35, 0.75))
     grey = float(np.clip((years - 40) / 35, 0, 0.85))
     odds = (FAIR_ODDS + (DARK_ODDS - FAIR_ODDS) * np.clip((darkness - 0.22) / 0.2, 0, 1)) * (1 - grey)
     odds[4] += grey
     if years > 60:
         odds[5] *= 0.3
     kind = rng.choice(list(HAIR), p=odds / odds.sum())
-    colours = {name: [drawn(rng, value) for value in values] for name, values in HAIR.items()}  # all of them are drawn
-    hair = colour(*colours[kind])
+    colors = {name: [drawn(rng, value) for value in values] for name, values in HAIR.items()}  # all of them are drawn
+    hair = color(*colors[kind])
     brown = darkness > 0.45 or rng.random() < 0.4
-    iris = colour(0.07, 0.6, rng.uniform(0.1, 0.3)) if brown else colour(rng.uniform(0.25, 0.62), 0.4, 0.5)
+    iris = color(0.07, 0.6, rng.uniform(0.1, 0.3)) if brown else color(rng.uniform(0.25, 0.62), 0.4, 0.5)
     if made_up and rng.random() < 0.5:  # nail varnish is not shown; a seed stays the same person
-        colour(rng.choice([rng.uniform(0.9, 1.05), rng.random()]), rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.8))
+        color(rng.choice([rng.uniform(0.9, 1.05), rng.random()]), rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.8))
     return Complexion(
         skin=skin.astype(np.float32),
         lips=np.asarray(lips, np.float32),
         hair=hair,
         iris=iris,
-        shadow_colour=colour(rng.random(), rng.uniform(0.2, 0.6), rng.uniform(0.2, 0.6)),
+        shadow_color=color(rng.random(), rng.uniform(0.2, 0.6), rng.uniform(0.2, 0.6)),
         brow=rng.uniform(0.55, 0.95),
         freckles=rng.uniform(0.3, 0.8) if darkness < 0.35 and rng.random() < 0.22 else 0.0,
         wrinkles=float(np.clip((years - 35) / 40, 0, 1)),
@@ -119,8 +119,8 @@ def _bell(*axes):
     return np.exp(-sum(((x - place) / width) ** 2 for x, place, width in axes))
 
 
-def _tinted(colours, tint, amount):
-    return mix(colours, colours * np.asarray(tint), amount)
+def _tinted(colors, tint, amount):
+    return mix(colors, colors * np.asarray(tint), amount)
 
 
 def _hand(tones, result, x, y):
@@ -144,7 +144,7 @@ def _cheeks_and_eyes(tones, features, result, x, y, front, template, seed):
         result = _tinted(result, (0.72, 0.58, 0.48), tones.freckles * spots)
     result = _tinted(result, (0.72, 0.66, 0.66), 0.7 * _bell((x, EYE_X, 0.017), (y, EYE_Y, 0.010)) * front)
     lid = _bell((x - EYE_X, 0.002, 0.017), (y - EYE_Y, 0.008, 0.007)) * (y > EYE_Y)
-    result = mix(result, tones.shadow_colour, tones.shadow * lid * front)
+    result = mix(result, tones.shadow_color, tones.shadow * lid * front)
     rim = np.sqrt(((x - EYE_X) / 0.0155) ** 2 + ((y - EYE_Y - 0.001) / (0.0075 * features["eye_opening"])) ** 2)
     lashes = band(rim, 0.75, 1.08 + 0.18 * tones.liner, 0.15)
     result = mix(result, result * 0.22, 0.8 * lashes * (y > EYE_Y - 0.002) * front)

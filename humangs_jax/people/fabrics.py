@@ -1,8 +1,8 @@
-"""Fabrics and materials: colours of points on a surface.
+"""Fabrics and materials: colors of points on a surface.
 
 A material maps `Spots` (points on a surface) to albedo in [0, ALBEDO_LIMIT]. It is evaluated per pixel or texel, so it is
 crisp at any resolution. A `Fabric` is a choice (pattern, dyes, seed). What else is random about it is drawn anew from its seed
-whenever it is asked for colours. Periods of patterns are metres on the cloth; the finest is a few millimetres.
+whenever it is asked for colors. Periods of patterns are metres on the cloth; the finest is a few millimetres.
 """
 
 import colorsys
@@ -69,7 +69,7 @@ class Material:
     draped: bool = False
 
 
-def colour(hue: float, saturation: float, value: float) -> Vector:
+def color(hue: float, saturation: float, value: float) -> Vector:
     """(3,) linear-as-given RGB."""
     return np.asarray(colorsys.hsv_to_rgb(hue % 1, np.clip(saturation, 0, 1), np.clip(value, 0, 1)), np.float32)
 
@@ -84,26 +84,26 @@ DYES = {
 """Kinds of dyes: odds; hue, saturation and value, each a range or a choice of more than two numbers."""
 
 
-def _colour_of(rng, ranges):
-    return colour(*(rng.uniform(*values) if len(values) == 2 else rng.choice(values) for values in ranges))
+def _color_of(rng, ranges):
+    return color(*(rng.uniform(*values) if len(values) == 2 else rng.choice(values) for values in ranges))
 
 
-def random_colour(rng: np.random.Generator) -> Vector:
-    """A dye: neutral, muted, vivid, an earth colour or navy."""
-    return _colour_of(rng, DYES[rng.choice(list(DYES), p=[odds for odds, *_ in DYES.values()])][1:])
+def random_color(rng: np.random.Generator) -> Vector:
+    """A dye: neutral, muted, vivid, an earth color or navy."""
+    return _color_of(rng, DYES[rng.choice(list(DYES), p=[odds for odds, *_ in DYES.values()])][1:])
 
 
 def accent(rng: np.random.Generator, base: Vector) -> Vector:
     """A second dye that stands out from the first."""
     for _ in range(8):
-        other = random_colour(rng)
+        other = random_color(rng)
         if np.abs(other - base).sum() > 0.6:
             return other
     return np.where(base.mean() > 0.45, base * 0.3, 0.3 + 0.55 * base).astype(np.float32)
 
 
 def mix(a: Float[np.ndarray, "*#n 3"], b: Float[np.ndarray, "*#n 3"], amount: Field) -> Points:
-    """Colours, of points (n, 3) or one for all (3,): `a` where amount (n,) is 0, `b` where it is 1."""
+    """Colors, of points (n, 3) or one for all (3,): `a` where amount (n,) is 0, `b` where it is 1."""
     return a + (b - a) * amount[:, None]
 
 
@@ -125,8 +125,8 @@ class Fabric:
         """Random numbers of the fabric's own; one stream for each feature."""
         return np.random.default_rng([self.seed, stream])
 
-    def colours(self, s: Spots) -> Points:
-        """(n, 3) the colours of points."""
+    def colors(self, s: Spots) -> Points:
+        """(n, 3) the colors of points."""
         return PATTERNS[self.pattern][1](s, self.rng(0), self.base, self.other)
 
 
@@ -143,13 +143,13 @@ CLOTHS = {
     "shoulder_bag": ("leather", 0.5), "watch": ("leather", 0.6), "glasses": ("leather", 0.6),
     "sunglasses": ("leather", 0.85), "track": ("suit", 0.5), "leggings": ("suit", 0.6), "wide": ("cotton", 0.4),
 }  # fmt: skip
-"""Usual cloth of a kind of garment, and how often it is of that colour."""
-COLOURS = (
+"""Usual cloth of a kind of garment, and how often it is of that color."""
+COLORS = (
     (("shirt", "socks", "sneakers"), 0.45, ((0, 1), (0, 0.05), (0.72, 0.87))),
     (("sneakers", "leggings", "coat", "puffer", "slim"), 0.4, ((0, 1), (0, 0.1), (0.06, 0.16))),
     (("sneakers", *LEATHER_SHOES), 0.6, ((0.03, 0.12), (0.0, 0.5), (0.1, 0.7))),
 )
-"""Kinds of garments, how often they are (if of no colour so far) of these colours; otherwise any dye."""
+"""Kinds of garments, how often they are (if of no color so far) of these colors; otherwise any dye."""
 PATTERN_RULES = (
     (("jeans", "denim_jacket"), "denim", 1, ()),
     (("cargo", "hooded_jacket", "shorts"), "camouflage", 0.25, ()),
@@ -173,12 +173,12 @@ def sample_fabric(rng: np.random.Generator, kind: str, plainness: float) -> Fabr
 
 
 def _dye(rng, kind):
-    """A usual colour of a kind of garment, or any."""
+    """A usual color of a kind of garment, or any."""
     cloth, odds = CLOTHS.get(kind, ("cotton", 0.0))
-    for kinds, share, ranges in (((kind,), odds, USUAL[cloth]), *COLOURS):
+    for kinds, share, ranges in (((kind,), odds, USUAL[cloth]), *COLORS):
         if kind in kinds and rng.random() < share:
-            return _colour_of(rng, ranges)
-    return random_colour(rng)
+            return _color_of(rng, ranges)
+    return random_color(rng)
 
 
 def _lines(x, period, width, shift=0.0):
@@ -275,11 +275,11 @@ CAMOUFLAGES = np.asarray([
     [[0.45, 0.46, 0.47], [0.14, 0.14, 0.15], [0.28, 0.29, 0.30], [0.72, 0.73, 0.74]],
     [[0.14, 0.20, 0.32], [0.06, 0.08, 0.14], [0.24, 0.33, 0.46], [0.45, 0.54, 0.62]],
 ], np.float32)  # fmt: skip
-"""Four colours each: earth, sand, town, sea."""
+"""Four colors each: earth, sand, town, sea."""
 
 
 def camouflage(s, rng, _base, _other):
-    """Torn blots of four colours, larger ones below smaller ones."""
+    """Torn blots of four colors, larger ones below smaller ones."""
     dyes = CAMOUFLAGES[rng.choice(4, p=[0.5, 0.2, 0.2, 0.1])]
     scale, seed = rng.uniform(0.045, 0.09), _seed(rng)
     p = s.cloth[:, :3] / scale * np.asarray([0.8, 1.4, 0.8], np.float32)
@@ -320,7 +320,7 @@ def dip_dye(s, rng, base, other):
 
 
 def tweed(s, rng, base, other):
-    """Woven in two threads of nearly one colour."""
+    """Woven in two threads of nearly one color."""
     seed, share = _seed(rng), rng.uniform(0.08, 0.25)
     return mix(base, other, share * _grain(s, 0.004, 0.02, seed) * _grain(s, 0.02, 0.004, seed + 1) * 2)
 
@@ -335,7 +335,7 @@ def cable_knit(s, rng, base, _other):
     return base * (1 + 0.13 * strand * inside + 0.07 * ribs * (1 - inside))[:, None]
 
 
-def colour_blocks(s, rng, base, other):
+def color_blocks(s, rng, base, other):
     """A chest (or thigh) in another dye, with a line between."""
     level, wide, third = rng.uniform(-0.15, 0.06), rng.uniform(0.01, 0.03), accent(rng, other)
     return mix(mix(base, other, band(s.along, level, 9.0)), third, band(s.along, level - wide, level))
@@ -344,7 +344,7 @@ def colour_blocks(s, rng, base, other):
 PATTERNS: dict[str, tuple[float, Callable]] = {
     "plain": (0.05, plain), "stripes": (0.2, stripes), "upright": (0.08, functools.partial(stripes, upright=True)),
     "checks": (0.17, checks), "dots": (0.06, dots), "flowers": (0.09, flowers), "mottled": (0.05, mottled),
-    "camouflage": (0.05, camouflage), "melange": (0.03, melange), "blocks": (0.09, colour_blocks),
+    "camouflage": (0.05, camouflage), "melange": (0.03, melange), "blocks": (0.09, color_blocks),
     "herringbone": (0.03, herringbone), "argyle": (0.03, argyle), "dip_dye": (0.04, dip_dye),
     "cable_knit": (0.03, cable_knit), "tweed": (0.0, tweed), "denim": (0.0, denim),
 }  # fmt: skip

@@ -13,7 +13,7 @@ from humangs_jax.people.anatomy import Anatomy, smoothstep
 from humangs_jax.people.kinematics import HEAD, LEFT_EYE, NECK, RIGHT_EYE, SPINE3
 from humangs_jax.people.noise import ripples
 from humangs_jax.people.outfits import HEADWEAR, drawn, row
-from humangs_jax.people.surfaces import Field, Points, Surface, around, blurred, cut, outlines, rigid, smooth
+from humangs_jax.people.surfaces import Field, Points, Surface, around, blurred, boundaries, cut, rigid, smooth
 from humangs_jax.people.tailoring import finished, nearest_weights
 
 CUTS = {
@@ -191,7 +191,7 @@ def scalp_shell(
 def falling_tube(
     rng, anatomy: Anatomy, thickness: float, bottom: float, opening: Opening, wave=0.004, ends=None, over=0.0
 ) -> Surface:
-    """Long hair, a hood or a headscarf: the skull's outline scaled up, then falling to the height `bottom` at the back.
+    """Long hair, a hood or a headscarf: the skull's silhouette scaled up, then falling to the height `bottom` at the back.
 
     ends: height at which it ends in front; None: hair, which ends on the shoulders at the sides. over: metres between skin
     and what is worn below it.
@@ -204,11 +204,11 @@ def falling_tube(
     levels = np.concatenate([np.arange(-0.3, 0.24, 0.02), np.linspace(0.24, CROWN - 0.0015, 24)])
     spine = np.repeat(center[None, [0, 2]], len(levels), 0)
     points = skin.vertices[head]
-    skull = blurred(outlines(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.012))
+    skull = blurred(boundaries(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.012))
     falling = surfaces.hanging(skull, 0.25)
     trunk = (np.abs(template[:, 0]) < 0.12) & (template[:, 1] < 0.24) & (template[:, 1] > -0.35)
     points = skin.vertices[trunk]
-    back = blurred(outlines(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.02), 2)
+    back = blurred(boundaries(points[:, 1], points[:, [0, 2]], to_rest(levels), spine, 0.02), 2)
 
     top = CROWN + (CROWN - SKULL[1]) * (scale - 1)
     dome = SKULL[1] + (top - SKULL[1]) * np.sin(np.linspace(np.pi / 2, 0, 12))

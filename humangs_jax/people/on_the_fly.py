@@ -2,7 +2,7 @@
 
 A key picks a person of the bank, dyes the clothes, mirrors left and right, picks poses (between two similar poses of the
 person's own), light and cameras. The same key gives the same bits on the same platform. Differences from
-`rendering.render_view`: colours come from baked textures, normals are skinned, vertices follow a few joints each.
+`rendering.render_view`: colors come from baked textures, normals are skinned, vertices follow a few joints each.
 
     bank = load_bank("people.npz")
     example = jax.jit(on_the_fly_example, static_argnames="config")(bank, key, OnTheFlyConfig())
@@ -54,7 +54,7 @@ class OnTheFlyConfig:
     jitter, scattered_share: see `cameras.azimuths_from`. close_share: share of close cameras among the targets.
     mirrored_share, dyed_share: of examples. supersampling: samples a side of each pixel. depths: also of every view.
     views_at_once: views drawn side by side: 1 suits CPUs, all of them accelerators. pixels_per_step: of the person, that are
-    coloured at a time: few for CPUs, whole images for accelerators.
+    colored at a time: few for CPUs, whole images for accelerators.
     """
 
     input_views: Few = 4
@@ -87,7 +87,7 @@ class Scene:
 
     person: () index in the bank. rotations: (o, j, 3). translations: (o, 3). vertices: (o, n, 3) metres.
     corners: (o, f, 15) of every face's corners normal, openness and share of the key light that arrives.
-    dyes: (m, 3, 3) colour matrix of every piece. lights.
+    dyes: (m, 3, 3) color matrix of every piece. lights.
     """
 
     person: Int[Array, ""]
@@ -129,7 +129,7 @@ def _draw_numbers(bank, key, config):
 
 
 def scene_from(numbers: dict[str, Array], bank: PeopleBank, config: OnTheFlyConfig) -> Scene:
-    """Who, in which poses, colours and light; numbers in [0, 1) by name."""
+    """Who, in which poses, colors and light; numbers in [0, 1) by name."""
     person = pick(numbers["person"], bank.people)
     faces = bank.faces[person].astype(jnp.int32)
     which = pick(numbers["poses"][:, 0], bank.rotations.shape[1])
@@ -226,7 +226,7 @@ def _box_average(samples, camera, s):
 
 
 def _light_pixels(bank, scene, corners, behind, fragments, step):
-    """(h w, 3) colours of all pixels, white in the background; covered pixels are coloured `step` at a time."""
+    """(h w, 3) colors of all pixels, white in the background; covered pixels are colored `step` at a time."""
     ids, weights = fragments.face_ids.reshape(-1), fragments.barycentrics.reshape(-1, 3)
     covered = ids >= 0
     count = ids.shape[0]
@@ -248,7 +248,7 @@ def _light_pixels(bank, scene, corners, behind, fragments, step):
 
 
 def _color_points(bank, scene, corners, faces, weights, behind):
-    """(p, 3) colours of points on faces (p,): corners (p, 15), see `Scene`; their weights (p, 3); inner sides (p,)."""
+    """(p, 3) colors of points on faces (p,): corners (p, 15), see `Scene`; their weights (p, 3); inner sides (p,)."""
     person = scene.person
     wa, wb, wc = (weights[:, i : i + 1] for i in range(3))
     uv = bank.uvs[person, faces].astype(weights.dtype)

@@ -18,7 +18,7 @@ from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 SUPERSAMPLING = 2
 VERTEX_STEP, FACE_STEP, POINT_STEP = 4096, 8192, 1 << 15
-"""Sizes of meshes are padded to multiples of these, and points are coloured in steps of that length: few shapes are compiled."""
+"""Sizes of meshes are padded to multiples of these, and points are colored in steps of that length: few shapes are compiled."""
 FOLD_SLOPE = 0.6
 """Slope of painted creases on the most wrinkled cloth."""
 
@@ -82,7 +82,7 @@ def render_view(posed: PosedSubject, camera: Camera, background: float = 1.0) ->
 def light_points(
     posed: PosedSubject, face_ids: Ids, weights: Values, albedo: Values, slopes: Values, eye: Array | None = None
 ) -> Values:
-    """Colours (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the weights of the corners.
+    """Colors (m, 3) in the subject's light of painted points (see `paint`) on faces, given by the weights of the corners.
 
     eye: camera centre (3,), which decides whether the inner side of cloth is seen; None: everything is seen from outside.
     """

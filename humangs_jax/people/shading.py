@@ -1,6 +1,6 @@
 """Soft light on posed surfaces, in JAX: sky and ground, three wide lights, occlusion and soft shadows, painted folds.
 
-Everything is diffuse or nearly so and fixed in the world: a point has one colour from wherever it is seen. Occlusion and the
+Everything is diffuse or nearly so and fixed in the world: a point has one color from wherever it is seen. Occlusion and the
 shadow of the key light are per vertex, from a voxel grid that holds the posed person. Exposure and white balance differ.
 """
 
@@ -175,7 +175,7 @@ def seen_from_behind(
 def light_points(
     lights: Lights, corners: Array, weights: Vectors, behind: Array, albedo: Vectors, slopes: Vectors, sheen: Values
 ) -> Vectors:
-    """Colours (p, 3) of points on faces.
+    """Colors (p, 3) of points on faces.
 
     corners: (p, 15) normal (3), openness and share of the key light of each corner of the point's face. weights: of the corners.
     behind: (p,) whether the inner side is seen. albedo, slopes, sheen: of the material there.
@@ -191,7 +191,7 @@ def light_points(
 
 
 def shade(lights: Lights, albedo: Vectors, normals: Vectors, openness: Values, lit: Values, sheen: Values) -> Vectors:
-    """Colours in [0, 1] of points; normals are unit, `lit` is the share of the key light that arrives."""
+    """Colors in [0, 1] of points; normals are unit, `lit` is the share of the key light that arrives."""
     up = 0.5 + 0.5 * normals[..., 1:2]
     light = (lights.ground + (lights.sky - lights.ground) * up) * openness[..., None]
     half = jnp.sqrt(openness)
@@ -207,7 +207,7 @@ def shade(lights: Lights, albedo: Vectors, normals: Vectors, openness: Values, l
 
 
 def rolled_off(colors: Vectors) -> Vectors:
-    """Colours from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns out at once."""
+    """Colors from 0 on, bent below WHITEST from SHOULDER on, as film and cameras do: nothing burns out at once."""
     reach = WHITEST - SHOULDER
     colors = jnp.maximum(colors, 0)
     return jnp.minimum(colors, SHOULDER) + reach * (1 - jnp.exp(-jnp.maximum(colors - SHOULDER, 0) / reach))
@@ -218,7 +218,7 @@ def _unit(vectors):
 
 
 def dyes_from(u: Float[Array, "4 m"], groups: Int[Array, " m"], dyeable: Float[Array, " m"]) -> Float[Array, "m 3 3"]:
-    """(m, 3, 3) matrices that recolour each piece: hue, saturation and brightness of cloth.
+    """(m, 3, 3) matrices that recolor each piece: hue, saturation and brightness of cloth.
 
     Pieces of one group are dyed alike. u: in [0, 1). Hues are turned about the grey axis for half of the pieces,
     brightness changes for all.

@@ -36,7 +36,7 @@ LENGTHS = ("height", "leg_length", "torso_length")
 class Person:
     """seed; betas: (s,) shape coefficients; male: dressed as a man; years; stature in metres, without shoes.
 
-    complexion: colours of skin, hair, eyes. haircut: hair and beard. garments: clothes, shoes and accessories, innermost first.
+    complexion: colors of skin, hair, eyes. haircut: hair and beard. garments: clothes, shoes and accessories, innermost first.
     lights: what the person stands in.
     """
 

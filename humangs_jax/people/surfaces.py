@@ -1,9 +1,9 @@
-"""Triangle surfaces on the host: cuts along a level set, smoothing, hems, tubes; and convex outlines of body parts.
+"""Triangle surfaces on the host: cuts along a level set, smoothing, hems, tubes; and convex silhouettes of body parts.
 
 A `Surface` carries per-vertex attributes through every operation: a garment cut out of the body keeps its skinning weights,
 its cloth coordinates and the skin point below it. Metres; faces counter-clockwise seen from outside; float32.
 
-`Outlines` say what taut cloth around a part of the body measures. The part is cut across an axis into slices; the outline of
+`Boundaries` say what taut cloth around a part of the body measures. The part is cut across an axis into slices; the silhouette of
 a slice is its radius around the slice's centre at `ANGLES` angles, angle 0 at +z and growing towards +x (for slices across y).
 """
 
@@ -221,7 +221,7 @@ def around(radius: Field | float | int, angle: Field, height: Field, center: np.
 
 
 ANGLES, EMPTY = 48, 1e-3
-"""Of an outline; radius (metres) of a slice without points."""
+"""Of a silhouette; radius (metres) of a slice without points."""
 _GRID = circle(ANGLES)
 _TURN = np.cos(_GRID[:, None] - _GRID[None, :])
 _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
@@ -229,7 +229,7 @@ _INVERSE = np.where(_TURN > 0.1, 1 / np.maximum(_TURN, 0.1), np.inf)
 
 
 @dataclasses.dataclass(frozen=True)
-class Outlines:
+class Boundaries:
     """levels: (l,) increasing positions along the axis. centers: (l, 2) across it. radii: (l, ANGLES). Metres."""
 
     levels: np.ndarray
@@ -256,10 +256,10 @@ def polar(across: np.ndarray, center: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.arctan2(d[:, 0], d[:, 1]), np.sqrt(np.sum(d * d, -1))
 
 
-def outlines(
+def boundaries(
     along: Field, across: np.ndarray, levels: np.ndarray, centers: np.ndarray | None, window: float
-) -> Outlines:
-    """Outlines of the points with position `along` (n,) on the axis and (n, 2) across it.
+) -> Boundaries:
+    """Silhouettes of the points with position `along` (n,) on the axis and (n, 2) across it.
 
     levels: (l,) increasing. centers: (l, 2), or None for the middle of each slice. window: half thickness of a slice, metres.
     """
@@ -279,10 +279,10 @@ def outlines(
             found[i] = 0.5 * (points.min(0) + points.max(0))
         support[i] = np.maximum(((points - found[i]) @ directions).max(0), EMPTY)
     radii = np.min(support[:, None, :] * _INVERSE[None], axis=-1)
-    return Outlines(levels, found, radii)
+    return Boundaries(levels, found, radii)
 
 
-def blurred(shape: Outlines, times: int = 1) -> Outlines:
+def blurred(shape: Boundaries, times: int = 1) -> Boundaries:
     """Radii averaged over neighbouring slices and angles."""
     radii = shape.radii
     for _ in range(times):
@@ -292,7 +292,7 @@ def blurred(shape: Outlines, times: int = 1) -> Outlines:
     return dataclasses.replace(shape, radii=radii)
 
 
-def hanging(shape: Outlines, slope: float) -> Outlines:
+def hanging(shape: Boundaries, slope: float) -> Boundaries:
     """Cloth that hangs: it keeps the largest radius of the slices above it, less `slope` metres per metre."""
     radii = shape.radii.copy()
     for i in range(len(radii) - 2, -1, -1):

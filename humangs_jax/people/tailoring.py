@@ -1,8 +1,8 @@
 """How clothes are cut and draped: cuts, shells of cloth around the body, tubes (skirts) around hips and legs.
 
 A cut is a field over template coordinates (n, 3), see `anatomy`, positive where there is cloth. A shell starts on the skin, is
-smoothed (cloth does not follow navels), moved outwards to the convex outlines of trunk and limbs, and never comes nearer to the
-skin than its ease.
+smoothed (cloth does not follow navels), moved outwards to the convex silhouettes of trunk and limbs, and never comes nearer to
+the skin than its ease.
 """
 
 import dataclasses
@@ -138,7 +138,7 @@ def sandal_straps(template: Points) -> tuple[Field, Field]:
 class Fit:
     """How a shell hangs. Metres.
 
-    ease: distance from skin (at least) and from the outlines. hang: slope by which hanging cloth may narrow downwards (metres
+    ease: distance from skin (at least) and from the silhouettes. hang: slope by which hanging cloth may narrow downwards (metres
     per metre; large clings). sleeve, leg: width added at the end of the limb. fold: height of the folds. hem: depth of the hem.
     quilt: period of padded rings, 0 for none. inner: nothing comes nearer to the skin than this (what is worn below).
     calm: height above which there are no folds. skirted: below the hips it goes around both legs (tops), not around each.
@@ -194,10 +194,10 @@ def _drape(rng, anatomy, surface, fit):
     points = points.astype(np.float64)
     points[:, [0, 2]] *= (grown / np.maximum(radius, 1e-4))[:, None]
     for side, sign in ((0, 1), (1, -1)):
-        outline, along = anatomy.arms[side], np.abs(points[:, 0])
-        start, end = outline.levels[0] + 0.12, outline.levels[-1] - 0.1
+        boundary, along = anatomy.arms[side], np.abs(points[:, 0])
+        start, end = boundary.levels[0] + 0.12, boundary.levels[-1] - 0.1
         wider = fit.ease, fit.sleeve * np.clip((along - start) / (end - start), 0, 1)
-        points = _push(points, (1, 2), along, outline, arm * (sign * points[:, 0] > 0), *wider)
+        points = _push(points, (1, 2), along, boundary, arm * (sign * points[:, 0] > 0), *wider)
         if not fit.skirted:
             shape = anatomy.legs[side]
             inner = dataclasses.replace(shape, radii=np.where(shape.levels[:, None] > -0.5, 0.0, shape.radii))
@@ -244,11 +244,11 @@ def _fold_heights(rng, cloth, arm, leg, fit):
     return heights
 
 
-def _push(points, across, along, outline, amount, ease, extra):
-    """Points moved away from an axis to `ease + extra` metres outside of an outline; along: (n,) on it; across: other axes."""
-    center, across = outline.center(along), list(across)
+def _push(points, across, along, boundary, amount, ease, extra):
+    """Points moved away from an axis to `ease + extra` metres outside of a silhouette; along: (n,) on it; across: other axes."""
+    center, across = boundary.center(along), list(across)
     angle, radius = polar(points[:, across], center)
-    missing = np.maximum(outline.radius(along, angle) + ease + extra - radius, 0)
+    missing = np.maximum(boundary.radius(along, angle) + ease + extra - radius, 0)
     scale = 1 + amount * missing / np.maximum(radius, 1e-4)
     points = points.copy()
     points[:, across] = center + (points[:, across] - center) * scale[:, None]
@@ -268,8 +268,8 @@ def skirt(
     template_y, angle, faces = surfaces.tube(np.linspace(top, bottom, rows), surfaces.circle(TUBE_COLUMNS))
     height, drop = rest_height(anatomy, template_y), top - template_y
     below = drop - cling
-    outline = blurred(hanging(anatomy.hips_and_legs, 0.15))
-    radius = outline.radius(height, angle) + ease + flare * np.maximum(below, 0)
+    boundary = blurred(hanging(anatomy.hips_and_legs, 0.15))
+    radius = boundary.radius(height, angle) + ease + flare * np.maximum(below, 0)
     radius = radius - UNDER_A_HEM * np.clip(1 - below / 0.06, 0, 1) * (cling > 0)
     waves = ripples(rng, surfaces.around(1, angle, 0.3 * height), wavelength=0.9)
     loose = np.clip(below / 0.25, 0, 1) * (drop / max(top - bottom, 1e-6)) ** 0.5

@@ -1,7 +1,7 @@
 """What is sewn on or printed on a fabric: prints, buttons, zips, seams, pockets, ribs, bands, stripes, laces.
 
-`sewn` is the fabric of a garment with all of that, by the table `SEWN_ON`. Its trimmings take colours (n, 3) at points, the
-points, random numbers and the garment, and return other colours. Words are set in a 5 x 7 alphabet of the package's own.
+`sewn` is the fabric of a garment with all of that, by the table `SEWN_ON`. Its trimmings take colors (n, 3) at points, the
+points, random numbers and the garment, and return other colors. Words are set in a 5 x 7 alphabet of the package's own.
 """
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import numpy as np
 
 from humangs_jax.core.array_types import Bool
 from humangs_jax.people.anatomy import ARMHOLE, WAIST
-from humangs_jax.people.fabrics import Spots, accent, band, colour, mix
+from humangs_jax.people.fabrics import Spots, accent, band, color, mix
 from humangs_jax.people.noise import lattice
 from humangs_jax.people.outfits import BOTTOMS, DRESSES, OUTER, TOPS, Garment
 from humangs_jax.people.surfaces import Field, Points
@@ -113,27 +113,27 @@ def _from_the_side(s):
     return np.abs(np.abs(s.around) - 0.5 * np.pi * s.cloth[:, 3])
 
 
-def _darker(colours, share, where):
-    return mix(colours, colours * share, where)
+def _darker(colors, share, where):
+    return mix(colors, colors * share, where)
 
 
-def seamed(colours: Points, s: Spots) -> Points:
+def seamed(colors: Points, s: Spots) -> Points:
     """Seams down the sides of trunk and limbs and around the armholes."""
     armhole = np.where(s.template[:, 1] > -0.02, np.abs(np.abs(s.template[:, 0]) - ARMHOLE), 1.0)
-    return _darker(colours, 0.8, np.maximum(band(_from_the_side(s), -1, 0.0022), band(armhole, -1, 0.0024)))
+    return _darker(colors, 0.8, np.maximum(band(_from_the_side(s), -1, 0.0022), band(armhole, -1, 0.0024)))
 
 
-def hemmed(colours: Points, s: Spots, hem: float, sleeve: float | None) -> Points:
+def hemmed(colors: Points, s: Spots, hem: float, sleeve: float | None) -> Points:
     """Stitching beside the hem at height y of trunk or legs, and at |x| = sleeve of the arms."""
     x, y, _ = s.template.T
     on_arm = np.abs(x) > 0.2
     line = band(np.abs(y - hem), 0.0, 0.002) * ~on_arm
     if sleeve is not None:
         line = np.maximum(line, band(np.abs(np.abs(x) - sleeve), 0.0, 0.002) * on_arm)
-    return _darker(colours, 0.8, line)
+    return _darker(colors, 0.8, line)
 
 
-def printed(colours: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+def printed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A print on the chest, and sometimes on the back: words, an emblem, both, a small logo or a scene."""
     number, base = "number" in garment.details, garment.fabric.base
     ink = accent(rng, base)
@@ -169,11 +169,11 @@ def printed(colours: Points, s: Spots, rng: np.random.Generator, garment: Garmen
         return result
 
     trunk, x, y = _trunk(s), 1.1 * s.template[:, 0], s.template[:, 1] - height
-    result = motif(colours, x, y, trunk * (s.cloth[:, 2] > 0))
+    result = motif(colors, x, y, trunk * (s.cloth[:, 2] > 0))
     return motif(result, -x, y - 0.02, trunk * (s.cloth[:, 2] < 0)) if on_back else result
 
 
-def side_striped(colours: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+def side_striped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """One to three stripes down the outside of arms and legs."""
     ink, count = accent(rng, garment.fabric.base), int(rng.integers(1, 4))
     girth, wide = s.cloth[:, 3], 0.022 / count
@@ -182,88 +182,88 @@ def side_striped(colours: Points, s: Spots, rng: np.random.Generator, garment: G
     outside = np.where(girth < 0.12, turned - 0.5 * np.pi * girth, outside)
     phase = (outside + 0.011) / wide
     stripes = band((phase % 1) * wide, 0.0, 0.6 * wide) * (np.floor(phase) >= 0) * (np.floor(phase) < count)
-    return mix(colours, ink, stripes * band(girth, 0.0, 0.12, 0.01))
+    return mix(colors, ink, stripes * band(girth, 0.0, 0.12, 0.01))
 
 
-def ribbed(colours: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
+def ribbed(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
     """Knitted bands at the hem and the cuffs: upright ribs, a little darker."""
     x, width = np.abs(s.template[:, 0]), 0.04
     at_hem = s.template[:, 1] < garment.sizes["bottom"] + 1.3 * width
     inside = np.where(x > 0.2, x > garment.sizes["sleeve"] - width, at_hem)
     ribs = 0.86 + 0.1 * np.cos(2 * np.pi * s.around / 0.009)
-    return _darker(colours, ribs[:, None], inside.astype(np.float32))
+    return _darker(colors, ribs[:, None], inside.astype(np.float32))
 
 
-def quilted(colours: Points, s: Spots, _rng: np.random.Generator, _garment: Garment) -> Points:
+def quilted(colors: Points, s: Spots, _rng: np.random.Generator, _garment: Garment) -> Points:
     """Dark stitched lines around the garment, between which it bulges."""
     phase = (s.along / QUILT) % 1
-    return _darker(colours, 0.55, np.exp(-((np.minimum(phase, 1 - phase) * QUILT / 0.006) ** 2)))
+    return _darker(colors, 0.55, np.exp(-((np.minimum(phase, 1 - phase) * QUILT / 0.006) ** 2)))
 
 
-def buttoned(colours: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+def buttoned(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A placket with buttons down the front."""
     sizes, high = garment.sizes, 0.2
     low = 0.02 if garment.kind == "polo" else sizes["end" if garment.kind in DRESSES else "bottom"]
     dyed = rng.random() < 0.3
-    ink = accent(rng, garment.fabric.base) if dyed else colour(0.1, 0.1, rng.choice([0.12, 0.8]))
+    ink = accent(rng, garment.fabric.base) if dyed else color(0.1, 0.1, rng.choice([0.12, 0.8]))
     pitch, size = rng.uniform(0.07, 0.1), rng.uniform(0.005, 0.0075)
     x, y = s.cloth[:, 0], s.cloth[:, 1]
     front = (s.cloth[:, 2] > 0) * _trunk(s) * band(y, low, high)
     button = band(np.sqrt(x * x + ((y - low) % pitch - 0.5 * pitch) ** 2), -1, size) * front
-    return mix(_darker(colours, 0.6, band(np.abs(x - 0.002), 0.0135, 0.016) * front), ink, button)
+    return mix(_darker(colors, 0.6, band(np.abs(x - 0.002), 0.0135, 0.016) * front), ink, button)
 
 
-def zipped(colours: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+def zipped(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A zip down the front, or its halves along the edges of an open front."""
-    ink, edge = colour(0.1, 0.05, rng.choice([0.15, 0.6, 0.75])), max(garment.sizes.get("gap", 0.0), 0.0)
+    ink, edge = color(0.1, 0.05, rng.choice([0.15, 0.6, 0.75])), max(garment.sizes.get("gap", 0.0), 0.0)
     front = (s.cloth[:, 2] > 0) * _trunk(s) * band(s.cloth[:, 1], garment.sizes["bottom"], 0.2)
     away = np.abs(np.abs(s.cloth[:, 0]) - edge)
-    return mix(_darker(colours, 0.55, band(away, 0.004, 0.011) * front), ink, band(away, -1, 0.0035) * front)
+    return mix(_darker(colors, 0.55, band(away, 0.004, 0.011) * front), ink, band(away, -1, 0.0035) * front)
 
 
-def _outline(x, y, half_width, half_height):
+def _boundary(x, y, half_width, half_height):
     return band(np.abs(np.maximum(np.abs(x) - half_width, np.abs(y) - half_height)), -1, 0.0018)
 
 
-def pocketed(colours: Points, s: Spots, rng: np.random.Generator, _garment: Garment, kind: str) -> Points:
-    """Pockets as stitched outlines: on the chest, in a jacket's front, on jeans (front and back) or on the thighs (cargo)."""
+def pocketed(colors: Points, s: Spots, rng: np.random.Generator, _garment: Garment, kind: str) -> Points:
+    """Pockets as stitched silhouettes: on the chest, in a jacket's front, on jeans (front and back) or on the thighs (cargo)."""
     sides = rng.choice([1, 2]) if kind == "chest" else 2
     bright = 1.6 if kind == "jeans" and rng.random() < 0.5 else 0.6
     x, y, front = s.template[:, 0], s.template[:, 1], s.cloth[:, 2] > 0
     if kind == "chest":
         own = x > 0 if sides == 1 else np.abs(x) > 0
-        line = _outline(np.abs(x) - 0.075, y - 0.0, 0.042, 0.048) * front * own * _trunk(s)
+        line = _boundary(np.abs(x) - 0.075, y - 0.0, 0.042, 0.048) * front * own * _trunk(s)
     elif kind == "jacket":
         line = band(np.abs(np.abs(x) - 0.09 + 0.3 * (y + 0.2)), -1, 0.0035) * band(y, -0.27, -0.15) * front
     elif kind == "jeans":
         curve = np.abs((np.abs(x) - 0.16) ** 2 + ((y + 0.25) * 0.9) ** 2 - 0.0065) / 0.16
         fly = band(np.abs(x - 0.018), -1, 0.0018) * band(y, -0.36, -0.2)
         line = np.maximum(band(curve, -1, 0.0022) * band(y, -0.36, -0.22), fly) * front
-        line = np.maximum(line, _outline(np.abs(x) - 0.075, y + 0.315, 0.052, 0.06) * ~front)
+        line = np.maximum(line, _boundary(np.abs(x) - 0.075, y + 0.315, 0.052, 0.06) * ~front)
     else:
         side, on_leg = _from_the_side(s), s.cloth[:, 3] < 0.12
         flap = band(np.abs(y + 0.57), -1, 0.002) * (side < 0.06)
-        line = np.maximum(_outline(side, y + 0.62, 0.06, 0.08), flap) * on_leg
-    return mix(colours, np.clip(colours * bright, 0, 0.85), 0.75 * line)
+        line = np.maximum(_boundary(side, y + 0.62, 0.06, 0.08), flap) * on_leg
+    return mix(colors, np.clip(colors * bright, 0, 0.85), 0.75 * line)
 
 
-def banded(colours: Points, s: Spots, ink: np.ndarray, low: float, high: float) -> Points:
+def banded(colors: Points, s: Spots, ink: np.ndarray, low: float, high: float) -> Points:
     """A sash or waistband between two heights of the trunk."""
-    return mix(colours, ink, band(s.cloth[:, 1], low, high) * band(s.cloth[:, 3], 0.1, 1.0, 0.01))
+    return mix(colors, ink, band(s.cloth[:, 1], low, high) * band(s.cloth[:, 3], 0.1, 1.0, 0.01))
 
 
-def sashed(colours: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
+def sashed(colors: Points, s: Spots, rng: np.random.Generator, garment: Garment) -> Points:
     """A sash around the waist of a coat or a dress."""
     if garment.kind == "coat":
-        return banded(colours, s, garment.fabric.base * 0.6, WAIST - 0.02, WAIST + 0.02)
+        return banded(colors, s, garment.fabric.base * 0.6, WAIST - 0.02, WAIST + 0.02)
     waist = garment.sizes["waist"]
-    return banded(colours, s, garment.fabric.other, waist - 0.01, waist + rng.uniform(0.02, 0.05))
+    return banded(colors, s, garment.fabric.other, waist - 0.01, waist + rng.uniform(0.02, 0.05))
 
 
-def turned_up(colours: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
+def turned_up(colors: Points, s: Spots, _rng: np.random.Generator, garment: Garment) -> Points:
     """The paler inner side of trouser legs above their hems."""
     pale = (0.5 * garment.fabric.base + 0.35).astype(np.float32)
-    return mix(colours, pale, band(s.template[:, 1], -9.0, garment.sizes["end"] + 0.045))
+    return mix(colors, pale, band(s.template[:, 1], -9.0, garment.sizes["end"] + 0.045))
 
 
 SEWN_ON = (
@@ -291,9 +291,9 @@ def sewn(garment: Garment, hem: float, sleeve: float | None = None, seams: bool 
     if "collar" in details and "open" not in details:
         details = details | {"closed collar"}
 
-    def colours(s):
+    def colors(s):
         rng = garment.fabric.rng(1)
-        result = hemmed(garment.fabric.colours(s), s, hem, sleeve)
+        result = hemmed(garment.fabric.colors(s), s, hem, sleeve)
         result = seamed(result, s) if seams else result
         result = ribbed(result, s, rng, garment) if "ribbed" in details and sleeve is not None else result
         result = printed(result, s, rng, garment) if details & {"print", "number"} else result
@@ -304,20 +304,20 @@ def sewn(garment: Garment, hem: float, sleeve: float | None = None, seams: bool 
                 result = trimming(result, s, rng, garment, *arguments)
         return result
 
-    return colours
+    return colors
 
 
 def leather(s: Spots, garment: Garment) -> Points:
-    """Shoes: upper, a sole of another colour, laces on the instep, and what marks the kind."""
+    """Shoes: upper, a sole of another color, laces on the instep, and what marks the kind."""
     rng, kind, base = garment.fabric.rng(2), garment.kind, garment.fabric.base
     white, sneakers = rng.random() < 0.75, kind == "sneakers"
     dark = base * rng.uniform(0.35, 0.6)
-    trim = colour(0.1, 0.05, 0.82 if white else 0.1) if sneakers else dark
+    trim = color(0.1, 0.05, 0.82 if white else 0.1) if sneakers else dark
     second = accent(rng, base) if rng.random() < 0.5 else trim
     laced = sneakers or (kind in ("flats", "ankle_boots") and rng.random() < 0.6)
     swoosh, toe = rng.uniform(0.2, 0.8), sneakers and rng.random() < 0.5
     if kind == "ankle_boots" and rng.random() < 0.3:
-        base, trim = colour(0.095, 0.6, 0.6), colour(0.08, 0.6, 0.25)
+        base, trim = color(0.095, 0.6, 0.6), color(0.08, 0.6, 0.25)
     y, x, z = s.cloth[:, 1], np.abs(s.cloth[:, 0]), s.cloth[:, 2]
     result = np.broadcast_to(base, (len(y), 3)).astype(np.float32)
     if sneakers:
@@ -338,8 +338,8 @@ def buckled(s: Spots, garment: Garment) -> Points:
     """A belt with stitched edges, holes and a buckle in front."""
     width = garment.sizes["width"]
     x, y, front = s.template[:, 0], s.template[:, 1] - (garment.sizes["top"] - 0.5 * width), s.cloth[:, 2] > 0
-    metal = colour(0.12, 0.3, 0.62) if width > 0.035 else colour(0.6, 0.05, 0.6)
-    result = _darker(garment.fabric.colours(s), 0.6, band(np.abs(np.abs(y) - 0.38 * width), -1, 0.0012))
+    metal = color(0.12, 0.3, 0.62) if width > 0.035 else color(0.6, 0.05, 0.6)
+    result = _darker(garment.fabric.colors(s), 0.6, band(np.abs(np.abs(y) - 0.38 * width), -1, 0.0012))
     frame = np.maximum(np.abs(x) / 0.026, np.abs(y) / (0.56 * width))
     holes = band(np.abs(x - 0.06) % 0.03, -1, 0.003) * band(np.abs(y), -1, 0.003) * (x > 0.03)
     return _darker(mix(result, metal, band(frame, 0.68, 1.02, 0.06) * front), 0.3, holes * front)
@@ -348,10 +348,10 @@ def buckled(s: Spots, garment: Garment) -> Points:
 def bagged(s: Spots, garment: Garment) -> Points:
     """A bag with a zip around the top, a front pocket and darker edges. Template: the bag's own unit box."""
     rng, base = garment.fabric.rng(2), garment.fabric.base
-    ink = colour(0.1, 0.05, rng.choice([0.1, 0.7]))
+    ink = color(0.1, 0.05, rng.choice([0.1, 0.7]))
     second = accent(rng, base) if rng.random() < 0.3 else base * 0.8
     x, y, z = s.template.T
     pocket = band(np.abs(x), -1, 0.72, 0.02) * (z > 0.3)
-    result = mix(garment.fabric.colours(s), second, band(y, -0.8, 0.05, 0.02) * pocket)
+    result = mix(garment.fabric.colors(s), second, band(y, -0.8, 0.05, 0.02) * pocket)
     result = mix(result, ink, band(np.abs(y - 0.05), -1, 0.025, 0.02) * pocket)
     return mix(result, ink, band(np.abs(y - 0.72), -1, 0.025, 0.02) * (z > -0.2))

@@ -249,7 +249,7 @@ def _dress(rng, outfit, garment):
 
 def _socks(rng, outfit, garment):
     ribs = lambda s: (0.94 + 0.06 * np.cos(2 * np.pi * s.around / 0.008))[:, None]
-    material = Material(lambda s: garment.fabric.colours(s) * ribs(s), wrinkles=0.1)
+    material = Material(lambda s: garment.fabric.colors(s) * ribs(s), wrinkles=0.1)
     fit = Fit(ease=0.003, fold=0.001, hem=0.003)
     _put(rng, outfit, [(tailoring.shaft, garment.sizes["height"])], fit, material, 0.008)
 
@@ -289,28 +289,28 @@ def _tie(rng, outfit, garment):
     field = tailoring.necktie(outfit.template, garment.sizes["length"], garment.sizes["width"])
     raised = outfit.trunk + 0.005 + outfit.fit.fold
     fit = dataclasses.replace(outfit.fit, ease=raised, inner=raised - 0.002, fold=0.0, hem=0.004)
-    _strip(rng, outfit, field, fit, Material(garment.fabric.colours, sheen=0.15), layered=True)
+    _strip(rng, outfit, field, fit, Material(garment.fabric.colors, sheen=0.15), layered=True)
 
 
 def _watch(rng, outfit, garment):
     field = tailoring.bracelet(outfit.template, garment.sizes["side"], 0.628, 0.650)
-    _strip(rng, outfit, field, Fit(ease=0.003, fold=0.0, hem=0.002), Material(garment.fabric.colours, sheen=0.3))
+    _strip(rng, outfit, field, Fit(ease=0.003, fold=0.0, hem=0.002), Material(garment.fabric.colors, sheen=0.3))
 
 
 def _bag(rng, outfit, garment):
     """A backpack or a shoulder bag, and its straps, which lie on what is worn."""
-    on_back, colours = garment.kind == "backpack", lambda s: trimmings.bagged(s, garment)
+    on_back, colors = garment.kind == "backpack", lambda s: trimmings.bagged(s, garment)
     if on_back:
-        ease, material, straps = outfit.trunk, Material(colours, 0.1), tailoring.straps(outfit.template, -0.16, -0.03)
+        ease, material, straps = outfit.trunk, Material(colors, 0.1), tailoring.straps(outfit.template, -0.16, -0.03)
     else:
         side, ease = garment.sizes["side"], max(outfit.trunk, min(outfit.legs, 0.02))
-        material = Material(colours, 0.0, 0.12)
+        material = Material(colors, 0.0, 0.12)
         straps = tailoring.sash(outfit.template, -side * 0.105, side * 0.165, 0.014)
     surface = accessories.bag(outfit.anatomy, garment, ease)
     outfit.add(surface, material, layered=False)
     raised = outfit.trunk + 0.009 + 1.5 * outfit.fit.fold
     flat = {"ease": raised, "inner": raised - 0.002, "fold": 0.0, "hem": 0.006, "quilt": 0.0, "skirted": True}
-    strap = Material(garment.fabric.colours, sheen=material.sheen)
+    strap = Material(garment.fabric.colors, sheen=material.sheen)
     _strip(rng, outfit, straps, dataclasses.replace(outfit.fit, **flat), strap)
 
 

@@ -5,10 +5,10 @@ from typing import Annotated
 
 from humangs_jax.core.configuration import (
     Few,
+    Iterations,
     PhotoSide,
     Range,
     RefineSteps,
-    Rounds,
     Seed,
     Share,
     Spread,
@@ -19,14 +19,14 @@ from humangs_jax.core.configuration import (
 )
 
 MEASURED = "refinement.md"
-ROUNDS = 4
+ITERATIONS = 4
 """As many as the learned update was trained with; docs/tradeoff.md has what each gains."""
 
 
 @configuration
 class LearningRates:
     """Change of each parameter in a step of Adam, in the space in which it is optimised; `refine` lowers all by a cosine
-    and, after rounds, in long runs (`RefineConfig.full_steps`).
+    and, after iterations, in long runs (`RefineConfig.full_steps`).
 
     means: metres, in the T-pose. quats: of quaternions that start at unit length. log_scales, opacity_logits, color_logits: no
     unit. rotations: radians of the pose's axis-angles, translations: metres; both only with `RefineConfig.poses`.
@@ -45,16 +45,16 @@ class LearningRates:
 class RefineConfig:
     """How `refine` fits an avatar to its photos.
 
-    rounds: of the learned update (see `learned.py`), before the first step. 0: none.
+    iterations: of the learned update (see `learned.py`), before the first step. 0: none.
 
     steps, seconds: limits of the run; the smaller number of steps counts. None: no limit. Compilation does not count. 0 steps:
-    rounds alone, which are always finished. seconds become a number of steps before the first step, by the time that a few take;
-    that number, `Refinement.planned`, repeats the run exactly.
+    iterations alone, which are always finished. seconds become a number of steps before the first step, by the time that a few
+    take; that number, `Refinement.planned`, repeats the run exactly.
     image_size: photos whose longer side is larger are reduced to it, pixels; None: photos as they are. views_per_step: photos
     drawn in a step.
 
-    structural, silhouette: weights of the structural dissimilarity, and of |alpha - mask|, beside the L1 distance of colours.
-    rates: see `LearningRates`. full_steps: after rounds, a run of more
+    structural, silhouette: weights of the structural dissimilarity, and of |alpha - mask|, beside the L1 distance of colors.
+    rates: see `LearningRates`. full_steps: after iterations, a run of more
     steps than this takes smaller ones in proportion; Gaussians that move further overfit to the photos.
 
     visible: a Gaussian whose
@@ -63,12 +63,14 @@ class RefineConfig:
 
     held_out: with fewer photos than `HELD_OUT_PHOTOS` the share of the pixels, in square blocks, that no round and no step sees:
     the state with the highest PSNR on them is returned. With as many or more, any share above 0 holds one whole photo out of a
-    trial, a third of the steps, which decides by its PSNR whether the rounds and how many of the steps are kept; then all photos
-    are fitted. 0: nothing is held out, and the last state is returned. checks: how often the PSNR is measured.
+    trial, a third of the steps, which decides by its PSNR whether the iterations and how many of the steps are kept; then all
+    photos are fitted. 0: nothing is held out, and the last state is returned. checks: how often the PSNR is measured.
     seed: of the order of the photos and of the blocks.
     """
 
-    rounds: Rounds = knob(ROUNDS, cost="blur without them", gain="0.25 to 0.5 s each with 4 photos", measured=MEASURED)
+    iterations: Iterations = knob(
+        ITERATIONS, cost="blur without them", gain="0.25 to 0.5 s each with 4 photos", measured=MEASURED
+    )
     steps: RefineSteps | None = knob(None, cost="blur at few", gain="time in proportion", measured=MEASURED)
     seconds: Annotated[float, Range(1e-6, 1e6)] | None = knob(5.0, cost="blur at few", gain="time", measured=MEASURED)
     image_size: PhotoSide | None = knob(None, cost="detail of the photos", gain="time of a step", measured=MEASURED)
@@ -89,7 +91,7 @@ class RefineConfig:
         """Raises ValueError for settings that do not fit together, naming them."""
         if self.steps is None and self.seconds is None:
             raise ValueError("RefineConfig: expected steps, seconds or both; without either a run would not end")
-        if self.rounds == self.steps == 0:
-            raise ValueError("RefineConfig: rounds 0, steps 0: expected one of them above 0")
+        if self.iterations == self.steps == 0:
+            raise ValueError("RefineConfig: iterations 0, steps 0: expected one of them above 0")
         if not self.held_out < 1:
             raise ValueError(f"RefineConfig.held_out {self.held_out:g}: expected less than 1")

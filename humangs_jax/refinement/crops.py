@@ -11,7 +11,7 @@ from humangs_jax.data.usable_views import usable_views
 from humangs_jax.data.views import SubjectViews, upright
 
 MARGIN = 8
-"""Pixels around the mask: the window of structural similarity has 11, and Gaussians beyond the outline cost alpha there."""
+"""Pixels around the mask: the window of structural similarity has 11, and Gaussians beyond the silhouette cost alpha there."""
 MULTIPLE = 16
 """Sides of crops are multiples of it, so that few sizes are compiled."""
 COVERED = 0.02

@@ -1,10 +1,11 @@
-"""Learned refinement: in a few rounds a small recurrent network reads the photos' errors at every Gaussian and moves it.
+"""Learned refinement: in a few iterations a small recurrent network reads the photos' errors at every Gaussian and moves it.
 
 After ReSplat (https://arxiv.org/abs/2510.08575): the input views are drawn, their errors are gathered at the Gaussians, and a
-network that knows the neighbours adds to their parameters; one set of weights for all rounds, no gradient through the errors.
+network that knows the neighbours adds to their parameters; one set of weights for all iterations, no gradient through the errors.
 Ours: the errors arrive as the gradient of the squared error with respect to each Gaussian's parameters, in place of features of
 a frozen network, and the neighbours are those in the T-pose, at two levels: of Gaussians, and of clusters of them. Between two
-photos, the nearest outline that a photo shows can be 20 cm away. Messages between Gaussians reach 5 cm; clusters carry them on.
+photos, the nearest silhouette that a photo shows can be 20 cm away. Messages between Gaussians reach 5 cm; clusters carry them
+on.
 
 Trained (`experiments/training/train_refiner.py`) on views that are not among the photos. Parts that no photo shows move with
 their neighbours. Gradient descent on the photos cannot do that.
@@ -36,7 +37,7 @@ FIELDS = ("means", "quats", "log_scales", "opacity_logits", "color_logits")
 COLUMNS = 14
 """Of these parameters side by side."""
 LARGEST_MOVES = np.asarray([0.01] * 3 + [0.1] * 4 + [0.2] * 3 + [0.5] * 4, np.float32)
-"""What an output of 1 moves: metres, quaternions, log scales, logits of opacity and colours."""
+"""What an output of 1 moves: metres, quaternions, log scales, logits of opacity and colors."""
 NEIGHBORS = 8
 CLUSTER_LEVELS, NEAREST_CLUSTERS = 9, 4
 CLUSTER_BLUR = 0.01
@@ -54,7 +55,7 @@ MOST_PHOTOS = 6
 class Signals:
     """What photos say about g Gaussians; without the axis v: one photo.
 
-    gradients: of the sum of squared errors of colours and coverage. visibility: largest weight on a pixel. pixels: sum of the
+    gradients: of the sum of squared errors of colors and coverage. visibility: largest weight on a pixel. pixels: sum of the
     weights.
     """
 
@@ -216,7 +217,7 @@ class Refiner(nn.Module):
 
 
 def _relative_errors(values, signals):
-    """Gradients for a pixel of a Gaussian's weight, lengths relative to its longest axis, those of colours before the sigmoid."""
+    """Gradients for a pixel of a Gaussian's weight, lengths relative to its longest axis, those of colors before the sigmoid."""
     colors = nn.sigmoid(values[:, 11:])
     longest = jnp.exp(jnp.max(values[:, 7:10], axis=-1, keepdims=True))
     units = [jnp.tile(longest, 3), jnp.ones((len(values), 8), values.dtype), 1 / (colors * (1 - colors) + 0.01)]
@@ -254,7 +255,7 @@ def squared_errors(image: Image, photo: Photos) -> Image:
 
 
 def colors_alone(image: Image) -> Image:
-    """Gradient of the sum of all colours with respect to the image."""
+    """Gradient of the sum of all colors with respect to the image."""
     return jnp.ones_like(image[0]), jnp.zeros_like(image[1])
 
 
@@ -262,7 +263,7 @@ def signals_from(gradient: Parameters, colors: Float[Array, " g"], rendering: Re
     """Signals from `squared_errors` and `colors_alone`, both pulled back to the Gaussians."""
     assert rendering.visibility is not None
     scale = PERSON / jnp.maximum(jnp.sum(photo.masks), 1.0)
-    # a change of all three colours of a Gaussian changes the sum of an image by three times its weights
+    # a change of all three colors of a Gaussian changes the sum of an image by three times its weights
     return Signals(scale * stacked(gradient), rendering.visibility, scale * colors / 3)
 
 

@@ -18,7 +18,7 @@ from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.objectives.ssim import structural_dissimilarity
+from humangs_jax.losses.ssim import structural_dissimilarity
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.parameters import Parameters, gaussians_of
 from humangs_jax.rendering.gaussians import Gaussians
@@ -26,7 +26,7 @@ from humangs_jax.rendering.splat_config import SplatConfig
 from humangs_jax.rendering.splatting import Rendering, render
 
 Image = tuple[Float[Array, "h w 3"], Float[Array, "h w"]]
-"""Colours and alpha."""
+"""Colors and alpha."""
 PullBack = Callable[[Image], tuple[Parameters, Float[Array, " g"]]]
 """From the gradient with respect to an image to those with respect to the parameters, and to the brightness of each Gaussian."""
 
@@ -89,7 +89,7 @@ def drawn_photo(
 
 
 def image_loss(image: Image, photo: Photos, config: RefineConfig) -> Scalar:
-    """Loss of one photo (without the axis v): L1 of colours, structural dissimilarity, L1 of coverage; means over the crop.
+    """Loss of one photo (without the axis v): L1 of colors, structural dissimilarity, L1 of coverage; means over the crop.
 
     A pixel that does not count takes the photo's value, so that it contributes nothing anywhere.
     """

@@ -1,4 +1,4 @@
-"""What a run of `refine` does on the host: draw a photo, take a step or rounds, compare, with buffers that grow as they must.
+"""What a run of `refine` does on the host: draw a photo, take a step or iterations, compare, with buffers that grow as they must.
 
 Everything but steps on a mesh consists of the same few compiled programs, one photo at a time.
 """
@@ -23,7 +23,7 @@ from humangs_jax.core.array_types import Array, Int
 from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.views import SubjectViews
-from humangs_jax.objectives.metrics import decibels
+from humangs_jax.losses.metrics import decibels
 from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.refinement.crops import held_out_blocks
 from humangs_jax.refinement.learned import (
@@ -68,7 +68,7 @@ BUFFERS = ("max_pairs", "max_rows")
 FASTER_COMPILATION = {"xla_backend_optimization_level": 1}
 """On a CPU: compiles in 0.8 to 0.9 of the time of level 3, and the programs take the same time. Level 0: eight times."""
 HOST_SETTINGS = {
-    "rounds": 1,
+    "iterations": 1,
     "steps": 1,
     "seconds": None,
     "image_size": None,
@@ -84,7 +84,7 @@ HOST_SETTINGS = {
 class Operations:
     """What one call of `refine` works with.
 
-    avatar: the one that is refined. fresh: the same with the scales that the rounds were trained with, without any low-pass.
+    avatar: the one that is refined. fresh: the same with the scales that the iterations were trained with, without any low-pass.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Operations:
         self.use(np.flatnonzero(np.asarray(~held).any(axis=(1, 2))))
 
     def use(self, photos: np.ndarray) -> None:
-        """From now on rounds and steps see these photos, in the order of the seed."""
+        """From now on iterations and steps see these photos, in the order of the seed."""
         self.useful = photos
         self.order = _order(photos, self.config.views_per_step, np.random.default_rng(self.config.seed))
 
@@ -132,7 +132,7 @@ class Operations:
         """Run each part of a run once, so that it is compiled."""
         if self.config.steps != 0:
             self.step(state, 0.0)
-        if self.config.rounds:
+        if self.config.iterations:
             self.learned(state.parameters, 1)
 
     def step(self, state: RefineState, passed: float, share: float = 1.0) -> RefineState:
@@ -213,13 +213,13 @@ class Operations:
         """The graph of the avatar's own Gaussians."""
         return graph_of(np.asarray(self.avatar.gaussians.means))
 
-    def learned(self, parameters: Parameters, rounds: int) -> Parameters:
-        """The parameters after rounds of the learned update."""
+    def learned(self, parameters: Parameters, iterations: int) -> Parameters:
+        """The parameters after iterations of the learned update."""
         start = values = stacked(parameters)
         hidden = jnp.zeros((len(values), Refiner.width))
         used = min(len(self.useful), MOST_PHOTOS)
         chosen = self.useful[np.arange(used) * len(self.useful) // used]
-        for _ in range(rounds):
+        for _ in range(iterations):
             each = [self.signals(parameters, int(i)) for i in chosen]
             signals = jax.tree.map(lambda *x: jnp.stack(x), *each)
             values, hidden = compiled(refiner_round)(

@@ -1,4 +1,4 @@
-"""Refinement: the Gaussians of an avatar are fitted to its photos, by rounds of a learned update, then by Adam.
+"""Refinement: the Gaussians of an avatar are fitted to its photos, by iterations of a learned update, then by Adam.
 
 The learned update moves what no photo shows, too; Adam leaves it where it is. `refine` is the whole job on the host: it crops the
 photos and leaves the rest to a `Run`, which decides by what no step saw how much of all that is kept.
@@ -78,8 +78,8 @@ def refine_with_report(
         avatar: of the person in the photos, on the body of the capture. capture: photos with masks, in any poses. seconds, steps:
             the limits, instead of those of the configuration. A number of steps repeats a run exactly on the same machine;
             `Refinement.planned` is that of a run that was limited by its seconds. mesh: of one axis, whose devices share the
-            `views_per_step` photos of a step. progress: show a bar. watch: gets the avatar so far after the rounds and at each of
-            the `checks`, also in the trial; its time counts.
+            `views_per_step` photos of a step. progress: show a bar. watch: gets the avatar so far after the iterations and at
+            each of the `checks`, also in the trial; its time counts.
 
     Ctrl-C ends the run; the best state until then is returned.
 
@@ -106,7 +106,7 @@ def refine_views(
 ) -> tuple[Avatar, Int[Array, ""]]:
     """The pure function behind `refine`: `steps` steps of one photo each, in turns, on all their pixels.
 
-    Static: config (its limits, rounds, `full_steps` and held-out pixels are not used), splat (with `max_pairs`, see
+    Static: config (its limits, iterations, `full_steps` and held-out pixels are not used), splat (with `max_pairs`, see
     `plan_buffers`), steps. Returns the avatar and the (splat, tile) pairs that did not fit. Batch over people whose arrays have
     the same shapes with `jax.vmap(..., in_axes=(0, 0, None, None, None))`.
     """

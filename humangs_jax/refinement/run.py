@@ -1,8 +1,8 @@
 """One run of `refine` on the host: it plans steps, tries them against a photo that they do not see, sizes buffers, keeps time.
 
-With `HELD_OUT_PHOTOS` photos or more, a run is made twice. The trial leaves one photo out and asks it whether the rounds help,
-whether they help without the photo that fits least, and how many of the steps do. Then all photos are fitted as the trial says.
-Rounds alone are tried only if one photo fits much less than the others.
+With `HELD_OUT_PHOTOS` photos or more, a run is made twice. The trial leaves one photo out and asks it whether the iterations
+help, whether they help without the photo that fits least, and how many of the steps do. Then all photos are fitted as the trial
+says. Rounds alone are tried only if one photo fits much less than the others.
 The photo that is asked is the one that the avatar explains best before it is refined: a photo that misleads is never asked.
 
 With fewer photos, blocks of pixels are held out instead, and one run is made.
@@ -19,7 +19,7 @@ import numpy as np
 from humangs_jax.avatar.avatar import Avatar
 from humangs_jax.core.array_types import Float
 from humangs_jax.core.progress import bar as progress_bar
-from humangs_jax.objectives.metrics import decibels
+from humangs_jax.losses.metrics import decibels
 from humangs_jax.refinement.objective import avatar_of, comparison_of
 from humangs_jax.refinement.operations import Operations, only
 from humangs_jax.refinement.parameters import RefineState
@@ -32,8 +32,9 @@ ALLOWED_LOSS = 0.1
 ALLOWED_LOSS_OF_ROUNDS = 1.0
 """Decibels, likewise, that the learned update may lose there: one of eight test people loses 0.2 and gains 2.1 by all."""
 SUSPICIOUS = 1.5
-"""Loss of the photo that fits least over the median, before refinement, from which on rounds alone are tried first. With right
-poses and masks eight of nine people have 1.0 to 1.3, one 1.55. Half a mask makes 1.6, a body that is turned by 10 degrees 2.1."""
+"""Loss of the photo that fits least over the median, before refinement, from which on iterations alone are tried first. With
+right poses and masks eight of nine people have 1.0 to 1.3, one 1.55. Half a mask makes 1.6, a body that is turned by 10 degrees
+2.1."""
 TIMED_STEPS = 3
 """Steps that are timed to plan how many a run has."""
 OVERRUN = 1.5
@@ -44,14 +45,14 @@ class Found(NamedTuple):
     """A state, and how many rounds it has had."""
 
     state: RefineState
-    rounds: int
+    iterations: int
 
 
 class Trial(NamedTuple):
-    """What a trial says. used: the photos to fit. rounds: how many of the learned update. share: of the steps."""
+    """What a trial says. used: the photos to fit. iterations: how many of the learned update. share: of the steps."""
 
     used: np.ndarray
-    rounds: int
+    iterations: int
     share: float
 
 
@@ -71,7 +72,7 @@ class Run(Operations):
             each = self.compared(self.start, self.all)
             self.best = Found(self.state(self.start, comparison_of(each, self.all)), 0)
         steps, interrupted = None, False
-        trial = Trial(self.useful, self.config.rounds, 1.0)
+        trial = Trial(self.useful, self.config.iterations, 1.0)
         try:
             with self.compiling():
                 self.compile(self.best.state)
@@ -84,7 +85,7 @@ class Run(Operations):
         self.bar.update(100 - self.bar.n)
         self.bar.close()
         seconds = self.elapsed()
-        state, rounds = self.best
+        state, iterations = self.best
         fitted, everybody = only(self.all, trial.used), [str(i) for i in range(len(self.all.images))]
         before, after = (
             comparison_of(x, fitted) for x in (only(each, trial.used), self.compared(state.parameters, fitted))
@@ -96,7 +97,7 @@ class Run(Operations):
         pair = (before, after if kept else before)
         return Refinement(
             refined,
-            rounds,
+            iterations,
             self.done,
             seconds,
             self.compile_seconds,
@@ -111,8 +112,8 @@ class Run(Operations):
     def run_with_blocks(self, loss: float) -> int:
         """A run whose best state the held-out pixels choose. loss: before it. Returns the number of steps that were planned."""
         highest = self.held_psnr(self.start)
-        if self.config.rounds:
-            found, reached = self.after_rounds()
+        if self.config.iterations:
+            found, reached = self.after_iterations()
             if reached < loss:
                 self.best, highest = found, self.held_psnr(found.state.parameters)
             self.show(self.best)
@@ -130,21 +131,21 @@ class Run(Operations):
         Returns the number of steps that were planned, and what the trial said.
         """
         checked, everybody = int(np.argmin(losses)), np.arange(len(losses))
-        if self.rounds_alone and np.max(losses) < SUSPICIOUS * np.median(losses):
-            self.best = self.after_rounds()[0]
+        if self.iterations_alone and np.max(losses) < SUSPICIOUS * np.median(losses):
+            self.best = self.after_iterations()[0]
             self.show(self.best)
-            return 0, Trial(everybody, self.best.rounds, 1.0)
+            return 0, Trial(everybody, self.best.iterations, 1.0)
         self.held = only(self.all, [checked])
         start, used, before, began = self.best, everybody, self.held_psnr(self.start), self.elapsed()
-        for photos in (everybody, np.delete(everybody, int(np.argmax(losses)))) if self.config.rounds else ():
+        for photos in (everybody, np.delete(everybody, int(np.argmax(losses)))) if self.config.iterations else ():
             self.use(photos[photos != checked])
-            found, _ = self.after_rounds()
+            found, _ = self.after_iterations()
             psnr = self.held_psnr(found.state.parameters)
             if psnr > before - ALLOWED_LOSS_OF_ROUNDS:
                 self.best, before, used = found, psnr, photos
                 break
             began = self.elapsed()
-        # rounds with all photos are still to come
+        # iterations with all photos are still to come
         ahead = (self.elapsed() - began) * len(used) / (len(used) - 1)
         self.use(used[used != checked])
         planned = self.planned_steps(ahead)
@@ -154,11 +155,11 @@ class Run(Operations):
             if self.held_psnr(found.state.parameters) > before - ALLOWED_LOSS:
                 share = done / tried
             self.show(found)
-        trial = Trial(used, self.best.rounds, share)
+        trial = Trial(used, self.best.iterations, share)
         self.use(used)
         begin = start
-        if trial.rounds:
-            self.best = begin = self.after_rounds()[0]
+        if trial.iterations:
+            self.best = begin = self.after_iterations()[0]
             self.show(begin)
         rest = planned - tried
         for _, found in self.steps(begin, rest, round(share * rest), (TRIAL, 1.0)):
@@ -167,15 +168,15 @@ class Run(Operations):
         return planned, trial
 
     @property
-    def rounds_alone(self) -> bool:
+    def iterations_alone(self) -> bool:
         """Whether no steps are to follow."""
-        return self.config.rounds > 0 and self.config.steps == 0
+        return self.config.iterations > 0 and self.config.steps == 0
 
-    def after_rounds(self) -> tuple[Found, float]:
-        """The state after the rounds, on the photos in use, and the loss on them."""
-        parameters, photos = self.learned(self.initial(self.fresh), self.config.rounds), only(self.all, self.useful)
+    def after_iterations(self) -> tuple[Found, float]:
+        """The state after the iterations, on the photos in use, and the loss on them."""
+        parameters, photos = self.learned(self.initial(self.fresh), self.config.iterations), only(self.all, self.useful)
         found = comparison_of(self.compared(parameters, photos), photos)
-        return Found(self.state(parameters, found), self.config.rounds), float(found.loss)
+        return Found(self.state(parameters, found), self.config.iterations), float(found.loss)
 
     def steps(self, begin: Found, total: int, end: int, shown: tuple[float, float]) -> Iterator[tuple[int, Found]]:
         """The first `end` of `total` steps: how many are done, and the state, at each check and at the end.
@@ -184,8 +185,8 @@ class Run(Operations):
         """
         config = self.config
         self.use(self.useful)  # the order of the photos begins again
-        state, rounds = begin
-        share = min(1.0, config.full_steps / max(total, 1)) if rounds else 1.0
+        state, iterations = begin
+        share = min(1.0, config.full_steps / max(total, 1)) if iterations else 1.0
         for done in range(1, end + 1):
             passed = (done - 1) / total
             state = self.step(state, passed, share)
@@ -193,7 +194,7 @@ class Run(Operations):
             self.bar.update(int(100 * (shown[0] + (shown[1] - shown[0]) * done / total)) - self.bar.n)
             self.late = self.late or (config.seconds is not None and self.elapsed() > OVERRUN * config.seconds)
             if done * config.checks // total > (done - 1) * config.checks // total or done == end or self.late:
-                yield done, Found(state, rounds)
+                yield done, Found(state, iterations)
             if self.late:
                 return
 

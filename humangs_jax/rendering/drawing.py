@@ -33,7 +33,7 @@ class Rendering(Batchable):
     """One image of a set of Gaussians; with leading axes, a batch of images.
 
     rgb: (h, w, 3) over the background. alpha: (h, w) in [0, 1). depth: (h, w) mean z of what is seen, weighted as the
-    colours are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that did not fit in the buffers and were not
+    colors are, metres; 0 where alpha is 0. overflow: (splat, tile) pairs that did not fit in the buffers and were not
     drawn. visibility: (g,) the largest weight alpha T of each Gaussian on any pixel, 0 if it is hidden; not
     differentiable; None unless `SplatConfig.visibility`.
     """
@@ -57,7 +57,7 @@ Background = Float[Array, "3"] | Float[np.ndarray, "3"] | Sequence[float | int] 
 def with_background(
     gaussians: Gaussians, cameras: Camera, background: Background
 ) -> tuple[Gaussians, Camera, Float[Array, "3"]]:
-    """What is drawn, in float32 at least. Raises: ValueError for a background that is no colour."""
+    """What is drawn, in float32 at least. Raises: ValueError for a background that is no color."""
     return at_least_float32((gaussians, cameras, _color(background, gaussians.means.dtype)))
 
 
@@ -74,7 +74,7 @@ def _color(background, dtype):
         fits = fits and all(isinstance(x, jax.Array) or (isinstance(x, Real) and 0 <= x <= 1) for x in background)
     if not fits:
         shown = f"shape {color.shape}" if hasattr(color, "shape") else repr(color)
-        raise ValueError(f"background: expected 3 numbers in [0, 1] or the name of a colour, got {shown}")
+        raise ValueError(f"background: expected 3 numbers in [0, 1] or the name of a color, got {shown}")
     return color if isinstance(color, jax.Array) else jnp.asarray(color, dtype)
 
 
@@ -87,7 +87,7 @@ def draw_projected(
 ) -> Rendering:
     """The second half of `render`, for use inside transformations.
 
-    projected: by `project_gaussians`, of these Gaussians, camera and config. Of the Gaussians only opacities and colours
+    projected: by `project_gaussians`, of these Gaussians, camera and config. Of the Gaussians only opacities and colors
     are read here. background: as `Background`.
     """
     gaussians, camera, background = with_background(gaussians, camera, background)

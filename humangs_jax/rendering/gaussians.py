@@ -43,7 +43,7 @@ class Gaussians(Batchable):
 def gaussian_values(gaussians: Gaussians) -> dict[str, tuple[Array | None, Values]]:
     """What `core.checks.check_values` needs to check Gaussians.
 
-    Colours may be any finite numbers: splatting is linear in them, and people draw normals and labels as colours.
+    Colors may be any finite numbers: splatting is linear in them, and people draw normals and labels as colors.
     """
     ranges = {"opacities": UNIT, "scales": NOT_NEGATIVE, "low_pass": NOT_NEGATIVE}
     names = (field.name for field in dataclasses.fields(gaussians))
@@ -92,7 +92,7 @@ def factored(gaussians: Gaussians) -> Gaussians:
 def skin_gaussians(
     gaussians: Gaussians, transforms: Float[Array, "g 4 4"], mode: Literal["affine", "rotation"] = "affine"
 ) -> Gaussians:
-    """Move each Gaussian by its (blended) transform; scales, opacities and colours stay.
+    """Move each Gaussian by its (blended) transform; scales, opacities and colors stay.
 
     affine: the covariance is transformed by the full linear part, which is appended to `deformations`.
     rotation: as published, the linear part times the Gaussian's rotation matrix is read as a quaternion. Where blending

@@ -49,10 +49,10 @@ def render(
         gradient = jax.jit(jax.grad(loss), compiler_options=compiler_options())(gaussians)
 
     Arguments: gaussians: (g, ...) one set, metres. camera: one camera; its size is the image's. config: what is drawn, and
-    the buffers; or the name of one of `SPLAT_PRESETS`. background: (3,) RGB, three numbers, or a colour's name; None: white.
+    the buffers; or the name of one of `SPLAT_PRESETS`. background: (3,) RGB, three numbers, or a color's name; None: white.
 
     Raises: TypeError for arguments of other classes; ValueError for a batch of cameras or of sets, for shapes that do not fit
-    each other, a background that is no colour, values that are not finite, opacities outside of [0, 1] and negative scales or
+    each other, a background that is no color, values that are not finite, opacities outside of [0, 1] and negative scales or
     focal lengths; BufferOverflowError if `config.max_pairs` or `max_rows` is too small. Inside a transformation values are not
     checked. Pairs that do not fit are not drawn there, and are counted in `Rendering.overflow`; `SplatConfig.warn_overflow` logs
     them. Loops that draw often jit `render`, which saves both checks.

@@ -1,4 +1,4 @@
-"""Gaussians as parameters without bounds, which optimizers may move freely: log scales, logits of opacities and colours."""
+"""Gaussians as parameters without bounds, which optimizers may move freely: log scales, logits of opacities and colors."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ class UnconstrainedGaussians(Batchable):
 
 
 def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
-    """Inverse of `constrain`, but for opacities and colours within `OPACITY_MARGIN` and `COLOR_MARGIN` of 0 or 1.
+    """Inverse of `constrain`, but for opacities and colors within `OPACITY_MARGIN` and `COLOR_MARGIN` of 0 or 1.
 
     A low-pass is no parameter: it stays in the scales. Raises: ValueError for Gaussians with deformations.
 
@@ -52,7 +52,7 @@ def unconstrain(gaussians: Gaussians) -> UnconstrainedGaussians:
 
 
 def constrain(parameters: UnconstrainedGaussians) -> Gaussians:
-    """The Gaussians that parameters stand for: scales are positive, opacities and colours in (0, 1)."""
+    """The Gaussians that parameters stand for: scales are positive, opacities and colors in (0, 1)."""
     return Gaussians(
         parameters.means,
         parameters.quats,

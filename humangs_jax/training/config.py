@@ -22,11 +22,11 @@ from humangs_jax.core.configuration import (
 )
 from humangs_jax.data.loader import ViewSampling
 from humangs_jax.io.text import read_configuration
+from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.network import presets
 from humangs_jax.network.config import HumanGSConfig
-from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.rendering.splat_config import SPLAT_PRESETS, SplatConfig
-from humangs_jax.training.disturbances import Disturbances
+from humangs_jax.training.augmentation import Augmentation
 from humangs_jax.training.optimizer import OptimizerConfig
 
 logger = logging.getLogger(__name__)
@@ -46,17 +46,17 @@ HOST_SETTINGS = {
 class LossConfig:
     """Weights of the terms, each a mean over pixels or vertices and over the targets.
 
-    squared: error of the colours. structural: structural dissimilarity at `structural_scales` sizes. silhouette:
+    squared: error of the colors. structural: structural dissimilarity at `structural_scales` sizes. silhouette:
     squared error of the coverage. tightness: squared tight offsets, normalised units. perceptual: difference of the
     features of VGG-19, lpips: learned distance of features; both need networks that the user has, see
-    `objectives.loss_networks`.
+    `losses.loss_networks`.
 
-    Against fog, which squared errors cause where the network is in doubt: absolute, outline: absolute errors of colours and
-    of coverage. depth: distance between the surfaces seen, metres; 0 for people on disk, whose depths are unknown. distortion:
-    spread of the weights along the rays. opaque: 4 o (1 - o) of the opacities o. shells: spread of the distances that a Gaussian
-    mixes, normalised units. Perceptual terms and those against fog are computed only where their weight is not 0.
-    random_background: share of the targets that are seen against one random colour instead of white, so that
-    white Gaussians differ from missing ones.
+    Against semi-transparent foreground, which squared errors cause where the network is in doubt: absolute, boundary: absolute
+    errors of colors and of coverage. depth: distance between the surfaces seen, metres; 0 for people on disk, whose depths are
+    unknown. distortion: spread of the weights along the rays. opaque: 4 o (1 - o) of the opacities o. shells: spread of the
+    distances that a Gaussian mixes, normalised units. Perceptual terms and those against semi-transparent foreground are
+    computed only where their weight is not 0. random_background: share of the targets that are seen against one random color
+    instead of white, so that white Gaussians differ from missing ones.
     """
 
     squared: Weight = 1.0
@@ -67,7 +67,7 @@ class LossConfig:
     perceptual: Weight = 0.0
     lpips: Weight = 0.0
     absolute: Weight = 0.0
-    outline: Weight = 0.0
+    boundary: Weight = 0.0
     depth: Weight = 0.0
     distortion: Weight = 0.0
     opaque: Weight = 0.0
@@ -103,7 +103,7 @@ class TrainConfig:
     model: HumanGSConfig = dataclasses.field(default_factory=presets.small)
     views: ViewSampling = dataclasses.field(default_factory=ViewSampling)
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
-    disturbances: Disturbances = dataclasses.field(default_factory=Disturbances)
+    augmentation: Augmentation = dataclasses.field(default_factory=Augmentation)
     optimizer: OptimizerConfig = dataclasses.field(default_factory=OptimizerConfig)
     splat: SplatConfig = dataclasses.field(default_factory=SplatConfig)
     target_size: Side = 128
@@ -121,9 +121,9 @@ class TrainConfig:
     keep_checkpoints: Steps = 2
 
     def __post_init__(self):
-        if self.model.execution.dtype == "float16":
+        if self.model.runtime.dtype == "float16":
             raise ValueError(
-                "model.execution.dtype float16: gradients underflow; expected float32 or bfloat16 for training"
+                "model.runtime.dtype float16: gradients underflow; expected float32 or bfloat16 for training"
             )
         starts = [stage.start for stage in self.stages]
         if starts and (starts != sorted(set(starts)) or starts[-1] >= self.steps):
@@ -160,20 +160,20 @@ def _changed(config, stage):
     if stage.image_size is not None:
         model = model.with_conventions(image_size=stage.image_size)
     if stage.token_capacity is not None:
-        model = model.with_execution(token_capacity=stage.token_capacity)
+        model = model.with_runtime(token_capacity=stage.token_capacity)
     own = {"target_size": stage.target_size, "batch_size": stage.batch_size}
     return dataclasses.replace(config, model=model, **{name: x for name, x in own.items() if x is not None})
 
 
 def small() -> TrainConfig:
     """For the shipped network: some hours on a CPU of two cores. Its present weights had other losses (assets/weights.md)."""
-    against_fog = LossConfig(
-        squared=0.5, absolute=0.15, silhouette=0.0, outline=0.1, depth=0.3, distortion=1.0, opaque=0.001
+    against_semi_transparency = LossConfig(
+        squared=0.5, absolute=0.15, silhouette=0.0, boundary=0.1, depth=0.3, distortion=1.0, opaque=0.001
     )
     return TrainConfig(
         views=ViewSampling(input_counts=(1, 2, 4, 4, 4, 6), target_count=3, mixed_pose_share=0.2),
-        loss=against_fog,
-        disturbances=Disturbances(share=0.4),
+        loss=against_semi_transparency,
+        augmentation=Augmentation(share=0.4),
         optimizer=OptimizerConfig(learning_rate=5e-4, warmup_steps=100),
         target_size=256,
         steps=20_000,
@@ -246,7 +246,7 @@ def read_config(preset_or_path: str | Path) -> TrainConfig:
         if "HumanGSConfig has no such field" not in str(error):
             raise
         raise ValueError(
-            f"{error}: expected architecture, conventions and execution. A run of a version before `model` was divided so "
+            f"{error}: expected architecture, conventions and runtime. A run of a version before `model` was divided so "
             "cannot be continued: start another with --init-weights (its weights.safetensors still loads) and another --out"
         ) from error
 

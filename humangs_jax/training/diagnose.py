@@ -23,9 +23,9 @@ from humangs_jax.data.loader import Example
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.reading import reading
 from humangs_jax.io.text import parse_json, read_text
+from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.stages import Named, Recorder, inexact_leaves
-from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training.checkpoint import Checkpoints, load_config
 from humangs_jax.training.config import TrainConfig
 from humangs_jax.training.diagnosis import Diagnosis, StageReport, leaves
@@ -71,7 +71,7 @@ def observe_subject(
     Blocks are neither looped over nor recomputed, so that each can be watched, and everything is kept: this needs more
     memory than a step (the published network at 512 pixels, 4 views each: 2.4 GB are kept).
     """
-    config = dataclasses.replace(config, model=config.model.with_execution(scan=False, remat="none"))
+    config = dataclasses.replace(config, model=config.model.with_runtime(scan=False, remat="none"))
 
     def loss(params, probes, recorder):
         recorder = recorder or Recorder(probes)

@@ -14,11 +14,11 @@ from humangs_jax.core.numerics import safe_divide
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews, prepare_inputs
+from humangs_jax.losses.losses import ray_spread
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.humangs import apply_humangs
 from humangs_jax.network.parts import HumanGSOutputs, Variables
 from humangs_jax.network.stages import StageCaller, call
-from humangs_jax.objectives.losses import ray_spread
 from humangs_jax.rendering.drawing import draw_projected
 from humangs_jax.rendering.projection import project_gaussians
 from humangs_jax.rendering.splatting import Rendering
@@ -50,10 +50,10 @@ def token_share(config: TrainConfig, views: int) -> HumanGSConfig:
     The configured capacity is for the largest of `views.input_counts`. Fewer photos get their share plus that of one view,
     because one photo may show more of a person than the others.
     """
-    most, capacity = max(config.views.input_counts), config.model.execution.token_capacity
+    most, capacity = max(config.views.input_counts), config.model.runtime.token_capacity
     if views >= most:
         return config.model
-    return config.model.with_execution(token_capacity=-(-capacity * (views + 1) // (most + 1)))
+    return config.model.with_runtime(token_capacity=-(-capacity * (views + 1) // (most + 1)))
 
 
 class DrawnTargets(NamedTuple):
@@ -137,7 +137,7 @@ def draw_targets(
 
 
 def _opaque(images):
-    """Renderings that are known as colours only."""
+    """Renderings that are known as colors only."""
     full = lambda rgb: Rendering(rgb, jnp.ones(rgb.shape[:2]), jnp.zeros(rgb.shape[:2]), jnp.zeros((), jnp.int32))
     return jax.vmap(full)(images)
 

@@ -27,9 +27,9 @@ from humangs_jax.data.loader import Waiting
 from humangs_jax.data.views import gaussian_body
 from humangs_jax.io.atomic import only_writer
 from humangs_jax.io.images import write_png
+from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.network.parts import Variables
 from humangs_jax.network.weights import save_weights
-from humangs_jax.objectives.loss_networks import LossNetworks
 from humangs_jax.training.checkpoint import Checkpoints, save_config
 from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.log import RunLog, Watch
@@ -46,8 +46,8 @@ VALIDATED = 8
 SHOWN = 4
 """Validation subjects on the sheet."""
 DROPPED = {
-    "dropped_tokens": "patches without room, mean: model.execution.token_capacity is too small for these photos",
-    "dropped_reads": "vertices without room, mean: model.execution.vertex_capacity is too small for these photos",
+    "dropped_tokens": "patches without room, mean: model.runtime.token_capacity is too small for these photos",
+    "dropped_reads": "vertices without room, mean: model.runtime.vertex_capacity is too small for these photos",
     "overflow": "(splat, tile) pairs without room, mean: they were not drawn",
 }
 """What the numbers of a validation say that should be 0."""

@@ -16,17 +16,17 @@ from humangs_jax.core.compiler_options import compiler_options
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
+from humangs_jax.losses.loss_networks import LossNetworks
+from humangs_jax.losses.losses import squared_error, surface_distance, tightness, translucency
+from humangs_jax.losses.lpips import lpips
+from humangs_jax.losses.metrics import psnr
+from humangs_jax.losses.perceptual import perceptual_loss
+from humangs_jax.losses.ssim import multiscale_structural_dissimilarity
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.stages import StageCaller, call, inexact_leaves
-from humangs_jax.objectives.loss_networks import LossNetworks
-from humangs_jax.objectives.losses import squared_error, surface_distance, tightness, translucency
-from humangs_jax.objectives.lpips import lpips
-from humangs_jax.objectives.metrics import psnr
-from humangs_jax.objectives.perceptual import perceptual_loss
-from humangs_jax.objectives.ssim import multiscale_structural_dissimilarity
 from humangs_jax.training import sharding
+from humangs_jax.training.augmentation import augment
 from humangs_jax.training.config import LossConfig, TrainConfig, compiled_for
-from humangs_jax.training.disturbances import disturb
 from humangs_jax.training.forward import DrawnTargets, draw_targets, reconstruct_example
 from humangs_jax.training.optimizer import GuardState, learning_rate, make_optimizer
 from humangs_jax.training.state import TrainState
@@ -38,9 +38,9 @@ COUNTS = ("dropped_tokens", "dropped_reads", "overflow")
 ALWAYS = ("squared", "structural", "silhouette", "tightness")
 """Terms that are computed, for the log, whatever their weight."""
 OF_COLORS = ("squared", "structural", "absolute", "perceptual", "lpips")
-"""Terms that compare colours: those of a network that draws pixels. For it the others do not exist, whatever their weight."""
-DISTURBED = 1
-"""Makes the key of a subject's disturbances from that of its backgrounds."""
+"""Terms that compare colors: those of a network that draws pixels. For it the others do not exist, whatever their weight."""
+AUGMENTED = 1
+"""Makes the key of a subject's augmentation from that of its backgrounds."""
 NO_NETWORKS = LossNetworks()
 
 Metrics = dict[str, Shaped[Array, ""]]
@@ -49,14 +49,14 @@ Gradients = tuple[Scalar, PyTree, PyTree, Metrics]
 
 
 def random_backgrounds(key: Key, count: int, share: float) -> Float[Array, "v 3"]:
-    """One colour per target: random for about `share` of them, white for the rest."""
+    """One color per target: random for about `share` of them, white for the rest."""
     color_key, choice_key = jax.random.split(key)
     colors = jax.random.uniform(color_key, (count, 3))
     return jnp.where(jax.random.bernoulli(choice_key, share, (count, 1)), colors, 1.0)
 
 
 def change_background(targets: SubjectViews, backgrounds: Float[Array, "v 3"]) -> Float[Array, "v h w 3"]:
-    """The target photos, which are on white, as they would look on other colours."""
+    """The target photos, which are on white, as they would look on other colors."""
     uncovered = 1 - targets.masks[..., None]
     return targets.images + uncovered * (backgrounds[:, None, None, :] - 1)
 
@@ -82,7 +82,7 @@ def loss_terms(
         "silhouette": lambda t: squared_error(t["alpha"], masks),
         "tightness": lambda t: jnp.zeros(()) if t["tight_offsets"] is None else tightness(t["tight_offsets"]),
         "absolute": lambda t: jnp.abs(t["rgb"] - images),
-        "outline": lambda t: jnp.abs(t["alpha"] - masks),
+        "boundary": lambda t: jnp.abs(t["alpha"] - masks),
         "opaque": lambda t: translucency(t["opacities"]),
         "distortion": lambda t: t["spread"],
         "shells": lambda t: _required(t["shell_spread"], "shells", "shell of the reader"),
@@ -148,8 +148,8 @@ def subject_loss(
     stage: StageCaller = call,
 ) -> tuple[Scalar, tuple[PyTree, Metrics]]:
     """Loss of one subject, with the updated batch statistics and metrics. stage: see `network.stages`."""
-    if config.disturbances.share:
-        example = disturb(jax.random.fold_in(key, DISTURBED), example, body, config.disturbances)
+    if config.augmentation.share:
+        example = augment(jax.random.fold_in(key, AUGMENTED), example, body, config.augmentation)
     variables = {"params": params, "batch_stats": batch_stats}
     outputs, batch_stats = reconstruct_example(variables, body, example.inputs, config, True, axis_name, stage)
     targets = example.targets
@@ -287,7 +287,7 @@ def _train_step(state, batch, body, networks, seed=None, *, config, mesh):
         if jnp.finfo(leaf.dtype).bits < 32:
             raise ValueError(
                 f"train_step: params.{name}: expected float32, got {leaf.dtype}: small updates would be rounded away; to "
-                'compute in bfloat16, keep the parameters and set model.execution.dtype to "bfloat16"'
+                'compute in bfloat16, keep the parameters and set model.runtime.dtype to "bfloat16"'
             )
     seed = seed_numbers(config.seed) if seed is None else seed
     keys = subject_keys(seed, state.step, batch.inputs.betas.shape[0])

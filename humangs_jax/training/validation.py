@@ -14,17 +14,17 @@ import numpy as np
 from humangs_jax.body.model import BodyModel
 from humangs_jax.core.array_types import Array, Float
 from humangs_jax.data.loader import Example, ViewSampling
+from humangs_jax.losses.loss_networks import LossNetworks
+from humangs_jax.losses.lpips import lpips
+from humangs_jax.losses.metrics import masked_psnr, psnr, semi_transparent
+from humangs_jax.losses.ssim import similarity_map
 from humangs_jax.network.parts import Variables
-from humangs_jax.objectives.loss_networks import LossNetworks
-from humangs_jax.objectives.lpips import lpips
-from humangs_jax.objectives.metrics import fog, masked_psnr, psnr
-from humangs_jax.objectives.ssim import similarity_map
 from humangs_jax.training.config import TrainConfig, compiled_for
 from humangs_jax.training.forward import predict
 from humangs_jax.training.sources import MakeSource
 
 NO_NETWORKS = LossNetworks()
-METRICS = ("psnr", "psnr_mask", "ssim", "fog", "dropped_tokens", "dropped_reads", "overflow")
+METRICS = ("psnr", "psnr_fg", "ssim", "semi_transparent", "dropped_tokens", "dropped_reads", "overflow")
 
 
 def validation_examples(make_source: MakeSource, config: TrainConfig, count: int) -> list[Example]:
@@ -50,17 +50,19 @@ def validation_examples(make_source: MakeSource, config: TrainConfig, count: int
 def evaluate(
     variables: Variables, body: BodyModel, example: Example, config: TrainConfig, networks: LossNetworks = NO_NETWORKS
 ) -> tuple[Float[Array, "v h w 3"], dict[str, Float[Array, ""]]]:
-    """The images of one example's targets and their mean psnr, psnr_mask (both dB), ssim, fog, and lpips if its network
-    is there. fog is NaN where the network draws pixels: there is no alpha.
+    """The images of one example's targets and their mean psnr, psnr_fg (both dB), ssim, semi-transparent foreground, and lpips
+    if its network is there. semi-transparent foreground is NaN where the network draws pixels: there is no alpha.
     """
     drawn, outputs = predict(variables, body, example, config)
     images, masks = example.targets.images, example.targets.masks
     shown = jnp.clip(drawn.rgb, 0, 1)
     metrics = {
         "psnr": jnp.mean(jax.vmap(psnr)(shown, images)),
-        "psnr_mask": jnp.mean(jax.vmap(masked_psnr)(shown, images, masks)),
+        "psnr_fg": jnp.mean(jax.vmap(masked_psnr)(shown, images, masks)),
         "ssim": jnp.mean(jax.vmap(similarity_map)(shown, images)),
-        "fog": jnp.full((), jnp.nan) if outputs.is_empty else jnp.mean(jax.vmap(fog)(drawn.alpha, masks)),
+        "semi_transparent": jnp.full((), jnp.nan)
+        if outputs.is_empty
+        else jnp.mean(jax.vmap(semi_transparent)(drawn.alpha, masks)),
         "dropped_tokens": outputs.dropped_tokens.astype(shown.dtype),
         "dropped_reads": outputs.dropped_reads.astype(shown.dtype),
         "overflow": jnp.sum(drawn.overflow).astype(shown.dtype),

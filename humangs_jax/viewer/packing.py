@@ -7,7 +7,7 @@ means              uint16 (g, 3)        from `low` to `high` of the header, per 
 scales             uint16 (g, 3)        log of the standard deviations in metres, from `low` to `high`
 quats              int16 (g, 4)         unit quaternions wxyz times 32767
 opacities          uint16 (g,)          [0, 1]
-colors             uint16 (g, 3)        from `low` to `high` ([0, 1] unless colours lie outside of it)
+colors             uint16 (g, 3)        from `low` to `high` ([0, 1] unless colors lie outside of it)
 weights            uint16 (g, 8)        skinning weights, the largest first; every row sums to 65535
 weight_joints      uint8 (g, 8)         their joints
 light_normals      int8 (g, 3)          times 127

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from humangs_jax.apps import check as module
-from humangs_jax.apps.check import OUTLINE, ViewCheck, check_capture, draw_body, overlay, side_tints
+from humangs_jax.apps.check import BOUNDARY, ViewCheck, check_capture, draw_body, overlay, side_tints
 from humangs_jax.body.model import BodyModel, rest_pose
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import capture_from_arrays
@@ -76,7 +76,7 @@ def test_a_right_capture_has_full_overlap_and_no_warning(tmp_path):
     text = str(report)
     assert "000" in text and "1.000" in text and "100%" in text and "warning:" not in text
     sheet, _ = read_image(tmp_path / "check.png")
-    assert (np.abs(sheet - OUTLINE).max(-1) < 0.01).sum() > 100  # the outlines
+    assert (np.abs(sheet - BOUNDARY).max(-1) < 0.01).sum() > 100  # the silhouettes
     assert (sheet[..., 2] - sheet[..., 0] > 0.2).sum() > 50  # something blue
     assert (sheet[..., 0] - sheet[..., 2] > 0.2).sum() > 50  # something red
     assert [p.name for p in tmp_path.iterdir()] == ["check.png"]
@@ -107,7 +107,7 @@ def test_overlay_changes_only_the_body():
     covered = np.asarray(parts.covered)
     assert 0.05 < covered.mean() < 0.5
     np.testing.assert_array_equal(image[~covered], photo[~covered])
-    edge = np.abs(image - OUTLINE).max(-1) < 1e-6
+    edge = np.abs(image - BOUNDARY).max(-1) < 1e-6
     assert edge.any() and not (edge & ~covered).any() and edge.sum() < covered.sum() / 2
     inner = covered & ~edge
     expected = (1 - module.OPACITY) * photo + module.OPACITY * np.asarray(parts.shaded)

@@ -55,7 +55,7 @@ def test_who_is_meant_is_never_guessed():
         choose([photo("a"), photo("b")], 0, Path("s.png"))
 
 
-def coloured(name, *shades, size=(60, 40)):
+def colored(name, *shades, size=(60, 40)):
     """A photo of people side by side, each of one grey."""
     picture, people = np.ones((size[1], size[0], 3)), []
     for i, shade in enumerate(shades):
@@ -66,8 +66,8 @@ def coloured(name, *shades, size=(60, 40)):
     return PhotoPeople(name, size, picture, tuple(people))
 
 
-def test_without_cameras_colours_tell_large_people_apart():
-    photos = same_people([coloured("a", 0.9, 0.1), coloured("b", 0.2, 0.8), coloured("c", 0.05), coloured("d")])
+def test_without_cameras_colors_tell_large_people_apart():
+    photos = same_people([colored("a", 0.9, 0.1), colored("b", 0.2, 0.8), colored("c", 0.05), colored("d")])
     shades = [[None if each is None else int(each.area) for each in p.people] for p in photos]
     assert shades == [[89, 90], [90, 89], [90, None], [None, None]]  # the dark one has more pixels in all
     with pytest.raises(ValueError, match="2 people in a, b: expected one"):
@@ -75,10 +75,10 @@ def test_without_cameras_colours_tell_large_people_apart():
     assert choose(photos, 1, Path("s.png")) == 1 and detect.absent(photos, 1) == ("c", "d")
 
 
-def test_people_of_one_colour_are_not_mixed_in_silence(tmp_path):
-    photos = same_people([coloured("a", 0.9, 0.1), coloured("b", 0.5, 0.5), coloured("c", 0.9, 0.2)])
+def test_people_of_one_color_are_not_mixed_in_silence(tmp_path):
+    photos = same_people([colored("a", 0.9, 0.1), colored("b", 0.5, 0.5), colored("c", 0.9, 0.2)])
     with pytest.raises(
-        ValueError, match=r"^b: which of the people of .*people\.png is meant\? Their colours do not tell"
+        ValueError, match=r"^b: which of the people of .*people\.png is meant\? Their colors do not tell"
     ):
         detect.chosen(photos, 1, tmp_path)
     assert (tmp_path / "people.png").is_file()

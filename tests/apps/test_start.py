@@ -380,7 +380,7 @@ def test_from_photos_to_the_page(mine, capsys, monkeypatch):
     assert cli.execute(["start", str(mine), "--out", "me"]) == 0, capsys.readouterr().err
     out, _ = capsys.readouterr()
     assert "keypoints, median error" in out and "silhouette IoU" in out and "next: humangs animate me/avatar.npz" in out
-    assert "4 rounds and 0 steps" in out and "dB in the foreground" in out
+    assert "4 iterations and 0 steps" in out and "dB in the foreground" in out
     assert opened == [(Path("me").resolve() / "avatar.html").as_uri()]
     assert len(Avatar.load("me/avatar.npz").gaussians.means) > 10_000
     fitted = load_capture("me")

@@ -18,8 +18,8 @@ from humangs_jax.avatar.shot import Shot
 from humangs_jax.cli.options import Preset
 from humangs_jax.data.capture import Capture, load_capture, save_capture
 from humangs_jax.network import presets
-from humangs_jax.network.execution import EXECUTIONS, Execution
 from humangs_jax.network.humangs import init_humangs
+from humangs_jax.network.runtime import RUNTIMES, Runtime
 from humangs_jax.network.weights import save_weights
 
 
@@ -53,10 +53,10 @@ def test_what_is_wrong_in_a_file_of_settings_is_one_line(content, said, tmp_path
 
 
 def test_presets_have_one_set_of_names():
-    assert tuple(PRESETS) == tuple(EXECUTIONS) == typing.get_args(Preset)
-    assert all(settings.execution == Execution.preset(name) for name, settings in PRESETS.items())
+    assert tuple(PRESETS) == tuple(RUNTIMES) == typing.get_args(Preset)
+    assert all(settings.runtime == Runtime.preset(name) for name, settings in PRESETS.items())
     with pytest.raises(ValueError, match="expected one of realtime, balanced, quality, best, got 'fast'"):
-        Execution.preset("fast")
+        Runtime.preset("fast")
     assert not Settings().refinement and PRESETS["best"].refinement.steps == PRESETS["best"].refine_steps
 
 
@@ -207,11 +207,11 @@ def test_tuning_for_real(tmp_path, monkeypatch, capsys):
     save_capture(tmp_path / "someone", capture)
     variables = init_humangs(jax.random.key(0), config)
     save_weights(tmp_path / "tiny.safetensors", variables, config)
-    small = Execution(image_size=32)
+    small = Runtime(image_size=32)
     front = [
-        FrontPoint("one photo", Settings(views=1, execution=small, splat="fast"), 0.5, 0.0, 0.8, 100.0, 20.0, 19.0),
+        FrontPoint("one photo", Settings(views=1, runtime=small, splat="fast"), 0.5, 0.0, 0.8, 100.0, 20.0, 19.0),
         FrontPoint(
-            "refined", Settings(execution=small, refine_rounds=1, refine_steps=3), 1.0, 2.0, 1.0, 150.0, 24.0, 21.0
+            "refined", Settings(runtime=small, refine_iterations=1, refine_steps=3), 1.0, 2.0, 1.0, 150.0, 24.0, 21.0
         ),
     ]
     assert tune(variables, config, capture, Budget(1e8, 1e8), 32, front).point.name == "refined"

@@ -39,7 +39,7 @@ BAD = {
     "--azimuth nan: expected": ("animate", "--azimuth", "nan"),
     "--size -5: expected 1 to 8192 pixels": ("animate", "--size", "-5"),
     "--height 100000: expected": ("render", "--height", "100000"),
-    "--background 'blu': expected a colour": ("animate", "--background", "blu"),
+    "--background 'blu': expected a color": ("animate", "--background", "blu"),
     "--out b.mp4: .mp4 has no transparency": ("animate", "--background", "transparent", "--out", "b.mp4"),
     "--out c.gif: .gif has no transparency": ("render", "--background", "transparent", "--out", "c.gif"),
     "--out b.avi: expected a name ending in": ("animate", "--out", "b.avi"),

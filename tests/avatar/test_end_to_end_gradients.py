@@ -55,7 +55,7 @@ POSE = ("rotations", "translations", "betas")
 @dataclasses.dataclass(frozen=True)
 class Case:
     """style: as the published network (mixed convention, rotation skinning, offsets without bound, Gouraud maps) or as
-    the small one (photo colours corrected, affine skinning, bounded offsets). train: statistics of the batch.
+    the small one (photo colors corrected, affine skinning, bounded offsets). train: statistics of the batch.
     bare: neither class token nor upsampler, but a head that corrects skinning weights.
     """
 
@@ -100,7 +100,7 @@ class Case:
             ray_origins="twice_normalized" if published else "normalized",
         )
         remat = "full" if self.remat else "none"
-        model = model.with_execution(tokens=self.tokens, token_capacity=40, remat=remat, scan=self.scan)
+        model = model.with_runtime(tokens=self.tokens, token_capacity=40, remat=remat, scan=self.scan)
         return TrainConfig(model=model, loss=LossConfig(structural_scales=2), target_size=TARGET_SIZE)
 
 

@@ -125,7 +125,7 @@ def read_spz(path):
 
 
 def off_by(a, b):
-    """Largest differences of covariances (relative to the largest), opacities and colours."""
+    """Largest differences of covariances (relative to the largest), opacities and colors."""
     exact = np.asarray(covariances(a))
     return [
         np.abs(np.asarray(covariances(b)) - exact).max() / np.abs(exact).max(),
@@ -246,7 +246,7 @@ def test_glb_holds_the_attributes_of_the_extension(tmp_path):
     encoded = np.where(
         fallback[:, :3] <= 0.0031308, 12.92 * fallback[:, :3], 1.055 * fallback[:, :3] ** (1 / 2.4) - 0.055
     )
-    np.testing.assert_allclose(encoded, gaussians.colors, atol=1e-6)  # glTF's colours of vertices are linear
+    np.testing.assert_allclose(encoded, gaussians.colors, atol=1e-6)  # glTF's colors of vertices are linear
 
 
 @settings(max_examples=5, deadline=None)
@@ -404,7 +404,7 @@ def _covariances(xyzw, scales):
 @needs_npm
 @pytest.mark.parametrize("name", ["a.ply", "a.spz"])
 def test_splat_transform_makes_our_glb_of_our_files(name, tmp_path):
-    """Worlds, scales, rotations, opacities and colours of both files are the same to a program that is not ours."""
+    """Worlds, scales, rotations, opacities and colors of both files are the same to a program that is not ours."""
     gaussians = person()
     write = {"a.ply": write_ply, "a.spz": write_spz}[name]
     write(tmp_path / name, turned(gaussians, USUAL_UP[Path(name).suffix]))

@@ -1,4 +1,4 @@
-"""The body as a mesh: its colours, skin and motion, read back by trimesh, by our own reader and by Khronos's validator."""
+"""The body as a mesh: its colors, skin and motion, read back by trimesh, by our own reader and by Khronos's validator."""
 
 import functools
 import json
@@ -34,7 +34,7 @@ TEXTURE = 256
 
 
 def color_at(points):
-    """A smooth colour of space."""
+    """A smooth color of space."""
     return 0.5 + 0.4 * np.sin(3 * points + [0, 1, 2])
 
 
@@ -72,7 +72,7 @@ def textured():
 
 
 def mesh():
-    """With a texture of one colour."""
+    """With a texture of one color."""
     one = avatar()
     vertices, weights = np.asarray(one.rest_vertices), np.asarray(one.skinning_weights)[::2]
     normals = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
@@ -86,7 +86,7 @@ def dance(frames=3):
     return Motion(jnp.asarray(rotations, jnp.float32), jnp.asarray(moves, jnp.float32), 24.0)
 
 
-def test_the_outermost_gaussians_give_the_skin_its_colour():
+def test_the_outermost_gaussians_give_the_skin_its_color():
     """A red sheet over a blue one over the skin, and nothing elsewhere but the nearest."""
     one = avatar()
     sheets = Gaussians(
@@ -123,7 +123,7 @@ def test_vertices_have_the_weights_of_their_gaussians_also_after_refinement():
 
 @pytest.mark.slow
 def test_the_texture_is_what_was_on_the_body(tmp_path):
-    """Colours at the vertices as trimesh looks them up in the file are those of the place."""
+    """Colors at the vertices as trimesh looks them up in the file are those of the place."""
     write_mesh_glb(tmp_path / "a.glb", avatar(), textured())
     read = trimesh.load(tmp_path / "a.glb", process=False).geometry["body"]
     np.testing.assert_allclose(read.vertices, textured().vertices, atol=1e-6)

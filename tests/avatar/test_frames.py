@@ -173,7 +173,7 @@ def test_the_a_pose_lowers_the_arms():
         frames.a_pose_of(replace(avatar, joint_names=("pelvis", "a", "right_shoulder")))
 
 
-# Frames and colours ------------------------------------------------------------------------------------------------------
+# Frames and colors ------------------------------------------------------------------------------------------------------
 
 
 def walk(count=24, fps=24.0):
@@ -211,7 +211,7 @@ def test_times_outside_of_the_motion_are_named(times):
 
 
 def test_what_is_behind_the_person():
-    """A colour shows through; without one the image has straight alpha, which gives the same over that colour."""
+    """A color shows through; without one the image has straight alpha, which gives the same over that color."""
     rng = np.random.default_rng(0)
     alpha = np.concatenate([[0.0, 1.0], rng.random(10)]).reshape(3, 4).astype(np.float32)
     own = rng.random((3, 4, 3)).astype(np.float32)
@@ -258,7 +258,7 @@ def test_a_shot_that_cannot_be_taken_is_named(message):
     assert str(error.value).startswith(message) and "expected" in str(error.value)
 
 
-def test_colours_have_names_and_numbers():
+def test_colors_have_names_and_numbers():
     assert (
         Shot().color() == (1, 1, 1) == Shot(background="#ffffff").color() == Shot(background="rgb(255,255,255)").color()
     )

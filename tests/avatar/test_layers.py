@@ -90,7 +90,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_drawn(tmp_path):
         layers.ExrLayers(("rgba", "depth")).check()
 
 
-def test_exr_colours_are_premultiplied(tmp_path, monkeypatch):
+def test_exr_colors_are_premultiplied(tmp_path, monkeypatch):
     """A compositing program shows what was rendered when it adds (1 - alpha) times the background."""
     avatar, shot = two_balls(1), Shot(width=3, height=1, background="#336699")
     alpha = np.asarray([[0.0, 0.5, 1.0]], np.float32)

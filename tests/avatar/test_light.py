@@ -21,7 +21,7 @@ PHOTOS = jnp.asarray([[0.0, 0.4, 0.0], [0.3, 0.0, 0.1], [0.0, 0.0, 0.0]])
 """Axis-angle of the joints in the photos; the balls' own joints turn them about their centres."""
 TURNED = BodyPose(jnp.asarray([[0.0, 2.0, 0.0], [0.0, 0.0, 1.5], [0.0, 0.0, 0.0]]), jnp.zeros(3))
 ESTIMATED = 0.01
-"""Of colours up to 1; measured 0.003: the ridge, and dyes that meet on one ball."""
+"""Of colors up to 1; measured 0.003: the ridge, and dyes that meet on one ball."""
 ROUNDING = 2e-6
 
 
@@ -39,7 +39,7 @@ def normals_in(avatar, pose):
 
 
 def lit(avatar, albedo, pose):
-    """The avatar with the colours that its albedo has in the sun."""
+    """The avatar with the colors that its albedo has in the sun."""
     colors = albedo * jnp.exp(light_terms(normals_in(avatar, pose)) @ SUN)[:, None]
     return replace(avatar, gaussians=replace(avatar.gaussians, colors=colors))
 
@@ -66,7 +66,7 @@ def test_turned_parts_are_lit_from_where_they_were(person):
     np.testing.assert_allclose(animate(avatar, TURNED).colors, skin(avatar, TURNED).colors, atol=ROUNDING)
 
 
-def test_in_the_pose_of_the_photos_colours_stay(person):
+def test_in_the_pose_of_the_photos_colors_stay(person):
     avatar, _ = person
     posed = skin(avatar, BodyPose(PHOTOS, jnp.zeros(3)))
     np.testing.assert_allclose(posed.colors, avatar.gaussians.colors, atol=ROUNDING)
@@ -79,7 +79,7 @@ def test_padding_is_not_a_photo(person):
     np.testing.assert_allclose(with_light(avatar, views).light.shading, avatar.light.shading, atol=ROUNDING)
 
 
-def test_colours_have_the_mean_light_of_photos_in_several_poses(person):
+def test_colors_have_the_mean_light_of_photos_in_several_poses(person):
     avatar, _ = person
     both, other = in_pose(PHOTOS, 2), TURNED.rotations
     both = replace(both, rotations=both.rotations.at[1].set(other))
@@ -109,7 +109,7 @@ def test_what_says_nothing_about_the_light_gives_finite_numbers(change):
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(light))
 
 
-def test_colours_stay_in_range_and_have_gradients():
+def test_colors_stay_in_range_and_have_gradients():
     normals = jnp.tile(jnp.asarray([[0.0, 0.0, 1.0]]), (3, 1))
     light = Light(jnp.zeros(8), normals, jnp.asarray([-9.0, 9.0, 0.0]))
     colors = jnp.asarray([[0.9, 0.3, 0.0], [0.5, 0.5, 0.5], [1.2, 0.1, 0.1]])

@@ -46,7 +46,7 @@ def body():
 
 @pytest.fixture(scope="module")
 def network():
-    config = tiny().with_execution(token_capacity=48)
+    config = tiny().with_runtime(token_capacity=48)
     return init_humangs(jax.random.key(0), config), config
 
 
@@ -258,7 +258,7 @@ def test_people_who_lie_before_upright_cameras_are_left_lying(body):
 
 
 def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
-    """The masks say where the person is; the pixel at which a camera shows a point has the same colour before and after."""
+    """The masks say where the person is; the pixel at which a camera shows a point has the same color before and after."""
     from humangs_jax.geometry.camera import project
 
     photos = capture(body, 48, 36)
@@ -285,12 +285,12 @@ def test_photos_cut_to_the_person_keep_what_a_pixel_shows(body):
 
 def test_bodies_of_fewer_vertices_have_wider_gaussians(body):
     config = tiny().with_conventions(body_vertices=400, longest_edge=0.2)
-    usual, fewer = gaussian_body(body, config), gaussian_body(body, config.with_execution(body_vertices=200))
+    usual, fewer = gaussian_body(body, config), gaussian_body(body, config.with_runtime(body_vertices=200))
     assert len(fewer.template) < 0.7 * len(usual.template) and usual.spacing is None
     np.testing.assert_allclose(fewer.spacing, np.sqrt(len(usual.template) / len(fewer.template)), rtol=1e-6)
-    assert gaussian_body(body, config.with_execution(body_vertices=900)).spacing is None  # no fewer than usual
+    assert gaussian_body(body, config.with_runtime(body_vertices=900)).spacing is None  # no fewer than usual
     with pytest.raises(ValueError, match="body_vertices asks for fewer vertices, longest_edge for more"):
-        gaussian_body(body, config.with_execution(body_vertices=200, longest_edge=0.1))
+        gaussian_body(body, config.with_runtime(body_vertices=200, longest_edge=0.1))
 
 
 def test_a_body_that_was_read_twice_is_remeshed_once(body):
@@ -304,10 +304,10 @@ def test_a_body_that_was_read_twice_is_remeshed_once(body):
 
 
 def test_the_size_of_the_photos_is_a_choice_of_execution():
-    config = tiny().with_execution(image_size=64)
+    config = tiny().with_runtime(image_size=64)
     assert (tiny().image_size, config.image_size, config.conventions.image_size) == (32, 64, 32)
     with pytest.raises(ValueError, match="image_size 33 is not a multiple of patch_size"):
-        tiny().with_execution(image_size=33)
+        tiny().with_runtime(image_size=33)
 
 
 @pytest.mark.parametrize(
@@ -344,7 +344,7 @@ def test_the_token_capacity_follows_the_photos(body, network):
     views = standardize(photos, SIZE)
     _, dropped = jax.jit(reconstruct_views, static_argnames="config")(variables, config, body, views)
     assert int(dropped) == 4 * 16 - 48
-    roomy = config.with_execution(token_capacity=64)
+    roomy = config.with_runtime(token_capacity=64)
     expected, none_dropped = jax.jit(reconstruct_views, static_argnames="config")(variables, roomy, body, views)
     assert int(none_dropped) == 0
     avatar = reconstruct(variables, config, photos)
@@ -388,7 +388,7 @@ def test_the_body_is_decimated_to_what_the_weights_want(body, network):
     variables, config = network
     avatar = reconstruct(
         variables,
-        config.with_conventions(body_vertices=300).with_execution(token_capacity=64),
+        config.with_conventions(body_vertices=300).with_runtime(token_capacity=64),
         capture(body, SIZE, SIZE),
     )
     per_vertex = config.architecture.decoder.gaussians_per_vertex
@@ -427,7 +427,7 @@ def test_a_batch_of_people_with_different_numbers_of_views(body, network):
 @pytest.mark.slow
 def test_programs_are_compiled_once_per_bucket(body, network):
     variables, config = network
-    config = config.with_execution(tokens="all")
+    config = config.with_runtime(tokens="all")
     before = _assemble_compiled._cache_size()
     for views in (17, 18, 19):
         reconstruct(variables, config, capture_of(body, 0, views))
@@ -449,10 +449,10 @@ def test_what_cannot_be_one_batch_is_named(body, network):
 def test_stacked_captures_are_a_batch_for_vmap(body, network):
     """The line of the README gives what `reconstruct_batch` gives, bit by bit: it is the same program."""
     variables, config = network
-    config = config.with_conventions(body_vertices=300, light=True).with_execution(token_capacity=0)
+    config = config.with_conventions(body_vertices=300, light=True).with_runtime(token_capacity=0)
     captures = [capture_of(body, seed, views) for seed, views in enumerate((2, 1))]
     made, views, fitted = stack_captures(config, captures)
-    assert len(made.template) == 300 and fitted.execution.token_capacity > 0 and views.images.shape[:2] == (2, 2)
+    assert len(made.template) == 300 and fitted.runtime.token_capacity > 0 and views.images.shape[:2] == (2, 2)
     avatars, dropped = jax.vmap(reconstruct_views, in_axes=(None, None, None, 0))(variables, fitted, made, views)
     assert len(avatars) == 2 and dropped.tolist() == [0, 0]
     expected = reconstruct_batch(variables, config, captures)
@@ -476,7 +476,7 @@ def test_views_and_bodies_of_another_configuration_are_refused(body, network):
     with pytest.raises(
         ValueError, match=r"photos of 32 x 32, config wants 64 x 64; body, views, config = stack_captures"
     ):
-        reconstruct_views(variables, config.with_execution(image_size=64), made, views)
+        reconstruct_views(variables, config.with_runtime(image_size=64), made, views)
     with pytest.raises(ValueError, match=r"views\.images: expected shape \(v, h, w, 3\), got \(1, 2, 32, 32, 3\)"):
         reconstruct_views(variables, config, made, jax.tree.map(lambda x: x[None], views))
 

@@ -10,13 +10,13 @@ from humangs_jax.avatar.video import check_video, write_video
 from humangs_jax.io.images import read_image
 
 H264_ERROR = 0.02
-"""Mean absolute difference after compression of a smooth image; a wrong colour matrix gives 0.03 and more."""
+"""Mean absolute difference after compression of a smooth image; a wrong color matrix gives 0.03 and more."""
 PALETTE_ERROR = 0.02
-"""256 colours for all frames."""
+"""256 colors for all frames."""
 
 
 def moving_square(count, height=48, width=64):
-    """A smooth coloured background, a saturated square that moves."""
+    """A smooth colored background, a saturated square that moves."""
     y, x = np.mgrid[:height, :width]
     frames = np.stack([np.stack([x / width, y / height, np.full(x.shape, 0.5)], -1) for _ in range(count)])
     for i in range(count):
@@ -46,18 +46,18 @@ def test_frames_come_back(tmp_path, name):
     back = read_back(tmp_path / name)
     assert back.shape == frames.shape
     assert np.abs(back - frames).mean() < (PALETTE_ERROR if name.endswith("gif") else H264_ERROR)
-    red = back[5, 12:20, 14:22].mean((0, 1))  # inside the square: the colours of the matrix that the file names
+    red = back[5, 12:20, 14:22].mean((0, 1))  # inside the square: the colors of the matrix that the file names
     np.testing.assert_allclose(red, [0.9, 0.1, 0.1], atol=0.03)
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
 def test_webm_and_png_files_are_transparent(tmp_path):
-    """Straight alpha: colours where it is, and none beside it, whatever lies there."""
-    colours = moving_square(6)
-    alpha = np.zeros((*colours.shape[:3], 1))
+    """Straight alpha: colors where it is, and none beside it, whatever lies there."""
+    colors = moving_square(6)
+    alpha = np.zeros((*colors.shape[:3], 1))
     alpha[:, 10:40, 10:50] = 0.5
     alpha[:, 20:30, 20:40] = 1
-    frames = np.concatenate([colours, alpha], axis=-1)
+    frames = np.concatenate([colors, alpha], axis=-1)
     write_video(tmp_path / "a.webm", frames, 24)
     decode = ("-c:v", "libvpx-vp9", "-i", tmp_path / "a.webm", "-f", "rawvideo", "-pix_fmt", "rgba", "-")
     back = np.frombuffer(ffmpeg("-v", "error", *decode).stdout, np.uint8).reshape(6, 48, 64, 4) / 255.0
@@ -160,7 +160,7 @@ def test_gif_background_does_not_flicker(tmp_path):
 
 @pytest.mark.parametrize("background", [1.0, 0.0, 0.37])
 def test_gif_background_is_exact(tmp_path, background):
-    """Median cut takes the mean of its boxes: white became 252 beside a person of many colours."""
+    """Median cut takes the mean of its boxes: white became 252 beside a person of many colors."""
     from PIL import Image
 
     frames = np.full((4, 48, 64, 3), background)

@@ -19,10 +19,10 @@ def test_ancestors_are_one_two_four_joints_up_and_end_beyond_the_root():
     above = lambda j, steps: (
         j if j == count or not steps else above(PARENTS[j] if PARENTS[j] >= 0 else count, steps - 1)
     )
-    rounds = skinning.ancestors(PARENTS)
-    for i, up in enumerate(rounds):
+    iterations = skinning.ancestors(PARENTS)
+    for i, up in enumerate(iterations):
         assert list(up) == [above(j, 2**i) for j in range(count)]
-    assert all(above(j, 2 ** len(rounds)) == count for j in range(count))
+    assert all(above(j, 2 ** len(iterations)) == count for j in range(count))
 
 
 @pytest.mark.parametrize("parents", [(0, 0), (-1, -1), (-1, 2, 1), (-1, 7), (-1, -2), (1, 2, 0)])

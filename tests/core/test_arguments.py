@@ -15,7 +15,7 @@ from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.configuration import Presets, check_fields
 from humangs_jax.core.pytree import replace
 from humangs_jax.geometry.camera import intrinsics_from_fov, stack_cameras
-from humangs_jax.network.execution import Execution
+from humangs_jax.network.runtime import Runtime
 
 COUNT = 7
 GAUSSIANS = hg.Gaussians(
@@ -61,12 +61,12 @@ WRONG = {
         r"it is a field of SplatConfig, config=SplatConfig\(tile",
     ),
     "a field of refinement": (
-        lambda: hg.refine(AVATAR, CAPTURE, rounds=10),
-        r"^refine\(avatar, capture, ...\): no argument 'rounds': it is a field of RefineConfig, config=RefineConfig",
+        lambda: hg.refine(AVATAR, CAPTURE, iterations=10),
+        r"^refine\(avatar, capture, ...\): no argument 'iterations': it is a field of RefineConfig, config=RefineConfig",
     ),
     "an unknown name": (
-        lambda: hg.render(GAUSSIANS, CAMERA, colour=1),
-        "no argument 'colour'; its arguments are gaussians, ",
+        lambda: hg.render(GAUSSIANS, CAMERA, color=1),
+        "no argument 'color'; its arguments are gaussians, ",
     ),
     "reference": (lambda: hg.render_reference(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar"),
     "buffers": (lambda: hg.plan_buffers(AVATAR, CAMERA), "gaussians: expected Gaussians, got Avatar"),
@@ -96,7 +96,7 @@ WRONG = {
         lambda: hg.train(CONFIG, None, [], "x"),
         "config: expected TrainConfig, got HumanGSConfig",
     ),
-    "fewer colours": (
+    "fewer colors": (
         lambda: hg.render(cut("colors", 3), CAMERA),
         r"gaussians.colors: expected shape \(7, 3\), got \(3, 3\)",
     ),
@@ -113,7 +113,7 @@ WRONG = {
         lambda: hg.skin(replace(AVATAR, skinning_weights=jnp.ones((COUNT, 5))), POSE),
         r"avatar.rest_joints: expected shape \(5, 3\), got \(2, 3\)",
     ),
-    "a colour": (lambda: hg.render(GAUSSIANS, CAMERA, background="blak"), "background 'blak': expected a colour"),
+    "a color": (lambda: hg.render(GAUSSIANS, CAMERA, background="blak"), "background 'blak': expected a color"),
     "two numbers": (
         lambda: hg.render(GAUSSIANS, CAMERA, background=(0, 0)),
         r"background: expected 3 numbers .* got \(0, 0\)",
@@ -148,8 +148,8 @@ def test_wrong_arguments_are_named(name):
     ("config", "change", "words"),
     [
         (hg.Settings(), {"splat": "fst"}, "Settings: splat: expected one of 'as_trained', .*, got 'fst'"),
-        (Execution(), {"attention": "flash"}, "Execution: attention: expected one of 'auto', 'xla', "),
-        (Execution(), {"crop": "yes"}, "Execution: crop: expected bool, got 'yes'"),
+        (Runtime(), {"attention": "flash"}, "Runtime: attention: expected one of 'auto', 'xla', "),
+        (Runtime(), {"crop": "yes"}, "Runtime: crop: expected bool, got 'yes'"),
         (hg.SplatConfig(), {"tile_size": 8.0}, "SplatConfig: tile_size: expected int, got 8.0"),
         (hg.SplatConfig(), {"matmul_precision": "float16"}, "matmul_precision: expected one of 'float32', 'bfloat16'"),
         (hg.RefineConfig(), {"steps": "10"}, "RefineConfig: steps: expected one of int, None, got '10'"),
@@ -158,7 +158,7 @@ def test_wrong_arguments_are_named(name):
             {"tokens": "front"},
             "Conventions: tokens: expected one of 'all', 'foreground', got 'front'",
         ),
-        (CONFIG, {"execution": "fast"}, "HumanGSConfig: execution: expected Execution, got 'fast'"),
+        (CONFIG, {"runtime": "fast"}, "HumanGSConfig: runtime: expected Runtime, got 'fast'"),
     ],
 )
 def test_wrong_fields_of_configurations_are_named(config, change, words):

@@ -11,7 +11,7 @@ import pytest
 import experiments.systems  # noqa: F401
 from humangs_jax.apps import settings, tune
 from humangs_jax.core.configuration import _PARTS, Range, _ranges, config_from_json, config_to_json, configuration, vary
-from humangs_jax.network.execution import Execution
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.people.on_the_fly import OnTheFlyConfig
 from humangs_jax.training import config
 
@@ -98,15 +98,15 @@ def test_a_file_names_the_path_of_the_field():
             config_from_json(Fit, text)
         assert str(caught.value).startswith(said)
     nested = json.loads(config_to_json(settings.PRESETS["best"]))
-    nested["execution"]["attention_chunk"] = 0
-    with pytest.raises(ValueError, match=r"config\.execution\.attention_chunk 0: expected 1 to 65,536"):
+    nested["runtime"]["attention_chunk"] = 0
+    with pytest.raises(ValueError, match=r"config\.runtime\.attention_chunk 0: expected 1 to 65,536"):
         config_from_json(settings.Settings, json.dumps(nested))
 
 
 def test_an_execution_is_checked_however_it_is_made():
     for changes in ({"image_size": 10**6}, {"image_size": 0}, {"attention_chunk": 0}, {"token_capacity": -5}):
-        with pytest.raises(ValueError, match="Execution"):
-            Execution(**changes)
+        with pytest.raises(ValueError, match="Runtime"):
+            Runtime(**changes)
 
 
 HOSTILE = (
@@ -160,9 +160,9 @@ def test_any_value_in_any_field_is_read_or_refused_in_one_line(whole):
 
 def test_fields_are_varied_by_their_paths():
     run = config.PRESETS["tiny"]()
-    varied = vary(run, {"model.execution.crop": not run.model.execution.crop, "loss.squared": 0.25})
-    assert varied.loss.squared == 0.25 and varied.model.execution.crop != run.model.execution.crop
-    assert vary(varied, {"model.execution.crop": run.model.execution.crop, "loss.squared": run.loss.squared}) == run
+    varied = vary(run, {"model.runtime.crop": not run.model.runtime.crop, "loss.squared": 0.25})
+    assert varied.loss.squared == 0.25 and varied.model.runtime.crop != run.model.runtime.crop
+    assert vary(varied, {"model.runtime.crop": run.model.runtime.crop, "loss.squared": run.loss.squared}) == run
     with pytest.raises(ValueError, match=r"loss\.squard: LossConfig has no field 'squard'; its fields are \['squared'"):
         vary(run, {"loss.squard": 1.0})
     with pytest.raises(ValueError, match=r"steps\.a: int has no field 'a'"):

@@ -542,7 +542,7 @@ def test_masks_that_are_likely_wrong_are_named(rig, tmp_path, mask, warning):
         ),
         (PERSON // 2, r"a\.png: values: the largest is 127 of 255"),
         ((PERSON > 0).astype(np.uint16) * 255, r"a\.png: values: the largest is 0.992 of 255"),
-        (np.dstack([PERSON, np.roll(PERSON, 4, axis=0), 0 * PERSON]), r"a\.png: 3 colours: which is the person\?"),
+        (np.dstack([PERSON, np.roll(PERSON, 4, axis=0), 0 * PERSON]), r"a\.png: 3 colors: which is the person\?"),
         (PERSON[:, :10], r"a\.png: size: 10 x 48, but its photo has 64 x 48"),
         (0 * PERSON, r"a\.png: mask: empty, as are all of them"),
     ],

@@ -158,22 +158,22 @@ def test_alpha_is_the_mask_and_goes_onto_white(folder):
     np.testing.assert_allclose(capture.images[0], pixels[..., :3] / 255 * alpha + 1 - alpha, atol=1e-6)
 
 
-def deep_png(pixels, colour_type):
+def deep_png(pixels, color_type):
     def chunk(name, data):
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
     rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in pixels)
-    header = struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], 16, colour_type, 0, 0, 0)
+    header = struct.pack(">IIBBBBB", pixels.shape[1], pixels.shape[0], 16, color_type, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
-@pytest.mark.parametrize(("channels", "colour_type"), [(1, 0), (3, 2), (4, 6), (2, 4)])
-def test_sixteen_bit_png_keeps_every_bit(tmp_path, channels, colour_type):
+@pytest.mark.parametrize(("channels", "color_type"), [(1, 0), (3, 2), (4, 6), (2, 4)])
+def test_sixteen_bit_png_keeps_every_bit(tmp_path, channels, color_type):
     pixels = np.random.default_rng(1).integers(0, 65536, (7, 9, channels), np.uint16)
-    (tmp_path / "deep.png").write_bytes(deep_png(pixels, colour_type))
-    colours, alpha = read_image(tmp_path / "deep.png")
+    (tmp_path / "deep.png").write_bytes(deep_png(pixels, color_type))
+    colors, alpha = read_image(tmp_path / "deep.png")
     expected = pixels.astype(np.float32) / np.float32(65535)
-    np.testing.assert_array_equal(colours, np.broadcast_to(expected[..., : 3 if channels > 2 else 1], (7, 9, 3)))
+    np.testing.assert_array_equal(colors, np.broadcast_to(expected[..., : 3 if channels > 2 else 1], (7, 9, 3)))
     if channels in (2, 4):
         np.testing.assert_array_equal(alpha, expected[..., -1])
     else:
@@ -187,10 +187,10 @@ def test_every_common_image_mode_is_read(tmp_path, mode):
     image = Image.fromarray(np.random.default_rng(2).integers(0, 256, (8, 9, 3), np.uint8)).convert(mode)
     suffix = "jpg" if mode == "CMYK" else "png"
     image.save(tmp_path / f"x.{suffix}")
-    colours, alpha = read_image(tmp_path / f"x.{suffix}")
-    assert colours.shape == (8, 9, 3) and (alpha is not None) == mode.endswith("A")
+    colors, alpha = read_image(tmp_path / f"x.{suffix}")
+    assert colors.shape == (8, 9, 3) and (alpha is not None) == mode.endswith("A")
     if mode != "CMYK":  # JPEG is lossy
-        np.testing.assert_allclose(colours, np.asarray(image.convert("RGB")) / 255, atol=1e-6)
+        np.testing.assert_allclose(colors, np.asarray(image.convert("RGB")) / 255, atol=1e-6)
 
 
 def test_frame_may_be_left_out_for_a_single_pose(folder):

@@ -23,7 +23,7 @@ POINTS = 4000
 
 
 def skin(rng, count=4, noise=0.05):
-    """Colours of common points in photos of equal exposure."""
+    """Colors of common points in photos of equal exposure."""
     own = rng.uniform(0.2, 0.7, (1, POINTS, 3))
     return own * np.exp(noise * rng.normal(size=(count, POINTS, 3)))
 

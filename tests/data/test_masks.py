@@ -14,10 +14,10 @@ from humangs_jax.data.capture import capture_from_arrays, load_capture
 from humangs_jax.data.masks import (
     PERSON_HEIGHT,
     STEP,
+    boundary_moves,
     box_of,
     fit_mask,
     masks_at_edges,
-    outline_moves,
     person_box,
     signed_distance,
 )
@@ -27,8 +27,8 @@ HEIGHT, WIDTH = 240, 160
 FOUND = 0.5
 """Of a step more than that of the search, in pixels of a person `PERSON_HEIGHT` high."""
 LEFT = 0.7
-"""Mean distance of an outline from the true one, in the same pixels; measured up to 0.4. The search has steps of 0.5; outlines
-with corners do not grow and shrink by a distance."""
+"""Mean distance of a silhouette from the true one, in the same pixels; measured up to 0.4. The search has steps of 0.5;
+silhouettes with corners do not grow and shrink by a distance."""
 
 
 def figure(scale=1):
@@ -52,13 +52,13 @@ def photo_of(mask, seed=0, background=None):
 
 
 def grown(mask, pixels):
-    """The mask with an outline that lies that many pixels further out."""
+    """The mask with a silhouette that lies that many pixels further out."""
     return np.clip(signed_distance(mask) + pixels + 0.5, 0, 1).astype(np.float32)
 
 
 @settings(max_examples=12, deadline=None)
 @given(st.floats(1.0, 3.5), st.booleans(), st.integers(0, 1000))
-def test_an_outline_that_is_off_is_moved_back(pixels, larger, seed):
+def test_an_boundary_that_is_off_is_moved_back(pixels, larger, seed):
     mask = figure()
     wrong = grown(mask, pixels if larger else -pixels)
     fitted, excess = fit_mask(photo_of(mask, seed), wrong)
@@ -85,7 +85,7 @@ def test_parts_are_moved_by_their_own_error():
 
 
 def test_one_side_alone_stays():
-    """A side that is too large cannot be told from one whose rim has the colour of the wall."""
+    """A side that is too large cannot be told from one whose rim has the color of the wall."""
     mask = figure()
     wrong = np.where(np.arange(HEIGHT)[:, None] < 120, grown(mask, 3.0), mask)
     fitted, excess = fit_mask(photo_of(mask), wrong)
@@ -94,7 +94,7 @@ def test_one_side_alone_stays():
 
 @pytest.fixture(scope="module")
 def person():
-    """The demo's person in four views: colours without the background, masks."""
+    """The demo's person in four views: colors without the background, masks."""
     capture = load_capture("demo_capture").resized(256)
     masks = capture.masks
     return np.clip(1 + (capture.images - 1) / np.maximum(masks[..., None], 1e-3), 0, 1), masks
@@ -103,13 +103,13 @@ def person():
 WALL = np.asarray([0.85, 0.83, 0.8])
 
 
-def before_a_wall(colours, masks, rim=0.0, colour=WALL, where=True):
-    """Photos with a noisy wall, and a stripe of a colour along the rim, that many pixels wide."""
+def before_a_wall(colors, masks, rim=0.0, color=WALL, where=True):
+    """Photos with a noisy wall, and a stripe of a color along the rim, that many pixels wide."""
     photos = []
-    for i, (image, mask) in enumerate(zip(colours, masks, strict=True)):
+    for i, (image, mask) in enumerate(zip(colors, masks, strict=True)):
         wall = WALL + 0.01 * np.random.default_rng(i).normal(size=image.shape)
         stripe = (np.clip(rim - signed_distance(mask) + 0.5, 0, 1) * where * (rim > 0))[..., None]
-        lit = stripe * colour + (1 - stripe) * image
+        lit = stripe * color + (1 - stripe) * image
         photos.append((np.rint(255 * (mask[..., None] * lit + (1 - mask[..., None]) * wall)) / 255).astype(np.float32))
     return photos
 
@@ -118,26 +118,26 @@ def before_a_wall(colours, masks, rim=0.0, colour=WALL, where=True):
 @pytest.mark.parametrize("kind", ["rim light", "piping", "on one side"])
 def test_exact_masks_stay_where_the_rim_looks_like_the_wall(person, kind, rim):
     """A stripe that cannot be told from the wall is told by the fingers, which a mask that is too large would not have."""
-    colours, masks = person
+    colors, masks = person
     side = np.arange(masks.shape[2]) < np.median(np.nonzero(masks > 0.5)[2])
-    how = {"rim light": {"colour": 0.97}, "piping": {}, "on one side": {"where": side}}[kind]
-    fitted = masks_at_edges(before_a_wall(colours, masks, rim, **how), list(masks))
+    how = {"rim light": {"color": 0.97}, "piping": {}, "on one side": {"where": side}}[kind]
+    fitted = masks_at_edges(before_a_wall(colors, masks, rim, **how), list(masks))
     assert [excess for _, excess in fitted] == [0] * len(masks)
     np.testing.assert_array_equal([found for found, _ in fitted], masks)
 
 
 @pytest.mark.parametrize("pixels", [-3.0, 2.0])
 def test_masks_of_the_same_person_that_are_off_are_moved(person, pixels):
-    colours, masks = person
+    colors, masks = person
     wrong = [grown(mask, pixels) for mask in masks]
-    fitted = masks_at_edges(before_a_wall(colours, masks), wrong)
+    fitted = masks_at_edges(before_a_wall(colors, masks), wrong)
     for (found, excess), own, mask in zip(fitted, wrong, masks, strict=True):
         assert abs(excess - pixels) < FOUND + STEP
         assert np.abs(found - mask).sum() < 0.4 * np.abs(own - mask).sum()  # measured 0.1 to 0.25
 
 
 def test_a_mask_that_most_views_contradict_stays():
-    """A rim of the colour of one of the walls; masks that are off are off in most views."""
+    """A rim of the color of one of the walls; masks that are off are off in most views."""
     mask = figure()
     photos = [photo_of(mask, seed) for seed in range(4)]
     for wrong, moved in (({3}, 0), ({1, 3}, 2), ({0, 1, 2, 3}, 4)):
@@ -197,7 +197,7 @@ def test_boxes_of_a_mask_and_of_the_person_in_it():
 
 def test_moves_are_positive_inside():
     mask = figure()
-    whole, moves = outline_moves(photo_of(mask), grown(mask, 2.0), 1.0)
+    whole, moves = boundary_moves(photo_of(mask), grown(mask, 2.0), 1.0)
     assert abs(whole - 2.0) < FOUND
     assert abs(np.median(moves[(mask > 0.1) & (mask < 0.9)]) - 2.0) < FOUND
     assert np.ptp(np.flatnonzero(mask.any(axis=1))) + 1 == PERSON_HEIGHT

@@ -1,4 +1,4 @@
-"""Colours along the edge of a mask."""
+"""Colors along the edge of a mask."""
 
 import numpy as np
 import pytest

@@ -77,8 +77,8 @@ def test_bilinear_is_linear_between_pixels_and_repeats_or_ends_at_the_edge():
     points = np.asarray([[[0.5, 0.5], [2.0, 1.0], [-0.5, 0.0], [-7.0, 0.0], [1.0, 9.0]]])
     np.testing.assert_allclose(bilinear(image, points), [[2.5, 6.0, 0.0, 0.0, 5.0]])
     np.testing.assert_allclose(bilinear(image, points, outside=-1.0), [[2.5, 6.0, 0.0, -1.0, -1.0]])
-    colours = bilinear(np.stack([image, image + 1], axis=-1), points)
-    np.testing.assert_allclose(colours[..., 1] - colours[..., 0], 1.0)
+    colors = bilinear(np.stack([image, image + 1], axis=-1), points)
+    np.testing.assert_allclose(colors[..., 1] - colors[..., 0], 1.0)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, -3.0])

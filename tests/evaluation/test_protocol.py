@@ -16,7 +16,7 @@ from humangs_jax.evaluation.protocol import (
     WholeFrame,
     find_protocol,
 )
-from humangs_jax.objectives.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM
+from humangs_jax.losses.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM
 
 
 def blob(seed, height, width):

@@ -12,9 +12,9 @@ from skimage.metrics import structural_similarity
 
 from humangs_jax.evaluation import scores
 from humangs_jax.evaluation.protocol import PROTOCOLS, CentredWindow
-from humangs_jax.objectives.lpips import lpips
-from humangs_jax.objectives.metrics import outline_psnr
-from humangs_jax.objectives.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM, mean_similarity, similarity_map
+from humangs_jax.losses.lpips import lpips
+from humangs_jax.losses.metrics import boundary_psnr
+from humangs_jax.losses.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM, mean_similarity, similarity_map
 
 DECIBELS = 1e-4
 """Of a mean of some thousand float32 squares: 10 / ln 10 times their relative error of 1e-5 at most."""
@@ -108,8 +108,8 @@ def test_backgrounds_masks_and_crops_of_every_protocol():
         if name in ("giga", "lhm++"):
             ours = ours * weight + white * (1 - weight)
         pair = (ours, true)
-        assert row["psnr_foreground"] == pytest.approx(psnr(*pair, masks), abs=DECIBELS)
-        assert row["psnr_outline"] == pytest.approx(outline_psnr(*pair, masks), abs=DECIBELS)
+        assert row["psnr_fg"] == pytest.approx(psnr(*pair, masks), abs=DECIBELS)
+        assert row["psnr_boundary"] == pytest.approx(boundary_psnr(*pair, masks), abs=DECIBELS)
         if name == "ghg":
             pair = tuple(protocol.crop.cut(x, masks, 0.0) for x in pair)
         elif name == "giga":
@@ -174,12 +174,15 @@ def test_what_is_not_defined_is_none_and_says_why():
     assert bare["psnr"] > 10 and [name for name, x in bare.items() if x is not None] == ["psnr", "ssim"]
     reasons = scores.missing_reasons(protocol, {}, masks=False, alpha=False)
     assert set(reasons) == set(bare) - {"psnr", "ssim"}
-    assert "no weights of LPIPS vgg" in reasons["lpips_vgg"] and reasons["fog"] == "the true images have no masks"
+    assert (
+        "no weights of LPIPS vgg" in reasons["lpips_vgg"]
+        and reasons["semi_transparent"] == "the true images have no masks"
+    )
     assert "alpha" in scores.missing_reasons(protocol, {}, masks=True, alpha=False)["iou"]
     (nobody,) = scores.score_views(predicted, capture_from(truth, 0 * masks), PROTOCOLS["giga"])
     assert [name for name, x in nobody.items() if x is not None] == ["foreground"] and nobody["foreground"] == 0
     (small,) = scores.score_views(predicted, capture_from(truth, masks), protocol)
-    assert small["patches"] == 0 and small["patch_psnr"] is None and small["psnr_foreground"] > 0
+    assert small["patches"] == 0 and small["patch_psnr"] is None and small["psnr_fg"] > 0
     with pytest.raises(ValueError, match="needs a mask for every view"):
         list(scores.score_views(predicted, capture_from(truth), PROTOCOLS["ghg"]))
     with pytest.raises(ValueError, match=r"\(1, 39, 32, 3\), the true ones \(1, 40, 32, 3\)"):

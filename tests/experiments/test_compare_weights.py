@@ -4,7 +4,7 @@ import pytest
 
 from experiments.evaluation.compare_weights import compare, section
 
-SCORES = {"psnr": 25.0, "psnr_foreground": 18.0, "ssim": 0.9, "fog": 0.1}
+SCORES = {"psnr": 25.0, "psnr_fg": 18.0, "ssim": 0.9, "semi_transparent": 0.1}
 
 
 def result(gain=0.0, seed=3):

@@ -13,9 +13,9 @@ import pytest
 from evaluation_cases import capture_from, random_lpips
 
 from experiments.evaluation import bodies, body_cases, subjects, synthetic
+from humangs_jax.losses.lpips import lpips
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables, save_weights
-from humangs_jax.objectives.lpips import lpips
 
 SMALL = ("--held-out", "1", "--poses", "1", "--pose-views", "1", "--size", "48")
 

@@ -24,12 +24,12 @@ def scores(psnr, baseline=15.0):
     return {
         "psnr": psnr,
         "ssim": 0.9,
-        "psnr_foreground": psnr - 6,
+        "psnr_fg": psnr - 6,
         "foreground": 0.1,
         "lpips": None,
         "baseline_psnr": baseline,
         "baseline_ssim": 0.8,
-        "baseline_psnr_foreground": 9.0,
+        "baseline_psnr_fg": 9.0,
         "baseline_lpips": None,
     }
 

@@ -16,7 +16,7 @@ def queue():
 
 
 def run(psnr, photos=4, **others):
-    scores = {"psnr": psnr + 6, "psnr_mask": psnr, "ssim": 0.9, **others}
+    scores = {"psnr": psnr + 6, "psnr_fg": psnr, "ssim": 0.9, **others}
     return {
         "by_views": {str(photos): scores},
         "photos": photos,
@@ -52,7 +52,7 @@ def test_differences_inside_the_interval_of_the_seeds_are_noise(queue):
     words = [bench.verdict(difference, 0.3) for difference in (0.2, -0.3, 0.4, -0.4)]
     assert words == ["within noise", "within noise", "better", "worse"] and bench.verdict(1.0, None) == "noise unknown"
     rows |= {"pooling over all views": run(15.0), "lhm": run(12.5, photos=1), "humangs, 1 photo": run(18.0, photos=1)}
-    painted = {"1": {"psnr_mask": 8.0}, "4": {"psnr_mask": 9.7}}
+    painted = {"1": {"psnr_fg": 8.0}, "4": {"psnr_fg": 9.7}}
     text = train_all.table(rows, queue, {"validation": ["a", "b"]}, painted)
     lines = {cells[0].strip(): cells for line in text.splitlines() if (cells := line.strip("| ").split("|"))}
     assert [lines["no shells"][i].strip() for i in (5, 6, 7)] == ["humangs", "-0.20", "within noise"]

@@ -4,8 +4,8 @@ import pytest
 
 from experiments.evaluation.readme import quality, times
 
-SCORES = {"psnr": 27.44, "ssim": 0.9464, "psnr_foreground": 18.75}
-BASELINE = {"baseline_psnr": 20.67, "baseline_psnr_foreground": 11.28}
+SCORES = {"psnr": 27.44, "ssim": 0.9464, "psnr_fg": 18.75}
+BASELINE = {"baseline_psnr": 20.67, "baseline_psnr_fg": 11.28}
 STAGES = {"reconstruct": (11.63, 0.291), "animate": (2.07, 0.0341), "render_held_out": (6.87, 0.1236)}
 DEMO = {
     **SCORES,
@@ -25,7 +25,7 @@ def test_quality():
         "by_views": {"4": {task: SCORES | BASELINE for task in ("novel", "animation")}},
     }
     lengths = {seconds: {task: SCORES for task in ("novel", "animation")} for seconds in ("0", "1")}
-    means = {f"{size} 4 network, 4 rounds": lengths for size in (256, 512)}
+    means = {f"{size} 4 network, 4 iterations": lengths for size in (256, 512)}
     refined = settings | {"people": 3, "means": means}
     demo = DEMO | {"refined": SCORES | {"psnr": 29.16, "seconds": 15.2}}
     rows = quality(demo, people, refined).splitlines()[2:]

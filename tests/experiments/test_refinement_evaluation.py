@@ -15,7 +15,14 @@ TASKS = ("novel", "animation")
 
 
 def row(psnr):
-    scores = {"psnr": psnr, "ssim": 0.9, "psnr_foreground": 18.0, "foreground": 0.1, "psnr_outline": 15.0, "fog": 0.1}
+    scores = {
+        "psnr": psnr,
+        "ssim": 0.9,
+        "psnr_fg": 18.0,
+        "foreground": 0.1,
+        "psnr_boundary": 15.0,
+        "semi_transparent": 0.1,
+    }
     return {task: scores for task in TASKS}
 
 

@@ -119,8 +119,8 @@ def test_background_tokens_are_left_out_alike_by_encoder_and_reader():
     inputs = replace(inputs, foreground=inputs.foreground.at[:, :16].set(False))
     packed = config.with_conventions(tokens="foreground")
     roomy = outputs_of("", inputs, packed)
-    close(roomy, outputs_of("", inputs, packed.with_execution(token_capacity=16)))  # 2 views, 2 of 4 rows of 4 patches
-    dropped = outputs_of("", inputs, packed.with_execution(token_capacity=15))
+    close(roomy, outputs_of("", inputs, packed.with_runtime(token_capacity=16)))  # 2 views, 2 of 4 rows of 4 patches
+    dropped = outputs_of("", inputs, packed.with_runtime(token_capacity=15))
     assert np.abs(dropped.colors - roomy.colors).max() > 1e-5
 
 
@@ -167,7 +167,7 @@ def test_a_body_that_has_no_room_in_the_groups_is_refused():
 
 
 @pytest.mark.slow
-def test_a_seen_texel_has_the_colour_of_the_pixel_that_sees_it_best_and_every_mean_lies_on_a_shell():
+def test_a_seen_texel_has_the_color_of_the_pixel_that_sees_it_best_and_every_mean_lies_on_a_shell():
     config, inputs = small_system("ghg"), photos("ghg")
     textures = read({}, encode({}, inputs, config), inputs, config)
     unit, texels = subject_unit(inputs.canonical_vertices), inputs.texels

@@ -9,8 +9,8 @@ from experiments.tradeoff.points import points
 
 
 def row(name, reconstruct, frame, psnr, start="network", steps=0):
-    scores = {task: {"psnr": psnr, "ssim": 0.9, "psnr_foreground": psnr - 6} for task in report.TASKS}
-    settings = {"refine_rounds": 0, "refine_steps": steps}
+    scores = {task: {"psnr": psnr, "ssim": 0.9, "psnr_fg": psnr - 6} for task in report.TASKS}
+    settings = {"refine_iterations": 0, "refine_steps": steps}
     return {
         "name": name,
         "reconstruct": reconstruct,
@@ -46,7 +46,7 @@ def test_the_points_are_many_and_change_one_knob_each():
         changed = [
             (each.size, default.size),
             (each.settings.views, default.settings.views),
-            (each.settings.execution, default.settings.execution),
+            (each.settings.runtime, default.settings.runtime),
             (each.settings.splat, default.settings.splat),
         ]
         assert sum(a != b for a, b in changed) == 1, each

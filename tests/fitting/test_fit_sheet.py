@@ -18,7 +18,7 @@ LEFT_WRIST, RIGHT_WRIST = (COCO_17.names.index(f"{side}_wrist") for side in ("le
 
 
 def drawn(sheet, color):
-    """Pixels that are nearly of a colour, on the photos only: (row, column) each."""
+    """Pixels that are nearly of a color, on the photos only: (row, column) each."""
     return np.argwhere(np.abs(sheet - np.asarray(color)).max(-1) < 0.08)
 
 

@@ -17,14 +17,14 @@ from humangs_jax.data.keypoints.keypoints import Keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
 from humangs_jax.fitting import refine as module
 from humangs_jax.fitting.refine import refine_capture
-from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, Scene, Score, start_state, usual_config
+from humangs_jax.fitting.refine_iterations import CaptureRefineConfig, Scene, Score, start_state, usual_config
 from humangs_jax.geometry import quaternion, transform
 from humangs_jax.geometry.camera import intrinsics_from_fov, orbit, project
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 from tests.fitting.fit_people import default_body, rotations_of
 
 SIZE, VIEWS = 192, 3
-CONFIG = CaptureRefineConfig(rounds=6, points=120)
+CONFIG = CaptureRefineConfig(iterations=6, points=120)
 
 
 @functools.cache
@@ -55,7 +55,7 @@ def turned(capture, degrees, axis=(0, 1, 0)):
 
 
 @functools.cache
-def disturbed():
+def augmented():
     """Focal lengths 5 % too long, cameras turned by 2 degrees, body joints bent by 3."""
     rng = np.random.default_rng(1)
     axes = rng.normal(size=(VIEWS + 22, 3))
@@ -91,30 +91,30 @@ def keypoints(confidence=1.0):
 
 @pytest.mark.slow
 def test_silhouettes_mend_cameras_focal_length_and_pose():
-    refined = refine_capture(disturbed(), config=CONFIG)
+    refined = refine_capture(augmented(), config=CONFIG)
     report = refined.report
     assert report.kept and report.errors["silhouette_iou"].before < 0.75
     assert report.errors["silhouette_iou"].after > 0.95
-    assert aligned_error(refined.capture) < 0.5 * aligned_error(disturbed())
+    assert aligned_error(refined.capture) < 0.5 * aligned_error(augmented())
     focal = np.asarray(refined.capture.cameras.K[:, 0, 0] / truth().cameras.K[:, 0, 0])
     np.testing.assert_allclose(focal, 1.0, atol=0.025)
     assert report.moved["camera_degrees"] == pytest.approx(2.0, abs=0.5)
     before = [view.iou_before for view in report.views]
     assert np.mean(before) == pytest.approx(report.errors["silhouette_iou"].before)
-    assert report.stages[0].runs == CONFIG.rounds and report.stages[0].after <= report.stages[0].before
+    assert report.stages[0].runs == CONFIG.iterations and report.stages[0].after <= report.stages[0].before
     text = str(report)
     assert "kept: refined" in text and "focal length x 0.9" in text and "front" in text
 
 
 @pytest.mark.slow
 def test_keypoints_alone_mend_them_too_and_with_masks_both_errors_fall():
-    alone = refine_capture(dataclasses.replace(disturbed(), masks=None), keypoints=keypoints(), config=CONFIG)
+    alone = refine_capture(dataclasses.replace(augmented(), masks=None), keypoints=keypoints(), config=CONFIG)
     assert alone.report.kept and "silhouette_iou" not in alone.report.errors
     error = alone.report.errors["keypoint_error_px"]
     assert error.after < 0.2 * error.before
-    assert aligned_error(alone.capture) < 0.6 * aligned_error(disturbed())
+    assert aligned_error(alone.capture) < 0.6 * aligned_error(augmented())
     assert "no mask" in str(alone.report)
-    both = refine_capture(disturbed(), keypoints=keypoints(), config=CONFIG)
+    both = refine_capture(augmented(), keypoints=keypoints(), config=CONFIG)
     errors = both.report.errors
     assert errors["silhouette_iou"].after > 0.95 and errors["keypoint_error_px"].after < 1.0
 
@@ -131,7 +131,7 @@ def test_a_start_that_is_right_stays():
 def test_a_single_view_with_a_mask_is_enough_and_the_others_stay():
     masks = np.zeros_like(truth().masks)
     masks[0] = truth().masks[0]
-    refined = refine_capture(dataclasses.replace(disturbed(), masks=masks), config=CONFIG)
+    refined = refine_capture(dataclasses.replace(augmented(), masks=masks), config=CONFIG)
     assert refined.report.kept and refined.report.errors["silhouette_iou"].after > 0.92
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
 
@@ -140,10 +140,10 @@ def test_a_single_view_with_a_mask_is_enough_and_the_others_stay():
 def test_a_view_with_an_empty_mask_takes_no_part():
     masks = np.array(truth().masks)
     masks[1] = 0
-    refined = refine_capture(dataclasses.replace(disturbed(), masks=masks), config=CONFIG)
+    refined = refine_capture(dataclasses.replace(augmented(), masks=masks), config=CONFIG)
     assert refined.report.kept and np.isnan(refined.report.views[1].iou_after)
     assert refined.report.errors["silhouette_iou"].after > 0.93
-    moved = refined.capture.cameras.cam_from_world - disturbed().cameras.cam_from_world
+    moved = refined.capture.cameras.cam_from_world - augmented().cameras.cam_from_world
     assert np.abs(moved[1]).max() < 1e-4 < np.abs(moved[0]).max(), "nothing is known of its camera"
 
 
@@ -157,8 +157,8 @@ def test_cameras_that_look_the_other_way_are_told_and_left():
 
 
 @pytest.mark.slow  # compiles once more
-def test_one_view_is_refined_by_its_outline():
-    refined = refine_capture(disturbed().select([0]), config=CONFIG)
+def test_one_view_is_refined_by_its_boundary():
+    refined = refine_capture(augmented().select([0]), config=CONFIG)
     assert refined.report.kept and refined.report.errors["silhouette_iou"].after > 0.92
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((refined.capture.poses, refined.capture.cameras)))
 

@@ -102,7 +102,7 @@ def textured(folder, name="skin.png"):
     return folder / "ball.obj"
 
 
-def test_a_scan_has_the_colours_of_its_texture_and_is_grey_with_a_warning_without_it(tmp_path, caplog):
+def test_a_scan_has_the_colors_of_its_texture_and_is_grey_with_a_warning_without_it(tmp_path, caplog):
     red = read_mesh(textured(tmp_path), colors=True).visual.vertex_colors
     assert (red == [255, 0, 0, 255]).all() and not caplog.records
     grey = read_mesh(textured(tmp_path, "moved.png"), colors=True).visual.vertex_colors

@@ -24,7 +24,7 @@ def blocks(path, up=2):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("up", [2, 0])
-def test_images_show_the_scan_upright_and_in_its_colours(tmp_path, up):
+def test_images_show_the_scan_upright_and_in_its_colors(tmp_path, up):
     blocks(tmp_path / "scan.ply", up)
     photos = load_photos(render_scan_views(tmp_path / "scan.ply", tmp_path / "views", views=2, size=64))
     rows, columns = np.nonzero(photos.masks[0])

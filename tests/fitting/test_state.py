@@ -11,7 +11,7 @@ from humangs_jax.body.joints import JOINT_NAMES
 from humangs_jax.body.model import BodyPose, pose_body, shape_body
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.capture import Capture
-from humangs_jax.fitting.refine_rounds import CaptureRefineConfig, capture_origin, moved_capture
+from humangs_jax.fitting.refine_iterations import CaptureRefineConfig, capture_origin, moved_capture
 from humangs_jax.fitting.residuals.priors import pose_prior
 from humangs_jax.fitting.state import (
     StateStd,

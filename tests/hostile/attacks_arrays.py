@@ -160,7 +160,7 @@ for kind, change in BANKS.items():
 
 for kind, change in {
     "means of 3e38": put("means", 3e38),
-    "colours of 3e38": put("colors", 3e38),
+    "colors of 3e38": put("colors", 3e38),
     "scales of 1e30": put("scales", 1e30),
     "quaternions of 1e30": put("quats", 1e30),
     "joints a light year away": put("rest_joints", 1e16),

@@ -52,7 +52,7 @@ WAYS_OUT = {
 }
 for way, (named, prepare) in WAYS_OUT.items():
     for key, name in (("image", "outside.png"), ("mask", "mask.png"), ("body", "outside.npz")):
-        for reader in ("capture", "photos", "outline"):
+        for reader in ("capture", "photos", "boundary"):
             unread = key == "body" and reader == "photos" and "characters" in way
             case(
                 f"{key}: {way}",
@@ -66,7 +66,7 @@ for key, name, target in (
     ("mask", "l.png", "mask.png"),
     ("body", "l.npz", "outside.npz"),
 ):
-    for reader in ("capture", "photos", "outline"):
+    for reader in ("capture", "photos", "boundary"):
         case(f"{key}: a link outwards", reader, capture_that_names(key, name, linked(name, target)), item=2)
 for name in ("images/000.png", "capture.json", "", ".", "images"):
     case(f"body: {name!r}", "capture", capture_that_names("body", name), item=2)
@@ -154,12 +154,12 @@ def five_thousand_photos(folder):
         (folder / f"{i}.png").write_bytes((folder / "images" / "000.png").read_bytes())
 
 
-for reader in ("capture", "photos", "outline"):
+for reader in ("capture", "photos", "boundary"):
     case("one photo 4,000 times", reader, capture_of(4000, large_photo), item=5)
     case("one photo 100 times", reader, capture_of(100, large_photo), item=5)
     for kind, link in {"links": lambda old, new: new.symlink_to(old), "hard links": os.link}.items():
         case(f"400 {kind} to a photo", reader, capture_of(400, copies(400, link), "{}.png"), item=5)
-    if reader != "outline":  # which reads one after the other
+    if reader != "boundary":  # which reads one after the other
         case("21 white photos of 49 million pixels", reader, capture_of(21, white_photos, "{}.png"), item=5)
 case("5,000 photos", "photos", capture_of(5000, five_thousand_photos, "{}.png"), item=5)
 for frame in (2_000_000_000, 10**30, 100_000, 1000):

@@ -18,8 +18,8 @@ def chunk(name, data):
     return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
 
-def png(width, height, depth=8, colour=2, data=b"", method=b"\0\0\0", extra=b""):
-    header = struct.pack(">IIBB", width, height, depth, colour) + method
+def png(width, height, depth=8, color=2, data=b"", method=b"\0\0\0", extra=b""):
+    header = struct.pack(">IIBB", width, height, depth, color) + method
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + extra + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
@@ -120,7 +120,7 @@ def capture_with_photo(data):
 
 
 for kind in ("EPS", "13,000 x 13,000", "WEBP", "16 bits, cut"):
-    for reader in ("capture", "photos", "outline"):
+    for reader in ("capture", "photos", "boundary"):
         case(f"a photo that is {kind}", reader, capture_with_photo(PHOTOS[kind][0]), item=PHOTOS[kind][1])
 
 
@@ -135,9 +135,9 @@ def damaged(data, name):
 
 
 ROWS = zlib.compress(bytes(4 * 5))
-BY_PALETTE = png(4, 4, colour=3, data=ROWS, extra=chunk(b"PLTE", bytes(range(48))))
+BY_PALETTE = png(4, 4, color=3, data=ROWS, extra=chunk(b"PLTE", bytes(range(48))))
 DECODED = {
-    "a palette that is not there": png(4, 4, colour=3, data=ROWS),
+    "a palette that is not there": png(4, 4, color=3, data=ROWS),
     "a false checksum of the pixels": damaged(png(4, 4, data=zlib.compress(bytes(52))), b"IDAT"),
     "a false checksum of the palette": damaged(BY_PALETTE, b"PLTE"),
     "a false checksum of the end": damaged(png(4, 4, data=zlib.compress(bytes(52))), b"IEND"),

@@ -391,7 +391,7 @@ STRUCTURES = {
         ("json", "configuration", "transforms", "opencv json", "openpose", "coco", "coco annotations"), mutated_json
     ),
     **dict.fromkeys(
-        ("mmpose", "lhm", "joints json", "manifest", "capture", "photos", "outline", "import"), mutated_json
+        ("mmpose", "lhm", "joints json", "manifest", "capture", "photos", "boundary", "import"), mutated_json
     ),
     **dict.fromkeys(
         ("avatarrex", "scene list", "evaluation", "preprocessed set", "preprocessed scene", "skipped subject"),

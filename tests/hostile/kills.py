@@ -68,9 +68,9 @@ def kill(command: Command, folder: Path, inputs: Path, count: int, seed: int = 0
     for moment in moments(undisturbed.changes, count, random.Random(f"{command.name} {seed}")):
         shutil.rmtree(place)
         shutil.copytree(kept, place)
-        disturbed = writers.run(command, place, inputs, 2, moment)
-        found = [] if disturbed.code in (None, 0) else [f"exit status {disturbed.code}: {disturbed.errors[-500:]}"]
-        killed += disturbed.code is None
+        augmented = writers.run(command, place, inputs, 2, moment)
+        found = [] if augmented.code in (None, 0) else [f"exit status {augmented.code}: {augmented.errors[-500:]}"]
+        killed += augmented.code is None
         left += bool(writers.snapshot(place)[1])
         found += writers.half_written(command, place, before, expected)
         found += writers.next_run(command, place, inputs, expected)
@@ -96,13 +96,13 @@ def interrupt(command: Command, folder: Path, inputs: Path, count: int, seed: in
         shutil.rmtree(place)
         shutil.copytree(kept, place)
         moment = Moment(None, generator.uniform(0, last), signal.SIGINT)
-        disturbed = writers.run(command, place, inputs, 2, moment)
+        augmented = writers.run(command, place, inputs, 2, moment)
         found = writers.half_written(command, place, before, expected)
         found += [f"{name}: left behind" for name in writers.snapshot(place)[1]]
-        lines = writers.error_lines(disturbed.errors)
-        if disturbed.code not in codes or (disturbed.code and lines[-1:] != ["humangs: interrupted"]):
-            found.append(f"exit status {disturbed.code}: {disturbed.errors[-500:]}")
-        codes[disturbed.code] = codes.get(disturbed.code, 0) + 1
+        lines = writers.error_lines(augmented.errors)
+        if augmented.code not in codes or (augmented.code and lines[-1:] != ["humangs: interrupted"]):
+            found.append(f"exit status {augmented.code}: {augmented.errors[-500:]}")
+        codes[augmented.code] = codes.get(augmented.code, 0) + 1
         faults += [f"{moment.seconds:.3f} s: {fault}" for fault in found]
     faults += writers.next_run(command, place, inputs, expected)
     seconds = round(time.monotonic() - began)

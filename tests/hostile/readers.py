@@ -38,7 +38,7 @@ from humangs_jax.data.datasets.scene_list import read_evaluation
 from humangs_jax.data.datasets.thuman import open_thuman
 from humangs_jax.data.keypoints.reading import read_keypoints
 from humangs_jax.data.keypoints.sets import COCO_17
-from humangs_jax.data.loading.captures import read_outline
+from humangs_jax.data.loading.captures import read_boundary
 from humangs_jax.data.motion import load_motion
 from humangs_jax.data.motion.skeleton import shipped_joints
 from humangs_jax.data.photos import load_photos
@@ -54,9 +54,9 @@ from humangs_jax.io.reading import reading
 from humangs_jax.io.restricted_pickle import as_array, read_pickle
 from humangs_jax.io.tensor_file import read_tensors
 from humangs_jax.io.text import read_json
+from humangs_jax.losses.loss_networks import load_vgg19
 from humangs_jax.network.conversion import load_checkpoint
 from humangs_jax.network.weights import expected_variables, load_weights, save_weights
-from humangs_jax.objectives.loss_networks import load_vgg19
 from humangs_jax.people.bank import load_bank
 from humangs_jax.people.seeds import GENERATOR_VERSION
 from humangs_jax.people.writer import begin_set, read_manifest
@@ -177,7 +177,7 @@ READERS = {
     "settings": load_settings,
     "capture": read_capture,
     "photos": load_photos,
-    "outline": lambda path: read_outline(path, tiny_body()),
+    "boundary": lambda path: read_boundary(path, tiny_body()),
     "transforms": read_cameras,
     "opencv yaml": read_cameras,
     "opencv json": read_cameras,
@@ -586,7 +586,7 @@ SEEDS = {
     "settings": saved("settings.json", lambda path: save_settings(path, PRESETS["best"])),
     "capture": write_capture,
     "photos": write_capture,
-    "outline": write_capture,
+    "boundary": write_capture,
     "transforms": text("transforms.json", lambda: json.dumps(transforms())),
     "opencv yaml": text("cameras.yml", opencv_yaml),
     "opencv json": text(

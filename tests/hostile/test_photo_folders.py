@@ -60,7 +60,7 @@ def one(change, name="odd.png", **options):
     return make
 
 
-def beside(scales, recoloured=False):
+def beside(scales, recolored=False):
     """People side by side, each of a share of the height."""
 
     def make(folder):
@@ -69,7 +69,7 @@ def beside(scales, recoloured=False):
             for k, scale in enumerate(scales):
                 size = round(384 * scale)
                 person, mask = view(i, size)
-                person = person[..., ::-1] if recoloured and k else person
+                person = person[..., ::-1] if recolored and k else person
                 part = photo[384 - size :, 384 * k : 384 * k + size]
                 part += mask[..., None] * (person - part)
             save(folder, f"both{i}.png", photo)

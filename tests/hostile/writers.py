@@ -399,7 +399,7 @@ def stand_ins(variant):
         ("fitting.scan_views", "_draw", mesh_views),
         ("network.conversion", "load_checkpoint", converted),
         ("network.conversion", "describe", lambda _: "a network"),
-        ("objectives.loss_networks", "collect_loss_networks", lambda _: ({"x": np.ones(999)}, ["VGG-19"])),
+        ("losses.loss_networks", "collect_loss_networks", lambda _: ({"x": np.ones(999)}, ["VGG-19"])),
         ("people.writer", "make_subject", person),
         ("people.writer", "sample_pose", posed),
         ("people.writer", "capture_views", views_of),

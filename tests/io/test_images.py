@@ -112,10 +112,10 @@ def test_photos_without_exif_and_with_a_damaged_one_have_no_focal_length(tmp_pat
 
 def test_heic_is_read_upright(tmp_path):
     pytest.importorskip("pi_heif")
-    colours, alpha = read_image(HEIC)
-    assert is_heic(HEIC) and colours.shape == (24, 32, 3) and alpha is None
-    np.testing.assert_allclose(colours[0, 0], np.asarray([20, 40, 220]) / 255, atol=0.03)  # compressed
-    np.testing.assert_allclose(colours[-1, -1], np.asarray([200, 120, 40]) / 255, atol=0.03)
+    colors, alpha = read_image(HEIC)
+    assert is_heic(HEIC) and colors.shape == (24, 32, 3) and alpha is None
+    np.testing.assert_allclose(colors[0, 0], np.asarray([20, 40, 220]) / 255, atol=0.03)  # compressed
+    np.testing.assert_allclose(colors[-1, -1], np.asarray([200, 120, 40]) / 255, atol=0.03)
     assert orientation(HEIC) == 1 and focal_length(HEIC) == pytest.approx(26 * 40 / 43.27)
     try:
         set_limits(Limits(pixels=700))

@@ -12,10 +12,10 @@ PERSON[2:10, 2:5] = True
 VOC = [0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0, 0, 0, 128, 128, 0, 128, 0, 128, 128, 128, 128, 128]
 
 
-def palette(labels, colours, **options):
+def palette(labels, colors, **options):
     image = Image.new("P", labels.shape[::-1])
     image.putdata(labels.astype(np.uint8).ravel().tolist())
-    image.putpalette(colours)
+    image.putpalette(colors)
     return image, options
 
 
@@ -27,7 +27,7 @@ def grey(mask):
     return np.where(mask, 255, 0).astype(np.uint8)
 
 
-def coloured(mask, person, background=(0, 0, 0)):
+def colored(mask, person, background=(0, 0, 0)):
     return np.where(mask[..., None], np.uint8(person), np.uint8(background))
 
 
@@ -43,10 +43,10 @@ READ = {
     "labels on a ramp of greys": palette(PERSON * 1, RAMP),
     "a white palette": palette(PERSON * 1, [0, 0, 0, 255, 255, 255]),
     "no label 0": palette(np.where(PERSON, 3, 2), [0, 0, 255, 0, 255, 0, 0, 0, 0, 128, 0, 0]),
-    "fewer colours than labels": palette(PERSON * 1, [0, 0, 0]),
+    "fewer colors than labels": palette(PERSON * 1, [0, 0, 0]),
     "an opaque palette": palette(PERSON * 1, VOC, transparency=bytes([255, 255])),
     "a transparent background": palette(PERSON * 1, VOC, transparency=0),
-    "red": pixels(coloured(PERSON, (255, 0, 0))),
+    "red": pixels(colored(PERSON, (255, 0, 0))),
     "a cut-out": pixels(np.dstack([PHOTO, grey(PERSON)])),
     "white with alpha": pixels(np.dstack([np.full_like(PHOTO, 255), grey(PERSON)])),
     "black with alpha": pixels(np.dstack([np.zeros_like(PHOTO), grey(PERSON)])),
@@ -67,7 +67,7 @@ def test_the_person_is_read(kind, tmp_path):
     [
         (palette(0 * PERSON, VOC), 0),
         (palette(1 + 0 * PERSON, VOC), 1),
-        (pixels(coloured(0 * PERSON, (9, 0, 0))), 0),
+        (pixels(colored(0 * PERSON, (9, 0, 0))), 0),
         (pixels(np.zeros((*PERSON.shape, 4), np.uint8)), 0),
     ],
 )
@@ -95,8 +95,8 @@ REFUSED = {
         PERSON * 1, [9, 9, 200, 200, 9, 9]
     ),
     "labels 0, 1: 0 is not black": palette(PERSON * 1, [255, 255, 255, 0, 0, 0]),
-    "2 colours: which is the person": pixels(coloured(TWO == 1, (255, 0, 0)) + coloured(TWO == 2, (0, 255, 0))),
-    "2 colours without black: which": pixels(coloured(PERSON, (255, 0, 0), (0, 0, 200))),
+    "2 colors: which is the person": pixels(colored(TWO == 1, (255, 0, 0)) + colored(TWO == 2, (0, 255, 0))),
+    "2 colors without black: which": pixels(colored(PERSON, (255, 0, 0), (0, 0, 200))),
     "an alpha channel besides its greys": pixels(np.dstack([grey(TWO == 1), grey(PERSON)])),
 }
 

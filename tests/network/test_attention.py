@@ -5,7 +5,7 @@ import pytest
 from jax.test_util import check_grads
 from rounding import bound
 
-from humangs_jax.network.execution import Execution
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import (
     Attention,
     attention,
@@ -94,7 +94,7 @@ def test_auto_follows_backend_length_and_precision(monkeypatch, backend, tokens,
 def test_query_key_norm_makes_attention_blind_to_their_lengths():
     tokens = jnp.asarray(np.random.default_rng(3).normal(size=(7, 8)), jnp.float32)
     for normed in (True, False):
-        module = Attention(4, normed, Execution(), jax.nn.initializers.normal(0.5))
+        module = Attention(4, normed, Runtime(), jax.nn.initializers.normal(0.5))
         variables = module.init(jax.random.key(0), tokens)
         kernel = variables["params"]["qkv"]["kernel"]
         longer = kernel.at[:, :16].multiply(3.0)  # queries and keys

@@ -14,6 +14,7 @@ from safetensors.numpy import save_file
 from torch_writer import FakeTensor, tensors, write_checkpoint
 
 from humangs_jax import cli
+from humangs_jax.losses.loss_networks import expected_tensors, load_lpips
 from humangs_jax.network.config import paper_parts
 from humangs_jax.network.conversion import (
     describe,
@@ -26,7 +27,6 @@ from humangs_jax.network.conversion import (
 from humangs_jax.network.presets import published
 from humangs_jax.network.transformer import TransformerConfig
 from humangs_jax.network.weights import load_weights
-from humangs_jax.objectives.loss_networks import expected_tensors, load_lpips
 
 VARIANTS = [
     Options(),

@@ -21,7 +21,7 @@ def test_every_stage_agrees(name, dtype):
     checkpoint, subject = golden.carried(name)
     with jax.enable_x64(dtype == "float64"):
         converted, arrays = load_checkpoint(checkpoint), golden.load_subject(name)
-        config = converted.config.with_conventions(pool=golden.POOLS[name]).with_execution(dtype="float32")
+        config = converted.config.with_conventions(pool=golden.POOLS[name]).with_runtime(dtype="float32")
         variables = jax.tree.map(lambda x: jnp.asarray(x, dtype), converted.variables)
         inputs, weights, transforms = check_parity.subject_inputs(arrays, 0, dtype)
         compute = jax.jit(check_parity.compute_stages, static_argnames="config")

@@ -11,11 +11,11 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.network import presets
 from humangs_jax.network.config import Architecture, paper_parts
 from humangs_jax.network.encoder import PatchTransformer, pack_patches, touched_patches
-from humangs_jax.network.execution import Execution
 from humangs_jax.network.humangs import apply_humangs, encode, needed_tokens, read
 from humangs_jax.network.inputs import subject_unit
 from humangs_jax.network.parts import Encoding
 from humangs_jax.network.reader import needed_reads, project_and_test
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import Block, TransformerConfig
 from humangs_jax.network.vertex_decoder import VertexDecoder
 from humangs_jax.network.weights import expected_variables
@@ -65,7 +65,7 @@ def test_presets_have_the_shapes_they_promise(name):
     width = encoder.upsampler.hidden // 2 if encoder.upsampler else encoder.transformer.width
     assert encoding.maps.shape == (views, side, side, width)
     assert (
-        encoding.maps.dtype == (jnp.bfloat16 if config.execution.dtype == "bfloat16" else jnp.float32)
+        encoding.maps.dtype == (jnp.bfloat16 if config.runtime.dtype == "bfloat16" else jnp.float32)
         or side == size // 8
     )
     assert outputs.gaussians.means.shape == (vertices * decoder.gaussians_per_vertex, 3)
@@ -117,7 +117,7 @@ def test_the_decoder_is_as_wide_as_what_enters(class_token, sample_rgb):
 
 
 @pytest.mark.slow
-def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
+def test_fresh_gaussians_sit_on_the_vertices_with_the_color_of_the_photos():
     inputs = random_inputs()
     inputs = replace(inputs, images=jnp.full_like(inputs.images, 0.7))
     plain = TINY.with_parts(
@@ -137,7 +137,7 @@ def test_fresh_gaussians_sit_on_the_vertices_with_the_colour_of_the_photos():
 
 def test_deeper_blocks_begin_smaller():
     config = TransformerConfig(width=64, layers=4, head_width=32)
-    kernel = jax.jit(Block(config, Execution(), 3).init)(jax.random.key(0), jnp.zeros((2, 64)))["params"]["mlp_in"][
+    kernel = jax.jit(Block(config, Runtime(), 3).init)(jax.random.key(0), jnp.zeros((2, 64)))["params"]["mlp_in"][
         "kernel"
     ]
     assert np.isclose(kernel.std(), 0.02 / np.sqrt(2 * 4), rtol=0.05)
@@ -163,7 +163,7 @@ def test_the_order_of_the_views_does_not_matter():
 def test_foreground_tokens_are_all_tokens_when_everything_is_foreground():
     inputs = random_inputs()
     patches = 2 * (32 // 8) ** 2
-    config = TINY.with_execution(token_capacity=patches + 50)
+    config = TINY.with_runtime(token_capacity=patches + 50)
     variables = variables_of(ALL_TOKENS)
     assert close(run(variables, inputs, config), run(variables, inputs, ALL_TOKENS))
 
@@ -175,7 +175,7 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
     foreground[0, 8:24, 16:32] = foreground[1, 3, 9] = True  # four patches, and one
     inputs = replace(inputs, foreground=jnp.asarray(foreground))
     variables = variables_of(TINY)
-    roomy, exact, tight = TINY, *(TINY.with_execution(token_capacity=n) for n in (5, 3))
+    roomy, exact, tight = TINY, *(TINY.with_runtime(token_capacity=n) for n in (5, 3))
     encoding, outputs = run(variables, inputs, roomy)
     assert outputs.dropped_tokens == 0 and close(
         (encoding, outputs), run(variables, inputs, exact)
@@ -195,7 +195,7 @@ def test_background_patches_are_unseen_and_dropped_ones_are_counted():
 )
 def test_short_number_types_are_close(dtype, tolerance):
     variables, inputs = variables_of(ALL_TOKENS), random_inputs()
-    encoding, outputs = run(variables, inputs, ALL_TOKENS.with_execution(dtype=dtype))
+    encoding, outputs = run(variables, inputs, ALL_TOKENS.with_runtime(dtype=dtype))
     exact_encoding, exact = run(variables, inputs, ALL_TOKENS)
     assert encoding.maps.dtype == dtype
     scale = jnp.abs(exact_encoding.maps).max()
@@ -243,7 +243,7 @@ PUBLISHED_LIKE = ALL_TOKENS.with_conventions(pool="all", pixel_grid="mixed")
 
 @pytest.mark.slow
 @pytest.mark.parametrize("train", [False, True])
-@pytest.mark.parametrize("config", [TINY.with_execution(token_capacity=64), PUBLISHED_LIKE])
+@pytest.mark.parametrize("config", [TINY.with_runtime(token_capacity=64), PUBLISHED_LIKE])
 def test_padding_views_change_nothing(config, train):
     inputs, variables = random_inputs(), variables_of(PUBLISHED_LIKE)
     apply = jax.jit(lambda x: apply_humangs(variables, x, config, train))
@@ -270,7 +270,7 @@ def test_views_are_read_only_for_the_vertices_they_see():
     variables, needed = variables_of(TINY), int(needed_reads(inputs, TINY.run()))
     seen = project_and_test(inputs, TINY.run())[1].sum(axis=1)
     assert needed == seen.max() and seen.min() < needed
-    of_capacity = lambda n: TINY.with_execution(vertex_capacity=n)
+    of_capacity = lambda n: TINY.with_runtime(vertex_capacity=n)
     reference, exact, tight = (run(variables, inputs, of_capacity(n))[1] for n in (None, needed, needed - 1))
     assert close(exact, reference) and exact.dropped_reads == 0
     assert tight.dropped_reads == (seen == needed).sum() and not close(tight.gaussians, reference.gaussians)
@@ -300,7 +300,7 @@ def test_gradients_are_finite_and_reach_every_parameter():
     )  # in and behind the camera
     inputs = replace(inputs, depth_maps=inputs.depth_maps.at[:, :16].set(-1.0))  # some vertices are seen by none
     continuous = {"posed_vertices": posed, "images": inputs.images, "canonical_vertices": inputs.canonical_vertices}
-    config = TINY.with_execution(remat="full")
+    config = TINY.with_runtime(remat="full")
     of_params, of_inputs = gradients(variables_of(TINY), continuous, inputs, config)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((of_params, of_inputs)))
     silent = [path for path, leaf in jax.tree_util.tree_leaves_with_path(of_params) if not np.abs(leaf).max() > 0]

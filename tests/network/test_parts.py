@@ -73,7 +73,7 @@ def test_a_part_is_named_in_json_and_found_again():
     text = config_to_json(CONFIG.architecture)
     assert config_from_json(Architecture, text) == CONFIG.architecture
     with pytest.raises(ValueError, match=r"config\.decoder\.kind: expected .* Decoder"):
-        config_from_json(Architecture, '{"decoder": {"kind": "Execution"}}')
+        config_from_json(Architecture, '{"decoder": {"kind": "Runtime"}}')
 
 
 def test_a_part_of_this_name_exists_once_and_only_a_registered_one_is_written():

@@ -15,7 +15,7 @@ DISTANCES = (0.0, 0.1, 0.2, 0.4)
 SIZE = 128
 VIEWS = 4
 LATERAL = 0.02
-"""A pixel is 0.02 wide at the sphere: what happens at the outline is known so well."""
+"""A pixel is 0.02 wide at the sphere: what happens at the silhouette is known so well."""
 
 
 def scene(views=VIEWS):
@@ -68,7 +68,7 @@ def test_hull_and_share_tell_how_far_the_coat_reaches():
 
 
 @pytest.mark.slow
-def test_colours_are_of_the_views_that_face_the_point():
+def test_colors_are_of_the_views_that_face_the_point():
     arguments = scene()
     shells = read(arguments)
     first = np.asarray(arguments[3].center[0]) / 4
@@ -114,7 +114,7 @@ def test_batches_by_vmap_and_gradients_are_finite():
 
 
 @pytest.mark.slow
-def test_the_background_lends_no_colour():
+def test_the_background_lends_no_color():
     arguments = scene()
     shells = read(arguments)
     away = lateral((BODY + DISTANCES[3]) * np.asarray(arguments[-1]), arguments[3])

@@ -7,32 +7,32 @@ import numpy as np
 import pytest
 from network_cases import random_like
 
-from humangs_jax.network.execution import Execution
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.network.transformer import Transformer, TransformerConfig
 
 CONFIG = TransformerConfig(width=16, layers=6, head_width=8)
-network = functools.partial(Transformer, execution=Execution())
+network = functools.partial(Transformer, runtime=Runtime())
 TOLERANCE = 1e-5
 """The same sums in another order, over six layers."""
 TOKENS = jnp.asarray(np.random.default_rng(0).normal(size=(11, 16)), jnp.float32)
 VARIABLES = random_like(jax.eval_shape(network(CONFIG).init, jax.random.key(0), TOKENS))
 
 
-def loss(variables, execution):
-    outputs = Transformer(CONFIG, execution).apply(variables, TOKENS, jnp.asarray(9))
+def loss(variables, runtime):
+    outputs = Transformer(CONFIG, runtime).apply(variables, TOKENS, jnp.asarray(9))
     return sum(jnp.sum(jnp.sin(k * x)) for k, x in enumerate(outputs, 1)), outputs
 
 
-value_and_grad = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnames="execution")
+value_and_grad = jax.jit(jax.value_and_grad(loss, has_aux=True), static_argnames="runtime")
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [{"scan": True}, {"remat": "dots"}, {"scan": True, "remat": "full"}], ids=str)
 def test_blocks_may_be_looped_over_and_recomputed(how):
-    execution = Execution(**how)
-    shapes = jax.eval_shape(Transformer(CONFIG, execution).init, jax.random.key(0), TOKENS)
+    runtime = Runtime(**how)
+    shapes = jax.eval_shape(Transformer(CONFIG, runtime).init, jax.random.key(0), TOKENS)
     assert jax.tree.structure(shapes) == jax.tree.structure(VARIABLES)
-    ours, reference = (jax.tree.leaves(value_and_grad(VARIABLES, x)) for x in (execution, Execution()))
+    ours, reference = (jax.tree.leaves(value_and_grad(VARIABLES, x)) for x in (runtime, Runtime()))
     for a, b in zip(ours, reference, strict=True):
         assert np.allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE * max(1, np.abs(b).max()))
 

@@ -57,7 +57,7 @@ def test_offsets_are_bounded_by_their_scale_and_untouched_near_zero():
     assert np.allclose(activate(near, bounded).offsets, activate(near, CONFIG).offsets, rtol=1e-3)
 
 
-def test_residual_colours_start_from_the_photo_and_stay_correctable():
+def test_residual_colors_start_from_the_photo_and_stay_correctable():
     raw = random_raw()
     photo = jnp.asarray([[0.2, 0.5, 0.8], [0.0, 1.0, 0.5], [1, 1, 1], [0, 0, 0]])
     config = dataclasses.replace(CONFIG, residual_color=True)
@@ -84,7 +84,7 @@ def shells_of(colors):
 
 
 @pytest.mark.slow
-def test_gaussians_choose_their_shell_and_its_colour():
+def test_gaussians_choose_their_shell_and_its_color():
     colors = jnp.asarray(np.random.default_rng(5).uniform(0.1, 0.9, (2, 3, 3)), jnp.float32)
     features = VertexFeatures(jnp.zeros((2, 1)), shells=shells_of(colors), normals=NORMALS)
     config, k = dataclasses.replace(CONFIG, frame="normal", residual_color=True), CONFIG.gaussians_per_vertex

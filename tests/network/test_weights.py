@@ -137,7 +137,7 @@ def grown(**decoder):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("more", [-1, 0, 2])
-def test_a_network_that_grows_keeps_the_opacities_and_colours_it_has_learnt(more):
+def test_a_network_that_grows_keeps_the_opacities_and_colors_it_has_learnt(more):
     old, new = grown(free=DECODER.free + more)
     variables, inputs = random_variables(old, 3), random_inputs()
     before, _ = apply_humangs(variables, inputs, old)

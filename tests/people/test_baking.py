@@ -21,7 +21,7 @@ LEAST_DENSITY = 0.4
 SKINNING = 1.5e-3
 """Metres; measured 0.4 mm with six joints a vertex."""
 SCAN_PSNR = 32
-"""A texture of 5 mm texels against colours per pixel, dB; measured 37 or more."""
+"""A texture of 5 mm texels against colors per pixel, dB; measured 37 or more."""
 
 
 @pytest.fixture(scope="module")

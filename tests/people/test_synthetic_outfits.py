@@ -91,9 +91,9 @@ def test_every_kind_of_garment_and_hair_can_be_built(body, people):
         for k, material in enumerate(built.materials):
             chosen = np.unique(s.faces[built.face_materials == k])[::7]
             if len(chosen):
-                colours = material.albedo(Spots(s.attributes["cloth"][chosen], s.attributes["template"][chosen]))
-                assert colours.shape == (len(chosen), 3) and np.isfinite(colours).all()
-                assert colours.min() > -0.1 and colours.max() < 1.6
+                colors = material.albedo(Spots(s.attributes["cloth"][chosen], s.attributes["template"][chosen]))
+                assert colors.shape == (len(chosen), 3) and np.isfinite(colors).all()
+                assert colors.min() > -0.1 and colors.max() < 1.6
     assert not missing
 
 
@@ -173,5 +173,5 @@ def test_fabrics_of_one_seed_are_one_fabric():
     spots = Spots(cloth, cloth[:, :3])
     for kind in ("tee", "jeans", "coat", "tie"):
         fabric = sample_fabric(rng, kind, 0.3)
-        np.testing.assert_array_equal(fabric.colours(spots), fabric.colours(spots))
-        assert isinstance(Material(fabric.colours), Material)
+        np.testing.assert_array_equal(fabric.colors(spots), fabric.colors(spots))
+        assert isinstance(Material(fabric.colors), Material)

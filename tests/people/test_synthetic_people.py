@@ -208,11 +208,11 @@ def test_patterns_stay_in_range_and_differ():
     spots = fabrics.Spots(cloth, cloth[:, :3])
     seen = []
     for name, (_, make) in PATTERNS.items():
-        base, other = fabrics.colour(0.6, 0.7, 0.5), fabrics.colour(0.1, 0.6, 0.8)
-        colours = make(spots, np.random.default_rng(1), base, other)
-        assert colours.shape == (500, 3) and np.isfinite(colours).all(), name
-        assert colours.min() >= -0.05 and colours.max() <= 1.15, name
-        seen.append(colours)
+        base, other = fabrics.color(0.6, 0.7, 0.5), fabrics.color(0.1, 0.6, 0.8)
+        colors = make(spots, np.random.default_rng(1), base, other)
+        assert colors.shape == (500, 3) and np.isfinite(colors).all(), name
+        assert colors.min() >= -0.05 and colors.max() <= 1.15, name
+        seen.append(colors)
     for i, a in enumerate(seen):
         for b in seen[i + 1 :]:
             assert np.abs(a - b).max() > 0.02

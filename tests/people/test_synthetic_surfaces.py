@@ -1,19 +1,19 @@
-"""Cuts, hems, outlines: the geometry under the garments."""
+"""Cuts, hems, silhouettes: the geometry under the garments."""
 
 import numpy as np
 import pytest
 
 from humangs_jax.people.surfaces import (
     ANGLES,
-    Outlines,
+    Boundaries,
     Surface,
+    boundaries,
     boundary_edges,
     compact,
     cut,
     grid_faces,
     hanging,
     join,
-    outlines,
     smooth,
     turn_in_hems,
     vertex_normals,
@@ -112,25 +112,25 @@ def ellipse_points(a=0.2, b=0.1):
     return along, np.stack([a * np.sin(angle), b * np.cos(angle)], -1)
 
 
-def test_outlines_of_an_ellipse():
+def test_boundaries_of_an_ellipse():
     along, across = ellipse_points()
-    found = outlines(along, across, np.linspace(-0.4, 0.4, 9), np.zeros((9, 2)), 0.03)
+    found = boundaries(along, across, np.linspace(-0.4, 0.4, 9), np.zeros((9, 2)), 0.03)
     angle = np.linspace(-3, 3, 31)
     expected = 1 / np.sqrt((np.sin(angle) / 0.2) ** 2 + (np.cos(angle) / 0.1) ** 2)
     chord = 0.04  # 48 angles: polygons instead of curves
     np.testing.assert_allclose(found.radius(np.zeros(31), angle), expected, rtol=chord)
 
 
-def test_outlines_bridge_hollows():
+def test_boundaries_bridge_hollows():
     along, across = ellipse_points()
     hollow = np.linalg.norm(across - [0.0, 0.1], axis=1) < 0.06  # a dent in front
-    found = outlines(along[~hollow], across[~hollow], np.asarray([-0.1, 0.0, 0.1]), np.zeros((3, 2)), 0.03)
+    found = boundaries(along[~hollow], across[~hollow], np.asarray([-0.1, 0.0, 0.1]), np.zeros((3, 2)), 0.03)
     assert found.radius(np.zeros(1), np.zeros(1))[0] > 0.07
 
 
 def test_hanging_cloth_narrows_no_faster_than_its_slope():
     radii = np.random.default_rng(0).uniform(0.05, 0.2, (9, ANGLES))
-    shape = Outlines(np.linspace(0, 0.8, 9), np.zeros((9, 2)), radii)
+    shape = Boundaries(np.linspace(0, 0.8, 9), np.zeros((9, 2)), radii)
     hung = hanging(shape, slope=0.5)
     assert (hung.radii >= radii).all()
     assert (hung.radii[:-1] - hung.radii[1:] >= -0.5 * 0.1 - ROUNDING).all()

@@ -1,4 +1,4 @@
-"""A toy person: a body with one Gaussian a vertex, and photos of the same one in other colours."""
+"""A toy person: a body with one Gaussian a vertex, and photos of the same one in other colors."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ from humangs_jax.refinement.config import RefineConfig
 from humangs_jax.rendering.gaussians import Gaussians
 
 WIDTH, HEIGHT = 48, 64
-STEPS = RefineConfig(rounds=0, steps=12, seconds=None, held_out=0.0)
+STEPS = RefineConfig(iterations=0, steps=12, seconds=None, held_out=0.0)
 
 
 def toy_avatar(body, shade):

@@ -34,14 +34,14 @@ from humangs_jax.refinement.parameters import parameters_of
 from humangs_jax.refinement.run import Run
 from humangs_jax.rendering.splatting import plan_buffers, render
 
-DIFFERENCE, DIFFERENCES = 1e-3, 2e-2  # of a colour; float32 sums over some thousand pixels
+DIFFERENCE, DIFFERENCES = 1e-3, 2e-2  # of a color; float32 sums over some thousand pixels
 ROUNDING = 1e-5
 ONE_STEP = 1e-3  # metres: five times the rate of the means
 
 
 @pytest.fixture(scope="module")
 def scene():
-    """Avatar, one photo of the same person in other colours, parameters, splatting."""
+    """Avatar, one photo of the same person in other colors, parameters, splatting."""
     body = decimate(load_body(), 400)
     avatar = toy_avatar(body, 0.0)
     views = crop_to_person(toy_capture(body, toy_avatar(body, 0.15)))
@@ -211,23 +211,23 @@ def test_weights_are_read_as_written(tmp_path, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, learned.load_refiner.__wrapped__(), changed)
 
 
-def test_rounds_move_gaussians(scene):
+def test_iterations_move_gaussians(scene):
     avatar, _, _, splat = scene
     views = crop_to_person(toy_capture(decimate(load_body(), 400), toy_avatar(decimate(load_body(), 400), 0.15)))
-    config = dataclasses.replace(STEPS, rounds=2, steps=0)
+    config = dataclasses.replace(STEPS, iterations=2, steps=0)
     run = Run(avatar, views, config, None, splat)
     before = refinement.start(run.avatar, run.all, config, splat)
     was, now = stacked(before.parameters), stacked(run.learned(before.parameters, 2))
     assert (np.abs(now - was).max(axis=0) > 0).all()
     report = run.go(progress=False, watch=None)
-    assert (report.rounds, report.steps) == (2, 0) and "2 rounds and 0 steps" in report.summary()
+    assert (report.iterations, report.steps) == (2, 0) and "2 iterations and 0 steps" in report.summary()
     assert report.loss[1] <= report.loss[0]
 
 
-def test_rounds_look_at_a_few_evenly_spaced_photos_and_buffers_grow(scene, monkeypatch):
+def test_iterations_look_at_a_few_evenly_spaced_photos_and_buffers_grow(scene, monkeypatch):
     avatar, _, _, splat = scene
     capture = toy_capture(decimate(load_body(), 400), toy_avatar(decimate(load_body(), 400), 0.15), views=9)
-    config = dataclasses.replace(STEPS, rounds=1, steps=0)
+    config = dataclasses.replace(STEPS, iterations=1, steps=0)
     small = dataclasses.replace(splat, max_pairs=64)
     run = Run(avatar, crop_to_person(capture), config, None, small)
     looked, signals = [], run.signals
@@ -240,20 +240,20 @@ def test_rounds_look_at_a_few_evenly_spaced_photos_and_buffers_grow(scene, monke
     jax.tree.map(np.testing.assert_array_equal, run.learned(before.parameters, 1), after)
 
 
-def test_what_only_the_avatar_after_the_rounds_shows_moves_in_steps(scene, monkeypatch):
-    """A Gaussian that is hidden at the start and seen after the rounds gets trust."""
+def test_what_only_the_avatar_after_the_iterations_shows_moves_in_steps(scene, monkeypatch):
+    """A Gaussian that is hidden at the start and seen after the iterations gets trust."""
     body = decimate(load_body(), 400)
     hidden = replace(
         scene[0], gaussians=replace(scene[0].gaussians, opacities=scene[0].gaussians.opacities.at[0].set(0))
     )
-    shown = lambda self, parameters, rounds: replace(
+    shown = lambda self, parameters, iterations: replace(
         parameters, opacity_logits=jnp.full_like(parameters.opacity_logits, 4.0)
     )
     monkeypatch.setattr(Run, "learned", shown)
     run = Run(
         hidden,
         crop_to_person(toy_capture(body, toy_avatar(body, 0.15))),
-        dataclasses.replace(STEPS, rounds=1),
+        dataclasses.replace(STEPS, iterations=1),
         None,
         scene[3],
     )
@@ -264,28 +264,28 @@ def test_what_only_the_avatar_after_the_rounds_shows_moves_in_steps(scene, monke
     jax.tree.map(np.testing.assert_array_equal, after.parameters, after.start)
 
 
-def test_interrupted_in_the_rounds_the_start_is_returned(scene, monkeypatch):
-    def interrupted(self, parameters, rounds):
+def test_interrupted_in_the_iterations_the_start_is_returned(scene, monkeypatch):
+    def interrupted(self, parameters, iterations):
         raise KeyboardInterrupt
 
     body = decimate(load_body(), 400)
     monkeypatch.setattr(Run, "learned", interrupted)
-    config = dataclasses.replace(STEPS, rounds=2, steps=0)
+    config = dataclasses.replace(STEPS, iterations=2, steps=0)
     report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
-    assert report.interrupted and (report.rounds, report.steps) == (0, 0)
+    assert report.interrupted and (report.iterations, report.steps) == (0, 0)
     jax.tree.map(np.testing.assert_array_equal, report.avatar, scene[0])
 
 
 @pytest.mark.parametrize("steps", [0, 1])
-def test_rounds_that_make_the_photos_worse_are_not_kept(steps, scene, monkeypatch):
-    def worse(self, parameters, rounds):
+def test_iterations_that_make_the_photos_worse_are_not_kept(steps, scene, monkeypatch):
+    def worse(self, parameters, iterations):
         return replace(parameters, means=parameters.means + 0.3)
 
     body = decimate(load_body(), 400)
     monkeypatch.setattr(Run, "learned", worse)
-    config = dataclasses.replace(STEPS, rounds=2, steps=steps, held_out=0.3)
+    config = dataclasses.replace(STEPS, iterations=2, steps=steps, held_out=0.3)
     report = refinement.refine_with_report(scene[0], toy_capture(body, toy_avatar(body, 0.15)), config)
-    assert report.rounds == 0
+    assert report.iterations == 0
     if not steps:
         assert not report.kept
         jax.tree.map(np.testing.assert_array_equal, report.avatar, scene[0])

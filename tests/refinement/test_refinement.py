@@ -1,4 +1,4 @@
-"""Refinement on a toy person: a body whose Gaussians differ in colour from its photos."""
+"""Refinement on a toy person: a body whose Gaussians differ in color from its photos."""
 
 import dataclasses
 import subprocess
@@ -39,7 +39,7 @@ def body():
 
 @pytest.fixture(scope="module")
 def person(body):
-    """The avatar to be refined, and photos of the same one in other colours."""
+    """The avatar to be refined, and photos of the same one in other colors."""
     return toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), moving=True)
 
 
@@ -207,8 +207,8 @@ def test_specks_of_a_mask_do_not_widen_the_crops():
     ("settings", "named"),
     [
         ({"steps": None, "seconds": None}, "steps, seconds"),
-        ({"rounds": 0, "steps": 0}, "rounds 0, steps 0"),
-        ({"rounds": -1}, "rounds -1"),
+        ({"iterations": 0, "steps": 0}, "iterations 0, steps 0"),
+        ({"iterations": -1}, "iterations -1"),
         ({"seconds": 0.0}, "seconds"),
         ({"visible": 0.0}, "visible"),
         ({"full_steps": 0}, "full_steps"),
@@ -245,7 +245,7 @@ from refinement_cases import STEPS, assert_nearly_all_close, toy_avatar, toy_cap
 body = decimate(load_body(), 400)
 avatar = toy_avatar(body, 0.0)
 capture = toy_capture(body, toy_avatar(body, 0.15), views=2)
-config = dataclasses.replace(STEPS, rounds=1, steps=3, views_per_step=2)
+config = dataclasses.replace(STEPS, iterations=1, steps=3, views_per_step=2)
 alone = refine_with_report(avatar, capture, config)
 shared = refine_with_report(avatar, capture, config, mesh=jax.make_mesh((2,), ("photos",)))
 assert alone.kept and shared.kept
@@ -273,11 +273,11 @@ def run_of(person, config=STEPS, views=3):
     return Run(avatar, crops, config, None, plan_buffers(avatar.gaussians, crops.cameras, margin=3.0))
 
 
-def test_long_runs_after_rounds_take_smaller_steps(person, monkeypatch):
+def test_long_runs_after_iterations_take_smaller_steps(person, monkeypatch):
     taken = []
     monkeypatch.setattr(Run, "step", lambda self, state, passed, share=1.0: taken.append((passed, share)) or state)
-    for rounds, share in ((2, 0.5), (0, 1.0)):
-        run_of(person, dataclasses.replace(STEPS, rounds=rounds, full_steps=6)).go(progress=False, watch=None)
+    for iterations, share in ((2, 0.5), (0, 1.0)):
+        run_of(person, dataclasses.replace(STEPS, iterations=iterations, full_steps=6)).go(progress=False, watch=None)
         assert taken[-12:] == [(i / 12, share) for i in range(12)]
 
 
@@ -290,23 +290,23 @@ def clock(monkeypatch):
         clock.now += 0.1 * clock.slower
         return step(self, state, *when)
 
-    def rounds(self, parameters, count):
+    def iterations(self, parameters, count):
         clock.now += 0.1 * count
         return learned(self, parameters, count)
 
     for module in (operations, run):
         monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: clock.now))
     monkeypatch.setattr(Run, "step", timed)
-    monkeypatch.setattr(Run, "learned", rounds)
+    monkeypatch.setattr(Run, "learned", iterations)
     return clock
 
 
 @pytest.mark.parametrize("views", [3, pytest.param(4, marks=pytest.mark.slow)])
 def test_a_run_by_the_clock_is_repeated_by_its_steps(views, body, clock):
     avatar, capture = toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), views=views)
-    config = dataclasses.replace(STEPS, rounds=1, steps=None, seconds=2.0, held_out=0.05)
+    config = dataclasses.replace(STEPS, iterations=1, steps=None, seconds=2.0, held_out=0.05)
     timed = refinement.refine_with_report(avatar, capture, config)
-    assert timed.kept and timed.rounds == 1 and timed.seconds <= 2.01
+    assert timed.kept and timed.iterations == 1 and timed.seconds <= 2.01
     steps = (
         16 if views == 3 else 14
     )  # three more are timed; rounds take as long as a step, and are made twice in a trial
@@ -353,7 +353,7 @@ def test_compiling_for_larger_buffers_does_not_count(person, monkeypatch):
 
 @pytest.fixture(scope="module")
 def four(body):
-    """An avatar, and four photos of the person, whom it shows in other colours."""
+    """An avatar, and four photos of the person, whom it shows in other colors."""
     return toy_avatar(body, 0.0), toy_capture(body, toy_avatar(body, 0.15), views=4)
 
 
@@ -378,25 +378,25 @@ def test_the_best_explained_photo_is_held_out_of_the_trial_and_then_fitted(four,
 
 
 @pytest.mark.parametrize("misleads", [False, True])
-def test_rounds_alone_are_tried_only_where_a_photo_fits_much_less_than_others(four, misleads, monkeypatch):
+def test_iterations_alone_are_tried_only_where_a_photo_fits_much_less_than_others(four, misleads, monkeypatch):
     avatar, capture = four
     images, asked = np.array(capture.images), []
     images[2] = 1 - images[2] if misleads else images[2]
-    monkeypatch.setattr(Run, "learned", lambda self, parameters, rounds: parameters)
+    monkeypatch.setattr(Run, "learned", lambda self, parameters, iterations: parameters)
     monkeypatch.setattr(Run, "held_psnr", lambda self, parameters: asked.append(parameters) or 20.0)
-    settings = dataclasses.replace(STEPS, rounds=1, steps=0, held_out=0.05)
+    settings = dataclasses.replace(STEPS, iterations=1, steps=0, held_out=0.05)
     report = refinement.refine_with_report(avatar, dataclasses.replace(capture, images=images), settings)
     assert bool(asked) == misleads and report.steps == 0 and not report.left_out
 
 
 @pytest.mark.slow
 def test_a_trial_that_loses_leaves_the_avatar_alone(four, monkeypatch):
-    """Steps and rounds that fit the photos they see and spoil the one that they do not."""
+    """Steps and iterations that fit the photos they see and spoil the one that they do not."""
     avatar, capture = four
     monkeypatch.setattr(Run, "held_psnr", lambda self, parameters, values=iter([20.0] + [10.0] * 99): next(values))
     seen = seen_by_steps(monkeypatch)
-    report = refinement.refine_with_report(avatar, capture, dataclasses.replace(STEPS, rounds=1, held_out=0.05))
-    assert (report.kept, report.rounds, report.left_out, len(seen)) == (False, 0, (), 1 + 4)
+    report = refinement.refine_with_report(avatar, capture, dataclasses.replace(STEPS, iterations=1, held_out=0.05))
+    assert (report.kept, report.iterations, report.left_out, len(seen)) == (False, 0, (), 1 + 4)
     jax.tree.map(np.testing.assert_array_equal, report.avatar, avatar)
 
 
@@ -407,16 +407,16 @@ def test_a_photo_that_contradicts_the_others_is_left_out_and_named(four, monkeyp
     images[2] = 1 - images[2]
     learned = Run.learned
 
-    def spoilt(self, parameters, rounds):
-        found = learned(self, parameters, rounds)
+    def spoilt(self, parameters, iterations):
+        found = learned(self, parameters, iterations)
         return replace(found, color_logits=found.color_logits - 9.0) if 2 in self.useful else found
 
     monkeypatch.setattr(Run, "learned", spoilt)
     seen = seen_by_steps(monkeypatch)
     misleading = dataclasses.replace(capture, images=images)
-    report = refinement.refine_with_report(avatar, misleading, dataclasses.replace(STEPS, rounds=1, held_out=0.05))
+    report = refinement.refine_with_report(avatar, misleading, dataclasses.replace(STEPS, iterations=1, held_out=0.05))
     assert report.left_out == (misleading.names[2],) and f"without {misleading.names[2]}, which" in report.summary()
-    assert report.rounds == 1 and 2 not in seen[1:]
+    assert report.iterations == 1 and 2 not in seen[1:]
 
 
 def test_buffers_grow_until_nothing_is_missing_in_the_corrected_poses(person, monkeypatch):

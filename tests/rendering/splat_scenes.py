@@ -23,7 +23,7 @@ def random_gaussians(seed, dtype=np.float64, count=COUNT) -> Gaussians:
     scales[6:9] = [2.0, 0.002, 0.002]  # needles across the image
     means[9, 2], means[10, 2] = -2.0, 0.011  # behind the camera; just beyond the near plane
     scales[11] = 0  # a point: one pixel's worth of eps2d
-    scales[12] = 5.0  # a fog
+    scales[12] = 5.0  # a semi-transparent foreground
     opacities[13:15] = [0, 1 / 255 - 1e-4]  # never drawn
     deformations = np.eye(3) + 0.3 * rng.normal(size=(count, 3, 3))
     arrays = means, rng.normal(size=(count, 4)), scales, opacities, rng.uniform(0, 1, (count, 3)), deformations

@@ -30,7 +30,7 @@ def knobs(**values):
 
 @pytest.mark.slow
 def test_visibility_is_the_largest_weight():
-    """With one colour channel that only Gaussian i has, that channel is the weight of i."""
+    """With one color channel that only Gaussian i has, that channel is the weight of i."""
     with jax.enable_x64(True):
         gaussians = random_gaussians(3)
         weights = jax.vmap(

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from humangs_jax.rendering.mesh.texturing import sample_texture
 
 ROUNDING = 2e-6
-"""Texel positions of up to 16 texels in float32, times colour steps of up to 1."""
+"""Texel positions of up to 16 texels in float32, times color steps of up to 1."""
 UPPER_LEFT, LOWER_RIGHT = (0.0, 1.0), (1.0, 0.0)
 
 

@@ -57,8 +57,8 @@ def a_training_step():
     from training_cases import tube, write_subject
 
     from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, find_captures
+    from humangs_jax.losses.loss_networks import LossNetworks
     from humangs_jax.network.humangs import init_humangs
-    from humangs_jax.objectives.loss_networks import LossNetworks
     from humangs_jax.training.config import tiny
     from humangs_jax.training.step import batch_gradients
 

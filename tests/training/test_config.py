@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from humangs_jax.core.configuration import config_from_json, config_to_json
-from humangs_jax.network.execution import Execution
-from humangs_jax.objectives.loss_networks import LossNetworks
+from humangs_jax.losses.loss_networks import LossNetworks
+from humangs_jax.network.runtime import Runtime
 from humangs_jax.training import config
 from humangs_jax.training.config import Stage, TrainConfig, fitting_losses, read_config, tiny
 from humangs_jax.training.sources import training_people
@@ -92,7 +92,7 @@ def test_nobody_to_train_on_is_an_error(tmp_path, body):
 
 def test_float16_is_refused_for_training(tmp_path):
     with pytest.raises(ValueError, match="float16: gradients underflow"):
-        dataclasses.replace(tiny(), model=tiny().model.with_execution(dtype="float16"))
+        dataclasses.replace(tiny(), model=tiny().model.with_runtime(dtype="float16"))
     file = tmp_path / "config.json"
     file.write_text(config_to_json(tiny()).replace('"dtype": "float32"', '"dtype": "float16"'))
     with pytest.raises(ValueError, match=r"config\.json: .*float16: gradients underflow") as caught:
@@ -102,7 +102,7 @@ def test_float16_is_refused_for_training(tmp_path):
 
 @pytest.mark.parametrize("dtype", ["half", "float64", np.float16])
 def test_other_names_of_number_types_are_an_error(dtype):
-    execution = Execution()
-    object.__setattr__(execution, "dtype", dtype)  # the type checker of the tests would say it in its own words
-    with pytest.raises(ValueError, match=r"Execution: dtype: expected one of 'float32', 'bfloat16', 'float16', got"):
-        execution.__post_init__()
+    runtime = Runtime()
+    object.__setattr__(runtime, "dtype", dtype)  # the type checker of the tests would say it in its own words
+    with pytest.raises(ValueError, match=r"Runtime: dtype: expected one of 'float32', 'bfloat16', 'float16', got"):
+        runtime.__post_init__()

@@ -16,15 +16,15 @@ from training_cases import without_upsampler
 from experiments.training.cases import random_weights
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, Loader
+from humangs_jax.losses.backbones import VGG16, channels
+from humangs_jax.losses.loss_networks import LossNetworks
+from humangs_jax.losses.lpips import Lpips
+from humangs_jax.losses.perceptual import VGG19, Vgg19
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import PRESETS
 from humangs_jax.network.reader import PixelAlignedReader
 from humangs_jax.network.stages import Recorder, inexact_leaves
 from humangs_jax.network.transformer import Block
-from humangs_jax.objectives.backbones import VGG16, channels
-from humangs_jax.objectives.loss_networks import LossNetworks
-from humangs_jax.objectives.lpips import Lpips
-from humangs_jax.objectives.perceptual import VGG19, Vgg19
 from humangs_jax.training import diagnose, forward
 from humangs_jax.training.config import tiny
 from humangs_jax.training.diagnose import diagnose_run, diagnose_step, first_failed_step
@@ -354,7 +354,7 @@ def test_losses_of_networks_are_stages_and_their_weights_are_looked_at(monkeypat
     heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))
     networks = LossNetworks(Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg"))
     loss = dataclasses.replace(CONFIG.loss, perceptual=0.5, lpips=0.25)
-    config = dataclasses.replace(CONFIG, loss=loss, model=CONFIG.model.with_execution(dtype="bfloat16"))
+    config = dataclasses.replace(CONFIG, loss=loss, model=CONFIG.model.with_runtime(dtype="bfloat16"))
     fresh(monkeypatch)
     whole = diagnose_step(init_state(config, variables), batch, body, config, networks)
     _, metrics = train_step(init_state(config, variables), batch, body, config, networks)
@@ -374,7 +374,7 @@ def test_networks_of_other_parts_have_the_same_stages(monkeypatch, body, batch):
     """Blocks in a loop and recomputed, all patches, no upsampler, corrected skinning weights, rotated quaternions."""
     decoder = dataclasses.replace(CONFIG.model.architecture.decoder, skinning_joints=2)
     model = without_upsampler(CONFIG.model).with_parts(decoder=decoder)
-    model = model.with_conventions(skinning="rotation").with_execution(tokens="all", scan=True, remat="full")
+    model = model.with_conventions(skinning="rotation").with_runtime(tokens="all", scan=True, remat="full")
     config = dataclasses.replace(CONFIG, model=model)
     fresh(monkeypatch)
     whole = diagnose_step(init_state(config), batch, body, config)

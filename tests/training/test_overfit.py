@@ -45,7 +45,7 @@ def configuration(free: int, longest_edge: float) -> TrainConfig:
         reader=dataclasses.replace(reader, output_width=128),
         decoder=dataclasses.replace(decoder, tight=1, free=free),
     )
-    model = model.with_conventions(image_size=SIZE, longest_edge=longest_edge).with_execution(token_capacity=288)
+    model = model.with_conventions(image_size=SIZE, longest_edge=longest_edge).with_runtime(token_capacity=288)
     return TrainConfig(
         model=model,
         loss=LossConfig(structural=0.0, tightness=0.0, random_background=0.0),

@@ -42,7 +42,7 @@ def shrunk(name):
     model = model.with_conventions(image_size=SIZE, body_vertices=None, longest_edge=None)
     return dataclasses.replace(
         config,
-        model=model.with_execution(token_capacity=16),
+        model=model.with_runtime(token_capacity=16),
         views=dataclasses.replace(config.views, input_counts=(2,), target_count=1),
         loss=dataclasses.replace(config.loss, structural_scales=1),  # images of 32 pixels have no third scale
         target_size=SIZE,

@@ -18,11 +18,11 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
+from humangs_jax.losses.backbones import VGG16, channels
+from humangs_jax.losses.loss_networks import LossNetworks
+from humangs_jax.losses.lpips import Lpips
+from humangs_jax.losses.perceptual import VGG19, Vgg19
 from humangs_jax.network.humangs import init_humangs
-from humangs_jax.objectives.backbones import VGG16, channels
-from humangs_jax.objectives.loss_networks import LossNetworks
-from humangs_jax.objectives.lpips import Lpips
-from humangs_jax.objectives.perceptual import VGG19, Vgg19
 from humangs_jax.rendering.splatting import render
 from humangs_jax.training.config import tiny
 from humangs_jax.training.forward import predict, token_share
@@ -76,7 +76,7 @@ def test_it_draws_the_avatars_that_reconstruct_makes(body, source, variables):
         np.testing.assert_allclose(rgb, expected, atol=bound(FLOAT32))
 
 
-AGAINST_FOG = {"absolute": 0.2, "outline": 0.1, "depth": 0.3, "distortion": 1.0, "opaque": 0.003, "shells": 3.0}
+AGAINST_FOG = {"absolute": 0.2, "boundary": 0.1, "depth": 0.3, "distortion": 1.0, "opaque": 0.003, "shells": 3.0}
 
 
 @pytest.mark.slow
@@ -196,7 +196,7 @@ def test_losses_of_networks_are_part_of_the_loss(body, source, variables, dtype)
     keys = jax.random.split(jax.random.key(0))
     heads = tuple(jnp.full(count, 1 / count) for count in channels(VGG16))
     networks = LossNetworks(Vgg19(random_weights(keys[0], VGG19)), Lpips(random_weights(keys[1], VGG16), heads, "vgg"))
-    config = dataclasses.replace(WITH_NETWORKS, model=CONFIG.model.with_execution(dtype=dtype))
+    config = dataclasses.replace(WITH_NETWORKS, model=CONFIG.model.with_runtime(dtype=dtype))
     state, metrics = train_step(init_state(config, variables), source.batch_at(0), body, config, networks)
     weights = dataclasses.asdict(config.loss)
     names = ("squared", "structural", "silhouette", "tightness", "perceptual", "lpips")
@@ -236,5 +236,5 @@ def test_the_share_of_random_backgrounds_is_kept():
 @pytest.mark.parametrize(("views", "capacity"), [(6, 70), (4, 50), (1, 20)])
 def test_fewer_photos_have_their_share_of_the_token_capacity(views, capacity):
     config = dataclasses.replace(tiny(), views=ViewSampling(input_counts=(1, 4, 6)))
-    config = dataclasses.replace(config, model=config.model.with_execution(token_capacity=70))
-    assert token_share(config, views).execution.token_capacity == capacity
+    config = dataclasses.replace(config, model=config.model.with_runtime(token_capacity=70))
+    assert token_share(config, views).runtime.token_capacity == capacity

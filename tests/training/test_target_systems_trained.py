@@ -66,7 +66,7 @@ def test_one_person_is_learnt_and_shown_by_the_evaluator(name, body, captures):
     _, numbers = validation.evaluate(state.variables, mapped, Example(views, views), config)
     scored = evaluate(Case("tube", chosen, chosen), weights=(state.variables, config.model))
     assert scored.means["psnr"].mean == pytest.approx(float(numbers["psnr"]), abs=0.05)
-    assert np.isnan(numbers["fog"]) == (scored.means["iou"] is None) == (name in PIXELS)
+    assert np.isnan(numbers["semi_transparent"]) == (scored.means["iou"] is None) == (name in PIXELS)
     if name in PIXELS:
         with pytest.raises(ValueError, match="shows people on white; background 0 was asked for"):
             evaluate(Case("tube", chosen, chosen), weights=(state.variables, config.model), protocol="ghg")
@@ -78,7 +78,7 @@ def test_a_run_of_a_network_that_draws_pixels_is_validated_logged_and_saved(body
     train(config, body, captures[:2], tmp_path / "run", validation=captures[2:], progress=False)
     lines = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     validated = next(line for line in lines if "val_psnr" in line)
-    assert validated["val_fog"] is None and validated["val_psnr"] > 0
+    assert validated["val_semi_transparent"] is None and validated["val_psnr"] > 0
     variables, model = load_weights(tmp_path / "run" / "best.safetensors")
     assert model.architecture == config.model.architecture
     assert set(variables["params"]) == {"decoder"}

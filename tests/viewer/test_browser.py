@@ -118,8 +118,8 @@ def test_a_shape_slider_moves_the_avatar_as_its_body(browser, avatar):
 def content_height(browser):
     """Pixels between the highest and lowest point of the person, left of the panel."""
     image = browser.screenshot()[:, :980]
-    colourful = np.ptp(image, axis=-1) > 0.15
-    rows = np.flatnonzero(colourful.any(axis=1))
+    colorful = np.ptp(image, axis=-1) > 0.15
+    rows = np.flatnonzero(colorful.any(axis=1))
     return int(rows[-1] - rows[0])
 
 

@@ -124,7 +124,7 @@ def test_a_browser_sees_the_person_and_the_next_one(person):
     blue = replace(person, gaussians=replace(person.gaussians, colors=person.gaussians.colors[:, ::-1]))
 
     def share(browser, channel):
-        """Share of the window where a colour is much brighter than the two others."""
+        """Share of the window where a color is much brighter than the two others."""
         image = browser.screenshot()
         others = np.delete(image, channel, axis=-1).max(axis=-1)
         return float((image[..., channel] - others > 0.4).mean())

@@ -74,7 +74,7 @@ def test_the_light_is_kept():
     assert np.abs(shading - np.asarray(light.shading, np.float64)).max() <= HALF * STEP * (high - low)
 
 
-def test_colours_beyond_one_and_flat_gaussians_are_kept():
+def test_colors_beyond_one_and_flat_gaussians_are_kept():
     avatar = small_avatar()
     gaussians = replace(avatar.gaussians, colors=2 * avatar.gaussians.colors - 0.5, scales=avatar.gaussians.scales * 0)
     got = decoded(packing.pack(replace(avatar, gaussians=gaussians)))

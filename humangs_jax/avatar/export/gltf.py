@@ -17,7 +17,7 @@ EXTENSION = "KHR_gaussian_splatting"
 def write_glb(path: str | os.PathLike, gaussians: Gaussians) -> None:
     """Write a `.glb` with KHR_gaussian_splatting; the file appears whole or not at all.
 
-    Viewers that do not know the extension draw coloured points: glTF's COLOR_0 is linear, unlike the extension's coefficients.
+    Viewers that do not know the extension draw colored points: glTF's COLOR_0 is linear, unlike the extension's coefficients.
     """
     means, quats, scales, opacities, colors = plain_arrays(gaussians)
     arrays = {

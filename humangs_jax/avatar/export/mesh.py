@@ -23,13 +23,13 @@ from humangs_jax.rendering.mesh.position_map import vertex_normals
 TEXTURE_SIZE = 1024
 """Texels a side: some 2 mm on an adult. Gaussians are 5 to 10 mm apart."""
 NEIGHBOURS = 32
-"""Gaussians that are asked for the colour of a point: those with the nearest means."""
+"""Gaussians that are asked for the color of a point: those with the nearest means."""
 CHUNK = 16384
 """Points at a time: some 100 MB."""
 SMALLEST_SCALE = 1e-4
 """Metres; flat Gaussians are seen as if they were a tenth of a millimetre thick."""
 LEAST_WEIGHT = 1e-4
-"""Of the nearest Gaussian, so that points that no Gaussian covers have a colour."""
+"""Of the nearest Gaussian, so that points that no Gaussian covers have a color."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,7 +58,7 @@ class BodyMesh:
 
 
 def body_mesh(avatar: Avatar, texture_size: int = TEXTURE_SIZE) -> BodyMesh:
-    """The body of an avatar in T-pose, with the colours of its Gaussians as a texture.
+    """The body of an avatar in T-pose, with the colors of its Gaussians as a texture.
 
     Raises: ValueError for an avatar without faces or Gaussians, or with numbers that files cannot hold, or a size that is no
     multiple of 128.

@@ -13,7 +13,7 @@ from humangs_jax.rendering.gaussians import Gaussians
 
 
 def write_splat(path: str | os.PathLike, gaussians: Gaussians) -> None:
-    """Write a `.splat`; the file appears whole or not at all. Colours and opacities lose to 8 bits, quaternions to 7."""
+    """Write a `.splat`; the file appears whole or not at all. Colors and opacities lose to 8 bits, quaternions to 7."""
     means, quats, scales, opacities, colors = plain_arrays(gaussians)
     rows = np.empty(len(means), [("position", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
     rows["position"], rows["scale"] = means, scales

@@ -1,6 +1,6 @@
 """`.spz` version 3 (https://github.com/nianticlabs/spz#file-format): gzip of a header and six arrays, 20 bytes a Gaussian.
 
-Positions are 24-bit fixed-point numbers, scales exp(k / 16 - 10) metres, opacities k / 255, colours
+Positions are 24-bit fixed-point numbers, scales exp(k / 16 - 10) metres, opacities k / 255, colors
 f_dc = (k / 255 - 1/2) / 0.15, quaternions their three smallest components in 10 bits each. Axes are right, up and back: a person
 that faces +z in a `.glb` faces -z here, as converters (Niantic's own, splat-transform) have it. Written here because the
 libraries for Python that write it bring a compiler of 200 MB (gsply: numba) or do not install (PyPI's spz).
@@ -26,7 +26,7 @@ QUATERNION_STEPS = 511
 def write_spz(path: str | os.PathLike, gaussians: Gaussians) -> None:
     """Write a `.spz`; the file appears whole or not at all.
 
-    Scales lose up to 3 %, colours and opacities to 8 bits, components of quaternions to 10.
+    Scales lose up to 3 %, colors and opacities to 8 bits, components of quaternions to 10.
 
     Raises: ValueError for Gaussians farther than 8,000 km from the origin.
     """

@@ -1,6 +1,6 @@
 """Our world and those of other programs: the one conversion of conventions that all exporters share.
 
-Ours are metres with y up, the person faces +z, quaternions wxyz, linear scales, opacities and colours in [0, 1]. glTF's world is
+Ours are metres with y up, the person faces +z, quaternions wxyz, linear scales, opacities and colors in [0, 1]. glTF's world is
 the same. Viewers of `.ply` and `.splat` take y for down: SuperSplat and PlayCanvas turn what they read by half a turn about z.
 `.spz` has axes to the right, up and back, half a turn about y from ours. So converters make the same of all of them.
 `grounded_gaussians`, `turned` and `rotated` bring a person into these worlds; `plain_arrays` and `sh_of` are the numbers that
@@ -86,7 +86,7 @@ def plain_arrays(
     Float[np.ndarray, " g"],
     Float[np.ndarray, "g 3"],
 ]:
-    """Means, unit quaternions (wxyz), scales, opacities and colours in float64, without deformations and without low-pass.
+    """Means, unit quaternions (wxyz), scales, opacities and colors in float64, without deformations and without low-pass.
 
     Viewers add `EPS2D` pixels^2, as 3DGS does, where our renderer adds less to scales that contain a low-pass
     (`Gaussians.low_pass`). It is taken out, so that both draw the same in images of the size that the Gaussians were fitted to.
@@ -116,6 +116,6 @@ def sh_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
 
 
 def linear_of(colors: Float[np.ndarray, "*g 3"]) -> Float[np.ndarray, "*g 3"]:
-    """Linear colours in [0, 1] of sRGB-encoded ones (IEC 61966-2-1)."""
+    """Linear colors in [0, 1] of sRGB-encoded ones (IEC 61966-2-1)."""
     encoded = np.clip(colors, 0, 1)
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)

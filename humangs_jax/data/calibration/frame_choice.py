@@ -20,7 +20,7 @@ LONGER_SIDE = 480
 CELLS = 24
 """Rows and columns of the thumbnails that are compared."""
 NOTHING_SHOWN = 3.0
-"""Levels of 255: the standard deviation of a frame that is all of one colour, but for noise."""
+"""Levels of 255: the standard deviation of a frame that is all of one color, but for noise."""
 NOTHING_NEW = 0.05
 """Root mean square of the difference of two thumbnails, in standard deviations of one."""
 

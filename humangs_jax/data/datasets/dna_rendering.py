@@ -5,7 +5,7 @@
 
 CC has two digits, C and FRAME have no zeros before. RT is world_from_cam, D is k1 k2 p1 p2 k3: photos and masks are undistorted.
 The mask is the greatest channel. fullpose: 55 x 3, hands relative to the mean hand (flat_hand_mean False), gendered model.
-`scale` and colour calibration are unused, as in the readers of others. Needs the package h5py.
+`scale` and color calibration are unused, as in the readers of others. Needs the package h5py.
 """
 
 import importlib

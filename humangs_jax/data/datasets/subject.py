@@ -136,7 +136,7 @@ class Person:
         """The subject. Raises: ValueError, naming file and field."""
         return self.open()
 
-    def outline(self) -> StoredSubject:
+    def boundary(self) -> StoredSubject:
         """All of it but pixels and poses."""
         subject, every = self.subject, np.arange(len(self.subject))
         R, t = subject.cam_from_world[:, :3, :3], subject.cam_from_world[:, :3, 3]

@@ -35,7 +35,7 @@ def find_captures(root: str | Path) -> tuple[Path, ...]:
     return tuple(folders)
 
 
-def read_outline(path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY) -> StoredSubject:
+def read_boundary(path: str | Path, body: BodyModel, body_file: str | Path = DEFAULT_BODY) -> StoredSubject:
     """All of a capture but its pixels: parameters that belong to `body`, images and masks of no views but of the right size.
 
     Images are opened and their sizes compared; PNG files are checked by their checksums, others by decoding them.
@@ -114,16 +114,16 @@ class StoredPerson(Protocol):
         """What the log and `broken` call it."""
         ...
 
-    def outline(self) -> StoredSubject:
+    def boundary(self) -> StoredSubject:
         """All of it but pixels, perhaps without poses. Raises: ValueError or OSError if it cannot be used."""
         ...
 
     def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
-        """Images and masks of these views. Raises: as `outline`."""
+        """Images and masks of these views. Raises: as `boundary`."""
         ...
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
-        """Some views of the outline, with at least the poses that they show. Raises: as `outline`."""
+        """Some views of the silhouette, with at least the poses that they show. Raises: as `boundary`."""
         ...
 
 
@@ -135,9 +135,9 @@ class CaptureFolder:
     body: BodyModel
     body_file: str | Path = DEFAULT_BODY
 
-    def outline(self) -> StoredSubject:
-        """See `read_outline`."""
-        return read_outline(self.name, self.body, self.body_file)
+    def boundary(self) -> StoredSubject:
+        """See `read_boundary`."""
+        return read_boundary(self.name, self.body, self.body_file)
 
     def decode(self, views: Sequence[int]) -> tuple[UInt8[np.ndarray, "n h w 3"], UInt8[np.ndarray, "n h w"]]:
         """See `StoredPerson`."""
@@ -147,7 +147,7 @@ class CaptureFolder:
         return to_uint8(capture.images), to_uint8(capture.masks)
 
     def posed(self, subject: StoredSubject) -> StoredSubject:
-        """The same: the outline has all poses."""
+        """The same: the silhouette has all poses."""
         return subject
 
 
@@ -164,7 +164,7 @@ class PeopleCache:
         self.broken: dict[Path | str, str] = {}
         self._free_bytes = limit_bytes
         self._left_out: set[Path | str] = set()
-        self._outlines: dict[Path | str, StoredSubject] = {}
+        self._boundaries: dict[Path | str, StoredSubject] = {}
         self._images: dict[tuple[Path | str, int], tuple[np.ndarray, np.ndarray]] = {}
         self._lock = threading.Lock()
 
@@ -175,37 +175,37 @@ class PeopleCache:
         """What errors call person `index`."""
         return self.people[index].name
 
-    def outline(self, index: int) -> StoredSubject | None:
+    def boundary(self, index: int) -> StoredSubject | None:
         """Person `index` without images, see `StoredPerson`; None if it is broken, which is reported once."""
         name = self.name(index)
         with self._lock:
             if name in self._left_out:
                 return None
-            if name in self._outlines:
-                return self._outlines[name]
+            if name in self._boundaries:
+                return self._boundaries[name]
         try:
-            outline = self.people[index].outline()
+            boundary = self.people[index].boundary()
         except (ValueError, OSError) as error:
             self.report(index, str(error))
             return None
         with self._lock:
-            return self._outlines.setdefault(name, outline)
+            return self._boundaries.setdefault(name, boundary)
 
     def some_views(self, index: int, views: Sequence[int]) -> StoredSubject:
         """Person `index` with these views alone, in this order. Raises: ValueError naming file and field."""
         person, name = self.people[index], self.name(index)
         with self._lock:
-            outline = self._outlines.get(name)
+            boundary = self._boundaries.get(name)
             decoded = {view: self._images[name, view] for view in views if (name, view) in self._images}
-        outline = person.outline() if outline is None else outline
+        boundary = person.boundary() if boundary is None else boundary
         if missing := [view for view in views if view not in decoded]:
             for view, image, mask in zip(missing, *person.decode(missing), strict=True):
                 decoded[view] = image, mask
                 self._keep(name, view, image, mask)
         chosen = np.asarray(views)
         images, masks = (np.stack(column) for column in zip(*(decoded[view] for view in views), strict=True))
-        of_views = {name: getattr(outline, name)[chosen] for name in ("K", "cam_from_world", "frames", "azimuths")}
-        return person.posed(outline._replace(images=images, masks=masks, **of_views))
+        of_views = {name: getattr(boundary, name)[chosen] for name in ("K", "cam_from_world", "frames", "azimuths")}
+        return person.posed(boundary._replace(images=images, masks=masks, **of_views))
 
     def note(self, index: int, problem: str) -> None:
         """Record person `index` as broken, and log it the first time; other views of it are still used."""
@@ -295,13 +295,13 @@ class CaptureSource:
         epoch, position = divmod(index, len(self.cache))
         order = subject_order(seed, epoch, len(self.cache))
         for subject_index in np.roll(order, -position).tolist():
-            outline = self.cache.outline(subject_index)
-            if outline is None:
+            boundary = self.cache.boundary(subject_index)
+            if boundary is None:
                 continue
             try:
-                inputs, targets = draw_views(view_generator(seed, index), outline, input_count, self.sampling)
+                inputs, targets = draw_views(view_generator(seed, index), boundary, input_count, self.sampling)
                 for size in (self.input_size, self.target_size):
-                    shrink(outline.images, size)  # without views: whether images of this size can be shrunk so
+                    shrink(boundary.images, size)  # without views: whether images of this size can be shrunk so
             except ValueError as error:
                 self.cache.report(subject_index, f"{self.cache.name(subject_index)}: {error}")
                 continue

@@ -1,8 +1,8 @@
 """Photos of a textured scan: our rasterizer, several samples a pixel, a texture shrunk to the samples, soft light.
 
-Colour = texture (ambient + headlight |n . v|), n the smooth normal and v the direction to the camera, both sides alike. The
+Color = texture (ambient + headlight |n . v|), n the smooth normal and v the direction to the camera, both sides alike. The
 published protocol names an ambient light of 0.3 and one headlight, and no strength of the latter: with 0.7 a surface that faces
-the camera has the colour of its texture.
+the camera has the color of its texture.
 """
 
 import dataclasses

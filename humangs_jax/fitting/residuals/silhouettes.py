@@ -1,8 +1,8 @@
-"""Silhouettes as evidence: outlines of a body against outlines of masks.
+"""Silhouettes as evidence: silhouettes of a body against silhouettes of masks.
 
-As in edge trackers (Harris and Stennett 1990, "RAPiD"): each point of the body's outline looks along its normal for the
-nearest end of the mask, and each point of the mask's outline for the nearest point of the body's that faces the same way. Both
-give an equation n . x = n . q: x, a point of the body in the image, may slide along the mask's outline.
+As in edge trackers (Harris and Stennett 1990, "RAPiD"): each point of the body's silhouette looks along its normal for the
+nearest end of the mask, and each point of the mask's silhouette for the nearest point of the body's that faces the same way. Both
+give an equation n . x = n . q: x, a point of the body in the image, may slide along the mask's silhouette.
 
 People wear clothes and hair: the body may end inside of the mask, but not outside. So distances outwards count in full, and
 distances inwards count less and less the larger they are.
@@ -20,7 +20,7 @@ from humangs_jax.body.model import BodyModel
 from humangs_jax.body.surface_points import SurfacePoints
 from humangs_jax.core.array_types import Array, Float, Int
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.fitting.residuals.outlines import Outline, inside_image
+from humangs_jax.fitting.residuals.boundaries import Boundary, inside_image
 from humangs_jax.fitting.solve import robust
 from humangs_jax.network.bilinear import sample_bilinear
 
@@ -32,7 +32,7 @@ FACING = 0.5
 
 @pytree_dataclass
 class Matches:
-    """Equations of one view: points[i] of the body's outline shall lie on the line normals[i] . x = offsets[i].
+    """Equations of one view: points[i] of the body's silhouette shall lie on the line normals[i] . x = offsets[i].
 
     points: (e,) indices. normals: (e, 2) unit, outwards. offsets: (e,) pixels. weights: (e,) 0: no equation.
     """
@@ -45,16 +45,16 @@ class Matches:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MaskView:
-    """A mask (h, w) with its outline."""
+    """A mask (h, w) with its silhouette."""
 
     mask: Float[np.ndarray, "h w"]
-    outline: Outline
+    boundary: Boundary
 
 
-def match(body: Outline, view: MaskView, reach: float, count: int) -> Matches:
+def match(body: Boundary, view: MaskView, reach: float, count: int) -> Matches:
     """At most 2 `count` equations, padded with weight 0. reach: pixels, how far points look."""
     own = _ends_of_mask(body, view.mask, reach)
-    other = _nearest(body, view.outline, reach)
+    other = _nearest(body, view.boundary, reach)
     rows = [np.concatenate(pair) for pair in zip(own, other, strict=True)]
     missing = 2 * count - len(rows[0])
     points, normals, offsets = (np.pad(x, ((0, missing),) + ((0, 0),) * (x.ndim - 1)) for x in rows)
@@ -109,11 +109,11 @@ def silhouette_residuals(
     scales: tuple[Float[Array, ""], Float[Array, ""]],
     independent: float,
 ) -> Float[Array, " e"]:
-    """Distances of outlines in standard deviations.
+    """Distances of silhouettes in standard deviations.
 
-    Arguments: clothes: pixels by which the mask reaches beyond the body. noise: std of an outline, pixels. scales: robust scales
-    outwards and inwards, pixels. independent: number of independent equations that all of a view count for, because neighbours on
-    an outline err together.
+    Arguments: clothes: pixels by which the mask reaches beyond the body. noise: std of a silhouette, pixels. scales: robust
+    scales outwards and inwards, pixels. independent: number of independent equations that all of a view count for, because
+    neighbours on a silhouette err together.
     """
     off = distances(matches, pixels) + clothes[matches.points]
     scale = jnp.where(off > 0, *scales)
@@ -122,14 +122,14 @@ def silhouette_residuals(
     return jnp.sqrt(matches.weights * jnp.minimum(share, 1.0)) * bounded
 
 
-# Points of outlines on the body --------------------------------------------------------------------------------------
+# Points of silhouettes on the body --------------------------------------------------------------------------------------
 
 
-def outline_points(body: BodyModel, outlines: Sequence[Outline], count: int, coefficients: int) -> SurfacePoints:
-    """The points of v outlines as functions of shape and pose, (v, count, ...), padded with points that no equation uses."""
+def boundary_points(body: BodyModel, boundaries: Sequence[Boundary], count: int, coefficients: int) -> SurfacePoints:
+    """The points of v silhouettes as functions of shape and pose, (v, count, ...), padded with points that no equation uses."""
     fill = lambda x: np.pad(x, ((0, count - len(x)),) + ((0, 0),) * (x.ndim - 1))
-    ends = jnp.asarray(np.stack([fill(outline.ends) for outline in outlines]))
-    shares = jnp.asarray(np.stack([fill(outline.shares) for outline in outlines]))
+    ends = jnp.asarray(np.stack([fill(boundary.ends) for boundary in boundaries]))
+    shares = jnp.asarray(np.stack([fill(boundary.shares) for boundary in boundaries]))
     return _between(body, ends, shares, coefficients)
 
 

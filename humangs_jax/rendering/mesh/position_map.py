@@ -5,7 +5,7 @@ lengths are in the network's normalised units: the caller divides vertices and c
 Pixels beside the body have the position (1, 1, 1) and depth -1.
 
 `plain_position_map` is the paper's: canonical positions, interpolated. `gouraud_position_map` is what the released
-network was trained on, and needed to run its weights: positions as colours, through a Gouraud shader with a point
+network was trained on, and needed to run its weights: positions as colors, through a Gouraud shader with a point
 light.
 """
 

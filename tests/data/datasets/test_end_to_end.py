@@ -56,7 +56,7 @@ def test_a_person_goes_all_the_way(layout, tmp_path):
     checked = check_capture(capture, tmp_path / "check.png")
     overlap = [view.iou for view in checked.views]
     assert np.mean(overlap) > TIGHT_IOU and max(view.outside for view in checked.views) < 0.01, overlap
-    config = tiny().with_execution(token_capacity=64)
+    config = tiny().with_runtime(token_capacity=64)
     avatar = reconstruct(init_humangs(jax.random.key(0), config), config, capture.select([0, 1]))
     last = capture.pose(capture.frame_count - 1)
     moved = animate(avatar, last)

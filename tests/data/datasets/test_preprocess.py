@@ -231,7 +231,7 @@ def test_wrong_options_are_one_line(tmp_path):
             made.run()
 
 
-def test_a_face_before_the_camera_has_the_colour_of_its_texture():
+def test_a_face_before_the_camera_has_the_color_of_its_texture():
     from humangs_jax.data.datasets.thuman import Scan
 
     corners = np.asarray([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0]])

@@ -1,5 +1,5 @@
-"""Rounds of refinement, similar to iterated closest points. Each draws the body, matches its outline with the mask's, and moves
-cameras, shape and poses by a few steps of damped least squares. The reach falls from round to round.
+"""Rounds of refinement, similar to iterated closest points. Each draws the body, matches its silhouette with the mask's, and
+moves cameras, shape and poses by a few steps of damped least squares. The reach falls from round to round.
 
 `StateStd` is a Gaussian prior around the start; without it the problem has free directions: cameras and people that move
 together look the same (a gauge), and silhouettes hardly show twists of limbs.
@@ -22,6 +22,7 @@ from humangs_jax.core.array_types import Array, Bool, Float
 from humangs_jax.core.pytree import pytree_dataclass, replace
 from humangs_jax.data.capture import Capture
 from humangs_jax.data.keypoints.keypoints import Keypoints
+from humangs_jax.fitting.residuals.boundaries import BodyView, body_boundary, mask_boundary, mesh_edges, view_body
 from humangs_jax.fitting.residuals.keypoints import (
     NEAR,
     Observations,
@@ -29,13 +30,12 @@ from humangs_jax.fitting.residuals.keypoints import (
     keypoint_residuals,
     make_observations,
 )
-from humangs_jax.fitting.residuals.outlines import BodyView, body_outline, mask_outline, mesh_edges, view_body
 from humangs_jax.fitting.residuals.silhouettes import (
     MaskView,
     Matches,
+    boundary_points,
     distances,
     match,
-    outline_points,
     silhouette_residuals,
 )
 from humangs_jax.fitting.solve import NORMAL_MAD, Outcome, solve
@@ -56,7 +56,7 @@ from humangs_jax.fitting.triangulation import reprojection_errors
 from humangs_jax.geometry.camera import Camera
 
 LEAST_NOISE = 0.7
-"""Pixels: outlines of masks are no better."""
+"""Pixels: silhouettes of masks are no better."""
 LM_UNKNOWNS = 400
 """With more unknowns L-BFGS replaces least squares, whose Jacobian grows with rows times columns."""
 PATIENCE = 6
@@ -72,8 +72,8 @@ class CaptureRefineConfig:
     """Static settings of a refinement.
 
     std: how far off the start is expected to be. shared_focal: focal lengths that start equal stay equal. coefficients: of the
-    shape, where the capture has fewer. fixed_cameras: only shape and poses move. rounds: number of matchings; steps: of the
-    solver in each. points: of an outline.
+    shape, where the capture has fewer. fixed_cameras: only shape and poses move. iterations: number of matchings; steps: of the
+    solver in each. points: of a silhouette.
     independent: number of independent equations that all points of a view count for. reach: how far points look in the first and
     the last round, shares of the person's height in the image. robust_scales: multiples of the reach, outwards and inwards of
     the mask. longest_side: larger photos are shrunk to this many pixels.
@@ -85,7 +85,7 @@ class CaptureRefineConfig:
     shared_focal: bool = True
     coefficients: int = 10
     fixed_cameras: bool = False
-    rounds: int = 10
+    iterations: int = 10
     steps: int = 4
     points: int = 300
     independent: float = 30.0
@@ -168,7 +168,7 @@ def _moved(origin, state):
 
 @pytree_dataclass
 class Evidence:
-    """What v views show. points: of the body's outline, and matches: their equations, batches of v. noise: () pixels; scales:
+    """What v views show. points: of the body's silhouette, and matches: their equations, batches of v. noise: () pixels; scales:
     (2,) robust scales, pixels, outwards and inwards. keypoints: a batch of v, each with one view (c = 1), or None.
     """
 
@@ -240,7 +240,7 @@ class Score:
 
 
 class Scene:
-    """What stays the same over the rounds: masks at the size that is looked at, keypoints, and the origin."""
+    """What stays the same over the iterations: masks at the size that is looked at, keypoints, and the origin."""
 
     def __init__(self, capture: Capture, keypoints: Keypoints | None, config: CaptureRefineConfig) -> None:
         self.capture, self.config = capture, config
@@ -250,7 +250,7 @@ class Scene:
         self.cameras, self.masks = looked_at.cameras, empty if looked_at.masks is None else looked_at.masks
         self.faces = np.asarray(capture.body.faces)
         self.edges = mesh_edges(self.faces)
-        self.views = [MaskView(mask, mask_outline(mask, config.points)) for mask in self.masks]
+        self.views = [MaskView(mask, mask_boundary(mask, config.points)) for mask in self.masks]
         names, places = ((), ()) if keypoints is None else (keypoints.set.names, keypoints.set.places)
         self.model = landmark_model(capture.body, names, places)
         self.scale = self.cameras.width / capture.cameras.width
@@ -260,13 +260,13 @@ class Scene:
         self.origin = capture_origin(capture, self.cameras, config)
 
     def run(self) -> tuple[FitState, Outcome, float]:
-        """The state after all rounds, what the solver did in each (a batch), and the largest move of the last round, in
+        """The state after all iterations, what the solver did in each (a batch), and the largest move of the last round, in
         expected standard deviations.
         """
         config, state, outcomes, move = self.config, start_state(self.origin, self.config), [], 0.0
         first, last = config.reach
-        for turn in range(config.rounds):
-            evidence = self.look(state, self.height * first * (last / first) ** (turn / max(config.rounds - 1, 1)))
+        for turn in range(config.iterations):
+            evidence = self.look(state, self.height * first * (last / first) ** (turn / max(config.iterations - 1, 1)))
             before = state
             state, outcome = solve_round(self.model, self.origin, evidence, state, config.independent, config.steps)
             outcomes.append(outcome)
@@ -278,12 +278,12 @@ class Scene:
         """What the views show, matched within `reach` pixels of the body in this state."""
         count = self.config.points
         moved = moved_capture(self.capture, self.origin, state)
-        outlines = [body_outline(view, self.faces, self.edges, count) for view in self.body_views(moved)]
-        matches = [match(outline, view, reach, count) for outline, view in zip(outlines, self.views, strict=True)]
+        boundaries = [body_boundary(view, self.faces, self.edges, count) for view in self.body_views(moved)]
+        matches = [match(boundary, view, reach, count) for boundary, view in zip(boundaries, self.views, strict=True)]
         return Evidence(
-            points=outline_points(self.capture.body, outlines, count, len(self.origin.betas)),
+            points=boundary_points(self.capture.body, boundaries, count, len(self.origin.betas)),
             matches=jax.tree.map(lambda *leaves: jnp.stack(leaves), *matches),
-            noise=jnp.asarray(_noise(outlines, matches), jnp.float32),
+            noise=jnp.asarray(_noise(boundaries, matches), jnp.float32),
             scales=reach * jnp.asarray(self.config.robust_scales, jnp.float32),
             keypoints=self._keypoints(moved),
         )
@@ -346,12 +346,12 @@ def _keypoint_errors(model, betas, poses, seen, frames):
     return jax.vmap(reprojection_errors)(seen, landmarks[frames])
 
 
-def _noise(outlines, matches):
+def _noise(boundaries, matches):
     """How far bodies are off their masks, pixels: clothes make masks less certain, and so does a body that is not yet there."""
     off = [
-        np.asarray(distances(m, jnp.asarray(outline.positions, jnp.float32)))[np.asarray(m.weights) > 0]
-        for outline, m in zip(outlines, matches, strict=True)
-        if len(outline.positions)
+        np.asarray(distances(m, jnp.asarray(boundary.positions, jnp.float32)))[np.asarray(m.weights) > 0]
+        for boundary, m in zip(boundaries, matches, strict=True)
+        if len(boundary.positions)
     ]
     off = np.concatenate([np.zeros(0), *off])
     return max(NORMAL_MAD * float(np.median(np.abs(off))), LEAST_NOISE) if len(off) else 1.0

@@ -18,7 +18,7 @@ def surface_distance(
 ) -> Float[Array, "*b"]:
     """Distance between the surface drawn and the true one, in the unit of the depths, where both are the person's.
 
-    0 where the true one is unknown (0). At most `FAR_SURFACE`: across an outline the nearest surfaces are different limbs.
+    0 where the true one is unknown (0). At most `FAR_SURFACE`: across a silhouette the nearest surfaces are different limbs.
     """
     known = target_depth > 0
     return alpha * mask * known * jnp.minimum(jnp.abs(depth - target_depth), FAR_SURFACE)

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from experiments.training.cases import random_weights
-from humangs_jax.objectives import backbones, lpips, perceptual
-from humangs_jax.objectives.backbones import Conv, Convolution, Pool, feature_maps
+from humangs_jax.losses import backbones, lpips, perceptual
+from humangs_jax.losses.backbones import Conv, Convolution, Pool, feature_maps
 
 TABLES = {"vgg19": perceptual.VGG19, **lpips.BACKBONES}
 SMALLEST = {"vgg19": 16, "vgg": 16, "alex": 31, "squeeze": 25}

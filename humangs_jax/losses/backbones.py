@@ -150,7 +150,7 @@ def smallest_side(slices: Slices) -> int:
 def feature_maps(
     weights: Weights, slices: Slices, image: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
 ) -> list[tuple[Float[Array, "y x c"], Int[Array, "2"] | None]]:
-    """The compared maps of an image whose colours are scaled as the network expects them, each with its size.
+    """The compared maps of an image whose colors are scaled as the network expects them, each with its size.
 
     size: the image's own height and width, where it was padded below and right so that images of several sizes share a program.
     The maps are then those of the image without padding, padded with zeros, and their sizes say where they end. Without it the

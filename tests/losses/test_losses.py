@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from rounding import bound
 
-from humangs_jax.objectives.losses import (
+from humangs_jax.losses.losses import (
     FAR_SURFACE,
     ray_spread,
     squared_error,
@@ -13,7 +13,15 @@ from humangs_jax.objectives.losses import (
     tightness,
     translucency,
 )
-from humangs_jax.objectives.metrics import LARGEST_PSNR, OUTLINE, fog, masked_psnr, outline_psnr, psnr, silhouette_iou
+from humangs_jax.losses.metrics import (
+    BOUNDARY,
+    LARGEST_PSNR,
+    boundary_psnr,
+    masked_psnr,
+    psnr,
+    semi_transparent,
+    silhouette_iou,
+)
 
 SIDE = 256
 FLOAT32 = 1e-6
@@ -90,11 +98,11 @@ def test_translucency_vanishes_for_opacities_of_0_and_1():
 
 def test_fog_is_the_share_of_the_mask_that_is_neither_clear_nor_opaque():
     alpha, mask = jnp.asarray([[0.0, 0.5, 1.0, 0.5]]), jnp.asarray([[1.0, 1.0, 1.0, 0.0]])
-    assert float(fog(alpha, mask)) == pytest.approx(1 / 3)
-    assert float(fog(alpha, 0 * mask)) == 0
+    assert float(semi_transparent(alpha, mask)) == pytest.approx(1 / 3)
+    assert float(semi_transparent(alpha, 0 * mask)) == 0
 
 
-def test_only_the_band_along_the_outline_counts():
+def test_only_the_band_along_the_boundary_counts():
     inside = np.zeros((SIDE, SIDE), bool)
     inside[64:192, 64:192] = True
     truth = np.zeros((SIDE, SIDE, 3))
@@ -102,8 +110,8 @@ def test_only_the_band_along_the_outline_counts():
     middle[100:150, 100:150] = 1
     corner[:20, :20] = 1
     edge[66, 100:110] = 0.5  # the third pixel inside
-    assert outline_psnr(middle, truth, inside) == outline_psnr(corner, truth, inside) == LARGEST_PSNR
-    width = round(OUTLINE * SIDE)
+    assert boundary_psnr(middle, truth, inside) == boundary_psnr(corner, truth, inside) == LARGEST_PSNR
+    width = round(BOUNDARY * SIDE)
     band = 4 * 128 * 2 * width  # but for the corners, outside rounded and inside shared
     expected = -10 * np.log10(10 * 0.25 / band)
-    assert outline_psnr(edge, truth, inside) == pytest.approx(expected, abs=0.1)
+    assert boundary_psnr(edge, truth, inside) == pytest.approx(expected, abs=0.1)

@@ -1,6 +1,6 @@
 """The published perceptual loss: L1 between the features of a VGG-19 with average pooling, at five depths, and pixels.
 
-Colours enter as 255 * rgb - (123.68, 116.779, 103.939), which is what the weights of the original VGG-19 expect (those of
+Colors enter as 255 * rgb - (123.68, 116.779, 103.939), which is what the weights of the original VGG-19 expect (those of
 MatConvNet's file and of the released checkpoint; torchvision's expect other scales and make another loss of it). The
 features are those after the second ReLU of each block. Losses are for ONE image; batch with `jax.vmap`.
 """
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from humangs_jax.core.array_types import Array, Float, Scalar
 from humangs_jax.core.numerics import absolute, at_least_float32
 from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.objectives.backbones import Weights, feature_maps, vgg
+from humangs_jax.losses.backbones import Weights, feature_maps, vgg
 
 VGG19 = vgg((2, 2, 4, 4, 4), (2, 2, 2, 2, 2), average=True)
 MEAN_COLOR = (123.68, 116.779, 103.939)

@@ -12,12 +12,12 @@ from scipy import ndimage
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader
 from humangs_jax.geometry.camera import project
-from humangs_jax.training import disturbances
+from humangs_jax.training import augmentation
+from humangs_jax.training.augmentation import Augmentation, augment_cameras, augment_photos, augment_views
 from humangs_jax.training.config import tiny
-from humangs_jax.training.disturbances import Disturbances, disturb_cameras, disturb_photos, disturb_views
 
 CONFIG = tiny()
-NOTHING = Disturbances(1.0, 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NOTHING = Augmentation(1.0, 0.0, 0.0, 0, 0.0, 0.0, 0.0, 0.0, 0.0)
 ROUNDING = 1e-6
 """Of a few float32 operations on numbers up to 1."""
 VIEWS = 64
@@ -25,7 +25,7 @@ VIEWS = 64
 
 @pytest.fixture(scope="module")
 def photos():
-    """Discs of random colours on white, with soft outlines."""
+    """Discs of random colors on white, with soft silhouettes."""
     y, x = np.mgrid[:24, :24] - 11.5
     mask = np.clip(8.5 - np.hypot(x, y), 0, 1).astype(np.float32)
     colors = np.random.default_rng(0).random((VIEWS, 24, 24, 3), np.float32) * 0.8
@@ -40,14 +40,14 @@ def example(body, captures):
 
 
 def test_without_disturbances_photos_stay(photos):
-    images, masks = disturb_photos(jax.random.key(0), *map(jnp.asarray, photos), NOTHING)
-    certain = (photos[1] == 0) | (photos[1] == 1)  # soft outlines show the background
+    images, masks = augment_photos(jax.random.key(0), *map(jnp.asarray, photos), NOTHING)
+    certain = (photos[1] == 0) | (photos[1] == 1)  # soft silhouettes show the background
     np.testing.assert_allclose(np.asarray(images)[certain], photos[0][certain], atol=ROUNDING)
     np.testing.assert_array_equal(masks, photos[1])
 
 
 def test_masks_grow_and_shrink_by_squares(photos):
-    _, masks = disturb_photos(jax.random.key(1), *map(jnp.asarray, photos), dataclasses.replace(NOTHING, mask_pixels=2))
+    _, masks = augment_photos(jax.random.key(1), *map(jnp.asarray, photos), dataclasses.replace(NOTHING, mask_pixels=2))
     possible = [photos[1][0]]
     for size in (3, 5):
         possible += [
@@ -60,19 +60,19 @@ def test_masks_grow_and_shrink_by_squares(photos):
 
 def test_a_larger_mask_shows_the_background_there_alone(photos):
     settings = dataclasses.replace(NOTHING, mask_pixels=2)
-    images, masks = disturb_photos(jax.random.key(1), *map(jnp.asarray, photos), settings)
+    images, masks = augment_photos(jax.random.key(1), *map(jnp.asarray, photos), settings)
     inner, outer = photos[1] == 1, (photos[1] == 0) & (np.asarray(masks) == 1)
     kept = inner & (np.asarray(masks) == 1)
     np.testing.assert_allclose(np.asarray(images)[kept], photos[0][kept], atol=ROUNDING)
     for image, place in zip(np.asarray(images), outer, strict=True):
-        if place.any():  # one colour, not white
+        if place.any():  # one color, not white
             assert np.ptp(image[place], axis=0).max() < ROUNDING and image[place].min() < 0.999
     np.testing.assert_array_equal(np.asarray(images)[np.asarray(masks) == 0], 1)
 
 
 def test_exposure_has_its_standard_deviation(photos):
     grey = jnp.full((2000, 1, 1, 3), 0.3), jnp.ones((2000, 1, 1))
-    images, _ = disturb_photos(jax.random.key(2), *grey, dataclasses.replace(NOTHING, exposure=0.1))
+    images, _ = augment_photos(jax.random.key(2), *grey, dataclasses.replace(NOTHING, exposure=0.1))
     gains = np.log(np.asarray(images)[:, 0, 0] / 0.3)
     assert np.std(gains) == pytest.approx(0.1, rel=0.1)
     np.testing.assert_allclose(gains, np.repeat(gains[:, :1], 3, 1), atol=ROUNDING * 10)
@@ -82,7 +82,7 @@ def test_cameras_turn_about_the_person(example):
     cameras = example.inputs.cameras
     count = len(cameras.K)
     centers = jnp.asarray([[0.1, 0.9, -0.2]] * count)
-    turned = disturb_cameras(jax.random.key(3), cameras, centers, dataclasses.replace(NOTHING, camera_degrees=2.0))
+    turned = augment_cameras(jax.random.key(3), cameras, centers, dataclasses.replace(NOTHING, camera_degrees=2.0))
     for before, after, center in zip(cameras, turned, centers, strict=True):
         np.testing.assert_allclose(project(after, center)[0], project(before, center)[0], rtol=1e-4)
         turn = np.asarray(after.cam_from_world)[:3, :3] @ np.asarray(before.cam_from_world)[:3, :3].T
@@ -92,7 +92,7 @@ def test_cameras_turn_about_the_person(example):
 
 def test_all_photos_of_an_example_have_the_same_wrong_body(example):
     views = example.inputs
-    off = disturb_views(
+    off = augment_views(
         jax.random.key(4), views, jnp.zeros(3), dataclasses.replace(NOTHING, pose_degrees=1.0, body_metres=0.01)
     )
     for name in ("rotations", "translations"):
@@ -103,11 +103,11 @@ def test_all_photos_of_an_example_have_the_same_wrong_body(example):
 
 
 def test_every_example_has_its_exposures_a_share_the_rest_and_targets_keep_photos_and_cameras(example, body):
-    settings = Disturbances(share=0.5)
-    disturb = jax.jit(lambda key: disturbances.disturb(key, example, body, settings))
+    settings = Augmentation(share=0.5)
+    augment = jax.jit(lambda key: augmentation.augment(key, example, body, settings))
     changed = []
     for seed in range(12):
-        after = disturb(jax.random.key(seed))
+        after = augment(jax.random.key(seed))
         changed.append(not np.array_equal(after.inputs.betas, example.inputs.betas))
         assert not np.array_equal(after.inputs.images, example.inputs.images)
         if not changed[-1]:
@@ -132,5 +132,5 @@ def _check_one_gain_a_channel(images, before):
 
 
 def test_a_share_above_one_is_refused():
-    with pytest.raises(ValueError, match=r"Disturbances.share 1.5"):
-        Disturbances(share=1.5)
+    with pytest.raises(ValueError, match=r"Augmentation.share 1.5"):
+        Augmentation(share=1.5)

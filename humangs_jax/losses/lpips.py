@@ -2,7 +2,7 @@
 
     d = sum over slices of the mean over pixels of sum_c w_c (x_c / |x| - y_c / |y|)^2
 
-Images in [0, 1] are brought to [-1, 1] and then to the colours that the backbones were trained on. For ONE image; batch
+Images in [0, 1] are brought to [-1, 1] and then to the colors that the backbones were trained on. For ONE image; batch
 with `jax.vmap`.
 """
 
@@ -11,12 +11,12 @@ import jax.numpy as jnp
 from humangs_jax.core.array_types import Array, Float, Int, Scalar
 from humangs_jax.core.numerics import at_least_float32, safe_sqrt
 from humangs_jax.core.pytree import pytree_dataclass, static_field
-from humangs_jax.objectives.backbones import ALEXNET, SQUEEZENET, VGG16, Slices, Weights, feature_maps
+from humangs_jax.losses.backbones import ALEXNET, SQUEEZENET, VGG16, Slices, Weights, feature_maps
 
 BACKBONES: dict[str, Slices] = {"vgg": VGG16, "alex": ALEXNET, "squeeze": SQUEEZENET}
 SHIFT = (-0.030, -0.088, -0.188)
 SCALE = (0.458, 0.448, 0.450)
-"""Mean and scale of colours in [-1, 1] that the backbones expect."""
+"""Mean and scale of colors in [-1, 1] that the backbones expect."""
 EPSILON = 1e-10
 """Added to the length of a feature vector."""
 

@@ -9,9 +9,9 @@ from humangs_jax.core.numerics import safe_divide
 LARGEST_PSNR = 100.0
 """dB reported for equal images, whose PSNR is infinite and would spoil any mean."""
 FOG = (0.05, 0.9)
-"""Alphas between these are fog."""
-OUTLINE = 3 / 256
-"""Half the width of the band at the outline, of the image's side."""
+"""Alphas between these are semi-transparent foreground."""
+BOUNDARY = 3 / 256
+"""Half the width of the band at the silhouette, of the image's side."""
 
 
 def decibels(mean_squared_error: Float[Array, "*b"]) -> Float[Array, "*b"]:
@@ -30,7 +30,7 @@ def masked_psnr(predicted: Float[Array, "h w c"], target: Float[Array, "h w c"],
     return decibels(safe_divide(jnp.sum(errors * mask), jnp.sum(mask)))
 
 
-def fog(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
+def semi_transparent(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Scalar:
     """Share of the pixels of a mask where alpha is neither near 0 nor near 1, see `FOG`; 0 where the mask is empty."""
     inside = mask > 0.5
     partly = (alpha > FOG[0]) & (alpha < FOG[1]) & inside
@@ -44,15 +44,15 @@ def silhouette_iou(alpha: Float[Array, "h w"], mask: Float[Array, "h w"]) -> Sca
     return jnp.where(union > 0, jnp.sum(drawn & inside) / jnp.maximum(union, 1), 1.0)
 
 
-def outline_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
-    """1 in the band to either side of the outline of a mask (h, w), see `OUTLINE`, 0 elsewhere; on the host."""
+def boundary_band(mask: np.ndarray) -> Float[np.ndarray, "h w"]:
+    """1 in the band to either side of the silhouette of a mask (h, w), see `BOUNDARY`, 0 elsewhere; on the host."""
     from scipy.ndimage import distance_transform_edt
 
     inside = np.asarray(mask) > 0.5
     distance = np.where(inside, distance_transform_edt(inside), distance_transform_edt(~inside))
-    return (distance <= OUTLINE * len(inside)).astype(np.float32)
+    return (distance <= BOUNDARY * len(inside)).astype(np.float32)
 
 
-def outline_psnr(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray) -> float:
-    """PSNR in dB of two (h, w, 3) images in the `outline_band` of a mask (h, w)."""
-    return float(masked_psnr(jnp.asarray(predicted), jnp.asarray(target), jnp.asarray(outline_band(mask))))
+def boundary_psnr(predicted: np.ndarray, target: np.ndarray, mask: np.ndarray) -> float:
+    """PSNR in dB of two (h, w, 3) images in the `boundary_band` of a mask (h, w)."""
+    return float(masked_psnr(jnp.asarray(predicted), jnp.asarray(target), jnp.asarray(boundary_band(mask))))

@@ -11,7 +11,7 @@ from loss_cases import BACKBONES, made_up_heads, made_up_state
 from safetensors.numpy import save_file
 from scipy.io import savemat
 
-from humangs_jax.objectives.loss_networks import (
+from humangs_jax.losses.loss_networks import (
     LossNetworks,
     collect_loss_networks,
     expected_tensors,

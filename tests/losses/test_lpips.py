@@ -9,8 +9,8 @@ import pytest
 from loss_cases import convolutions_of, image_pair, made_up_heads
 from rounding import bound
 
-from humangs_jax.objectives.backbones import Convolution
-from humangs_jax.objectives.lpips import BACKBONES, Lpips, lpips, lpips_distances
+from humangs_jax.losses.backbones import Convolution
+from humangs_jax.losses.lpips import BACKBONES, Lpips, lpips, lpips_distances
 
 DATA = Path(__file__).parent / "data"
 SIZES = {"vgg": (37, 32), "alex": (37, 43), "squeeze": (40, 33)}

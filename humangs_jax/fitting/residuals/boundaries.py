@@ -1,10 +1,10 @@
-"""Outlines in images: of a posed body, by the edges at which its surface turns away from the camera, and of a mask.
+"""Silhouettes in images: of a posed body, by the edges at which its surface turns away from the camera, and of a mask.
 
-A body's outline is exact to rounding. It consists of mesh edges between a face that looks at the camera and one that looks away
-(Sander et al. 2000, "Silhouette clipping"), as far as the image shows no body outside of them. Its points lie on edges, so
-they are known functions of the pose. A mask's outline is where its coverage crosses one half.
+A body's silhouette is exact to rounding. It consists of mesh edges between a face that looks at the camera and one that looks
+away (Sander et al. 2000, "Silhouette clipping"), as far as the image shows no body outside of them. Its points lie on edges, so
+they are known functions of the pose. A mask's silhouette is where its coverage crosses one half.
 
-NumPy on the host: outlines are held fixed while a solver moves the body.
+NumPy on the host: silhouettes are held fixed while a solver moves the body.
 """
 
 import dataclasses
@@ -20,11 +20,11 @@ from humangs_jax.rendering.mesh.position_map import vertex_normals
 from humangs_jax.rendering.mesh.rasterizer import rasterize_mesh
 
 PROBE = 1.5
-"""Pixels outside of an outline at which there must be no body."""
+"""Pixels outside of a silhouette at which there must be no body."""
 NEAREST_EDGE = 0.05
-"""Metres: edges of faces nearer to the camera than this, or behind it, are no outline."""
+"""Metres: edges of faces nearer to the camera than this, or behind it, are no silhouette."""
 BORDER = 1.0
-"""Pixels from the image border within which nothing is an outline: the image ends there, not the person."""
+"""Pixels from the image border within which nothing is a silhouette: the image ends there, not the person."""
 SPECK = 0.03
 """Contours shorter than this share of a mask's longest are noise."""
 SMOOTHING = 1.5
@@ -52,11 +52,11 @@ class BodyView:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Outline:
-    """Points of an outline, evenly spread over it. positions: (p, 2) pixels. normals: (p, 2) unit, outwards.
+class Boundary:
+    """Points of a silhouette, evenly spread over it. positions: (p, 2) pixels. normals: (p, 2) unit, outwards.
 
     ends: (p, 2), shares: (p,): for a body, the vertices of each point's edge and its position between them in [0, 1].
-    An outline may be empty.
+    A silhouette may be empty.
     """
 
     positions: Float[np.ndarray, "p 2"]
@@ -94,8 +94,8 @@ def _look(vertices, faces, camera):
     return pixels, depths, normals, rasterize_mesh(vertices, faces, camera).face_ids >= 0
 
 
-def body_outline(view: BodyView, faces: Int[np.ndarray, "f 3"], edges: MeshEdges, count: int) -> Outline:
-    """`count` points of the body's outline, or none if the image shows none."""
+def body_boundary(view: BodyView, faces: Int[np.ndarray, "f 3"], edges: MeshEdges, count: int) -> Boundary:
+    """`count` points of the body's silhouette, or none if the image shows none."""
     corners = view.pixels[faces]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     towards = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0] > 0
@@ -112,11 +112,11 @@ def body_outline(view: BodyView, faces: Int[np.ndarray, "f 3"], edges: MeshEdges
     edge, shares = _spread(lengths, count)
     ends, shares = ends[edge], shares.astype(np.float32)
     positions = view.pixels[ends[:, 0]] * (1 - shares[:, None]) + view.pixels[ends[:, 1]] * shares[:, None]
-    return Outline(positions, normals[edge], ends, shares)
+    return Boundary(positions, normals[edge], ends, shares)
 
 
-def mask_outline(mask: Float[np.ndarray, "h w"], count: int) -> Outline:
-    """`count` points where coverage crosses one half, or none. The image border is no outline."""
+def mask_boundary(mask: Float[np.ndarray, "h w"], count: int) -> Boundary:
+    """`count` points where coverage crosses one half, or none. The image border is no silhouette."""
     from skimage.filters import gaussian
     from skimage.measure import find_contours
 
@@ -132,7 +132,7 @@ def mask_outline(mask: Float[np.ndarray, "h w"], count: int) -> Outline:
     positions = starts[segment] + shares[:, None] * (ends - starts)[segment]
     down, right = np.gradient(gaussian(mask, SMOOTHING, mode="nearest"))
     column, row = np.floor(positions).astype(int).T
-    return Outline(positions.astype(np.float32), _unit(-np.stack([right[row, column], down[row, column]], axis=-1)))
+    return Boundary(positions.astype(np.float32), _unit(-np.stack([right[row, column], down[row, column]], axis=-1)))
 
 
 def inside_image(positions: Float[np.ndarray, "*p 2"], shape: tuple[int, int]) -> Bool[np.ndarray, "*p"]:

@@ -1,4 +1,4 @@
-"""How the network runs, which weights files do not record (`Execution`), and what the weights were trained with."""
+"""How the network runs, which weights files do not record (`Runtime`), and what the weights were trained with."""
 
 import dataclasses
 from typing import Any, Literal
@@ -17,7 +17,7 @@ ComputeType = Literal["float32", "bfloat16", "float16"]
 
 
 @configuration
-class Execution:
+class Runtime:
     """How the network runs.
 
     tokens: patches that become tokens: "all", those that the "foreground" touches, or None: as the weights were trained.
@@ -82,18 +82,18 @@ class Execution:
     )
     crop: bool = knob(
         False,
-        cost="0.15 dB on the person for one of four people",
-        gain="pixels of the person in place of background: 0.3 dB on the person on average",
+        cost="0.15 dB in the foreground for one of four people",
+        gain="pixels of the person in place of background: 0.3 dB in the foreground on average",
         measured=EVALUATION,
     )
     raster: RasterConfig = dataclasses.field(default_factory=RasterConfig)
 
     @staticmethod
-    def preset(name: str) -> "Execution":
+    def preset(name: str) -> "Runtime":
         """How the network runs in a preset of `apps.settings`: realtime, balanced, quality or best. Raises: ValueError."""
-        if name not in EXECUTIONS:
-            raise ValueError(f"Execution.preset: expected one of {', '.join(EXECUTIONS)}, got {name!r}")
-        return EXECUTIONS[name]
+        if name not in RUNTIMES:
+            raise ValueError(f"Runtime.preset: expected one of {', '.join(RUNTIMES)}, got {name!r}")
+        return RUNTIMES[name]
 
     @property
     def compute_dtype(self) -> Any:
@@ -143,12 +143,12 @@ class Conventions:
     )
 
 
-EXECUTIONS = Presets(
+RUNTIMES = Presets(
     {
-        "realtime": Execution(crop=True, body_vertices=1000),
-        "balanced": Execution(crop=True, body_vertices=2000),
-        "quality": Execution(crop=True),
-        "best": Execution(crop=True),
+        "realtime": Runtime(crop=True, body_vertices=1000),
+        "balanced": Runtime(crop=True, body_vertices=2000),
+        "quality": Runtime(crop=True),
+        "best": Runtime(crop=True),
     }
 )
 """The network's part of `apps.settings.PRESETS`, measured in docs/tradeoff.md."""

@@ -21,12 +21,12 @@ from humangs_jax.geometry.camera import Camera
 
 
 @configuration
-class Disturbances:
+class Augmentation:
     """Standard deviations of normal distributions, unless said otherwise; one draw for each photo, or for each example.
 
     exposure: of every photo, natural logarithm of the gain. tint: of each channel of a photo, likewise.
     share: of the examples that are disturbed in the other ways, too; 0: nothing is disturbed, and no work.
-    mask_pixels: masks are eroded or dilated by up to this, uniform, and the colour of some background appears there.
+    mask_pixels: masks are eroded or dilated by up to this, uniform, and the color of some background appears there.
     camera_degrees: of a camera about the person. camera_metres: its shift, each axis.
     pose_degrees: each axis of each joint, the same in all photos of an example, as are the following.
     body_metres: each axis of the translation. betas: each shape coefficient; the wrong shape is also that of the targets.
@@ -43,15 +43,15 @@ class Disturbances:
     betas: Spread = 0.1
 
 
-def disturb(key: Key, example: Example, body: BodyModel, config: Disturbances) -> Example:
+def augment(key: Key, example: Example, body: BodyModel, config: Augmentation) -> Example:
     """The example with other exposures, or with all of its inputs and betas disturbed. Pure and jittable."""
     choice_key, betas_key, views_key = jax.random.split(key, 3)
 
-    def disturbed(example):
+    def augmented(example):
         inputs, targets = example.inputs, example.targets
         betas = inputs.betas + config.betas * jax.random.normal(betas_key, inputs.betas.shape, inputs.betas.dtype)
         pelvis = shape_body(body, betas).joints[0]
-        inputs = disturb_views(views_key, replace(inputs, betas=betas), pelvis, config)
+        inputs = augment_views(views_key, replace(inputs, betas=betas), pelvis, config)
         return replace(example, inputs=inputs, targets=replace(targets, betas=betas))
 
     def exposed(example):
@@ -61,7 +61,7 @@ def disturb(key: Key, example: Example, body: BodyModel, config: Disturbances) -
         return replace(example, inputs=replace(views, images=jnp.clip(images, 0, 1)))
 
     chosen = jax.random.bernoulli(choice_key, config.share)
-    return jax.lax.cond(chosen, disturbed, exposed, example)
+    return jax.lax.cond(chosen, augmented, exposed, example)
 
 
 def _gains(key, count, dtype, config):
@@ -71,29 +71,29 @@ def _gains(key, count, dtype, config):
     return jnp.exp(gain + config.tint * jax.random.normal(tint_key, (count, 1, 1, 3), dtype))
 
 
-def disturb_views(key: Key, views: SubjectViews, pelvis: Float[Array, "3"], config: Disturbances) -> SubjectViews:
+def augment_views(key: Key, views: SubjectViews, pelvis: Float[Array, "3"], config: Augmentation) -> SubjectViews:
     """Photos, masks, cameras and poses. pelvis: (3,) metres, in the rest pose: cameras turn about the posed one."""
     photo_key, camera_key, pose_key, body_key = jax.random.split(key, 4)
     normal = lambda key, like: jax.random.normal(key, like.shape, like.dtype)
     rotations = views.rotations[0]
-    images, masks = disturb_photos(photo_key, views.images, views.masks, config)
+    images, masks = augment_photos(photo_key, views.images, views.masks, config)
     return replace(
         views,
         images=images,
         masks=masks,
-        cameras=disturb_cameras(camera_key, views.cameras, views.translations + pelvis, config),
+        cameras=augment_cameras(camera_key, views.cameras, views.translations + pelvis, config),
         rotations=views.rotations + math.radians(config.pose_degrees) * normal(pose_key, rotations),
         translations=views.translations + config.body_metres * normal(body_key, views.translations[0]),
     )
 
 
-def disturb_photos(
-    key: Key, images: Float[Array, "v h w 3"], masks: Float[Array, "v h w"], config: Disturbances
+def augment_photos(
+    key: Key, images: Float[Array, "v h w 3"], masks: Float[Array, "v h w"], config: Augmentation
 ) -> tuple[Float[Array, "v h w 3"], Float[Array, "v h w"]]:
     """Photos on white whose exposure, tint and masks are off.
 
-    A photo is m f + (1 - m) of its mask m and the person's colour f. It becomes m' (m g f + (1 - m) b) + (1 - m') with the gain
-    g, the mask m' and the colour b of a background.
+    A photo is m f + (1 - m) of its mask m and the person's color f. It becomes m' (m g f + (1 - m) b) + (1 - m') with the gain
+    g, the mask m' and the color b of a background.
     """
     count = len(images)
     gain_key, radius_key, background_key = jax.random.split(key, 3)
@@ -125,7 +125,7 @@ def _largest_near(images):
     return images
 
 
-def disturb_cameras(key: Key, cameras: Camera, centers: Float[Array, "v 3"], config: Disturbances) -> Camera:
+def augment_cameras(key: Key, cameras: Camera, centers: Float[Array, "v 3"], config: Augmentation) -> Camera:
     """Cameras that are turned about centres (v, 3) of the world, and shifted."""
     turn_key, shift_key = jax.random.split(key)
     dtype = centers.dtype

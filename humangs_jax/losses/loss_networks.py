@@ -18,10 +18,10 @@ import numpy as np
 
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.io.tensor_file import read_tensors
+from humangs_jax.losses.backbones import Convolution, Slices, Weights, channels, convolutions
+from humangs_jax.losses.lpips import BACKBONES, Lpips
+from humangs_jax.losses.perceptual import VGG19, Vgg19
 from humangs_jax.network.conversion import LOSS_PREFIX
-from humangs_jax.objectives.backbones import Convolution, Slices, Weights, channels, convolutions
-from humangs_jax.objectives.lpips import BACKBONES, Lpips
-from humangs_jax.objectives.perceptual import VGG19, Vgg19
 
 NETWORKS: dict[str, Slices] = {
     "VGG-19": VGG19,

@@ -9,8 +9,8 @@ import pytest
 from loss_cases import convolutions_of, image_pair
 from rounding import bound
 
-from humangs_jax.objectives.backbones import Convolution
-from humangs_jax.objectives.perceptual import DIVISORS, Vgg19, perceptual_errors, perceptual_loss
+from humangs_jax.losses.backbones import Convolution
+from humangs_jax.losses.perceptual import DIVISORS, Vgg19, perceptual_errors, perceptual_loss
 
 DATA = Path(__file__).parent / "data"
 FLOAT32 = 2e-6  # relative; sums of some thousand products, 14 times over

@@ -1,11 +1,11 @@
-"""Outlines of a sphere and of a disc, which are known, and what of two outlines belongs together."""
+"""Silhouettes of a sphere and of a disc, which are known, and what of two silhouettes belongs together."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import trimesh
 
-from humangs_jax.fitting.residuals.outlines import BodyView, body_outline, mask_outline, mesh_edges, view_body
+from humangs_jax.fitting.residuals.boundaries import BodyView, body_boundary, mask_boundary, mesh_edges, view_body
 from humangs_jax.fitting.residuals.silhouettes import MaskView, distances, match, silhouette_residuals
 from humangs_jax.geometry.camera import Camera
 
@@ -26,9 +26,9 @@ def sphere():
     return np.asarray(mesh.vertices, np.float32), np.asarray(mesh.faces, np.int32)
 
 
-def outline_of(sphere, camera):
+def boundary_of(sphere, camera):
     vertices, faces = sphere
-    return body_outline(
+    return body_boundary(
         view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera), faces, mesh_edges(faces), COUNT
     )
 
@@ -48,16 +48,16 @@ def test_edges_of_a_tetrahedron_have_two_faces_each_and_of_a_triangle_one():
     assert set(mesh_edges(tetrahedron[:1]).faces[:, 1]) == {-1}
 
 
-def test_a_sphere_s_outline_is_the_circle_of_its_tangents(sphere):
-    outline = outline_of(sphere, camera())
-    offsets = outline.positions - SIZE / 2
+def test_a_sphere_s_boundary_is_the_circle_of_its_tangents(sphere):
+    boundary = boundary_of(sphere, camera())
+    offsets = boundary.positions - SIZE / 2
     # corners of a mesh of 2,562 vertices: chords cut 0.1 % of the radius off
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), IMAGE_RADIUS, atol=0.25)
-    assert (np.sum(offsets / IMAGE_RADIUS * outline.normals, axis=1) > 0.98).all()
+    assert (np.sum(offsets / IMAGE_RADIUS * boundary.normals, axis=1) > 0.98).all()
     angles = np.sort(np.arctan2(*offsets.T))
     assert np.diff(angles).max() < 2 * 2 * np.pi / COUNT, "evenly spread"
-    share = outline.shares[:, None]
-    on_edges = (1 - share) * sphere[0][outline.ends[:, 0]] + share * sphere[0][outline.ends[:, 1]]
+    share = boundary.shares[:, None]
+    on_edges = (1 - share) * sphere[0][boundary.ends[:, 0]] + share * sphere[0][boundary.ends[:, 1]]
     projected = FOCAL * on_edges[:, :2] / (on_edges[:, 2:] + DISTANCE)
     np.testing.assert_allclose(
         projected,
@@ -66,69 +66,69 @@ def test_a_sphere_s_outline_is_the_circle_of_its_tangents(sphere):
     )
 
 
-def test_what_leaves_the_image_or_is_behind_the_camera_is_no_outline(sphere):
-    cut = outline_of(sphere, camera(x=-1.0))
+def test_what_leaves_the_image_or_is_behind_the_camera_is_no_boundary(sphere):
+    cut = boundary_of(sphere, camera(x=-1.0))
     assert len(cut.positions) == COUNT and (cut.positions > 0).all()
     assert (
         np.abs(np.linalg.norm(cut.positions - [SIZE / 2 - FOCAL / DISTANCE, SIZE / 2], axis=1) - IMAGE_RADIUS).max() < 3
     )
-    assert len(outline_of(sphere, camera(z=-DISTANCE)).positions) == 0
+    assert len(boundary_of(sphere, camera(z=-DISTANCE)).positions) == 0
 
 
-def test_an_edge_before_the_body_is_no_outline():
-    """A small square before a large one: only the large one's border is the outline."""
+def test_an_edge_before_the_body_is_no_boundary():
+    """A small square before a large one: only the large one's border is the silhouette."""
     square = np.asarray([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float32)
     vertices = np.concatenate([square, 0.3 * square - [0, 0, 0.5]]).astype(np.float32)
     faces = np.asarray([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]])
     image = view_body(jnp.asarray(vertices), jnp.asarray(faces, jnp.int32), camera())
     outwards = np.concatenate([square[:, :2]] * 2) / np.sqrt(2)  # normals of a flat mesh do not show its border
     image = BodyView(image.pixels, image.depths, outwards.astype(np.float32), image.covered)
-    outline = body_outline(image, faces, mesh_edges(faces), COUNT)
-    assert len(outline.positions) == COUNT and outline.ends.max() < 4
+    boundary = body_boundary(image, faces, mesh_edges(faces), COUNT)
+    assert len(boundary.positions) == COUNT and boundary.ends.max() < 4
 
 
-def test_a_disc_s_outline_is_its_circle_to_a_tenth_of_a_pixel():
-    outline = mask_outline(disc(30.0), COUNT)
-    offsets = outline.positions - SIZE / 2
+def test_a_disc_s_boundary_is_its_circle_to_a_tenth_of_a_pixel():
+    boundary = mask_boundary(disc(30.0), COUNT)
+    offsets = boundary.positions - SIZE / 2
     np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), 30.0, atol=0.1)
-    assert (np.sum(offsets / 30 * outline.normals, axis=1) > 0.98).all()
+    assert (np.sum(offsets / 30 * boundary.normals, axis=1) > 0.98).all()
 
 
-def test_masks_without_an_outline_have_no_points_and_specks_none_either():
-    assert len(mask_outline(np.zeros((SIZE, SIZE), np.float32), COUNT).positions) == 0
-    assert len(mask_outline(np.ones((SIZE, SIZE), np.float32), COUNT).positions) == 0
+def test_masks_without_an_boundary_have_no_points_and_specks_none_either():
+    assert len(mask_boundary(np.zeros((SIZE, SIZE), np.float32), COUNT).positions) == 0
+    assert len(mask_boundary(np.ones((SIZE, SIZE), np.float32), COUNT).positions) == 0
     speckled = disc(30.0)
     speckled[5, 5] = 1
-    assert (np.linalg.norm(mask_outline(speckled, COUNT).positions - SIZE / 2, axis=1) < 31).all()
-    cut = mask_outline(disc(30.0, x=SIZE - 10), COUNT).positions
-    assert len(cut) == COUNT and cut.max() < SIZE - 1, "the image's edge is no outline"
+    assert (np.linalg.norm(mask_boundary(speckled, COUNT).positions - SIZE / 2, axis=1) < 31).all()
+    cut = mask_boundary(disc(30.0, x=SIZE - 10), COUNT).positions
+    assert len(cut) == COUNT and cut.max() < SIZE - 1, "the image's edge is no silhouette"
 
 
 def test_points_find_the_mask_in_reach_and_tell_how_far_outside_they_are(sphere):
-    outline = outline_of(sphere, camera())
+    boundary = boundary_of(sphere, camera())
     gap = 4.0
     mask = disc(IMAGE_RADIUS + gap)
-    view = MaskView(mask, mask_outline(mask, COUNT))
-    matches = match(outline, view, 10.0, COUNT)
+    view = MaskView(mask, mask_boundary(mask, COUNT))
+    matches = match(boundary, view, 10.0, COUNT)
     assert matches.weights.shape == (2 * COUNT,) and float(matches.weights.mean()) == 1.0
-    off = distances(matches, jnp.asarray(outline.positions, jnp.float32))
+    off = distances(matches, jnp.asarray(boundary.positions, jnp.float32))
     np.testing.assert_allclose(off, -gap, atol=0.35)  # inside; polygons and the nearest of 90 points make up the rest
-    assert float(match(outline, view, 2.0, COUNT).weights.sum()) == 0, "out of reach"
+    assert float(match(boundary, view, 2.0, COUNT).weights.sum()) == 0, "out of reach"
 
 
-def test_an_empty_outline_matches_nothing(sphere):
+def test_an_empty_boundary_matches_nothing(sphere):
     mask = np.zeros((SIZE, SIZE), np.float32)
-    matches = match(outline_of(sphere, camera()), MaskView(mask, mask_outline(mask, COUNT)), 10.0, COUNT)
+    matches = match(boundary_of(sphere, camera()), MaskView(mask, mask_boundary(mask, COUNT)), 10.0, COUNT)
     assert float(matches.weights.sum()) == 0
 
 
 def test_clothes_explain_a_gap_and_a_body_outside_costs_more_than_one_inside(sphere):
-    outline = outline_of(sphere, camera())
-    pixels = jnp.asarray(outline.positions, jnp.float32)
+    boundary = boundary_of(sphere, camera())
+    pixels = jnp.asarray(boundary.positions, jnp.float32)
 
     def cost(gap, clothes):
         mask = disc(IMAGE_RADIUS + gap)
-        matches = match(outline, MaskView(mask, mask_outline(mask, COUNT)), 10.0, COUNT)
+        matches = match(boundary, MaskView(mask, mask_boundary(mask, COUNT)), 10.0, COUNT)
         thick = jnp.full(len(pixels), clothes)
         residuals = silhouette_residuals(
             matches, pixels, thick, jnp.asarray(1.0), (jnp.asarray(10.0), jnp.asarray(3.0)), 40.0
