@@ -12,7 +12,7 @@ from .apps.tune import tune as tune
 from .avatar.animate import animate as animate
 from .avatar.animate import skin as skin
 from .avatar.avatar import Avatar as Avatar
-from .avatar.export import export as export
+from .avatar.export.files import export as export
 from .avatar.reconstruct import reconstruct as reconstruct
 from .avatar.reconstruct import reconstruct_batch as reconstruct_batch
 from .avatar.reconstruct import reconstruct_views as reconstruct_views

@@ -248,7 +248,7 @@ def write_viewer(path: Path, folder: Path, avatar: Path) -> None:
 def write_files(folder: Path, path: Path) -> None:
     """One person in every format."""
     from humangs_jax.avatar.avatar import Avatar
-    from humangs_jax.avatar.export import export
+    from humangs_jax.avatar.export.files import export
     from humangs_jax.data.motion import load_motion
 
     avatar = Avatar.load(path)

@@ -2,10 +2,11 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
+from humangs_jax.avatar.export import EXPORTS, ExportFormat, Up, chosen_format
 from humangs_jax.cli.options import (
     LARGEST_IMAGE,
     Preset,
@@ -21,6 +22,7 @@ from humangs_jax.cli.options import (
     require_suffix,
 )
 from humangs_jax.cli.screen import stage, suggest, tell, warn, wrote
+from humangs_jax.core.registry import alternatives
 from humangs_jax.refinement.config import ITERATIONS, RefineConfig
 
 if TYPE_CHECKING:
@@ -31,6 +33,10 @@ if TYPE_CHECKING:
 
 DEMO_SECONDS = 15.0
 """Of refinement."""
+
+_USUAL_UP = (
+    f"-y for {alternatives(EXPORTS.where(lambda each: each.up == '-y').suffixes)}, as their viewers expect, else y."
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -231,33 +237,33 @@ def _save(avatar: "Avatar", out: Path, how: str) -> None:
 class Export:
     """Export an avatar (docs/export.md): a page that shows it moving in any browser (--html), or a file for other programs.
 
-    Gaussians: 3DGS .ply, .splat, .spz, .glb with KHR_gaussian_splatting. The body as a textured mesh: .obj, and with --mesh a
-    .glb with skin and motion. In the T-pose, in one frame of a motion, or in many.
+    Gaussians, or the body as a textured mesh: in the T-pose, in one frame of a motion, or in many.
     """
 
     avatar: Positional[Path]
     """File written by `humangs reconstruct`."""
-    out: Path | None = None
-    """File to write: .ply, .splat, .spz, .glb or .obj. Default: avatar.ply without --html, none with it."""
+    out: Annotated[
+        Path | None, arg(help=f"File to write: {EXPORTS.listed()}. Default: avatar.ply without --html, none with it.")
+    ] = None
     html: Path | None = None
     """The page to write: one .html file that needs no network (docs/viewer.md)."""
     mesh: bool = False
-    """--out X.glb: the body as a textured mesh with its skin, and --motion as animation, in place of Gaussians."""
+    """--out: the body as a textured mesh where the suffix has Gaussians, too; a .glb has its skin, and --motion as animation."""
     motion: Path | None = None
     """Page: the motion it plays (default: the shipped walk). --out: pose it by this motion (default: T-pose). docs/motions.md."""
     frame: int | None = None
     """--out: which frame of the motion, from 0 (default: the first)."""
     frames: str | None = None
     """--out: many frames: a:b:step as in Python, ":" for all. X.ply becomes X_0000.ply, X_0005.ply and so on."""
-    up: Literal["y", "-y", "z"] | None = None
-    """--out: the axis that points up in the file; the feet stand on 0. Default: -y for .ply and .splat, as their viewers expect,
-    y for the others."""
+    up: Annotated[
+        Up | None, arg(help=f"--out: the axis that points up in the file; feet are on 0. Default: {_USUAL_UP}")
+    ] = None
     rest: bool = False
-    """.ply: add the 45 zero f_rest fields that some importers (Unity) require."""
+    """3DGS: add the 45 zero f_rest fields that some importers (Unity) require."""
 
     def run(self) -> None:
         out = Path("avatar.ply") if self.out is None and self.html is None else self.out
-        suffixes = (".glb", ".obj") if self.mesh else (".ply", ".splat", ".spz", ".glb", ".obj")
+        suffixes = EXPORTS.where(lambda each: each.mesh >= self.mesh).suffixes
         for option, path, allowed in (("--out", out, suffixes), ("--html", self.html, (".html",))):
             if path is not None:
                 require_parent(path, option)
@@ -289,32 +295,35 @@ class Export:
         for option, value in (("--frame", self.frame), ("--frames", self.frames)):
             if value is not None and (self.motion is None or out is None):
                 raise ValueError(f"{option} {value}: expected --motion and --out with it")
-        if self.frame is not None and (self.frames is not None or self._animated(out)):
-            with_it = "--frames" if self.frames is not None else "--mesh, whose .glb holds the motion: use --frames"
+        form = self._format(out)
+        if self.frame is not None and (self.frames is not None or (form is not None and form.animated)):
+            with_it = "--frames" if self.frames is not None else "a file that holds the whole motion: use --frames"
             raise ValueError(f"--frame {self.frame}: does not go with {with_it}")
+        if self.rest and form is not None and not form.rest_fields:
+            raise UsageError(f"--rest: {out} has no such fields: expected a file of 3DGS")
 
-    def _animated(self, out: Path | None) -> bool:
-        return self.mesh and out is not None and out.suffix.lower() == ".glb"
+    def _format(self, out: Path | None) -> "ExportFormat | None":
+        return None if out is None else chosen_format(out.suffix, self.mesh)
 
     def _write(self, out: Path, avatar: "Avatar", motion: "Motion | None") -> None:
-        from humangs_jax.avatar.export import export
+        from humangs_jax.avatar.export.files import export
 
-        numbers, animated = None, self._animated(out)
+        form, numbers = self._format(out), None
+        assert form is not None  # its suffix was checked
         name = "motion" if self.motion is None else self.motion.stem
         if motion is not None:
-            motion, numbers = self._frames(motion, animated)
-        mesh = self.mesh or out.suffix.lower() == ".obj"
-        numbers = None if animated else numbers
+            motion, numbers = self._frames(motion, form.animated)
+        options = {"mesh": form.mesh, "up": self.up, "rest_fields": self.rest, "name": name}
         with stage("writing"):
-            files = export(out, avatar, motion, numbers, mesh=mesh, up=self.up, rest_fields=self.rest, name=name)
-        what = f"{len(avatar.faces):,} triangles" if mesh else f"{len(avatar.gaussians.means):,} Gaussians"
-        poses = f", {len(motion.translations)} frames" if motion is not None and animated else ""
+            files = export(out, avatar, motion, None if form.animated else numbers, **options)
+        what = f"{len(avatar.faces):,} triangles" if form.mesh else f"{len(avatar.gaussians.means):,} Gaussians"
+        poses = f", {len(motion.translations)} frames" if motion is not None and form.animated else ""
         written = str(out) if len(files) == 1 else f"{files[0]} to {files[-1].name}: {len(files)} files"
         wrote(written, f"{what}{poses}, feet on 0")
 
     def _frames(self, motion: "Motion", animated: bool) -> "tuple[Motion, range | None]":
         """The frames asked for, and their numbers where there are many."""
-        from humangs_jax.avatar.export import frame_range
+        from humangs_jax.avatar.export.files import frame_range
         from humangs_jax.core.pytree import replace
 
         count = len(motion.translations)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from humangs_jax.core.progress import say
+from humangs_jax.core.registry import alternatives
 
 if TYPE_CHECKING:
     from humangs_jax.apps.settings import Settings
@@ -99,7 +100,7 @@ def tell_deleted(folder: Path, unless: Path | None = None) -> None:
 def require_suffix(path: Path, suffixes: tuple[str, ...], option: str = "--out") -> None:
     """The name of a file ends as its format requires. Raises: UsageError."""
     if path.suffix.lower() not in suffixes:
-        raise UsageError(f"{option} {path}: expected a name ending in {' or '.join(suffixes)}")
+        raise UsageError(f"{option} {path}: expected a name ending in {alternatives(suffixes)}")
 
 
 def require_at_least(least: float | int, **values: float | int | None) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from humangs_jax.avatar.animate import animate, skin
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export import SH_C0, write_ply
+from humangs_jax.avatar.export.gaussians import SH_C0, write_ply
 from humangs_jax.body.model import BodyPose
 from humangs_jax.core.pytree import replace
 from humangs_jax.io.reading import FileError
@@ -182,7 +182,7 @@ def test_ply_holds_what_viewers_expect(tmp_path):
     import plyfile
 
     gaussians = make_avatar().gaussians
-    write_ply(tmp_path / "a.ply", gaussians, spherical_harmonics_rest=True)
+    write_ply(tmp_path / "a.ply", gaussians, rest_fields=True)
     vertex = plyfile.PlyData.read(str(tmp_path / "a.ply"))["vertex"]
     assert len(vertex.data) == 12 and sum(name.startswith("f_rest_") for name in vertex.data.dtype.names) == 45
     read = lambda *names: np.stack([vertex[name] for name in names], axis=-1)

@@ -1,6 +1,7 @@
 """Files for other people's viewers: one world for all of them, read back by hand, by plyfile and by npm's tools."""
 
 import gzip
+import importlib
 import json
 import os
 import shutil
@@ -17,10 +18,10 @@ from hypothesis import strategies as st
 
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export import (
+from humangs_jax.avatar.export import EXPORTS, ExportFormat, chosen_format
+from humangs_jax.avatar.export.files import export, frame_range
+from humangs_jax.avatar.export.gaussians import (
     SH_C0,
-    export,
-    frame_range,
     grounded_gaussians,
     turned,
     write_glb,
@@ -28,8 +29,9 @@ from humangs_jax.avatar.export import (
     write_splat,
     write_spz,
 )
-from humangs_jax.avatar.export.files import USUAL_UP
+from humangs_jax.cli import avatars
 from humangs_jax.core.pytree import replace
+from humangs_jax.core.registry import imported
 from humangs_jax.data.motion import Motion, save_motion
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.rendering.gaussians import Gaussians, covariances, widened
@@ -186,6 +188,15 @@ def test_the_lowest_gaussian_that_is_seen_stands_on_the_floor():
     assert np.isfinite(grounded_gaussians(faint).means).all()
 
 
+def test_colours_are_those_of_the_constant_spherical_harmonic(tmp_path):
+    """rgb = 1/2 + Y00 f: viewers know the constant to more digits than colours have bits."""
+    gaussians = person()
+    write_ply(tmp_path / "a.ply", gaussians)
+    constant = 0.5 / np.sqrt(np.pi)
+    assert pytest.approx(constant, rel=1e-12) == SH_C0
+    np.testing.assert_allclose(read_ply(tmp_path / "a.ply").colors, gaussians.colors, atol=1e-6)
+
+
 def test_splat_holds_thirty_two_bytes_each_the_largest_first(tmp_path):
     gaussians = person()
     write_splat(tmp_path / "a.splat", gaussians)
@@ -307,6 +318,24 @@ def test_the_suffix_decides_the_format_and_its_world(name, axis, tmp_path, monke
     np.testing.assert_allclose(np.sort(heights), np.sort(own - own.min()), atol=1e-5)
 
 
+def test_a_format_is_one_line_of_the_table(tmp_path, monkeypatch, capsys):
+    """Known to the command's help, to its check of suffixes, and to `export`."""
+    heights = lambda path, gaussians: path.write_text(f"{float(gaussians.means[:, 2].min()):.3f}")
+    monkeypatch.setitem(EXPORTS, "toy", ExportFormat("made up", heights, (".toy",), up="z"))
+    monkeypatch.setattr(avatars, "Export", avatars.Export)  # reloading replaces it
+    importlib.reload(avatars)
+    with pytest.raises(SystemExit):
+        exported(monkeypatch, "--help")
+    assert ".toy: made up" in " ".join(capsys.readouterr().out.split())
+    exported(monkeypatch, small_file(tmp_path), "--out", tmp_path / "x.toy")
+    assert (tmp_path / "x.toy").read_text() == "0.000"
+
+
+@pytest.mark.parametrize("each", EXPORTS.values(), ids=EXPORTS)
+def test_every_row_names_code_that_is_there(each):
+    assert callable(imported(each.code)) and each.suffixes
+
+
 def exported(monkeypatch, *words):
     monkeypatch.setattr(sys, "argv", ["humangs", "export", *map(str, words)])
     cli.main()
@@ -331,7 +360,8 @@ def test_the_function_checks_as_the_command_does(tmp_path):
     avatar = Avatar.load(tmp_path / "me.npz")
     jump = Motion(jnp.zeros((4, 1, 3)), jnp.zeros((4, 3)), 24.0)
     for name, options, message in (
-        ("x.sog", {}, "expected a name ending in .ply or .splat or .spz or .glb"),
+        ("x.sog", {}, "expected a name ending in .ply, .splat, .spz, .glb or .obj"),
+        ("x.spz", {"rest_fields": True}, "no rest fields: expected a name ending in .ply"),
         ("x.ply", {"mesh": True}, "expected a name ending in .glb or .obj for a mesh"),
         ("x.ply", {"motion": jump}, "each of the 4 frames, got no numbers"),
         ("x.ply", {"motion": jump, "numbers": [1, 2]}, "each of the 4 frames, got 2 numbers"),
@@ -362,11 +392,12 @@ MISUSES = {
     "--frame 1: expected --motion and --out": ["--out", "x.ply", "--frame", "1"],
     "--frames :: expected --motion and --out": ["--html", "x.html", "--motion", "jump.npz", "--frames", ":"],
     "--frame 1: does not go with --frames": ["--out", "x.ply", "--motion", "jump.npz", "--frame", "1", "--frames", ":"],
-    "whose .glb holds the motion": ["--out", "x.glb", "--mesh", "--motion", "jump.npz", "--frame", "1"],
+    "a file that holds the whole motion": ["--out", "x.glb", "--mesh", "--motion", "jump.npz", "--frame", "1"],
     "expected a name ending in .glb or .obj": ["--out", "x.ply", "--mesh"],
-    "expected a name ending in .ply or .splat or .spz or .glb or .obj": ["--out", "x.sog"],
+    "expected a name ending in .ply, .splat, .spz, .glb or .obj": ["--out", "x.sog"],
     "none of the 4 frames": ["--out", "x.ply", "--motion", "jump.npz", "--frames", "9:"],
     "--frame 9: jump.npz has 4 frames": ["--out", "x.ply", "--motion", "jump.npz", "--frame", "9"],
+    "--rest: x.spz has no such fields": ["--out", "x.spz", "--rest"],
     "rotations: expected 1 joints, got 10": ["--out", "x.ply", "--motion", "ten.npz"],
 }
 
@@ -407,7 +438,7 @@ def test_splat_transform_makes_our_glb_of_our_files(name, tmp_path):
     """Worlds, scales, rotations, opacities and colors of both files are the same to a program that is not ours."""
     gaussians = person()
     write = {"a.ply": write_ply, "a.spz": write_spz}[name]
-    write(tmp_path / name, turned(gaussians, USUAL_UP[Path(name).suffix]))
+    write(tmp_path / name, turned(gaussians, chosen_format(Path(name).suffix).up))
     write_glb(tmp_path / "a.glb", gaussians)
     transformed(tmp_path / name, tmp_path / "b.glb")
     (ours, arrays), (theirs, others) = (read_glb(tmp_path / name) for name in ("a.glb", "b.glb"))

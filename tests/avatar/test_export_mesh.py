@@ -15,9 +15,16 @@ from scipy.spatial.transform import Rotation
 
 from humangs_jax import cli
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export import BodyMesh, body_mesh, files, write_glb, write_mesh_glb
-from humangs_jax.avatar.export.mesh import skin_colors, vertex_weights
-from humangs_jax.avatar.export.mesh_gltf import strongest
+from humangs_jax.avatar.export import mesh as mesh_export
+from humangs_jax.avatar.export.gaussians import write_glb
+from humangs_jax.avatar.export.mesh import (
+    BodyMesh,
+    body_mesh,
+    skin_colors,
+    strongest,
+    vertex_weights,
+    write_mesh_glb,
+)
 from humangs_jax.body.joints import JOINT_NAMES, PARENTS
 from humangs_jax.body.model import RestBody
 from humangs_jax.core.pytree import replace
@@ -187,10 +194,26 @@ def test_a_motion_that_was_exported_is_read_again(tmp_path):
     assert back.fps == pytest.approx(24)
 
 
+def test_numbers_of_turns_never_jump_between_frames(tmp_path):
+    """Some players interpolate numbers: two whole turns, each wrapped at half a turn, so that the sign flips twice."""
+    angles = (np.linspace(0, 4 * np.pi, 25) + np.pi) % (2 * np.pi) - np.pi
+    rotations = np.zeros((25, 55, 3))
+    rotations[:, 0, 1], rotations[:, 3, 0] = angles, -angles
+    write_mesh_glb(
+        tmp_path / "a.glb", avatar(), mesh(), Motion(jnp.asarray(rotations, jnp.float32), jnp.zeros((25, 3)))
+    )
+    content, binary = parse_glb((tmp_path / "a.glb").read_bytes())
+    tracks = [x for x in content["animations"][0]["channels"] if x["target"]["path"] == "rotation"]
+    assert len(tracks) == 2
+    for track in tracks:
+        quats = read_accessor(content, binary, content["animations"][0]["samplers"][track["sampler"]]["output"])
+        assert np.abs(np.diff(quats, axis=0)).max() < 0.3  # a twelfth of a turn
+
+
 @pytest.mark.slow
 def test_trimesh_reads_our_obj(tmp_path, monkeypatch, capsys):
     one = avatar()
-    monkeypatch.setattr(files, "body_mesh", lambda _: textured())
+    monkeypatch.setattr(mesh_export, "body_mesh", lambda _: textured())
     one.save(tmp_path / "me.npz")
     save_motion(tmp_path / "dance.npz", dance())
     export = ["humangs", "export", str(tmp_path / "me.npz"), "--out", str(tmp_path / "x.obj")]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import humangs_jax as hg
-from humangs_jax.avatar.export import write_ply
+from humangs_jax.avatar.export.gaussians import write_ply
 from humangs_jax.core.arguments import checked_arguments
 from humangs_jax.core.configuration import Presets, check_fields
 from humangs_jax.core.pytree import replace

@@ -11,7 +11,7 @@ import pytest
 from toy_body import MODEL
 
 from humangs_jax.apps import check
-from humangs_jax.avatar.export.world import turned
+from humangs_jax.avatar.export.gaussians import turned
 from humangs_jax.body import skinning
 from humangs_jax.body.landmarks import pose_landmarks
 from humangs_jax.body.model import BodyModel, BodyPose, person_vertices

@@ -1,37 +1,17 @@
 """An avatar to a file, or a motion to a sequence of files: the suffix decides the format."""
 
-import dataclasses
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-
-import numpy as np
 
 from humangs_jax.avatar.animate import animate
 from humangs_jax.avatar.avatar import Avatar
-from humangs_jax.avatar.export.gltf import write_glb
-from humangs_jax.avatar.export.mesh import body_mesh
-from humangs_jax.avatar.export.mesh_gltf import write_mesh_glb
-from humangs_jax.avatar.export.obj import write_material, write_obj
-from humangs_jax.avatar.export.ply import write_ply
-from humangs_jax.avatar.export.splat import write_splat
-from humangs_jax.avatar.export.spz import write_spz
-from humangs_jax.avatar.export.world import Up, grounded_gaussians, turned
-from humangs_jax.body.model import BodyPose, RestBody
+from humangs_jax.avatar.export import EXPORTS, Up, chosen_format
+from humangs_jax.avatar.export.gaussians import grounded_gaussians, turned
+from humangs_jax.body.model import RestBody
+from humangs_jax.core.registry import alternatives
 from humangs_jax.data.motion import Motion, grounded
-from humangs_jax.rendering.gaussians import Gaussians
 
-GAUSSIANS: dict[str, Callable[[Path, Gaussians], None]] = {
-    ".ply": write_ply,
-    ".splat": write_splat,
-    ".spz": write_spz,
-    ".glb": write_glb,
-}
-"""Writers of files of Gaussians by suffix."""
-MESHES = (".glb", ".obj")
-"""Suffixes of files of meshes."""
-USUAL_UP: dict[str, Up] = {".ply": "-y", ".splat": "-y", ".spz": "y", ".glb": "y", ".obj": "y"}
-"""The axis that the readers of a format take for up."""
 DIGITS = 4
 """Of the numbers in the names of a sequence."""
 
@@ -64,65 +44,34 @@ def export(
     """Write an avatar in T-pose, in one pose, or in the poses of a motion; returns the files. Each appears whole or not at all.
 
     Arguments:
-        path: with a suffix of GAUSSIANS or, with `mesh`, of MESHES.
+        path: with a suffix of `EXPORTS`. mesh: as a mesh where the suffix has formats of Gaussians, too.
         motion: None for the T-pose. A `.glb` of the mesh holds all of it as animation.
         numbers: of the motion's frames: "x.ply" becomes "x_0007.ply". All stand on one floor: who jumps leaves it. None: the
             motion has one frame, whose feet are on 0.
-        up: the axis that points up; None for USUAL_UP. rest_fields: see `write_ply`. name: of the animation.
+        up: the axis that points up; None for the format's own. rest_fields: see `write_ply`. name: of the animation.
 
-    Raises: ValueError for another suffix, or if `numbers` are not one for each frame of the motion.
+    Raises: ValueError for another suffix, a format without what is asked for, or if `numbers` are not one for each frame.
     """
-    _check(path, motion, numbers, mesh)
-    suffix = path.suffix.lower()
-    up = up or USUAL_UP[suffix]
-    if motion is not None and (mesh or numbers is not None):
-        motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
-    if mesh and suffix == ".glb":
-        write_mesh_glb(path, avatar, body_mesh(avatar), motion, name, up)
-        return [path]
-    poses = [None] if motion is None else [motion.pose(i) for i in range(len(motion.translations))]
-    paths = [path] if numbers is None else [path.with_stem(f"{path.stem}_{number:0{DIGITS}d}") for number in numbers]
-    if mesh:
-        write = _mesh_writer(path, avatar, up)
-    else:
-        write = _gaussian_writer(avatar, up, rest_fields, each_on_the_floor=numbers is None)
-    for file, pose in zip(paths, poses, strict=True):
-        write(file, pose)
-    return paths
-
-
-def _check(path, motion, numbers, mesh):
-    """Before any file is written."""
-    suffixes = MESHES if mesh else tuple(GAUSSIANS)
-    if path.suffix.lower() not in suffixes:
-        raise ValueError(f"{path}: expected a name ending in {' or '.join(suffixes)}{' for a mesh' if mesh else ''}")
-    if mesh and path.suffix.lower() == ".glb":
-        return
+    form = chosen_format(path.suffix, mesh)
+    if form is None:
+        known = EXPORTS.where(lambda each: each.mesh >= mesh).suffixes
+        raise ValueError(f"{path}: expected a name ending in {alternatives(known)}{' for a mesh' if mesh else ''}")
+    if rest_fields and not form.rest_fields:
+        holding = EXPORTS.where(lambda each: each.rest_fields).suffixes
+        raise ValueError(f"{path}: has no rest fields: expected a name ending in {alternatives(holding)}")
     frames = 1 if motion is None else len(motion.translations)
-    if frames != (1 if numbers is None else len(numbers)):
+    if not form.animated and frames != (1 if numbers is None else len(numbers)):
         given = "no numbers" if numbers is None else f"{len(numbers)} numbers"
         raise ValueError(f"numbers: expected one for each of the {frames} frames, got {given}")
-
-
-def _gaussian_writer(avatar, up, rest_fields, each_on_the_floor):
-    def write(path: Path, pose: BodyPose | None) -> None:
-        gaussians = avatar.gaussians if pose is None else animate(avatar, pose)
-        gaussians = turned(grounded_gaussians(gaussians) if each_on_the_floor else gaussians, up)
-        if path.suffix.lower() == ".ply":
-            write_ply(path, gaussians, spherical_harmonics_rest=rest_fields)
-        else:
-            GAUSSIANS[path.suffix.lower()](path, gaussians)
-
-    return write
-
-
-def _mesh_writer(path, avatar, up):
-    mesh = body_mesh(avatar)
-    material = write_material(path, mesh)
-    floor = np.asarray([0, mesh.vertices[:, 1].min(), 0], np.float32)
-
-    def write(file: Path, pose: BodyPose | None) -> None:
-        shown = dataclasses.replace(mesh, vertices=mesh.vertices - floor) if pose is None else mesh.posed(avatar, pose)
-        write_obj(file, shown, material, up)
-
-    return write
+    if motion is not None and (form.mesh or numbers is not None):
+        motion = grounded(motion, RestBody(avatar.rest_vertices, avatar.rest_joints), avatar.parents)
+    one = form.animated or numbers is None
+    files = [path] if one else [path.with_stem(f"{path.stem}_{number:0{DIGITS}d}") for number in numbers or ()]
+    if form.mesh:
+        form(path, files, avatar, motion, up or form.up, name)
+        return files
+    for i, file in enumerate(files):
+        gaussians = avatar.gaussians if motion is None else animate(avatar, motion.pose(i))
+        gaussians = turned(grounded_gaussians(gaussians) if numbers is None else gaussians, up or form.up)
+        form(file, gaussians, **({"rest_fields": True} if rest_fields else {}))
+    return files
