@@ -7,8 +7,7 @@ import numpy as np
 
 from humangs_jax.body.model import BodyModel
 from humangs_jax.data.capture import Capture, capture_from_arrays
-from humangs_jax.losses.backbones import Convolution, channels, convolutions
-from humangs_jax.losses.lpips import BACKBONES, Lpips
+from humangs_jax.losses.perceptual import BACKBONES, Convolution, Lpips, channels, convolutions
 
 
 @functools.cache

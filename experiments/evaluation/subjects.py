@@ -25,7 +25,7 @@ from humangs_jax.evaluation.tables import mean_scores
 from humangs_jax.geometry.camera import Camera
 from humangs_jax.geometry.quaternion import matrix_from_axis_angle
 from humangs_jax.io.images import to_uint8
-from humangs_jax.losses.lpips import Lpips
+from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 from humangs_jax.people.cameras import cameras_around, spread_azimuths

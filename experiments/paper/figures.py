@@ -206,7 +206,7 @@ def patch_lpips(network: Any) -> Callable[..., float]:
     """LPIPS of a patch."""
     import jax
 
-    from humangs_jax.losses.lpips import lpips
+    from humangs_jax.losses.perceptual import lpips
 
     compare = jax.jit(lpips)
     return lambda truth, shown, box: float(compare(network, shown[box], truth[box]))

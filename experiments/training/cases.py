@@ -66,11 +66,11 @@ def abstract_batch(config: Any, joints: int, betas: int) -> Any:
 
 
 def random_weights(key: Any, slices: Any) -> Any:
-    """Random weights of a network of `losses.backbones`."""
+    """Random weights of a network of `losses.perceptual`."""
     import jax
     import jax.numpy as jnp
 
-    from humangs_jax.losses.backbones import Convolution, convolutions
+    from humangs_jax.losses.perceptual import Convolution, convolutions
 
     def draw(layer, key):
         shape = (layer.size, layer.size, layer.inputs, layer.outputs)
@@ -86,15 +86,12 @@ def random_networks(config: Any) -> Any:
     import jax
 
     from humangs_jax.losses.loss_networks import LossNetworks
-    from humangs_jax.losses.lpips import BACKBONES, Lpips
-    from humangs_jax.losses.perceptual import VGG19, Vgg19
+    from humangs_jax.losses.perceptual import BACKBONES, VGG19, Lpips, Vgg19, channels
 
     key = jax.random.key(0)
     perceptual = Vgg19(random_weights(key, VGG19)) if config.loss.perceptual else None
     lpips = None
     if config.loss.lpips:
-        from humangs_jax.losses.backbones import channels
-
         slices = BACKBONES["vgg"]
         heads = [jax.numpy.full(count, 1.0 / count) for count in channels(slices)]
         lpips = Lpips(random_weights(key, slices), tuple(heads), "vgg")

@@ -38,7 +38,7 @@ from humangs_jax.evaluation.tables import (
 )
 from humangs_jax.io.atomic import write_texts
 from humangs_jax.io.text import json_text
-from humangs_jax.losses.lpips import Lpips
+from humangs_jax.losses.perceptual import Lpips
 from humangs_jax.network.config import HumanGSConfig
 from humangs_jax.network.parts import Variables
 

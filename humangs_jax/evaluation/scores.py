@@ -19,9 +19,8 @@ from humangs_jax.core.checks import FINITE, check_values
 from humangs_jax.data.capture import Capture
 from humangs_jax.evaluation.protocol import PROTOCOLS, EvaluationProtocol, WholeFrame
 from humangs_jax.evaluation.tables import Row, mean_scores
-from humangs_jax.losses.backbones import smallest_side
-from humangs_jax.losses.lpips import BACKBONES, Lpips, lpips
 from humangs_jax.losses.metrics import boundary_band, decibels, masked_psnr, semi_transparent, silhouette_iou
+from humangs_jax.losses.perceptual import BACKBONES, Lpips, lpips, smallest_side
 from humangs_jax.losses.ssim import SsimWindow, mean_similarity, similarity_map
 from humangs_jax.rendering.buffers import round_up
 

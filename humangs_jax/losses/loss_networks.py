@@ -18,18 +18,21 @@ import numpy as np
 
 from humangs_jax.core.pytree import pytree_dataclass
 from humangs_jax.io.tensor_file import read_tensors
-from humangs_jax.losses.backbones import Convolution, Slices, Weights, channels, convolutions
-from humangs_jax.losses.lpips import BACKBONES, Lpips
-from humangs_jax.losses.perceptual import VGG19, Vgg19
+from humangs_jax.losses.perceptual import (
+    BACKBONES,
+    VGG19,
+    Convolution,
+    Lpips,
+    Slices,
+    Vgg19,
+    Weights,
+    channels,
+    convolutions,
+)
 from humangs_jax.network.conversion import LOSS_PREFIX
 
-NETWORKS: dict[str, Slices] = {
-    "VGG-19": VGG19,
-    "VGG-16": BACKBONES["vgg"],
-    "AlexNet": BACKBONES["alex"],
-    "SqueezeNet 1.1": BACKBONES["squeeze"],
-}
 LPIPS_NETWORKS = {"vgg": "VGG-16", "alex": "AlexNet", "squeeze": "SqueezeNet 1.1"}
+NETWORKS: dict[str, Slices] = {"VGG-19": VGG19} | {name: BACKBONES[net] for net, name in LPIPS_NETWORKS.items()}
 LAYER = re.compile(
     r"(?P<before>(?:.*?\.)??)(?:slices?\.?\d+\.)?"
     r"(?P<layer>\d+(?:\.(?:squeeze|expand1x1|expand3x3))?\.(?:weight|bias))"
@@ -146,9 +149,6 @@ def _which_net(tensors: Tensors) -> str:
             find_heads(tensors, net)
             return net
     return "vgg"  # its errors then name what is wrong
-
-
-# Names of layers -------------------------------------------------------------------------------------------------------
 
 
 def is_layer(key: str) -> bool:

@@ -1,19 +1,273 @@
-"""The published perceptual loss: L1 between the features of a VGG-19 with average pooling, at five depths, and pixels.
+"""Losses that compare the features of frozen convolutional networks: LPIPS and the published perceptual loss.
 
-Colors enter as 255 * rgb - (123.68, 116.779, 103.939), which is what the weights of the original VGG-19 expect (those of
-MatConvNet's file and of the released checkpoint; torchvision's expect other scales and make another loss of it). The
-features are those after the second ReLU of each block. Losses are for ONE image; batch with `jax.vmap`.
+A network is a tuple of slices, a slice a tuple of layers; the map after the last layer of each slice is a feature that is
+compared. Layers carry torchvision's numbers in its `features` list as names ("0", "3.squeeze"). Every convolution has a
+bias and is followed by a ReLU; a fire module is a 1x1 convolution whose output a 1x1 and a 3x3 convolution share.
+
+All is for ONE image in [0, 1]; batch with `jax.vmap`. `losses.loss_networks` reads the weights.
 """
+
+import functools
+import itertools
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from humangs_jax.core.array_types import Array, Float, Scalar
-from humangs_jax.core.numerics import absolute, at_least_float32
-from humangs_jax.core.pytree import pytree_dataclass
-from humangs_jax.losses.backbones import Weights, feature_maps, vgg
+from humangs_jax.core.array_types import Array, Float, Int, Scalar
+from humangs_jax.core.numerics import absolute, at_least_float32, safe_sqrt
+from humangs_jax.core.pytree import pytree_dataclass, static_field
+from humangs_jax.network.convolution import convolve
 
+
+@pytree_dataclass
+class Convolution:
+    """kernel (rows, columns, in, out) and bias of one convolution."""
+
+    kernel: Float[Array, "y x i o"]
+    bias: Float[Array, " o"]
+
+
+Weights = dict[str, Convolution]
+"""Convolutions by the name of their layer."""
+
+
+class Conv(NamedTuple):
+    """A convolution with `padding` zeros on each side, and its ReLU."""
+
+    name: str
+    inputs: int
+    outputs: int
+    size: int = 3
+    stride: int = 1
+    padding: int = 1
+
+
+class Pool(NamedTuple):
+    """Largest or mean value of a window; without `ceil`, rows and columns that fill no window are ignored."""
+
+    size: int = 3
+    stride: int = 2
+    average: bool = False
+    ceil: bool = False
+
+
+class Fire(NamedTuple):
+    """SqueezeNet's module: `outputs` is that of both expanding convolutions together."""
+
+    name: str
+    inputs: int
+    squeezed: int
+    outputs: int
+
+    @property
+    def convolutions(self) -> tuple[Conv, Conv, Conv]:
+        """The one that comes first, and the two that look at its output."""
+        half = self.outputs // 2
+        return (
+            Conv(f"{self.name}.squeeze", self.inputs, self.squeezed, 1, 1, 0),
+            Conv(f"{self.name}.expand1x1", self.squeezed, half, 1, 1, 0),
+            Conv(f"{self.name}.expand3x3", self.squeezed, half),
+        )
+
+
+Layer = Conv | Pool | Fire
+Slices = tuple[tuple[Layer, ...], ...]
+
+
+def vgg(depths: tuple[int, ...], feature: tuple[int, ...], average: bool = False) -> Slices:
+    """A VGG whose block b has `depths[b]` convolutions, of which the one numbered `feature[b]` (from 1) is compared."""
+    slices: list[tuple[Layer, ...]] = []
+    layers: list[Layer] = []
+    index, inputs = 0, 3
+    for block, depth in enumerate(depths):
+        outputs = min(64 << block, 512)
+        for number in range(1, depth + 1):
+            layers.append(Conv(str(index), inputs, outputs))
+            index, inputs = index + 2, outputs  # its ReLU has a number too
+            if number == feature[block]:
+                slices.append(tuple(layers))
+                layers = []
+        layers.append(Pool(2, 2, average))
+        index += 1
+    return tuple(slices)  # what follows the last feature is not needed
+
+
+VGG16 = vgg((2, 2, 3, 3, 3), (2, 2, 3, 3, 3))
 VGG19 = vgg((2, 2, 4, 4, 4), (2, 2, 2, 2, 2), average=True)
+ALEXNET: Slices = (
+    (Conv("0", 3, 64, 11, 4, 2),),
+    (Pool(), Conv("3", 64, 192, 5, 1, 2)),
+    (Pool(), Conv("6", 192, 384)),
+    (Conv("8", 384, 256),),
+    (Conv("10", 256, 256),),
+)
+SQUEEZENET: Slices = (
+    (Conv("0", 3, 64, 3, 2, 0),),
+    (Pool(ceil=True), Fire("3", 64, 16, 128), Fire("4", 128, 16, 128)),
+    (Pool(ceil=True), Fire("6", 128, 32, 256), Fire("7", 256, 32, 256)),
+    (Pool(ceil=True), Fire("9", 256, 48, 384)),
+    (Fire("10", 384, 48, 384),),
+    (Fire("11", 384, 64, 512),),
+    (Fire("12", 512, 64, 512),),
+)
+BACKBONES: dict[str, Slices] = {"vgg": VGG16, "alex": ALEXNET, "squeeze": SQUEEZENET}
+"""Of LPIPS."""
+
+
+def convolutions(slices: Slices) -> Iterator[Conv]:
+    """All convolutions of a network, including those of the fire modules."""
+    for layer in itertools.chain.from_iterable(slices):
+        if isinstance(layer, Fire):
+            yield from layer.convolutions
+        elif isinstance(layer, Conv):
+            yield layer
+
+
+def channels(slices: Slices) -> tuple[int, ...]:
+    """Number of channels of each compared feature map."""
+    return tuple([layer for layer in part if not isinstance(layer, Pool)][-1].outputs for part in slices)
+
+
+@functools.cache
+def smallest_side(slices: Slices) -> int:
+    """Pixels that an image must have per side for every layer to find a whole window."""
+
+    def fits(side: int) -> bool:
+        for layer in itertools.chain.from_iterable(slices):
+            if isinstance(layer, Fire):
+                continue
+            if side + 2 * getattr(layer, "padding", 0) < layer.size:
+                return False
+            side = _size_after(layer, side)
+        return True
+
+    return next(side for side in itertools.count(1) if fits(side))
+
+
+def _size_after(layer, size):
+    """Of a convolution or a pool on maps of a size: an int, or an array of several."""
+    margin = 2 * layer.padding if isinstance(layer, Conv) else (layer.stride - 1) * layer.ceil
+    return (size + margin - layer.size) // layer.stride + 1
+
+
+def feature_maps(
+    weights: Weights, slices: Slices, image: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
+) -> list[tuple[Float[Array, "y x c"], Int[Array, "2"] | None]]:
+    """The compared maps of an image whose colors are scaled as the network expects them, each with its size.
+
+    size: the image's own height and width, where it was padded below and right so that images of several sizes share a program.
+    The maps are then those of the image without padding, padded with zeros, and their sizes say where they end. Without it the
+    sizes are None.
+    Computed in the dtype of the weights. Raises: ValueError for an image that is too small for the network.
+    """
+    height, width, _ = image.shape
+    if min(height, width) < (least := smallest_side(slices)):
+        raise ValueError(f"an image of {width} x {height} is too small for this network: {least} pixels a side needed")
+    maps, x = [], _cleared(image.astype(weights["0"].kernel.dtype), size)
+    for part in slices:
+        for layer in part:
+            x, size = _apply(weights, layer, x, size)
+        maps.append((x, size))
+    return maps
+
+
+def _cleared(x, size):
+    """A map with zeros beyond its size: what a convolution finds outside of an image."""
+    if size is None:
+        return x
+    inside = [jnp.arange(side) < n for side, n in zip(x.shape[:2], size, strict=True)]
+    return jnp.where((inside[0][:, None] & inside[1])[..., None], x, 0)
+
+
+def _apply(weights, layer, x, size):
+    if isinstance(layer, Fire):
+        first, *expand = layer.convolutions
+        x, size = _apply(weights, first, x, size)
+        return jnp.concatenate([_apply(weights, part, x, size)[0] for part in expand], axis=-1), size
+    # values are not negative, so a zero beyond the map changes no maximum of a pool
+    x = _pool(layer, x) if isinstance(layer, Pool) else _convolve(weights[layer.name], layer, x)
+    size = None if size is None else _size_after(layer, size)
+    return _cleared(x, size), size
+
+
+def _convolve(weights, layer, x):
+    if (layer.size, layer.stride, layer.padding) == (3, 1, 1):
+        y = convolve(x[None], weights.kernel)
+    else:
+        stride, padding, layout = (layer.stride,) * 2, [(layer.padding,) * 2] * 2, ("NHWC", "HWIO", "NHWC")
+        y = jax.lax.conv_general_dilated(x[None], weights.kernel, stride, padding, dimension_numbers=layout)
+    return jax.nn.relu(y[0] + weights.bias)
+
+
+def _pool(layer, x):
+    """Columns, then rows, by strided slices: seven times as fast on a CPU as a windowed reduction and its gradient."""
+    if layer.ceil:
+        missing = [-(side - layer.size) % layer.stride for side in x.shape[:2]]
+        x = jnp.pad(x, [(0, missing[0]), (0, missing[1]), (0, 0)], constant_values=-jnp.inf)
+    combine = jnp.add if layer.average else _larger
+    for axis in (1, 0):
+        length = (x.shape[axis] - layer.size) // layer.stride * layer.stride + 1
+        slices = [jax.lax.slice_in_dim(x, i, i + length, layer.stride, axis) for i in range(layer.size)]
+        x = functools.reduce(combine, slices)
+    return x / layer.size**2 if layer.average else x
+
+
+def _larger(x, y):
+    # of equal values (plain backgrounds) the first gets the gradient, as in torch; NaN propagates
+    return jnp.where((y > x) | jnp.isnan(y), y, x)
+
+
+SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+"""Mean and scale of colors in [-1, 1] that the backbones of LPIPS expect."""
+EPSILON = 1e-10
+"""Added to the length of a feature vector."""
+
+
+@pytree_dataclass
+class Lpips:
+    """A backbone's convolutions, the weight of each channel of its compared maps, and which of `BACKBONES` it is."""
+
+    backbone: Weights
+    heads: tuple[Float[Array, " _"], ...]
+    net: str = static_field()
+
+
+def _unit(x):
+    return x / (safe_sqrt(jnp.sum(jnp.square(x), axis=-1, keepdims=True)) + EPSILON)
+
+
+def lpips_distances(
+    weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
+) -> Float[Array, " _"]:
+    """The distance at each depth of the backbone: five for vgg and alex, seven for squeeze. See `lpips`."""
+    images = at_least_float32((predicted, target))
+    shift, scale = (jnp.asarray(x, images[0].dtype) for x in (SHIFT, SCALE))
+    slices = BACKBONES[weights.net]
+    maps = [feature_maps(weights.backbone, slices, (2 * image - 1 - shift) / scale, size) for image in images]
+    distances = []
+    for head, (x, own), (y, _) in zip(weights.heads, *maps, strict=True):
+        x, y = at_least_float32((x, y))
+        different = jnp.sum(head * jnp.square(_unit(x) - _unit(y)), axis=-1)
+        distances.append(jnp.mean(different) if own is None else jnp.sum(different) / (own[0] * own[1]))
+    return jnp.stack(distances)
+
+
+def lpips(
+    weights: Lpips, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"], size: Int[Array, "2"] | None = None
+) -> Scalar:
+    """LPIPS (Zhang et al., 2018, version 0.1): distances of unit-length features, weighed per channel by learned heads.
+
+        d = sum over slices of the mean over pixels of sum_c w_c (x_c / |x| - y_c / |y|)^2
+
+    size: height and width of the images where both were padded below and right, see `feature_maps`: the distance is that of the
+    images without padding. Raises: ValueError for images that are too small (16 pixels a side for vgg, 31 for alex, 25 for
+    squeeze).
+    """
+    return jnp.sum(lpips_distances(weights, predicted, target, size))
+
+
 MEAN_COLOR = (123.68, 116.779, 103.939)
 DIVISORS = (1.0, 2.6, 4.8, 3.7, 5.6, 0.15)
 """Divisors of the errors of the pixels and of the five depths."""
@@ -21,15 +275,18 @@ DIVISORS = (1.0, 2.6, 4.8, 3.7, 5.6, 0.15)
 
 @pytree_dataclass
 class Vgg19:
-    """The convolutions of VGG-19 that the loss looks at (14 of 16), by torchvision's numbers."""
+    """The convolutions of VGG-19 that the perceptual loss looks at (14 of 16), by torchvision's numbers."""
 
     weights: Weights
 
 
 def perceptual_errors(vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Float[Array, "6"]:
-    """Mean absolute differences of the pixels in [0, 255] and of the features at the five depths.
+    """Mean absolute differences of the pixels in [0, 255] and of the features of VGG-19, with average pooling, at five depths.
 
-    Images are in [0, 1]. No gradient flows into the target. Raises: ValueError for images under 16 pixels a side.
+    Colors enter as 255 * rgb - (123.68, 116.779, 103.939), which is what the weights of the original VGG-19 expect (those of
+    MatConvNet's file and of the released checkpoint; torchvision's expect other scales and make another loss of it). The
+    features are those after the second ReLU of each block. No gradient flows into the target.
+    Raises: ValueError for images under 16 pixels a side.
     """
     target = jax.lax.stop_gradient(target)
     images = [255 * image for image in at_least_float32((predicted, target))]
@@ -40,6 +297,6 @@ def perceptual_errors(vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Floa
 
 
 def perceptual_loss(vgg: Vgg19, predicted: Float[Array, "h w 3"], target: Float[Array, "h w 3"]) -> Scalar:
-    """The weighted sum of `perceptual_errors`."""
+    """The published perceptual loss: the weighted sum of `perceptual_errors`."""
     errors = perceptual_errors(vgg, predicted, target)
     return jnp.sum(errors / jnp.asarray(DIVISORS, errors.dtype)) / 255

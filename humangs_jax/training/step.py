@@ -18,9 +18,8 @@ from humangs_jax.data.loader import Example
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.losses.loss_networks import LossNetworks
 from humangs_jax.losses.losses import squared_error, surface_distance, tightness, translucency
-from humangs_jax.losses.lpips import lpips
 from humangs_jax.losses.metrics import psnr
-from humangs_jax.losses.perceptual import perceptual_loss
+from humangs_jax.losses.perceptual import lpips, perceptual_loss
 from humangs_jax.losses.ssim import multiscale_structural_dissimilarity
 from humangs_jax.network.parts import HumanGSOutputs
 from humangs_jax.network.stages import StageCaller, call, inexact_leaves

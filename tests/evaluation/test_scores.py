@@ -12,8 +12,8 @@ from skimage.metrics import structural_similarity
 
 from humangs_jax.evaluation import scores
 from humangs_jax.evaluation.protocol import PROTOCOLS, CentredWindow
-from humangs_jax.losses.lpips import lpips
 from humangs_jax.losses.metrics import boundary_psnr
+from humangs_jax.losses.perceptual import lpips
 from humangs_jax.losses.ssim import GAUSSIAN, TORCHMETRICS, UNIFORM, mean_similarity, similarity_map
 
 DECIBELS = 1e-4

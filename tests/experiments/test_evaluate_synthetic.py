@@ -13,7 +13,7 @@ import pytest
 from evaluation_cases import capture_from, random_lpips
 
 from experiments.evaluation import bodies, body_cases, subjects, synthetic
-from humangs_jax.losses.lpips import lpips
+from humangs_jax.losses.perceptual import lpips
 from humangs_jax.network.presets import tiny
 from humangs_jax.network.weights import expected_variables, save_weights
 

@@ -16,10 +16,8 @@ from training_cases import without_upsampler
 from experiments.training.cases import random_weights
 from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Example, Loader
-from humangs_jax.losses.backbones import VGG16, channels
 from humangs_jax.losses.loss_networks import LossNetworks
-from humangs_jax.losses.lpips import Lpips
-from humangs_jax.losses.perceptual import VGG19, Vgg19
+from humangs_jax.losses.perceptual import VGG16, VGG19, Lpips, Vgg19, channels
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.network.presets import PRESETS
 from humangs_jax.network.reader import PixelAlignedReader

@@ -18,10 +18,8 @@ from humangs_jax.core.pytree import replace
 from humangs_jax.data.loader import CaptureCache, CaptureSource, Loader, ViewSampling
 from humangs_jax.data.views import SubjectViews
 from humangs_jax.geometry.camera import Camera
-from humangs_jax.losses.backbones import VGG16, channels
 from humangs_jax.losses.loss_networks import LossNetworks
-from humangs_jax.losses.lpips import Lpips
-from humangs_jax.losses.perceptual import VGG19, Vgg19
+from humangs_jax.losses.perceptual import VGG16, VGG19, Lpips, Vgg19, channels
 from humangs_jax.network.humangs import init_humangs
 from humangs_jax.rendering.splatting import render
 from humangs_jax.training.config import tiny
