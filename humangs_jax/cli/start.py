@@ -78,13 +78,13 @@ class Start:
         self._resumes()  # what is wrong with --out is said before the work
         with stage("starting"):
             from humangs_jax.apps.start import look
-            from humangs_jax.io.atomic import only_maker
+            from humangs_jax.io.atomic import only_writer
 
         material = look(self._photos(), cameras=self.cameras, masks=self.masks, keypoints=self.keypoints)
         if self.without_masks:
             material = dataclasses.replace(material, masks=None)
         tell(material)
-        with only_maker(self.out):
+        with only_writer(self.out, replaced=True):
             self._go_on(material, limits)
 
     def _go_on(self, material: "Material", limits: dict[str, Any] | None) -> None:

@@ -22,8 +22,6 @@ from humangs_jax.core.signals import undisturbed
 MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"
 ABANDONED_SECONDS = 24 * 3600.0
 """A temporary file of another machine (on a shared disk) is abandoned when it was not touched for this long."""
-WRITERS = 8
-"""Processes that may replace one folder at the same time: so often the renames are tried."""
 TOLD = 12
 """Entries of a folder that are named before it is deleted; the others are counted."""
 _TEMPORARY = re.compile(
@@ -67,23 +65,19 @@ def replace_files(writers: Mapping[str | os.PathLike, Callable[[Path], object]])
     Raises: FileNotFoundError if a folder does not exist; OSError, naming the path, if it cannot be written; what `write` raises.
     """
     temporaries: dict[Path, Path] = {}
-    try:
+    with contextlib.ExitStack() as unfinished:
         for path, write in ((Path(path), write) for path, write in writers.items()):
             if not path.parent.is_dir():
                 raise FileNotFoundError(f"{path.parent}: no such folder")
             _sweep(path.parent.resolve())
             temporaries[path] = temporary = path.with_name(f".{path.stem}.new-{_tag()}{path.suffix}")
-            _being_written.add(temporary.absolute())
+            unfinished.enter_context(_unfinished(temporary))
             with _naming(path, temporary):
                 write(temporary)
         with undisturbed():
             for path, temporary in temporaries.items():
                 with _naming(path, temporary):
                     temporary.replace(path)
-    finally:
-        for temporary in temporaries.values():
-            _being_written.discard(temporary.absolute())
-            _delete(temporary)
 
 
 def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *, mark: str) -> None:
@@ -100,50 +94,57 @@ def replace_folder(folder: str | os.PathLike, write: Callable[[Path], object], *
     _sweep(folder.parent.resolve())
     tag = _tag()
     temporary, aside = (folder.with_name(f".{folder.name}.{kind}-{tag}") for kind in ("new", "old"))
-    try:
-        with _naming(folder, temporary):
-            with _unfinished(temporary):
-                write(temporary)
-            with undisturbed():
-                _exchange(folder, temporary, aside)
-                shutil.rmtree(aside, ignore_errors=True)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with _naming(folder, temporary), _unfinished(temporary):
+        write(temporary)
+        with undisturbed():
+            _exchange(folder, temporary, aside)
+            shutil.rmtree(aside, ignore_errors=True)
 
 
 _being_written: set[Path] = set()
 
 
 @contextlib.contextmanager
-def _unfinished(temporary):
+def _unfinished(temporary: Path) -> Generator[None]:
+    """Removes a temporary file or folder at the end, if it is still there, or when the process is ended."""
     _being_written.add(temporary.absolute())
     try:
         yield
     finally:
         _being_written.discard(temporary.absolute())
+        _remove(temporary)
+
+
+def _remove(path: Path) -> None:
+    """A file or a folder; what ended the write is what is said, not that this failed."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        with contextlib.suppress(OSError):
+            path.unlink(missing_ok=True)
 
 
 def remove_unfinished() -> None:
     """Removes the temporary files that this process is still writing, just before it is ended. Final files are not touched."""
     for temporary in tuple(_being_written):
-        shutil.rmtree(temporary, ignore_errors=True) if temporary.is_dir() else _delete(temporary)
+        _remove(temporary)
 
 
-def _exchange(folder, temporary, aside):
+def _exchange(folder: Path, temporary: Path, aside: Path) -> None:
     """Rename `folder` to `aside` and `temporary` to `folder`. Where another process is faster, its folder is replaced too."""
-    for left in reversed(range(WRITERS)):
+    while True:
+        with contextlib.suppress(FileNotFoundError):
+            folder.rename(aside)
         try:
-            with contextlib.suppress(FileNotFoundError):
-                folder.rename(aside)
             temporary.rename(folder)
             return
         except BaseException as error:
-            if not folder.exists() and aside.is_dir():
-                with contextlib.suppress(OSError):  # another process has made the folder meanwhile
-                    aside.rename(folder)
-            if not left or not isinstance(error, OSError) or error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-                raise
-            shutil.rmtree(aside, ignore_errors=True)  # replaced by the other process
+            if isinstance(error, OSError) and error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                shutil.rmtree(aside, ignore_errors=True)  # replaced by the other process
+                continue
+            with contextlib.suppress(OSError):
+                aside.rename(folder)
+            raise
 
 
 def check_replaceable(
@@ -162,16 +163,16 @@ def check_replaceable(
     folder = Path(folder)
     if folder.is_symlink():
         raise ValueError(f"{folder}: is a symbolic link: expected the folder itself")
-    if folder.is_file():
-        raise ValueError(f"{folder}: is a file: expected a folder name")
     place = folder.resolve()
-    if Path.cwd().is_relative_to(place):
-        raise ValueError(f"{folder}: is the working folder or contains it: expected another folder")
-    if os.path.ismount(folder):
-        raise ValueError(f"{folder}: is a mount point, which cannot be renamed: expected a folder in it")
     above = next(parent for parent in place.parents if parent.exists())
-    if not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)):
-        raise ValueError(f"{folder}: cannot be made: {above} cannot be written to")
+    for wrong, problem in (
+        (folder.is_file(), "is a file: expected a folder name"),
+        (Path.cwd().is_relative_to(place), "is the working folder or contains it: expected another folder"),
+        (os.path.ismount(folder), "is a mount point, which cannot be renamed: expected a folder in it"),
+        (not (above.is_dir() and os.access(above, os.W_OK | os.X_OK)), f"cannot be made: {above} cannot be written to"),
+    ):
+        if wrong:
+            raise ValueError(f"{folder}: {problem}")
     for path in (Path(path) for path in inputs if path is not None):
         if place.exists() and any(real.is_relative_to(place) for real in (path.resolve(), path.absolute())):
             raise ValueError(f"{folder}: {path} lies in it and would be deleted: expected another folder")
@@ -192,7 +193,7 @@ def contents(folder: str | os.PathLike) -> str:
     return ", ".join(told) + (f" and {len(entries) - TOLD} more" if len(entries) > TOLD else "")
 
 
-def _entries(folder):
+def _entries(folder: str | os.PathLike) -> list[str]:
     """Names in a folder, sorted; none if it does not exist (any more: another process may be replacing it)."""
     try:
         return sorted(os.listdir(folder))
@@ -200,7 +201,7 @@ def _entries(folder):
         return []
 
 
-def _told(entry):
+def _told(entry: Path) -> str:
     if entry.is_symlink() or not entry.is_dir():
         return entry.name
     count = sum(len(files) for _, _, files in os.walk(entry))
@@ -225,62 +226,50 @@ def add_files(
     folder.parent.mkdir(parents=True, exist_ok=True)
     _sweep(folder.resolve().parent)  # also of one that was killed after it had made the folder
     temporary = (folder if inside else folder.parent) / f".{folder.resolve().name}.new-{_tag()}"
-    try:
-        with _naming(folder, temporary):
-            with _unfinished(temporary):
-                temporary.mkdir()
-                write(temporary)
-            with undisturbed():
-                folder.mkdir(exist_ok=True)
-                with _locked(folder, wait=True):
-                    for file in without:
-                        (folder / file).unlink(missing_ok=True)
-                    for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
-                        target = folder / file.relative_to(temporary)
-                        target.parent.mkdir(parents=True, exist_ok=True)
-                        file.replace(target)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+    with _naming(folder, temporary), _unfinished(temporary):
+        temporary.mkdir()
+        write(temporary)
+        with undisturbed():
+            folder.mkdir(exist_ok=True)
+            with _locked(folder, wait=True):
+                for file in without:
+                    (folder / file).unlink(missing_ok=True)
+                for file in sorted(path for path in temporary.rglob("*") if path.is_file()):
+                    target = folder / file.relative_to(temporary)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    file.replace(target)
 
 
 @contextlib.contextmanager
-def only_writer(folder: str | os.PathLike) -> Generator[None]:
+def only_writer(folder: str | os.PathLike, *, replaced: bool = False) -> Generator[None]:
     """Keeps other processes out of a folder that one writes to for long. The lock ends with the process, however that ends.
 
-    Where folders cannot be locked (Windows, some network disks), nothing is checked.
-    Raises: BlockingIOError, an OSError, if another process holds the folder.
+    Where there are no locks (Windows, some network disks), nothing is checked.
+
+    Arguments: replaced: the work makes or replaces the folder: what is locked is a file beside it, there until the work ends.
+    Raises: BlockingIOError, an OSError, if another process holds the folder; OSError, naming it, if it cannot be locked.
     """
-    with _locked(Path(folder), wait=False):
+    folder = Path(folder)
+    if not replaced:
+        with _locked(folder, wait=False):
+            yield
+        return
+    lock = folder.absolute().with_name(f".{folder.absolute().name}.lock")
+    lock.parent.mkdir(parents=True, exist_ok=True)
+    with _locked(folder, wait=False, lock=lock), _unfinished(lock):
         yield
 
 
 @contextlib.contextmanager
-def only_maker(folder: str | os.PathLike) -> Generator[None]:
-    """`only_writer` of a folder that the work makes or replaces: what is locked is a file beside it, there until the work ends.
-
-    Raises: as `only_writer`; OSError, naming the folder, if nothing can be written beside it.
-    """
-    folder = Path(folder)
-    lock = folder.absolute().with_name(f".{folder.absolute().name}.lock")
-    lock.parent.mkdir(parents=True, exist_ok=True)
-    with _locked(lock, wait=False, folder=folder), _unfinished(lock):
-        try:
-            yield
-        finally:
-            _delete(lock)
-
-
-@contextlib.contextmanager
-def _locked(place, wait, folder=None):
-    """place: a folder, or a file that is made for this and stands for `folder`."""
+def _locked(folder: Path, wait: bool, lock: Path | None = None) -> Generator[None]:
+    """lock: a file that is made for this and stands for the folder."""
     try:
         import fcntl
     except ImportError:  # Windows
         yield
         return
-    folder = folder or place
-    with _naming(folder, place):
-        descriptor = os.open(place, os.O_RDONLY | (0 if folder == place else os.O_CREAT))
+    with _naming(folder, lock or folder):
+        descriptor = os.open(lock or folder, os.O_RDONLY | (os.O_CREAT if lock else 0))
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
@@ -294,7 +283,7 @@ def _locked(place, wait, folder=None):
 
 
 @contextlib.contextmanager
-def _naming(path, temporary):
+def _naming(path: Path, temporary: Path) -> Generator[None]:
     """A full or read-only disk and other errors of the temporary file or folder become errors of `path`."""
     try:
         yield
@@ -305,11 +294,6 @@ def _naming(path, temporary):
         if str(temporary) in str(error):  # what a writer says in a text of its own
             raise OSError(str(error).replace(str(temporary), str(path))) from error
         raise
-
-
-def _delete(file):
-    with contextlib.suppress(OSError):  # what ended the write is what is said
-        file.unlink(missing_ok=True)
 
 
 def check_writable(path: str | os.PathLike) -> None:
@@ -325,7 +309,7 @@ def check_writable(path: str | os.PathLike) -> None:
         raise PermissionError(f"{path}: cannot be written: {above} is read-only or belongs to somebody else")
 
 
-def _tag():
+def _tag() -> str:
     return f"{MACHINE}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
 
 
@@ -339,13 +323,11 @@ def _sweep(parent: Path) -> None:
                 continue
             if found["kind"] == "old" and not (original := parent / found["name"]).exists():
                 entry.rename(original)  # the process was killed between its two renames
-            elif entry.is_dir():
-                shutil.rmtree(entry, ignore_errors=True)
             else:
-                entry.unlink(missing_ok=True)
+                _remove(entry)
 
 
-def _abandoned(path, machine, pid):
+def _abandoned(path: Path, machine: str, pid: int) -> bool:
     try:
         age = time.time() - path.stat().st_mtime
     except FileNotFoundError:
@@ -353,13 +335,12 @@ def _abandoned(path, machine, pid):
     return age > ABANDONED_SECONDS or (machine == MACHINE and not _runs(pid))
 
 
-def _runs(pid):
-    if os.name != "posix":  # os.kill would end the process there
-        return True
+def _runs(pid: int) -> bool:
     try:
-        os.kill(pid, 0)
+        if os.name == "posix":  # elsewhere it would end the process
+            os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except OSError:  # of another user
-        return True
+        pass
     return True

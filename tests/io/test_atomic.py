@@ -169,19 +169,19 @@ def test_if_one_of_several_files_fails_none_appears(tmp_path):
     assert names(tmp_path) == ["a.csv", "b.html"] and (tmp_path / "a.csv").read_text() == "new"
 
 
-@pytest.mark.parametrize("lock", ["only_writer", "only_maker"])
-def test_a_folder_has_one_writer_at_a_time(tmp_path, lock):
-    place, held = tmp_path / "place", getattr(atomic, lock)
-    if lock == "only_writer":
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_folder_has_one_writer_at_a_time(tmp_path, replaced):
+    place = tmp_path / "place"
+    if not replaced:
         place.mkdir()
     code = "import sys; from humangs_jax.io import atomic\n"
-    code += f"with atomic.{lock}(sys.argv[1]): print('held', flush=True); input()"
+    code += f"with atomic.only_writer(sys.argv[1], replaced={replaced}): print('held', flush=True); input()"
     with subprocess.Popen([sys.executable, "-c", code, place], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         other.stdout.readline()
-        with pytest.raises(BlockingIOError, match=f"{place}: another process is writing here"), held(place):
-            pass
+        with pytest.raises(BlockingIOError, match=f"{place}: another process is writing here"):
+            atomic.only_writer(place, replaced=replaced).__enter__()
         other.kill()
-    with held(place):
+    with atomic.only_writer(place, replaced=replaced):
         atomic.replace_folder(tmp_path / "place", writes("whole"), mark=MARK)
     assert names(tmp_path) == ["place"]
 
